@@ -1,45 +1,279 @@
-"""Nodes: functions that compute one step of a recipe, with typed parameters and attached functions
-(hooks).
-
-The signature defines the node. Arguments before ``*`` are data from other steps.
-Arguments after ``*`` are parameters from the recipe, and the engine gives the random
-generator for a parameter named ``rng``.
-
-    @node(rtol=0.0)
-    def digitize(electrons: Tensor, *, gain: Gain, bits: Bits = 16) -> Tensor: ...
-
-    @digitize.reference        # slow and simple form in float64; a test compares to rtol
-    @digitize.skip_bound       # upper bound of the change if the step is skipped
-    @digitize.propagate_error  # upper bound of the error that errors of the inputs cause
-    @digitize.rounding_error   # the same with what rounding to whole numbers adds, an estimate
-    @digitize.preflight        # checks the parameters before anything runs
-    @digitize.check            # checks that the result is plausible
-    @digitize.shape            # shape and type of the result, before anything runs
-    @digitize.expected_range   # least and largest element of the result, guessed before a run
-    @digitize.work             # memory and number of operations beside what the shapes say
-    @digitize.example          # arguments of one small call, for `neusee check`
-
-``digitize.hooks`` has each attached function under the name of its decorator; `nodes/_hooks.py`
-lists all hooks.
-"""
+"""Nodes: functions for one step of a recipe, with error bounds, checks and other hooks."""
 
 from __future__ import annotations
 
 import functools
 import importlib
 import inspect
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Literal, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_type_hints
 
 from pydantic import BaseModel, create_model
 
-from neusee.nodes._error_bound import ErrorBound, TensorStats
-from neusee.nodes._hooks import Check, Hooks
-from neusee.nodes.file_parameters import as_paths, is_file
 from neusee.nodes.own_modules import import_missing, own_files
-from neusee.nodes.parameter_model import ParameterModel
+from neusee.nodes.parameters import ParameterModel, as_paths, is_file
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+# --- error bound ----------------------------------------------------------------------------------
+
+# Statistics and error bounds of tensors, which an engine reads in place of the tensors.
+
+
+_FEW = 64  #: up to this many elements, a loop in Python is faster than five calls of torch
+#: elements of one part, and elements that are summed in the precision of the tensor
+_PART, _ROW = 1 << 17, 1 << 10
+_SUMMED = 1e-4  #: relative round-off of a sum, which float32 rows of 1024 elements keep far below
+
+
+@dataclass(frozen=True, slots=True)
+class TensorStats:
+    """Statistics of a tensor, such as range and sum, which are stored so that the tensor need
+    not be loaded.
+    """
+
+    shape: tuple[int, ...]
+    dtype: str
+    min: float
+    max: float
+    sum: float
+    support: int  #: elements that are not zero
+    finite: bool
+
+    @classmethod
+    def of(cls, value: Any) -> TensorStats | None:
+        """Return the statistics of a tensor, or of the first tensor in a named tuple; return
+        None for other values.
+        """
+        # here, so that a command that computes nothing need not import torch
+        from torch import Tensor
+
+        if isinstance(value, tuple | list) and value:
+            return cls.of(value[0])
+        if not isinstance(value, Tensor):
+            return None
+        x = value.detach()
+        shape, dtype = tuple(x.shape), str(x.dtype).removeprefix("torch.")
+        if x.numel() == 0:
+            return cls(shape, dtype, math.nan, math.nan, 0.0, 0, True)
+        x = x.abs() if x.is_complex() else x
+        few = x.reshape(-1).tolist() if x.numel() <= _FEW else []
+        if few and math.isfinite(total := float(sum(few))):
+            return cls(
+                shape,
+                dtype,
+                float(min(few)),
+                float(max(few)),
+                total,
+                sum(v != 0 for v in few),
+                True,
+            )
+        low, high, total, support = _measure(x.reshape(-1))
+        finite = all(map(math.isfinite, (low, high, total)))
+        return cls(shape, dtype, low, high, total, support, finite)
+
+    @property
+    def largest_rms(self) -> float:
+        """Return the largest root mean square that a tensor of this count, minimum, maximum and sum
+        can have.
+
+        The squares are largest where all elements but one are at an end of the range. Without a
+        finite sum, every element may be at the farther end.
+        """
+        low, high, count = self.min, self.max, math.prod(self.shape)
+        farthest = max(abs(low), abs(high))
+        if count == 0 or high <= low or not math.isfinite(self.sum):
+            return farthest
+        at_top = min(max((self.sum - count * low) / (high - low), 0.0), count)
+        between = low + (at_top - math.floor(at_top)) * (high - low)
+        at_bottom = max(count - math.floor(at_top) - 1, 0)
+        squares = math.floor(at_top) * high**2 + between**2 + at_bottom * low**2
+        return min(farthest, math.sqrt(squares / count) * (1 + _SUMMED))
+
+
+def _measure(flat: Tensor) -> tuple[float, float, float, int]:
+    """Return minimum, maximum, sum and number of nonzero elements of a flat tensor, in parts for
+    the CPU cache.
+    """
+    import torch
+
+    small = flat.dtype == torch.bool or (flat.is_floating_point() and flat.element_size() < 4)
+    parts = []
+    for part in torch.split(flat, _PART):
+        part = part.float() if small else part
+        rows = part.view(-1, _ROW) if part.numel() % _ROW == 0 else part[None]
+        parts.append(
+            (*torch.aminmax(part), rows.sum(1).sum(dtype=torch.float64), torch.count_nonzero(part))
+        )
+    lows, highs, sums, counts = (torch.stack(each) for each in zip(*parts, strict=True))
+    low, high, total = (float(x) for x in (lows.min(), highs.max(), sums.sum()))
+    # the sum of a row overflowed
+    if math.isinf(total) and math.isfinite(low) and math.isfinite(high):
+        total = float(sum(part.sum(dtype=torch.float64) for part in torch.split(flat, _PART)))
+    return low, high, total, int(counts.sum())
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorBound:
+    """A bound, or an estimate, of the error of an input of a node, with the statistics of this
+    input.
+    """
+
+    rms: float  #: bound of the root mean square error over the elements, in the unit of the input
+    stats: TensorStats | None = None
+    #: bound of the error of the largest element, as a share of this element; None if it is unknown
+    peak: float | None = None
+    #: True if the error counts an estimate; else it is a proved upper bound
+    estimated: bool = False
+    #: part of `rms` that changes from element to element like noise; the other part is like the
+    #: light itself
+    scattered: float = 0.0
+
+    @property
+    def top(self) -> float:
+        """Return the largest absolute element of the input, or 0 if nothing is known of the
+        input.
+        """
+        return max(abs(self.stats.min), abs(self.stats.max)) if self.stats else 0.0
+
+    @property
+    def share(self) -> float:
+        """Return the bound of the rms error of a node input, relative to the largest absolute
+        element of the input.
+        """
+        if self.rms == 0.0:
+            return 0.0
+        return self.rms / self.top if self.top > 0 else math.inf
+
+    @property
+    def largest(self) -> float:
+        """Return the bound of the relative error of the largest element of a node input, or inf
+        if unknown.
+        """
+        return 0.0 if self.rms == 0.0 else math.inf if self.peak is None else self.peak
+
+
+# --- hooks ----------------------------------------------------------------------------------------
+
+# Hooks: the functions that are attached to a node, such as bounds of its error and checks of its
+# result.
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One finding about the result of a node, such as ``Check("phase step 0.31 turn < 0.5",
+    True)``.
+    """
+
+    text: str
+    ok: bool = True
+
+
+@dataclass(slots=True)
+class Hooks:
+    """The functions attached to a node (hooks), such as ``check``, which ``@digitize.check``
+    attaches.
+    """
+
+    #: slow float64 form: same arguments, same result within ``rtol``
+    reference: Callable[..., Any] | None = None
+    #: (`TensorStats` of each input, *, parameters): bound of ``max |with - without| / max |with|``
+    #: if the step is left out and its first input is used instead; for a random node, in root mean
+    #: square over the noise
+    skip_bound: Callable[..., float] | None = None
+    #: (`TensorStats` of the first input, *, parameters): the factor by which the root mean square
+    #: of one draw of the noise exceeds `skip_bound` in one of 10 000 draws
+    skip_draw: Callable[..., float] | None = None
+    #: True if `skip_bound` is an estimate and no bound, for which a recipe with ``estimates:
+    #: false`` omits nothing
+    skip_estimated: bool = False
+    #: (`TensorStats` of the first input, *, parameters): the scale of `skip_bound`, such as the
+    #: full well, because a later step cuts off larger values
+    skip_scale: Callable[..., float] | None = None
+    #: (`TensorStats` of each input, None for an absent input, *, parameters): bound of the result's
+    #: largest element; where the bound is 0, the step and the steps that only feed this step are
+    #: left out
+    zero_bound: Callable[..., float] | None = None
+    #: (`ErrorBound` of each input, *, result: TensorStats, parameters): the error that errors of
+    #: the inputs cause in the result; both errors are upper bounds in root mean square; a list
+    #: input has a list, an absent input None; an `ErrorBound` in place of a number also tells the
+    #: error of the largest element; without this hook the inputs must satisfy the tolerance
+    #: themselves, because the error of the result is not known
+    propagate_error: Callable[..., float | ErrorBound] | None = None
+    #: (the same arguments): the error that one of 10 000 draws of the noise exceeds, where
+    #: `propagate_error` gives that of all draws; a run states it and does not hold it to the
+    #: tolerance
+    propagate_draw: Callable[..., float] | None = None
+    #: (the same arguments): the error of the result from errors like noise (`ErrorBound.scattered`,
+    #: here as ``rms``); without this hook `propagate_error` holds for these errors too
+    propagate_scattered: Callable[..., float] | None = None
+    #: (rms error of the result as `propagate_error` gives it, *, result: TensorStats, parameters):
+    #: the rms error with what rounding to whole numbers adds; an estimate, which a run states and
+    #: does not hold to the tolerance
+    rounding_error: Callable[..., float] | None = None
+    #: True if `propagate_error` or `approximation_error` gives an estimate and no bound, which a
+    #: recipe with ``estimates: false`` does not use
+    estimated: bool = False
+    #: (result): the error of a cheaper form relative to its largest element, in root mean square
+    #: and for the largest element alone; both include the cheaper forms of the inputs, and not what
+    #: was left out of the inputs
+    approximation_error: Callable[[Any], tuple[float, float]] | None = None
+    #: (parameters): True if the result is the same for every band
+    band_invariant: Callable[[Mapping[str, Any]], bool] | None = None
+    #: (*, parameters): notes for the user, before anything runs; may raise `ParameterError`; an
+    #: argument with the name of an input receives what is known of that input before the run, as
+    #: ``shape`` gives it, else None
+    preflight: Callable[..., Sequence[str]] | None = None
+    #: (result, *inputs, **parameters): findings, once after computing
+    check: Callable[..., Sequence[Check]] | None = None
+    #: (what is known of each input, None where nothing is, **parameters): what is known of the
+    #: result before the run: tensors on the device ``meta``, which have a shape and a type but no
+    #: values; a tensor of few numbers may have values. A rule that fails, such as one that needs an
+    #: unknown input, leaves the result unknown
+    shape: Callable[..., Any] | None = None
+    #: (`TensorStats` of each input, *, parameters): least and largest element of the result as a
+    #: plan expects them before the run, no bound; an input of which nothing is known raises
+    #: LookupError where it is read
+    expected_range: Callable[..., tuple[float, float]] | None = None
+    #: (): the arguments of one small call by name, on which `neusee check` tries the node
+    example: Callable[[], Mapping[str, Any]] | None = None
+    #: (result, *inputs, **parameters), all as for ``shape``: bytes of memory during the run beside
+    #: inputs and result, and number of operations, both up to a constant factor, which is measured
+    work: Callable[..., tuple[float, float]] | None = None
+
+
+# --- node -----------------------------------------------------------------------------------------
+
+# Nodes: functions that compute one step of a recipe, with typed parameters and attached functions
+# (hooks).
+#
+# The signature defines the node. Arguments before ``*`` are data from other steps. Arguments after
+# ``*`` are parameters from the recipe, and the engine gives the random generator for a parameter
+# named ``rng``.
+#
+#     @node(rtol=0.0)
+#     def digitize(electrons: Tensor, *, gain: Gain, bits: Bits = 16) -> Tensor: ...
+#
+#     @digitize.reference        # slow and simple form in float64; a test compares to rtol
+#     @digitize.skip_bound       # upper bound of the change if the step is skipped
+#     @digitize.propagate_error  # upper bound of the error that errors of the inputs cause
+#     @digitize.rounding_error   # the same with what rounding to whole numbers adds, an estimate
+#     @digitize.preflight        # checks the parameters before anything runs
+#     @digitize.check            # checks that the result is plausible
+#     @digitize.shape            # shape and type of the result, before anything runs
+#     @digitize.expected_range   # least and largest element of the result, guessed before a run
+#     @digitize.work             # memory and number of operations beside what the shapes say
+#     @digitize.example          # arguments of one small call, for `neusee check`
+#
+# ``digitize.hooks`` has each attached function under the name of its decorator; `nodes/_node.py`
+# lists all hooks.
+
 
 Device = Literal["any", "cpu", "gpu"]
 Fn = TypeVar("Fn", bound=Callable[..., Any])

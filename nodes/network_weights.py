@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from neusee.nodes import ParameterError
-from neusee.nodes.array_bytes import safetensors_need
+from neusee.nodes.file_headers import safetensors_need
 from neusee.nodes.input_files import once_per_version
 
 Net = TypeVar("Net", bound=nn.Module)

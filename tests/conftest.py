@@ -55,7 +55,7 @@ def nodes_of_tests_are_not_observed():
     """Let nodes that stand in a test itself run as those of neusee do: side by side, in the
     thread of their lane.
     """
-    from neusee.workflows.keys import module_owner
+    from neusee.workflows.keys import cache_key as module_owner
 
     module_owner.PROVEN = ("neusee.", "tests.", "engine_toys.")
 

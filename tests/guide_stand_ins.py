@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from neusee.workflows.calibration.emva_figures import PICTURES
 from neusee.workflows.evaluation.pipelines import CASES as LASERS
 from neusee.workflows.evaluation.pipelines import NONE
-from neusee.workflows.studies.leave_out.possible_omissions import omissions
+from neusee.workflows.studies.leave_out.left_out_steps import omissions
 from neusee.workflows.studies.stability import stability_study
 from neusee.workflows.studies.stability.extreme_cases import CASES
 from tests.drawn_chains import drawn_chains
@@ -154,8 +154,8 @@ ONE_PLOT = {"calibration.emva_figures:PICTURES": {"photon_transfer": PICTURES["p
 #: two lasers of an evaluation's page, as weak as its points: each saturated pixel adds an unknown
 #: to the filter
 WEAK = {
-    "evaluation.comparison_pictures:_WEAKEST": 30.0,
-    "evaluation.comparison_pictures:CASES": {name: LASERS[name] for name in ("green", "red", NONE)},
+    "evaluation.evaluation_result:_WEAKEST": 30.0,
+    "evaluation.evaluation_result:CASES": {name: LASERS[name] for name in ("green", "red", NONE)},
 }
 PROTOCOL = (
     "scene.shape=[28,28]",
@@ -171,8 +171,8 @@ PROTOCOL = (
 )
 #: two of the six lasers of the protocol's page, and weak ones
 TWO_OF_SIX = {
-    "evaluation.comparison_pictures:_WEAKEST": 30.0,
-    "evaluation.measured_points:SIX": {name: LASERS[name] for name in ("green", "red", NONE)},
+    "evaluation.evaluation_result:_WEAKEST": 30.0,
+    "evaluation.evaluation_result:SIX": {name: LASERS[name] for name in ("green", "red", NONE)},
 }
 #: settings of an accuracy study, each measured once
 FEW_POINTS = {
@@ -272,7 +272,7 @@ STAND_INS = {
     "study leave-out first_light": StandIn(
         "minutes: three omissions, and what simpler scenes cost is not measured", more=("outputs=[raw,lsr]",),
         constants={"studies.leave_out.leave_out_study:measure_scenes": lambda *_: [],
-            "studies.leave_out.omission_rows:omissions": three_omissions}),
+            "studies.leave_out.left_out_steps:omissions": three_omissions}),
     "study calibration calibrate --simulations 100": StandIn(
         "minutes: 20 sensors of 32 x 32 pixels, and draws without a walk", more=("flats.shape=[32,32]",
             "sensor.gain=0.37 DN/e-"), instead={"100": "20"},

@@ -30,7 +30,7 @@ ROOMS = (
     "graph", "keys", "observation", "recipe.text", "recipe.blocks", "recipe.distributions", "recipe", "store",
     "placement", "tolerance", "engine", "report.figures", "report", "contract", "explain", "simulation", "comparison",
     "safety", "restoration", "protection", "priors", "sweeps", "training.loop",
-    "training.parallel", "training.mask_design", "training", "training.lift", "evaluation", "frames", "calibration",
+    "training.mask_design", "training", "training.lift", "evaluation", "frames", "calibration",
     "studies", "studies.accuracy", "studies.stability", "studies.leave_out", "studies.uncertainty",
     "studies.calibration", "studies.protection", "api",
     "handbook", "answers", "cli",
@@ -80,21 +80,20 @@ ACROSS = {
 #: Calls that import a module by a name that is only known when they run.
 DYNAMIC = {
     "__init__.py": "the names that workflows offers are imported when they are first used",
-    "keys/loaded_source.py": (
+    "keys/module_digest.py": (
         "a node imports a module when it runs, and the values of the module count before"
     ),
     "report/run_pictures.py": "report.contents names the function that draws each picture",
     "studies/run_study.py": "a kind of study names its room",
     "recipe/node_families.py": "a recipe names the family of a node",
-    "cli/typer_program.py": "a command line names the command, whose module alone is imported",
-    "training/tensorboard_log.py": "TensorBoard is optional, and has no types",
+    "cli/program_options.py": "a command line names the command, whose module alone is imported",
+    "training/run_training.py": "TensorBoard is optional, and has no types",
 }
 
 #: Files that may use pi.
 PI = {
-    "recipe/blocks/train_lift_block.py": "half a cosine, along which the rate of training falls",
-    "training/mask_design/gradient_descent.py": "half a cosine, along which a rate falls",
-    "training/mask_design/differential_evolution.py": "the bound of an angle",
+    "recipe/blocks/train_block.py": "half a cosine, along which the rate of training falls",
+    "training/mask_design/mask_optimisers.py": "half a cosine, along which a rate falls, and the bound of an angle",
 }
 #: files that fork a process and end it
 FORKS = {
@@ -107,8 +106,6 @@ MEASURED = {
     "wavelengths",
     "centres",
 }  #: fields of neusee.nodes.values that formulas of optics are made of
-
-MOST_LINES = 6800  #: of a room with its inner rooms
 
 # --- what a file says -----------------------------------------------------------------------------
 
@@ -410,17 +407,6 @@ def places(files):
     )
 
 
-def lengths(files, most=MOST_LINES):
-    """Rooms with too many lines, inner rooms counted with them."""
-    lines = Counter()
-    for file, tree in files.items():
-        path = HOUSE / file
-        lines[file.partition("/")[0]] += (
-            len(path.read_text().splitlines()) if path.exists() else tree.body[-1].end_lineno
-        )
-    yield from (f"{room}: {count} lines" for room, count in lines.items() if count > most)
-
-
 def offers(files):
     """Rooms whose `__init__` does not ask a question and name what the room offers, or holds
     more than words.
@@ -428,7 +414,7 @@ def offers(files):
     for room in ROOMS:
         file = f"{room.replace('.', '/')}/__init__.py"
         tree = files[file]
-        question, _, rest = (ast.get_docstring(tree) or "").partition("\n")
+        question, _, rest = (ast.get_docstring(tree) or "").partition("\n\n")
         offered = re.findall(r"`(\w+)\.(\w+)`", rest.partition("Offers: ")[2])
         if not question.endswith("?") or not offered:
             yield f"{file}: no question, or nothing that it offers"
@@ -441,26 +427,15 @@ def offers(files):
 
 
 FILE_RULES = (direction, siblings, exits, terminal, samplers, private, dynamic, formulas)
-HOUSE_RULES = (classes, names, places, lengths, offers)
+HOUSE_RULES = (classes, names, places, offers)
 
 # --- the tests ------------------------------------------------------------------------------------
 
 #: modules of nodes/ itself, each with the modules of neusee.nodes that it may import
 BELOW = {
-    **{
-        name: set()
-        for name in ("units.py", "constants.py", "values.py", "_error_bound.py", "own_modules.py")
-    },
-    "parameter_model.py": set(),
-    "file_parameters.py": {"neusee.nodes.units"},
-    "_hooks.py": {"neusee.nodes._error_bound"},
-    "_node.py": {
-        "neusee.nodes._error_bound",
-        "neusee.nodes._hooks",
-        "neusee.nodes.file_parameters",
-        "neusee.nodes.own_modules",
-        "neusee.nodes.parameter_model",
-    },
+    **{name: set() for name in ("units.py", "constants.py", "values.py", "own_modules.py")},
+    "parameters.py": {"neusee.nodes.units"},
+    "_node.py": {"neusee.nodes.own_modules", "neusee.nodes.parameters"},
 }
 
 
@@ -576,7 +551,7 @@ OFFENCES = [
         "evaluation/pipelines.py",
         "from neusee.workflows.calibration.run_calibration import calibrate",
     ),
-    (siblings, "calibration/ensembles.py", "from neusee.workflows.sweeps import axes"),
+    (siblings, "calibration/emcee_sampler.py", "from neusee.workflows.sweeps import axes"),
     (
         siblings,
         "studies/leave_out/leave_out_study.py",
@@ -596,7 +571,7 @@ OFFENCES = [
         "report/data_exports.py",
         "def _():\n    from neusee.nodes.scene._spectral_exr import write_spectral",
     ),
-    (private, "training/run_training.py", "import neusee.nodes._half_precision"),
+    (private, "training/run_training.py", "import neusee.nodes._node"),
     (private, "engine/runner.py", "from neusee.nodes.doe import _refractive_index"),
     (private, "engine/runner.py", "from neusee.workflows.store.lease import _name"),
     (dynamic, "engine/runner.py", "importlib.import_module('neusee.workflows.cli.app')"),
@@ -618,7 +593,6 @@ OFFENCES = [
     (names, "studies/run_study.py", "def accuracy():\n    pass"),
     (places, "helpers.py", "x = 1"),
     (places, "engine/loops/__init__.py", "x = 1"),
-    (lengths, "graph/more.py", "\n" * MOST_LINES + "x = 1"),
     (offers, "graph/__init__.py", "import torch"),
 ]
 

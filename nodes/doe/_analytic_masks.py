@@ -11,8 +11,13 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import node
-from neusee.nodes.doe._height_from_phase import height_checks, height_from_phase
-from neusee.nodes.doe._refractive_index import AnyGlass, Glass, refuse_material
+from neusee.nodes.doe._refractive_index import (
+    AnyGlass,
+    Glass,
+    height_checks,
+    height_from_phase,
+    refuse_material,
+)
 from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, polar
 from neusee.nodes.optics._zernike import surface
 from neusee.nodes.units import Angle, Charge, Count, Height, Slope, Wavelength

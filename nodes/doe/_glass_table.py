@@ -13,7 +13,7 @@ from typing_extensions import TypedDict
 
 from neusee.nodes import ParameterError
 from neusee.nodes.input_files import once_per_version
-from neusee.nodes.spectra._spectral_tables import Table
+from neusee.nodes.spectra._cie_tables import Table
 from neusee.nodes.spectra._table_files import LENGTHS, Curves, Rows, curves, refused, table_rows
 from neusee.nodes.units import Real, Wavelength
 

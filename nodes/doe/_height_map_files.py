@@ -15,10 +15,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.nodes import ParameterError
-from neusee.nodes.array_bytes import mat_needs, npy_needs, safetensors_need
-from neusee.nodes.input_files import once_per_version, refuse_large_array
-from neusee.nodes.input_size import head_of, refuse_other_than_file
-from neusee.nodes.picture_bytes import picture_needs
+from neusee.nodes.file_headers import mat_needs, npy_needs, picture_needs, safetensors_need
+from neusee.nodes.input_files import (
+    head_of,
+    once_per_version,
+    refuse_large_array,
+    refuse_other_than_file,
+)
 from neusee.nodes.scene._spectral_exr import exr_header, exr_parts
 from neusee.nodes.units import read_quantity
 

@@ -1,8 +1,9 @@
-"""Materials of the mask, and their refractive indices relative to air."""
+"""Materials of the mask, their refractive indices, and the height that gives a phase."""
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from pydantic import Discriminator, Tag, WithJsonSchema
@@ -16,8 +17,14 @@ from neusee.nodes.doe._glass_table import (
     glass_range,
     refuse_glass,
 )
+from neusee.nodes.optics._pupil_grid import PupilGrid, inside
 from neusee.nodes.units import DataFile
 from neusee.nodes.values import Bands
+
+# --- refractive index -----------------------------------------------------------------------------
+
+# Materials of the mask, and their refractive indices relative to air.
+
 
 Material = Literal["fused silica", "PMMA", "BK7", "photoresist"]
 #: a known material, a file with a table or coefficients, or coefficients
@@ -165,3 +172,32 @@ def _name_and_range(material: AnyGlass) -> tuple[str, tuple[float, float]]:
     return material.name if isinstance(
         material, Path
     ) else "own Sellmeier coefficients", glass_range(material)
+
+
+# --- height from phase ----------------------------------------------------------------------------
+
+# The height map of a mask that produces a given phase, and the check of a height map.
+
+
+def height_from_phase(
+    phase: Tensor, grid: PupilGrid, wavelength: float, material: AnyGlass
+) -> Tensor:
+    """Return the height map (float32, m) that delays ``wavelength`` by ``phase``; the least height
+    is 0.
+
+    The height outside the stop is 0 too.
+    """
+    open_ = inside(grid, phase.device)
+    raised = phase - torch.where(open_, phase, math.inf).min()
+    return torch.where(open_, raised * (wave_height(material, wavelength) / (2 * math.pi)), 0.0).to(
+        torch.float32
+    )
+
+
+def height_checks(height: Tensor, *_: Any, **__: Any) -> list[Check]:
+    """Check that all heights are finite and at least 0, and state the least and the greatest
+    height.
+    """
+    low, high = (float(value) for value in torch.aminmax(height))
+    sound = math.isfinite(low) and math.isfinite(high) and low >= 0
+    return [Check(f"height map from {low * 1e6:.3g} to {high * 1e6:.4g} um", sound)]

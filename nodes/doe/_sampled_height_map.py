@@ -8,7 +8,6 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.doe._height_from_phase import height_checks
 from neusee.nodes.doe._height_map_files import map_header, read_height_map
 from neusee.nodes.doe._map_resampling import (
     Between,
@@ -18,9 +17,10 @@ from neusee.nodes.doe._map_resampling import (
     resampling_error,
     too_small,
 )
+from neusee.nodes.doe._refractive_index import height_checks
 from neusee.nodes.input_files import once_per_version
-from neusee.nodes.optics._phase_screen import screen
 from neusee.nodes.optics._pupil_grid import PupilGrid, grid_of
+from neusee.nodes.optics._zernike import screen
 from neusee.nodes.units import DataFile, Depth, LengthUnit, PupilPitch
 from neusee.nodes.values import Stop
 

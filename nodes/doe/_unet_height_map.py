@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from neusee.nodes import node
-from neusee.nodes.bicubic_resize import enlarge
-from neusee.nodes.doe._height_from_phase import height_checks
+from neusee.nodes.doe._refractive_index import height_checks
 from neusee.nodes.network_weights import loaded, same_layout
+from neusee.nodes.resampling import enlarge
 from neusee.nodes.units import Count, DataFile, Depth, Layers
 from neusee.nodes.values import Stop
 

@@ -10,7 +10,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, TensorStats, node
-from neusee.nodes._half_precision import single
+from neusee.nodes.precision import single
 from neusee.nodes.units import FocalLength, Fraction, PixelPitch, SensorLength
 from neusee.nodes.values import Bands
 

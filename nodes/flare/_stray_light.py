@@ -14,7 +14,6 @@ from torch import Tensor
 from typing_extensions import TypedDict
 
 from neusee.nodes import Check, ParameterError, TensorStats, node
-from neusee.nodes._half_precision import refuse_not_finite, single
 from neusee.nodes.flare._harvey_shack import (
     NEAR,
     Lobe,
@@ -23,7 +22,8 @@ from neusee.nodes.flare._harvey_shack import (
     on_pixels,
     scattered_share,
 )
-from neusee.nodes.optics._f_number import refuse_impossible_f_number
+from neusee.nodes.optics._lens import refuse_impossible_f_number
+from neusee.nodes.precision import refuse_not_finite, single
 from neusee.nodes.units import Angle, BeamRadius, Diameter, FocalLength, PixelPitch, Wavelength
 from neusee.nodes.values import Psf, Pupil
 

@@ -16,29 +16,25 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neusee.nodes.laser._damage_curve import (
+from neusee.nodes.laser._damage_laws import (
+    ABSORPTION_SOURCE,
     CONTINUOUS_FROM,
+    PUBLISHED_DAMAGE,
     PULSE_END,
     SHORTEST,
+    SILICON_RANGE,
     SPREAD,
     Bracket,
     CurveEnds,
-    first_damage,
-)
-from neusee.nodes.laser._damage_laws import (
     DamageLaw,
     Kind,
     Number,
     Quantity,
+    absorption_bracket,
     double,
+    first_damage,
     matching_laws,
     spot_factor,
-)
-from neusee.nodes.laser._damage_published import PUBLISHED_DAMAGE
-from neusee.nodes.laser._silicon_absorption import (
-    ABSORPTION_SOURCE,
-    SILICON_RANGE,
-    absorption_bracket,
 )
 
 Part = Literal["pulse", "mean", "accumulation", "incubation"]

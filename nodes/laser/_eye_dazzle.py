@@ -18,7 +18,7 @@ from typing import NamedTuple
 from neusee.nodes import ParameterError
 from neusee.nodes.laser._beam import Beam
 from neusee.nodes.laser._eye_limits import hazard_distance
-from neusee.nodes.spectra._spectral_tables import observer
+from neusee.nodes.spectra._cie_tables import observer
 
 LUMENS_PER_WATT = 683.0  #: at 555 nm
 STEADY = 100.0  #: Hz, from which a train of pulses looks steady: above the fusion of flicker

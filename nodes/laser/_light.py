@@ -9,17 +9,18 @@ import torch
 from pydantic import Field
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.laser._air import Law, air_transmittance
 from neusee.nodes.laser._beam import (
     Beam,
     Convention,
+    Law,
+    air_transmittance,
     axis_density,
     beam,
     beam_radius,
     curvature_radius,
     plain,
 )
-from neusee.nodes.optics._f_number import refuse_impossible_f_number
+from neusee.nodes.optics._lens import refuse_impossible_f_number
 from neusee.nodes.optics._pupil_grid import clear_area, gaussian_over
 from neusee.nodes.spectra._bands import mean_wavelength
 from neusee.nodes.units import (

@@ -8,7 +8,7 @@ import math
 
 from neusee.nodes import ParameterError
 from neusee.nodes.constants import PLANCK, SPEED_OF_LIGHT
-from neusee.nodes.spectra._spectral_tables import daylight
+from neusee.nodes.spectra._cie_tables import daylight
 
 _WHITE = (400e-9, 700e-9)  #: m, over which the white light of the picture counts
 _DAYLIGHT = 6504.0  #: K

@@ -8,10 +8,8 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.laser._bright_pixels import PARTS, RINGS, BrightPixels, bright_pixels
-from neusee.nodes.laser._damage_pixels import damaged_pixels
-from neusee.nodes.laser._damage_spot import SpotDamage, damage, parts_before
-from neusee.nodes.laser._dazzle_curve import DECADES, DazzleCurve, dazzle_curve
-from neusee.nodes.laser._dazzle_picture import Dazzle, dazzle
+from neusee.nodes.laser._damage_spot import SpotDamage, damage, damaged_pixels, parts_before
+from neusee.nodes.laser._dazzle import DECADES, Dazzle, DazzleCurve, dazzle, dazzle_curve
 from neusee.nodes.laser._light import light, wavefront
 from neusee.nodes.shape_rules import (
     at_least_single,

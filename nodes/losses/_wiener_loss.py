@@ -9,11 +9,10 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import node
-from neusee.nodes._half_precision import single
-from neusee.nodes.losses._contrast_loss import HighestFrequency
-from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_shares
-from neusee.nodes.restore._inverse._masked_blur import variance
-from neusee.nodes.restore._inverse._picture_scale import fall
+from neusee.nodes.losses._mask_losses import HighestFrequency
+from neusee.nodes.precision import single
+from neusee.nodes.restore._inverse._masked_blur import effective_psf, grey_shares, variance
+from neusee.nodes.restore._inverse._wiener_prior import fall
 from neusee.nodes.values import Bands, Psf
 
 OneBandShare = Annotated[float, Field(ge=0, le=1)]

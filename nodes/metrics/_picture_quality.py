@@ -8,8 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes._half_precision import single
-from neusee.nodes.exact_convolution import exact_convolutions
+from neusee.nodes.precision import exact_convolutions, single
 
 _WINDOW = 11  #: width in pixels of the Gaussian window of SSIM
 _STRIPE = 118  #: rows that are compared at a time: 128 with the margin of the window

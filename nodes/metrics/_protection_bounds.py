@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.metrics._filtered_picture import Light
-from neusee.nodes.optics._lens_band import averaging, cut_off, round_lens, stop_width
+from neusee.nodes.optics._lens import averaging, cut_off, round_lens, stop_width
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Psf
 

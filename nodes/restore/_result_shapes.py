@@ -1,41 +1,47 @@
-"""Shapes of the results of the restoring nodes, and the work of the deconvolution and of the
-networks.
-"""
+"""Shapes of the results of the restoring nodes, and the work of those that take long."""
+
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from neusee.nodes.network_classes import Architecture
-from neusee.nodes.restore._colour_matrix import colour_matrix
-from neusee.nodes.restore._electrons_and_colour import clipped, colour, electrons
-from neusee.nodes.restore._inverse._conjugate_gradients import LOWEST
-from neusee.nodes.restore._inverse._fft_grid import halvings, torus
-from neusee.nodes.restore._inverse._filter_facts import EACH, MAPS, filter_facts
+from neusee.nodes.own_modules import Architecture
+from neusee.nodes.restore._electrons_and_colour import (
+    clipped,
+    colour,
+    colour_matrix,
+    electrons,
+    white_level,
+)
+from neusee.nodes.restore._inverse._conjugate_gradients import LOWEST, MODES, SHARE
+from neusee.nodes.restore._inverse._glare import nearby_glare
 from neusee.nodes.restore._inverse._hidden_pixels import MOST, STEPS
-from neusee.nodes.restore._inverse._lowest_frequencies import MODES, SHARE
-from neusee.nodes.restore._inverse._nearby_glare import nearby_glare
+from neusee.nodes.restore._inverse._masked_blur import bordered, halvings, torus
 from neusee.nodes.restore._inverse._posterior_spread import wiener_spread
-from neusee.nodes.restore._inverse._psf_on_grid import bordered
 from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
-from neusee.nodes.restore._inverse._wiener import PRECISE, wiener
-from neusee.nodes.restore._inverse._wiener_problem import wiener_problem
-from neusee.nodes.restore._lasers._find_lasers import find_lasers
-from neusee.nodes.restore._lasers._found_glare import found_glare, found_nearby
+from neusee.nodes.restore._inverse._wiener import (
+    EACH,
+    MAPS,
+    PRECISE,
+    filter_facts,
+    wiener,
+    wiener_problem,
+)
+from neusee.nodes.restore._lasers._find_lasers import find_lasers, found_glare, found_nearby
+from neusee.nodes.restore._measured_psf import measured_psf
 from neusee.nodes.restore._networks._fft_mamba import fft_mamba
-from neusee.nodes.restore._networks._informed import informed
-from neusee.nodes.restore._networks._nafnet import nafnet
-from neusee.nodes.restore._networks._network_node import network
+from neusee.nodes.restore._networks._network_files import network
 from neusee.nodes.restore._networks._own_network import tried
-from neusee.nodes.restore._networks._unet import unet
-from neusee.nodes.restore._networks._unrolled import unrolled
-from neusee.nodes.restore._points._by_field import spread_by_field, wiener_by_field
-from neusee.nodes.restore._shading._frame_cells import grid
-from neusee.nodes.restore._shading._shading_node import shading
-from neusee.nodes.restore._white_level import white_level
+from neusee.nodes.restore._networks._unet_and_nafnet import nafnet, unet
+from neusee.nodes.restore._networks._wiener_networks import informed, unrolled
+from neusee.nodes.restore._point_frames import points_in
+from neusee.nodes.restore._shading_field import grid, shading
+from neusee.nodes.restore._wiener_by_field import spread_by_field, wiener_by_field
 from neusee.nodes.shape_rules import (
     at_least_single,
     blank,
@@ -43,7 +49,22 @@ from neusee.nodes.shape_rules import (
     like_first,
     transform_operations,
 )
-from neusee.nodes.values import Bands, FilterFacts, FoundLasers, Psf, Pupil, Shading, WienerProblem
+from neusee.nodes.values import (
+    Bands,
+    FilterFacts,
+    FoundLasers,
+    MeasuredPsf,
+    Psf,
+    Pupil,
+    Shading,
+    WienerProblem,
+)
+
+# --- result shapes --------------------------------------------------------------------------------
+
+# Shapes of the results of the restoring nodes, and the work of the deconvolution and of the
+# networks.
+
 
 _SYSTEM = 35.0  #: bytes for each element of a dense system: the matrix, its factors and copies
 #: operations of a transform that take as long as one of the cube of the side of an inverted matrix
@@ -372,3 +393,122 @@ def _(
     return _KEPT * trial.memory * min(
         pixels, tile**2 if tile else math.inf
     ), _LAYER * trial.operations * pixels
+
+
+# --- result shapes --------------------------------------------------------------------------------
+
+# The shape of a measured PSF, and the work of measuring it and of restoring with it.
+
+
+_FITS = 6  #: steps of Gauss and Newton that a fit usually takes, each of as much work as a draw
+#: bytes for each pixel of each window: the points, their slopes and the arrays of a step
+_HELD = 80.0
+_SEEN = 40.0  #: bytes for each pixel of a frame while it is searched for points
+
+
+@measured_psf.shape
+def _(
+    responses: Tensor,
+    *,
+    files: Sequence[Path],
+    window: Sequence[int],
+    zones: Sequence[int],
+    draws: int = 24,
+    gain: float,
+    offset: float,
+    full_well: float,
+    read_noise: float,
+    bits: int = 16,
+    **params: Any,
+) -> MeasuredPsf:
+    channels, (y, x), (rows, columns) = len(responses), window, zones
+    kernels = rows, columns, channels, y, x
+    points = points_in(files, (y, x), (gain, offset, full_well, bits, read_noise))
+    each = [double(rows, columns) for _ in range(2)]
+    return MeasuredPsf(
+        double(*kernels),
+        double(*kernels),
+        blank(draws, *kernels),
+        double(points, 4),
+        double(channels),
+        double(channels),
+        *each,
+    )
+
+
+@measured_psf.work
+def _(
+    result: MeasuredPsf,
+    *inputs: Any,
+    files: Sequence[Path] = (),
+    shape: Sequence[int],
+    **params: Any,
+) -> tuple[float, float]:
+    """Return the bytes of the windows and a frame, and the products of the shifts of all draws and
+    fits.
+
+    Each node slows the iteration down, because points tell several PSFs at once.
+    """
+    rows, columns, channels, y, x = result.kernels.shape
+    windows = float(len(result.places) * channels * y * x)
+    pixels = float(channels * math.prod(shape))
+    steps = rows * columns * (_FITS + len(result.draws))
+    return _HELD * windows + _SEEN * pixels, steps * windows * (y + x) + len(files) * pixels
+
+
+@wiener_by_field.work
+def _(
+    result: Tensor,
+    electrons: Tensor,
+    measured: MeasuredPsf,
+    clipped: Any = None,
+    glare: Any = None,
+    nearby: Sequence[Tensor] | None = None,
+    **params: Any,
+) -> tuple[float, float]:
+    """Return the work of the filter on the largest part, and on all parts."""
+    rows, columns = (
+        _sides(n, count, size)
+        for n, count, size in zip(
+            electrons.shape[-2:],
+            measured.kernels.shape[:2],
+            measured.kernels.shape[-2:],
+            strict=True,
+        )
+    )
+    psf, memory, operations = Psf(measured.kernels[0, 0], measured.fit), 0.0, 0.0
+    for y in rows:
+        for x in columns:
+            part = blank(len(electrons), y, x)
+            doubts = [blank(len(each), *part.shape) for each in nearby or ()]
+            held, taken = wiener.hooks.work(part, part, psf, None, None, None, None, None, doubts)  # type: ignore[misc]
+            memory, operations = max(memory, held), operations + taken
+    return memory, operations
+
+
+@spread_by_field.work
+def _(
+    result: Tensor,
+    electrons: Tensor,
+    measured: MeasuredPsf,
+    clipped: Any,
+    matrix: Any,
+    *others: Any,
+    draws: int = 8,
+    **params: Any,
+) -> tuple[float, float]:
+    memory, operations = wiener_by_field.hooks.work(  # type: ignore[misc]
+        result, electrons, measured, clipped, *others[:2]
+    )
+    return memory, draws * operations
+
+
+def _sides(size: int, count: int, window: int) -> list[int]:
+    """Return the pixels that the parts around each of ``count`` nodes have along one axis, at
+    most.
+    """
+    if count == 1:
+        return [size]
+    ends = math.ceil(1.5 * size / count) + window // 2
+    inner = math.ceil(2.0 * size / count) + 2 * (window // 2)
+    return [min(side, size) for side in (ends, *[inner] * (count - 2), ends)]

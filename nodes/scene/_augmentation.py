@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from neusee.nodes.bicubic_resize import resize
+from neusee.nodes.resampling import resize
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes._colour_science import colour_science
 from neusee.nodes.input_files import not_finite, once_per_version, refuse_large_picture
-from neusee.nodes.scene._crop_to_frame import enlarged
-from neusee.nodes.scene._large_picture import Linear, bands_of, linear_light
+from neusee.nodes.scene._picture_scaling import Linear, bands_of, enlarged, linear_light
 from neusee.nodes.scene._spectral_exr import PartHeader, exr_parts, part_headers
 from neusee.nodes.units import DataFile, Shape
 

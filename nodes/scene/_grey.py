@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes._half_precision import single
+from neusee.nodes.precision import single
 
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  #: of linear red, green and blue with the primaries of sRGB
 

@@ -14,9 +14,16 @@ from neusee.nodes.sensor._noise import (
     photon_noise,
     read_noise,
 )
-from neusee.nodes.sensor._room_for_light import refuse_without_room, refuse_without_steps
-from neusee.nodes.sensor._saturation import Efficiency, Well
-from neusee.nodes.units import Count, DarkCurrent, Electrons, ElectronsPerSecond, Exposure, Gain
+from neusee.nodes.sensor._saturation import Well, refuse_without_room, refuse_without_steps
+from neusee.nodes.units import (
+    Count,
+    DarkCurrent,
+    Efficiency,
+    Electrons,
+    ElectronsPerSecond,
+    Exposure,
+    Gain,
+)
 
 well_of, read_of = full_well, read_noise  # parameters below have the same names
 

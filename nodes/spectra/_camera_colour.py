@@ -7,8 +7,8 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes._half_precision import single
-from neusee.nodes.spectra._spectral_tables import to_srgb
+from neusee.nodes.precision import single
+from neusee.nodes.spectra._cie_tables import to_srgb
 from neusee.nodes.values import Bands
 
 GrainDeviation = Annotated[float, Field(ge=0, le=1)]

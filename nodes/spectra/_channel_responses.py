@@ -1,18 +1,24 @@
-"""Spectral responses of the colour channels of a sensor."""
+"""Spectral responses of the channels of a sensor, and weights of the bands in them."""
 
 import re
 from pathlib import Path
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.constants import ELEMENTARY_CHARGE, PLANCK, SPEED_OF_LIGHT
 from neusee.nodes.input_files import once_per_version
-from neusee.nodes.spectra._spectral_tables import Table, measured_camera, observer
+from neusee.nodes.spectra._cie_tables import Table, measured_camera, observer
 from neusee.nodes.spectra._table_files import Curves, curves, refused
 from neusee.nodes.units import DataFile, Efficiency
 from neusee.nodes.values import Bands
+
+# --- channel responses ----------------------------------------------------------------------------
+
+# Spectral responses of the colour channels of a sensor.
+
 
 Camera = Literal["CIE 1931", "Nikon 5100", "Sigma SDMerill"]
 _UNSEEN = 1e-3  #: of the largest sensitivity; a band that every channel sees less counts as unseen
@@ -229,3 +235,48 @@ def seen_range(camera: str | Path) -> tuple[float, float]:
 @once_per_version
 def _from_file(file: Path) -> Table:
     return camera_curves(file)[0].table()
+
+
+# --- distinct band sums ---------------------------------------------------------------------------
+
+# Weights of the spectral bands in each colour channel, and in the electrons that fill a pixel.
+
+
+@node(rtol=1e-12)
+def rows(bands: Bands, responses: Tensor, *, well: bool = True) -> Tensor:
+    """Return the weight of each spectral band in each colour channel, and in the electrons that
+    fill a pixel.
+
+    The first rows are for the colour channels. The last row is for the electrons that fill the
+    well. A channel counts photons, so that the weights are response times wavelength. The weights
+    of the last row are the wavelengths alone, because a photon of any wavelength frees one
+    electron. With `well` false, the last row is omitted.
+
+    Shapes: bands (band,), responses (channel, band) -> (channel + 1, band) float64, or (channel,
+            band).
+    Units:  m; the node that counts photons applies the common factor.
+    Error:  exact.
+    Raises: ValueError where responses and bands differ in the number of bands.
+    Source: NeuSee, Eq. (photon_count) and Eq. (ThresSat).
+    """
+    if responses.ndim != 2 or responses.shape[1] != len(bands.centres):
+        raise ValueError(
+            f"responses have shape {tuple(responses.shape)}, not (channel, band) with"
+            f" {len(bands.centres)} bands: compute responses and bands from the same `bands` step"
+        )
+    centres = bands.centres.double().to(responses.device)
+    channels = responses.double() * centres
+    return torch.cat([channels, centres[None]]) if well else channels
+
+
+@rows.check
+def _(result: Tensor, *inputs: object, **params: object) -> list[Check]:
+    rank = int(
+        torch.linalg.matrix_rank(result / result.abs().amax(1, keepdim=True).clamp_min(1e-300))
+    )
+    return [
+        Check(
+            f"{len(result)} weighted sums over {result.shape[1]} bands; the matrix of weights has"
+            f" rank {rank}"
+        )
+    ]

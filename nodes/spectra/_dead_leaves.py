@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from neusee.nodes import Check, node
-from neusee.nodes.spectra._spectral_tables import daylight, light
+from neusee.nodes.spectra._cie_tables import daylight, light
 from neusee.nodes.units import Fraction, Shape
 from neusee.nodes.values import Bands
 

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes._half_precision import single
 from neusee.nodes.input_files import once_per_version
-from neusee.nodes.spectra._spectral_tables import Table, daylight, light, observer, require_range
+from neusee.nodes.precision import single
+from neusee.nodes.spectra._cie_tables import Table, daylight, light, observer, require_range
 from neusee.nodes.spectra._table_files import Curves, curves, refused
 from neusee.nodes.units import DataFile, Temperature
 from neusee.nodes.values import Bands, LowRankCube

@@ -7,11 +7,17 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, Node, node
-from neusee.nodes._half_precision import single
-from neusee.nodes.spectra._linear_planes import linear_planes
-from neusee.nodes.spectra._low_rank_cube import Share, as_low_rank_cube, compress, plane_checks
-from neusee.nodes.spectra._principal_planes import Source, few_planes
-from neusee.nodes.spectra._spectral_tables import mallett, paints, require_range, to_srgb
+from neusee.nodes.precision import single
+from neusee.nodes.spectra._cie_tables import mallett, paints, require_range, to_srgb
+from neusee.nodes.spectra._low_rank_cube import (
+    Share,
+    Source,
+    as_low_rank_cube,
+    compress,
+    few_planes,
+    linear_planes,
+    plane_checks,
+)
 from neusee.nodes.values import Bands, LowRankCube
 
 _FIRST, _LAST = 380e-9, 780e-9  #: m, range of the measured reflectances and of the basis

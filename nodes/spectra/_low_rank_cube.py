@@ -1,16 +1,142 @@
-"""Low-rank approximation of a spectral cube: a sum of a few basis images times spectra, with an
-error bound.
-"""
+"""Low-rank approximations of a spectral cube, with an error bound."""
 
-from typing import Annotated
+from collections.abc import Callable
+from typing import Annotated, NamedTuple
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.spectra._principal_planes import Source, few_planes
 from neusee.nodes.values import LowRankCube
+
+# --- principal planes -----------------------------------------------------------------------------
+
+# Principal components of a spectral cube, computed and verified in blocks of pixels.
+
+
+_PIECE = 4096  #: pixels of a block: 31 bands in float64 take 1 MB and stay in the cache
+_FLOOR = 8  #: round-off units of the planes; no smaller error can be guaranteed
+_ROOT = 2e-7  #: relative resolution of a root mean square that is computed from products in float64
+
+
+class Source(NamedTuple):
+    """A spectral cube that is read in blocks of pixels, so that the whole cube is never in
+    memory.
+    """
+
+    #: a block of pixels, (band, pixel) float64, as a copy that may be changed
+    part: Callable[[slice], Tensor]
+    bands: int
+    pixels: int
+    dtype: torch.dtype  #: of the planes
+
+    def pieces(self) -> list[slice]:
+        return [slice(i, min(i + _PIECE, self.pixels)) for i in range(0, self.pixels, _PIECE)]
+
+
+def few_planes(source: Source, within: float) -> LowRankCube:
+    """Approximate a spectral cube by the fewest principal components that keep the rms error within
+    a bound.
+
+    The bound ``within`` is relative to the largest element. The planes and the map of errors are
+    flat, with all pixels in one row. Raises ValueError for NaN.
+    """
+    most, gram = _largest_and_products(source)
+    scale = float(most.max())
+    scaled = scale > 0 and not 1e-280 < float(gram.amax()) < 1e280
+    if scaled:
+        gram = _largest_and_products(source, scale)[1]
+    axes = torch.linalg.eigh(gram).eigenvectors.flip(1)
+    eps = torch.finfo(source.dtype).eps
+    target = max(within, _FLOOR * eps, _ROOT) * scale
+    spread = _spread(gram / source.pixels, axes, source.bands, eps) * (scale if scaled else 1.0)
+    count = max(
+        1, next((k for k, left in enumerate(spread) if float(left.max()) <= target), source.bands)
+    )
+    planes, last, off = _projected(source, axes[:, :count])
+    rest = bound_by_planes(most, planes, axes[:, :count], last)
+    # no more than was measured
+    spread = torch.cat([spread[:count], torch.minimum(spread[count], rest[count])[None]])
+    return LowRankCube(planes, axes[:, :count], rest, spread, off)
+
+
+def _largest_and_products(source: Source, scale: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Return the largest absolute element of each band of a cube, and the Gram matrix of the bands.
+
+    The Gram matrix is that of the cube divided by ``scale``.
+    """
+    if not source.pixels or not source.bands:
+        raise ValueError("the cube has no pixels: give a scene with pixels")
+    tops, gram = [], None
+    for piece in source.pieces():
+        x = source.part(piece).div_(scale) if scale != 1.0 else source.part(piece)
+        gram = x @ x.T if gram is None else gram.addmm_(x, x.T)
+        tops.append(x.abs_().amax(1))
+    most = torch.stack(tops).amax(0) * scale
+    if gram is None or not bool(torch.isfinite(most).all()):
+        raise ValueError(
+            "the cube holds NaN or infinite values: replace these values, or do not compress the"
+            " cube"
+        )
+    return most, gram
+
+
+def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Project a spectral cube on the axes of principal components, and return the largest error by
+    band and by pixel.
+
+    The first returned value holds the basis images, in the precision of the source.
+    """
+    planes = torch.empty(axes.shape[1], source.pixels, dtype=source.dtype, device=axes.device)
+    last, off = axes.new_zeros(source.bands), planes.new_empty(source.pixels)
+    for piece in source.pieces():
+        x = source.part(piece)
+        planes[:, piece] = axes.T @ x
+        left = x.sub_(axes @ planes[:, piece].double()).abs_()
+        last = torch.maximum(last, left.amax(1))
+        off[piece] = left.amax(0)
+    return planes, last, off.mul_(1 + 2 * torch.finfo(source.dtype).eps)
+
+
+def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
+    """Return the rms error of each band if a spectral cube is approximated by its first k principal
+    components.
+
+    The rows of the result are for k = 0, 1, 2 and so on. The error is that of the omitted
+    components plus the round-off of the basis images. ``power`` holds the mean products of the
+    bands. The round-off of these products counts as part of the error.
+    """
+    each = axes.square() * ((power @ axes) * axes).sum(0).clamp_min(0)
+    after = torch.cat([each.flip(1).cumsum(1).flip(1), torch.zeros_like(each[:, :1])], 1)[
+        :, : count + 1
+    ].T
+    total = power.diagonal()
+    double = 64 * torch.finfo(torch.float64).eps * total.sum()
+    planes = torch.arange(count + 1, dtype=total.dtype, device=total.device)[:, None]
+    return (after + double).sqrt() + eps * (planes * total).sqrt()
+
+
+def bound_by_planes(most: Tensor, planes: Tensor, basis: Tensor, last: Tensor) -> Tensor:
+    """Return a bound of the largest error of each band if a cube is approximated by its first k
+    principal components.
+
+    The rows of the result are for k = 0, 1, 2 and so on. The errors with no component and with all
+    components are measured. In between, the bound adds the omitted components to the error with all
+    components.
+    """
+    each = basis.abs() * torch.maximum(planes.amax(1), -planes.amin(1)).double()
+    # round-off of the measurement
+    last = last + 4 * torch.finfo(torch.float64).eps * (most + each.sum(1))
+    after = each.flip(1).cumsum(1).flip(1).T
+    return torch.cat([most[None], last + after[1:], last[None]])
+
+
+# --- low rank cube --------------------------------------------------------------------------------
+
+# Low-rank approximation of a spectral cube: a sum of a few basis images times spectra, with an
+# error bound.
+
 
 Share = Annotated[float, Field(ge=0, le=1)]  #: relative to the largest element
 
@@ -89,3 +215,130 @@ def plane_checks(result: LowRankCube, *inputs: object, **params: object) -> list
             " the cube"
         )
     ]
+
+
+# --- linear planes --------------------------------------------------------------------------------
+
+# Low-rank form of a spectral cube that is a matrix times a picture, with negative light clipped to
+# 0.
+#
+# Without the clipping, such a cube has as many principal components as the picture has channels,
+# and these follow from the products of the channels: the cube itself need not be analysed. The
+# clipped light is measured on every pixel.
+
+
+_PLANES_PIECE = 1 << 14  #: pixels of a block: 31 bands in float32 take 2 MB and stay in the cache
+_SAMPLE = 1 << 14  #: pixels that tell beforehand whether the clipped light is within the error
+_LEAST = 1e-5  #: least error that is tried: float32 alone leaves a few 1e-7
+
+
+class _Axes(NamedTuple):
+    """Orthonormal spectra of the unclipped cube, the strongest first, and what makes the planes
+    from the picture.
+    """
+
+    basis: Tensor  #: (band, k) float64
+    weights: Tensor  #: (k, channel) float64
+    power: Tensor  #: (k,) mean square of each plane
+
+
+def linear_planes(picture: Tensor, matrix: Tensor, within: float) -> LowRankCube | None:
+    """Return the cube ``matrix @ picture``, clipped at 0, as its fewest components with an rms
+    error of ``within``.
+
+    Shapes: picture (channel, pixel) float32, matrix (band, channel) float64. The error is relative
+            to the largest
+    element. Return None where more components are needed than the picture has channels, or
+    ``within`` is below 1e-5.
+    """
+    if (
+        picture.dtype != torch.float32
+        or within < _LEAST
+        or not bool(torch.isfinite(picture.sum(1)).all())
+    ):
+        return None
+    axes = _axes(picture, matrix)
+    some = matrix @ picture[:, :: max(1, picture.shape[1] // _SAMPLE)].double()
+    target = within * float(some.amax())
+    count = next(
+        (k for k in range(1, len(axes.power) + 1) if float(_omitted(axes, k).max()) <= target), 0
+    )
+    if not count or float(some.clamp_max(0).square().mean(1).max()) >= target**2:
+        return None
+    found = _measured(picture, matrix, axes, count)
+    return (
+        found
+        if float(found.residual_rms[-1].max()) <= within * float(found.residual_max[0].max())
+        else None
+    )
+
+
+def _axes(picture: Tensor, matrix: Tensor) -> _Axes:
+    gram = matrix.new_zeros(len(picture), len(picture))
+    for at in range(0, picture.shape[1], _PLANES_PIECE):
+        x = picture[:, at : at + _PLANES_PIECE].double()
+        gram.addmm_(x, x.T)
+    values, vectors = torch.linalg.eigh(gram / picture.shape[1])
+    root = vectors * values.clamp_min(0).sqrt()  # root @ root.T is the mean product of the channels
+    basis, strength, _ = torch.linalg.svd(matrix @ root, full_matrices=False)
+    return _Axes(basis, basis.T @ matrix, strength.square())
+
+
+def _omitted(axes: _Axes, count: int) -> Tensor:
+    """Return the rms of each band of the unclipped cube that is not in its first ``count``
+    components.
+    """
+    return (axes.basis[:, count:].square() @ axes.power[count:]).sqrt()
+
+
+def _measured(picture: Tensor, matrix: Tensor, axes: _Axes, count: int) -> LowRankCube:
+    """Return the first components of a cube, and the errors that omitted components and clipping
+    leave.
+    """
+    basis, weights = axes.basis[:, :count], axes.weights[:count]
+    light, kept = (
+        matrix.to(picture),
+        None if count == len(axes.power) else (basis @ weights).to(picture),
+    )
+    planes, off = picture.new_empty(count, picture.shape[1]), picture.new_empty(picture.shape[1])
+    tops, lasts, squares = [], [], matrix.new_zeros(len(matrix))
+    for at in range(0, picture.shape[1], _PLANES_PIECE):
+        part = slice(at, at + _PLANES_PIECE)
+        x = picture[:, part]
+        planes[:, part] = weights @ x.double()
+        bands = light @ x
+        tops.append(bands.amax(1))
+        if kept is None:  # what is clipped is all that is lost
+            lost = bands.amin(0).neg_().clamp_min_(0)
+            off[part], at_loss = lost, lost.nonzero()[:, 0]
+            left = bands[:, at_loss].clamp_max_(0)
+        else:
+            left = bands.clamp_min_(0).sub_(kept @ x)
+            off[part] = left.abs().amax(0)
+        if left.shape[1]:
+            lasts.append(left.abs().amax(1))
+            squares += left.square().sum(1)
+    rms = (squares / picture.shape[1]).sqrt()
+    return _bounded(planes, basis, axes, off, (torch.stack(tops), lasts, rms))
+
+
+def _bounded(
+    planes: Tensor,
+    basis: Tensor,
+    axes: _Axes,
+    off: Tensor,
+    found: tuple[Tensor, list[Tensor], Tensor],
+) -> LowRankCube:
+    """Return the low-rank cube with the bounds of its errors, to which the rounding of float32
+    is added.
+    """
+    tops, lasts, rms = found
+    most = tops.amax(0).double().clamp_min(0)
+    sizes = torch.maximum(planes.amax(1), -planes.amin(1)).double()
+    rounding = 4 * torch.finfo(planes.dtype).eps * float((basis.abs() @ sizes).max())
+    last = (torch.stack(lasts).amax(0).double() if lasts else torch.zeros_like(most)) + rounding
+    before = [_omitted(axes, k) + rms for k in range(planes.shape[0])]
+    spread = torch.stack([*before, rms]) + rounding
+    return LowRankCube(
+        planes, basis, bound_by_planes(most, planes, basis, last), spread, off.add_(rounding)
+    )

@@ -1,4 +1,4 @@
-"""Measured reflectances from colour-science and from the user's files."""
+"""Measured reflectances from colour-science and from the files of a user."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,16 +7,63 @@ from zipfile import BadZipFile
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.array_bytes import mat_needs, npz_needs
-from neusee.nodes.input_files import once_per_version
+from neusee.nodes.file_headers import mat_needs, npz_needs
+from neusee.nodes.input_files import csv_rows, once_per_version
+from neusee.nodes.spectra._cie_tables import Table, gamut_samples, paints, require_range
 from neusee.nodes.spectra._linear_lift import inside_charts
-from neusee.nodes.spectra._spectral_tables import Table, gamut_samples, paints, require_range
-from neusee.nodes.spectra._spectrum_tables import Numbers, csv_spectra, wrong_wavelengths
 from neusee.nodes.units import DataFiles
 from neusee.nodes.values import Bands
+
+# --- spectrum tables ------------------------------------------------------------------------------
+
+# CSV files of spectra: a header, wavelengths in nm in the first column, and one further column for
+# each spectrum.
+
+
+Numbers = NDArray[np.float64]
+
+
+def csv_spectra(file: Path) -> tuple[Numbers, Numbers]:
+    """Read the wavelengths of a CSV file, in nm, and its spectra (spectrum, wavelength).
+
+    Raises ValueError for lines of different length, for a cell that is not a number, and for a file
+    without columns.
+    """
+    rows = [[_number(cell, file, line) for cell in row] for line, row in list(csv_rows(file))[1:]]
+    if len({len(row) for row in rows}) > 1:
+        raise ValueError("the lines have different numbers of cells")
+    numbers = np.array(rows, np.float64)
+    if numbers.ndim != 2 or numbers.shape[1] < 2:
+        raise ValueError("the file has no columns of numbers below a header")
+    return numbers[:, 0].copy(), numbers[:, 1:].T
+
+
+def wrong_wavelengths(wavelengths: Numbers, values: Numbers) -> str:
+    """Return the reason why numbers from a file cannot be wavelengths in nm and their spectra,
+    or an empty text.
+    """
+    if not (np.isfinite(wavelengths).all() and np.isfinite(values).all()):
+        return "some of its numbers are NaN or infinite"
+    if len(wavelengths) < 2 or not (np.diff(wavelengths) > 0).all() or wavelengths[0] < 100:
+        return "the file needs at least two wavelengths in nm, in rising order"
+    return ""
+
+
+def _number(cell: str, file: Path, line: int) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        raise ValueError(f"{file.name}:{line}: {cell!r} is not a number") from None
+
+
+# --- measured reflectances ------------------------------------------------------------------------
+
+# Measured reflectances from colour-science and from the user's files.
+
 
 Set = Literal["charts", "CIE 2017", "CQS"]
 _MOST = 1.5  #: largest reflectance; a file with larger values is probably in percent

@@ -9,8 +9,8 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.spectra._cie_tables import to_srgb
 from neusee.nodes.spectra._linear_lift import lift_matrix
-from neusee.nodes.spectra._spectral_tables import to_srgb
 from neusee.nodes.units import Count
 from neusee.nodes.values import Bands
 

@@ -8,9 +8,8 @@ from torch import Tensor
 
 from neusee.nodes.shape_rules import at_least_single, blank, double, known, like_first
 from neusee.nodes.spectra._camera_colour import grain, render
-from neusee.nodes.spectra._channel_responses import channel_count, responses, seen_range
+from neusee.nodes.spectra._channel_responses import channel_count, responses, rows, seen_range
 from neusee.nodes.spectra._dead_leaves import _FINE, leaves
-from neusee.nodes.spectra._distinct_band_sums import rows
 from neusee.nodes.spectra._illuminant import illuminant, illuminate
 from neusee.nodes.spectra._linear_lift import (
     lift_lmmse,
@@ -20,7 +19,7 @@ from neusee.nodes.spectra._linear_lift import (
 )
 from neusee.nodes.spectra._low_rank_cube import compress
 from neusee.nodes.spectra._metamers import metamers
-from neusee.nodes.spectra._mst_lift_node import lift_mst_plus_plus
+from neusee.nodes.spectra._mst_plus_plus import lift_mst_plus_plus
 from neusee.nodes.values import Bands, LowRankCube
 
 _FEW = 20  #: bands of a laser line, at most

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from neusee.nodes import ParameterError
 from neusee.nodes.input_files import csv_rows
-from neusee.nodes.spectra._spectral_tables import Table
+from neusee.nodes.spectra._cie_tables import Table
 
 Numbers = NDArray[np.float64]
 

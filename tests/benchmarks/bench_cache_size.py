@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.keys.seal import seal_record
+from neusee.workflows.keys.sealed_files import seal_record
 from neusee.workflows.store.journal import row_of
 
 RESULTS = Path(__file__).with_name("RESULTS.md")

@@ -30,11 +30,10 @@ import numpyro
 import torch
 from numpyro.infer import MCMC, NUTS
 
-from neusee.nodes.calibrate._likelihood._quantised_gaussian import log_cell
+from neusee.nodes.calibrate._sensor_likelihood import log_cell
 from neusee.workflows.calibration import emcee_sampler
-from neusee.workflows.calibration.log_posterior import SensorPosterior
+from neusee.workflows.calibration.log_posterior import SensorPosterior, search_mode
 from neusee.workflows.calibration.posterior_checks import importance_samples
-from neusee.workflows.calibration.posterior_mode import search_mode
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store

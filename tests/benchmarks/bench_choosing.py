@@ -22,12 +22,12 @@ from functools import wraps
 from pathlib import Path
 from unittest import mock
 
-from neusee.nodes.optics._imaging import _channel_image
+from neusee.nodes.optics import _channel_image
 from neusee.workflows import load
 from neusee.workflows.engine import execution, resolve_keys, runner
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.cold_run import cold
-from neusee.workflows.tolerance.error_budget import ErrorBudget
+from neusee.workflows.tolerance.skip_decision import ErrorBudget
 
 ENGINE = (
     (runner, "economised"),

@@ -37,14 +37,13 @@ from neusee.workflows.calibration.calibration_page import CalibrationResult
 from neusee.workflows.calibration.emcee_sampler import Chains
 from neusee.workflows.calibration.frame_validity import frame_checks, inspect_recipe, widened
 from neusee.workflows.calibration.identifiability import identify
-from neusee.workflows.calibration.log_posterior import SensorPosterior
+from neusee.workflows.calibration.log_posterior import SensorPosterior, find_mode, initial_theta
 from neusee.workflows.calibration.posterior_checks import (
     Check,
     _of_data,
     count_failures,
     importance_samples,
 )
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
 from neusee.workflows.calibration.run_calibration import (
     CalibrationRefused,
     FramesRefused,

@@ -12,7 +12,7 @@ from statistics import median
 from fit_costs import LARGE, LONG, SOME, grouped, loaders, read
 from measured_runs import FIT, HELD_OUT
 
-from neusee.workflows.engine import cost_laws
+from neusee.workflows.engine import cost_model as cost_laws
 
 CLOSE = 0.2  #: relative error that counts as met
 

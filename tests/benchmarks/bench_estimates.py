@@ -27,7 +27,8 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "workflows"))
 import random_recipes
 
-from neusee.nodes.optics._imaging import _band_thumbnail, _few_bands
+from neusee.nodes.optics import _few_bands
+from neusee.nodes.optics import _few_bands as _band_thumbnail
 from neusee.workflows.engine.runner import run
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.cold_run import cold

@@ -23,17 +23,13 @@ import torch
 from scipy import stats
 
 from neusee.nodes import metrics, restore
-from neusee.nodes.restore._inverse import (
-    _conjugate_gradients,
-    _fft_grid,
-    _hidden_pixels,
-    _lowest_frequencies,
-    _wiener,
-)
+from neusee.nodes.restore._inverse import _conjugate_gradients, _hidden_pixels, _wiener
+from neusee.nodes.restore._inverse import _conjugate_gradients as _lowest_frequencies
+from neusee.nodes.restore._inverse import _masked_blur as _fft_grid
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.parallel.shared_graph import Shared
+from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.run_training import _photographs
 from neusee.workflows.training.training_pictures import TrainingStream
 

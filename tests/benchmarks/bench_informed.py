@@ -30,7 +30,7 @@ from neusee.nodes.restore import Informed
 from neusee.nodes.scene import Photographs
 from neusee.nodes.values import FilterFacts
 from neusee.workflows import Store, load
-from neusee.workflows.evaluation.paired_intervals import less
+from neusee.workflows.evaluation.confidence_intervals import less
 from neusee.workflows.training.training_pictures import HELD_OUT, TrainingStream
 
 ROOT = Path(__file__).parents[2]

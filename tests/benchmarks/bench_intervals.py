@@ -12,7 +12,7 @@ import sys
 import numpy as np
 from scipy.stats import t as student
 
-from neusee.workflows.evaluation import paired_intervals
+from neusee.workflows.evaluation import confidence_intervals as paired_intervals
 
 TIMES, *COUNTS = [int(word) for word in sys.argv[1:]] or [1000, 5, 8, 20]
 DRAWS = 2000

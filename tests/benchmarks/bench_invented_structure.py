@@ -29,7 +29,7 @@ from safetensors.numpy import load_file
 from scipy.ndimage import uniform_filter
 
 from neusee.workflows.cli import app
-from neusee.workflows.report.figures.frame_and_interval import half_width
+from neusee.workflows.report.figures.camera_pictures import half_width
 from tests.benchmarks import bench_restored_frames as frames
 from tests.nodes.restore.lasers import own_camera as own
 

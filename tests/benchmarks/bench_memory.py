@@ -30,7 +30,7 @@ from fit_costs import read
 from measured_runs import FIT, HELD_OUT, at
 from scipy.optimize import nnls
 
-from neusee.workflows.explain import report_memory
+from neusee.workflows.explain import run_forecast as report_memory
 from neusee.workflows.explain.run_forecast import lanes_for, planned
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store

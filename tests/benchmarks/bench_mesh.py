@@ -26,7 +26,7 @@ import mesh_processes
 from mesh_processes import DO, _photographs, start
 
 from neusee.workflows import Store, load
-from neusee.workflows.training.parallel.process_mesh import Mesh
+from neusee.workflows.training.process_mesh import Mesh
 from neusee.workflows.training.training_iteration import Learner
 from neusee.workflows.training.training_pictures import TrainingStream
 

@@ -18,7 +18,8 @@ from pathlib import Path
 import torch
 
 from neusee.nodes import metrics, restore
-from neusee.nodes.restore._inverse import _conjugate_gradients, _fft_grid
+from neusee.nodes.restore._inverse import _conjugate_gradients
+from neusee.nodes.restore._inverse import _masked_blur as _fft_grid
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store

@@ -22,11 +22,11 @@ from functools import partial
 import numpy as np
 import torch
 
-from neusee.workflows.engine.memory_use import process_memory
+from neusee.workflows.engine.machine_resources import process_memory
 from neusee.workflows.engine.step_process import call_in_fork
 from neusee.workflows.observation import kernel_layer
 from neusee.workflows.observation.observed_call import observed
-from neusee.workflows.observation.shared_generators import SharedGenerators
+from neusee.workflows.observation.random_generators import SharedGenerators
 from neusee.workflows.observation.taints import Covered
 
 COVERED = Covered(frozenset(), lambda name: True)

@@ -30,7 +30,7 @@ import torch
 
 from neusee.workflows import RecipeError, load
 from neusee.workflows.safety import safety_estimate
-from neusee.workflows.safety.limit_ratios import limit_ratio
+from neusee.workflows.safety.exposure_limits import limit_ratio
 from neusee.workflows.safety.run_safety import document
 from tests.benchmarks.random_cameras import DRAWS, OWN_DRAWS, Camera, camera
 from tests.workflows.safety import own_camera_limits as own

@@ -41,12 +41,9 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
 from neusee.nodes.calibrate import CLEAN_PAIRS, STATISTICS  # noqa: E402
-from neusee.nodes.calibrate._budget._camera_sources import SOURCES  # noqa: E402
+from neusee.nodes.calibrate._sheet_budget import SOURCES  # noqa: E402
 from neusee.workflows.calibration import emcee_sampler  # noqa: E402
-from neusee.workflows.calibration.run_calibration import (  # noqa: E402
-    CalibrationRefused,
-    find_posterior,
-)
+from neusee.workflows.calibration.run_calibration import CalibrationRefused, find_posterior  # noqa: E402
 from neusee.workflows.frames.folder_recipe import recipe_of_folder  # noqa: E402
 from neusee.workflows.store.result_store import Store  # noqa: E402
 from tests.drawn_chains import drawn_chains  # noqa: E402

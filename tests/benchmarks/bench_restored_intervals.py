@@ -28,7 +28,7 @@ from scipy.signal import fftconvolve
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from neusee.workflows.report.figures.frame_and_interval import half_width
+from neusee.workflows.report.figures.camera_pictures import half_width
 from tests.benchmarks import bench_restored_frames as frames
 from tests.nodes.restore.lasers import own_camera as own
 

@@ -23,13 +23,16 @@ from plain_camera import PlainCamera, frames_recipe, table
 
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.importance_sampling import draw_guide
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import search_mode
+from neusee.workflows.calibration.log_posterior import SensorPosterior, search_mode
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.calibration.independent_draws import DRAWS, walk_draws
-from neusee.workflows.studies.calibration.rank_uniformity import rank_tests
-from neusee.workflows.studies.calibration.simulated_sensors import PosteriorDraws, rank_truth
+from neusee.workflows.studies.calibration.posterior_tests import (
+    DRAWS,
+    PosteriorDraws,
+    rank_tests,
+    rank_truth,
+    walk_draws,
+)
 
 #: by mode and parameter: median and factor; mean and standard deviation of those in `LINEAR`
 PRIORS = {

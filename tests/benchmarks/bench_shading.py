@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from neusee.nodes.restore._shading._frame_cells import at_pixels, cells_of, grid
-from neusee.nodes.restore._shading._shared_field import shared_field
+from neusee.nodes.restore._shading_field import at_pixels, cells_of, grid, shared_field
 
 FULL, READ, ERROR = 20000.0, 10.0, 0.04
 

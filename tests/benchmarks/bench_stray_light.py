@@ -19,8 +19,8 @@ import torch
 
 from neusee.workflows.calibration.identifiability import identify
 from neusee.workflows.calibration.importance_sampling import draw_samples, weights
+from neusee.workflows.calibration.log_posterior import find_mode, initial_theta
 from neusee.workflows.calibration.posterior_checks import _SMOOTH, _SURPRISE, slow_waves
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
 from tests.workflows.calibration.simulated_lenses import (
     PRIOR,
     drawn_camera,

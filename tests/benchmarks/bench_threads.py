@@ -32,9 +32,7 @@ for _ in range(3):
     work()
 print(time.process_time() - cpu, time.perf_counter() - wall, torch.get_num_threads())
 """
-_SETTLED = (
-    "from neusee.workflows.cli.thread_settings import settle_threads; settle_threads('run')\n"
-)
+_SETTLED = "from neusee.workflows.cli.app import settle_threads; settle_threads('run')\n"
 _WAYS = {
     "one thread": (_WORK, {"OMP_NUM_THREADS": "1"}),
     "two threads, torch's own waiting": (_WORK, {"OMP_NUM_THREADS": "2"}),

@@ -29,7 +29,7 @@ import random_recipes
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.recipe.changed_recipe import changed
+from neusee.workflows.recipe.loading import changed
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.accuracy.recipe_knobs import knobs
 from neusee.workflows.studies.cold_run import cold

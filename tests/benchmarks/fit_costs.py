@@ -24,7 +24,7 @@ from measured_runs import FIT, file_of
 from scipy.optimize import nnls
 
 from neusee.nodes import registered_nodes
-from neusee.workflows.engine import cost_laws
+from neusee.workflows.engine import cost_model as cost_laws
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.report.contents import steps_of, wanted
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions

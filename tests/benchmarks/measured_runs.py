@@ -160,7 +160,8 @@ def measure(target, words):
     what the process held.
     """
     from neusee.workflows.cli.app import main
-    from neusee.workflows.engine import memory_use, step_job
+    from neusee.workflows.engine import machine_resources as memory_use
+    from neusee.workflows.engine import step_job
     from neusee.workflows.simulation import simulate_recipe
 
     step_job.time = SimpleNamespace(time=time.time, perf_counter=time.thread_time)

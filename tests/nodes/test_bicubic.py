@@ -5,7 +5,7 @@ import torch
 from torch.nn.functional import interpolate
 from torch.testing import assert_close
 
-from neusee.nodes.bicubic_resize import enlarge, resize
+from neusee.nodes.resampling import enlarge, resize
 
 SIZES = [
     ((16, 16), (8, 8)),

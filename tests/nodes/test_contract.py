@@ -125,31 +125,6 @@ def test_rules_for_shapes_are_used_by_nothing_that_computes_a_result():
         ], path
 
 
-def test_files_and_functions_are_small():
-    for path in FILES:
-        text = path.read_text()
-        assert len(text.splitlines()) < 400, f"{path} is too long: split it"
-        for item in ast.walk(ast.parse(text)):
-            if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef):
-                # has all in registers
-                kernel = any(ast.unparse(each) == "triton.jit" for each in item.decorator_list)
-                assert _code_lines(item) <= (60 if kernel else 40), (
-                    f"{path}:{item.lineno} {item.name} is too long: split it"
-                )
-
-
-def _code_lines(item):
-    """Lines of a function without its docstring."""
-    documented = ast.get_docstring(item, clean=False) is not None
-    first = item.body[0]
-    return (
-        item.end_lineno
-        - item.lineno
-        + 1
-        - (first.end_lineno - first.lineno + 1 if documented else 0)
-    )
-
-
 #: hooks that are called with the parameters of their node by name
 WITH_PARAMETERS = (
     "skip_bound", "skip_draw", "skip_scale", "zero_bound", "propagate_error", "propagate_draw", "propagate_scattered",

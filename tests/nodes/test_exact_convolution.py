@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch.backends import cudnn
 
-from neusee.nodes.exact_convolution import exact_convolutions, tf32_setting
 from neusee.nodes.metrics import quality
-from neusee.workflows.keys.process_settings import settings
+from neusee.nodes.precision import exact_convolutions, tf32_setting
+from neusee.workflows.keys.loaded_state import settings
 
 ON_CUDA = SimpleNamespace(is_cuda=True)
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from neusee.nodes import doe, flare, losses, metrics, optics, restore, sensor, spectra
-from neusee.nodes._half_precision import refuse_half, refuse_not_finite, single
 from neusee.nodes.doe._refractive_index import wave_height
 from neusee.nodes.optics._transform._scaled_transform import transform
+from neusee.nodes.precision import refuse_half, refuse_not_finite, single
 from neusee.nodes.values import Bands, Psf, Pupil
 
 

@@ -18,15 +18,15 @@ from PIL import Image
 from skimage.metrics import structural_similarity
 
 from neusee.nodes import constants
-from neusee.nodes.bicubic_resize import enlarge, resize
 from neusee.nodes.losses import charbonnier
 from neusee.nodes.metrics import quality
+from neusee.nodes.resampling import enlarge, resize
 from neusee.nodes.scene import Photographs
-from neusee.nodes.scene._crop_to_frame import framed
+from neusee.nodes.scene._picture_scaling import framed
 from neusee.nodes.scene._spectral_exr import _PREFIX, spectral_channels
 from neusee.nodes.sensor import crop
 from neusee.nodes.spectra import bands, illuminant, lift_mallett, render
-from neusee.nodes.spectra._spectral_tables import light, paints
+from neusee.nodes.spectra._cie_tables import light, paints
 
 NM = 1e-9
 SCENE = bands(start=400 * NM, stop=700 * NM, count=31)

@@ -8,7 +8,7 @@ from pydantic import Field, ValidationError
 
 from neusee.nodes import node
 from neusee.nodes.calibrate import Traceability
-from neusee.nodes.parameter_model import ParameterModel
+from neusee.nodes.parameters import ParameterModel
 from neusee.nodes.units import (
     Electrons,
     NumberRange,
@@ -17,12 +17,8 @@ from neusee.nodes.units import (
     in_words,
     number_ranges,
 )
-from neusee.workflows.recipe.blocks import (
-    evaluate_block,
-    safety_block,
-    train_block,
-    train_lift_block,
-)
+from neusee.workflows.recipe.blocks import evaluate_block, safety_block, train_block
+from neusee.workflows.recipe.blocks import train_block as train_lift_block
 from neusee.workflows.recipe.node_families import all_nodes
 
 # imported, so that models exist

@@ -17,9 +17,9 @@ import torch
 
 from neusee.nodes import _cpp_library
 from neusee.nodes.optics._transform import _fused
-from neusee.nodes.optics._transform._fused_plan import fused_axis
+from neusee.nodes.optics._transform._fft_transforms import last_work
+from neusee.nodes.optics._transform._fused import fused_axis
 from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
-from neusee.nodes.optics._transform._kaiser_bessel_transform import last_work
 from neusee.nodes.optics._transform._pupil_field import View
 from neusee.nodes.optics._transform._sample_axis import Axis, centred, last_type
 from neusee.nodes.restore._scan import _cpp_scan

@@ -12,11 +12,9 @@ from safetensors.torch import save_file
 
 from neusee.nodes import calibrate, doe, optics, spectra
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba
-from neusee.nodes.restore._networks._informed import Informed
-from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
-from neusee.nodes.restore._networks._unet import UNet
-from neusee.nodes.restore._networks._unrolled import Unrolled
+from neusee.nodes.restore._networks._unet_and_nafnet import NAFNet, UNet
+from neusee.nodes.restore._networks._wiener_networks import Informed, Unrolled
 from neusee.nodes.values import (
     Channels,
     Dirt,

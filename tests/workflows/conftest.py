@@ -79,7 +79,7 @@ def no_fault_in_any_figure(monkeypatch):
     """Every figure that the program draws in a test has panels with content, and texts that can
     be read.
     """
-    from neusee.workflows.report import drawing_process
+    from neusee.workflows.report import files_beside as drawing_process
     from neusee.workflows.report.figures import style
     from tests.figure_faults import watched
 

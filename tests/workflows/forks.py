@@ -95,7 +95,7 @@ def serve() -> None:
     """Fork a child for each line that comes in, and tell its number."""
     import torch
 
-    from neusee.workflows.engine.cost_laws import shipped
+    from neusee.workflows.engine.cost_model import shipped
 
     shipped()  # a file that another user may not read
 

@@ -23,8 +23,8 @@ from typing import Any
 import torch
 
 from neusee.workflows import Store, load
-from neusee.workflows.training.parallel.process_mesh import Mesh, joined
-from neusee.workflows.training.parallel.shared_graph import Shared
+from neusee.workflows.training.band_shards import Shared
+from neusee.workflows.training.process_mesh import Mesh, joined
 from neusee.workflows.training.run_training import _photographs, train
 from neusee.workflows.training.training_iteration import Learner
 from neusee.workflows.training.training_pictures import TrainingStream

@@ -12,24 +12,22 @@ import torch
 from matplotlib.colors import to_hex
 
 from neusee.nodes.values import Bands
-from neusee.workflows.evaluation import evaluation_figures
+from neusee.workflows.evaluation import evaluation_page as evaluation_figures
 from neusee.workflows.evaluation.confidence_intervals import MetricTable
 from neusee.workflows.placement.heft_schedule import Schedule, Slot
-from neusee.workflows.report.figures import (
-    gantt,
-    numerics,
-    optics,
-    photon_transfer,
-    recipe_graph,
-    scene_spectra,
-)
+from neusee.workflows.report.figures import camera_pictures as scene_spectra
+from neusee.workflows.report.figures import graph_and_timeline as gantt
+from neusee.workflows.report.figures import graph_and_timeline as recipe_graph
+from neusee.workflows.report.figures import optics
+from neusee.workflows.report.figures import verification as numerics
+from neusee.workflows.report.figures import verification as photon_transfer
 from neusee.workflows.report.figures.style import canvas
-from neusee.workflows.studies.accuracy import accuracy_figures
+from neusee.workflows.studies.accuracy import accuracy_page as accuracy_figures
 from neusee.workflows.studies.leave_out import leave_out_study
-from neusee.workflows.studies.leave_out.scene_costs import SceneCost
+from neusee.workflows.studies.leave_out.leave_out_study import SceneCost
 from neusee.workflows.studies.stability.case_result import Cell
-from neusee.workflows.studies.stability.stability_figures import grid_picture
-from neusee.workflows.studies.uncertainty import uncertainty_figures
+from neusee.workflows.studies.stability.stability_study import grid_picture
+from neusee.workflows.studies.uncertainty import uncertainty_page as uncertainty_figures
 from neusee.workflows.training.mask_design import design_page
 
 # a function that is called as it is writes the picture: the check of all figures then reads it

@@ -4,5 +4,5 @@ without torch?
 An answer is the text of a command with the files of its folder. Everything that decided the answer
 is compared first; in doubt there is no answer, and the command runs as ever. Nothing but the
 standard library and xxhash is imported.
-Offers: `repeated_command.Command`, `stored_answer.read_answer`, `answer_upkeep.sweep`.
+Offers: `repeated_command.Command`, `stored_answer.read_answer`, `stored_answer.sweep`.
 """

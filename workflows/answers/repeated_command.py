@@ -1,45 +1,213 @@
-"""A command that may have a stored answer: the answer is looked for before the command, and kept
-after it.
-
-command = begin(["safety", "safety_pointer"], terminal)   # None where no answer can be right
-text = command.answer()                                   # None if there is none: run the command
-command.keep(...)                                         # after the command
-"""
+"""A command that may have a stored answer, which is looked for before the command runs."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from neusee.workflows.answers.answer_upkeep import make_room
-from neusee.workflows.answers.installed_program import (
-    ROOT,
-    SITES,
-    SOURCES,
-    program_state,
-    standard_library,
-)
-from neusee.workflows.answers.opened_files import Folders, Opened
 from neusee.workflows.answers.results_folder import kept_files, printed, write_again
-from neusee.workflows.answers.stored_answer import RUN, Answer, read_answer, used, write_answer
-from neusee.workflows.answers.stored_results import note_use, still_there, taken_from
-from neusee.workflows.answers.typed_command import command_name
-from neusee.workflows.answers.witnesses import Unsettled, Witnesses, hold, witnesses_of
+from neusee.workflows.answers.stored_answer import (
+    RUN,
+    Answer,
+    make_room,
+    read_answer,
+    used,
+    write_answer,
+)
+from neusee.workflows.answers.witnesses import (
+    Folders,
+    Opened,
+    Unsettled,
+    Witnesses,
+    hold,
+    note_use,
+    still_there,
+    taken_from,
+    witnesses_of,
+)
+from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.run_folder import writable_folder
-from neusee.workflows.store.environment import budget_bytes, default_root
+from neusee.workflows.store.cache_settings import budget_bytes, default_root
 from neusee.workflows.store.shared_folder import Disk
 
 if TYPE_CHECKING:
-    from neusee.workflows.answers.repeated_run import RunResults
+    from neusee.workflows.answers.results_folder import RunResults
     from neusee.workflows.graph.recipe_graph import Recipe
     from neusee.workflows.report.study_folder import StudyReport
     from neusee.workflows.store.result_store import Store
+
+
+# --- typed command --------------------------------------------------------------------------------
+
+# Name of a stored answer: the digest of the command as typed and of the process in which it runs.
+
+
+#: variables of a login or a terminal window that no program of this house reads; the working folder
+#: counts by itself, and the secret of the cache by the signature of each answer
+IGNORED = frozenset(
+    {
+        "NEUSEE_CACHE_SECRET",
+        "OLDPWD",
+        "PWD",
+        "SHLVL",
+        "SSH_AUTH_SOCK",
+        "SSH_CLIENT",
+        "SSH_CONNECTION",
+        "SSH_TTY",
+        "TERM_SESSION_ID",
+        "TMUX",
+        "TMUX_PANE",
+        "WINDOWID",
+        "XDG_SESSION_ID",
+        "_",
+    }
+)
+
+
+def command_name(words: Sequence[str], terminal: Sequence[object]) -> str:
+    """Return the name of the answer to a command; ``terminal`` says how wide the terminal is and
+    what it shows.
+
+    The name depends on the words, the working folder, all variables of the environment but
+    `IGNORED`, the terminal, Python with its options and search path, and the machine. Answers of
+    another form have other names.
+    """
+    python = [
+        sys.version,
+        sys.executable,
+        list(sys.flags),
+        list(sys.warnoptions),
+        dict(sys._xoptions),
+        sys.path,
+    ]
+    place = [os.getcwd(), sorted(_decisive(os.environ).items()), list(os.uname()), os.cpu_count()]
+    return digest("answer 2", list(words), list(terminal), python, place)
+
+
+def _decisive(variables: Mapping[str, str]) -> dict[str, str]:
+    return {name: value for name, value in variables.items() if name not in IGNORED}
+
+
+# --- installed program ----------------------------------------------------------------------------
+
+# Digest of the program as it is installed: its source files, the packages beside it, and the
+# graphics devices.
+
+
+ROOT = Path(__file__).parents[2]  #: of the package neusee
+SOURCES = ("nodes", "workflows")  #: folders of the package of which every file counts
+SITES = ("site-packages", "dist-packages")  #: names of folders of installed packages
+_ABOUT = (".dist-info", ".egg-info", ".egg-link", ".pth")
+_CODE = (".py", ".so", ".pyd", ".zip")
+_DRIVER = "/proc/driver/nvidia/version"
+
+
+class ProgramState(NamedTuple):
+    """Digest of the installed program, and when the newest of its source files changed."""
+
+    digest: str
+    changed: int  #: ns since 1970
+
+
+def standard_library() -> str:
+    """Return the folder of Python's own modules."""
+    return os.path.dirname(os.path.realpath(os.__file__))
+
+
+def program_state(root: Path = ROOT) -> ProgramState:
+    """Return the state of the program, with the content of each of its source files; import
+    nothing.
+
+    Raises `OSError` if the package is not a folder of files.
+    """
+    text, changed = hashlib.blake2b(digest_size=16), 0
+    for name in _source_files(root):
+        with open(root / name, "rb") as file:
+            stat, content = os.fstat(file.fileno()), file.read()
+        text.update(b"%s\0%d\0" % (os.fsencode(name), len(content)) + content)
+        changed = max(changed, stat.st_mtime_ns, stat.st_ctime_ns)
+    text.update(
+        repr([[_importable(folder) for folder in dict.fromkeys(sys.path)], _devices()]).encode(
+            errors="replace"
+        )
+    )
+    return ProgramState(text.hexdigest(), changed)
+
+
+def _source_files(root: Path) -> list[str]:
+    """Return the paths of all source files relative to the package, sorted."""
+    found = [name for name in ("__init__.py", "__main__.py") if (root / name).is_file()]
+    for folder in SOURCES:
+        inside = [os.path.join(folder, name) for name in _below(os.fspath(root / folder))]
+        if not inside:
+            raise FileNotFoundError(f"{root / folder} has no source files")
+        found += inside
+    return sorted(found)
+
+
+def _below(folder: str, above: str = "") -> Iterator[str]:
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            name = f"{above}{entry.name}"
+            if entry.name == "__pycache__":
+                continue
+            if entry.is_dir():
+                yield from _below(entry.path, f"{name}/")
+            else:
+                yield name
+
+
+def _importable(folder: str) -> list[tuple[str, int]]:
+    """Return what a folder of the search path can import: installed packages with their time, or
+    files of code.
+
+    The folders of Python itself count by the version of Python.
+    """
+    where = os.path.realpath(folder or ".")
+    installed = os.path.basename(where) in SITES
+    if not installed and f"{where}/".startswith(f"{standard_library()}/"):
+        return []
+    try:
+        with os.scandir(where) as entries:
+            kept = [
+                each
+                for each in entries
+                if (each.name.endswith(_ABOUT) if installed else _is_code(each))
+            ]
+            return sorted((each.name, each.stat().st_mtime_ns if installed else 0) for each in kept)
+    except OSError as error:
+        return [(type(error).__name__, 0)]
+
+
+def _is_code(entry: os.DirEntry[str]) -> bool:
+    return entry.name.endswith(_CODE) or os.path.isfile(f"{entry.path}/__init__.py")
+
+
+def _devices() -> list[str]:
+    """Return the names of the graphics devices and the version of their driver."""
+    names = sorted(name for name in os.listdir("/dev") if name.startswith(("nvidia", "kfd", "dri")))
+    try:
+        return [*names, Path(_DRIVER).read_text(errors="replace")]
+    except OSError:
+        return names
+
+
+# --- repeated command -----------------------------------------------------------------------------
+
+# A command that may have a stored answer: the answer is looked for before the command, and kept
+# after it.
+#
+# command = begin(["safety", "safety_pointer"], terminal)   # None where no answer can be right
+# text = command.answer()                                   # None if there is none: run the command
+# command.keep(...)                                         # after the command
+
 
 running: list[Command] = []  #: the command of this process, if its answer may be kept
 _SYSTEM = ("/proc", "/sys", "/dev")
@@ -154,7 +322,7 @@ class Command:
             return printed(
                 answer, write_again(answer, time.perf_counter() - self._began) / "report.html"
             )
-        from neusee.workflows.answers.repeated_run import said_again, write_run_again
+        from neusee.workflows.answers.results_folder import said_again, write_run_again
 
         folder, document = write_run_again(answer, self._disk, time.perf_counter() - self._began)
         note_use(self._disk, answer.stored)
@@ -261,7 +429,7 @@ def _are_free(memory: int) -> bool:
     """Return True if a run may use so many bytes of memory now."""
     if not memory:
         return True
-    from neusee.workflows.engine.memory_use import free_memory
+    from neusee.workflows.engine.machine_resources import free_memory
 
     return _SHARE * free_memory() >= memory
 
@@ -284,7 +452,7 @@ def _parts(folder: str) -> tuple[str, str]:
 
 def _recipe_folders(words: Sequence[str]) -> set[str]:
     """Return the folders in which the recipe and its options are looked for."""
-    from neusee.workflows.recipe.text.option_groups import shared_folders
+    from neusee.workflows.recipe.text.composition import shared_folders
 
     beside = (
         os.path.dirname(os.path.expanduser(word)) for word in words if word.endswith(_RECIPES)

@@ -1,12 +1,29 @@
-"""Files and folders on which an answer rests, and the comparison with what they are now."""
+"""Files, folders and results on which an answer rests, and whether they are as they were."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
+import re
 import stat
+import sys
 from collections.abc import Iterable, Iterator, Mapping
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import xxhash
+
+from neusee.workflows.keys.sealed_files import secrets
+from neusee.workflows.store import metadata
+from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept
+from neusee.workflows.store.payload import SmallResults
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.shared_folder import Disk
+
+# --- witnesses ------------------------------------------------------------------------------------
+
+# Files and folders on which an answer rests, and the comparison with what they are now.
 
 
 class Unsettled(ValueError):
@@ -148,3 +165,222 @@ def _digest(names: list[str]) -> str:
     return hashlib.blake2b(
         "\0".join(names).encode(errors="surrogateescape"), digest_size=16
     ).hexdigest()
+
+
+# --- opened files ---------------------------------------------------------------------------------
+
+# Record of the files that this process opens to read and of the folders that it lists, by an audit
+# hook of Python.
+
+
+_LISTS = ("os.listdir", "os.scandir")
+_WRITES = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+_listeners: list[Opened] = []  #: at most one; the hook of a process cannot be removed
+_hooked: list[bool] = []
+
+
+class Opened:
+    """The files that were opened to read and the folders that were listed, as absolute paths."""
+
+    def __init__(self) -> None:
+        self.files: dict[str, None] = {}
+        self.folders: dict[str, Listing] = {}  #: as each was when it was listed first
+        self._lists = False
+
+    def listen(self) -> None:
+        """Begin the record; another record of this process ends."""
+        _listeners[:] = [self]
+        if not _hooked:
+            _hooked.append(True)
+            sys.addaudithook(_hear)
+
+    def end(self) -> None:
+        """End the record."""
+        if self in _listeners:
+            _listeners.remove(self)
+
+    def hear(self, event: str, arguments: tuple[Any, ...]) -> None:
+        """Note one event of Python's audit; a file descriptor in place of a path says nothing
+        new.
+        """
+        path = os.curdir if event in _LISTS and arguments[0] is None else arguments[0]
+        if not isinstance(path, str | bytes | os.PathLike):
+            return
+        if event in _LISTS:
+            self._list(os.path.abspath(os.fsdecode(path)))
+        elif not _is_written(*arguments[1:3]):
+            self.files[os.path.abspath(os.fsdecode(path))] = None
+
+    def _list(self, folder: str) -> None:
+        if self._lists or folder in self.folders:
+            return
+        self._lists = True  # listing is an event too
+        try:
+            self.folders[folder] = listing(folder)
+        finally:
+            self._lists = False
+
+
+class Folders:
+    """Some folders with all that is below them."""
+
+    def __init__(self, roots: Iterable[str | os.PathLike[str]]) -> None:
+        named = (
+            str(each) for root in roots for each in (os.path.abspath(root), os.path.realpath(root))
+        )
+        self._starts = tuple(f"{each.rstrip('/')}/" for each in named)
+
+    def __contains__(self, path: object) -> bool:
+        """Return True if a path is one of the folders or below one of them, whatever links lead
+        there.
+        """
+        return any(
+            f"{each}/".startswith(self._starts) for each in (str(path), os.path.realpath(str(path)))
+        )
+
+
+def _is_written(mode: Any, flags: Any) -> bool:
+    """Return True for a file that is opened to be written anew or made."""
+    if isinstance(mode, str):
+        return mode[:1] in ("w", "x", "a")
+    return isinstance(flags, int) and bool(flags & _WRITES)
+
+
+def _hear(event: str, arguments: tuple[Any, ...]) -> None:
+    if _listeners and (event == "open" or event in _LISTS):
+        _listeners[0].hear(event, arguments)
+
+
+# --- stored results -------------------------------------------------------------------------------
+
+# Results and files of the cache on which an answer rests, and the comparison with what they are
+# now, without torch.
+#
+# A result that was loaded is compared byte by byte, as a run that loads it does; of the others the
+# metadata are compared, which hold the size and the checksum of the value, and the size of its
+# file.
+
+
+_KEY = re.compile(r"[0-9a-z-]{2,64}")
+_FILE = re.compile(r"(files|bands)/[0-9a-z]{2}/\w[\w.-]*")
+
+
+class StoredResults(NamedTuple):
+    """What of a cache an answer rests on; by default nothing."""
+
+    #: by key: digest of the metadata, or an empty text for a result that was missing
+    results: Mapping[str, str] = {}
+    loaded: tuple[str, ...] = ()  #: keys of the results whose values were loaded
+    files: Mapping[str, str] = {}  #: by path in the cache: digest of a band, a picture or an export
+    taken: Mapping[str, str] = {}  #: by name in the folder of results: the path in the cache
+
+
+NOTHING = StoredResults()
+
+
+def taken_from(store: Store, taken: Mapping[str, Path]) -> StoredResults:
+    """Return what a process has asked of a store so far, and the stored files that it took into a
+    folder of results.
+
+    Raises `Unsettled` for a file that is not in the store, and `OSError` for one that cannot be
+    read.
+    """
+    asked, loaded = store.asked(), sorted(store.loaded())
+    paths = {name: os.path.relpath(path, store.root) for name, path in taken.items()}
+    bands = (
+        f"bands/{name[:2]}/{name}" for key in loaded for name in metadata.bands(asked[key] or {})
+    )
+    used = sorted({*paths.values(), *bands})
+    if outside := [path for path in used if not _FILE.fullmatch(path)]:
+        raise Unsettled(f"{outside[0]} is not in the folders of a store")
+    files = {path: _digest_of_results(f"{store.disk.folder}/{path}") for path in used}
+    results = {key: _said(about) for key, about in sorted(asked.items())}
+    return StoredResults(results, tuple(loaded), files, paths)
+
+
+def still_there(disk: Disk, then: StoredResults) -> bool:
+    """Return True if every result is as it was and every file has the same content; change
+    nothing in the cache.
+    """
+    small = SmallResults(disk)
+    try:
+        found = {key: _about(disk, small, key) for key in then.results}
+        return (
+            all(_said(found[key]) == digest for key, digest in then.results.items())
+            and all(_is_whole(disk, found[key]) for key in then.loaded)
+            and all(
+                _digest_of_results(f"{disk.folder}/{path}") == digest
+                for path, digest in then.files.items()
+            )
+        )
+    except (*UNREADABLE, Unsettled):
+        return False
+
+
+def note_use(disk: Disk, then: StoredResults) -> None:
+    """Record that the values were used, as a run that loads them does."""
+    for key in then.loaded:
+        metadata.record_use(disk, key)
+
+
+def checked(fields: Mapping[str, Any]) -> StoredResults:
+    """Return the results that the JSON of an answer names.
+
+    Raises `ValueError` or `TypeError` for what `taken_from` never gives.
+    """
+    found = StoredResults(**{**fields, "loaded": tuple(fields.get("loaded", ()))})
+    if not all(isinstance(each, dict) for each in (found.results, found.files, found.taken)):
+        raise ValueError("a field of the answer is not of its type")
+    names = [
+        (_KEY, [*found.results, *found.loaded]),
+        (_FILE, [*found.files, *found.taken.values()]),
+    ]
+    if any(not form.fullmatch(name) for form, many in names for name in many):
+        raise ValueError("the answer names what is no result and no file of a cache")
+    digests = [*found.results.values(), *found.files.values()]
+    if not all(isinstance(text, str) for text in digests) or not {*found.taken.values()} <= {
+        *found.files
+    }:
+        raise ValueError("a field of the answer is not of its type")
+    if not {*found.loaded} <= {*found.results}:
+        raise ValueError("a result was loaded and is not named")
+    return found
+
+
+def _about(disk: Disk, small: SmallResults, key: str) -> Metadata | None:
+    """Return the metadata of a result as a store finds them, without moving a damaged result
+    away.
+    """
+    about = small.find(key)
+    return about if is_kept(about) else metadata.find(disk, key) or about
+
+
+def _said(about: Metadata | None) -> str:
+    if about is None:
+        return ""
+    return hashlib.blake2b(json.dumps(about, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+
+def _is_whole(disk: Disk, about: Metadata | None) -> bool:
+    """Return True if the file of a value has the checksum in the metadata, or with a secret the
+    signed digest.
+    """
+    if not is_kept(about):
+        return False
+    payload = about.get("payload")
+    if not payload:
+        return True
+    how, name = (hashlib.sha256, "sha256") if secrets() else (xxhash.xxh3_128, "xxh3")
+    return bool(_digest_by(disk.path(about["key"], "safetensors"), how) == payload.get(name))
+
+
+def _digest_of_results(path: str) -> str:
+    """Return a digest of a file, of the kind that the store uses for its files."""
+    return _digest_by(path, hashlib.sha256 if secrets() else xxhash.xxh3_128)
+
+
+def _digest_by(path: str, how: Any) -> str:
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise Unsettled(f"{path} is not a file")
+        return hashlib.file_digest(file, how).hexdigest()

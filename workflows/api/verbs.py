@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.recipe.text.overrides import Override
-from neusee.workflows.recipe.text.python_overrides import overrides_of
+from neusee.workflows.recipe.text.overrides import Override, overrides_of
 from neusee.workflows.report.run_folder import writable_folder
 from neusee.workflows.report.study_folder import Progress, silent
 from neusee.workflows.store.remote_store import open_store
@@ -27,10 +26,10 @@ if TYPE_CHECKING:
     from neusee.workflows.engine.runner import Result
     from neusee.workflows.engine.step_job import Executor
     from neusee.workflows.evaluation.pipelines import Pipeline
-    from neusee.workflows.graph.step_record import Event
+    from neusee.workflows.graph.recipe_graph import Event
     from neusee.workflows.store.result_store import Store
     from neusee.workflows.sweeps.sweep_run import Sweep
-    from neusee.workflows.training.parallel.process_mesh import Mesh
+    from neusee.workflows.training.process_mesh import Mesh
 
 Named = str | os.PathLike[str]  #: the name of a packaged recipe, or the path of a file
 Changes = Mapping[str, Any] | Sequence[str]
@@ -120,7 +119,7 @@ def train(
         from neusee.workflows.training.lift.lift_run import train_lift
 
         return train_lift(recipe, store, folder, command, progress, device, watch)
-    from neusee.workflows.training.parallel.process_mesh import ALONE
+    from neusee.workflows.training.process_mesh import ALONE
     from neusee.workflows.training.run_training import train as run_training
 
     numbers = stages if stages is not None else recipe.training.learnt if recipe.training else ()

@@ -1,20 +1,31 @@
-"""The pictures of a calibration: photon-transfer curve, rings about a source, and traces of the
-chains.
-"""
+"""The pictures of a calibration: transfer curve, rings, corner plot and chains."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from neusee.nodes.calibrate import Rings, Sufficient
+from neusee.nodes.values import Levels
+from neusee.workflows.calibration.posterior_checks import is_camera
 from neusee.workflows.report.figures.style import BLACK, BLUE, ORANGE, VERMILION, canvas, drawn
+from neusee.workflows.report.study_page import Section
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from neusee.workflows.calibration.calibration_page import CalibrationResult
     from neusee.workflows.calibration.log_posterior import FloatArray
+
+
+# --- calibration figures --------------------------------------------------------------------------
+
+# The pictures of a calibration: photon-transfer curve, rings about a source, and traces of the
+# chains.
+
 
 _BAND = (5.0, 50.0, 95.0)  #: percentiles
 _POINTS = 1500  #: most points of a chain in the picture
@@ -147,3 +158,253 @@ def traces(draws: FloatArray, labels: Sequence[str]) -> Any:
         ax.ticklabel_format(axis="y", useOffset=False)
     axes[-1, 0].set_xlabel("step after the discarded steps")
     return figure
+
+
+# --- corner figure --------------------------------------------------------------------------------
+
+# A corner plot: the draws of each parameter, and of every pair of parameters, in a triangle of
+# panels.
+#
+# The package `corner` draws the same picture; it makes all panels of the square and hides half,
+# which takes three times as long for ten parameters.
+
+
+_PAGE = 11.4  #: inches, the width of the page at 100 pixels an inch
+_WIDEST = 13  #: characters of a line of a label
+#: quantiles, so that a single draw does not squeeze a panel of the corner plot
+_NEARLY_ALL = (0.005, 0.995)
+_BINS = 20  #: of each side of a panel
+#: shares of the draws inside the contours
+_LEVELS = 1 - np.exp(-0.5 * np.array([0.5, 1.0, 1.5, 2.0]) ** 2)
+#: inches of a panel, of the margin with the labels, and between panels
+_SIZE, _LEFT, _GAP = 1.75, 0.9, 0.06
+
+
+@drawn
+def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -> Any:
+    """Draw a corner plot of all pairs of parameters, with the recipe's own values in orange."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    count = len(names)
+    size = _SIZE * count + _LEFT
+    text = 10 * max(1.0, size / _PAGE)  # a large picture is shrunk to the width of the page
+    figure = Figure(figsize=(size, size), dpi=100)
+    FigureCanvasAgg(figure)
+    ranges = _ranges(draws, nominal)
+    for row in range(count):
+        for column in range(row + 1):
+            left, low = _LEFT + _SIZE * column, _LEFT + _SIZE * (count - 1 - row)
+            ax = figure.add_axes(
+                (left / size, low / size, (_SIZE - _GAP) / size, (_SIZE - _GAP) / size)
+            )
+            _panel(
+                ax,
+                draws[:, [column, row]],
+                [ranges[column], ranges[row]],
+                (nominal[column], nominal[row]),
+            )
+            _labelled(
+                ax,
+                names[column] if row == count - 1 else "",
+                names[row] if column == 0 < row else "",
+                text,
+            )
+    return figure
+
+
+def _panel(
+    ax: Any, pair: FloatArray, ends: Sequence[tuple[float, float]], own: tuple[float, float]
+) -> None:
+    """Draw the histogram of one parameter, or the histogram of two with its contours, and the
+    recipe's own values.
+    """
+    ax.grid(False)
+    ax.set_xlim(ends[0])
+    ax.axvline(own[0], color=ORANGE, linewidth=1.0)
+    if np.array_equal(pair[:, 0], pair[:, 1]):
+        ax.stairs(*np.histogram(pair[:, 0], _BINS, ends[0]), color=BLUE)
+        ax.set(yticks=[], ylim=(0, None))
+        return
+    counts, x, y = np.histogram2d(pair[:, 0], pair[:, 1], _BINS, np.array(ends))
+    ax.imshow(
+        counts.T, origin="lower", extent=(*ends[0], *ends[1]), aspect="auto", cmap="Blues", vmin=0
+    )
+    heights = _heights(counts)
+    if len(heights):
+        middle = [0.5 * (edges[1:] + edges[:-1]) for edges in (x, y)]
+        ax.contour(*middle, counts.T, levels=heights, colors=BLUE, linewidths=0.8)
+    ax.axhline(own[1], color=ORANGE, linewidth=1.0)
+    ax.set_ylim(ends[1])
+
+
+def _heights(counts: FloatArray) -> FloatArray:
+    """Return the counts of a cell above which the shares `_LEVELS` of all draws lie, rising and
+    different.
+    """
+    rising = np.sort(counts.ravel())[::-1]
+    at = np.searchsorted(np.cumsum(rising), _LEVELS * rising.sum())
+    heights = np.unique(rising[at.clip(max=len(rising) - 1)])
+    inside: FloatArray = heights[(heights > 0) & (heights < rising[0])]
+    return inside
+
+
+def _labelled(ax: Any, below: str, left: str, text: float) -> None:
+    from matplotlib.ticker import MaxNLocator, ScalarFormatter
+
+    for axis, label in ((ax.xaxis, below), (ax.yaxis, left)):
+        if not label:
+            axis.set_ticks([])
+            continue
+        axis.set_major_locator(MaxNLocator(3, prune="lower"))
+        axis.set_major_formatter(ScalarFormatter(useOffset=False))
+        axis.set_tick_params(labelsize=0.9 * text, labelrotation=45)
+        axis.set_label_text(_wrapped(label), fontsize=text)
+
+
+def _wrapped(label: str) -> str:
+    """Return a label with its lines broken between words, so that it is no wider than a panel."""
+    return "\n".join(textwrap.fill(line, _WIDEST) for line in label.splitlines())
+
+
+def _ranges(draws: FloatArray, nominal: Sequence[float]) -> list[tuple[float, float]]:
+    """Return the range of each parameter in the corner plot: nearly all draws, and the recipe's
+    value if among them.
+    """
+    ends = np.quantile(draws, _NEARLY_ALL, axis=0).T
+    rim = 0.1 * (ends[:, 1] - ends[:, 0])
+    shown = np.column_stack([ends[:, 0] - rim, ends[:, 1] + rim]).clip(
+        draws.min(0)[:, None], draws.max(0)[:, None]
+    )
+    own = np.asarray(nominal)
+    inside = (own >= draws.min(0)) & (own <= draws.max(0))
+    low, high = (
+        np.where(inside, which(shown[:, i], own), shown[:, i])
+        for i, which in ((0, np.minimum), (1, np.maximum))
+    )
+    return [
+        (float(a), float(b)) if b > a else (float(a) - 0.5, float(a) + 0.5)
+        for a, b in zip(low, high, strict=True)
+    ]
+
+
+# --- picture sections -----------------------------------------------------------------------------
+
+# The sections of a calibration's page with its pictures: curve or rings, parameters in pairs, and
+# chains.
+
+
+_PREDICTED = 400  #: draws for the band of the predicted variance
+_COUNTED = """The measured variance of each level against its mean, and the prediction of the
+    posterior for a repeated measurement, before corrections for what the frames show or may hide.
+    If a level is clipped by the well or the converter, or too coarse for a mean and a variance,
+    each of its digital numbers enters the likelihood, and the level has no prediction here."""
+_EXCLUDED = """The measured variance of each level against its mean, and the prediction of the
+    posterior for a repeated measurement, before corrections for what the frames show or may hide.
+    Below it, how far each variance, and each mean from what the stated light gives, lies from the
+    prediction. Levels above {share}, and levels that are clipped, are not used and have no
+    prediction."""
+_CORNER = 20_000  #: draws for the picture of pairs
+
+
+def words(name: str) -> str:
+    """Return the name of a parameter as words."""
+    return name.replace("_", " ")
+
+
+def curve_section(result: CalibrationResult) -> Section:
+    """Return the section with the photon-transfer curve, or with the rings about a point source."""
+    if isinstance(result.problem.levels, Rings):
+        return _rings(result, result.problem.levels)
+    levels: Any = result.problem.levels
+    mean, variance, away = _repeated(result)
+    whole: NDArray[np.bool_] = np.asarray((variance > 0).all(0))
+    whole[levels.cell_level.numpy()] = False
+    text, label = _COUNTED, COUNTED
+    if is_camera(result.problem):
+        share = f"{result.params['share']:.0%} of saturation"
+        text, label = _EXCLUDED.format(share=share), f"not used: above {share}, or clipped"
+    picture = transfer(np.stack(_moments(levels)), np.stack([mean, variance]), whole, label, away)
+    return Section("Photon-transfer curve", text, picture=picture)
+
+
+def _repeated(result: CalibrationResult) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Return mean and variance (draw, level) of a repeated measurement, with what scatters beyond
+    chance.
+
+    For a real camera also the distances (level,) of the means from those that the light gives, in
+    standard deviations.
+    """
+    rng = np.random.default_rng(1)
+    flat = result.walked.flat
+    drawn = flat[rng.integers(len(flat), size=_PREDICTED)]
+    levels: Any = result.problem.levels
+    look = result.problem.likelihood(drawn)
+    freedom = levels.degrees_of_freedom.numpy().clip(1)
+    values = {**result.params, **result.problem.parameters(drawn)}
+    scatter = np.broadcast_to(np.asarray(values.get("scatter", 0.0)), len(drawn))
+    width = np.sqrt(2 / freedom + scatter[:, None] ** 2)
+    variance, away = look.variance.numpy() * (1 + width * rng.standard_normal(width.shape)), None
+    if is_camera(result.problem):
+        away = np.full(len(freedom), np.nan)
+        away[look.degrees_of_freedom.numpy() > 0] = np.split(look.scaled.numpy(), 4, axis=-1)[
+            2
+        ].mean(0)
+    return look.mean.numpy(), variance, away
+
+
+def _rings(result: CalibrationResult, levels: Rings) -> Section:
+    rng, flat = np.random.default_rng(1), result.walked.flat
+    look = result.problem.likelihood(flat[rng.integers(len(flat), size=_PREDICTED)])
+    picture = rings(
+        *ring_radii(levels), levels.mean.numpy(), look.mean.numpy(), look.variance.numpy()
+    )
+    text = """The mean signal of each ring about the source, and the prediction of the posterior for
+        a repeated measurement. Rings whose every pixel is cut off only bound the signal from
+        below."""
+    return Section("Rings about the source", text, picture=picture)
+
+
+def ring_radii(rings: Rings) -> tuple[FloatArray, FloatArray]:
+    """Return the root mean square radius of each averaged ring, and of each ring that is cut
+    off, in pixels.
+    """
+    at, count = rings.ring.numpy(), rings.weight.numpy()
+    square = np.bincount(at, count * rings.square.numpy()) / np.bincount(at, count)
+    return np.sqrt(square), np.sqrt(rings.cut_square.numpy())
+
+
+def _moments(levels: Sufficient | Levels) -> tuple[FloatArray, FloatArray]:
+    """Return the mean and the variance of all digital numbers of each light level, including
+    histograms.
+    """
+    if isinstance(levels, Levels):
+        return levels.mean.numpy(), levels.variance.numpy()
+    at, value, count = (x.numpy() for x in levels[-3:])
+    total, mean, variance = (x.numpy() for x in (levels.pixels, levels.mean, levels.variance))
+    sums = [np.bincount(at, count * value**n, minlength=len(total)) for n in range(3)]
+    every = total + sums[0]
+    middle = (total * mean + sums[1]) / every
+    square = total * (variance + mean**2) + sums[2]
+    return middle, square / every - middle**2
+
+
+def corner_section(result: CalibrationResult) -> Section:
+    """Return the section with the distribution of every pair of parameters."""
+    every = max(1, result.chains.flat.shape[0] // _CORNER)
+    told = [r for r in result.rows() if r.kind != "none"]
+    shown = np.stack([result.draws[r.name].reshape(-1)[::every] for r in told], -1)
+    text = """Every pair of parameters of which the frames tell a value or a limit; the recipe's own
+        values are orange. Gain, offset, noise and efficiency correlate."""
+    picture = corners(
+        shown, [f"{words(r.name)}\n{r.unit}" for r in told], [r.nominal for r in told]
+    )
+    return Section("Parameters in pairs", text, picture=picture)
+
+
+def chains_section(result: CalibrationResult) -> Section:
+    """Return the section with the traces of the walkers."""
+    text = """Four independent ensembles of walkers, in the coordinates of the posterior, before
+        corrections for what the frames show or may hide."""
+    picture = traces(result.walked.draws, result.problem.coordinates.labels)
+    return Section("Chains", text, picture=picture)

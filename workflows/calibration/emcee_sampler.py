@@ -1,16 +1,9 @@
-"""Sampling of a sensor's posterior with emcee: four ensembles of walkers, until the chains are long
-enough.
-
-Only this file and `ensembles` import emcee. After each round all draws are written in emcee's HDF5
-format, behind a seal in the first bytes, which HDF5 leaves to its users. A killed run continues
-from the last round and gives the same draws, to the last bit, as a run that never stopped. Chains
-whose file has no right seal start anew.
-"""
+"""Sampling of a posterior with emcee, by ensembles of walkers, until chains are long enough."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,18 +12,173 @@ from typing import TYPE_CHECKING, Any
 import emcee
 import numpy as np
 
-from neusee.nodes.array_bytes import hdf5_needs
-from neusee.nodes.input_size import bytes_of
-from neusee.workflows.calibration.ensembles import Walk, walk_until
-from neusee.workflows.calibration.guided_move import GuidedMove
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import LaplaceFit
-from neusee.workflows.keys.seal import seal_file, unseal_file
+from neusee.nodes.file_headers import hdf5_needs
+from neusee.nodes.input_files import bytes_of
+from neusee.workflows.calibration.log_posterior import LaplaceFit, SensorPosterior
+from neusee.workflows.calibration.posterior_mixture import Density
+from neusee.workflows.keys.sealed_files import seal_file, unseal_file
 from neusee.workflows.report.study_folder import Progress, silent
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.importance_sampling import Guide
     from neusee.workflows.calibration.log_posterior import FloatArray
+
+
+# --- ensembles ------------------------------------------------------------------------------------
+
+# Ensembles of walkers that advance together, so that one call evaluates the proposals of all
+# ensembles.
+#
+# Each ensemble has emcee's moves and its own random stream. The draws are exactly those of emcee's
+# `EnsembleSampler`, which evaluates one ensemble after another in a loop over walkers. A likelihood
+# of few numbers takes as long for one ensemble as for four, and less time than the loop of emcee.
+
+
+#: returns the log density (walker,) at (walker, free), never NaN
+Weigh = Callable[["FloatArray"], "FloatArray"]
+
+
+class Walk:
+    """An ensemble of walkers, with the draws, the move and the random stream of the ensemble."""
+
+    def __init__(
+        self,
+        backend: Any,
+        move: Any,
+        random: np.random.RandomState,
+        initial_theta: FloatArray | None,
+    ) -> None:
+        self.backend = backend  #: emcee's backend in memory, with all steps so far
+        self.move, self.random = move, random
+        self.initial_theta = initial_theta  #: (walker, free) before the first step; None after it
+
+    @property
+    def iteration(self) -> int:
+        """Return the number of steps that the walkers have made."""
+        return int(self.backend.iteration)
+
+    def prepare(self, steps: int, weigh: Weigh) -> None:
+        """Reserve memory for ``steps`` more steps of the walkers, and load their state after the
+        last step.
+        """
+        if self.initial_theta is not None and self.iteration == 0:
+            self._state = emcee.State(self.initial_theta.copy(), log_prob=weigh(self.initial_theta))
+        else:
+            self._state = emcee.State(self.backend.get_last_sample(), copy=True)
+        self.backend.grow(steps, None)
+
+    def begin_step(self) -> None:
+        """Split the walkers into parts for one step; the proposals for each part depend on the
+        other parts.
+        """
+        self.random.random_sample()  # emcee draws one of several moves with this number
+        self.move.setup(self._state.coords)
+        self._part = np.arange(len(self._state.coords)) % self.move.nsplits
+        if self.move.randomize_split:
+            self.random.shuffle(self._part)
+        self._accepted = np.zeros(len(self._part), dtype=bool)
+
+    def propose(self, part: int) -> FloatArray:
+        """Return the proposed coordinates (walker, free parameter) for one part of the walkers."""
+        sets = [self._state.coords[self._part == other] for other in range(self.move.nsplits)]
+        others = sets[:part] + sets[part + 1 :]
+        self._proposed, self._factors = self.move.get_proposal(sets[part], others, self.random)
+        proposed: FloatArray = self._proposed
+        return proposed
+
+    def decide(self, part: int, log: FloatArray) -> None:
+        """Accept or reject the proposed coordinates of one part of the walkers."""
+        own = np.flatnonzero(self._part == part)
+        gain = self._factors + log - self._state.log_prob[own]
+        accepted = gain > np.log(self.random.rand(len(own)))
+        at = own[accepted]
+        self._state.coords[at], self._state.log_prob[at] = self._proposed[accepted], log[accepted]
+        self._accepted[at] = True
+
+    def end_step(self) -> None:
+        """Add the walkers' coordinates after this step to the draws."""
+        self.backend.save_step(self._state, self._accepted)
+
+    def rest(self) -> None:
+        """Store the state of the random stream, so that a later run can continue from this
+        state.
+        """
+        self.backend.random_state = self.random.get_state()
+
+
+def walk_until(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
+    """Advance the ensembles until each has ``steps`` steps; ensembles with the fewest steps go
+    first.
+    """
+    while (now := min(walk.iteration for walk in walks)) < steps:
+        behind = [walk for walk in walks if walk.iteration == now]
+        until = min([steps, *(walk.iteration for walk in walks if walk.iteration > now)])
+        _together(behind, until - now, weigh)
+
+
+def _together(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
+    for walk in walks:
+        walk.prepare(steps, weigh)
+    for _ in range(steps):
+        for walk in walks:
+            walk.begin_step()
+        for part in range(walks[0].move.nsplits):
+            log = weigh(np.concatenate([walk.propose(part) for walk in walks]))
+            for walk, own in zip(walks, np.split(log, len(walks)), strict=True):
+                walk.decide(part, own)
+        for walk in walks:
+            walk.end_step()
+    for walk in walks:
+        walk.rest()
+
+
+# --- guided move ----------------------------------------------------------------------------------
+
+# A move of walkers that also proposes places from a density like the posterior, whatever the
+# walkers' own places.
+
+
+_SHARE = 0.8  #: of the proposals that come from the density
+
+
+class GuidedMove:
+    """A move of emcee that proposes some of the new places from a density, by which walkers also
+    change modes.
+
+    Each proposal has the factor of Metropolis and Hastings, so that the chains have the posterior
+    as their limit, however well or badly the density agrees with it.
+    """
+
+    def __init__(self, move: Any, density: Density) -> None:
+        self.move, self.density = move, density
+        self.nsplits, self.randomize_split = move.nsplits, move.randomize_split
+
+    def setup(self, places: FloatArray) -> None:
+        """Prepare the move of emcee for walkers at ``places``."""
+        self.move.setup(places)
+
+    def get_proposal(
+        self, own: FloatArray, others: Sequence[FloatArray], random: np.random.RandomState
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return proposed places (walker, free), and the logarithm of the factor of each in its
+        acceptance.
+        """
+        proposed, factors = self.move.get_proposal(own, others, random)
+        drawn, ratio = self.density.propose(own, random)
+        guided = random.random_sample(len(own)) < _SHARE
+        return np.where(guided[:, None], drawn, proposed), np.where(guided, ratio, factors)
+
+
+# --- emcee sampler --------------------------------------------------------------------------------
+
+# Sampling of a sensor's posterior with emcee: four ensembles of walkers, until the chains are long
+# enough.
+#
+# Only this file and `emcee_sampler` import emcee. After each round all draws are written in emcee's
+# HDF5 format, behind a seal in the first bytes, which HDF5 leaves to its users. A killed run
+# continues from the last round and gives the same draws, to the last bit, as a run that never
+# stopped. Chains whose file has no right seal start anew.
+
 
 ENSEMBLES = 4
 STRANDED = 20.0  #: nats by which the median of a stranded walker lies below that of all walkers

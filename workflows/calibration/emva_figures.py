@@ -1,14 +1,17 @@
-"""The pictures of the EMVA 1288 sheet, in the order of the standard."""
+"""The pictures of the EMVA 1288 sheet, and its PDF."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import io
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from neusee.nodes.calibrate import EmvaSheet, general_model
-from neusee.workflows.calibration import emva_patterns
+from neusee.nodes.calibrate import COVERAGE, Budget, EmvaSheet, general_model
+from neusee.workflows.calibration import emva_sheet
+from neusee.workflows.calibration.uncertainty_budget import BUDGETED, budget_figure, two_digits
 from neusee.workflows.report.figures.style import (
     BLACK,
     BLUE,
@@ -19,6 +22,11 @@ from neusee.workflows.report.figures.style import (
     drawn,
     styled,
 )
+
+# --- emva figures ---------------------------------------------------------------------------------
+
+# The pictures of the EMVA 1288 sheet, in the order of the standard.
+
 
 Draw = Callable[[EmvaSheet], Any]
 _DOTS = {"linestyle": "", "marker": "o", "color": BLACK, "markersize": 3.5}
@@ -192,13 +200,13 @@ def dark_current(sheet: EmvaSheet) -> Any:
 
 def spectrograms(sheet: EmvaSheet) -> Any:
     """Draw the spectrograms of DSNU and PRNU along rows and columns; None without a series."""
-    images = emva_patterns.spectrograms(sheet)
+    images = emva_sheet.spectrograms(sheet)
     if not images:
         return None
     figure, axes = canvas(_WIDTH, 3.4 * len(images), len(images), 2)
     for row, ((name, unit), directions) in zip(axes, images.items(), strict=True):
         quantity = sheet[f"{name}1288_DN" if name == "DSNU" else f"{name}1288"]
-        one, average = emva_patterns.noise_in_time(sheet, name)
+        one, average = emva_sheet.noise_in_time(sheet, name)
         for ax, (direction, found) in zip(row, directions.items(), strict=True):
             ax.plot(
                 found.frequency[1:], found.amplitude[1:].clip(1e-12), color=BLACK, linewidth=0.8
@@ -227,7 +235,7 @@ def line_profiles(sheet: EmvaSheet) -> Any:
     """Draw the horizontal and vertical profiles of the averaged dark and lit frames; None
     without a series.
     """
-    images = emva_patterns.line_profiles(sheet)
+    images = emva_sheet.line_profiles(sheet)
     if not images:
         return None
     figure, axes = canvas(_WIDTH, 3.4 * len(images), len(images), 2)
@@ -247,7 +255,7 @@ def defect_pixels(sheet: EmvaSheet) -> Any:
     """Draw the logarithmic and the accumulated histograms of DSNU and PRNU; None without a
     series.
     """
-    found = emva_patterns.defect_histograms(sheet)
+    found = emva_sheet.defect_histograms(sheet)
     if not found:
         return None
     figure, axes = canvas(_WIDTH, 3.4 * len(found), len(found), 2)
@@ -314,3 +322,74 @@ def _light(sheet: EmvaSheet) -> str:
 
 def _straight(x: Any, y: Any) -> Any:
     return np.polyval(np.polyfit(x, y, 1), x)
+
+
+# --- emva pdf -------------------------------------------------------------------------------------
+
+# The PDF of the EMVA 1288 sheet: a page with all quantities, and a page for each picture.
+
+
+_LINE = 105  #: characters of a line of the summary
+_COLUMNS = ("symbol", "quantity", "value", f"U ({COVERAGE:.0%})")
+_A4 = (8.27, 11.69)  #: inches
+
+
+def pdf(sheet: EmvaSheet, title: str, lines: list[str], budgets: Sequence[Budget] = ()) -> bytes:
+    """Return a PDF: the summary of the sheet on its first page, and the pictures on the pages after
+    it.
+
+    ``budgets`` have the expanded uncertainty of each quantity with a value.
+    """
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    out = io.BytesIO()
+    # equal frames give equal bytes
+    about = {"Title": title, "Creator": "neusee", "CreationDate": None}
+    with styled(), PdfPages(out, metadata=about) as pages:
+        pages.savefig(_summary(sheet, title, lines, {b.key: b for b in budgets}))
+        for draw in PICTURES.values():
+            if (figure := draw(sheet)) is not None:
+                pages.savefig(figure, bbox_inches="tight", pad_inches=0.3)
+        if named := [budget for budget in budgets if budget.key in BUDGETED]:
+            pages.savefig(budget_figure(named), bbox_inches="tight", pad_inches=0.3)
+    return out.getvalue()
+
+
+def _summary(sheet: EmvaSheet, title: str, lines: list[str], budgets: Mapping[str, Budget]) -> Any:
+    """Return a page of A4 with title, what is told of the camera, and the table of all
+    quantities.
+    """
+    figure, axes = canvas(*_A4, 2, 1, height_ratios=(0.25, 1.0))
+    figure.get_layout_engine().set(rect=(0.07, 0.04, 0.86, 0.92))
+    for ax in axes[:, 0]:
+        ax.set_axis_off()
+    axes[0, 0].text(
+        0, 1, title, fontsize=14, fontweight="bold", va="top", transform=axes[0, 0].transAxes
+    )
+    shown = "\n".join(part for text in lines for part in textwrap.wrap(text, _LINE))
+    axes[0, 0].text(
+        0, 0.86, shown, fontsize=9, va="top", linespacing=1.4, transform=axes[0, 0].transAxes
+    )
+    rows = [(q.symbol, q.name, q.text, _expanded(budgets.get(q.key))) for q in sheet.quantities]
+    table = axes[1, 0].table(
+        rows,
+        colLabels=_COLUMNS,
+        colWidths=(0.22, 0.46, 0.2, 0.12),
+        cellLoc="left",
+        loc="upper center",
+    )
+    table.auto_set_font_size(False)
+    table.set_fontsize(9)
+    for cell in table.get_celld().values():
+        cell.set_linewidth(0.3)
+        cell.PAD = 0.03
+    return figure
+
+
+def _expanded(budget: Budget | None) -> str:
+    """Return the expanded uncertainty in the unit of the value as text; + says that a source is
+    not stated.
+    """
+    if budget is None:
+        return "–"
+    return two_digits(budget.expanded) + " +" * bool(budget.missing)

@@ -12,8 +12,7 @@ import numpy as np
 import torch
 
 from neusee.nodes.calibrate import Ridge
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import LaplaceFit
+from neusee.workflows.calibration.log_posterior import LaplaceFit, SensorPosterior
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import FloatArray

@@ -13,10 +13,9 @@ import numpy as np
 import torch
 
 from neusee.nodes.calibrate import Laboratory, Traceability
-from neusee.workflows.calibration.frame_validity import wider
+from neusee.workflows.calibration.frame_validity import ModelSpread, wider
 from neusee.workflows.calibration.identifiability import Identifiability
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.model_spread import ModelSpread
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe
 

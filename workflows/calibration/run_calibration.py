@@ -16,18 +16,19 @@ import numpy as np
 
 from neusee.nodes.calibrate import FrameTest, Laboratory, Rings
 from neusee.nodes.values import Levels
-from neusee.workflows.calibration.budget_page import COLUMNS, budget_document, budget_rows
-from neusee.workflows.calibration.calibration_budget import budgets
 from neusee.workflows.calibration.calibration_page import (
     NOT_TOLD,
     CalibrationResult,
+    agreement,
     banner,
+    compared,
     estimated_models,
     lead,
     sections,
 )
 from neusee.workflows.calibration.frame_validity import (
     as_rows,
+    compare_models,
     data_check,
     frame_checks,
     frame_section,
@@ -46,21 +47,24 @@ from neusee.workflows.calibration.laboratory import (
     with_laboratory_models,
     without_efficiency,
 )
-from neusee.workflows.calibration.level_misfit import is_camera
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.model_spread import compare_models
+from neusee.workflows.calibration.log_posterior import LaplaceFit, SensorPosterior, search_mode
 from neusee.workflows.calibration.posterior_checks import (
     Check,
     arviz,
     checks,
     count_failures,
     importance_samples,
+    is_camera,
 )
-from neusee.workflows.calibration.posterior_mode import LaplaceFit, search_mode
-from neusee.workflows.calibration.standard_fit import agreement, compared
+from neusee.workflows.calibration.uncertainty_budget import (
+    COLUMNS,
+    budget_document,
+    budget_rows,
+    budgets,
+)
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.keys.code_digest import engine
 from neusee.workflows.report.study_folder import (
     Content,
     CsvTable,

@@ -8,8 +8,25 @@ from pathlib import Path
 from typing import Any
 
 from neusee.nodes.calibrate import Budget, EmvaSheet, emva_sheet, sheet_budgets
-from neusee.workflows.calibration import emva_figures, emva_pdf
-from neusee.workflows.calibration.budget_page import (
+from neusee.workflows.calibration import emva_figures
+from neusee.workflows.calibration import emva_figures as emva_pdf
+from neusee.workflows.calibration.emva_sheet import (
+    OPERATING_POINT,
+    EmvaFrames,
+    Release,
+    banner,
+    frames_of_recipe,
+    group_of,
+    lead,
+    operating_point,
+    pattern_tables,
+    requirements,
+    sections,
+    temporal_variance,
+)
+from neusee.workflows.calibration.frame_validity import as_rows
+from neusee.workflows.calibration.laboratory import is_relative, laboratory_of, stated
+from neusee.workflows.calibration.uncertainty_budget import (
     BUDGETED,
     COLUMNS,
     budget_document,
@@ -17,24 +34,6 @@ from neusee.workflows.calibration.budget_page import (
     budget_rows,
     budget_sections,
 )
-from neusee.workflows.calibration.emva_frames import (
-    OPERATING_POINT,
-    EmvaFrames,
-    Release,
-    frames_of_recipe,
-)
-from neusee.workflows.calibration.emva_page import (
-    banner,
-    group_of,
-    lead,
-    operating_point,
-    requirements,
-    sections,
-    temporal_variance,
-)
-from neusee.workflows.calibration.emva_patterns import pattern_tables
-from neusee.workflows.calibration.frame_validity import as_rows
-from neusee.workflows.calibration.laboratory import is_relative, laboratory_of, stated
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.study_folder import StudyReport, StudyRun, as_json

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from neusee.workflows.answers import answer_upkeep
+from neusee.workflows.answers import stored_answer
 from neusee.workflows.cli.command_frame import failing, say, the_store
-from neusee.workflows.cli.command_list import MISSED
-from neusee.workflows.report.text_table import columns
-from neusee.workflows.store.byte_sizes import format_size, parse_size
+from neusee.workflows.cli.commands_and_exit_codes import MISSED
+from neusee.workflows.report.terminal_text import columns
+from neusee.workflows.store.cache_settings import format_size, parse_size
 from neusee.workflows.store.metadata import is_kept
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def ls_lines(store: Store, whole: bool = False) -> Iterator[str]:
     last = f"{_count(kept, 'result')}, {format_size(size)}{by}, in {store.root}"
     if receipts:
         last += f"; of {_count(receipts, 'more result')} the receipt alone"
-    last += _answers_text(answer_upkeep.answers(store.disk))
+    last += _answers_text(stored_answer.answers(store.disk))
     if store.budget is not None:
         last += f"; the budget is {format_size(store.budget)}"
     yield last
@@ -190,7 +190,7 @@ def verify_lines(store: Store) -> tuple[list[str], int]:
             damaged.append(f"{entry.key}  {about.get('step') or '?'}  {problem}")
         elif is_kept(about):
             sizes.append(_size(about))
-    answers, broken = answer_upkeep.check(store.disk)
+    answers, broken = stored_answer.check(store.disk)
     damaged += [
         f"{each.name}  the answer of a command, which is not what was written" for each in broken
     ]
@@ -214,9 +214,9 @@ def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list
     """
     swept = store.gc(None if budget is None else parse_size(budget), dry)
     full = budget is not None and swept.left + sum(
-        map(_bytes, answer_upkeep.answers(store.disk))
+        map(_bytes, stored_answer.answers(store.disk))
     ) > parse_size(budget)
-    old = answer_upkeep.sweep(store.disk, dry, everything=full)
+    old = stored_answer.sweep(store.disk, dry, everything=full)
     abouts = ((key, store.about(key)) for key in swept.evicted)  # the receipts of what went
     rows = [[*_row(key, about, False)[1:4], key[:8]] for key, about in abouts if about is not None]
     went = (
@@ -292,7 +292,7 @@ def _size(about: dict[str, Any]) -> int:
     return size
 
 
-def _answers_text(answers: Sequence[answer_upkeep.Kept]) -> str:
+def _answers_text(answers: Sequence[stored_answer.Kept]) -> str:
     """Return how many stored answers there are and their bytes, after a comma, or an empty text
     without answers.
     """
@@ -300,7 +300,7 @@ def _answers_text(answers: Sequence[answer_upkeep.Kept]) -> str:
     return f", {_count(len(answers), 'answer')} of commands of {size}" if answers else ""
 
 
-def _bytes(answer: answer_upkeep.Kept) -> int:
+def _bytes(answer: stored_answer.Kept) -> int:
     return answer.size
 
 

@@ -16,7 +16,7 @@ from neusee.workflows.cli.command_frame import failing, refusing, say
 from neusee.workflows.cli.command_options import Debug
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.report.paper_readings import READINGS, SETTLED
-from neusee.workflows.report.text_table import columns
+from neusee.workflows.report.terminal_text import columns
 
 if TYPE_CHECKING:
     from neusee.nodes import Node
@@ -142,7 +142,7 @@ def nodes_lines(own: Own = MappingProxyType({})) -> list[str]:
 
 def _networks(own: Own) -> list[str]:
     """Return a line for each network class of the user's families."""
-    from neusee.nodes.network_classes import network_classes
+    from neusee.nodes.own_modules import network_classes
 
     lines = ["", "Network classes, for restore.network"]
     for family, module in own.items():

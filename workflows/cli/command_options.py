@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing, keep_for_result
-from neusee.workflows.cli.interruption import print_warning
-from neusee.workflows.report.text_table import lasts
-from neusee.workflows.store.byte_sizes import parse_size
+from neusee.workflows.cli.command_frame import fail, failing, keep_for_result, print_warning
+from neusee.workflows.report.terminal_text import lasts
+from neusee.workflows.store.cache_settings import parse_size
 
 if TYPE_CHECKING:
     from neusee.workflows.engine.step_job import Executor
@@ -163,7 +162,7 @@ def option_words(options: Mapping[str, Any]) -> list[str]:
 
 def check_device(device: str) -> None:
     """End the command if this machine does not have ``device``, which may be a list with commas."""
-    from neusee.workflows.engine.device_names import check_devices
+    from neusee.workflows.engine.local_executor import check_devices
 
     with failing(ValueError, before="--device "):
         check_devices(device)
@@ -186,7 +185,7 @@ def within_memory(text: str) -> Iterator[int | None]:
     if limit is None:
         yield None
         return
-    from neusee.workflows.engine.memory_watch import limited
+    from neusee.workflows.engine.memory_limits import limited
 
     with limited(limit):
         yield limit
@@ -239,7 +238,7 @@ def check_executor(place: str, job: Sequence[str]) -> None:
         return
     if find_spec("dask_jobqueue") is None:
         fail(f'--executor {place}: dask_jobqueue is not installed: pip install "neusee[slurm]"')
-    from neusee.workflows.engine.slurm_options import SlurmOptions, missing_command
+    from neusee.workflows.engine.dask_cluster import SlurmOptions, missing_command
 
     with failing(ValueError, before="--job "):
         SlurmOptions.read(job)

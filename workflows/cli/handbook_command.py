@@ -11,8 +11,8 @@ from typing import Annotated
 import typer
 
 from neusee.workflows.cli.command_frame import failing, say
-from neusee.workflows.cli.command_list import FAILED
 from neusee.workflows.cli.command_options import Debug, Quiet, progress_lines
+from neusee.workflows.cli.commands_and_exit_codes import FAILED
 
 
 def handbook(
@@ -43,7 +43,7 @@ def handbook(
         site_build.check_modules()
         site_build.check_folder(out)
     from neusee.workflows.cli.handbook_reference import reference_pages
-    from neusee.workflows.handbook.command_pictures import NoPicture
+    from neusee.workflows.handbook.guide_pages import NoPicture
 
     with failing(
         site_build.HandbookError, NoPicture, OSError, code=FAILED, before="neusee handbook: "

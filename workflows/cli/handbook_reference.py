@@ -16,11 +16,15 @@ import typer
 from typer.main import get_command
 
 from neusee.workflows.cli.catalogue import first_sentence, parameter_rows
-from neusee.workflows.cli.command_list import EXIT_CODES
-from neusee.workflows.cli.typer_program import program
-from neusee.workflows.handbook.plain_markdown import escaped, prose, table
-from neusee.workflows.handbook.python_reference import python_page
-from neusee.workflows.handbook.recipe_reference import recipe_page
+from neusee.workflows.cli.commands_and_exit_codes import EXIT_CODES
+from neusee.workflows.cli.program_options import program
+from neusee.workflows.handbook.recipe_and_python_reference import (
+    escaped,
+    prose,
+    python_page,
+    recipe_page,
+    table,
+)
 from neusee.workflows.recipe.node_families import all_nodes, family_title
 
 if TYPE_CHECKING:

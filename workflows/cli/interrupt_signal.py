@@ -11,7 +11,7 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
-from neusee.workflows.cli.command_list import INTERRUPTED
+from neusee.workflows.cli.commands_and_exit_codes import INTERRUPTED
 
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs

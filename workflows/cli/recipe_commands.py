@@ -1,6 +1,4 @@
-"""The commands for one recipe or one run of a recipe: run, validate, plan, why, config and
-report.
-"""
+"""Commands on recipes and runs: run, validate, plan, why, report, safety, sweep, restore …"""
 
 from __future__ import annotations
 
@@ -15,13 +13,19 @@ import typer
 from neusee.workflows.cli.command_frame import (
     fail,
     failing,
+    kept_in,
     load,
+    print_warning,
     refusing,
+    resumable,
     say,
+    say_json,
     say_line,
+    search_for_garbage,
+    split,
+    split_frames,
     the_store,
 )
-from neusee.workflows.cli.command_list import FAILED, MISSED
 from neusee.workflows.cli.command_options import (
     AsJson,
     Debug,
@@ -34,17 +38,23 @@ from neusee.workflows.cli.command_options import (
     check_device,
     check_executor,
     executor_of,
+    option_words,
     within_memory,
 )
-from neusee.workflows.cli.interruption import kept_in, print_warning, resumable, say_json
-from neusee.workflows.cli.repetition import keep_run, say_and_keep
-from neusee.workflows.report.json_output import json_line
-from neusee.workflows.report.next_commands import commands_to_try
+from neusee.workflows.cli.commands_and_exit_codes import FAILED, MISSED, TYPED
+from neusee.workflows.cli.repetition import keep_answer, keep_run, say_and_keep
+from neusee.workflows.report.terminal_text import commands_to_try, json_line
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
     from neusee.workflows.simulation.simulate_recipe import Simulation
     from neusee.workflows.store.result_store import Store
+
+
+# --- recipe commands ------------------------------------------------------------------------------
+
+# The commands for one recipe or one run of a recipe: run, validate, plan, why, config and report.
+
 
 Rerun = Annotated[
     list[str] | None,
@@ -322,8 +332,268 @@ def report(
     debug: Debug = False,
 ) -> None:
     """Write the page of a run again from stored results."""
-    from neusee.workflows.report.run_folder import find_run
-    from neusee.workflows.report.run_html import rebuild
+    from neusee.workflows.report.run_folder import find_run, rebuild
 
     with failing(FileNotFoundError):
         say([str(rebuild(find_run(folder, out)))])
+
+
+# --- safety command -------------------------------------------------------------------------------
+
+# The command ``neusee safety``: is the sensor damaged or dazzled by a laser, and from which
+# distance?
+
+
+def safety(
+    words: Words = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
+    out: Out = Path("runs"),
+) -> None:
+    """Estimate damage and dazzle by a laser, and the distances.
+
+    The recipe needs a block `safety` and a laser in watts: see safety_pointer. The page has the
+    limits of the sensor with their sources, the distances where the laser exceeds them, behind the
+    plain lens, a mask, a grey filter and a smaller stop, and the limit of the eye beside them. It
+    is an estimate, no certificate.
+    """
+    recipe, command = load(words, "safety")
+    store = the_store()
+    from neusee.workflows.graph.run_error import RunError
+    from neusee.workflows.safety.run_safety import assess
+    from neusee.workflows.safety.safety_text import lines
+
+    with refusing(), failing(RunError, code=FAILED):
+        folder, found = assess(recipe, store, out, command)
+
+    def text(page: str) -> str:
+        if as_json:
+            return json_line({"report": page, **found.document})
+        return page if quiet else "\n".join([*lines(found.paragraphs), "", f"page   {page}"])
+
+    say([text(str(folder / "report.html"))])
+    keep_answer(text, as_json, out, folder, found.report, recipe)
+
+
+# --- sweep command --------------------------------------------------------------------------------
+
+# The command ``neusee sweep``: run a recipe at several values of its parameters.
+
+
+def sweep(
+    words: Words = None,
+    paired: Annotated[
+        bool, typer.Option("--zip", help="Pair the values of the axes instead of combining them.")
+    ] = False,
+    on_error: Annotated[
+        str,
+        typer.Option("--on-error", help="After a failed point: stop, or continue with the next."),
+    ] = "stop",
+    workers: Annotated[
+        int,
+        typer.Option(
+            "--workers",
+            min=0,
+            max=10_000,
+            help="Number of points that run at the same time; 0: by free processors.",
+        ),
+    ] = 0,
+    netcdf: Annotated[
+        bool, typer.Option("--netcdf", help="Write sweep.nc too (needs neusee[xarray]).")
+    ] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+    device: Device = "cpu",
+    out: Out = Path("runs"),
+) -> None:
+    """Run a recipe at several values of its parameters.
+
+    Write values as a=1,2,3 or b='linspace(450 nm, 650 nm, 5)'. All combinations run unless --zip
+    pairs them. Run the same command again to continue a sweep that was stopped.
+    """
+    name, words, first = split(words)
+    if on_error not in ("stop", "continue"):
+        fail(f"--on-error {on_error}: write stop or continue")
+    check_device(device)
+    store = the_store()
+    from neusee.workflows.cli.sweep_screen import run_sweep
+
+    with refusing(), resumable(lambda: kept_in(store, "the points that are finished are")):
+        search_for_garbage()
+        code = run_sweep(
+            name,
+            words,
+            first=first,
+            zip=paired,
+            on_error="continue" if on_error == "continue" else "stop",
+            netcdf=netcdf,
+            device=device,
+            out=out,
+            store=store,
+            quiet=quiet,
+            as_json=as_json,
+            workers=workers,
+        )
+    if code:
+        raise typer.Exit(code)
+
+
+# --- restore command ------------------------------------------------------------------------------
+
+# The command ``neusee restore``: the scene from a frame that somebody took, and what is not known
+# of it.
+
+
+Frames = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="FRAME... [OVERRIDE]...",
+        help="Frames or folders of frames, then changes: a.b=1, +a.b=1, ~a.b, restore=wiener.",
+        show_default=False,
+    ),
+]
+
+
+def restore(
+    words: Frames,
+    camera: Annotated[
+        str, typer.Option("--camera", help="Recipe of the camera, or file of its sensor group.")
+    ],
+    mask: Annotated[
+        str, typer.Option("--mask", help="Mask: an option of the group doe, or a height-map file.")
+    ] = "",
+    psf: Annotated[
+        str, typer.Option("--psf", help="Folder of frames of point sources: measure the PSF.")
+    ] = "",
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
+    device: Device = "cpu",
+    memory: Memory = "",
+    out: Out = Path("runs"),
+) -> None:
+    """Restore the scene from frames that a camera took.
+
+    A frame has the digital numbers of the sensor in three channels, without a tone curve: PNG or
+    TIFF of 8 or 16 bits, OpenEXR or .npy. Of the recipe --camera the lens, mask, sensor and
+    illuminant count, not the scene and the laser. With --psf, the PSF by field is measured from
+    frames of point sources, and its error enters the uncertainty. The page has the picture, the
+    uncertainty of each pixel, and what is invented because pixels were saturated.
+    """
+    frames, changes, first = split_frames(words)
+    check_device(device)
+    folder = Path.cwd()
+    from neusee.workflows.restoration.frame_recipes import named_frames, recipes_of
+
+    with within_memory(memory) as limit, refusing():
+        files = named_frames(frames, folder)
+        recipes = recipes_of(files, camera, mask, changes, folder, first, psf)
+    store, silent = the_store(), quiet or as_json
+    options = option_words({"camera": camera, "mask": mask, "psf": psf})
+    from neusee.workflows.graph.run_error import RunError
+
+    with resumable(lambda: kept_in(store, "finished steps are")), failing(RunError, code=FAILED):
+        for file, recipe in zip(files, recipes, strict=True):
+            command = ["neusee", "restore", str(file), *changes, *options]
+            done = _restored(recipe, store, out, command, (device, limit), silent)
+            _say(done, as_json, quiet)
+
+
+def _restored(
+    recipe: Recipe,
+    store: Store,
+    out: Path,
+    command: list[str],
+    place: tuple[str, int | None],
+    silent: bool,
+) -> Simulation:
+    """Run the recipe of a frame, with the lines of its steps unless the command is silent."""
+    from neusee.workflows.explain.run_forecast import lanes_for, planned
+    from neusee.workflows.report import console, contents
+    from neusee.workflows.simulation.simulate_recipe import simulate
+    from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+
+    device, limit = place
+    plan = planned(recipe, store, lanes_for(recipe, device, limit))
+    if plan.refused:
+        fail(f"{'memory' if limit is None else '--memory'}: {plan.refused}; nothing was run")
+    if not silent:
+        say(console.opening(recipe, shlex.join(command[1:])))
+    cheaper = with_substitutions(recipe, contents.wanted(recipe))
+    with console.RunTable(
+        cheaper, contents.steps_of(cheaper), console.mode_for(silent), {}
+    ) as table:
+        return simulate(cheaper, store, out, command, device, table.watch, None, limit)
+
+
+def _say(done: Simulation, as_json: bool, quiet: bool) -> None:
+    if as_json:
+        say_json({"report": str(done.page), **done.document})
+    elif quiet:
+        say([str(done.page)])
+    else:
+        from neusee.workflows.report.console import story_lines
+
+        say(
+            [
+                *story_lines(done.document),
+                "",
+                f"restored {done.folder / 'data' / 'restored.png'}",
+                f"report   {done.page}",
+            ]
+        )
+    for line in done.document["warnings"] if quiet or as_json else ():
+        print_warning(line)
+
+
+# --- compare command ------------------------------------------------------------------------------
+
+# The command ``neusee compare``: what differs between two runs?
+
+
+_RUN = "A run's folder: a name below --out, a path, or `latest`."
+
+
+def compare(
+    left: Annotated[str, typer.Argument(help=_RUN)],
+    right: Annotated[str, typer.Argument(help=_RUN)],
+    fail_above: Annotated[
+        float,
+        typer.Option(
+            "--fail-above",
+            min=0.0,
+            help="Exit with code 3 if a number differs by more, relatively.",
+        ),
+    ] = float("inf"),
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
+    out: Out = Path("runs"),
+) -> None:
+    """Compare two runs: numbers, pictures, recipe and code.
+
+    The environment is compared too, and nothing is computed again. The page shows the pictures side
+    by side with their difference. The exit code is 0 also where the runs differ, unless
+    --fail-above says what may differ at most; a number that only one run has differs by more than
+    any limit.
+    """
+    from neusee.workflows.comparison.run_record import NotComparable, read_record
+
+    with failing(NotComparable):
+        records = [read_record(where, out) for where in (left, right)]
+        from neusee.workflows.comparison import comparison_report
+
+        found = comparison_report.compare(*records)
+    page = comparison_report.write_comparison(found, out, ["neusee", *TYPED]) / "report.html"
+    if as_json:
+        say_json({"report": str(page), **comparison_report.document(found)})
+    else:
+        say([str(page)] if quiet else [*comparison_report.lines(found), "", f"page   {page}"])
+    if found.largest > fail_above:
+        worst = max(found.numbers, key=lambda each: each.relative)
+        fail(
+            f"{worst.name} differs by {found.largest:.3g} relatively, more than {fail_above:g}",
+            MISSED,
+        )

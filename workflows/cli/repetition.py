@@ -85,7 +85,7 @@ def keep_run(
     ``text`` returns the text of the command for the path of the folder of the run and the seconds
     that it took.
     """
-    from neusee.workflows.answers.repeated_run import FOLDER, TOOK, RunResults
+    from neusee.workflows.answers.results_folder import FOLDER, TOOK, RunResults
 
     for command in repeated_command.running:
         results = RunResults(done.folder, out, done.document, done.taken, store)

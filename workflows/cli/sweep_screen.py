@@ -12,21 +12,25 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.cli.command_frame import say_line
-from neusee.workflows.cli.command_list import DONE, FAILED, INTERRUPTED
-from neusee.workflows.cli.interruption import say_json
+from neusee.workflows.cli.command_frame import say_json, say_line
+from neusee.workflows.cli.commands_and_exit_codes import DONE, FAILED, INTERRUPTED
 from neusee.workflows.report.console import Mode, ProgressTable, mode_for
-from neusee.workflows.report.text_table import lasts
+from neusee.workflows.report.terminal_text import lasts
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import read_words
-from neusee.workflows.sweeps.sweep_files import require_xarray
 from neusee.workflows.sweeps.sweep_points import OnError, PointOutcome, outcomes
 from neusee.workflows.sweeps.sweep_run import Sweep, Sweeping, SweepState, counted, write_sweep
-from neusee.workflows.sweeps.sweep_table import AxisColumn, cell_text, headline, point_cells
+from neusee.workflows.sweeps.sweep_table import (
+    AxisColumn,
+    cell_text,
+    headline,
+    point_cells,
+    require_xarray,
+)
 
 if TYPE_CHECKING:
-    from neusee.workflows.graph.step_record import Event
+    from neusee.workflows.graph.recipe_graph import Event
     from neusee.workflows.sweeps.axes import Point
 
 _NUMBERS = 4  #: results in the row of a point

@@ -12,8 +12,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, the_store
-from neusee.workflows.cli.command_list import FAILED
+from neusee.workflows.cli.command_frame import (
+    fail,
+    failing,
+    kept_training,
+    load,
+    refusing,
+    resumable,
+    say,
+    say_json,
+    the_store,
+)
 from neusee.workflows.cli.command_options import (
     AsJson,
     Debug,
@@ -24,8 +33,8 @@ from neusee.workflows.cli.command_options import (
     check_device,
     progress_lines,
 )
-from neusee.workflows.cli.interruption import kept_training, resumable, say_json
-from neusee.workflows.keys.regular_file import text_of
+from neusee.workflows.cli.commands_and_exit_codes import FAILED
+from neusee.workflows.keys.sealed_files import text_of
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
@@ -84,12 +93,7 @@ def train(
         return _lift(recipe, command, out, device, quiet, as_json)
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
-    from neusee.workflows.training.parallel.process_mesh import (
-        MeshError,
-        device_here,
-        joined,
-        processes,
-    )
+    from neusee.workflows.training.process_mesh import MeshError, device_here, joined, processes
 
     device, (rank, world) = device_here(device), processes()
     check_device(device)

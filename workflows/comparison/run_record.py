@@ -14,10 +14,9 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.final_values import flow
-from neusee.workflows.keys.regular_file import NotRegular, text_of
+from neusee.workflows.keys.sealed_files import NotRegular, text_of
 from neusee.workflows.recipe.text.yaml_values import read
-from neusee.workflows.report.run_code import CODE
-from neusee.workflows.report.run_folder import find_run
+from neusee.workflows.report.run_folder import CODE, find_run
 
 M = TypeVar("M", bound=BaseModel)
 

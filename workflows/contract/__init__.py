@@ -3,6 +3,6 @@ surroundings?
 
 The nodes of neusee pass the same rules in the tests.
 Nothing here reads a recipe or a cache.
-Offers: `node_contract.check_node`, `whole_contract.check_all`, `elsewhere_client.elsewhere`,
-        `finding.Finding`.
+Offers: `node_contract.check_node`, `node_contract.check_all`, `surroundings.elsewhere`,
+        `node_rules.Finding`.
 """

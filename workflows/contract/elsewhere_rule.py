@@ -1,30 +1,171 @@
-"""Rule on surroundings: the same call in other processes, of which everything around the call is
-changed.
-"""
+"""Rule on surroundings: the same call in processes of which everything else is changed."""
 
 from __future__ import annotations
 
+import decimal
+import faulthandler
+import inspect
+import locale
+import multiprocessing
+import os
 import pickle
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import random
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from neusee.nodes.own_modules import own_files
-from neusee.workflows.contract.elsewhere_client import Elsewhere, NotStartedError
-from neusee.workflows.contract.elsewhere_process import Asked
-from neusee.workflows.contract.finding import Finding
-from neusee.workflows.contract.outcomes import Difference, Outcome, difference, outcome_of
+import numpy as np
+import torch
+from torch import nn
+
+from neusee.nodes.own_modules import Architecture, import_missing, own_files
+from neusee.nodes.restore import own_network
+from neusee.workflows.contract.node_rules import (
+    Call,
+    Difference,
+    Finding,
+    Outcome,
+    difference,
+    failed,
+    outcome_of,
+)
 from neusee.workflows.contract.surroundings import (
     FRESH,
     HASH,
     THREADS,
     VARIABLES,
     WORK,
+    Elsewhere,
+    NotStartedError,
     Others,
+    Settings,
     Surrounding,
 )
+from neusee.workflows.keys.code_digest import Code
+
+# --- elsewhere process ----------------------------------------------------------------------------
+
+# What runs in a process with other surroundings: its forks import the modules of the calls, and
+# send the outcomes.
+
+
+#: s of a call after which its process ends: the one that asked, which waits less, has died
+_LONGEST = 600
+_SIDE = 64  #: of the matrices of unrelated work
+_errors: list[object] = [None]  #: what NumPy does at an error, as this process has set it last
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """The calls that a process makes, each pickled as a function without arguments, with the
+    module of its code.
+    """
+
+    settings: Settings
+    files: tuple[str, ...]  #: files and folders of the user to import
+    calls: tuple[tuple[str, bytes], ...]
+
+
+def serve(pipe: int) -> None:
+    """Answer what is asked through a pipe, given by its number, until its other end is closed.
+
+    Each answer comes from a fork, which has imported no code of the user before, and ends with its
+    exit code.
+    """
+    fork = multiprocessing.get_context("fork")
+    with Connection(pipe) as connection:
+        connection.send_bytes(b"ready")
+        try:
+            while True:
+                asked: Asked = pickle.loads(connection.recv_bytes())
+                process = fork.Process(target=_answer, args=(connection, asked))
+                process.start()
+                process.join()
+                connection.send_bytes(pickle.dumps(process.exitcode))
+        except (EOFError, OSError):
+            return
+
+
+def _answer(connection: Connection, asked: Asked) -> None:
+    """Send the outcome of each call, in the order that was asked for."""
+    _settle(asked.settings)
+    for module, pickled in asked.calls:
+        faulthandler.dump_traceback_later(_LONGEST, exit=True)
+        connection.send_bytes(pickle.dumps(_called(asked, module, pickled)))
+        faulthandler.cancel_dump_traceback_later()
+
+
+def _called(asked: Asked, module: str, pickled: bytes) -> Outcome:
+    _disturb(asked.settings)
+    try:
+        import_missing(asked.files, module)
+        function = pickle.loads(pickled)
+    except (Exception, SystemExit) as error:
+        found = failed(error, module)
+        return Outcome(failure=f"cannot be imported: it {found.failure}", place=found.place)
+    _disturb(asked.settings)  # again, as the import may have changed it back
+    return outcome_of(function, module)
+
+
+def _settle(settings: Settings) -> None:
+    """Change what is set once: the folder, variables, the zone, the locale, the threads of
+    torch.
+    """
+    for name, value in settings.variables.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
+    time.tzset()
+    if settings.folder:
+        os.chdir(settings.folder)
+    if settings.has_locale:
+        locale.setlocale(locale.LC_ALL, "")
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+
+
+def _disturb(settings: Settings) -> None:
+    """Change what other code changes between two calls: other work, states of generators, errors
+    of NumPy.
+    """
+    if settings.has_other_work:
+        _work()
+    if settings.has_other_states:
+        torch.manual_seed(4711)
+        np.random.seed(4711)
+        random.seed(4711)
+    # so that a second time does not change it back
+    if settings.has_other_errors and np.geterr() != _errors[0]:
+        np.seterr(
+            **{name: "ignore" if what == "raise" else "raise" for name, what in np.geterr().items()}
+        )
+        _errors[0] = np.geterr()
+
+
+def _work() -> None:
+    """Do what other steps may have done before: numbers, and settings of libraries that code of
+    others changes.
+    """
+    x = torch.full((_SIDE, _SIDE), 3.0)
+    torch.fft.fft2(x @ x).abs().sort()
+    np.linalg.svd(np.full((_SIDE, _SIDE), 7.0))
+    np.set_printoptions(precision=3, suppress=True)
+    torch.set_printoptions(precision=2)  # type: ignore[no-untyped-call]
+    decimal.getcontext().prec = 9
+
+
+# --- elsewhere rule -------------------------------------------------------------------------------
+
+# Rule on surroundings: the same call in other processes, of which everything around the call is
+# changed.
+
 
 RULE = "elsewhere"
 #: hash seeds that are tried where two gave the same order: a set of two words has only two orders
@@ -284,3 +425,78 @@ def check_elsewhere(
     except NotStartedError as error:
         return {each.name: Finding(RULE, None, f"not tried: {error}") for each in tried}, set()
     return trial.findings, {each.name for each in tried if trial.ends(each.name)}
+
+
+# --- tried calls ----------------------------------------------------------------------------------
+
+# Calls of nodes and networks as another process makes them: pickled, with full paths, and with what
+# keys cover.
+
+
+_TRIED_SIDE = 32  #: pixels of a picture
+_VARIABLE = "env:"  #: begins the declaration of a variable of the environment
+
+
+def node_call(name: str, call: Call) -> Tried:
+    """Return the call of a node's example; files of its parameters are named by their full
+    paths.
+    """
+    full = Call(
+        call.node, call.inputs, {key: _with_full_paths(value) for key, value in call.params.items()}
+    )
+    return _tried(name, call.node.fn, call.node.rtol, full.result, call.node.depends)
+
+
+def network_call(name: str, network: type[nn.Module]) -> Tried:
+    """Return the call of a network, built with its defaults, on a small picture."""
+    rtol = 1e-5  # as a node by default
+    return _tried(name, network, rtol, partial(_on_a_picture, Architecture(name, network)), ())
+
+
+def _tried(
+    name: str, code: Any, rtol: float, function: Callable[[], Any], depends: tuple[str, ...]
+) -> Tried:
+    module = code.__module__
+    variables = [*depends, *_declarations(module)]
+    names = {entry.removeprefix(_VARIABLE) for entry in variables if entry.startswith(_VARIABLE)}
+    declared = {each: os.environ[each] for each in sorted(names) if each in os.environ}
+    return Tried(name, module, _place(code), rtol, function, declared)
+
+
+def _declarations(module: str) -> Iterator[str]:
+    """Yield what a module, and those that it imports, declare that they read."""
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            looks = Code(Path(folder) / "code.json").looks(module)
+        except LookupError:
+            return  # the rule on the key says so
+    for look in looks.values():
+        yield from look.summary.depends if look.summary else ()
+
+
+def _with_full_paths(value: Any) -> Any:
+    if isinstance(value, Path):
+        return value.absolute()
+    return type(value)(map(_with_full_paths, value)) if type(value) in (tuple, list) else value
+
+
+def _on_a_picture(architecture: Architecture) -> torch.Tensor:
+    net = own_network(architecture, None, None).eval()
+    picture = torch.rand(
+        1,
+        3,
+        _TRIED_SIDE + 1,
+        _TRIED_SIDE + 3,
+        generator=torch.Generator().manual_seed(3),
+    )
+    with torch.no_grad(), torch.random.fork_rng(devices=[]):
+        result: torch.Tensor = net(picture)
+    return result
+
+
+def _place(code: Any) -> str:
+    try:
+        lines = inspect.getsourcelines(inspect.unwrap(code))[1]
+        return f"{Path(inspect.getfile(inspect.unwrap(code))).name}:{lines}"
+    except (OSError, TypeError):
+        return str(code.__module__)

@@ -1,29 +1,46 @@
-"""The contract of a node: every rule, and what each found on one example of a call."""
+"""The contract of nodes and networks: every rule, and what each found."""
 
 from __future__ import annotations
 
+import ast
+import inspect
+import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
+import torch
 from pydantic import ValidationError
+from torch import nn
 
-from neusee.nodes import Node
-from neusee.workflows.contract.document_rules import check_docstring, check_hooks, check_signature
-from neusee.workflows.contract.finding import Finding
-from neusee.workflows.contract.value_rules import (
+from neusee.nodes import Node, ParameterError, restore
+from neusee.nodes.own_modules import Architecture, network_classes
+from neusee.nodes.restore import OwnNetwork, own_network, try_network
+from neusee.workflows.contract.elsewhere_rule import check_elsewhere, network_call, node_call
+from neusee.workflows.contract.node_rules import (
     Call,
+    Finding,
     check_bands,
+    check_docstring,
     check_gradient,
+    check_hooks,
     check_reference,
     check_result,
     check_shape,
+    check_signature,
     check_skip_bound,
 )
+from neusee.workflows.contract.surroundings import Elsewhere
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.user_code import own_code_of
-from neusee.workflows.observation.own_call import WORDS, call_observed
+from neusee.workflows.observation.observed_call import WORDS, call_observed
+
+# --- node contract --------------------------------------------------------------------------------
+
+# The contract of a node: every rule, and what each found on one example of a call.
 
 
 def check_reach(call: Call) -> Iterator[Finding]:
@@ -136,3 +153,172 @@ def _guarded(rule: Callable[[Call], Iterator[Finding]], call: Call) -> Iterator[
     except Exception as error:
         name = rule.__name__.removeprefix("check_").replace("_", " ")
         yield Finding(name, False, f"raises {type(error).__name__}: {error}")
+
+
+# --- network contract -----------------------------------------------------------------------------
+
+# The contract of a network class of a user, and what each rule found on small pictures.
+
+
+Make = Callable[[int], OwnNetwork]  #: returns a network with initial weights of a seed
+_SIDE = 32  #: pixels of a picture, at least
+
+
+def whole_networks(module: ModuleType) -> dict[str, type[nn.Module]]:
+    """Return the network classes of a module by name, without those that other definitions of
+    their file use.
+    """
+    classes = network_classes(module)
+    used: set[str] = set()
+    for name in {value.__module__ for value in classes.values()}:
+        for item in ast.parse(inspect.getsource(sys.modules[name])).body:
+            own = getattr(item, "name", "")
+            used |= {
+                part.id for part in ast.walk(item) if isinstance(part, ast.Name) and part.id != own
+            }
+    return {name: value for name, value in classes.items() if name not in used}
+
+
+def check_network(name: str, network: type[nn.Module]) -> list[Finding]:
+    """Return what each rule found on a network class, built with the defaults of its arguments."""
+    found = [*_check_docstring(network), *_check_network_key(network)]
+    make: Make = partial(own_network, Architecture(name, network), None, None)
+    try:
+        make(0)
+    except ParameterError as error:
+        return [
+            *found,
+            Finding("arguments", False, f"{error}: give each argument a default, for this check"),
+        ]
+    found.append(Finding("arguments", True, "the class builds with its defaults"))
+    for rule in (_check_picture, _check_double, _check_weights, _check_gradient):
+        found += _guarded_network(rule, make)
+    return found
+
+
+def _guarded_network(rule: Callable[[Make], Iterator[Finding]], make: Make) -> Iterator[Finding]:
+    try:
+        yield from rule(make)
+    except (ParameterError, RuntimeError, TypeError, ValueError) as error:
+        yield Finding(rule.__name__.removeprefix("_check_"), False, str(error))
+
+
+def _check_docstring(network: type[nn.Module]) -> Iterator[Finding]:
+    """Find whether the class has a docstring of its own that begins with a sentence."""
+    first = (vars(network).get("__doc__") or "").strip().partition("\n")[0]
+    ok = first[:1].isupper() and first.endswith(".")
+    yield Finding(
+        "docstring",
+        ok,
+        "one sentence" if ok else "begin the class with one sentence that ends with a stop",
+    )
+
+
+def _check_network_key(network: type[nn.Module]) -> Iterator[Finding]:
+    """Find whether a cache key can follow the code of the class."""
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            Code(Path(folder) / "code.json").of(
+                restore.network, ((network.__module__, network.__qualname__),)
+            )
+        except LookupError as error:
+            yield Finding("key", False, str(error.args[0]))
+        else:
+            yield Finding("key", True, "follows the code and all that it names")
+
+
+def _check_picture(make: Make) -> Iterator[Finding]:
+    """Find whether a picture gives one of the same sizes, finite, the same twice, and the input
+    is left alone.
+    """
+    net = make(0)
+    trial = try_network(net)
+    cost = f"{trial.operations:.3g} operations and {trial.memory:.3g} bytes a pixel"
+    yield Finding(
+        "picture",
+        True,
+        f"same sizes, finite, same twice, input as before; sides by {net.multiple}; {cost}",
+    )
+
+
+def _check_double(make: Make) -> Iterator[Finding]:
+    """Find whether the network computes in float64."""
+    try_network(make(0), torch.float64)
+    yield Finding("double", True, "float64 in, float64 out")
+
+
+def _check_weights(make: Make) -> Iterator[Finding]:
+    """Find whether the weights of one network make another one, built with other random numbers,
+    equal to it.
+    """
+    one, other = make(1).eval(), make(2).eval()
+    other.inner.load_state_dict(one.inner.state_dict())
+    picture = _picture()
+    with torch.no_grad():
+        same = torch.equal(one(picture), other(picture))
+    text = "a file of weights holds all that the network has drawn"
+    wrong = (
+        "two networks with the same weights differ: register each drawn tensor as a parameter or a"
+        " buffer"
+    )
+    yield Finding("weights", same, text if same else wrong)
+
+
+def _check_gradient(make: Make) -> Iterator[Finding]:
+    """Find whether each trainable parameter receives a finite gradient in training."""
+    net = make(0).train()
+    with torch.random.fork_rng([]):
+        torch.manual_seed(0)
+        (net(_picture()) - _picture().flip(-1)).square().mean().backward()
+    trained = {name: one.grad for name, one in net.inner.named_parameters() if one.requires_grad}
+    if not trained:
+        yield Finding("gradient", False, "the class has no parameters: there is nothing to train")
+        return
+    unused = [name for name, grad in trained.items() if grad is None]
+    wrong = [
+        name for name, grad in trained.items() if grad is not None and not grad.isfinite().all()
+    ]
+    if wrong:
+        yield Finding("gradient", False, f"the gradient of {wrong[0]} is not finite")
+    elif unused:
+        yield Finding(
+            "gradient", False, f"{unused[0]} has no gradient: the result does not depend on it"
+        )
+    else:
+        yield Finding("gradient", True, f"finite for each of {len(trained)} parameters")
+
+
+def _picture() -> torch.Tensor:
+    random = torch.Generator().manual_seed(3)
+    return torch.rand(1, 3, _SIDE + 1, _SIDE + 3, generator=random)
+
+
+# --- whole contract -------------------------------------------------------------------------------
+
+# The contract of all nodes and networks of a place, with the calls in other processes.
+
+
+def check_all(
+    nodes: Mapping[str, Node],
+    networks: Mapping[str, type[nn.Module]],
+    process: Callable[[], Elsewhere],
+) -> dict[str, list[Finding]]:
+    """Return what each rule found on each node and network, by name.
+
+    ``process`` returns a process in which all surroundings are changed. A call that ends this
+    process would end the check, so each is made there first.
+    """
+    found = {name: check_words(node) for name, node in nodes.items()}
+    calls = {name: example_call(node) for name, node in nodes.items()}
+    tried = [node_call(name, call) for name, call in calls.items() if isinstance(call, Call)]
+    tried += [network_call(name, network) for name, network in networks.items()]
+    away, ending = check_elsewhere(tried, process)
+    for name, call in calls.items():
+        found[name] += (
+            [call] if isinstance(call, Finding) else [] if name in ending else check_values(call)
+        )
+    for name, network in networks.items():
+        found[name] = [] if name in ending else check_network(name, network)
+    for name, finding in away.items():
+        found[name].append(finding)
+    return found

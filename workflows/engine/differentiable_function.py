@@ -22,7 +22,7 @@ from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import settle
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
-from neusee.workflows.tolerance.error_budget import ErrorBudget
+from neusee.workflows.tolerance.skip_decision import ErrorBudget
 
 Theta = Mapping[str, Any]
 

@@ -1,23 +1,17 @@
-"""Execution of one run: the keys of the steps, the choice to load or compute each value, and the
-records.
-
-No function is recursive over the graph. Values are kept by key: two steps with one key are computed
-once. A step that is left out has the key of its input.
-"""
+"""Execution of one run: keys of the steps, values in memory, and records."""
 
 from __future__ import annotations
 
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from neusee.nodes import TensorStats
-from neusee.workflows.engine.cost_laws import sizes_of
-from neusee.workflows.engine.cost_model import Costs, Estimate
+from neusee.workflows.engine.cost_model import Costs, Estimate, sizes_of
 from neusee.workflows.engine.dispatch import Loop, chains_of
-from neusee.workflows.engine.finished_step import facts_in, loaded, ran, unneeded
 from neusee.workflows.engine.load_or_recompute import (
     Upstream,
     cheaper_to_recompute,
@@ -33,13 +27,21 @@ from neusee.workflows.engine.placement_inputs import (
     room_for,
     small_result,
 )
-from neusee.workflows.engine.private_steps import refuse_taints
-from neusee.workflows.engine.run_series import RunSeries
-from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Read, Show, StepJob
-from neusee.workflows.engine.values_in_memory import ValuesInMemory
+from neusee.workflows.engine.provenance import facts_in, loaded, ran, unneeded
+from neusee.workflows.engine.step_job import (
+    Executor,
+    InputMissing,
+    Outcome,
+    Read,
+    Show,
+    StepJob,
+    WriteBehind,
+)
 from neusee.workflows.graph.recipe_graph import (
+    Event,
     Recipe,
     Step,
+    StepRecord,
     Wire,
     dependents,
     in_order,
@@ -47,13 +49,141 @@ from neusee.workflows.graph.recipe_graph import (
     nodes_of,
 )
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key, is_private
-from neusee.workflows.keys.user_code import own_code
+from neusee.workflows.keys.code_digest import Code, KnownKeys
+from neusee.workflows.keys.module_digest import say_once
+from neusee.workflows.keys.user_code import own_code, taint_code
+from neusee.workflows.observation.observed_call import WORDS, tainted_modules
 from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.error_budget import ErrorBudget
-from neusee.workflows.tolerance.skip_decision import SkipDecision
+from neusee.workflows.tolerance.skip_decision import ErrorBudget, SkipDecision
+
+# --- run series -----------------------------------------------------------------------------------
+
+# A series of runs, such as those of the points of a sweep: what a run found that holds for the next
+# run as well.
+
+
+@dataclass(eq=False)
+class RunSeries:
+    """What the runs of a series share: the code of nodes, keys of steps, and statistics of results.
+
+    The key of a result decides its statistics, so that they hold whatever has become of the result
+    in the store.
+    """
+
+    known_keys: KnownKeys
+    #: of the results of the newest run alone
+    facts: dict[Key, TensorStats] = field(default_factory=dict)
+
+    @classmethod
+    def begun(cls, store: Store) -> RunSeries:
+        """Return a series without a run, whose code is read now."""
+        return cls(KnownKeys(Code(store.code_memo)))
+
+    def read_code_again(self, store: Store) -> None:
+        """Forget the digests of code and the keys that rest on them."""
+        self.known_keys = KnownKeys(Code(store.code_memo))
+
+    def keep(self, facts: Mapping[Key, TensorStats | None], keys: Iterable[Key]) -> None:
+        """Keep the statistics of the results ``keys`` for the next run, in place of those of
+        earlier runs.
+
+        The next run computes private results again, which may differ then.
+        """
+        public = [key for key in keys if not is_private(key)]
+        self.facts = {key: found for key in public if (found := facts.get(key)) is not None}
+
+
+# --- values in memory -----------------------------------------------------------------------------
+
+# The values of a run that are in memory, each until no later step of the run needs it.
+
+
+class ValuesInMemory(dict[Key, Any]):
+    """Values by cache key, with what this run knows of their copies in the store.
+
+    ``later`` has the values that are being written in the background.
+    """
+
+    def __init__(self, store: Store, later: WriteBehind) -> None:
+        super().__init__()
+        self._store, self._later = store, later
+        # values that the store may lack; True after a write in the background
+        self._unsure = dict[Key, bool]()
+
+    def add(self, outcome: Outcome) -> None:
+        """Add the value of a step that was computed."""
+        key = outcome.work.key
+        self[key] = outcome.value
+        self._unsure.pop(key, None)
+        if outcome.waits or not outcome.kept:
+            self._unsure[key] = outcome.waits
+
+    def free(self, keys: Iterable[Key], uses: Counter[Key], keep: bool) -> None:
+        """Delete the values that no later step needs; with ``keep``, only those of which the
+        store has a copy.
+        """
+        for key in keys:
+            unused = uses[key] <= 0 and key in self and key not in self._later
+            if unused and not (keep and self._is_only_here(key)):
+                del self[key]
+
+    def _is_only_here(self, key: Key) -> bool:
+        """Return True if the store has no copy of a value; a write in the background may have
+        failed.
+        """
+        return key in self._unsure and (not self._unsure[key] or not self._store.has(key))
+
+
+# --- private steps --------------------------------------------------------------------------------
+
+# Steps whose results hold for this process alone, since own code was seen to read what its key does
+# not cover.
+
+
+class TaintedRun(Exception):
+    """Signal of a run whose keys no longer hold: an own step reached what its key does not cover.
+
+    The run begins again with private keys for this code and for all that follows from it.
+    """
+
+    def __init__(self, outcome: Outcome) -> None:
+        super().__init__(outcome.work.step.name)
+        self.outcome = outcome
+
+
+def refuse_taints(outcome: Outcome) -> None:
+    """Taint the code of a step that was seen to reach what its key does not cover; say so, and
+    raise `TaintedRun`.
+
+    A step whose code was tainted before has a private key, and its run goes on.
+    """
+    if not outcome.taints or outcome.work.own is None:
+        return
+    step = outcome.work.step
+    for taint in outcome.taints:
+        text = (
+            f"{step.name} ({step.node.path}): {WORDS[taint.kind]} {taint.what}, which its cache key"
+            " does not cover"
+        )
+        say_once(
+            step.node.fn.__module__,
+            f"{text}: its result, and all that follow, are not stored."
+            f" {taint.fix[0].upper()}{taint.fix[1:]}",
+        )
+    if taint_code(tainted_modules(outcome.work.own, outcome.taints), outcome.taints):
+        raise TaintedRun(outcome)
+
+
+# --- execution ------------------------------------------------------------------------------------
+
+# Execution of one run: the keys of the steps, the choice to load or compute each value, and the
+# records.
+#
+# No function is recursive over the graph. Values are kept by key: two steps with one key are
+# computed once. A step that is left out has the key of its input.
+
 
 _QUICK = 1e-3  #: s below which two processes may both compute a step without a lease
 _UNKNOWN = 100.0  #: s of a step without measurement, when loading is compared with computing
@@ -164,9 +294,7 @@ class Execution:
             below = Upstream(self.known, self.sources)
             order = in_order(below, targets)
             if again := self._dear(below, targets):
-                below = Upstream(
-                    lambda key, again=again: key not in again and self.known(key), self.sources
-                )  # type: ignore[misc]
+                below = Upstream(partial(self._known_but, again), self.sources)
                 order = in_order(below, targets)
             try:
                 plan = [key for key in order if key in below.missing]
@@ -242,6 +370,10 @@ class Execution:
             return about is not None
         self.receipts[key] = about
         return False
+
+    def _known_but(self, again: Collection[Key], key: Key) -> bool:
+        """Return True for a stored value that is not to be computed again."""
+        return key not in again and self.known(key)
 
     def _dear(self, below: Upstream, targets: list[Key]) -> frozenset[Key]:
         """Return the keys of the stored values that are cheaper to compute than to read."""

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from neusee.workflows.engine.cost_laws import Size
-from neusee.workflows.engine.cost_model import Costs, Estimate
+from neusee.workflows.engine.cost_model import Costs, Estimate, Size
 from neusee.workflows.engine.dispatch import MemoryProfile
-from neusee.workflows.engine.memory_use import pool_of
+from neusee.workflows.engine.machine_resources import pool_of
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.step_job import Executor, Lane, StepJob
 from neusee.workflows.graph.recipe_graph import Step

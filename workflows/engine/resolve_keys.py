@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from neusee.nodes import TensorStats
-from neusee.workflows.engine.finished_step import facts_in
 from neusee.workflows.engine.node_call import place
+from neusee.workflows.engine.provenance import facts_in
 from neusee.workflows.engine.resolved_keys import Resolved
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.error_budget import ErrorBudget
+from neusee.workflows.tolerance.skip_decision import ErrorBudget
 
 
 def resolve(

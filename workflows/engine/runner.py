@@ -1,6 +1,4 @@
-"""Run of a recipe: stored results are reused, and missing results that the outputs depend on are
-computed.
-"""
+"""Run of a recipe: stored results are reused, and missing ones are computed."""
 
 from __future__ import annotations
 
@@ -11,33 +9,74 @@ from typing import Any
 
 import torch
 
-from neusee.workflows.engine.cost_laws import sizes_of
-from neusee.workflows.engine.device_names import check_devices
-from neusee.workflows.engine.execution import Execution
-from neusee.workflows.engine.local_executor import memory_limit
-from neusee.workflows.engine.memory_use import give_back, process_peak
-from neusee.workflows.engine.memory_watch import limited
+from neusee.workflows.engine.cost_model import sizes_of
+from neusee.workflows.engine.execution import Execution, RunSeries, TaintedRun
+from neusee.workflows.engine.local_executor import check_devices, memory_limit
+from neusee.workflows.engine.machine_resources import give_back, process_peak
+from neusee.workflows.engine.memory_limits import limited
 from neusee.workflows.engine.node_call import to_device
 from neusee.workflows.engine.placement_inputs import past_costs, running_peak
-from neusee.workflows.engine.private_steps import TaintedRun
-from neusee.workflows.engine.run_series import RunSeries
 from neusee.workflows.engine.step_job import Executor, Outcome, Show
-from neusee.workflows.engine.step_order import shortest_first
-from neusee.workflows.graph.recipe_graph import Recipe, copies_of, needed, unknown_step
-from neusee.workflows.graph.step_record import Event, StepRecord
+from neusee.workflows.graph.recipe_graph import (
+    Event,
+    Recipe,
+    StepRecord,
+    copies_of,
+    needed,
+    unknown_step,
+)
 from neusee.workflows.keys.cache_key import Key
-from neusee.workflows.keys.code_memo import Parts
+from neusee.workflows.keys.module_digest import Parts
 from neusee.workflows.placement.heft_schedule import Schedule
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import stricter_scale, with_substitutions
-from neusee.workflows.tolerance.error_budget import skip_share
 from neusee.workflows.tolerance.error_propagation import (
     ErrorBounds,
     ToleranceNotProven,
     proof,
     tolerance_frontier,
 )
+from neusee.workflows.tolerance.skip_decision import skip_share
+
+# --- step order -----------------------------------------------------------------------------------
+
+# Order in which the results of a run are made: those that need only short steps before those that
+# need a long one.
+#
+# Pictures and files of the short steps are then made beside the long ones, and values that only
+# short steps read are no longer in memory.
+
+
+def shortest_first(
+    recipe: Recipe,
+    order: Iterable[str],
+    first: Collection[str],
+    others: Iterable[str],
+    seconds: Mapping[str, float],
+) -> list[str]:
+    """Return the steps ``first``, and ``others`` that need only shorter steps, by the longest step
+    that each needs.
+
+    Args: order: all steps, each after its inputs. first: steps whose results are needed before all
+            others are made.
+    seconds: of each step that must run, as predicted. A step of ``others`` that needs a step as
+    long as the longest that ``first`` need is left out.
+    """
+    longest: dict[str, float] = {}
+    for name in order:
+        below = (longest[source] for source in recipe.steps[name].sources)
+        longest[name] = max(seconds.get(name, 0.0), max(below, default=0.0))
+    most = max((longest[name] for name in first), default=0.0)
+    found = dict.fromkeys([*first, *(name for name in others if longest[name] < most)])
+    return sorted(found, key=longest.__getitem__)
+
+
+# --- runner ---------------------------------------------------------------------------------------
+
+# Run of a recipe: stored results are reused, and missing results that the outputs depend on are
+# computed.
+
 
 _ROUNDING = 1.4e-6  #: error that rounding leaves in sums over bands, whatever their limit
 

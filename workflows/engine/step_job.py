@@ -1,13 +1,14 @@
-"""Job of one step: the step with the keys of its inputs, and the outcome of the job.
-
-A job contains keys and parameters but no tensor, so that any process can compute the step. The cost
-of a value decides whether the store keeps the value.
-"""
+"""Job of one step: the step with the keys of its inputs, its outcome, and its late writes."""
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any, Protocol, TypeVar
@@ -15,22 +16,17 @@ from typing import Any, Protocol, TypeVar
 import torch
 
 from neusee.nodes import Check, TensorStats
-from neusee.workflows.engine.allocation_limit import refusing_allocations
-from neusee.workflows.engine.band_results import call_by_band, plain_of
-from neusee.workflows.engine.cost_laws import measured_size
-from neusee.workflows.engine.memory_use import PeakMemory
-from neusee.workflows.engine.memory_watch import guarded
-from neusee.workflows.engine.node_call import call, examine
+from neusee.workflows.engine.cost_model import measured_size
+from neusee.workflows.engine.machine_resources import PeakMemory
+from neusee.workflows.engine.memory_limits import guarded, refusing_allocations
+from neusee.workflows.engine.node_call import call, call_by_band, examine, plain_of
 from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.engine.step_process import ProcessEnded, call_in_fork, may_fork
-from neusee.workflows.engine.write_behind import LARGE, WriteBehind
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.keys.cache_key import Key, device_kind, is_private, plain
-from neusee.workflows.keys.input_file_digest import file_stamps
-from neusee.workflows.keys.tainted_code import hold_back, may_be_stored
-from neusee.workflows.keys.user_code import OwnCode
-from neusee.workflows.observation.own_call import (
+from neusee.workflows.keys.cache_key import Key, device_kind, file_stamps, is_private, plain
+from neusee.workflows.keys.user_code import OwnCode, hold_back, may_be_stored
+from neusee.workflows.observation.observed_call import (
     call_observed,
     say_hidden,
     say_lost,
@@ -42,6 +38,80 @@ from neusee.workflows.store.lease import Lease
 from neusee.workflows.store.metadata import INLINE
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import pack, tensors_in
+
+# --- write behind ---------------------------------------------------------------------------------
+
+# Writes of large results in the background, while the next steps compute.
+#
+# A run ends after all writes. A result that waits stays in memory and keeps its lease, so that
+# another process that needs the same result finds either the lease or the result.
+
+
+LARGE = 1 << 20  #: bytes; a larger result is written during the next step
+_ROOM = 1 << 29  #: bytes that may wait; a larger result waits alone
+_NICE = 10  #: how much nicer the writing thread is; 19 is the nicest
+
+
+class WriteBehind:
+    """Pending writes of results, one at a time in the background."""
+
+    def __init__(self) -> None:
+        self._pool: ThreadPoolExecutor | None = None
+        self._sizes: dict[Key, int] = {}
+        self._writes: dict[Key, Future[Any]] = {}
+        self._guard = threading.Lock()
+
+    def __contains__(self, key: Key) -> bool:
+        return key in self._sizes
+
+    def add(self, key: Key, size: int, write: Callable[[], Any]) -> None:
+        """Start a write in the background; wait for earlier writes if too many bytes would be
+        pending.
+        """
+        while self._sizes and sum(list(self._sizes.values())) + size > _ROOM:
+            wait(
+                [self._writes[key] for key in list(self._sizes) if key in self._writes],
+                return_when=FIRST_COMPLETED,
+            )
+        with self._guard:
+            self._pool = self._pool or ThreadPoolExecutor(1, "neusee store", _lower_priority)
+            self._sizes[key] = size
+            self._writes[key] = self._pool.submit(self._write, key, write)
+
+    def finish(self) -> None:
+        """Wait for all writes; raise the error of a failed write."""
+        with self._guard:
+            pool, self._pool = self._pool, None
+            writes, self._writes = self._writes, {}
+        if pool is not None:
+            pool.shutdown(wait=True)
+        for future in writes.values():
+            future.result()
+
+    def _write(self, key: Key, write: Callable[[], Any]) -> None:
+        try:
+            write()
+        finally:
+            del self._sizes[key]
+
+
+def _lower_priority() -> None:
+    """Lower the priority of the writing thread, so that the computing threads run first."""
+    if sys.platform == "linux":  # on other systems the call would affect the whole process
+        with suppress(OSError):
+            thread = threading.get_native_id()
+            os.setpriority(
+                os.PRIO_PROCESS, thread, min(os.getpriority(os.PRIO_PROCESS, thread) + _NICE, 19)
+            )
+
+
+# --- step job -------------------------------------------------------------------------------------
+
+# Job of one step: the step with the keys of its inputs, and the outcome of the job.
+#
+# A job contains keys and parameters but no tensor, so that any process can compute the step. The
+# cost of a value decides whether the store keeps the value.
+
 
 #: content of one input: one value, a list of values, or nothing
 Read = Key | tuple[Key, ...] | None
@@ -103,7 +173,7 @@ class Outcome:
     #: error of a cheaper form: `Node.approximation_error`
     deviation: tuple[float, float] | None = None
     peak: int | None = None  #: peak bytes beside the memory in use before
-    size: list[float] | None = None  #: the size of the step: `cost_laws.Size`
+    size: list[float] | None = None  #: the size of the step: `cost_model.Size`
     kept: bool = False  #: True if the store has the value
     #: True if the value is written during the next steps; its lease is released afterwards
     waits: bool = False

@@ -26,7 +26,7 @@ from typing import Generic, TypeVar
 
 import torch
 
-from neusee.workflows.engine.processors import free_processors
+from neusee.workflows.engine.machine_resources import free_processors
 from neusee.workflows.observation.step_thread import is_alone
 from neusee.workflows.store.lease import retire
 

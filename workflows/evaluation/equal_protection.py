@@ -19,8 +19,13 @@ from neusee.workflows.evaluation.pipelines import (
     compose_pipelines,
 )
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.protection.camera_parts import ProtectionCamera
-from neusee.workflows.protection.equal_shade import WAYS, EqualProtection, EqualShade, shade_equally
+from neusee.workflows.protection.equal_rivals import (
+    WAYS,
+    EqualProtection,
+    EqualShade,
+    shade_equally,
+)
+from neusee.workflows.protection.protection_camera import ProtectionCamera
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.study_folder import Progress
 from neusee.workflows.report.study_page import Section

@@ -1,35 +1,144 @@
-"""The evaluation points: the metrics of one scene at one laser strength with one pipeline (mask
-and restorer).
-"""
+"""The metrics of one scene, laser and pipeline, and the command that repeats them."""
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.metrics import quality
+from neusee.nodes.resampling import resize
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.node_call import call, place
-from neusee.workflows.evaluation.evaluation_scenes import Scene
-from neusee.workflows.evaluation.mistold_filter import shifted
-from neusee.workflows.evaluation.pipelines import BEAM, NONE, PipelineRecipes
-from neusee.workflows.graph.recipe_graph import Recipe, Step, dependents, needed
-from neusee.workflows.graph.told_copies import TOLD
+from neusee.workflows.evaluation.evaluation_scenes import PHOTOGRAPH, Scene
+from neusee.workflows.evaluation.pipelines import (
+    BEAM,
+    NONE,
+    WAVELENGTHS,
+    PipelineRecipes,
+    laser_line,
+)
+from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.recipe_graph import (
+    FRAME,
+    TOLD,
+    Recipe,
+    Step,
+    dependents,
+    knowers,
+    known,
+    needed,
+    with_copies,
+)
 from neusee.workflows.keys.cache_key import device_kind, digest, key_of
-from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.keys.code_digest import Code, engine
+from neusee.workflows.recipe.blocks.evaluate_block import Mismatch
+from neusee.workflows.recipe.distributions.shapes import written
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs, NothingDrawn
-from neusee.workflows.store.memo import compute_once
-from neusee.workflows.store.result_store import Store
+from neusee.workflows.recipe.loading import load
+from neusee.workflows.recipe.text.overrides import Override
+from neusee.workflows.store.result_store import Store, compute_once
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+
+# --- mistold filter -------------------------------------------------------------------------------
+
+# Recipes whose restorer is told optics and laser with one error, while the camera stays as it is.
+#
+# The steps that compute what the restorer knows are copied with another parameter; the copies have
+# the prefix ``told_``.
+
+
+def errors_of(recipe: Recipe, mismatch: Mismatch) -> dict[str, Mapping[str, Any]]:
+    """Return the errors in what the restorer of a recipe is told: by text, what is added to which
+    parameters.
+
+    A parameter with None is removed: the input ``dirt`` of a pupil. The result is empty if the
+    restorer knows nothing.
+    """
+    told = known(recipe, _readers(recipe))
+    if not told:
+        return {}
+    pupils = [
+        name for name in needed(recipe, told) if recipe.steps[name].node.path == "optics.pupil"
+    ]
+    found: dict[str, Mapping[str, Any]] = {}
+    direction, line = f"direction[{BEAM}]", f"line[{BEAM}]"
+    glare = [name for name in needed(recipe, told) if direction in recipe.steps[name].sources]
+    if mismatch.pixels and glare:
+        lens = recipe.steps[glare[0]].params
+        angle = mismatch.pixels * lens["pixel_pitch"] / lens["focal_length"]
+        found[f"direction {mismatch.pixels:g} px off"] = {f"{direction}.angle": (angle, angle)}
+    if mismatch.wavelength and glare and "wavelength" in recipe.steps[line].params:
+        found[f"wavelength {mismatch.wavelength * 1e9:g} nm off"] = {
+            f"{line}.wavelength": mismatch.wavelength
+        }
+    if mismatch.defocus and pupils:
+        found[f"defocus {mismatch.defocus:g} waves off"] = dict.fromkeys(
+            (f"{name}.defocus" for name in pupils), mismatch.defocus
+        )
+    dirty = [name for name in pupils if recipe.steps[name].wires.get("dirt") is not None]
+    if mismatch.dirt and dirty:
+        found["dirt not told"] = dict.fromkeys(f"{name}.dirt" for name in dirty)
+    return found
+
+
+def mistold(recipe: Recipe, error: Mapping[str, Any]) -> Recipe:
+    """Return the recipe with a copy of each step that the error changes, from which alone the
+    restorer knows.
+    """
+    added = {
+        name: value for name, value in error.items() if name.rpartition(".")[0] in recipe.steps
+    }
+    changed = {name.rpartition(".")[0] for name in added}
+    readers = _readers(recipe)
+    copied = {
+        name
+        for name in dependents(recipe, changed) & set(needed(recipe, known(recipe, readers)))
+        if not recipe.steps[name].node.random or name in changed  # another name would draw anew
+    }
+    return with_copies(recipe, readers, copied, lambda step: _changed(step, added))
+
+
+def shifted(value: Any, by: Any) -> Any:
+    """Return a parameter to which an error is added: a number, or the two angles of a direction."""
+    return (
+        tuple(a + b for a, b in zip(value, by, strict=True))
+        if isinstance(by, tuple)
+        else value + by
+    )
+
+
+def _readers(recipe: Recipe) -> list[str]:
+    """Return the steps that restore the picture of the mask and know optics or lasers."""
+    return knowers(recipe, dependents(recipe, [FRAME])) if FRAME in recipe.steps else []
+
+
+def _changed(step: Step, error: Mapping[str, Any]) -> Step:
+    params, wires = dict(step.params), dict(step.wires)
+    for full, by in error.items():
+        name, _, param = full.rpartition(".")
+        if name != step.name:
+            continue
+        if by is None:
+            wires[param] = None
+        elif params[param] is not None:  # a direction is drawn for each scene
+            params[param] = shifted(params[param], by)
+    return replace(step, params=params, wires=wires)
+
+
+# --- evaluation points ----------------------------------------------------------------------------
+
+# The evaluation points: the metrics of one scene at one laser strength with one pipeline (mask and
+# restorer).
+
 
 _MOVED = ("spot", "photons")  #: names of the first steps that depend on the laser strength
 
@@ -325,3 +434,185 @@ def reduced(picture: Tensor, side: int) -> Tensor:
     y, x = picture.shape[-2:]
     scale = side / min(y, x)
     return resize(picture.clamp(0, 1), round(y * scale), round(x * scale))
+
+
+# --- point commands -------------------------------------------------------------------------------
+
+# The command of `neusee run` that gives the numbers of an evaluation point, to the last bit.
+#
+# The command has the camera of the evaluation, the mask and the restorer, the part of the
+# photograph, the laser with its direction, the seed of the scene, and the values that were drawn
+# for the scene.
+
+
+_WAVELENGTH, _DIRECTION = f"lasers.{BEAM}.wavelength", f"direction[{BEAM}]"
+
+
+@dataclass(frozen=True)
+class PointCommands:
+    """What the commands of all points of an evaluation have in common."""
+
+    recipe: str
+    changes: Sequence[str | Override]
+    folder: Path  #: in which the commands are run
+    bench: EvaluationPoints
+
+    def commands(
+        self, each: Sequence[PipelineRecipes], scenes: Sequence[Scene], strengths: Sequence[float]
+    ) -> dict[str, list[dict[float, str]]]:
+        """Return the command of each point by pipeline, scene and strength; empty where no command
+        gives the point.
+
+        One point of each pipeline is proved, and one beyond the scene 0, which has the seed of the
+        evaluation: the command loads a recipe whose steps have the same keys.
+        """
+        proved: dict[tuple[str, bool], bool] = {}
+        listed: dict[str, list[dict[float, str]]] = {}
+        for pipeline in each:
+            listed[pipeline.name] = []
+            for scene in scenes:
+                points = [
+                    PointRequest(scene, k) for k in (strengths if scene.case != NONE else (0.0,))
+                ]
+                kind = (pipeline.name, scene.number == 0)
+                if kind not in proved:
+                    proved[kind] = self.is_same(pipeline, points[-1])
+                own = {
+                    point.strength: self._command(pipeline, point) if proved[kind] else ""
+                    for point in points
+                }
+                listed[pipeline.name].append(own)
+        return listed
+
+    def _command(self, pipeline: PipelineRecipes, point: PointRequest) -> str:
+        return shlex.join(["neusee", "run", self.recipe, *self.words(pipeline, point)])
+
+    def words(
+        self, pipeline: PipelineRecipes, point: PointRequest, strength: float | None = None
+    ) -> list[str]:
+        """Return the arguments of `neusee run` after the recipe; ``strength`` replaces that of
+        the laser.
+        """
+        scene, line = point.scene, pipeline.pipeline
+        recipe = pipeline.recipe(point.lit)
+        drawn = self._drawn(pipeline, point)
+        wavelength = drawn.pop(_WAVELENGTH, None)
+        words = [change if isinstance(change, str) else change.text for change in self.changes]
+        words += [
+            *pipeline.words,
+            *_scene_words(recipe, scene),
+            _laser_word(pipeline, point, wavelength, strength),
+        ]
+        words += [f"{path}={value}" for path, value in drawn.items()]
+        outputs = ", ".join(f'"{name}"' for name in (line.quality, "saturated[mask]", "peak[mask]"))
+        return [*words, f"seed={scene.seed}", "estimates=false", f"outputs=[{outputs}]"]
+
+    def _drawn(self, pipeline: PipelineRecipes, point: PointRequest) -> dict[str, str]:
+        """Return the values that were drawn for a scene, as they are written in a recipe."""
+        inputs = self.bench.inputs(pipeline, point.lit, pipeline.pipeline.outputs)
+        if inputs is None:
+            return {}
+        laws, units = inputs.uncertain.laws, inputs.uncertain.units
+        drawn = point.scene.draw(inputs)
+        return {
+            path: str(written(value, laws[path].unit if path in laws else units[path]))
+            for path, value in drawn.items()
+        }
+
+    def is_same(self, pipeline: PipelineRecipes, point: PointRequest) -> bool:
+        """Return True if the recipe of a command has the steps of an evaluation point, with equal
+        keys.
+
+        An evaluation computes a laser of strength 1 and gives each spot its strength, and so does
+        this comparison. A random step that no scene reaches, such as dirt on the lens, has the seed
+        of the evaluation, which the command gives only for the scene 0.
+        """
+        outputs = [name for name in pipeline.pipeline.outputs if name != "bsr[mask]"]
+        try:
+            recipe = load(self.recipe, self.words(pipeline, point, 1.0), self.folder)
+        except RecipeError:
+            return False
+        scene = point.scene
+        if scene.seed != scene.recipe.seed and _has_fixed_noise(recipe, outputs):
+            return False
+        if scene.path is not None and not _shows(recipe, scene):
+            return False
+        steps = dict(recipe.steps)
+        for name in spots(recipe, outputs):
+            steps[name] = replace(
+                steps[name], params={**steps[name].params, "strength": point.strength}
+            )
+        same_seed = replace(recipe, seed=scene.recipe.seed, steps=steps)
+        return self.bench.keys(same_seed, outputs, scene) == self.bench.point_keys(
+            pipeline, point, outputs
+        )
+
+
+def _has_fixed_noise(recipe: Recipe, outputs: Sequence[str]) -> bool:
+    order = needed(recipe, outputs)
+    moved = dependents(recipe, ["scene"], order) | {_DIRECTION}
+    return any(recipe.steps[name].node.random for name in order if name not in moved)
+
+
+def _shows(recipe: Recipe, scene: Scene) -> bool:
+    """Return True if the scene of a recipe is the part of the photograph that an evaluation
+    shows.
+    """
+    step = recipe.steps["scene"]
+    if step.node.path != PHOTOGRAPH or scene.path is None:
+        return False
+    file, shape, crop = (step.params.get(name) for name in ("file", "shape", "crop"))
+    same_file = Path(str(file)).absolute() == scene.path.absolute()
+    return (
+        same_file
+        and tuple(shape or ()) == scene.shape
+        and tuple(crop or ()) == (scene.recipe.seed, scene.number)
+    )
+
+
+def _scene_words(recipe: Recipe, scene: Scene) -> list[str]:
+    """Return the words that show a part of a photograph, or nothing for the recipe's own scene."""
+    if scene.path is None:
+        return []
+    file, crop = _quoted(scene.path), f"[{scene.recipe.seed}, {scene.number}]"
+    step = recipe.steps["scene"]
+    if step.node.path == PHOTOGRAPH and "scene.file" in recipe.config.settings:
+        return [f"scene.file={file}", f"+steps.scene.with.crop={crop}"]
+    shape = list(scene.shape)
+    return [
+        f"steps.scene={{node: {PHOTOGRAPH}, with: {{file: {file}, shape: {shape}, crop: {crop}}}}}"
+    ]
+
+
+def _laser_word(
+    pipeline: PipelineRecipes, point: PointRequest, wavelength: str | None, strength: float | None
+) -> str:
+    """Return the word that sets the laser of a scene, with its direction and strength."""
+    if point.lit == NONE:
+        return "lasers={}"
+    y, x = point.scene.angle(pipeline.recipe(point.lit))
+    if wavelength is None:
+        line = laser_line(WAVELENGTHS[point.lit], pipeline.fwhm)
+    else:
+        line = f"wavelength: '{wavelength}', fwhm: {pipeline.fwhm * 1e9:g} nm"
+    shown = point.strength if strength is None else strength
+    return f"lasers={{{BEAM}: {{{line}, strength: {shown!r}, angle: [{y!r} rad, {x!r} rad]}}}}"
+
+
+def _quoted(path: Path) -> str:
+    return "'" + str(path.absolute()).replace("'", "''") + "'"
+
+
+def shown_commands(
+    commands: Mapping[str, Sequence[Mapping[float, str]]],
+) -> list[tuple[str, int, float, str]]:
+    """Return pipeline, place of the scene, strength and command of one point of each pipeline:
+    the strongest laser.
+    """
+    rows: list[tuple[str, int, float, str]] = []
+    for pipeline, scenes in commands.items():
+        lit = [(place, max(own)) for place, own in enumerate(scenes) if own]
+        if lit:
+            place, strength = max(lit, key=lambda point: (point[1], -point[0]))
+            rows.append((pipeline, place, strength, scenes[place][strength]))
+    return rows

@@ -25,9 +25,8 @@ from neusee.workflows.evaluation.pipelines import (
 )
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.cache_key import digest, key_of, stream_seed
+from neusee.workflows.keys.cache_key import digest, file_digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.input_file_digest import file_digest
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs, NothingDrawn
 from neusee.workflows.store.result_store import Store
 

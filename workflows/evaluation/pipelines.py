@@ -14,10 +14,9 @@ from typing import Any, NamedTuple
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.protection.equal_shade import EqualShade
+from neusee.workflows.protection.equal_rivals import EqualShade
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.recipe.text.composition import compose
-from neusee.workflows.recipe.text.named_files import refuse_outside
+from neusee.workflows.recipe.text.composition import compose, refuse_outside
 from neusee.workflows.recipe.text.overrides import Override
 
 NONE = "none"  #: name of the restorer that restores nothing, and of the case without a laser

@@ -19,10 +19,16 @@ from typing import Any
 import numpy as np
 
 from neusee.workflows.evaluation import equal_protection
-from neusee.workflows.evaluation.confidence_intervals import METRICS, metric_table
+from neusee.workflows.evaluation.confidence_intervals import METRICS, compare_with, metric_table
 from neusee.workflows.evaluation.equal_protection import protect, read_protection
-from neusee.workflows.evaluation.evaluation_points import EvaluationPoints
-from neusee.workflows.evaluation.evaluation_result import EvaluationResult
+from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointCommands
+from neusee.workflows.evaluation.evaluation_result import (
+    AskedCamera,
+    EvaluationResult,
+    Measured,
+    measure,
+    mistold_rows,
+)
 from neusee.workflows.evaluation.evaluation_scenes import (
     Scene,
     photographs,
@@ -30,9 +36,6 @@ from neusee.workflows.evaluation.evaluation_scenes import (
     scenes,
     wavelengths,
 )
-from neusee.workflows.evaluation.measured_points import AskedCamera, Measured, measure
-from neusee.workflows.evaluation.mistold_points import mistold_rows
-from neusee.workflows.evaluation.paired_intervals import compare_with
 from neusee.workflows.evaluation.pipelines import (
     CASES,
     DRAWN,
@@ -45,11 +48,10 @@ from neusee.workflows.evaluation.pipelines import (
     read_pipelines,
     refuse_fixed_laser,
 )
-from neusee.workflows.evaluation.point_commands import PointCommands
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.protection.equal_shade import EqualProtection
+from neusee.workflows.protection.equal_rivals import EqualProtection
 from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport, StudyRun, silent

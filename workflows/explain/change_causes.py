@@ -1,23 +1,344 @@
-"""Causes of a changed result: differences between a new and an earlier result, in the step or
-upstream of it.
-
-A pair is a new and an earlier result. The two results are compared by the parts of their keys, so
-that no tensor is read. The search goes from a pair to the pairs of its inputs whose keys differ.
-"""
+"""Causes of a changed result: parameters, files and code that differ, in words."""
 
 from __future__ import annotations
 
+import ast
 import functools
-from collections.abc import Mapping
+import math
+import re
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from neusee.nodes.units import read_quantity
 from neusee.workflows.engine.resolved_keys import Resolved
-from neusee.workflows.explain.change_wording import Wording
-from neusee.workflows.explain.code_changes import edits
-from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.cache_key import Key, is_private
+from neusee.workflows.graph.final_values import Setting, flow
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.keys.cache_key import USUAL, Key, is_private
+from neusee.workflows.keys.module_digest import read_parts
+from neusee.workflows.keys.module_origin import source_file
 from neusee.workflows.store.result_store import Store
+
+# --- code changes ---------------------------------------------------------------------------------
+
+# Changes of code: the functions, classes and constants that differ between two digests of code.
+
+
+_STATE, _SETTINGS = "state of ", "settings"
+_PROGRAM = "neusee.workflows"
+_OTHER = frozenset({"Python", _SETTINGS, "closure", _PROGRAM})
+
+
+def edits(root: Path, old: str, new: str) -> list[str]:
+    """Return one text clause for each definition that differs between two versions of code; []
+    if no record exists.
+    """
+    before, after = read_parts(root, old), read_parts(root, new)
+    if not before or not after:
+        return []
+    names = [name for name in after if name in before and _is_module(name)]
+    inside = [text for name in names for text in _inside(name, before[name], after[name])]
+    came = [
+        f"{_file(name)} is imported now"
+        for name in after
+        if name not in before and _is_module(name)
+    ]
+    gone = [
+        f"{_file(name)} is no longer imported"
+        for name in before
+        if name not in after and _is_module(name)
+    ]
+    source = sorted(inside, key=lambda text: text.startswith("the ")) + came + gone
+    beside = [
+        text
+        for name in dict.fromkeys([*after, *before])
+        if not _is_module(name) and not name.startswith(_STATE)
+        for text in _beside(name, before.get(name, {}), after.get(name, {}))
+    ]
+    return source + beside or [
+        f"a value that {_file(name.removeprefix(_STATE))} holds was changed while the program ran:"
+        " a constant, a table, a default or a function"
+        for name in after
+        if name.startswith(_STATE) and before.get(name, after[name]) != after[name]
+    ]
+
+
+def _is_module(name: str) -> bool:
+    return all(part.isidentifier() for part in name.split(".")) and name not in _OTHER
+
+
+def _beside(name: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
+    """Return one text clause for each difference in versions, settings and declared
+    dependencies.
+    """
+    labels = [label for label in dict.fromkeys([*new, *old]) if old.get(label) != new.get(label)]
+    if not labels:
+        return []
+    if name == _SETTINGS:
+        values = [
+            (label, old.get(label, USUAL.get(label)), new.get(label, USUAL.get(label)))
+            for label in labels
+        ]
+        return [
+            f"{label} {before} -> {after}, a setting of this process"
+            for label, before, after in values
+        ]
+    if name == "Python" or name.startswith("package "):
+        before, after = old.get("version"), new.get("version")
+        if not before or not after:
+            return [f"{name} is {'used now' if after else 'no longer used'}"]
+        if before == after:
+            return [f"{name} has other files, under the same version: {after}"]
+        return [f"{before} -> {after}{', an installed package' if name != 'Python' else ''}"]
+    if name == "closure":
+        return ["a value that the function of the node holds from the function around it changed"]
+    if name == _PROGRAM:
+        return ["the program itself changed, which the node imports (neusee/workflows)"]
+    what = f"declared {name}" if name.startswith("file ") else name
+    return [
+        f"{what} changed" if old and new else f"{name} is declared {'now' if new else 'no more'}"
+    ]
+
+
+def _inside(module: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
+    """Return one text clause for each changed, added or removed definition of a module."""
+    file = _file(module)
+    differ = [label for label in new if label in old and old[label] != new[label]]
+    lines = _lines(module) if differ else {}
+    at = {label: f" (line {lines[label]})" if label in lines else "" for label in differ}
+    changed = [
+        f"{'code of ' + label if label.endswith('()') else _named(label)} in {file}"
+        f" changed{at[label]}"
+        for label in differ
+    ]
+    added = [f"{_named(label)} was added to {file}" for label in new if label not in old]
+    removed = [f"{_named(label)} was removed from {file}" for label in old if label not in new]
+    return changed + added + removed
+
+
+def _lines(module: str) -> dict[str, int]:
+    """Return the line of each function, hook, class and constant at the top of a module, as its
+    file is now.
+    """
+    path = source_file(module)
+    try:
+        body = ast.parse(path.read_bytes()).body if path else []
+    except (OSError, SyntaxError):
+        return {}
+    found = dict[str, int]()
+    for item in body:
+        if isinstance(item, ast.ClassDef):
+            found[f"class {item.name}"] = item.lineno
+        elif isinstance(item, ast.FunctionDef):
+            hooks = [ast.unparse(each) for each in item.decorator_list] if item.name == "_" else []
+            found |= {f"{name}()": item.lineno for name in hooks or [item.name]}
+        elif isinstance(item, ast.Assign):
+            found |= {
+                f"constant {each.id}": item.lineno
+                for each in item.targets
+                if isinstance(each, ast.Name)
+            }
+    return found
+
+
+def _named(label: str) -> str:
+    """Return the name of a definition with its kind, such as ``function psf()`` or ``the
+    imports``.
+    """
+    if label.endswith("()"):
+        return f"function {label}"
+    return label if label.startswith(("class ", "constant ")) else f"the {label}"
+
+
+def _file(module: str) -> str:
+    path = source_file(module)
+    package = path is not None and path.name == "__init__.py"
+    return module.replace(".", "/") + ("/__init__.py" if package else ".py")
+
+
+# --- change wording -------------------------------------------------------------------------------
+
+# Texts that describe changed parameters, with path, unit and location in the recipe.
+
+
+_QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\D.*)")
+_ABSENT = object()
+
+
+class Wording:
+    """Texts that describe changed parameters in the units of a recipe, or without a recipe in SI
+    units.
+    """
+
+    def __init__(self, recipe: Recipe | None = None) -> None:
+        self._recipe = recipe
+
+    def params(self, label: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+        """Return one text clause for each parameter that differs between two results of the step
+        ``label``.
+        """
+        step = self._recipe.steps.get(label) if self._recipe else None
+        names = [n for n in dict.fromkeys([*old, *new]) if old.get(n) != new.get(n)]
+        return [self._param(step, n, old.get(n, _ABSENT), new.get(n, _ABSENT)) for n in names]
+
+    def source(self, *path: str) -> str:
+        """Return the location of a value in the recipe, such as `` (recipe.yaml:3:7)``, or an
+        empty string.
+        """
+        setting = self._recipe.config.settings.get(".".join(path)) if self._recipe else None
+        return f" ({setting.source})" if setting else ""
+
+    def _param(self, step: Step | None, name: str, old: Any, new: Any) -> str:
+        if new is _ABSENT:
+            return f"{name} is no longer a parameter"
+        setting, source = self._setting(step, name)
+        path = ".".join(map(str, setting.path)) if setting else name
+        where = f" ({source})" if source else ""
+        if isinstance(new, Mapping) and "file" in new:
+            inside = f" ({path}{f', {source}' if source else ''})" if setting else where
+            return f"file {_file_wording(step, name)}: {_other_file(old, new)}{inside}"
+        written = (
+            setting.value
+            if setting and not (isinstance(setting.value, str) and "${" in setting.value)
+            else None
+        )
+        if old is _ABSENT:
+            return f"{path} is new: {_as_written(written, new)}{where}"
+        before, after = _both(written, old, new)
+        return f"{path} {before} -> {after}{where}"
+
+    def _setting(self, step: Step | None, name: str) -> tuple[Setting | None, str]:
+        """Return the recipe setting that gives a parameter its value, or None, and the location
+        of the value.
+        """
+        if step is None:
+            return None, ""
+        if name not in step.param_marks:
+            return None, f"default of {step.node.path}"
+        mark = str(step.param_marks[name])
+        found = self._marked.get(mark, [])
+        here = ("steps", step.name.partition("[")[0], "with", name)
+        named = [s for s in found if s.path == here] or [s for s in found if s.path[-1:] == (name,)]
+        setting = (named or found)[0] if named or len(found) == 1 else None
+        return setting, setting.source if setting else mark
+
+    @cached_property
+    def _marked(self) -> Mapping[str, list[Setting]]:
+        """Return the settings that the user wrote, by location in the recipe files."""
+        settings = defaultdict(list)
+        for setting in self._recipe.config.settings.values() if self._recipe else ():
+            if not setting.default:
+                settings[setting.source.partition(", ")[0]].append(setting)
+        return settings
+
+
+def _file_wording(step: Step | None, name: str) -> str:
+    value = step.params.get(name) if step else None
+    return value.name if isinstance(value, Path) else name
+
+
+def _other_file(old: Any, new: Mapping[str, Any]) -> str:
+    if not isinstance(old, Mapping) or "file" not in old:
+        return "is given now"
+    return (
+        "other content" if old["file"] != new["file"] else f"{new['suffix']}, not {old['suffix']}"
+    )
+
+
+def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
+    """Return the old and the new value of a parameter as text, both in the unit of the new
+    value.
+    """
+    after = _as_written(written, new)
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        parts = (
+            written if isinstance(written, list) and len(written) == len(old) else [None] * len(old)
+        )
+        return f"[{', '.join(map(_in_unit_of, parts, new, old))}]", after
+    if isinstance(old, Mapping) and isinstance(new, Mapping):
+        return _items(old, new)
+    unit = _unit(written, new)
+    before = spoken(unit[0](old)) if unit and _is_number(old) else spoken(old)
+    # the values differ by less than the shown digits
+    if before in (spoken(new), after.partition(" ")[0]):
+        return repr(old), repr(new)
+    return before, after
+
+
+def _in_unit_of(written: Any, new: Any, old: Any) -> str:
+    unit = _unit(written, new)
+    return f"{spoken(unit[0](old))} {unit[1]}" if unit and _is_number(old) else spoken(old)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float | int) and not isinstance(value, bool)
+
+
+def _items(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, str]:
+    """Return two texts: the entries that only the old mapping has, and the entries that only the
+    new mapping has.
+    """
+    pairs = [[(str(key), value) for key, value in m.get("items", ())] for m in (old, new)]
+    only = [
+        [f"{k}: {spoken(v)}" for k, v in pairs[i] if (k, v) not in pairs[1 - i]] for i in (0, 1)
+    ]
+    return f"{{{', '.join(only[0])}}}", f"{{{', '.join(only[1])}}}"
+
+
+def _as_written(written: Any, new: Any) -> str:
+    """Return a parameter value as text: as the user wrote the value if that text has a unit,
+    else in short form.
+    """
+    if _unit(written, new) or (isinstance(written, list) and isinstance(new, list)):
+        return flow(written)
+    return spoken(new)
+
+
+def _unit(written: Any, new: Any) -> tuple[Callable[[float], float], str] | None:
+    """Return a function from SI units to the unit that the user wrote, and this unit; None if
+    there is no unit.
+    """
+    match = _QUANTITY.fullmatch(written.strip()) if isinstance(written, str) else None
+    if match is None or not _is_number(new):
+        return None
+    if match[2].strip() == "e-/DN":
+        return (lambda si: 1.0 / si if si else math.inf), match[2]
+    if new and float(match[1]):
+        return _times(float(match[1]) / new), match[2]
+    for si in ("m", "s", "rad", "K", "e-", "waves", "DN/e-"):
+        with suppress(ValueError):
+            return _times(1.0 / read_quantity(f"1 {match[2]}", si)), match[2]
+    return None
+
+
+def _times(factor: float) -> Callable[[float], float]:
+    return lambda si: si * factor
+
+
+def spoken(value: Any) -> str:
+    """Return a short text for the value of a parameter."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Mapping):
+        items = ", ".join(f"{spoken(k)}: {spoken(v)}" for k, v in value.get("items", ()))
+        return f"a {value['suffix']} file".replace("  ", " ") if "file" in value else f"{{{items}}}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(spoken, value))}]"
+    return "none" if value is None else flow(value)
+
+
+# --- change causes --------------------------------------------------------------------------------
+
+# Causes of a changed result: differences between a new and an earlier result, in the step or
+# upstream of it.
+#
+# A pair is a new and an earlier result. The two results are compared by the parts of their keys, so
+# that no tensor is read. The search goes from a pair to the pairs of its inputs whose keys differ.
+
 
 Origin = Mapping[str, Any]  #: the parts of a key: node, code, params, inputs, stream
 _FEW = 4  #: steps of an input that a clause names

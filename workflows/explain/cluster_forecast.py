@@ -11,8 +11,8 @@ from neusee.workflows.engine.placement_inputs import parts_of
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.placement.heft_schedule import Schedule, Task, TooLarge, heft
 from neusee.workflows.placement.machine_file import Machines
-from neusee.workflows.report.text_table import columns
-from neusee.workflows.store.byte_sizes import format_size
+from neusee.workflows.report.terminal_text import columns
+from neusee.workflows.store.cache_settings import format_size
 
 _SHOWN = 24  #: steps of the critical path
 

@@ -1,29 +1,250 @@
-"""Forecast of a run from earlier runs: cache hits, bytes, seconds, memory and devices."""
+"""Forecast of a run from earlier runs: cache hits, seconds, memory and devices."""
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+import re
+from collections import Counter
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from textwrap import wrap
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.engine.cost_laws import sizes_of
-from neusee.workflows.engine.cost_model import Costs, Estimate
-from neusee.workflows.engine.local_executor import lanes_of, memory_limit
+from neusee.workflows.engine.cost_model import Costs, Estimate, Range, sizes_of
+from neusee.workflows.engine.local_executor import lanes_of, memory_limit, program_memory
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import past_costs, prepare, running_peak
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.step_job import Lane, StepJob
-from neusee.workflows.explain.forecast_table import forecast_rows, seconds_text, table_lines
-from neusee.workflows.explain.report_memory import held_beside, report_peak, shown_steps
 from neusee.workflows.graph.recipe_graph import Recipe, needed, nodes_of
-from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.keys.cache_key import Key, device_kind
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
-from neusee.workflows.report.contents import steps_of, wanted
-from neusee.workflows.store.byte_sizes import format_size
+from neusee.workflows.report.contents import FIGURES, files_of, steps_of, wanted
+from neusee.workflows.report.files_beside import LARGE, ROOM
+from neusee.workflows.report.terminal_text import columns
+from neusee.workflows.store.cache_settings import UNITS, format_size
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+
+if TYPE_CHECKING:
+    from neusee.workflows.engine.cost_model import Estimate
+    from neusee.workflows.store.result_store import Store
+
+
+# --- forecast table -------------------------------------------------------------------------------
+
+# Table of a forecast: what each step of a recipe would cost, with the range that is expected, in 80
+# columns.
+
+
+Row = dict[str, Any]
+_SHORT, _SMALL = 0.01, 1e6  #: s and bytes below which a cost is not written out in the table
+#: bytes of a peak below which its range is not written, because freed memory is used again
+_SURE = 1e7
+
+
+def forecast_rows(plan: Plan, store: Store) -> list[Row]:
+    """Return what is expected of each step of a recipe as values for JSON: its state, its costs and
+    their ranges.
+
+    A range is a dict with the keys ``expected``, ``least`` and ``most``. A guess counts at its
+    upper end.
+    """
+    return [_row(name, plan, store) for name in plan.order]
+
+
+def _row(name: str, plan: Plan, store: Store) -> Row:
+    step, about = plan.recipe.steps[name], store.about(plan.keys[name])
+    row: Row = {
+        "step": name,
+        "node": step.node.path,
+        "state": "",
+        "where": "",
+        "seconds": None,
+        "bytes": None,
+    }
+    row |= {"memory": None, "guess": False, "reads": list(dict.fromkeys(step.sources))}
+    if plan.left_out.get(name):
+        return row | {"state": "left out"}
+    if name in plan.expected:
+        where = plan.lanes.get(name, "?")
+        return row | {"state": "run", "where": where, **_costs(plan.expected[name], where)}
+    state = (
+        "stored" if store.has(plan.keys[name]) else "run" if name in plan.awake else "not needed"
+    )
+    known = (
+        {"seconds": _ranged(about["seconds"], Range()), "bytes": about["bytes"]} if about else {}
+    )
+    return row | {"state": state, **known}
+
+
+def _costs(cost: Estimate, where: str) -> Row:
+    seconds = cost.seconds.get(device_kind(where), cost.seconds["cpu"])
+    memory, time = cost.spread
+    peak = _ranged(cost.peak, memory)
+    peak["least"] = max(peak["least"], cost.bytes)
+    found = {"seconds": _ranged(seconds, time), "bytes": cost.bytes, "memory": peak}
+    return found | {"guess": not cost.known, "bytes_guessed": not cost.sized}
+
+
+def _ranged(expected: float, around: Range) -> dict[str, float]:
+    return {"expected": expected, "least": expected * around.least, "most": expected * around.most}
+
+
+def table_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the table of a forecast as lines of text, from the rows of `forecast_rows`.
+
+    A range is written behind its value, ``0.81 (0.7-1.2)``. What is negligible is written as below
+    a limit, and a guess as ``guess`` with its upper end.
+    """
+    head = ["step", "where", "seconds", "bytes", "memory"]
+    return columns([head, *(_cells(row) for row in rows)])
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    state = row["where"] or row["state"]
+    seconds, memory = row["seconds"], row["memory"]
+    size = "" if row["bytes"] is None else format_size(row["bytes"])
+    if row["guess"]:
+        size = f"guess <{size}" if row["bytes_guessed"] else size
+        return [
+            row["step"],
+            state,
+            f"guess <{seconds['most']:.2g}",
+            size,
+            f"guess <{format_size(memory['most'])}",
+        ]
+    return [
+        row["step"],
+        state,
+        seconds_text(seconds) if seconds else "",
+        size,
+        memory_text(memory) if memory else "",
+    ]
+
+
+def seconds_text(cost: Mapping[str, float]) -> str:
+    """Return a duration in s with its range as text, such as ``0.81 (0.7-1.2)``."""
+    if cost["expected"] < _SHORT:
+        return f"<{_SHORT}"
+    return f"{_figures(cost['expected'])}{_between(cost, 1.0)}"
+
+
+def memory_text(cost: Mapping[str, float]) -> str:
+    """Return a number of bytes with its range as text, such as ``120 MB (98-140)``."""
+    if cost["expected"] < _SMALL:
+        return f"<{format_size(_SMALL)}"
+    text = format_size(cost["expected"])
+    return text if cost["expected"] < _SURE else f"{text}{_between(cost, UNITS[text.split()[1]])}"
+
+
+def _between(cost: Mapping[str, float], unit: float) -> str:
+    """Return the range of a cost as text, or an empty text for a cost that is known exactly."""
+    least, most = (_figures(cost[end] / unit) for end in ("least", "most"))
+    return f" ({least}-{most})" if least != most else ""
+
+
+def _figures(value: float) -> str:
+    """Return a number as text without an exponent: two decimals below 1, one below 10, and none
+    above.
+    """
+    return f"{value:.{2 if value < 0.995 else 1 if value < 9.95 else 0}f}"
+
+
+# --- report memory --------------------------------------------------------------------------------
+
+# Memory of the report of a run: the results that its pictures and data files show, and the copies
+# that are written.
+#
+# Also of the results that files hold which are made beside the run.
+
+
+#: Three numbers that tests/benchmarks/bench_memory.py fits to the measured memory of the reports of
+#: shipped recipes.
+DRAWING = 74.3e6  #: bytes of the libraries that draw pictures and write files
+#: share of the memory of the steps that the process does not give back to the system
+HELD_BACK = 0.0101
+COPIES = 2.25  #: copies of the results in memory, while a picture or file of them is made
+# not a parameter and not a function of a step
+_NEED = re.compile(r"\??(?P<step>[\w.]+(\[[^\]]*\])?)$")
+
+
+def shown_steps(recipe: Recipe) -> list[str]:
+    """Return the steps whose results the pictures and data files of a run show, as far as the
+    recipe has them.
+    """
+    groups = [recipe.outputs, *(group for job in _jobs(recipe) for group in job)]
+    return list(dict.fromkeys(name for group in groups for name in group if name in recipe.steps))
+
+
+def held_beside(recipe: Recipe, costs: Costs, limit: float) -> float:
+    """Return the most bytes of results that files hold which are made beside a run, as
+    `FilesBeside` holds them.
+
+    The values that the run returns are not counted, because they stay in memory with or without
+    files. ``limit`` is the memory (bytes) that the process may use; with 0 no file is made beside
+    the run.
+    """
+    large, room, most = min(LARGE, limit / 32), min(ROOM, limit / 16), limit / 16
+    sizes = [costs.size_of(name) for name in shown_steps(recipe) if name not in wanted(recipe)]
+    small = sum(size for size in sizes if size <= large)
+    return min(small, room) + max((size for size in sizes if large < size <= most), default=0.0)
+
+
+def report_peak(
+    works: list[StepJob],
+    recipe: Recipe,
+    keys: Mapping[str, str],
+    costs: Costs,
+    lanes: Mapping[str, Lane],
+    running: float = 0.0,
+) -> float:
+    """Return the predicted peak memory of this process in bytes while the report is written.
+
+    Args: works: the steps that only the report needs. keys: the keys of the results that are shown,
+            by step.
+    running: the predicted peak memory of this process while the steps run.
+    """
+    schedule = prepare(works, costs, {}, lanes, list(keys.values())).schedule if works else None
+    made = max(schedule.peak.values(), default=0.0) if schedule else 0.0
+    held = max((lane.held for lane in lanes.values()), default=0.0) or program_memory()
+    shown = COPIES * shown_at_once(recipe, costs)
+    return held + DRAWING + HELD_BACK * max(0.0, running - held) + max(made, shown)
+
+
+def shown_at_once(recipe: Recipe, costs: Costs) -> float:
+    """Return the largest number of bytes of results that are in memory together while pictures and
+    files are made.
+
+    The outputs of the recipe stay in memory. Another result is there from the first picture or file
+    that shows it to the last, as `workflows.report.shown_values` holds it.
+    """
+    most = 0.0
+    for groups in _jobs(recipe):
+        uses, there = Counter(name for group in groups for name in group), set(recipe.outputs)
+        for group in groups:
+            there.update(group)
+            most = max(most, sum(costs.size_of(name) for name in there if name in recipe.steps))
+            uses.subtract(group)
+            there = {name for name in there if uses[name] > 0 or name in recipe.outputs}
+    return most
+
+
+def _jobs(recipe: Recipe) -> tuple[Sequence[Sequence[str]], ...]:
+    """Return the steps that each picture shows, and the steps that each data file shows."""
+    pictures = [list(_found(recipe, figure.needs)) for figure in FIGURES]
+    return pictures, [list(_found(recipe, needs)) for _, needs in files_of(recipe).values()]
+
+
+def _found(recipe: Recipe, needs: Mapping[str, str]) -> Iterator[str]:
+    for match in filter(None, map(_NEED.match, needs.values())):
+        pattern = re.escape(match["step"]).replace(r"\*", "[^,]*")
+        yield from (name for name in recipe.steps if re.fullmatch(pattern, name))
+
+
+# --- run forecast ---------------------------------------------------------------------------------
+
+# Forecast of a run from earlier runs: cache hits, bytes, seconds, memory and devices.
 
 
 @dataclass(frozen=True)

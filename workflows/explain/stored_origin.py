@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from neusee.workflows.explain.change_causes import Comparison, Pair, Roots
-from neusee.workflows.explain.change_wording import spoken
+from neusee.workflows.explain.change_causes import Comparison, Pair, Roots, spoken
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 

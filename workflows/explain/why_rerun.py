@@ -12,8 +12,7 @@ from neusee.workflows.engine.resolved_keys import Resolved
 from neusee.workflows.explain.change_causes import Comparison, Origin
 from neusee.workflows.explain.stored_origin import because, keys_in, state_of
 from neusee.workflows.graph.diagnostics import nearest
-from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
-from neusee.workflows.graph.step_record import Event
+from neusee.workflows.graph.recipe_graph import Event, Recipe, Step, needed
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions

@@ -1,7 +1,8 @@
-"""The recipe of a calibration of the frames in a folder, which is written into the results."""
+"""The recipe of a calibration of a folder of frames, and the EMVA 1288 descriptor file."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +18,6 @@ from neusee.nodes.calibrate import (
     refuse_descriptor,
 )
 from neusee.workflows.engine.runner import run
-from neusee.workflows.frames.descriptor_file import descriptor_of, descriptors_in, quoted
 from neusee.workflows.frames.frame_folder import (
     FolderLevel,
     FolderLevels,
@@ -26,9 +26,60 @@ from neusee.workflows.frames.frame_folder import (
 )
 from neusee.workflows.graph.final_values import Config
 from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.keys.sealed_files import text_of
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.report.study_folder import Progress, silent
 from neusee.workflows.store.result_store import Store
+
+# --- descriptor file ------------------------------------------------------------------------------
+
+# The descriptor file of a measurement in the data format of EMVA 1288.
+
+
+#: a line of a descriptor that begins a light level
+_LEVEL = re.compile(r"^[bd]\s+[\d.,]+(\s|$)", re.MULTILINE)
+
+
+def descriptors_in(folder: Path) -> list[Path]:
+    """Return the descriptor files of a folder."""
+    return [file for file in sorted(folder.glob("*.txt")) if _LEVEL.search(_text(file))]
+
+
+def _text(file: Path) -> str:
+    """Return the text of a file, or nothing of what is no text file, such as a pipe."""
+    try:
+        return text_of(file, "utf-8-sig", "replace")
+    except ValueError:
+        return ""
+
+
+def descriptor_of(path: Path) -> Path:
+    """Return the descriptor file that a path is, or the only one in the folder that a path is.
+
+    Raises: ValueError for a folder without a descriptor, or with several.
+    """
+    if not path.is_dir():
+        return path
+    found = descriptors_in(path)
+    if len(found) == 1:
+        return found[0]
+    has = (
+        f"has {len(found)} descriptors"
+        if found
+        else "has no descriptor, a .txt with levels in lines b and d"
+    )
+    raise ValueError(f"{path} {has}: name one file")
+
+
+def quoted(text: str) -> str:
+    """Return a text as a scalar of YAML in single quotes."""
+    return "'" + text.replace("'", "''") + "'"
+
+
+# --- folder recipe --------------------------------------------------------------------------------
+
+# The recipe of a calibration of the frames in a folder, which is written into the results.
+
 
 _BITS = (8, 10, 12, 14)  #: of converters whose numbers are shifted to the left in files of 16 bits
 _EFFICIENCY = 0.5  #: electrons per photon, which relative light is scaled to

@@ -1,9 +1,8 @@
-"""The light levels in a folder of frames: which files belong together, and what is missing or
-does not fit.
-"""
+"""The light levels in a folder of frames, by file names or a table, and what is missing."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
@@ -11,11 +10,277 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from neusee.nodes.calibrate import FrameHeader, frame_header
-from neusee.workflows.frames.frame_names import NamedFrame, read_name
-from neusee.workflows.frames.frame_table import TableRow, find_table, read_table
-from neusee.workflows.frames.odd_frames import misplaced_frames
+import numpy as np
+
+from neusee.nodes.calibrate import FrameHeader, frame_header, frame_means
+from neusee.nodes.input_files import csv_rows
+from neusee.nodes.units import read_any
 from neusee.workflows.report.study_folder import Progress, silent
+
+# --- frame names ----------------------------------------------------------------------------------
+
+# Exposure, light and level of a frame by the name of its file.
+
+
+_NUMBER = r"(\d+(?:[.,p]\d+)?(?:e[-+]?\d+)?)"  #: 10p5 is 10.5, as in names without points
+_UNIT = r"(ns|us|µs|μs|ms|s)"
+_WORD = r"(?:exposure|exptime|texp|exp|t)"
+_SPACE = r"[ =_-]?"
+#: 1/200 of a second: a file name has no stroke; after a hyphen, and between lone numbers, it may be
+#: something else
+_FRACTION = re.compile(
+    rf"(?<![a-z0-9.,-]){_WORD}?{_SPACE}(?<![\d.,-])1(?:[-⁄]|over|div)([1-9][\d.]*)"
+    r" ?s(?:ec)?(?![a-z0-9])"
+)
+_DOUBTFUL = re.compile(r"(?<![\d.,])(?:(?<=[a-z-])1-|1[_/ ])([1-9]\d*) ?s(?:ec)?(?![a-z0-9])")
+_EXPOSURE = re.compile(rf"(?<![a-z0-9.,]){_WORD}?{_SPACE}{_NUMBER}[ _-]?{_UNIT}(?:ec)?(?![a-z0-9])")
+_UNIT_FIRST = re.compile(rf"(?<![a-z0-9]){_WORD}{_SPACE}{_UNIT}{_SPACE}{_NUMBER}(?![a-z.,0-9])")
+_SHORT_UNIT_FIRST = re.compile(rf"(?<![a-z0-9])(ns|us|µs|μs|ms){_SPACE}{_NUMBER}(?![a-z.,0-9])")
+_AFTER = re.compile(rf"(?<![a-z0-9.,]){_NUMBER}[ _-]?(?:photons?|ph)(?![a-z])")
+_BEFORE = re.compile(rf"(?<![a-z])(?:photons?|ph)[ =_-]?{_NUMBER}(?![a-z.,0-9])")
+_DARK = re.compile(r"(?<![a-z])(?:darks?(?:frames?)?|bias|closed|nolight)(?![a-z])")
+_INDEX = re.compile(r"(?:[ ._-]*(?:frame|image|img|shot|no|n|f|#)?[ ._-]*\d+|[ ._-][ab])$")
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
+
+
+class NamedFrame(NamedTuple):
+    """What the name of a file says of its frames; None for what it does not say."""
+
+    level: str  #: the name without exposure, light and the number of the frame
+    dark: bool
+    exposure: float | None  #: s
+    photons: float | None  #: per pixel and exposure
+    written: str = ""  #: the part of the name that is read as the exposure
+    doubtful: str = ""  #: a part that may be a fraction of a second, or a number and seconds
+
+
+class _Exposure(NamedTuple):
+    seconds: float
+    written: str
+
+
+def read_name(file: Path, folder: Path) -> NamedFrame:
+    """Return what the path of a file below ``folder`` says, such as ``flat_10ms_1200ph_2.tif``.
+
+    Folders count as parts of the name: ``dark/10ms/1.png``. An exposure is a number and its unit in
+    either order: ``10ms``, ``10p5ms``, ``exp_ms_10``, or a fraction of a second such as ``1-200s``.
+    """
+    parts = file.relative_to(folder).with_suffix("").parts
+    text = "/".join(parts).lower()
+    exposure, light = _exposure(text), _last(_AFTER, text) or _last(_BEFORE, text)
+    dark = _DARK.search(text) is not None
+    photons = 0.0 if dark else None if light is None else _float(light[1])
+    left = text.replace(exposure.written, "") if exposure else text
+    left = left.replace(light[0], "") if light else left
+    level = _INDEX.sub("", left).strip(" /._-")
+    seconds, written = (exposure.seconds, exposure.written) if exposure else (None, "")
+    doubtful = _last(_DOUBTFUL, text)
+    unsure = doubtful[0] if doubtful and not _last(_FRACTION, text) else ""
+    return NamedFrame(level, dark or photons == 0, seconds, photons, written.strip(" =_-"), unsure)
+
+
+def _exposure(text: str) -> _Exposure | None:
+    """Return the last exposure of a name; a fraction counts before a number, and a number before
+    a unit.
+    """
+    if fraction := _last(_FRACTION, text):
+        return _Exposure(1 / _float(fraction[1]), fraction[0])
+    if match := _last(_EXPOSURE, text):
+        return _Exposure(_float(match[1]) * _SECONDS[match[2]], match[0])
+    if match := _last(_UNIT_FIRST, text) or _last(_SHORT_UNIT_FIRST, text):
+        return _Exposure(_float(match[2]) * _SECONDS[match[1]], match[0])
+    return None
+
+
+def _last(pattern: re.Pattern[str], text: str) -> re.Match[str] | None:
+    matches = list(pattern.finditer(text))
+    return matches[-1] if matches else None
+
+
+def _float(number: str) -> float:
+    return float(number.replace(",", ".").replace("p", "."))
+
+
+# --- frame table ----------------------------------------------------------------------------------
+
+# A table that names the exposure and the light of each file of frames.
+
+
+_TIMES = {
+    "exposure": 0.0,
+    "exposure_s": 1.0,
+    "exposure_ms": 1e-3,
+    "exposure_us": 1e-6,
+    "exposure_ns": 1e-9,
+}
+_FRACTION_IN_TABLE = re.compile(r"\s*(\d+)\s*[/⁄]\s*([1-9]\d*(?:\.\d+)?)\s*(s|sec)?\s*")  #: 1/200 s
+_COLUMNS = "file, exposure (such as 10 ms) or exposure_ms, and photons or light"
+
+
+class TableRow(NamedTuple):
+    """A line of a table: a file and what is told of it; None for an empty cell or a column that
+    is missing.
+    """
+
+    line: int
+    file: Path
+    exposure: float | None  #: s
+    photons: float | None  #: per pixel and exposure
+    light: float | None  #: relative
+
+
+def find_table(folder: Path) -> Path | None:
+    """Return the only CSV file of a folder with a column ``file``, or None; raise ValueError for
+    several.
+    """
+    found = [path for path in sorted(folder.glob("*.csv")) if "file" in _header(path)]
+    if len(found) > 1:
+        raise ValueError(
+            f"{folder} has {len(found)} tables of frames, {', '.join(p.name for p in found)}:"
+            " keep one"
+        )
+    return found[0] if found else None
+
+
+def read_table(table: Path) -> list[TableRow]:
+    """Return the lines of a table of frames; raise ValueError with all mistakes, each with its
+    line.
+    """
+    found = list(_read(table))
+    rows = [item for item in found if isinstance(item, TableRow)]
+    if problems := [item for item in found if isinstance(item, str)]:
+        raise ValueError("\n".join(problems))
+    if not rows:
+        raise ValueError(f"{table.name} has no line below its header: write one line for each file")
+    return rows
+
+
+def _header(table: Path) -> list[str]:
+    try:
+        return next(([cell.strip().lower() for cell in row] for _, row in csv_rows(table)), [])
+    except ValueError:
+        return []
+
+
+def _read(table: Path) -> Iterator[TableRow | str]:
+    lines = csv_rows(table)
+    names = [cell.strip().lower() for cell in next(lines)[1]]
+    time = next((name for name in names if name in _TIMES), None)
+    if strange := [name for name in names if name not in (*_TIMES, "file", "photons", "light")]:
+        yield f"{table.name}:1: column {strange[0]} is unknown: write {_COLUMNS}"
+    for line, cells in lines:
+        row = dict(zip(names, (cell.strip() for cell in cells), strict=False))
+        file = table.parent / row.get("file", "")
+        if not file.is_file():
+            yield f"{table.name}:{line}: no such file: {row.get('file') or '(empty)'}"
+            continue
+        try:
+            exposure = _exposure_of_row(row.get(time or "", ""), time or "")
+            yield TableRow(line, file, exposure, _light(row, "photons"), _light(row, "light"))
+        except ValueError as error:
+            yield f"{table.name}:{line}: {error}"
+
+
+def _exposure_of_row(text: str, column: str) -> float | None:
+    if not text:
+        return None
+    scale = _TIMES[column]
+    if fraction := _FRACTION_IN_TABLE.fullmatch(text):
+        number, unit = float(fraction[1]) / float(fraction[2]), "s" if scale or fraction[3] else ""
+        scale = 0.0 if fraction[3] else scale
+    else:
+        number, unit = (float(text), "s") if scale else read_any(text)
+    if unit != "s" or not 0 < number < math.inf:
+        raise ValueError(
+            f"exposure {text}: write a time with a unit, such as 10 ms, or name the column"
+            " exposure_ms"
+        )
+    return number * (scale or 1.0)
+
+
+def _light(row: dict[str, str], column: str) -> float | None:
+    text = row.get(column, "")
+    if not text:
+        return None
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 <= number < math.inf:
+        raise ValueError(f"{column} {text}: write a number of 0 or more")
+    return number
+
+
+# --- odd frames -----------------------------------------------------------------------------------
+
+# Frames whose mean does not fit their level, as where a file has the wrong name.
+
+
+#: most difference of two frames: of their signal, and of the brightest signal
+_OFF, _FLOOR = 0.1, 0.01
+
+_CHANCE = 6.0  #: standard errors of a mean, added to the difference
+
+Files = tuple[str, bool, Sequence[Path]]  #: name of a level, True for a dark one, its files
+
+
+def misplaced_frames(levels: Sequence[Files], folder: Path) -> Iterator[str]:
+    """Yield a sentence for each level whose frames differ too much in their means, or one if
+    darks are not dark.
+    """
+    means = [
+        [(file, *found) for file in files for found in frame_means(file)] for _, _, files in levels
+    ]
+    middles = [float(np.median([mean for _, mean, _ in each])) for each in means]
+    darks = [middle for middle, (_, dark, _) in zip(middles, levels, strict=True) if dark]
+    lit = float(
+        np.median(
+            [middle for middle, (_, dark, _) in zip(middles, levels, strict=True) if not dark]
+        )
+    )
+    if lit <= max(darks):
+        yield (
+            f"{folder}: dark frames have means up to {max(darks):.0f} DN, and half of the lit "
+            "levels no more than "
+            f"{lit:.0f} DN: cover the lens, or check which files are dark"
+        )
+        return
+    black, bright = min(darks), max(middles)
+    for (_, dark, _), each, middle in zip(levels, means, middles, strict=True):
+        room = _OFF * (0.0 if dark else middle - black) + _FLOOR * (bright - black)
+        room += _CHANCE * max(error for _, _, error in each)
+        values = [mean for _, mean, _ in each]
+        if max(values) - min(values) > room:
+            yield _odd([(file, mean) for file, mean, _ in each], middle, room, folder)
+
+
+def _odd(each: Sequence[tuple[Path, float]], middle: float, room: float, folder: Path) -> str:
+    """Return which frame of a level does not fit the others, or both of a pair."""
+    values = [mean for _, mean in each]
+    if len(values) == 2:
+        (a, one), (b, other) = each
+        both = (
+            f"{_name(a, folder)} and {_name(b, folder)} count as one level, but have means of"
+            f" {one:.1f} and"
+        )
+        return f"{both} {other:.1f} DN: check names and table"
+    file, mean = max(each, key=lambda pair: abs(pair[1] - middle))
+    return (
+        f"{_name(file, folder)} has a mean of {mean:.1f} DN, but its level {middle:.1f} DN, "
+        "which may differ by "
+        f"{room:.1f} DN: check its name, or remove it"
+    )
+
+
+def _name(file: Path, folder: Path) -> str:
+    return str(file.relative_to(folder)) if file.is_relative_to(folder) else str(file)
+
+
+# --- frame folder ---------------------------------------------------------------------------------
+
+# The light levels in a folder of frames: which files belong together, and what is missing or does
+# not fit.
+
 
 SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr", ".fits", ".fit", ".fts")
 #: suffixes of pictures that hold no raw grey numbers, or that nothing here reads

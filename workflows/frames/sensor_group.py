@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neusee.nodes.array_bytes import npz_needs
 from neusee.nodes.calibrate import SaturationSignal, frame_header, saturation_signal
+from neusee.nodes.file_headers import npz_needs
 from neusee.nodes.values import Levels
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.keys.regular_file import head_of, text_of
+from neusee.workflows.keys.sealed_files import head_of, text_of
 from neusee.workflows.store.result_store import Store
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*")

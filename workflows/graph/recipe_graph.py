@@ -1,15 +1,13 @@
-"""Graph of a checked recipe: its steps, the connections between the steps, and the order in
-which the steps run.
-"""
+"""Graph of a checked recipe: its steps, their connections and order, and their records."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from neusee.nodes import Node
+from neusee.nodes import Check, Node, TensorStats
 from neusee.workflows.graph.diagnostics import Location, nearest
 from neusee.workflows.graph.final_values import Config, Setting
 
@@ -17,13 +15,63 @@ if TYPE_CHECKING:
     from neusee.nodes.calibrate import Traceability
     from neusee.workflows.engine.runner import Result
     from neusee.workflows.engine.step_job import Executor
-    from neusee.workflows.graph.step_record import Event
     from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
     from neusee.workflows.recipe.blocks.safety_block import Safety
-    from neusee.workflows.recipe.blocks.train_block import Training
-    from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
+    from neusee.workflows.recipe.blocks.train_block import LiftTraining, Training
     from neusee.workflows.recipe.distributions.nominal_values import Uncertain
     from neusee.workflows.store.result_store import Store
+
+
+# --- step record ----------------------------------------------------------------------------------
+
+# Records of the steps of a run: the state of each step with its reason, and the device, time and
+# memory.
+
+
+State = Literal["run", "cached", "left out", "not needed"]
+
+
+@dataclass(frozen=True, slots=True)
+class StepRecord:
+    """Record of one step in a run: its state, the reason for this state, its time, memory and
+    checks.
+    """
+
+    step: str
+    state: State  #: ``not needed``: no step that ran needed this step
+    why: str
+    seconds: float
+    key: str  #: cache key of the result
+    facts: TensorStats | None = None
+    checks: tuple[Check, ...] = ()
+    device: str = "cpu"
+    bytes: int = 0
+    bound: float | None = None  #: upper bound of the change of the result if the step is omitted
+    began: float = 0.0  #: start time of the step in s after the start of the run
+    lane: str = ""  #: device or worker of the executor that computed the step
+    peak: int | None = None  #: peak memory in bytes beyond the memory in use before the step
+    predicted: float | None = None  #: time in s predicted from earlier runs
+    #: of a cheaper step: rms and maximum, relative to the largest element
+    error: tuple[float, float] | None = None
+    predicted_peak: float | None = None  #: predicted peak memory in bytes, as ``peak``
+    kept: bool = True  #: whether the value is in the store
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Start or end of a step during a run, reported to a live display; ``done`` is None at the
+    start.
+    """
+
+    step: str
+    done: StepRecord | None
+
+
+# --- recipe graph ---------------------------------------------------------------------------------
+
+# Graph of a checked recipe: its steps, the connections between the steps, and the order in which
+# the steps run.
+
 
 __all__ = [
     "Config",
@@ -261,3 +309,57 @@ def unknown_step(name: str, steps: Collection[str]) -> str:
         return f"no step {name!r}; {nearest(name, steps)}"
     more = f" and {len(copies) - _COPIES} more" if len(copies) > _COPIES else ""
     return f"no output {name}: this recipe has {', '.join(copies[:_COPIES])}{more}"
+
+
+# --- told copies ----------------------------------------------------------------------------------
+
+# Copies of the steps from which a restorer knows optics and laser, so that a camera may differ from
+# what is believed.
+#
+# The camera keeps its steps. The copies have the prefix ``told_``, and the restorer reads these in
+# place of the camera's.
+
+
+TOLD = "told_"  #: prefix of the copies
+#: inputs of a restorer that say what the optics and the laser are
+KNOWLEDGE = ("psf", "glare", "nearby")
+#: step of the frame behind the mask, before which the camera is and after which the user
+FRAME = "raw[mask]"
+
+
+def knowers(recipe: Recipe, steps: Iterable[str]) -> list[str]:
+    """Return those of the steps that read what optics or lasers are."""
+    return [name for name in steps if any(recipe.steps[name].wires.get(key) for key in KNOWLEDGE)]
+
+
+def known(recipe: Recipe, readers: Iterable[str]) -> list[str]:
+    """Return the steps whose results tell the steps ``readers`` what optics and lasers are."""
+    wires = (recipe.steps[name].wires.get(key) for name in readers for key in KNOWLEDGE)
+    return [name for wire in wires for name in ((wire,) if isinstance(wire, str) else wire or ())]
+
+
+def with_copies(
+    recipe: Recipe, readers: Iterable[str], copied: Collection[str], change: Callable[[Step], Step]
+) -> Recipe:
+    """Return the recipe with changed copies of the steps ``copied``, from which alone the
+    ``readers`` know.
+    """
+    steps = dict(recipe.steps)
+    for name in copied:
+        step = change(recipe.steps[name])
+        wires = {key: _told(wire, copied) for key, wire in step.wires.items()}
+        steps[TOLD + name] = replace(step, name=TOLD + name, wires=wires)
+    for name in readers:
+        step = recipe.steps[name]
+        wires = {
+            key: _told(wire, copied) if key in KNOWLEDGE else wire
+            for key, wire in step.wires.items()
+        }
+        steps[name] = replace(step, wires=wires)
+    return replace(recipe, steps=steps)
+
+
+def _told(wire: Wire, copied: Collection[str]) -> Wire:
+    if isinstance(wire, str):
+        return TOLD + wire if wire in copied else wire
+    return None if wire is None else tuple(TOLD + name if name in copied else name for name in wire)

@@ -19,10 +19,10 @@ from pydantic_core import core_schema
 from neusee.nodes import Node, units
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.distributions.law_text import KINDS
-from neusee.workflows.recipe.exported_files import ALL, HALF, NAMES, NONE
+from neusee.workflows.recipe.global_settings import ALL, HALF, NAMES, NONE
 from neusee.workflows.recipe.loading import groups
 from neusee.workflows.recipe.node_families import Own, all_nodes
-from neusee.workflows.recipe.wiring import takes_many
+from neusee.workflows.recipe.steps import takes_many
 
 Schema = dict[str, Any]
 

@@ -17,10 +17,10 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
-from neusee.workflows.handbook.command_pictures import draw_pictures
 from neusee.workflows.handbook.guide_pages import (
     GUIDE,
     Picture,
+    draw_pictures,
     pictures_of,
     read_pages,
     title_of,

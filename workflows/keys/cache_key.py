@@ -1,26 +1,205 @@
-"""Cache keys: the key of a result is a digest of everything that determines the result, and of
-nothing else.
-
-A key depends on the node with its code, the versions of the packages that the code imports, the
-parameters, the content of input files, the keys of the inputs and the random stream. A key does not
-depend on tensors, the number of threads or, except for random nodes, the device.
-"""
+"""Cache key of a result: the digest of everything that determines the result."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import sys
-from collections.abc import Mapping
+import time
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.keys.input_file_digest import file_digest
-from neusee.workflows.keys.written_params import written
+import xxhash
+
+from neusee.workflows.keys.sealed_files import opened
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Step, Wire
     from neusee.workflows.keys.code_digest import Code
+
+
+# --- usual settings -------------------------------------------------------------------------------
+
+# Settings of a new process, from which `loaded_state.settings` tells the differences; torch is
+# not needed.
+
+
+#: settings that only code of a user reads
+OWN_USUAL = {
+    "floating-point errors": "told",
+    "printed numbers": "as NumPy prints",
+    "encoding of texts": "utf-8",
+    "time zone": "UTC",
+    "code at the start of Python": "none",
+}
+#: settings of a new process
+USUAL = {
+    "default dtype": "torch.float32",
+    "default device": "cpu",
+    "matmul precision": "highest",
+    "TF32": "True",
+    "autocast": "off",
+    "numbers below 1e-308": "kept",
+    "assert statements": "run",
+    **OWN_USUAL,
+}
+
+
+# --- module owner ---------------------------------------------------------------------------------
+
+# Whose module is it: one of neusee, whose nodes its own tests prove, or one of the user?
+
+
+PROVEN = ("neusee.",)  #: packages whose nodes are not observed
+
+
+def is_own(module: str) -> bool:
+    """Return True for a module outside of neusee, whose nodes are proven by its own tests."""
+    return not f"{module}.".startswith(PROVEN)
+
+
+# --- written params -------------------------------------------------------------------------------
+
+# What the parameters of an own node say beside their values: names of files, and the order of
+# mappings.
+#
+# The nodes of neusee read the content of a file and the entries of a mapping, so equal ones share
+# results. A node of a user may also read an exposure in ``dark_20ms.npy``, or take the first entry
+# of a mapping.
+
+
+#: parameters of nodes of neusee whose entries count in their order: light meets the first surface
+#: of a lens first
+_ORDERED = frozenset({("flare.stray_light", "surfaces"), ("flare.stray_shares", "surfaces")})
+
+
+def written(step: Step) -> dict[str, Any]:
+    """Return the names of files and the order of mappings in the parameters of an own node, as JSON
+    by parameter.
+
+    Of a node of neusee only the order of a mapping counts, where the node says so.
+    """
+    found: dict[str, Any] = {}
+    own = is_own(step.node.fn.__module__)
+    for name, value in step.params.items():
+        if not own and (step.node.path, name) not in _ORDERED:
+            continue
+        marks = [mark for mark in (step.param_marks.get(name), step.mark) if mark is not None]
+        said = _said(value, [os.path.abspath(mark.folder) for mark in marks])
+        if said is not None:
+            found[name] = said
+    return found
+
+
+def _said(value: Any, folders: list[str]) -> Any:
+    """Return what a value says beside its content, or None if it says nothing."""
+    if isinstance(value, Path):
+        return _name(value, folders)
+    if isinstance(value, Mapping):
+        parts = [[str(key), _said(part, folders)] for key, part in value.items()]
+        return parts if len(parts) > 1 or any(part is not None for _, part in parts) else None
+    if isinstance(value, tuple | list):
+        said = [_said(part, folders) for part in value]
+        return said if any(part is not None for part in said) else None
+    return None
+
+
+def _name(path: Path, folders: list[str]) -> list[str]:
+    """Return the path of a file as a recipe in one of some folders writes it, and the name that
+    links lead to.
+    """
+    full = os.path.abspath(path)
+    folder = next((each for each in folders if _is_in(full, each)), None)
+    real, top = os.path.realpath(full), folder and os.path.realpath(folder)
+    name = Path(os.path.relpath(full, folder) if folder else full).as_posix()
+    target = Path(
+        os.path.relpath(real, top) if top and _is_in(real, top) else os.path.basename(real)
+    ).as_posix()
+    plain = target == (name if top and _is_in(real, top) else os.path.basename(full))
+    return [name] if plain else [name, target]
+
+
+def _is_in(path: str, folder: str) -> bool:
+    return path.startswith(folder.rstrip(os.sep) + os.sep)
+
+
+# --- input file digest ----------------------------------------------------------------------------
+
+# Digest of the content of an input file, which is part of the cache key of each step that reads the
+# file.
+
+
+#: ns after a change of a file in which a second change may not change the time stamp
+_SETTLED = 2_000_000_000
+_TICK = 20_000_000  #: ns, longer than a tick of the clock of a file system
+_TRIES = 3  #: readings of a file that changes while it is read
+_files: dict[tuple[int, ...], str] = {}
+
+#: device, inode, size, and the times (ns) of the last change of content and of the entry
+Stamp = tuple[int, ...]
+
+
+def file_digest(path: Path) -> str:
+    """Return the xxh3 digest of a file; an unchanged file is read only once in a process.
+
+    A file that changed in the last two seconds is read each time, because its time stamp may not
+    show a second change. Raises `OSError` if the file changes each time while it is read.
+    """
+    for _ in range(_TRIES):
+        stamp = _stamp(path)
+        if stamp in _files:
+            return _files[stamp]
+        with opened(path) as file:
+            digits = hashlib.file_digest(file, xxhash.xxh3_128).hexdigest()
+        if _stamp(path) == stamp:
+            if time.time_ns() - max(stamp[-2:]) > _SETTLED:
+                _files[stamp] = digits
+            return digits
+    raise OSError(f"{path} changes while it is read: wait until it is written, and run again")
+
+
+def file_stamps(value: Any) -> list[Stamp]:
+    """Return a stamp of each file in a parameter or a collection of parameters.
+
+    Equal stamps before and after a reading say that the file was not replaced in between, not even
+    by a file that was taken away again. A file that changed in this moment is waited for, because
+    its next change could have its stamp.
+    """
+    stamps = [_stamp(path) for path in files_in(value)]
+    if stamps and time.time_ns() - max(max(stamp[-2:]) for stamp in stamps) < _TICK:
+        time.sleep(_TICK / 1e9)
+    return stamps
+
+
+def files_in(value: Any) -> Iterable[Path]:
+    """Return the files in a parameter or a collection of parameters."""
+    if isinstance(value, Path):
+        return [value]
+    if isinstance(value, Mapping):
+        return [path for part in value.values() for path in files_in(part)]
+    return (
+        [path for part in value for path in files_in(part)]
+        if isinstance(value, tuple | list)
+        else []
+    )
+
+
+def _stamp(path: Path) -> Stamp:
+    stat = os.stat(path)
+    return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
+
+
+# --- cache key ------------------------------------------------------------------------------------
+
+# Cache keys: the key of a result is a digest of everything that determines the result, and of
+# nothing else.
+#
+# A key depends on the node with its code, the versions of the packages that the code imports, the
+# parameters, the content of input files, the keys of the inputs and the random stream. A key does
+# not depend on tensors, the number of threads or, except for random nodes, the device.
+
 
 Key = str
 #: first letters of the key of a result that holds for one process alone and is not stored
@@ -79,7 +258,7 @@ def _network_of(value: Any) -> type[Any] | None:
     """Return the network class that a parameter names, or None for another value, without an
     import of torch.
     """
-    module = sys.modules.get("neusee.nodes.network_classes")  # imported where there is such a value
+    module = sys.modules.get("neusee.nodes.own_modules")  # imported where there is such a value
     return value.network if module and isinstance(value, module.Architecture) else None
 
 

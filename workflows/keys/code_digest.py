@@ -1,64 +1,270 @@
-"""Digests of the code of nodes: what a node's module and all that it imports were loaded from, and
-what they hold.
-
-A digest covers by source each module of `neusee.nodes`, of the user, of an editable install and of
-a package with nodes; other packages by their version; the values of each loaded module; and what
-`depends=` declares. Comments, layout and docstrings that nobody reads do not count. What cannot be
-followed is refused. Loaded code that is not that of its file gives a private digest, whose results
-are not stored.
-
-A file stores the summaries of source files, so that a run from the cache parses no source. The
-files ``code/<digest>.json`` store the digests of single definitions. Cache keys do not need these
-files; reports of changes use them to name the changed function.
-"""
+"""Digests of the code of nodes and of the program, and keys kept from recipe to recipe."""
 
 from __future__ import annotations
 
 import functools
 import os
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import xxhash
 
 from neusee.nodes import Node
-from neusee.workflows.keys.cache_key import PRIVATE, digest, is_private
-from neusee.workflows.keys.code_memo import (
+from neusee.workflows.graph.step_shapes import has_path
+from neusee.workflows.keys.cache_key import (
+    PRIVATE,
+    Key,
+    device_kind,
+    digest,
+    is_own,
+    is_private,
+    key_of,
+)
+from neusee.workflows.keys.loaded_state import (
+    LoadedState,
+    counted_values,
+    own_settings,
+    settings,
+    without_modules,
+    workflows_digest,
+)
+from neusee.workflows.keys.module_digest import (
     EDITION,
+    OURS,
+    Look,
+    Names,
+    Outline,
     Parts,
+    Whole,
+    compiled_as_written,
+    digest_of,
+    imported,
+    installed_look,
     is_complete,
+    outlines,
+    parts_of,
     read_memo,
+    say_once,
+    source_of,
     write_memo,
     write_parts,
 )
-from neusee.workflows.keys.code_objects import PYTHON
-from neusee.workflows.keys.declared_dependencies import (
+from neusee.workflows.keys.module_origin import (
+    Kind,
+    Origin,
+    contents,
+    look_again,
+    module_path,
+    origin_of,
+)
+from neusee.workflows.keys.source_summary import (
+    PYTHON,
+    ROOT,
+    Import,
+    Summary,
+    Use,
+    module_file,
+    reached,
+    read_names,
+    summarise,
+    syntax_outline,
+)
+from neusee.workflows.keys.unfollowed_constructs import UnfollowedCode
+from neusee.workflows.keys.user_code import (
     FREE,
+    Siblings,
     changing_refusal,
+    holds_here_alone,
+    reads_time,
     refusal,
     resolve,
     uncovered,
 )
-from neusee.workflows.keys.followed_imports import Imports
-from neusee.workflows.keys.loaded_source import compiled_as_written, imported, say_once, source_of
-from neusee.workflows.keys.loaded_state import LoadedState, counted_values, without_modules
-from neusee.workflows.keys.module_look import (
-    OURS,
-    Look,
-    Names,
-    Whole,
-    digest_of,
-    installed_look,
-    parts_of,
-)
-from neusee.workflows.keys.module_origin import Origin, look_again, module_path, origin_of
-from neusee.workflows.keys.module_owner import is_own
-from neusee.workflows.keys.process_settings import own_settings, settings, workflows_digest
-from neusee.workflows.keys.reachable_code import reached, read_names
-from neusee.workflows.keys.sibling_modules import Siblings
-from neusee.workflows.keys.source_summary import ROOT, Summary, summarise
-from neusee.workflows.keys.tainted_code import holds_here_alone
-from neusee.workflows.keys.unfollowed_code import UnfollowedCode
-from neusee.workflows.keys.user_code import reads_time
+
+if TYPE_CHECKING:
+    from neusee.workflows.graph.recipe_graph import Step
+
+
+# --- followed imports -----------------------------------------------------------------------------
+
+# Modules that the imports of a module lead to, with the names that are used of each.
+
+
+Lookup = Callable[[str], tuple[Path, Summary] | None]
+
+
+class Imports:
+    """The imports of one module, resolved to modules."""
+
+    def __init__(
+        self, module: str, path: Path, summary_of: Lookup, kind_of: Callable[[str], Kind]
+    ) -> None:
+        self._module, self._path, self._summary_of, self._kind_of = (
+            module,
+            path,
+            summary_of,
+            kind_of,
+        )
+        self._package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+
+    def names(self, summary: Summary) -> dict[str, set[str]]:
+        """Return the imported modules with the names that are used; an empty name stands for the
+        whole module.
+
+        Raises `LookupError` if the package of all nodes is used as a whole.
+        """
+        found: dict[str, set[str]] = {}
+        for item in summary.imports:
+            for module, name in self._imported(item):
+                found.setdefault(module, set()).add(name)
+        for use in summary.uses:
+            used = self._used(use)
+            if used is None and self._module.startswith(ROOT):
+                what = (
+                    "the package of all nodes is used, so the modules that a result depends on are"
+                    " unknown"
+                )
+                raise UnfollowedCode(
+                    f"{self._path}:{use[-1]}: {what}: import each name from its own module"
+                )
+            for module in used or ():
+                found.setdefault(module, set()).add("")
+        return found
+
+    def _imported(self, item: Import) -> Iterator[tuple[str, str]]:
+        """Yield the modules that an import needs: a submodule, or the module that defines the
+        imported name.
+        """
+        level, base, name = item
+        base = absolute(level, base, self._package)
+        if name and name != "*" and self._is_module(base, name):
+            yield f"{base}.{name}", ""
+            inner = self._summary_of(base)
+            if inner is None or name not in inner[1].binds:
+                return
+        yield base, name
+
+    def _used(self, use: Use) -> list[str] | None:
+        """Return the modules in an expression such as ``name.a.b``, or None if it uses all of
+        `neusee.nodes`.
+        """
+        level, base, name, chain, _ = use
+        first = ".".join(filter(None, (absolute(level, base, self._package), name)))
+        modules, rest = [first], chain.split(".") if chain else []
+        while rest and self._is_module(modules[-1], rest[0]):
+            modules.append(f"{modules[-1]}.{rest.pop(0)}")
+        whole = modules[-1] in ("neusee", ROOT) and (not rest or rest[0].startswith("__"))
+        return None if whole else modules[1:]
+
+    def _is_module(self, package: str, name: str) -> bool:
+        """Return True if a package, whose source is followed or which is a folder, has a module
+        of this name.
+        """
+        module = f"{package}.{name}"
+        if module == ROOT:
+            return True
+        inside = package == ROOT or self._kind_of(package) in ("source", "folder")
+        if package in sys.modules and "__path__" not in contents(package):
+            return False
+        return inside and module_path(module) is not None
+
+
+def absolute(level: int, base: str, package: str) -> str:
+    """Return the absolute name of the module ``base`` in a relative import with ``level``
+    leading dots.
+    """
+    if not level:
+        return base
+    above = package.split(".")
+    return ".".join([*above[: len(above) - level + 1], *filter(None, [base])])
+
+
+# --- engine digest --------------------------------------------------------------------------------
+
+# Digest of the program's own code, over given modules and all modules of `neusee.workflows` that
+# they import.
+#
+# The key of a stored study, design or posterior contains this digest, so that changed code never
+# leads to an old result. `code_digest.Code` computes the digests of nodes.
+
+
+_HERE = Path(__file__).parents[1]
+_ROOT = "neusee.workflows"
+
+
+@functools.cache
+def engine(*modules: str) -> str:
+    """Return the digest of the code of some modules of neusee.workflows and of all modules that
+    these import.
+
+    The default module is ``engine.runner``. Only imports of neusee.workflows at the top level of a
+    module count. Raises `LookupError` for a module without a source file.
+    """
+    seen: dict[str, str] = {}
+    todo = list(modules or ("engine.runner",))
+    while todo:
+        name = todo.pop()
+        if name in seen:
+            continue
+        path = _source(name)
+        if path is None:
+            raise LookupError(
+                f"{_ROOT}.{name} has no source file below {_HERE}, so its results have no cache key"
+            )
+        seen[name], imports = outline(path.read_bytes())
+        todo += imported_by_engine(imports)
+    return digest(seen)
+
+
+def outline(source: bytes) -> Outline:
+    """Return the digest of a source file and the import statements at its top level; an equal
+    source is parsed once.
+    """
+    name = f"{PYTHON}:{EDITION}:{xxhash.xxh3_128_hexdigest(source)}"
+    if name not in outlines:
+        outlines[name] = Outline(*syntax_outline(source))
+    return outlines[name]
+
+
+def imported_by_engine(statements: Iterable[tuple[str, list[str]]]) -> Iterator[str]:
+    """Yield the name of each module of neusee.workflows in import statements, such as
+    ``engine.runner``.
+    """
+    for base, names in statements:
+        if not base:
+            yield from (_below(name) for name in names if name.startswith(f"{_ROOT}."))
+        elif f"{base}.".startswith(f"{_ROOT}."):
+            below = _below(base)
+            for name in names:
+                module = f"{below}.{name}".lstrip(".")
+                yield module if _source(module) is not None or not below else below
+
+
+def _below(module: str) -> str:
+    return module.removeprefix(_ROOT).lstrip(".")
+
+
+def _source(name: str) -> Path | None:
+    return module_file(_HERE, name.split("."))
+
+
+# --- code digest ----------------------------------------------------------------------------------
+
+# Digests of the code of nodes: what a node's module and all that it imports were loaded from, and
+# what they hold.
+#
+# A digest covers by source each module of `neusee.nodes`, of the user, of an editable install and
+# of a package with nodes; other packages by their version; the values of each loaded module; and
+# what `depends=` declares. Comments, layout and docstrings that nobody reads do not count. What
+# cannot be followed is refused. Loaded code that is not that of its file gives a private digest,
+# whose results are not stored.
+#
+# A file stores the summaries of source files, so that a run from the cache parses no source. The
+# files ``code/<digest>.json`` store the digests of single definitions. Cache keys do not need these
+# files; reports of changes use them to name the changed function.
+
 
 #: modules that decide no result
 _LEFT_OUT = frozenset(
@@ -394,3 +600,69 @@ def _packages(module: str) -> frozenset[str]:
     and this one.
     """
     return OURS | {module.partition(".")[0]}
+
+
+# --- known keys -----------------------------------------------------------------------------------
+
+# Cache keys of recipes that follow one another, such as the points of a sweep: most steps keep the
+# key they had.
+
+
+class _Known(NamedTuple):
+    """The newest key of a step, with all that the key depends on."""
+
+    step: Step
+    beside: tuple[Any, ...]  #: seed, kind of the device and keys of the inputs
+    key: Key
+    origin: dict[str, Any]
+
+
+class KnownKeys:
+    """The newest cache key of each step; a key is computed again only if something that it depends
+    on has changed.
+
+    The code of nodes counts as it is in ``code``, and files are read again each time.
+    """
+
+    def __init__(self, code: Code) -> None:
+        self.code = code
+        self._newest: dict[str, _Known] = {}
+
+    def of(
+        self, step: Step, keys: Mapping[str, Key], seed: int, device: str
+    ) -> tuple[Key, dict[str, Any]]:
+        """Return the cache key of ``step`` and the data from which the key is computed, as
+        `key_of` does.
+        """
+        beside = (seed, device_kind(device), *(keys[name] for name in step.sources))
+        known = self._newest.get(step.name)
+        if known is not None and known.beside == beside and _is_same(step, known.step):
+            return known.key, known.origin
+        key, origin = key_of(step, keys, seed, self.code, device)
+        if known is not None and known.key == key:
+            key = known.key  # the same object, which saves memory where many points keep their keys
+        if not has_path(step.params):
+            self._newest[step.name] = _Known(step, beside, key, origin)
+        return key, origin
+
+
+def _is_same(step: Step, other: Step) -> bool:
+    """Return True if two steps of one name have the same node, inputs and parameters, to the
+    sign of each zero.
+    """
+    if step is other:
+        return True
+    same = step.node is other.node and step.wires == other.wires and step.cached == other.cached
+    same = same and step.params.keys() == other.params.keys()
+    return same and all(_is_equal(value, other.params[name]) for name, value in step.params.items())
+
+
+def _is_equal(one: Any, other: Any) -> bool:
+    """Return True for the same object, and for numbers and words that are equal and written
+    alike.
+    """
+    if one is other:
+        return True
+    return (
+        type(one) is type(other) and isinstance(one, float | int | str) and repr(one) == repr(other)
+    )

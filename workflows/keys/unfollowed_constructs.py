@@ -1,12 +1,4 @@
-"""Constructs of source code that read what no import shows: files, environment variables, names at
-run time, a clock.
-
-A digest of code does not cover what these constructs read, so a node declares it with ``depends=``.
-Code below ``if __name__ == "__main__"`` and files that are written do not count. A file counts
-unless its path comes from an argument of the function that reads it, because the file of a
-parameter is part of the key, or is that of a temporary file or of an object in memory: what own
-code really opens is observed.
-"""
+"""Constructs of source code that read what no key covers: files, clocks, hash order."""
 
 from __future__ import annotations
 
@@ -15,9 +7,42 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
-from neusee.workflows.keys.local_names import arguments, assigned, dotted, read_by
-from neusee.workflows.keys.scratch_files import Scratch
-from neusee.workflows.keys.syntax_pass import Kinds, Scope, Syntax, each
+from neusee.workflows.keys.source_syntax import (
+    Kinds,
+    NameScope,
+    Scope,
+    Scratch,
+    Syntax,
+    arguments,
+    assigned,
+    dotted,
+    each,
+    last_name,
+    read_by,
+    text_of,
+    texts,
+)
+
+# --- unfollowed code ------------------------------------------------------------------------------
+
+# The error for code that rests on something that a cache key cannot cover.
+
+
+class UnfollowedCode(LookupError):
+    """A node has no cache key; the message has file, line, reason and what to write."""
+
+
+# --- unfollowed constructs ------------------------------------------------------------------------
+
+# Constructs of source code that read what no import shows: files, environment variables, names at
+# run time, a clock.
+#
+# A digest of code does not cover what these constructs read, so a node declares it with
+# ``depends=``. Code below ``if __name__ == "__main__"`` and files that are written do not count. A
+# file counts unless its path comes from an argument of the function that reads it, because the file
+# of a parameter is part of the key, or is that of a temporary file or of an object in memory: what
+# own code really opens is observed.
+
 
 _CLOCK = "a clock, a process or a machine decides"
 _DRAWN = "random numbers without a seed: draw them from a parameter rng"
@@ -322,3 +347,434 @@ def _file_names(kinds: Kinds, scratch: set[int]) -> Iterator[Construct]:
     for item in each(kinds, ast.Constant):
         if _FILE_NAME.fullmatch(text := _literal(item)) and id(item) not in spoken | scratch:
             yield Construct("file", text, repr(text), _FILE, item.lineno)
+
+
+# --- hash order -----------------------------------------------------------------------------------
+
+# Results that the hash seed of a process decides: the order of a set of texts, and ``hash()`` of
+# one.
+#
+# Python draws the seed anew for each process unless ``PYTHONHASHSEED`` gives it. A set is seen by
+# its form: ``{"a", b}``, ``set(x)``, a union of these, and a name that is one of them. Sets of
+# numbers have one order.
+
+
+_WHY = "the hash seed of a process decides"
+_ORDERED = frozenset(
+    {"list", "tuple", "iter", "enumerate", "zip", "map", "filter", "join", "fromkeys", "fromiter"}
+)
+#: functions to which the order is nothing, or no more than rounding
+_UNORDERED = frozenset(
+    {
+        "sorted",
+        "len",
+        "min",
+        "max",
+        "any",
+        "all",
+        "sum",
+        "fsum",
+        "prod",
+        "set",
+        "frozenset",
+        "bool",
+        "isdisjoint",
+    }
+)
+_SETS = ("set", "frozenset", "AbstractSet", "Set", "MutableSet")
+_OF_SETS = ("union", "intersection", "difference", "symmetric_difference", "copy")
+_SCOPES = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Lambda)
+_LISTED = (ast.ListComp, ast.DictComp, ast.GeneratorExp)
+
+
+def orders(tree: ast.Module) -> list[Construct]:
+    """Return each place where a module takes the order of a set, or a hash, that differs between
+    processes.
+    """
+    found = _found(tree, NameScope(tree, None))
+    return [Construct("hash", "", ast.unparse(item)[:60], _WHY, item.lineno) for item in found]
+
+
+def _found(item: ast.AST, scope: NameScope) -> Iterator[ast.expr]:
+    if isinstance(item, _SCOPES):
+        scope = NameScope(item, scope)
+    yield from (each for each in _taken(item, scope) if _is_set(each, scope))
+    if isinstance(item, ast.Call):
+        if _is_hash(item, scope) or (
+            last_name(item.func) == "pop"
+            and not item.args
+            and _of_set(item.func, scope, frozenset())
+        ):
+            yield item
+        if last_name(item.func) in _UNORDERED:
+            yield from (each for argument in item.args for each in _below(argument, scope))
+            return
+    if not (isinstance(item, ast.FunctionDef) and item.name == "__hash__"):
+        for child in ast.iter_child_nodes(item):
+            yield from _found(child, scope)
+
+
+def _below(argument: ast.expr, scope: NameScope) -> Iterator[ast.expr]:
+    """Yield what is found inside of an argument whose own order is nothing."""
+    if isinstance(argument, ast.Call) and last_name(argument.func) in _ORDERED:
+        for part in argument.args:
+            yield from _below(part, scope)
+    elif isinstance(argument, _LISTED):
+        first = argument.generators[0].iter
+        inner = [
+            each for part in argument.generators for each in (part.target, part.iter, *part.ifs)
+        ]
+        values = (
+            [argument.key, argument.value] if isinstance(argument, ast.DictComp) else [argument.elt]
+        )
+        yield from (
+            each for part in (*inner, *values) if part is not first for each in _found(part, scope)
+        )
+    else:
+        for child in ast.iter_child_nodes(argument):
+            yield from _found(child, scope)
+
+
+def _taken(item: ast.AST, scope: NameScope) -> list[ast.expr]:
+    """Return the expressions whose order a statement or an expression takes."""
+    if isinstance(item, ast.For | ast.AsyncFor):
+        return [item.iter]
+    if isinstance(item, _LISTED):
+        return [part.iter for part in item.generators]
+    if isinstance(item, ast.Starred):
+        return [item.value]
+    return [*item.args] if isinstance(item, ast.Call) and last_name(item.func) in _ORDERED else []
+
+
+def _is_hash(call: ast.Call, scope: NameScope) -> bool:
+    """Return True for a call of the builtin ``hash``, or of the method behind it."""
+    if isinstance(call.func, ast.Attribute) and call.func.attr == "__hash__":
+        return True
+    return (
+        isinstance(call.func, ast.Name) and call.func.id == "hash" and scope.holder("hash") is None
+    )
+
+
+def _is_set(item: ast.expr, scope: NameScope, seen: frozenset[str] = frozenset()) -> bool:
+    """Return True for an expression that is a set, and not one of numbers."""
+    if isinstance(item, ast.Set):
+        return not all(
+            isinstance(each, ast.Constant) and isinstance(each.value, int | float)
+            for each in item.elts
+        )
+    if isinstance(item, ast.BinOp) and isinstance(
+        item.op, ast.BitOr | ast.BitAnd | ast.Sub | ast.BitXor
+    ):
+        return _is_set(item.left, scope, seen) or _is_set(item.right, scope, seen)
+    if isinstance(item, ast.Call):
+        made = isinstance(item.func, ast.Name) and item.func.id in ("set", "frozenset")
+        ranged = (
+            bool(item.args)
+            and isinstance(item.args[0], ast.Call)
+            and last_name(item.args[0].func) == "range"
+        )
+        return (made and not ranged) or (
+            last_name(item.func) in _OF_SETS and _of_set(item.func, scope, seen)
+        )
+    if isinstance(item, ast.Name) and item.id not in seen:
+        holder = scope.holder(item.id)
+        values = holder.values.get(item.id, []) if holder is not None else []
+        return holder is not None and any(
+            value is not None and _is_set(value, holder, seen | {item.id}) for value in values
+        )
+    return isinstance(item, ast.SetComp)
+
+
+def _of_set(function: ast.expr, scope: NameScope, seen: frozenset[str]) -> bool:
+    return isinstance(function, ast.Attribute) and _is_set(function.value, scope, seen)
+
+
+# --- facts beside content -------------------------------------------------------------------------
+
+# Facts that no key covers although it covers the file: when it was changed, who may read it, where
+# code stands.
+#
+# The key has the content of a parameter file, and source without its comments, layout and line
+# numbers. Own code that reads what lies beside these is found by the names it uses, also in a text
+# such as ``attrgetter("st_mtime")``.
+
+
+_STAMP = "times, rights and marks of a file are not its content"
+_SOURCE = "comments and numbers of lines of code are read"
+_TIMES_OF_FILES = ("mtime", "ctime", "atime", "birthtime")
+_FIELDS = ("mode", "uid", "gid", "ino", "dev", "nlink")
+_STAMPS = frozenset(
+    {
+        *(f"st_{name}{unit}" for name in _TIMES_OF_FILES for unit in ("", "_ns")),
+        *(f"st_{name}" for name in _FIELDS),
+        *(f"ST_{name.upper()}" for name in (*_TIMES_OF_FILES, *_FIELDS)),
+        *(
+            "getmtime",
+            "getctime",
+            "getatime",
+            "samefile",
+            "sameopenfile",
+            "samestat",
+            "getxattr",
+            "listxattr",
+        ),
+        *("mtime", "date_time", "gettarinfo"),
+        *("is_symlink", "islink", "readlink", "is_mount", "ismount", "is_junction", "isjunction"),
+    }
+)
+_SOURCES = frozenset(
+    {
+        *(
+            "getsource",
+            "getsourcelines",
+            "getsourcefile",
+            "getcomments",
+            "findsource",
+            "getframeinfo",
+        ),
+        *(
+            "getouterframes",
+            "getinnerframes",
+            "f_lineno",
+            "tb_lineno",
+            "co_firstlineno",
+            "co_positions",
+            "co_lines",
+        ),
+        *(
+            "co_linetable",
+            "co_lnotab",
+            "extract_stack",
+            "extract_tb",
+            "walk_stack",
+            "walk_tb",
+            "StackSummary",
+        ),
+        *("findlinestarts", "TracebackException"),
+    }
+)
+_WHY_BESIDE = {
+    **dict.fromkeys(_STAMPS, ("stamp", _STAMP)),
+    **dict.fromkeys(_SOURCES, ("source", _SOURCE)),
+}
+#: names that mean something else in other packages, in full
+_FULL = {
+    **dict.fromkeys(("os.access", "grp", "pwd"), ("stamp", _STAMP)),
+    **dict.fromkeys(
+        ("inspect.stack", "inspect.trace", "tokenize.open", "linecache", "dis"), ("source", _SOURCE)
+    ),
+}
+#: functions whose result has the size of a file, and more
+_STATING = frozenset({"stat", "lstat", "fstat"})
+_SIZE = 6  #: place of the size in such a result
+_TAKING = frozenset(
+    {"tuple", "list", "str", "repr", "hash", "sum", "max", "min", "iter", "map", "zip", "enumerate"}
+)
+
+
+def facts(kinds: Kinds, bound: Mapping[str, str]) -> list[Construct]:
+    """Return each use of a fact beside the content of a file; ``bound`` has the full name of
+    each imported name.
+    """
+    found = [*_by_name(kinds, bound), *_by_text(kinds), *_by_place(kinds), *_of_paths(kinds)]
+    return [Construct(why[0], "", text, why[1], line) for text, why, line in found]
+
+
+_Found = Iterator[tuple[str, tuple[str, str], int]]
+
+
+def _by_name(kinds: Kinds, bound: Mapping[str, str]) -> _Found:
+    for item in each(kinds, ast.Attribute, ast.Name):
+        if isinstance(item.ctx, ast.Load):
+            full = dotted(item, bound)
+            last = (
+                item.attr
+                if isinstance(item, ast.Attribute)
+                else full.rpartition(".")[2]
+                if item.id in bound
+                else ""
+            )
+            why = _WHY_BESIDE.get(last) or (_FULL.get(full) if _is_imported(item, bound) else None)
+            if why is not None:
+                yield last if last in _WHY_BESIDE else full, why, item.lineno
+
+
+def _is_imported(item: ast.expr, bound: Mapping[str, str]) -> bool:
+    while isinstance(item, ast.Attribute):
+        item = item.value
+    return isinstance(item, ast.Name) and item.id in bound
+
+
+def _by_text(kinds: Kinds) -> _Found:
+    """Yield each text that is such a name, or ends with one: ``"__code__.co_firstlineno"``."""
+    for text, line in texts(kinds):
+        last = text.rpartition(".")[2]
+        if last in _WHY_BESIDE:
+            yield last, _WHY_BESIDE[last], line
+
+
+def _by_place(kinds: Kinds) -> _Found:
+    """Yield each use of the result of ``os.stat`` as a row of numbers."""
+    assigned = [item for item in each(kinds, ast.Assign) if _is_stat(item.value, frozenset())]
+    named = frozenset(
+        target.id for item in assigned for target in item.targets if isinstance(target, ast.Name)
+    )
+    rows = [
+        target
+        for item in assigned
+        for target in item.targets
+        if isinstance(target, ast.Tuple | ast.List)
+    ]
+    rows += [
+        item
+        for item in each(kinds, ast.Subscript)
+        if _is_stat(item.value, named)
+        and not (isinstance(item.slice, ast.Constant) and item.slice.value == _SIZE)
+    ]
+    rows += [
+        item for item in each(kinds, ast.Starred, ast.FormattedValue) if _is_stat(item.value, named)
+    ]
+    calls = [call for call in each(kinds, ast.Call) if last_name(call.func) in _TAKING]
+    rows += [call for call in calls if any(_is_stat(argument, named) for argument in call.args)]
+    yield from (("stat", ("stamp", _STAMP), row.lineno) for row in rows)
+
+
+def _is_stat(item: ast.expr, named: frozenset[str]) -> bool:
+    """Return True for a call of ``os.stat`` or ``Path.stat``, or for a name that has its result."""
+    if isinstance(item, ast.Name):
+        return item.id in named
+    return isinstance(item, ast.Call) and last_name(item.func) in _STATING
+
+
+def _of_paths(kinds: Kinds) -> _Found:
+    """Yield ``path.owner()`` and ``path.group()`` of arguments that are paths; a match of a
+    pattern has groups too.
+    """
+    annotated = [item for item in each(kinds, ast.arg) if item.annotation is not None]
+    paths = {
+        item.arg
+        for item in annotated
+        if any(word in ast.unparse(item.annotation) for word in ("Path", "DataFile"))
+    }
+    for item in each(kinds, ast.Attribute):
+        if (
+            item.attr in ("owner", "group")
+            and isinstance(item.value, ast.Name)
+            and item.value.id in paths
+        ):
+            yield item.attr, ("stamp", _STAMP), item.lineno
+
+
+# --- facts of the moment --------------------------------------------------------------------------
+
+# Facts that another moment or machine would change: clocks, addresses, numbers of threads,
+# processors, programs.
+#
+# The kernel hands most of them out without a call that can be watched, and each library has names
+# of its own for them. So own code is searched for the last part of a name, whatever library it is
+# of: ``pandas.Timestamp.now`` as well as ``datetime.now``. ``getattr(time, name)`` is no way around
+# it.
+
+
+_WHY_OF_MOMENT = "a clock, a process or a machine decides"
+_LOOKED_UP = "a name that only a run knows is looked up in a module of Python"
+_LAST = frozenset(
+    {
+        *(
+            "now",
+            "utcnow",
+            "today",
+            "formatdate",
+            "default_timer",
+            "Timer",
+            "timeit",
+            "relativeCreated",
+        ),
+        *(
+            "data_ptr",
+            "get_native_id",
+            "native_id",
+            "sched_getaffinity",
+            "process_cpu_count",
+            "getpriority",
+        ),
+        *("getloadavg", "get_terminal_size", "getswitchinterval", "gettempdir", "gettempdirb"),
+        *("isEnabledFor", "getEffectiveLevel", "makeLogRecord"),
+    }
+)
+_FULL_NAMES_OF_MOMENT = frozenset(
+    {"shutil.which", "os.nice", "os.times", "sys.getrefcount", "sys.getsizeof"}
+)
+#: modules of Python with such facts
+_HOLDING = frozenset(
+    {
+        *(
+            "os",
+            "posix",
+            "nt",
+            "time",
+            "datetime",
+            "sys",
+            "platform",
+            "socket",
+            "threading",
+            "resource",
+            "shutil",
+        ),
+        *("locale", "random", "uuid", "secrets", "getpass", "gc"),
+    }
+)
+#: take a text with a date
+_DATES = frozenset({"datetime64", "Timestamp", "to_datetime", "Time", "DatetimeIndex"})
+_PRESENT = frozenset({"now", "today"})  #: such a text
+
+
+def moments(kinds: Kinds, bound: Mapping[str, str]) -> list[Construct]:
+    """Return each use of a fact of the moment; ``bound`` has the full name of each imported
+    name.
+    """
+    found = [
+        *_moment_by_name(kinds, bound),
+        *_by_date(kinds),
+        *_looked_up(kinds, bound),
+    ]
+    return [Construct("state", "", text, why, line) for text, why, line in found]
+
+
+_MomentFact = Iterator[tuple[str, str, int]]
+
+
+def _moment_by_name(kinds: Kinds, bound: Mapping[str, str]) -> _MomentFact:
+    for item in each(kinds, ast.Attribute, ast.Name):
+        if isinstance(item.ctx, ast.Load) and (isinstance(item, ast.Attribute) or item.id in bound):
+            full = dotted(item, bound) or last_name(item)
+            if full.rpartition(".")[2] in _LAST or full in _FULL_NAMES_OF_MOMENT:
+                yield full, _WHY_OF_MOMENT, item.lineno
+
+
+def _by_date(kinds: Kinds) -> _MomentFact:
+    """Yield ``np.datetime64("now")`` and the like."""
+    for call in each(kinds, ast.Call):
+        if last_name(call.func) in _DATES and any(
+            text_of(argument) in _PRESENT for argument in call.args
+        ):
+            yield ast.unparse(call)[:60], _WHY_OF_MOMENT, call.lineno
+
+
+def _looked_up(kinds: Kinds, bound: Mapping[str, str]) -> _MomentFact:
+    """Yield ``getattr(os, name)``, and ``getattr(os, "envi" + "ron")`` with the reason why that
+    is refused.
+    """
+    for call in each(kinds, ast.Call):
+        if last_name(call.func) != "getattr" or len(call.args) < 2:
+            continue
+        base, name = dotted(call.args[0], bound), text_of(call.args[1])
+        if base.partition(".")[0] not in _HOLDING:
+            continue
+        known = entry_of(f"{base}.{name}") if name else ("state", _LOOKED_UP)
+        if known or name in _LAST:
+            yield (
+                ast.unparse(call)[:60],
+                known[1] if known else _WHY_OF_MOMENT,
+                call.lineno,
+            )

@@ -1,24 +1,311 @@
-"""The code of a step that is not of neusee: its modules, and the files that its key covers."""
+"""Code of the user behind a step: declared dependencies, taints and modules beside it."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from neusee.workflows.keys.cache_key import networks_of
-from neusee.workflows.keys.declared_dependencies import FREE, VARIABLE
-from neusee.workflows.keys.input_file_digest import files_in
-from neusee.workflows.keys.module_owner import is_own
-from neusee.workflows.keys.outward_code import is_calm, outward_names
-from neusee.workflows.keys.reachable_code import written_only
+from neusee.nodes.import_times import import_time
+from neusee.nodes.own_modules import own_modules
+from neusee.workflows.keys.cache_key import digest, file_digest, files_in, is_own, networks_of
+from neusee.workflows.keys.module_digest import Look, Whole, edited_since
+from neusee.workflows.keys.module_origin import origin_of
+from neusee.workflows.keys.source_summary import Reach, is_calm, outward_names, written_only
+from neusee.workflows.keys.unfollowed_constructs import Construct, UnfollowedCode
 
 if TYPE_CHECKING:
     from neusee.nodes import Node
     from neusee.workflows.graph.recipe_graph import Step
     from neusee.workflows.keys.code_digest import Code
-    from neusee.workflows.keys.module_look import Look
+    from neusee.workflows.keys.module_digest import Look
+
+
+# --- declared dependencies ------------------------------------------------------------------------
+
+# Dependencies that a node declares with ``depends=`` or a module with ``__depends__``, and the
+# constructs they cover.
+#
+# An entry is a file or folder beside the module (``table.csv``), ``env:NAME``, the name of a
+# module, or ``unaffected:open``: the author states that no result depends on this construct.
+
+
+FREE = "unaffected:"
+VARIABLE = "env:"
+_FIX = {
+    "file": (
+        'give it as a parameter of type Path, or declare it: depends=["{name}"], beside the module'
+    ),
+    "env": 'make it a parameter, or declare it: depends=["env:{name}"]',
+    "import": 'write the import as a statement, or declare each module: depends=["package.module"]',
+    "run": 'declare the file or the module that it runs: depends=["kernel.cpp"]',
+    "state": "make it a parameter",
+    "stamp": "make it a parameter",
+    "source": 'declare the file of the code, with its comments and lines: depends=["helper.py"]',
+    "hash": "write sorted(...) around the set, or a digest of hashlib",
+}
+_NAME = {"file": "table.csv", "env": "NAME"}
+
+
+class Declared(NamedTuple):
+    """Declared dependencies: the digest of each, by its name, the modules among them, and the
+    changed files.
+    """
+
+    parts: dict[str, dict[str, str]]
+    modules: list[str]
+    changed: list[str]  #: files that were changed after the import of the module that declares them
+
+
+def resolve(
+    entries: Sequence[str],
+    module: str,
+    source: Path,
+    then: Mapping[str, str | None],
+    exists: Callable[[str], bool],
+) -> Declared:
+    """Return the dependencies that a module declares; ``then`` are the variables of the environment
+    at its import.
+
+    Raises `LookupError` for an entry that is neither a file nor a module.
+    """
+    found = Declared({}, [], [])
+    for entry in entries:
+        if entry.startswith(VARIABLE):
+            name = entry.removeprefix(VARIABLE)
+            values = dict.fromkeys([then.get(name, os.environ.get(name)), os.environ.get(name)])
+            found.parts[f"environment variable {name}"] = {"value": digest(*values)[:16]}
+        elif not entry.startswith(FREE):
+            path = source.parent / entry
+            if path.exists():
+                found.parts[f"file {entry}"] = {"content": _content(path)}
+                found.changed.extend([entry] if _changed(path, import_time(module)) else [])
+            elif all(part.isidentifier() for part in entry.split(".")) and exists(entry):
+                found.modules.append(entry)
+            else:
+                text = (
+                    f"{source}: depends={entry!r} is no file in {source.parent} and no module:"
+                    " correct the name"
+                )
+                raise UnfollowedCode(text)
+    return found
+
+
+def uncovered(found: Iterable[Construct], entries: Sequence[str]) -> Construct | None:
+    """Return the first construct that no entry covers, or None."""
+    return next(
+        (item for item in found if not any(_covers(entry, item) for entry in entries)), None
+    )
+
+
+def refusal(item: Construct, source: Path) -> str:
+    """Return the message that refuses a construct: its place, its text, the reason and the fix."""
+    fix = _FIX[item.kind].format(name=item.name or _NAME.get(item.kind, ""))
+    free = (
+        "or, if no result depends on it,"
+        f' depends=["{FREE}{item.text if item.text.isidentifier() else item.kind}"]'
+    )
+    return (
+        f"{source}:{item.line}: {item.text}: {item.why}, and a cache key cannot see it: {fix};"
+        f" {free}"
+    )
+
+
+def changing_refusal(name: str, what: str, source: Path) -> str:
+    """Return the message that refuses a name of a module whose object changes while a process
+    runs, or is not read.
+    """
+    return (
+        f"{source}: {name} is or holds a {what}, and a cache key cannot see it: "
+        "make it inside of the function that uses it; or, if no result depends on it,"
+        f' depends=["{FREE}{name}"]'
+    )
+
+
+def _covers(entry: str, item: Construct) -> bool:
+    if entry.startswith(FREE):
+        free = entry.removeprefix(FREE)
+        named = (item.kind, item.name, PurePath(item.name).name, item.text)
+        return free in named or item.text.startswith((f"{free}.", f"{free}("))
+    if entry.startswith(VARIABLE):
+        return item.kind == "env" and item.name in ("", entry.removeprefix(VARIABLE))
+    if item.kind == "file":
+        return (
+            not item.name
+            or not PurePath(entry).suffix
+            or PurePath(entry).name == PurePath(item.name).name
+        )
+    if item.kind == "source":
+        return PurePath(entry).suffix == ".py"
+    return item.kind in ("run", "import")
+
+
+def _content(path: Path) -> str:
+    """Return the digest of a file, or of all files of a folder with their names."""
+    if not path.is_dir():
+        return file_digest(path)
+    files = sorted(
+        file for file in path.rglob("*") if file.is_file() and "__pycache__" not in file.parts
+    )
+    return digest([[file.relative_to(path).as_posix(), file_digest(file)] for file in files])
+
+
+def _changed(path: Path, since: int) -> bool:
+    """Return True if a file, or anything in a folder, was changed after a time (ns)."""
+    inside = path.rglob("*") if path.is_dir() else ()
+    return any(os.stat(file).st_ctime_ns > since for file in (path, *inside))
+
+
+# --- tainted code ---------------------------------------------------------------------------------
+
+# Own code that was seen to reach what its key does not cover: its results hold for this process
+# alone.
+#
+# What a module has read stays with it, in a memo or in a variable, where no later call can be seen
+# to read it again. Therefore a taint stays until the process ends, for all code that uses one of
+# the tainted modules.
+
+
+_taints: dict[str, tuple[Any, ...]] = {}  #: by module, what it reached: `observation.taints.Taint`
+#: modules whose taint the run may not know yet, since it looks at results one by one
+_held_back: set[str] = set()
+
+
+def hold_back(modules: Iterable[str]) -> None:
+    """Let no result of own modules be stored from now on: one of their steps was just seen to
+    reach too much.
+    """
+    _held_back.update(modules)
+
+
+def may_be_stored(modules: Iterable[str]) -> bool:
+    """Return True if no step that was seen to reach too much has ended while one of these
+    modules computed.
+    """
+    return _held_back.isdisjoint(modules)
+
+
+def taint_code(modules: Iterable[str], taints: tuple[Any, ...]) -> bool:
+    """Mark own modules as code whose results no other process may use; return True if one was
+    not marked before.
+    """
+    new = [module for module in modules if module not in _taints]
+    _taints.update(dict.fromkeys(new, taints))
+    return bool(new)
+
+
+def taints_of(modules: Iterable[str]) -> tuple[Any, ...]:
+    """Return what modules have reached in this process although their keys do not cover it."""
+    return tuple(dict.fromkeys(taint for module in modules for taint in _taints.get(module, ())))
+
+
+def holds_here_alone(module: str) -> bool:
+    """Return True if no other process may use what a module computes: its file was edited, or it
+    is tainted.
+    """
+    return edited_since(module) or module in _taints
+
+
+# --- sibling modules ------------------------------------------------------------------------------
+
+# Modules of a user beside those of a node: which of them may change what the node computes?
+#
+# All files under ``nodes:`` of a recipe are loaded into one process. A file that patches a library
+# changes every result of the process, also those of neusee's own nodes; one that fills a registry
+# or derives a class changes results of other own nodes. Such a file joins their keys. A file that
+# changes nothing beyond itself joins no other key.
+
+
+Scope = Literal["nothing", "own", "all"]  #: nodes whose results a module may change
+_GETTER = re.compile(r"get|current|default|instance|global|regist|shared|root", re.IGNORECASE)
+_UNSEEN = ("run", "import")  #: kinds of constructs whose code nobody knows
+
+
+class Siblings:
+    """The own modules of this process, and which of them join the key of a node."""
+
+    def __init__(self, whole_of: Callable[[str], Whole]) -> None:
+        self._whole_of = whole_of
+        self._scopes: dict[str, Scope] = {}
+
+    def of(self, roots: Sequence[str]) -> list[str]:
+        """Return the own modules that may change what the code of ``roots`` computes, in the order
+        of their import.
+
+        Raises `LookupError` for a module that cannot be followed.
+        """
+        others = own_modules()
+        if not others:
+            return []
+        followed = {
+            name: look for root in roots for name, look in self._whole_of(root).looks.items()
+        }
+        mine = _own(followed)
+        beside = [name for name in others if name not in followed]
+        return [name for name in beside if self._joins(name, mine, any(map(is_own, roots)))]
+
+    def _joins(self, module: str, mine: Mapping[str, Reach], own: bool) -> bool:
+        scope = self._scope_of(module)
+        if scope == "all" or not own:
+            return scope == "all"
+        shared = _own(self._whole_of(module).looks).keys() & mine.keys()
+        changed = any(mine[name].inward for name in shared)
+        return scope == "own" or changed or any(reach.seeks for reach in mine.values())
+
+    def _scope_of(self, module: str) -> Scope:
+        if module not in self._scopes:
+            self._scopes[module] = _scope(self._whole_of(module).looks)
+        return self._scopes[module]
+
+
+def _scope(looks: Mapping[str, Look]) -> Scope:
+    """Return whose results the code of a module and of its helpers may change."""
+    reaches = _own(looks).values()
+    names = outward_names(reaches)
+    names |= {name for reach in reaches for name in reach.unused if _kind(name) == "distribution"}
+    summaries = [look.summary for name, look in looks.items() if is_own(name) and look.summary]
+    unseen = any(each.kind in _UNSEEN for summary in summaries for each in summary.constructs)
+    own = {name for name in names if _is_of_user(name)}
+    if unseen or any(_is_shared(name) for name in names - own):
+        return "all"
+    return "own" if own else "nothing"
+
+
+def _own(looks: Mapping[str, Look]) -> dict[str, Reach]:
+    """Return what the modules of a user reach, by name."""
+    return {
+        name: look.summary.reach for name, look in looks.items() if is_own(name) and look.summary
+    }
+
+
+def _is_of_user(name: str) -> bool:
+    """Return True if a full name is that of something in a module of a user."""
+    return name.startswith(".") or (
+        _kind(name) in ("source", "folder") and is_own(name.partition(".")[0])
+    )
+
+
+def _is_shared(name: str) -> bool:
+    """Return True for something of a library that others see: not for the result of a call, such
+    as an open file.
+    """
+    called, found, _ = name.rpartition("()")
+    return not found or _GETTER.search(called.rpartition(".")[2]) is not None
+
+
+def _kind(name: str) -> str:
+    return (
+        origin_of(name.partition(".")[0], frozenset()).kind if name.partition(".")[0] else "nowhere"
+    )
+
+
+# --- user code ------------------------------------------------------------------------------------
+
+# The code of a step that is not of neusee: its modules, and the files that its key covers.
+
 
 _TIMED = frozenset({"datetime", "time", "calendar", "email", "zoneinfo", "sqlite3", "logging"})
 

@@ -16,7 +16,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import neusee.nodes
-from neusee.workflows.keys.regular_file import bytes_of
+from neusee.workflows.keys.sealed_files import bytes_of
 
 #: folders and files of the system that a library reads on its own, with the reason why no result
 #: depends on them

@@ -22,10 +22,18 @@ import select
 import signal
 import socket
 
-from neusee.workflows.observation.recorded_call import Record, recorded, without_reading
-from neusee.workflows.observation.stopped_task import Task
-from neusee.workflows.observation.system_calls import Call, audit_arch, machine, numbers
-from neusee.workflows.observation.trusted_tasks import MARKS, TrustedTasks
+from neusee.workflows.observation.system_calls import (
+    MARKS,
+    Call,
+    Record,
+    Task,
+    TrustedTasks,
+    audit_arch,
+    machine,
+    numbers,
+    recorded,
+    without_reading,
+)
 
 SECCOMP_USER_NOTIF_FLAG_CONTINUE = 1
 SECCOMP_IOCTL_NOTIF_RECV, SECCOMP_IOCTL_NOTIF_SEND = 0xC0502100, 0xC0182101

@@ -29,7 +29,7 @@ from typing import Any
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, nearest
 from neusee.workflows.placement.tasks_and_devices import BUS, Cluster, Device, Link
 from neusee.workflows.recipe.text.yaml_values import Value, kind, read
-from neusee.workflows.store.byte_sizes import UNITS
+from neusee.workflows.store.cache_settings import UNITS
 
 _KINDS = ("cpu", "cuda", "mps")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}

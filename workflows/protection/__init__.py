@@ -2,6 +2,6 @@
 picture?
 
 Measures of the picture behind each of them, for a quiet frame and under attack, each computed once.
-Offers: `camera_parts.ProtectionCamera`, `equal_rivals.Rival`,
+Offers: `protection_camera.ProtectionCamera`, `equal_rivals.Rival`,
         `protection_result.measure_protection`.
 """

@@ -14,7 +14,6 @@ import torch
 
 from neusee.nodes import metrics
 from neusee.nodes.metrics import PixelNoise, attacked_picture, largest_glare
-from neusee.workflows.protection.camera_parts import refuse_no_mask
 from neusee.workflows.protection.equal_rivals import (
     Candidate,
     Rival,
@@ -24,7 +23,7 @@ from neusee.workflows.protection.equal_rivals import (
     neq_curve,
     quiet_picture,
 )
-from neusee.workflows.protection.front_optics import Front, FrontBench
+from neusee.workflows.protection.protection_camera import Front, FrontBench, refuse_no_mask
 from neusee.workflows.protection.unknown_conditions import Condition, usual_condition
 
 LIGHTS = (10.0, 30.0, 100.0, 300.0, 1e3, 3e3, 1e4)  #: e- a pixel

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
 from neusee.workflows.recipe.distributions.law_text import read_law
-from neusee.workflows.recipe.distributions.scalar import draw_laws
+from neusee.workflows.recipe.distributions.shapes import draw_laws
 
 _MOST_SCATTER = 0.99  #: share of the light; a lens that scatters all light has no picture
 

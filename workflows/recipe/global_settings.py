@@ -1,18 +1,118 @@
-"""Global settings of a recipe: outputs, seed, tolerance, and the numbers that a run is expected
-to give.
-"""
+"""Global settings of a recipe: outputs, seed, tolerance, exports, expected numbers."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any
 
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
-from neusee.workflows.graph.recipe_graph import Expectation
+from neusee.workflows.graph.recipe_graph import Expectation, Recipe, needed
+from neusee.workflows.recipe.steps import Wiring
 from neusee.workflows.recipe.text.references import BROKEN, References, Scope
 from neusee.workflows.recipe.text.yaml_values import Value, kind
-from neusee.workflows.recipe.wiring import Wiring
+
+# --- expected numbers -----------------------------------------------------------------------------
+
+# Selection of the expected numbers of a recipe that remain valid after the user's changes.
+
+
+def unaffected_expectations(recipe: Recipe, written: Recipe | None) -> Recipe:
+    """Return a recipe without the expected numbers that are affected by the user's changes to
+    ``written``.
+
+    None for ``written`` means that the recipe is not valid without the changes, so that the changes
+    affect everything.
+    """
+    same: set[str] = set()
+    for name in needed(recipe, recipe.steps) if written else ():
+        if (
+            written
+            and same.issuperset(recipe.steps[name].sources)
+            and _alike(recipe, written, name)
+        ):
+            same.add(name)
+    lost = [
+        e for e in recipe.expect if (written is None or e in written.expect) and e.step not in same
+    ]
+    if not lost:
+        return recipe
+    note = (
+        "not compared, because your changes affect these numbers:"
+        f" {', '.join(e.name for e in lost)}"
+    )
+    kept = tuple(e for e in recipe.expect if e not in lost)
+    return replace(recipe, expect=kept, notes=(*recipe.notes, note))
+
+
+def _alike(recipe: Recipe, written: Recipe, name: str) -> bool:
+    one, other = recipe.steps[name], written.steps.get(name)
+    if other is None or (one.node.random and recipe.seed != written.seed):
+        return False
+    return (one.node, one.params, one.wires) == (other.node, other.params, other.wires)
+
+
+# --- exported files -------------------------------------------------------------------------------
+
+# Data files that a run writes: the key ``exports`` of a recipe, with the names of the files.
+
+
+KEY, ALL, NONE, HALF = "exports", "all", "none", "@half"
+#: files of the folder ``data`` of a run; `report.contents` says what each of them has
+NAMES = (
+    "radiance.exr",
+    "psf_plain.exr",
+    "psf_mask.exr",
+    "raw_plain.png",
+    "raw_mask.png",
+    "raw_plain.exr",
+    "raw_mask.exr",
+    "restored.exr",
+    "restored.png",
+    "restored_spread.exr",
+    "invented.png",
+    "outputs.safetensors",
+)
+
+
+def exports_of(root: Value, wiring: Wiring) -> dict[str, bool] | None:
+    """Return the names of the data files that a run writes, with True for half floats; None for
+    all files.
+    """
+    given = root.items.get(KEY)
+    if given is None:
+        return None
+    values = given.data if isinstance(given.data, list) else [given]
+    words = [wiring.references.resolve(value, Scope({}, KEY)) for value in values]
+    if not isinstance(given.data, list) and words[0].data in (None, ALL, NONE):
+        return {} if words[0].data == NONE else None
+    return dict(_named(words, wiring))
+
+
+def _named(words: list[Value], wiring: Wiring) -> Iterator[tuple[str, bool]]:
+    for word in words:
+        name = str(word.data).removesuffix(HALF)
+        half = str(word.data) != name
+        if word.data is BROKEN:
+            continue
+        if name not in NAMES:
+            text = (
+                f"no file of a run; {nearest(name, NAMES)}: write {ALL}, {NONE} or a list of names"
+            )
+            wiring.refuse(word, f"{KEY} = {word.data}", text)
+        elif half and not name.endswith(".exr"):
+            wiring.refuse(word, f"{KEY} = {word.data}", "only an .exr file can have half floats")
+        else:
+            yield name, half
+
+
+# --- global settings ------------------------------------------------------------------------------
+
+# Global settings of a recipe: outputs, seed, tolerance, and the numbers that a run is expected to
+# give.
+
 
 _EXPECTED = ("step", "at", "value", "rtol")
 #: key of a recipe, false if only proved errors may count towards the tolerance

@@ -1,46 +1,58 @@
-"""Loading of a recipe from its name or file and from arguments, with a check that reports all
-mistakes at once.
-"""
+"""Loading of a recipe from its name or file and arguments; all mistakes are told at once."""
 
 from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError, visible
-from neusee.workflows.graph.final_values import Config
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, visible
+from neusee.workflows.graph.final_values import Config, Setting, changes
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.keys.regular_file import head_of
-from neusee.workflows.recipe.bound_steps import Attempt
-from neusee.workflows.recipe.distributions.mismatch_laws import read_mismatch
+from neusee.workflows.keys.sealed_files import head_of
+from neusee.workflows.recipe.distributions.law_text import read_mismatch
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
-from neusee.workflows.recipe.expected_numbers import unaffected_expectations
-from neusee.workflows.recipe.exported_files import exports_of
 from neusee.workflows.recipe.global_settings import (
     estimates_of,
     expectations,
+    exports_of,
     outputs_of,
     seed_and_tolerance,
+    unaffected_expectations,
 )
-from neusee.workflows.recipe.graph_cache import CachedGraph, cache_graph, cached_graph
-from neusee.workflows.recipe.known_before_run import CheckedStep, check_steps, refuse_indices
-from neusee.workflows.recipe.node_families import NO_FAMILY, Own, class_context
-from neusee.workflows.recipe.other_cameras import with_cameras
-from neusee.workflows.recipe.own_families import KEY, OwnFamilies, read_own_families
-from neusee.workflows.recipe.parameters import Checker
-from neusee.workflows.recipe.recipe_settings import final_values, settings_of
-from neusee.workflows.recipe.step_declarations import Declared, cached_of, declare, device_of
-from neusee.workflows.recipe.text.composition import Composed, compose
-from neusee.workflows.recipe.text.option_groups import groups_of, shared_folders
-from neusee.workflows.recipe.text.overrides import Override
-from neusee.workflows.recipe.text.python_overrides import overrides_of
+from neusee.workflows.recipe.node_families import (
+    KEY,
+    NO_FAMILY,
+    Own,
+    OwnFamilies,
+    class_context,
+    read_own_families,
+)
+from neusee.workflows.recipe.step_checks import (
+    Attempt,
+    CachedGraph,
+    CheckedStep,
+    Checker,
+    GraphMemory,
+    cache_graph,
+    cached_graph,
+    check_steps,
+    refuse_indices,
+)
+from neusee.workflows.recipe.steps import Declared, Wiring, cached_of, cycles, declare, device_of
+from neusee.workflows.recipe.text.composition import Composed, compose, groups_of, shared_folders
+from neusee.workflows.recipe.text.overrides import (
+    Override,
+    arguments_in,
+    overrides_of,
+    read_override,
+)
 from neusee.workflows.recipe.text.references import References
 from neusee.workflows.recipe.text.yaml_values import Value, Where
-from neusee.workflows.recipe.wiring import Wiring, cycles
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -48,8 +60,128 @@ if TYPE_CHECKING:
     from neusee.nodes.calibrate import Traceability
     from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
     from neusee.workflows.recipe.blocks.safety_block import Safety
-    from neusee.workflows.recipe.blocks.train_block import Training
-    from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
+    from neusee.workflows.recipe.blocks.train_block import LiftTraining, Training
+
+
+# --- other cameras --------------------------------------------------------------------------------
+
+# The other cameras of a training: the same recipe, each time with other overrides.
+
+
+_TRAIN, _CAMERAS = "train", "train.cameras"
+
+
+def with_cameras(
+    recipe: Recipe, composed: Composed, made: Callable[[Sequence[Override]], Recipe]
+) -> Recipe:
+    """Return a recipe with the recipes of `train.cameras`, which ``made`` loads with the overrides
+    of each.
+
+    The final values state each camera by the values that differ, so that their text needs no groups
+    of options. Raises `RecipeError` with the location of an override, also for one that changes the
+    training.
+    """
+    given = composed.root.items[_TRAIN].items["cameras"]
+    cameras = tuple(
+        made([_override("train.cameras=[]", given), *_overrides(each)])
+        for each in given.items.values()
+    )
+    settings = dict(recipe.config.settings)
+    stated = [changes(recipe.config, camera.config, _TRAIN) for camera in cameras]
+    settings[_CAMERAS] = replace(settings[_CAMERAS], value=stated)
+    return replace(recipe, cameras=cameras, config=Config(settings))
+
+
+def _overrides(camera: Value) -> list[Override]:
+    found = [_override(str(value.plain), value) for value in camera.items.values()]
+    if wrong := [o for o in found if o.path[0] == _TRAIN]:
+        raise RecipeError(
+            Diagnostic(o.mark, camera.name, f"{o.text} is no setting of a camera") for o in wrong
+        )
+    return found
+
+
+def _override(text: str, value: Value) -> Override:
+    return read_override(text, Location(str(value.mark), folder=value.mark.folder))
+
+
+# --- recipe settings ------------------------------------------------------------------------------
+
+# Final values of a checked recipe: those that it writes, and the default values of the nodes of its
+# steps.
+
+
+def final_values(
+    wiring: Wiring,
+    bound: dict[str, Step],
+    checker: Checker,
+    uncertain: Uncertain | None,
+    memory: GraphMemory | None,
+) -> dict[str, Setting]:
+    """Return the final values of a recipe by path: the written values and the default values of
+    the steps' nodes.
+    """
+    settings: dict[str, Setting] = {}
+    spare = wiring.references.spare
+    for key, block in wiring.root.items.items():
+        if key != "steps":
+            found = _block_settings(block, checker, memory)
+            settings |= {name: value for name, value in found.items() if value.path not in spare}
+            continue
+        for name, step in block.items.items():
+            settings |= _block_settings(step, checker, memory)
+            if str(name) in wiring.steps:
+                settings |= _defaults(wiring.steps[str(name)], bound)
+    for name, law in uncertain.laws.items() if uncertain else ():
+        if name in settings:
+            settings[name] = replace(settings[name], value=law.full_text)
+    return settings
+
+
+def _block_settings(
+    block: Value, checker: Checker, memory: GraphMemory | None
+) -> dict[str, Setting]:
+    """Return the final values of a block by path, those of an earlier check if the block is the
+    same object.
+    """
+    known = memory.settings.get(block.path) if memory else None
+    same = known is not None and known[0] is block
+    found = known[1] if known and same else dict(settings_of([block], checker))
+    # paths of files may differ
+    if any(setting.path in checker.files for setting in found.values()):
+        return dict(settings_of([block], checker))
+    if memory and not same:
+        memory.settings[block.path] = block, found
+    return found
+
+
+def settings_of(blocks: Iterable[Value], checker: Checker) -> Iterator[tuple[str, Setting]]:
+    """Yield the values that blocks of a recipe write, each with its path."""
+    for leaf in (leaf for block in blocks for leaf in block.leaves()):
+        value: Any = checker.files.get(leaf.path, leaf.plain)
+        sources = dict.fromkeys(map(str, (leaf.mark, *arguments_in(leaf))))
+        yield leaf.name, Setting(value, ", ".join(sources), leaf.path)
+
+
+def _defaults(step: Declared, bound: dict[str, Step]) -> Iterator[tuple[str, Setting]]:
+    """Yield the parameters of a step that the recipe does not set, with the default values in
+    SI.
+    """
+    first = bound.get(step.instances[0]) if step.instances else None
+    for name, value in (first.params if first else {}).items():
+        if first and name not in first.param_marks:
+            path = (*step.value.path, "with", name)
+            yield (
+                ".".join(map(str, path)),
+                Setting(value, f"default of {first.node.path}", path, True),
+            )
+
+
+# --- loading --------------------------------------------------------------------------------------
+
+# Loading of a recipe from its name or file and from arguments, with a check that reports all
+# mistakes at once.
+
 
 TRACED = "traceability"  #: key of the block in which a laboratory states its light and temperature
 BLOCKS = ("train", "train_lift", "evaluate", TRACED)  #: keys of the blocks of settings in a recipe
@@ -133,8 +265,7 @@ def _settings_blocks(
     their models.
     """
     from neusee.workflows.recipe.blocks.evaluate_block import read_evaluate
-    from neusee.workflows.recipe.blocks.train_block import read_training
-    from neusee.workflows.recipe.blocks.train_lift_block import read_lift_training
+    from neusee.workflows.recipe.blocks.train_block import read_lift_training, read_training
 
     composed, training = read_training(composed, class_context(modules))
     composed, lifting = read_lift_training(composed)
@@ -359,3 +490,33 @@ _TITLE = 4096  #: bytes of the first line of a recipe, at most
 def _titled(path: Path) -> Titled:
     first = head_of(path, _TITLE).decode("utf-8", "replace").partition("\n")[0].strip()
     return Titled(path.stem, visible(first.lstrip("# ")) if first.startswith("#") else "")
+
+
+# --- changed recipe -------------------------------------------------------------------------------
+
+# Changes of a loaded recipe: its final values are written to a file, changed by overrides and
+# checked again.
+
+
+def changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
+    """Return a loaded recipe with values changed by ``overrides``; raise `RecipeError` for an
+    invalid value.
+    """
+    with TemporaryDirectory(prefix="neusee-") as folder:
+        path = Path(folder) / "recipe.yaml"
+        path.write_text(recipe.config.to_yaml(), encoding="utf-8")
+        loaded = load(path, overrides)
+    loaded = replace(
+        loaded,
+        name=recipe.name,
+        title=recipe.title,
+        seed=recipe.seed,
+        outputs=recipe.outputs,
+        expect=(),
+    )
+    return replace(
+        loaded,
+        tolerance=recipe.tolerance,
+        exact=recipe.exact,
+        estimates=recipe.estimates and loaded.estimates,
+    )

@@ -1,10 +1,4 @@
-"""Families of nodes, such as ``optics``: those of neusee, of installed packages, and of files that
-a recipe names.
-
-A package installs a family by an entry point of the group ``neusee.nodes``. A family of a package
-is imported when a recipe uses it or when all are listed, so that a broken package breaks no other
-recipe.
-"""
+"""Families of nodes, such as optics: of neusee, of packages, and of files a recipe names."""
 
 from __future__ import annotations
 
@@ -12,11 +6,13 @@ import functools
 import importlib
 import importlib.util
 import inspect
+import os
 import pkgutil
 import re
 import sys
 import traceback
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -24,10 +20,21 @@ from typing import Any
 
 import neusee.nodes
 from neusee.nodes import Node
-from neusee.nodes.network_classes import FAMILY, network_classes
-from neusee.nodes.own_modules import import_file, note_module
-from neusee.workflows.graph.diagnostics import nearest
+from neusee.nodes.own_modules import FAMILY, import_file, network_classes, note_module
+from neusee.workflows.graph.diagnostics import Diagnostic, nearest
+from neusee.workflows.recipe.text.composition import NO_CODE_VARIABLE, is_strange
 from neusee.workflows.recipe.text.renamed_keys import instead
+from neusee.workflows.recipe.text.yaml_values import Value, kind
+
+# --- node families --------------------------------------------------------------------------------
+
+# Families of nodes, such as ``optics``: those of neusee, of installed packages, and of files that a
+# recipe names.
+#
+# A package installs a family by an entry point of the group ``neusee.nodes``. A family of a package
+# is imported when a recipe uses it or when all are listed, so that a broken package breaks no other
+# recipe.
+
 
 GROUP = "neusee.nodes"  #: group of the entry points by which packages install families of nodes
 
@@ -181,7 +188,7 @@ def import_own(where: str, folder: Path) -> ModuleType:
 
     Raises `LookupError` with place and cause.
     """
-    from neusee.workflows.observation.own_import import import_observed  # imports torch
+    from neusee.workflows.observation.observed_call import import_observed  # imports torch
 
     is_path = where.endswith(".py") or "/" in where or "\\" in where or where in (".", "..")
     path = Path(folder, where).expanduser()
@@ -307,3 +314,94 @@ def _elsewhere(attribute: str, own: Own) -> str:
     """Return a hint with the nodes of other families that have the name of an unknown node."""
     names = [name for name, _ in all_nodes(own) if name.partition(".")[2] == attribute]
     return f"did you mean {' or '.join(names)}?" if names else ""
+
+
+# --- own families ---------------------------------------------------------------------------------
+
+# The list ``nodes`` of a recipe: the files, folders and packages with the user's own families of
+# nodes.
+
+
+KEY = "nodes"
+_FORM = "must be a file, a folder or a module, such as bloom.py, or `family: module`"
+
+
+@dataclass
+class OwnFamilies:
+    """The families of nodes that a recipe names."""
+
+    modules: dict[str, ModuleType] = field(default_factory=dict)  #: by family
+    places: list[Any] = field(default_factory=list)  #: the entries, with the full path of each file
+    notes: list[str] = field(default_factory=list)
+    is_whole: bool = True  #: whether every family could be read
+
+
+def read_own_families(root: Value, diagnostics: list[Diagnostic]) -> OwnFamilies:
+    """Import what the list ``nodes`` of a recipe names, and return the families; report each
+    mistake at its entry.
+
+    Importing runs the code. The variable ``NEUSEE_NO_CODE`` refuses that.
+    """
+    found = OwnFamilies()
+    given = root.items.get(KEY)
+    if given is None or given.data is None:
+        return found
+    if not isinstance(given.data, list):
+        diagnostics.append(
+            Diagnostic(given.mark, KEY, f"must be a list of files and modules, not {kind(given)}")
+        )
+        found.is_whole = False
+        return found
+    before = len(diagnostics)
+    for entry in given.data:
+        pair = _pair(entry)
+        if pair is None:
+            diagnostics.append(Diagnostic(entry.mark, entry.name, _FORM))
+            continue
+        if is_strange():
+            message = f"names code, which {NO_CODE_VARIABLE} or --no-code refuses to run"
+            diagnostics.append(Diagnostic(entry.mark, f"{entry.name} = {pair[1].data}", message))
+            continue
+        try:
+            _add(found, *pair)
+        except LookupError as error:
+            diagnostics.append(
+                Diagnostic(entry.mark, f"{entry.name} = {pair[1].data}", str(error.args[0]))
+            )
+    found.is_whole = len(diagnostics) == before
+    if found.modules:
+        names = ", ".join(
+            str(getattr(module, "__file__", module)) for module in found.modules.values()
+        )
+        found.notes.append(f"reading this recipe ran code: {names}")
+    return found
+
+
+def _pair(entry: Value) -> tuple[str, Value] | None:
+    """Return the family, or an empty text, and the place of an entry, or None for another form."""
+    if isinstance(entry.data, str):
+        return "", entry
+    pair = list(entry.items.items()) if isinstance(entry.data, dict) else []
+    if len(pair) == 1 and isinstance(pair[0][1].data, str) and str(pair[0][0]).isidentifier():
+        return str(pair[0][0]), pair[0][1]
+    return None
+
+
+def _add(found: OwnFamilies, family: str, where: Value) -> None:
+    """Import one entry; raise `LookupError` if that fails or if its family has the name of
+    another one.
+    """
+    folder = Path(where.mark.folder)
+    module = import_own(str(where.data), folder)
+    name = family or module.__name__.rpartition(".")[2]
+    if found.modules.get(name) is module:
+        return
+    if name in found.modules or is_known(name):
+        other = getattr(found.modules.get(name), "__file__", "neusee or an installed package")
+        text = f"a family of nodes {name} is there already, of {other}"
+        raise LookupError(f"{text}: name yours, as in `nodes: [my_{name}: {where.data}]`")
+    own_nodes(name, module)
+    found.modules[name] = module
+    full = folder / str(where.data)
+    place = os.path.abspath(full) if full.exists() else str(where.data)
+    found.places.append({family: place} if family else place)

@@ -16,7 +16,7 @@ from neusee.workflows.report import result_numbers
 from neusee.workflows.report.contents import BANDS, FIGURES, LINES, TABLE, wanted
 from neusee.workflows.report.result_numbers import metrics_of, table
 from neusee.workflows.report.study_page import filled
-from neusee.workflows.report.text_table import by_family
+from neusee.workflows.report.terminal_text import by_family
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -207,7 +207,7 @@ def _pictures(values: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Encode the truth, raw and restored pictures of a run as PNG, or up to four other images if
     one is missing.
     """
-    from neusee.workflows.report.figures.camera_overview import centre, high
+    from neusee.workflows.report.figures.camera_pictures import centre, high
 
     needs = _of_overview()
     if all(need in values for need in FIGURES[0].needs.values() if not need.startswith("?")):

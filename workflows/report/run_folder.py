@@ -1,23 +1,35 @@
-"""The folder of a run, which gets its final name when all files are written, and the link
-``latest`` to this folder.
-"""
+"""The folder of a run: its final name, ``latest``, ``code.json``, and the HTML page."""
 
 from __future__ import annotations
 
+import base64
 import csv
+import json
 import os
 import shutil
+import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from datetime import date
+from datetime import date, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.keys.regular_file import head_of
-from neusee.workflows.report.run_crate import write_crate
+from neusee.workflows.keys.sealed_files import bytes_of, head_of, text_of
+from neusee.workflows.report.run_crate import remove_crate, restore_crate, write_crate
+from neusee.workflows.report.study_page import compiled, filled
+
+if TYPE_CHECKING:
+    from neusee.workflows.engine.runner import Result
+
+
+# --- run folder -----------------------------------------------------------------------------------
+
+# The folder of a run, which gets its final name when all files are written, and the link ``latest``
+# to this folder.
+
 
 _NAME = 4096  #: bytes of the name of a folder, at most
 _OTHER_FOLDER = "name another folder with --out"
@@ -214,3 +226,90 @@ def _plain(cell: Any) -> Any:
     options decide.
     """
     return cell.item() if hasattr(cell, "dtype") and not cell.ndim else cell
+
+
+# --- run code -------------------------------------------------------------------------------------
+
+# The file ``code.json`` in the folder of a run: digests of the code of each node, and of all that
+# the code uses.
+
+
+CODE = "code.json"
+
+
+def code_text(result: Result) -> str:
+    """Return the digests of code of a run as JSON text with one line for each node and each module.
+
+    ``nodes`` has the digest of each node with all that it uses; ``parts`` has, for each module, the
+    digest of every function, class and constant, and for each package its version.
+    """
+    origins = [result.origins[key] for key in result.keys.values() if key in result.origins]
+    nodes = {origin["node"]: origin["code"] for origin in origins}
+    parts = {
+        name: part
+        for code in dict.fromkeys(nodes.values())
+        for name, part in result.code.get(code, {}).items()
+    }
+    return f'{{"nodes": {_lines(nodes)},\n"parts": {_lines(parts)}}}\n'
+
+
+def _lines(values: object) -> str:
+    assert isinstance(values, dict)
+    return (
+        "{\n"
+        + ",\n".join(f"{json.dumps(k)}: {json.dumps(v)}" for k, v in sorted(values.items()))
+        + "\n}"
+    )
+
+
+# --- run html -------------------------------------------------------------------------------------
+
+# The HTML page of a run, from its document and its pictures alone, and the page of an earlier run
+# written again.
+#
+# Neither torch nor a recipe is needed.
+
+
+_TEMPLATE = "run_page.html.j2"
+
+
+def prepare() -> None:
+    """Read and compile the template of the page, which takes longer than to fill it."""
+    compiled(_TEMPLATE)
+
+
+def document_text(doc: Mapping[str, Any]) -> str:
+    """Return the document of a run as the text of its file ``provenance.json``."""
+    return json.dumps(doc, indent=1, ensure_ascii=False, allow_nan=True)
+
+
+def present_time() -> str:
+    """Return the present time as the page of a run shows it."""
+    return datetime.now().astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
+
+
+def page(doc: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
+    """Return the report of a run, from its document and pictures, as one HTML page that loads no
+    other file.
+    """
+    inline = {name: base64.b64encode(content).decode() for name, content in pictures.items()}
+    shown = {**doc, "figures": [f for f in doc["figures"] if f["name"] in inline]}
+    return filled(_TEMPLATE, doc=shown, pictures=inline)
+
+
+def rebuild(folder: Path) -> Path:
+    """Write ``report.html`` of a run again, from the document and the pictures in ``folder``,
+    and return its path.
+    """
+    doc = json.loads(text_of(folder / "provenance.json"))
+    pictures = {
+        p.stem: bytes_of(p, sys.maxsize) for p in sorted((folder / "figures").glob("*.png"))
+    }
+    target = folder / "report.html"
+    part = folder / ".report.html.part"
+    part.write_text(page(doc, pictures), encoding="utf-8")
+    crate = remove_crate(folder)
+    part.replace(target)
+    if crate is not None:
+        restore_crate(folder, crate)
+    return target

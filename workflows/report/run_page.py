@@ -1,8 +1,4 @@
-"""The report of a run as JSON document: numbers, steps, pictures and provenance.
-
-`document` returns JSON values, which a run stores beside the pictures as ``provenance.json``.
-`run_html.page` needs this document and the pictures only.
-"""
+"""The report of a run as JSON document: numbers, steps, times, pictures and provenance."""
 
 from __future__ import annotations
 
@@ -18,22 +14,140 @@ from pathlib import Path
 from typing import Any
 
 from neusee.nodes import Check
-from neusee.workflows.engine.finished_step import facts_in
-from neusee.workflows.engine.provenance import version_of
+from neusee.workflows.engine.provenance import facts_in, version_of
 from neusee.workflows.engine.runner import Result
-from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.graph.step_record import StepRecord
+from neusee.workflows.graph.recipe_graph import Recipe, StepRecord
 from neusee.workflows.recipe.distributions.nominal_values import told
 from neusee.workflows.report.contents import FIGURES, compared
-from neusee.workflows.report.frame_story import said_of_frame
-from neusee.workflows.report.mask_story import story
 from neusee.workflows.report.paper_readings import consequences, in_force
 from neusee.workflows.report.result_numbers import expected, metrics, table
-from neusee.workflows.report.run_html import present_time
-from neusee.workflows.report.run_timing import said_of, timing
-from neusee.workflows.report.spectral_sampling import spectral_error
-from neusee.workflows.report.tolerance_spent import spent
-from neusee.workflows.store.byte_sizes import format_size
+from neusee.workflows.report.run_folder import present_time
+from neusee.workflows.report.run_summary import said_of_frame, story
+from neusee.workflows.report.tolerance_spent import spectral_error, spent
+from neusee.workflows.store.cache_settings import format_size
+
+# --- run timing -----------------------------------------------------------------------------------
+
+# Times of a run: computing time, time that the cache saved, and predicted time.
+
+
+StepRow = Mapping[str, Any]  #: a step in the document of a run
+
+#: of the file ``timing.csv``, which has a line for each step
+COLUMNS = (
+    "step",
+    "node",
+    "device",
+    "lane",
+    "state",
+    "began",
+    "seconds",
+    "predicted",
+    "peak",
+    "predicted_peak",
+    "bytes",
+    "key",
+)
+
+
+def rows(steps: Iterable[StepRow]) -> list[list[Any]]:
+    """Return the rows of ``timing.csv``, one for each step of a run, with the values of
+    `COLUMNS`.
+    """
+    return [[step[column] for column in COLUMNS] for step in steps]
+
+
+def timing(steps: Sequence[StepRow], planned: float | None = None) -> dict[str, Any]:
+    """Return the total times of a run (predicted, actual, saved by the cache), and the bytes read
+    and written.
+
+    Steps with the same result count once.
+    """
+    ran = [s for s in steps if s["state"] == "run"]
+    own = {s["key"] for s in ran}
+    served = _once(
+        s for s in steps if s["state"] in ("cached", "not needed") and s["key"] not in own
+    )
+    known = [s for s in ran if s["predicted"] is not None]
+    took, saved = sum(s["seconds"] for s in ran), sum(s["made_in"] for s in served)
+    ends = [s["began"] + s["seconds"] for s in ran]
+    return {
+        "ran": len(ran),
+        "served": len([s for s in steps if s["state"] in ("cached", "not needed")]),
+        "steps": len(steps),
+        "seconds": took,
+        "span": max(ends) - min(s["began"] for s in ran) if ran else 0.0,
+        "planned": planned if ran else None,
+        "told": len(known),
+        "predicted": sum(s["predicted"] for s in known),
+        "actual": sum(s["seconds"] for s in known),
+        "saved": saved,
+        "share": saved / (saved + took) if saved + took else 0.0,
+        "read": sum(s["bytes"] for s in served if s["state"] == "cached"),
+        "written": sum(s["bytes"] for s in ran if s["kept"]),
+    }
+
+
+def _once(steps: Iterable[StepRow]) -> list[StepRow]:
+    """Return one step for each distinct result, with preference for a step whose result was read
+    from the cache.
+    """
+    found: dict[str, StepRow] = {}
+    for step in steps:
+        if step["key"] not in found or step["state"] == "cached":
+            found[step["key"]] = step
+    return list(found.values())
+
+
+def said_of(found: Mapping[str, Any]) -> list[str]:
+    """Return the times and the sizes in bytes of a run, which `timing` computed, as sentences."""
+    lines = []
+    if found["ran"]:
+        lines.append(
+            f"{found['ran']} of {found['steps']} steps ran: {_seconds(found['seconds'])} of"
+            " computing time."
+        )
+    if found["told"]:
+        known = (
+            "these steps"
+            if found["told"] == found["ran"]
+            else f"the {found['told']} whose time was no guess"
+        )
+        predicted, actual = _seconds(found["predicted"]), _seconds(found["actual"])
+        lines.append(f"Predicted for {known}: {predicted}; actual: {actual}.")
+    if found["planned"] is not None:
+        planned, span = _seconds(found["planned"]), _seconds(found["span"])
+        lines.append(f"Planned duration, with parallel branches: {planned}; actual: {span}.")
+    if found["ran"] and found.get("peak", [None])[0]:
+        predicted, actual = (format_size(size) for size in found["peak"])
+        lines.append(
+            f"Predicted peak memory of the program while the steps ran: {predicted}; actual:"
+            f" {actual}."
+        )
+    if found["served"]:
+        share = f"{100 * found['share']:.3g} % of all computing time"
+        lines.append(
+            f"The cache served {found['served']} steps and saved {_seconds(found['saved'])},"
+            f" {share}."
+        )
+    lines.append(
+        f"Read from the cache: {format_size(found['read'])}; written to it:"
+        f" {format_size(found['written'])}."
+    )
+    return lines
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.3g} s" if value < 100 else f"{value:.0f} s"
+
+
+# --- run page -------------------------------------------------------------------------------------
+
+# The report of a run as JSON document: numbers, steps, pictures and provenance.
+#
+# `document` returns JSON values, which a run stores beside the pictures as ``provenance.json``.
+# `run_folder.page` needs this document and the pictures only.
+
 
 _LIBRARIES = ("torch", "numpy", "kornia", "colour-science", "OpenEXR", "pydantic", "safetensors")
 _COPIED = (
@@ -340,7 +454,7 @@ def _facts(result: Result) -> list[list[str]]:
 
 def _inputs(recipe: Recipe) -> list[dict[str, str]]:
     """Return parameter, name and digest of every input file of a recipe."""
-    from neusee.workflows.keys.input_file_digest import file_digest
+    from neusee.workflows.keys.cache_key import file_digest
 
     return [
         {"parameter": f"{step.name}.{name}", "file": value.name, "digest": file_digest(value)}

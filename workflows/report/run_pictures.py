@@ -1,28 +1,88 @@
-"""Pictures of a run, each drawn once and stored under a cache key of the results that the
-picture shows.
-"""
+"""Pictures of a run, each drawn once and stored under a key of the results that it shows."""
 
 from __future__ import annotations
 
 import importlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.engine.runner import Result
-from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.graph.step_record import StepRecord
+from neusee.workflows.engine.machine_resources import give_back
+from neusee.workflows.engine.node_call import to_device
+from neusee.workflows.engine.runner import Result, run
+from neusee.workflows.graph.recipe_graph import Recipe, StepRecord
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.keys.code_digest import Code, engine
 from neusee.workflows.placement.tasks_and_devices import Schedule, Slot
-from neusee.workflows.report.contents import FIGURES
-from neusee.workflows.report.requirements import Found, Missing, find, is_table
-from neusee.workflows.report.shown_values import in_turn
+from neusee.workflows.report.contents import FIGURES, Found, Missing, find, is_table
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
+
+# --- shown values ---------------------------------------------------------------------------------
+
+# Values that the pictures and data files of a run show, in memory only from their first use to
+# their last.
+
+
+def in_turn(groups: Sequence[Sequence[str]], result: Result) -> Iterator[Mapping[str, Any]]:
+    """Yield for each group of steps the values of these steps, on the first device of the run.
+
+    The values of the run itself are used where it has them. Other values are read from the store
+    when their group comes, and the few that the store lacks are computed together before the first
+    group. A value is deleted after the last group that needs it.
+    """
+    uses = Counter(step for group in groups for step in group)
+    lacking = [
+        step
+        for step in uses
+        if step not in result.values and not result.store.has(result.keys[step])
+    ]
+    values = dict(_computed(lacking, result))
+    for group in groups:
+        values |= _read([step for step in group if step not in values], result)
+        yield {step: values[step] for step in group}
+        uses.subtract(group)
+        done = [step for step in values if uses[step] <= 0]
+        for step in done:
+            del values[step]
+        if done:
+            give_back()
+
+
+def _read(steps: Iterable[str], result: Result) -> dict[str, Any]:
+    """Return the values of steps from the run, from its store, or computed again if the store
+    has lost them.
+    """
+    device, found, lost = result.device.partition(",")[0], {}, list[str]()
+    for step in steps:
+        if step in result.values:
+            found[step] = result.values[step]
+            continue
+        hint = result.recipe.steps[step].node.hints.get("return", Any)
+        with suppress(KeyError):
+            found[step] = to_device(result.store.get(result.keys[step], hint), device)
+        if step not in found:
+            lost.append(step)
+    return {**found, **_computed(lost, result)}
+
+
+def _computed(steps: Sequence[str], result: Result) -> Mapping[str, Any]:
+    return (
+        run(result.recipe, result.store, sorted(steps), device=result.device).values
+        if steps
+        else {}
+    )
+
+
+# --- run pictures ---------------------------------------------------------------------------------
+
+# Pictures of a run, each drawn once and stored under a cache key of the results that the picture
+# shows.
+
 
 GRAPH = (
     "graph",
@@ -124,7 +184,7 @@ def states_of(done: Mapping[str, StepRecord]) -> dict[str, str]:
 
 def _drawing_code() -> str:
     modules = sorted({figure.draw.partition(":")[0] for figure in FIGURES})
-    return engine(*modules, "report.figures.recipe_graph")
+    return engine(*modules, "report.figures.graph_and_timeline")
 
 
 def files_of(
@@ -247,6 +307,6 @@ def _function(path: str) -> Callable[..., bytes]:
     )
 
 
-GRAPH_DRAWING = Drawing("report.figures.recipe_graph:graph")
+GRAPH_DRAWING = Drawing("report.figures.graph_and_timeline:graph")
 # not stored, for no two runs take the same times
-TIMELINE_DRAWING = Drawing("report.figures.gantt:timeline")
+TIMELINE_DRAWING = Drawing("report.figures.graph_and_timeline:timeline")

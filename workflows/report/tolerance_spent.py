@@ -1,23 +1,26 @@
-"""Account of the numerical errors that a run accepts within its tolerance: omitted and cheaper
-steps, error bounds.
-"""
+"""Account of the numerical errors of a run: within its tolerance, and by its bands."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from neusee.workflows.engine.cost_laws import sizes_of
-from neusee.workflows.engine.cost_model import Costs
+from neusee.workflows.engine.cost_model import Costs, sizes_of
 from neusee.workflows.engine.placement_inputs import past_costs
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.runner import Result
-from neusee.workflows.graph.recipe_graph import Recipe, Substitution, dependents, needed
+from neusee.workflows.graph.recipe_graph import Recipe, StepRecord, Substitution, dependents, needed
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.graph.step_record import StepRecord
+from neusee.workflows.report.contents import SPECTRAL, spectral_steps
 from neusee.workflows.tolerance.error_norm import error_of
 from neusee.workflows.tolerance.error_propagation import COVERAGE
+
+# --- tolerance spent ------------------------------------------------------------------------------
+
+# Account of the numerical errors that a run accepts within its tolerance: omitted and cheaper
+# steps, error bounds.
+
 
 NORM = "root mean square over the largest element"
 
@@ -232,3 +235,40 @@ def _full_keys(result: Result) -> dict[str, str]:
         return resolve(whole, needed(whole, whole.outputs), result.store, result.device).keys
     except (OSError, LookupError, RunError):
         return {}
+
+
+# --- spectral sampling ----------------------------------------------------------------------------
+
+# Account of the error by the number of spectral bands, which the tolerance of a run does not
+# include.
+
+
+def spectral_error(
+    recipe: Recipe, keys: Mapping[str, str], value: Callable[[str], Any]
+) -> dict[str, Any]:
+    """Return the largest error by the number of bands, over channels, by what it is the error
+    of; empty if unknown.
+    """
+    found: dict[str, float] = {}
+    for name in spectral_steps(recipe):
+        if name in keys:
+            what = SPECTRAL[name.partition("[")[0]]
+            found[what] = max(found.get(what, 0.0), float(value(name).max()))
+    if not found:
+        return {}
+    larger = max(found.values()) > recipe.tolerance
+    return {"errors": found, "larger": larger, "said": _said(found, recipe.tolerance, larger)}
+
+
+def _said(found: Mapping[str, float], tolerance: float, larger: bool) -> str:
+    """Return one sentence with the errors by the number of bands, and a warning if one exceeds
+    the tolerance.
+    """
+    errors = ", ".join(f"{error:.1e} {what}" for what, error in found.items())
+    beside = f"tolerance {tolerance:g}, which is relative to the bands of the recipe"
+    if not larger:
+        return f"bands    error by the number of bands: {errors}; {beside}"
+    return (
+        f"bands    LOOK: error by the number of bands: {errors}, larger than the {beside}: set more"
+        " bands"
+    )

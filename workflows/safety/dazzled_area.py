@@ -15,17 +15,17 @@ import torch
 from neusee.nodes.laser import Beam, BrightPixels, defocus_at, round_pixels
 from neusee.workflows.recipe.blocks.safety_block import Safety
 from neusee.workflows.recipe.distributions.shapes import FloatArray
-from neusee.workflows.safety.distance_ladder import (
+from neusee.workflows.safety.exposures import (
     FOLLOWED_WAVES,
+    Exposures,
+    Option,
+    SettingDraws,
     as_wide,
     fill_at,
     focus_of,
     ladder,
 )
-from neusee.workflows.safety.exposures import Exposures, Option
-from neusee.workflows.safety.light_levels import Grid, Levels, Veil, levels_of, veil_of
-from neusee.workflows.safety.spots_along import Ranked
-from neusee.workflows.safety.uncertain_values import SettingDraws
+from neusee.workflows.safety.laser_spots import Grid, Levels, Ranked, Veil, levels_of, veil_of
 
 _RANKS = 80  #: numbers of pixels at which levels are computed
 _STEP, _WAVES = 0.3, 0.25  #: of the ladder of a clear round lens

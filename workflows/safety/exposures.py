@@ -1,16 +1,15 @@
-"""Exposure at the lens and on the sensor over the distance, for nominal values and for draws of
-uncertain ones.
-"""
+"""Exposure at lens and sensor over the distance, and the distances where it exceeds a limit."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from neusee.nodes import ParameterError
 from neusee.nodes.laser import (
@@ -29,18 +28,358 @@ from neusee.nodes.laser import (
     widest_heated_diameter,
 )
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
+from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.blocks.safety_block import BEAM, Lens, Safety
+from neusee.workflows.recipe.distributions.nominal_values import Uncertain
 from neusee.workflows.recipe.distributions.shapes import FloatArray
-from neusee.workflows.safety.distance_ladder import as_wide, interpolated, miss_between
-from neusee.workflows.safety.distance_zones import sampled
-from neusee.workflows.safety.uncertain_values import SettingDraws
+from neusee.workflows.recipe.distributions.uncertain_inputs import (
+    NEGLIGIBLE,
+    only_values,
+    within_allowed,
+)
+
+# --- uncertain values -----------------------------------------------------------------------------
+
+# Random draws of the settings of an estimate that a recipe gives as distributions or by a
+# posterior.
+
+
+_ROWS = 3  #: stream of random numbers that selects rows of a table of samples
+
+
+@dataclass(frozen=True)
+class SettingDraws:
+    """Draws of the uncertain settings of an estimate."""
+
+    count: int
+    values: Mapping[str, FloatArray]  #: (draw,) in SI by setting, such as ``laser.power``
+    laws: Mapping[str, str]  #: distribution as written, by setting
+    seed: int
+
+    def column(self, name: str, nominal: float) -> FloatArray:
+        """Return the nominal value of a setting and its draws (1 + draw,)."""
+        rest = self.values.get(name, np.full(self.count, nominal))
+        return np.concatenate([[nominal], rest])
+
+    def normal(self, stream: int) -> FloatArray:
+        """Return a standard normal number for each draw; another ``stream`` has independent
+        numbers.
+        """
+        return np.random.default_rng([self.seed, 2, stream]).standard_normal(self.count)
+
+
+def draw_settings(recipe: Recipe, safety: Safety) -> SettingDraws:
+    """Return draws of each setting whose value in the recipe is a distribution or belongs to a
+    posterior.
+
+    A negligible part of a distribution outside the values that the recipe allows is cut off, and
+    its text says so. Raises `RecipeError` for a distribution with more outside.
+    """
+    uncertain, count = recipe.uncertain, safety.settings.draws
+    if uncertain is None:
+        return SettingDraws(count, {}, {}, recipe.seed)
+    paths = {
+        setting: value.name
+        for setting, value in safety.values.items()
+        if value.name in uncertain.names
+    }
+    allowed, notes = within_allowed(only_values(uncertain, paths.values()), NEGLIGIBLE)
+    drawn = _draws(allowed, count, recipe.seed)
+    texts = {path: uncertain.said(path) for path in drawn}
+    texts |= {path: f"{texts[path]} ({note})" for path, note in notes.items()}
+    order = sorted(paths, key=lambda setting: list(drawn).index(paths[setting]))
+    values = {setting: drawn[paths[setting]] for setting in order}
+    return SettingDraws(
+        count, values, {setting: texts[paths[setting]] for setting in order}, recipe.seed
+    )
+
+
+def _draws(uncertain: Uncertain, count: int, seed: int) -> dict[str, FloatArray]:
+    """Return ``count`` draws of each uncertain value; those of a table of samples are whole rows
+    of the table.
+    """
+    z = np.random.default_rng([seed, 1]).standard_normal((count, len(uncertain.names)))
+    drawn = {name: law.at(z[:, i]) for i, (name, law) in enumerate(uncertain.laws.items())}
+    joint = uncertain.joint
+    if joint is None:
+        return drawn
+    if joint.draws is None:
+        rows = joint.at(z[:, len(drawn) :])
+    else:
+        rows = joint.draws[
+            np.random.default_rng([seed, _ROWS]).integers(0, len(joint.draws), count)
+        ]
+    return drawn | dict(zip(joint.names, rows.T, strict=True))
+
+
+# --- distance ladder ------------------------------------------------------------------------------
+
+# Distances at which the spot of a laser is computed anew: dense where its shape changes, none where
+# it does not.
+
+
+#: largest fill and defocus of a spot that is taken as that of a distant laser
+FAR_FILL, FAR_WAVES = 0.02, 0.03
+#: the same for a lens that is out of focus far away, where each wave counts at first order
+UNFOCUSED_WAVES = 0.002
+#: defocus up to which rungs follow how the middle of a spot turns bright and dark
+FOLLOWED_WAVES = 2.0
+_DEFOCUS = 550e-9  #: m; the wavelength in which waves of defocus are counted
+
+
+def far_distance(beam: Beam, diameter: float, waves: float = FAR_WAVES) -> float:
+    """Return the distance in m from which the beam overfills a lens and its wavefront is plane.
+
+    The fill (D / (2 w))^2 is then at most 0.02, which lowers the spot by 2 %, and the curvature at
+    most 0.03 waves, which lowers the spot of a lens in focus by 0.3 %; the power into the lens is
+    exact at every distance.
+    """
+    width = diameter / (2 * math.sqrt(FAR_FILL))
+    filled = 2 * math.sqrt(max(width**2 - beam.waist**2, 0.0)) / beam.divergence
+    plane = diameter**2 / (8 * beam.wavelength * waves)
+    return max(filled, plane)
+
+
+def focus_of(lens: Lens) -> float:
+    """Return the distance in m on which a lens is focused; infinity for a lens that follows the
+    laser.
+    """
+    return math.inf if isinstance(lens.focus, str) else lens.focus
+
+
+def ladder(
+    beam: Beam, lens: Lens, diameter: float, ends: tuple[float, float], step: float, waves: float
+) -> FloatArray:
+    """Return rising distances from the nearest to the furthest of ``ends``, or to that of a distant
+    laser.
+
+    Between two of them the distance grows by the factor 1 + ``step`` at most, and the defocus
+    changes by ``waves`` or, from `FOLLOWED_WAVES`, by the share ``step`` of itself at most.
+    """
+    nearest, furthest = ends
+    follows = lens.focus == "laser"
+    focused = follows or (lens.focus == "infinity" and not lens.defocus)
+    last = min(furthest, far_distance(beam, diameter, FAR_WAVES if focused else UNFOCUSED_WAVES))
+
+    def defocus(distance: float) -> float:
+        found = defocus_at(beam, distance, diameter, focus_of(lens), lens.defocus * _DEFOCUS)
+        return 0.0 if follows else float(found)
+
+    rungs = [last]
+    while rungs[-1] > nearest:
+        here, factor = rungs[-1], 1 + step
+        allowed = (
+            waves if abs(defocus(here)) < FOLLOWED_WAVES else max(waves, step * abs(defocus(here)))
+        )
+        while abs(defocus(here / factor) - defocus(here)) > allowed and factor > 1.002:
+            factor = math.sqrt(factor)
+        rungs.append(max(here / factor, nearest))
+    return np.array(rungs[::-1])
+
+
+def miss_between(rungs: FloatArray, misses: Sequence[float], place: FloatArray) -> FloatArray:
+    """Return by how much an interpolation may miss at places: nothing at a rung, the whole miss in
+    the middle of a gap.
+
+    ``misses`` has one number for each gap between two rungs; without any nothing is missed.
+    """
+    if not len(misses):
+        return np.zeros_like(place)
+    gap = np.clip(np.searchsorted(rungs, place, side="right") - 1, 0, len(rungs) - 2)
+    part = np.clip((place - rungs[gap]) / (rungs[gap + 1] - rungs[gap]), 0, 1)
+    missed: FloatArray = np.asarray(misses, np.float64)[gap] * 4 * part * (1 - part)
+    return missed
+
+
+def interpolated(rungs: FloatArray, values: FloatArray, place: FloatArray) -> FloatArray:
+    """Return values (rung, ...) at places (any, ...), without overshoot between rungs; one rung
+    holds everywhere.
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    if len(rungs) == 1:
+        return np.broadcast_to(values[0], (*np.shape(place), *values.shape[1:]))
+    between: FloatArray = PchipInterpolator(rungs, values)(place)
+    return between
+
+
+def as_wide(beam: Beam, radius: FloatArray) -> FloatArray:
+    """Return the distance in m at which a beam has a 1/e2 radius; 1 mm where it is wider
+    everywhere.
+    """
+    square = np.maximum(radius**2 - beam.waist**2, (5e-4 * beam.divergence) ** 2)
+    distance: FloatArray = 2 * np.sqrt(square) / beam.divergence
+    return distance
+
+
+def fill_at(beam: Beam, diameter: float, distance: float) -> float:
+    """Return (D / (2 w))^2 at a distance."""
+    return diameter**2 / (4 * beam_radius(beam, distance) ** 2)
+
+
+# --- distance zones -------------------------------------------------------------------------------
+
+# Intervals of distance in which an exposure exceeds a limit, for nominal values and for random
+# draws of them.
+
+
+QUANTILES = (0.05, 0.95)  #: ends of the interval that contains 90 % of the draws
+_ROUNDED = 1e-9  #: relative rounding of the logarithm of a distance
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A number with the interval that contains 90 % of its draws; all three are equal if nothing
+    is uncertain.
+    """
+
+    value: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, value: float, draws: FloatArray) -> Spread:
+        """Return a number with the interval of its draws; NaN in a draw is left out."""
+        known = draws[~np.isnan(draws)]
+        if not known.size:
+            return cls(value, value, value)
+        low, high = np.quantile(known, QUANTILES)
+        return cls(value, float(low), float(high))
+
+
+@dataclass(frozen=True)
+class Zone:
+    """An interval of distance in m, whose ends have intervals of their own."""
+
+    near: Spread
+    far: Spread
+    begins_before: bool  #: whether the zone reaches below the shortest distance that is asked for
+    ends_beyond: bool  #: whether the zone reaches beyond the longest distance that is asked for
+
+
+@dataclass(frozen=True)
+class Zones:
+    """The intervals of distance in which a limit is exceeded, none or several, and how sure each
+    statement is.
+    """
+
+    zones: tuple[Zone, ...]  #: at the nominal values
+    none: float  #: share of the draws without any zone
+    #: share of the draws with as many zones as the nominal values; ends between zones are from
+    #: these
+    alike: float
+    #: largest distance of any zone, over the draws that have one; None without such a draw
+    reach: Spread | None
+    #: share of the draws in which the limit is exceeded at the distance of the recipe
+    inside: float
+
+
+def crossings(distances: FloatArray, ratio: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the near and the far ends (draw, zone) of the intervals in which ``ratio`` (draw,
+    distance) is at least 1.
+
+    Ends between two distances are interpolated in the logarithms. Rows with fewer zones than others
+    end with NaN. A zone that begins before the first distance, or ends beyond the last, has this
+    distance as its end.
+    """
+    with np.errstate(divide="ignore"):
+        height = np.log(np.maximum(ratio, 1e-300))
+    at, inside = np.log(distances), height >= 0
+    edge = np.zeros((len(inside), 1), bool)
+    begins = inside & ~np.concatenate([edge, inside[:, :-1]], 1)
+    ends = inside & ~np.concatenate([inside[:, 1:], edge], 1)
+    return _placed(at, height, begins, -1), _placed(at, height, ends, 1)
+
+
+def _placed(at: FloatArray, height: FloatArray, marks: NDArray[np.bool_], step: int) -> FloatArray:
+    """Return the distance (draw, zone) where the height crosses 0 beside each marked sample, on
+    the side ``step``.
+    """
+    row, column = np.nonzero(marks)
+    other = np.clip(column + step, 0, len(at) - 1)
+    inner, outer = height[row, column], height[row, other]
+    share = np.where(other == column, 0.0, inner / np.where(other == column, 1.0, inner - outer))
+    found = np.exp(at[column] + share * (at[other] - at[column]))
+    count = marks.sum(1)
+    placed = np.full((len(marks), int(count.max(initial=0))), np.nan)
+    placed[row, np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)] = found
+    return placed
+
+
+def zones_of(
+    distances: FloatArray,
+    nominal: FloatArray,
+    drawn: FloatArray,
+    at: float,
+    asked: tuple[float, float] | None = None,
+) -> Zones:
+    """Return the zones of a limit from the ratio of exposure to limit: nominal (distance,), drawn
+    (draw, distance).
+
+    Zones lie between the two distances ``asked``, whether or not the distance ``at`` of the recipe
+    does. The outer ends, such as the farthest distance, have the interval of all draws that have a
+    zone; ends between two zones have that of the draws with as many zones as the nominal values.
+    """
+    within = _at(distances, drawn, at) >= 1
+    if asked is not None:
+        shown = (distances >= asked[0] * (1 - _ROUNDED)) & (distances <= asked[1] * (1 + _ROUNDED))
+        distances, nominal, drawn = distances[shown], nominal[shown], drawn[:, shown]
+    near, far = (ends[0] for ends in crossings(distances, nominal[None]))
+    starts, stops = crossings(distances, drawn)
+    count = (~np.isnan(starts)).sum(1)
+    alike = count == len(near)
+    furthest = np.nanmax(stops[count > 0], 1) if (count > 0).any() else np.zeros(0)
+    # outer ends are those of every draw with a zone
+    first, last = starts[count > 0, :1].ravel(), len(near) - 1
+    zones = tuple(
+        Zone(
+            Spread.of(float(near[i]), _column(starts[alike], i) if i else first),
+            Spread.of(float(far[i]), _column(stops[alike], i) if i < last else furthest),
+            bool(near[i] <= distances[0] * (1 + _ROUNDED)),
+            bool(far[i] >= distances[-1] * (1 - _ROUNDED)),
+        )
+        for i in range(len(near))
+    )
+    reach = (
+        Spread.of(float(far.max()) if len(far) else float(np.median(furthest)), furthest)
+        if furthest.size
+        else None
+    )
+    return Zones(
+        zones, float((count == 0).mean()), float(alike.mean()), reach, float(within.mean())
+    )
+
+
+def _column(ends: FloatArray, zone: int) -> FloatArray:
+    """Return the ends (draw,) of one of several zones; none without a draw."""
+    return ends[:, zone] if len(ends) else np.zeros(0)
+
+
+def _at(distances: FloatArray, ratio: FloatArray, at: float) -> FloatArray:
+    """Return the ratio (draw,) at a distance, which is one of the distances."""
+    column: FloatArray = ratio[:, int(np.argmin(np.abs(distances - at)))]
+    return column
+
+
+def sampled(first: float, last: float, also: Sequence[float] = (), count: int = 600) -> FloatArray:
+    """Return distances from ``first`` to ``last`` at equal ratios, with the distances ``also``
+    among them.
+    """
+    return np.unique(
+        np.concatenate([np.geomspace(first, last, count), np.asarray(also, np.float64)])
+    )
+
+
+# --- exposures ------------------------------------------------------------------------------------
+
+# Exposure at the lens and on the sensor over the distance, for nominal values and for draws of
+# uncertain ones.
+
 
 Emission = Literal["continuous", "single pulse", "pulse train"]
 #: relative change of the defocus over which the largest peak counts: that of half a step of
 #: distance
 WITHIN = 0.01
-_ROUNDED = 1e-9  #: rounding of the logarithm of a distance
-_DEFOCUS = 550e-9  #: m; the wavelength in which waves of defocus are counted
 
 
 @dataclass(frozen=True)
@@ -124,9 +463,9 @@ def compute_exposures(
     beams = tuple(_beams(safety, draws))
     beam, where = _stacked(beams), torch.from_numpy(at)
     air: Any = torch.from_numpy(_air(safety, draws, at) * _uneven(safety, draws, at))
-    lens = _column(draws, "lens.transmittance", safety.settings.lens.transmittance)
-    focal_length = _column(draws, "lens.focal_length", safety.settings.lens.focal_length)
-    diameter = _column(draws, "lens.diameter", safety.settings.lens.diameter)
+    lens = _exposure_column(draws, "lens.transmittance", safety.settings.lens.transmittance)
+    focal_length = _exposure_column(draws, "lens.focal_length", safety.settings.lens.focal_length)
+    diameter = _exposure_column(draws, "lens.diameter", safety.settings.lens.diameter)
     columns: dict[str, dict[str, FloatArray]] = {
         name: {} for name in ("sensor", "spot", "through", "fill", "waves")
     }
@@ -265,7 +604,7 @@ def _short(values: FloatArray) -> Any:
     return torch.from_numpy((values if np.ptp(values) else values[:1])[:, None])
 
 
-def _column(draws: SettingDraws, name: str, nominal: float) -> Any:
+def _exposure_column(draws: SettingDraws, name: str, nominal: float) -> Any:
     """Return the nominal value and the draws of a setting as a column (1 + draw, 1), or as one
     row if all are equal.
     """

@@ -10,18 +10,17 @@ from typing import Any
 from neusee.nodes.laser import BrightPixels
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.keys.code_digest import Code, engine
 from neusee.workflows.report.study_folder import StudyReport, StudyRun
 from neusee.workflows.report.study_page import Section
-from neusee.workflows.safety.damage_verdict import DamageRow, DamageVerdict
-from neusee.workflows.safety.damage_words import damage_sentence, is_bracket
-from neusee.workflows.safety.dazzle_curves import Dazzled
-from neusee.workflows.safety.dead_pixels import DeadPixels
-from neusee.workflows.safety.distance_zones import Spread
-from neusee.workflows.safety.light_levels import Veil
+from neusee.workflows.safety.damage_pattern import DeadPixels
+from neusee.workflows.safety.exposures import Spread
+from neusee.workflows.safety.laser_spots import Veil
 from neusee.workflows.safety.safety_estimate import (
     CERTIFICATE,
+    DamageRow,
+    DamageVerdict,
+    Dazzled,
     Estimate,
     Finding,
     Prepared,
@@ -29,10 +28,9 @@ from neusee.workflows.safety.safety_estimate import (
     prepare,
 )
 from neusee.workflows.safety.safety_page import report
-from neusee.workflows.safety.safety_text import paragraphs
+from neusee.workflows.safety.safety_text import damage_sentence, is_bracket, paragraphs
 from neusee.workflows.safety.worksheet import worksheet_page
-from neusee.workflows.store.memo import compute_once
-from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.result_store import Store, compute_once
 
 
 @dataclass(frozen=True)

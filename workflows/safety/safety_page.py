@@ -1,18 +1,204 @@
-"""The page of an estimate of safety: limits, distances, the eye, what is not said, assumptions
-and sources.
-"""
+"""The page of an estimate of safety, with its figures."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from neusee.workflows.report.figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    VERMILION,
+    canvas,
+    drawn,
+)
 from neusee.workflows.report.study_folder import StudyReport
 from neusee.workflows.report.study_page import Mark, Section
-from neusee.workflows.safety import counted_parts as parts
-from neusee.workflows.safety import eye_words, helps_words
-from neusee.workflows.safety import safety_figures as figures
-from neusee.workflows.safety import safety_words as words
-from neusee.workflows.safety.damage_verdict import state_of_finding
-from neusee.workflows.safety.damage_words import is_bracket, limit_rows, verdict, zone_rows
-from neusee.workflows.safety.safety_estimate import CERTIFICATE, Estimate, Finding
+from neusee.workflows.safety import safety_estimate, safety_text
+from neusee.workflows.safety.damage_pattern import DamagePattern, DeadPixels
+from neusee.workflows.safety.exposures import QUANTILES
+from neusee.workflows.safety.safety_estimate import CERTIFICATE, Estimate, Finding, state_of_finding
+from neusee.workflows.safety.safety_text import is_bracket, limit_rows, verdict, zone_rows
+
+# --- safety figures -------------------------------------------------------------------------------
+
+# Figures of an estimate of safety: irradiance over distance with its limits, and zones of distance.
+
+
+_COLOURS = (VERMILION, ORANGE, "#CC79A7", "#56B4E9", "#8c510a", "#7f7f7f")
+_BELOW = 1.5  #: decades below the peak of a spot that a picture of the spot shows at least
+_DASHES = ("-", "--", ":", "-.", (0, (5, 1)), (0, (1, 1)))
+_NAMES = {
+    "irradiance": "irradiance at the lens (W/m2)",
+    "fluence": "fluence of a pulse at the lens (J/m2)",
+}
+
+
+@drawn
+def over_distance(found: Estimate) -> Any:
+    """Draw the exposure at the lens over the distance, and the limits at the lens behind the
+    plain lens.
+    """
+    plain = [each for each in found.findings if each.option == found.options[0].name]
+    kinds = list(
+        dict.fromkeys(
+            [
+                "fluence" if found.exposures.beams[0].is_pulsed else "irradiance",
+                *(each.limit.quantity for each in plain if _has_mean(found)),
+            ]
+        )
+    )
+    figure, axes = canvas(9.0, 4.6 * len(kinds), len(kinds), 1)
+    for axis, kind in zip(axes[:, 0], kinds, strict=True):
+        _panel(axis, found, kind, [each for each in plain if each.limit.quantity == kind])
+    return figure
+
+
+def _has_mean(found: Estimate) -> bool:
+    return found.exposures.beams[0].power is not None
+
+
+def _panel(axis: Any, found: Estimate, kind: Any, findings: list[Finding]) -> None:
+    at = found.exposures.distances
+    curve = found.exposures.emitted(kind) * found.exposures.lens
+    low, high = np.quantile(curve[1:], QUANTILES, axis=0)
+    axis.fill_between(at, low, high, color=BLUE, alpha=0.25, linewidth=0)
+    axis.plot(at, curve[0], color=BLUE, linewidth=2, label="laser")
+    for i, each in enumerate(findings):
+        colour, dash = _COLOURS[i % len(_COLOURS)], _DASHES[i % len(_DASHES)]
+        axis.fill_between(at, each.curve[1], each.curve[2], color=colour, alpha=0.15, linewidth=0)
+        axis.plot(at, each.curve[0], color=colour, linestyle=dash, label=each.limit.name)
+    if found.eye and found.eye.quantity == kind:
+        axis.plot(
+            at, np.full_like(at, found.eye.limit), color=GREEN, linewidth=2, label="eye (MPE)"
+        )
+    axis.axvline(found.safety.laser.distance, color=BLACK, linewidth=0.8)
+    axis.set(
+        xscale="log", yscale="log", xlabel="distance (m)", ylabel=_NAMES[kind], xlim=(at[0], at[-1])
+    )
+    shown = np.concatenate([curve[0], *(each.curve[0] for each in findings)])
+    axis.set_ylim(shown.min() / 5, shown.max() * 5)
+    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+
+
+@drawn
+def spots(patterns: Sequence[DamagePattern]) -> Any:
+    """Draw the exposure on the sensor over the limit of damage: red above the limit, blue below."""
+    figure, axes = canvas(4.6 * len(patterns), 4.0, 1, len(patterns))
+    for axis, each in zip(axes[0], patterns, strict=True):
+        half, brightest = each.width / 2 * 1e6, float(np.log10(each.peak))
+        decades = max(1.0, brightest, _BELOW - brightest)  # a spot far below the limit is seen too
+        light = np.log10(np.maximum(each.ratio, 10.0**-decades))
+        limits = {"vmin": -decades, "vmax": decades}
+        shown = axis.imshow(light, cmap="RdBu_r", extent=(-half, half, -half, half), **limits)
+        axis.set(title=f"{each.option}: {each.limit}", xlabel="um", ylabel="um")
+        axis.grid(False)
+        figure.colorbar(shown, ax=axis, label="log10 of exposure over limit", shrink=0.8)
+    return figure
+
+
+@drawn
+def zones(found: Estimate) -> Any:
+    """Draw the zones of distance of each limit behind each protection, with the intervals of
+    their ends.
+    """
+    rows = list(found.findings)
+    figure, axes = canvas(9.0, 1.2 + 0.32 * (len(rows) + 1))
+    axis, at = axes[0, 0], found.exposures.distances
+    labels = []
+    for i, each in enumerate(rows):
+        labels.append(f"{each.option}, {each.limit.name}")
+        colour = VERMILION if each.limit.effect == "damage" else ORANGE
+        for zone in each.zones.zones:
+            axis.barh(
+                i, zone.far.value - zone.near.value, left=zone.near.value, height=0.6, color=colour
+            )
+            for end in (zone.near, zone.far):
+                axis.plot([end.low, end.high], [i, i], color=BLACK, linewidth=1.5)
+    if found.eye:
+        labels.append("eye, unaided (NOHD)")
+        reach = min(found.eye.distance.value, at[-1])
+        axis.barh(len(rows), max(reach - at[0], 0.0), left=at[0], height=0.6, color=GREEN)
+        ends = np.clip([found.eye.distance.low, found.eye.distance.high], at[0], at[-1])
+        axis.plot(ends, [len(rows)] * 2, color=BLACK, linewidth=1.5)
+    axis.axvline(found.safety.laser.distance, color=BLACK, linewidth=0.8)
+    axis.set(
+        xscale="log", xlabel="distance (m)", xlim=(at[0], at[-1]), ylim=(len(labels) - 0.4, -0.6)
+    )
+    axis.set_yticks(range(len(labels)), labels)
+    axis.grid(False, axis="y")
+    return figure
+
+
+@drawn
+def dazzled_share(found: Estimate) -> Any:
+    """Draw the share of the picture that the laser saturates against the mean irradiance at the
+    lens.
+    """
+    figure, axes = canvas(9.0, 4.4)
+    axis = axes[0, 0]
+    for i, each in enumerate(found.dazzled):
+        shown = each.curve > 0
+        look = {"color": (BLUE, *_COLOURS)[i], "linestyle": _DASHES[i % len(_DASHES)]}
+        axis.plot(each.at_lens[shown], each.curve[shown], label=each.option, **look)
+    assert found.safety.settings.dazzle is not None
+    axis.axhline(found.safety.settings.dazzle.share, color=BLACK, linewidth=0.8, linestyle=":")
+    axis.axvline(found.mean_at_lens, color=BLACK, linewidth=0.8)
+    axis.set(
+        xscale="log",
+        yscale="log",
+        xlabel="mean irradiance at the lens (W/m2)",
+        ylabel="share of saturated pixels",
+    )
+    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure
+
+
+@drawn
+def dead_frames(dead: Sequence[DeadPixels]) -> Any:
+    """Draw a part of the raw frame of an evenly grey scene with its dead pixels, behind each
+    protection.
+    """
+    figure, axes = canvas(3.6 * len(dead), 3.8, 1, len(dead))
+    for axis, each in zip(axes[0], dead, strict=True):
+        half = each.frame.shape[0] / 2
+        axis.imshow(
+            each.frame,
+            cmap="gray",
+            vmin=0,
+            vmax=1,
+            extent=(-half, half, -half, half),
+            interpolation="nearest",
+        )
+        axis.set(
+            title=f"{each.option}\n{', '.join(each.kinds) or 'no damage'}",
+            xlabel="pixels",
+            ylabel="pixels",
+        )
+        if "frame" in each.kinds:
+            box = {"facecolor": "white", "edgecolor": "none"}
+            axis.text(
+                0.5,
+                0.9,
+                "no valid frame",
+                transform=axis.transAxes,
+                ha="center",
+                va="center",
+                bbox=box,
+            )
+        axis.grid(False)
+    return figure
+
+
+# --- safety page ----------------------------------------------------------------------------------
+
+# The page of an estimate of safety: limits, distances, the eye, what is not said, assumptions and
+# sources.
+
 
 _CSV = (
     "protection",
@@ -40,15 +226,15 @@ _CSV = (
 
 def report(found: Estimate) -> StudyReport:
     """Return the page of an estimate with its pictures and its table of limits."""
-    shown = {"irradiance": figures.over_distance(found)}
+    shown = {"irradiance": over_distance(found)}
     if found.findings or found.eye:
-        shown["distances"] = figures.zones(found)
+        shown["distances"] = zones(found)
     if found.dazzled:
-        shown["dazzle"] = figures.dazzled_share(found)
+        shown["dazzle"] = dazzled_share(found)
     if found.patterns:
-        shown["pattern"] = figures.spots(found.patterns)
+        shown["pattern"] = spots(found.patterns)
     if found.dead:
-        shown["dead_pixels"] = figures.dead_frames(found.dead)
+        shown["dead_pixels"] = dead_frames(found.dead)
     sections = [
         _limits(found),
         _distances(found, shown.get("distances")),
@@ -65,7 +251,12 @@ def report(found: Estimate) -> StudyReport:
     return StudyReport(
         f"{found.recipe.name}: damage, dazzle and distance",
         "\n\n".join(
-            [CERTIFICATE, found.recipe.title, words.laser_text(found), " ".join(verdict(found))]
+            [
+                CERTIFICATE,
+                found.recipe.title,
+                safety_text.laser_text(found),
+                " ".join(verdict(found)),
+            ]
         ),
         [each for each in sections if each],
         shown,
@@ -78,17 +269,18 @@ def _limits(found: Estimate) -> Section | None:
     if not rows:
         return None
     text = f"""Each limit on the sensor, the share of it that the laser reaches at
-        {words.metres(found.safety.laser.distance)}, and the exposure at the lens that reaches it:
-        the maximum permissible exposure (MPE_S) for damage, the maximum dazzle exposure (MDE_S) for
-        dazzle of the sensor. Damage has a row for each part of the light: one pulse, the mean over
-        the dwell time, the heat of both together (accumulation) and, for a train, the incubation of
-        many pulses. A probability is stated for a law with data of devices alone, and is that of a
-        device drawn from all devices. {words.intervals_text(found)} {CERTIFICATE}"""
+        {safety_text.metres(found.safety.laser.distance)}, and the exposure at the lens that reaches
+        it: the maximum permissible exposure (MPE_S) for damage, the maximum dazzle exposure (MDE_S)
+        for dazzle of the sensor. Damage has a row for each part of the light: one pulse, the mean
+        over the dwell time, the heat of both together (accumulation) and, for a train, the
+        incubation of many pulses. A probability is stated for a law with data of devices alone, and
+        is that of a device drawn from all devices. {safety_text.intervals_text(found)}
+        {CERTIFICATE}"""
     marks: dict[tuple[int, int], Mark] = {
         (i, 3): "warn" for i in range(len(found.findings), len(rows))
     }
     marks |= {(i, 3): _mark(each) for i, each in enumerate(found.findings)}
-    return Section("Limits", text, words.LIMIT_COLUMNS, rows, marks=marks)
+    return Section("Limits", text, safety_text.LIMIT_COLUMNS, rows, marks=marks)
 
 
 def _mark(finding: Finding) -> Mark:
@@ -105,13 +297,13 @@ def _mark(finding: Finding) -> Mark:
 def _distances(found: Estimate, picture: bytes | None) -> Section | None:
     if not found.findings:
         return None
-    near, far = (words.metres(found.exposures.distances[i]) for i in (0, -1))
+    near, far = (safety_text.metres(found.exposures.distances[i]) for i in (0, -1))
     text = f"""Where the laser exceeds each limit, from {near} to {far}. A zone may begin away from
         the laser, because close to it a narrow beam fills only a part of the lens. The probability
         of nowhere is the share of the draws in which no distance exceeds the limit; the probability
         here is that at the distance of the recipe, the vertical line. Black lines are the intervals
         of the ends. {CERTIFICATE}"""
-    return Section("Distances", text, words.ZONE_COLUMNS, zone_rows(found), picture)
+    return Section("Distances", text, safety_text.ZONE_COLUMNS, zone_rows(found), picture)
 
 
 def _curve(picture: bytes) -> Section:
@@ -124,14 +316,14 @@ def _curve(picture: bytes) -> Section:
 def _dazzled(found: Estimate, picture: bytes | None) -> Section | None:
     if picture is None or found.safety.settings.dazzle is None:
         return None
-    text = f"""{words.enlarged_text(found)} The figure shows the share of saturated pixels against
-        the irradiance at the lens, the mean over one exposure. The dotted line is the share that
-        may be lost, {100 * found.safety.settings.dazzle.share:g} %, and the vertical line the
-        irradiance at {words.metres(found.safety.laser.distance)}.
+    text = f"""{safety_text.enlarged_text(found)} The figure shows the share of saturated pixels
+        against the irradiance at the lens, the mean over one exposure. The dotted line is the share
+        that may be lost, {100 * found.safety.settings.dazzle.share:g} %, and the vertical line the
+        irradiance at {safety_text.metres(found.safety.laser.distance)}.
 
-        {parts.scatter_text(found.veil)} {CERTIFICATE}"""
-    rows = [words.dazzled_cells(each) for each in found.dazzled]
-    return Section("Dazzled area", text, words.DAZZLE_COLUMNS, rows, picture)
+        {safety_estimate.scatter_text(found.veil)} {CERTIFICATE}"""
+    rows = [safety_text.dazzled_cells(each) for each in found.dazzled]
+    return Section("Dazzled area", text, safety_text.DAZZLE_COLUMNS, rows, picture)
 
 
 def _dead(found: Estimate, picture: bytes | None) -> Section | None:
@@ -147,7 +339,7 @@ def _dead(found: Estimate, picture: bytes | None) -> Section | None:
             " the plain lens."
         )
         return Section(heading, f"{text} {CERTIFICATE}")
-    distance = words.metres(found.dead[0].distance)
+    distance = safety_text.metres(found.dead[0].distance)
     text = f"""An example pattern and no prediction: the raw frame of an evenly grey scene around
         the spot, after the laser has hit a device whose thresholds are those stated, at {distance}.
         A point is white, a destroyed pixel black; lines and crosses are black rows and columns
@@ -163,10 +355,10 @@ def _pattern(found: Estimate, picture: bytes | None) -> Section | None:
     if picture is None:
         return None
     pitch = found.safety.settings.sensor.pixel_pitch
-    text = f"""The exposure on the sensor at {words.metres(found.safety.laser.distance)} over the
-        limit that is named, that of the part of the light with the largest ratio. Where it is red
-        the limit is exceeded; a pixel is {pitch * 1e6:.3g} um wide. A line, a cross or a lost frame
-        is the damage of the circuits around this spot. {CERTIFICATE}"""
+    text = f"""The exposure on the sensor at {safety_text.metres(found.safety.laser.distance)} over
+        the limit that is named, that of the part of the light with the largest ratio. Where it is
+        red the limit is exceeded; a pixel is {pitch * 1e6:.3g} um wide. A line, a cross or a lost
+        frame is the damage of the circuits around this spot. {CERTIFICATE}"""
     rows = [
         [each.option, each.limit, each.peak, each.area, each.area / (pitch * 1e6) ** 2]
         for each in found.patterns
@@ -179,25 +371,25 @@ def _eye(found: Estimate) -> Section | None:
     if found.eye is None:
         return None
     return Section(
-        "The eye", f"{words.eye_text(found.eye)} Source: {found.eye.source}. {CERTIFICATE}"
+        "The eye", f"{safety_text.eye_text(found.eye)} Source: {found.eye.source}. {CERTIFICATE}"
     )
 
 
 def _helps(found: Estimate) -> Section | None:
     if not found.helps:
         return None
-    text = " ".join([helps_words.EXPLAINED, *helps_words.sentences(found.helps), CERTIFICATE])
-    return Section("What helps", text, helps_words.COLUMNS, helps_words.table(found.helps))
+    text = " ".join([safety_text.EXPLAINED, *safety_text.sentences(found.helps), CERTIFICATE])
+    return Section("What helps", text, safety_text.COLUMNS, safety_text.table(found.helps))
 
 
 def _eye_dazzle(found: Estimate) -> Section:
     dazzle = found.eye_dazzle
     text = (
-        f"{eye_words.dazzle_text(dazzle, found.safety.settings.eye.dazzle)} Source:"
+        f"{safety_text.dazzle_text(dazzle, found.safety.settings.eye.dazzle)} Source:"
         f" {dazzle.source}. {CERTIFICATE}"
     )
-    rows = [eye_words.dazzle_cells(each) for each in dazzle.rows]
-    return Section("Dazzle of the eye", text, eye_words.DAZZLE_COLUMNS if rows else (), rows)
+    rows = [safety_text.dazzle_cells(each) for each in dazzle.rows]
+    return Section("Dazzle of the eye", text, safety_text.EYE_DAZZLE_COLUMNS if rows else (), rows)
 
 
 def _unsaid(found: Estimate) -> Section | None:
@@ -209,23 +401,24 @@ def _assumed(found: Estimate) -> Section:
     air = "Clear air."
     if laser.air_transmittance is not None:
         air = (
-            f"Air that passes {laser.air_transmittance:g} over {words.metres(laser.distance)},"
+            f"Air that passes {laser.air_transmittance:g} over "
+            f"{safety_text.metres(laser.distance)},"
             " evenly."
         )
     elif laser.visibility is not None:
         air = (
-            f"Air with a visibility of {words.metres(laser.visibility)} by the law of"
+            f"Air with a visibility of {safety_text.metres(laser.visibility)} by the law of"
             f" {laser.haze.capitalize()}."
         )
     text = f"""The beam is Gaussian and hits the middle of the lens: a narrow beam beside the middle
         gives less. The share of its power that passes the lens, the width and the curvature of its
         wavefront, and with them the peak and every pixel, are those of each distance.
-        {parts.focus_text(found.safety)} {parts.scatter_text(found.veil)} {air}
+        {safety_estimate.focus_text(found.safety)} {safety_estimate.scatter_text(found.veil)} {air}
 
-        {" ".join(parts.counted(found.safety))}
+        {" ".join(safety_estimate.counted(found.safety))}
 
-        {parts.ladder_text(found.ranked, found.peaks)} Between two distances the largest peak
-        counts.
+        {safety_estimate.ladder_text(found.ranked, found.peaks)} Between two distances the largest
+        peak counts.
 
         {_damage_assumed(found)}
 
@@ -286,7 +479,7 @@ def _row(each: Finding) -> list[object]:
     return [
         *start,
         *numbers,
-        words.zones_text(each.zones),
+        safety_text.zones_text(each.zones),
         *ends,
         each.limit.source,
         *_beside(each),

@@ -26,12 +26,9 @@ from neusee.nodes.laser import (
 from neusee.workflows.recipe.blocks.safety_block import Safety
 from neusee.workflows.recipe.distributions.shapes import FloatArray
 from neusee.workflows.safety.dazzled_area import Area, area_of
-from neusee.workflows.safety.distance_zones import Spread
-from neusee.workflows.safety.exposures import Option, compute_exposures
-from neusee.workflows.safety.limit_ratios import limit_ratio, limits_behind
-from neusee.workflows.safety.sensor_limits import veil_level
-from neusee.workflows.safety.spots_along import Ranked
-from neusee.workflows.safety.uncertain_values import SettingDraws
+from neusee.workflows.safety.exposure_limits import limit_ratio, limits_behind, veil_level
+from neusee.workflows.safety.exposures import Option, SettingDraws, Spread, compute_exposures
+from neusee.workflows.safety.laser_spots import Ranked
 
 Problem = Literal["damage", "saturation", "contrast"]
 Means = Literal["grey filter", "notch filter", "stop", "exposure"]

@@ -26,10 +26,9 @@ from neusee.nodes.laser import (
     underfilled,
 )
 from neusee.workflows.report.study_page import filled
-from neusee.workflows.safety.eye_findings import EyeDazzleRow, EyeFinding
+from neusee.workflows.safety.exposure_limits import EyeDazzleRow, EyeFinding, saturating
 from neusee.workflows.safety.safety_estimate import CERTIFICATE, Estimate, Finding
-from neusee.workflows.safety.safety_words import UNITS, laser_text
-from neusee.workflows.safety.sensor_limits import saturating
+from neusee.workflows.safety.safety_text import UNITS, laser_text
 from neusee.workflows.safety.what_helps import Remedy
 
 _SYMBOL = re.compile(r"\b[A-Za-z]\w*\b")

@@ -12,21 +12,19 @@ from pathlib import Path
 from typing import Any
 
 from neusee.workflows.engine.local_executor import memory_limit
-from neusee.workflows.engine.memory_watch import MemoryLimit, guarded, limited
+from neusee.workflows.engine.memory_limits import MemoryLimit, guarded, limited
 from neusee.workflows.engine.provenance import timestamp
 from neusee.workflows.engine.runner import Result, run
 from neusee.workflows.engine.step_job import Executor
 from neusee.workflows.explain.why_rerun import explained
-from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.graph.step_record import Event, StepRecord
+from neusee.workflows.graph.recipe_graph import Event, Recipe, StepRecord
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.report import run_html, run_page, run_timing
+from neusee.workflows.report import run_folder, run_page
+from neusee.workflows.report import run_page as run_timing
 from neusee.workflows.report.contents import wanted
 from neusee.workflows.report.data_exports import data_files, exports
-from neusee.workflows.report.files_beside import FilesBeside
-from neusee.workflows.report.graph_ahead import GraphAhead
-from neusee.workflows.report.run_code import code_text
-from neusee.workflows.report.run_folder import NotWritten, RunFolder, new_run
+from neusee.workflows.report.files_beside import FilesBeside, GraphAhead
+from neusee.workflows.report.run_folder import NotWritten, RunFolder, code_text, new_run
 from neusee.workflows.report.run_pictures import (
     GRAPH_DRAWING,
     TIMELINE_DRAWING,
@@ -142,7 +140,7 @@ def _write(
     folder.write("recipe.yaml", recipe_text(result.recipe))
     folder.write_rows("metrics.csv", ("step", "field", "index", "value"), doc["metrics"])
     folder.write_rows("timing.csv", run_timing.COLUMNS, run_timing.rows(doc["steps"]))
-    run_html.prepare()
+    run_folder.prepare()
     finish()
     drawn, missing = pictures(result, shelf)
     files, refused = exports(result, shelf)
@@ -155,9 +153,10 @@ def _write(
     for name, path in files.items():
         folder.take(f"data/{name}", path)
     shown = {**drawn, **({"timeline": bars} if bars.exists() else {})}
-    folder.write("provenance.json", run_html.document_text(doc))
+    folder.write("provenance.json", run_folder.document_text(doc))
     folder.write(
-        "report.html", run_html.page(doc, {name: path.read_bytes() for name, path in shown.items()})
+        "report.html",
+        run_folder.page(doc, {name: path.read_bytes() for name, path in shown.items()}),
     )
     return doc
 

@@ -29,7 +29,7 @@ import torch
 import xxhash
 from torch import Tensor
 
-from neusee.workflows.keys.seal import (
+from neusee.workflows.keys.sealed_files import (
     FORMAT,
     NotRead,
     OtherFormat,
@@ -38,7 +38,7 @@ from neusee.workflows.keys.seal import (
     secrets,
     signature,
 )
-from neusee.workflows.store.layout_check import is_band, is_checksum, is_shape
+from neusee.workflows.store.metadata import is_band, is_checksum, is_shape
 from neusee.workflows.store.shared_folder import Disk, open_now
 
 _SMALL = 4096  #: bytes up to which a blob is not synced to disk: a torn blob fails its checksum

@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import xxhash
 
-from neusee.workflows.keys.inherited_modes import make_folders
-from neusee.workflows.keys.seal import secrets
+from neusee.workflows.keys.sealed_files import make_folders, secrets
 from neusee.workflows.store.metadata import is_kept
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.shared_folder import open_now

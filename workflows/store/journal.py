@@ -18,9 +18,9 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from typing import Any, BinaryIO
 
-from neusee.workflows.keys.seal import FORMAT, seal_record, unseal_record
+from neusee.workflows.keys.sealed_files import FORMAT, seal_record, unseal_record
 from neusee.workflows.store import metadata
-from neusee.workflows.store.metadata_fields import FIELDS, is_text
+from neusee.workflows.store.metadata import FIELDS, is_text
 from neusee.workflows.store.shared_folder import Disk, append, read_file
 
 Row = dict[str, Any]

@@ -18,8 +18,7 @@ import threading
 import time
 from contextlib import suppress
 
-from neusee.workflows.store.process_owner import me, owner_of
-from neusee.workflows.store.shared_folder import Disk, append, open_now
+from neusee.workflows.store.shared_folder import Disk, append, me, open_now, owner_of
 
 BEAT = 2.0  #: s between heartbeats
 WINDOW = 10.0  #: s without a heartbeat after which an owner on another machine counts as dead

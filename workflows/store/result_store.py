@@ -1,13 +1,4 @@
-"""Store of results: a folder with the files ``<key>.json`` and ``<key>.safetensors`` of each
-result.
-
-The JSON holds the metadata of a result (the parts of its key, layout, statistics, checks, seconds,
-versions) and the whole value of a small result. Of an evicted or unsaved value only the metadata
-remain, called a receipt. A checksum covers every byte and is compared at each load. A result that
-fails the comparison is moved away with one warning and counts as missing. A result gets its final
-name when it is complete, so that a killed process leaves no incomplete result. If the folder cannot
-be written, a run issues one warning and continues.
-"""
+"""Store of results: a folder with the files of each result, its speed and its warnings."""
 
 from __future__ import annotations
 
@@ -17,28 +8,157 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import asdict, is_dataclass
+from datetime import UTC, datetime
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
-from neusee.workflows.keys.seal import NotRead
+from neusee.workflows.keys.sealed_files import NotRead, Unsigned, seal_record, unseal_record
 from neusee.workflows.store import metadata, payload
-from neusee.workflows.store.bandwidth import Speeds
-from neusee.workflows.store.budget_eviction import LOW, CacheBudget
-from neusee.workflows.store.environment import Verify, budget_bytes, default_root, verify_mode
+from neusee.workflows.store.cache_settings import Verify, budget_bytes, default_root, verify_mode
+from neusee.workflows.store.eviction import LOW, CacheBudget, Maintained
 from neusee.workflows.store.journal import Journal
 from neusee.workflows.store.lease import Lease, Leases
-from neusee.workflows.store.maintenance import Maintained
-from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept, record_use
-from neusee.workflows.store.receipts import Receipts
-from neusee.workflows.store.shared_folder import Disk
-from neusee.workflows.store.small_results import SmallResults
-from neusee.workflows.store.store_warnings import Warned
+from neusee.workflows.store.metadata import INLINE, UNREADABLE, Metadata, is_kept, record_use
+from neusee.workflows.store.payload import Receipts, SmallResults
+from neusee.workflows.store.shared_folder import Disk, read_file
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from neusee.workflows.store.band_files import Blobs
+
+
+# --- bandwidth ------------------------------------------------------------------------------------
+
+# Read and write speed of a store of results, measured in normal use and saved in a file of the
+# store.
+
+
+Direction = Literal["read", "write"]
+_FILE = "speeds.json"
+LARGE = 1_000_000  #: bytes from which a transfer updates the speed
+_USUAL: dict[Direction, float] = {"read": 8e9, "write": 0.4e9}  #: bytes / s
+#: s for each transfer, whatever its size; to write is to make a file, which takes 0.5 to 2 ms
+_SETUP: dict[Direction, float] = {"read": 5e-5, "write": 1e-3}
+_SYNC = 3e-3  #: s until the disk has a file, for each result that is written to a file of its own
+_LEARN = 0.3  #: weight of the newest transfer
+_NEWS = 1.25  #: factor by which a speed must differ from the stored speed to be written to the file
+
+
+class Speeds:
+    """Read and write speed of one store in bytes per second."""
+
+    def __init__(self, disk: Disk) -> None:
+        self._disk = disk
+        self._now: dict[Direction, float] = {}
+        self._written: dict[Direction, float] = {}
+
+    def seconds(self, way: Direction, size: float) -> float:
+        """Return the predicted time in seconds for reading or writing ``size`` bytes in the
+        store.
+        """
+        return _setup(way, size) + size / self._speed(way)
+
+    def learn(self, way: Direction, size: int, seconds: float) -> None:
+        """Update the estimated read or write speed of the store with the measured ``seconds`` of
+        one transfer.
+        """
+        if size < LARGE:
+            return
+        newest = size / max(seconds - _setup(way, size), 1e-6)
+        self._now[way] = self._speed(way) ** (1 - _LEARN) * newest**_LEARN
+        written = self._written.get(way, _USUAL[way])
+        if not written / _NEWS < self._now[way] < written * _NEWS:
+            self._written = dict(self._now)
+            with suppress(OSError):
+                self._disk.replace(
+                    _FILE,
+                    seal_record("speeds", {str(way): speed for way, speed in self._now.items()}),
+                )
+
+    def _speed(self, way: Direction) -> float:
+        if not self._now:
+            self._written = self._stored()
+            self._now = {**_USUAL, **self._written}
+        return self._now[way]
+
+    def _stored(self) -> dict[Direction, float]:
+        try:
+            speeds = unseal_record("speeds", read_file(f"{self._disk.folder}/{_FILE}"))
+            return {way: float(speeds[way]) for way in _USUAL if 1e3 < speeds[way] < 1e13}
+        except (OSError, ValueError, LookupError, TypeError):
+            return {}
+
+
+def _setup(way: Direction, size: float) -> float:
+    return _SETUP[way] + (_SYNC if way == "write" and size > INLINE else 0.0)
+
+
+# --- store warnings -------------------------------------------------------------------------------
+
+# Warnings of a store, each issued once: a folder that cannot be used, and results that are not
+# read.
+
+
+_CONSEQUENCE = (
+    "the run goes on, but results are not stored, so that the next run computes them again"
+)
+
+
+class Warned:
+    """Base class of `Store` with its warnings; `Store` defines the folder ``root``."""
+
+    root: Path
+    #: the warnings of all stores of this process, for the reports of studies
+    failures: ClassVar[list[str]] = []
+    failure = ""  #: the warning after the first write that failed
+    _told = False
+
+    def report_failure(self, error: Exception, use: str = "written") -> None:
+        """Warn that the folder cannot be written or read, once for each store; `failure` keeps
+        the text for reports.
+        """
+        if not self.failure:
+            self.pass_on(f"the cache {self.root} cannot be {use} ({error}): {_CONSEQUENCE}")
+            warnings.warn(self.failure, stacklevel=5)
+
+    def pass_on(self, failure: str) -> None:
+        """Keep for reports the warning ``failure``, which this store or that of a worker process
+        has issued.
+        """
+        if not self.failure:
+            self.failure = failure
+            self.failures.append(failure)
+
+    def leave(self, error: NotRead) -> None:
+        """Issue one warning for all results that are left alone, because they are of another
+        format or unsigned.
+        """
+        if not self._told:
+            what = (
+                "without a signature by NEUSEE_CACHE_SECRET"
+                if isinstance(error, Unsigned)
+                else "of another version"
+            )
+            text = f"results {what} in {self.root} are not read, and count as missing"
+            warnings.warn(
+                f"{text}: `neusee cache gc` removes those that nobody used for a week", stacklevel=4
+            )
+        self._told = True
+
+
+# --- result store ---------------------------------------------------------------------------------
+
+# Store of results: a folder with the files ``<key>.json`` and ``<key>.safetensors`` of each result.
+#
+# The JSON holds the metadata of a result (the parts of its key, layout, statistics, checks,
+# seconds, versions) and the whole value of a small result. Of an evicted or unsaved value only the
+# metadata remain, called a receipt. A checksum covers every byte and is compared at each load. A
+# result that fails the comparison is moved away with one warning and counts as missing. A result
+# gets its final name when it is complete, so that a killed process leaves no incomplete result. If
+# the folder cannot be written, a run issues one warning and continues.
 
 
 class Store(Warned, Maintained):
@@ -342,3 +462,50 @@ class Store(Warned, Maintained):
                 self.brief.append(metadata.receipt(small))
             if not os.path.lexists(self.disk.path(key, "json")):
                 self._lost.discard(key)
+
+
+# --- memo -----------------------------------------------------------------------------------------
+
+# Values that are computed only once: a value is read from the store, or computed and then stored.
+
+
+T = TypeVar("T")
+
+
+def compute_once(
+    store: Store,
+    key: str,
+    kind: type[T],
+    compute: Callable[[], T],
+    about: Metadata,
+    *,
+    small: bool = False,
+) -> T:
+    """Return the value that ``store`` has under ``key``, or compute and store the value if it is
+    missing.
+
+    Args: kind: the type of the value. A dataclass is stored as the dict of its fields. about:
+            metadata of the value,
+    which get the date and the seconds that ``compute`` took. small: whether to store the value with
+    `Store.put_small`.
+    """
+    with suppress(KeyError):
+        kept = store.get(key, dict if is_dataclass(kind) else kind)
+        make: Callable[..., T] = kind
+        try:
+            return make(**kept) if is_dataclass(kind) else make(kept)
+        except (TypeError, ValueError) as error:  # a value with other fields
+            store.put_aside(key, error)
+    began = time.perf_counter()
+    value = compute()
+    spent: Metadata = {
+        "seconds": time.perf_counter() - began,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    keep = store.put_small if small else store.put
+    keep(
+        key,
+        asdict(value) if is_dataclass(value) and not isinstance(value, type) else value,
+        spent | about,
+    )
+    return value

@@ -21,9 +21,26 @@ from pathlib import Path
 from typing import Any
 
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.regular_file import text_of
+from neusee.workflows.keys.sealed_files import text_of
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
+
+# --- study refused --------------------------------------------------------------------------------
+
+# Error for a study that has nothing to study, raised before anything long runs.
+
+
+class StudyRefused(ValueError):
+    """Error for a study whose recipe or options leave nothing to study; the message names the
+    remedy.
+    """
+
+
+# --- run study ------------------------------------------------------------------------------------
+
+# Studies of a recipe: accuracy, stability, left-out steps, calibration, uncertainty and equal
+# protection.
+
 
 KINDS = ("accuracy", "stability", "leave-out", "calibration", "uncertainty", "protection")
 

@@ -23,12 +23,11 @@ from neusee.workflows.graph.final_values import flow
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.run_folder import new_run
-from neusee.workflows.report.text_table import indented
+from neusee.workflows.report.terminal_text import indented
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import Argument, Axis, points, read_axes, read_words
 from neusee.workflows.sweeps.point_order import Sharing, sharing
-from neusee.workflows.sweeps.sweep_files import dataset, require_xarray
 from neusee.workflows.sweeps.sweep_points import (
     OnError,
     PointOutcome,
@@ -36,7 +35,15 @@ from neusee.workflows.sweeps.sweep_points import (
     outcomes,
     plan_sweep,
 )
-from neusee.workflows.sweeps.sweep_table import AxisColumn, column, header, rows_of, wide
+from neusee.workflows.sweeps.sweep_table import (
+    AxisColumn,
+    column,
+    dataset,
+    header,
+    require_xarray,
+    rows_of,
+    wide,
+)
 
 SweepState = Literal["complete", "stopped", "interrupted"]
 

@@ -23,10 +23,8 @@ from neusee.workflows.graph.recipe_graph import (
     needed,
     ordered,
 )
-from neusee.workflows.tolerance.error_budget import CHANNELS
-from neusee.workflows.tolerance.error_propagation import unbounded_steps
-from neusee.workflows.tolerance.expected_errors import expected_excess
-from neusee.workflows.tolerance.zero_effect_steps import without_nothing
+from neusee.workflows.tolerance.error_propagation import expected_excess, unbounded_steps
+from neusee.workflows.tolerance.skip_decision import CHANNELS, without_nothing
 
 if TYPE_CHECKING:
     from neusee.nodes import Node

@@ -15,11 +15,20 @@ from typing import Any
 import numpy as np
 
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
-from neusee.workflows.graph.recipe_graph import Recipe, Step, dependents, needed
-from neusee.workflows.graph.told_copies import FRAME, TOLD, knowers, known, with_copies
+from neusee.workflows.graph.recipe_graph import (
+    FRAME,
+    TOLD,
+    Recipe,
+    Step,
+    dependents,
+    knowers,
+    known,
+    needed,
+    with_copies,
+)
 from neusee.workflows.recipe.blocks.train_block import KEY, Training
-from neusee.workflows.recipe.distributions.mismatch_laws import ANGLE, Difference
-from neusee.workflows.recipe.distributions.scalar import draw_laws
+from neusee.workflows.recipe.distributions.law_text import ANGLE, Difference
+from neusee.workflows.recipe.distributions.shapes import draw_laws
 from neusee.workflows.recipe.distributions.uncertain_inputs import Index, Inputs, put_at
 
 _FAR = 4.5  #: standard deviations up to which the drawn values must be valid

@@ -17,13 +17,12 @@ from torch import Tensor, nn
 from neusee.nodes import metrics
 from neusee.nodes.scene import Photographs
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.input_file_digest import file_digest
+from neusee.workflows.keys.cache_key import file_digest
 from neusee.workflows.recipe.blocks.train_block import KEY, Training
+from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.loop.resumable_loop import Losses
-from neusee.workflows.training.parallel.process_mesh import Mesh
-from neusee.workflows.training.parallel.shared_graph import Shared
-from neusee.workflows.training.several_cameras import Samples
-from neusee.workflows.training.training_pictures import HELD_OUT, Sample
+from neusee.workflows.training.process_mesh import Mesh
+from neusee.workflows.training.training_pictures import HELD_OUT, Sample, Samples
 
 CONFIDENCE = 0.9  #: of the interval of a mean over photographs
 _METRICS = ("PSNR", "L1", "SSIM")

@@ -1,43 +1,150 @@
-"""The training of a mask and of the network that restores the pictures behind the mask, in two
-stages.
-"""
+"""The training of a mask and of the network behind it, in two stages, with its files."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import copy
+import importlib
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from neusee.nodes import doe
+from neusee.nodes import ParameterError, doe
+from neusee.nodes.file_headers import safetensors_need
 from neusee.nodes.network_weights import file_metadata
+from neusee.nodes.restore import Restorer, export_network, require_exportable
 from neusee.nodes.scene import Photographs
 from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.keys.cache_key import Stamp, file_digest, file_stamps
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.input_file_digest import file_digest
 from neusee.workflows.recipe.blocks.train_block import KEY, Stage, Training
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training import held_out
 from neusee.workflows.training.camera_mismatch import CameraMismatch
-from neusee.workflows.training.exported_files import require_exports, write_exports
 from neusee.workflows.training.held_out import Best, Split, Validation
-from neusee.workflows.training.loop.changed_inputs import prepare_folder
-from neusee.workflows.training.loop.checkpoint import export
-from neusee.workflows.training.loop.recorded_inputs import RecordedInputs, folder_of
-from neusee.workflows.training.loop.resumable_loop import Losses, Progress, ResumableLoop, Watch
+from neusee.workflows.training.loop.recorded_inputs import RecordedInputs, folder_of, prepare_folder
+from neusee.workflows.training.loop.resumable_loop import (
+    Losses,
+    Progress,
+    ResumableLoop,
+    Watch,
+    export,
+)
 from neusee.workflows.training.mask_design.design_run import MASK, design_in, designed
-from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh, MeshError
-from neusee.workflows.training.several_cameras import require_alone, samples_of
-from neusee.workflows.training.tensorboard_log import open_board
-from neusee.workflows.training.training_figures import curves, png, strip
+from neusee.workflows.training.process_mesh import ALONE, Mesh, MeshError
 from neusee.workflows.training.training_inputs import inputs_of
-from neusee.workflows.training.training_iteration import Learner
-from neusee.workflows.training.training_page import write_page
-from neusee.workflows.training.unchanged_files import UnchangedFiles
-from neusee.workflows.training.warm_start import WarmStart
+from neusee.workflows.training.training_iteration import Learner, WarmStart
+from neusee.workflows.training.training_page import curves, png, strip, write_page
+from neusee.workflows.training.training_pictures import require_alone, samples_of
+
+# --- unchanged files ------------------------------------------------------------------------------
+
+# Files that must stay as they are while a training runs: its photographs, which are read again and
+# again.
+
+
+@dataclass
+class UnchangedFiles:
+    """Files with the digests that their training recorded before its first iteration."""
+
+    contents: Mapping[Path, str]
+    _stamps: dict[Path, Stamp] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, paths: Iterable[Path]) -> UnchangedFiles:
+        """Note the content of files."""
+        return cls({path: file_digest(path) for path in paths})
+
+    def require(self) -> None:
+        """Raise ValueError if a file is gone or has another content; a file that was only
+        touched is the same.
+        """
+        for path, content in self.contents.items():
+            try:
+                stamp = file_stamps(path)[0]
+                if self._stamps.get(path) == stamp:
+                    continue
+                same = file_digest(path) == content
+            except OSError as error:
+                raise ValueError(
+                    self._said(path, f"cannot be read any more ({error.strerror})")
+                ) from error
+            if not same:
+                raise ValueError(self._said(path, "has another content now"))
+            self._stamps[path] = stamp
+
+    @staticmethod
+    def _said(path: Path, what: str) -> str:
+        return (
+            f"the photograph {path} {what}, after this training began with it; the checkpoint"
+            " before is kept: put the file back and give the command again to go on, or give the"
+            " command as it is to begin anew"
+        )
+
+
+# --- tensorboard log ------------------------------------------------------------------------------
+
+# The TensorBoard log of a training, with its losses and pictures by iteration.
+
+
+def open_board(folder: Path, first: int) -> Any:
+    """Return a TensorBoard writer for a training, which hides older events from iteration ``first``
+    on.
+
+    Raises ValueError if TensorBoard is not installed.
+    """
+    try:
+        module = importlib.import_module("torch.utils.tensorboard")
+    except ImportError as error:
+        text = (
+            f'TensorBoard is not installed ({error}): pip install -e ".[tensorboard]", or leave'
+            " tensorboard false"
+        )
+        raise ValueError(f"train.tensorboard: {text}") from error
+    return module.SummaryWriter(str(folder / "tensorboard"), purge_step=first)
+
+
+# --- exported files -------------------------------------------------------------------------------
+
+# The trained network as a file that other programs run, beside its weights.
+
+
+def require_exports(net: Restorer, settings: Training) -> None:
+    """Raise ValueError before a training whose network cannot be exported as ``train.export``
+    asks.
+    """
+    for kind in settings.export:
+        try:
+            require_exportable(net, f".{kind}")
+        except ParameterError as error:
+            raise ValueError(f"{KEY}.export: {error}") from error
+
+
+def write_exports(folder: Path, net: Restorer, settings: Training) -> None:
+    """Write the best network of a training, or the last one if no state is the best, as
+    ``train.export`` asks.
+    """
+    if not settings.export:
+        return
+    from safetensors.torch import load_file
+
+    name = "best" if (folder / "best.safetensors").is_file() else "network"
+    file = folder / f"{name}.safetensors"
+    safetensors_need(file, 2.0)
+    whole = copy.deepcopy(net).cpu().float()
+    whole.stored.load_state_dict(load_file(file))
+    for kind in settings.export:
+        export_network(whole, folder / f"{name}.{kind}")
+
+
+# --- run training ---------------------------------------------------------------------------------
+
+# The training of a mask and of the network that restores the pictures behind the mask, in two
+# stages.
+
 
 MASK_FILE = "mask.safetensors"  #: of a folder of results: the mask that was learnt or designed
 _COLUMNS = (

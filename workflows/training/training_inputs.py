@@ -8,21 +8,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neusee.nodes.network_classes import Architecture
+from neusee.nodes.own_modules import Architecture
 from neusee.nodes.restore import network as network_node
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.engine_digest import outline
+from neusee.workflows.keys.code_digest import Code, outline
 from neusee.workflows.recipe.blocks.train_block import KEY, Network, Training
 from neusee.workflows.training.held_out import Split
-from neusee.workflows.training.loop.changed_inputs import CAMERA
 from neusee.workflows.training.loop.recorded_inputs import (
+    CAMERA,
     CameraInputs,
     RecordedFile,
     RecordedInputs,
 )
 from neusee.workflows.training.mask_design.design_run import design_inputs
-from neusee.workflows.training.warm_start import WarmStart
+from neusee.workflows.training.training_iteration import WarmStart
 
 #: settings that change no weight
 _WITHOUT_EFFECT = {"tensorboard", "keep_pool", "export", "keep", "show"}
@@ -30,13 +29,10 @@ _WITHOUT_EFFECT = {"tensorboard", "keep_pool", "export", "keep", "show"}
 _BY_CONTENT = {"photographs", "start", "cameras", "mismatch", "network", "mask"}
 _OF_VALIDATION = {"held_out", "held_out_pictures", "validate_every", "patience"}
 #: nodes that an iteration calls itself
-_COMPUTE = ("losses", "metrics", "restore", "doe", "scene", "bicubic_resize")
+_COMPUTE = ("losses", "metrics", "restore", "doe", "scene", "resampling")
 _LOOPS = (
     "training_iteration",
     "training_pictures",
-    "posed_pictures",
-    "picture_batches",
-    "several_cameras",
     "camera_mismatch",
     "held_out",
     "loop/resumable_loop",

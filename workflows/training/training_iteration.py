@@ -1,21 +1,25 @@
-"""The trainable parts of a training (mask, restoration network, critics), and one training
-iteration.
-"""
+"""One iteration of a training: mask, network and critics, and the weights they begin with."""
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from neusee.nodes import losses, metrics
-from neusee.nodes.bicubic_resize import resize
+from neusee.nodes import ParameterError, losses, metrics
 from neusee.nodes.doe import PARAMETRISATIONS
+from neusee.nodes.file_headers import safetensors_need
+from neusee.nodes.input_files import bytes_of
+from neusee.nodes.network_weights import fits
+from neusee.nodes.resampling import resize
 from neusee.nodes.restore import (
     FFTMamba,
     Informed,
@@ -32,19 +36,144 @@ from neusee.nodes.restore import (
     start_network,
     try_network,
 )
-from neusee.nodes.values import Psf, Stop
+from neusee.nodes.values import FilterFacts, Psf, Stop
 from neusee.workflows.engine.node_call import call
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import device_kind, stream_seed
-from neusee.workflows.recipe.blocks.train_block import Network, Stage, Training
+from neusee.workflows.recipe.blocks.train_block import KEY, Network, Stage, Training
+from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.loop.resumable_loop import Losses, averaged, require_finite
-from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
-from neusee.workflows.training.parallel.shared_graph import Shared
-from neusee.workflows.training.picture_batches import noted, together
-from neusee.workflows.training.several_cameras import Samples
-from neusee.workflows.training.training_pictures import Sample
-from neusee.workflows.training.warm_start import WarmStart
+from neusee.workflows.training.process_mesh import ALONE, Mesh
+from neusee.workflows.training.training_pictures import Sample, Samples
+
+# --- picture batches ------------------------------------------------------------------------------
+
+# Pictures of a training batch that go through the network together, and their results one by one.
+
+
+def together(
+    pictures: Iterable[tuple[int, Sample]], whole: bool
+) -> Iterator[tuple[list[int], Sample]]:
+    """Yield the pictures of a batch with their numbers: each alone, or if ``whole`` those of one
+    size as one sample.
+
+    A small picture leaves most of a GPU idle, so that sixteen take little longer there than one. On
+    a processor each picture goes alone, so that one picture is in memory at a time.
+    """
+    if not whole:
+        yield from (([number], sample) for number, sample in pictures)
+        return
+    alike: dict[object, dict[int, Sample]] = {}
+    for number, sample in pictures:
+        known = sample.given[0] if sample.given else None
+        free = known is None or isinstance(known, FilterFacts)
+        shapes = tuple((name, x.shape) for name, x in sample.tensors.items()) if free else number
+        alike.setdefault(shapes, {})[number] = sample
+    for group in alike.values():
+        yield list(group), joined(list(group.values()))
+
+
+def joined(samples: list[Sample]) -> Sample:
+    """Return pictures of one size as one sample, whose maps beside the pictures have one axis
+    more, the first.
+    """
+    first = samples[0]
+    if len(samples) == 1:
+        return first
+    pictures, truths = (
+        torch.cat([getattr(s, name) for s in samples]) for name in ("picture", "truth")
+    )
+    light = torch.stack([s.light for s in samples])
+    if not first.given:
+        return Sample(pictures, truths, light, first.drawn)
+    facts = FilterFacts._make(
+        map(torch.stack, zip(*(s.given[0] for s in samples if s.given), strict=True))
+    )
+    return Sample(
+        pictures,
+        truths,
+        light,
+        first.drawn,
+        (facts, torch.stack([s.given[1] for s in samples if s.given])),
+    )
+
+
+def noted(
+    pictures: Iterable[tuple[int, Sample]], seen: list[Sample]
+) -> Iterator[tuple[int, Sample]]:
+    """Yield numbered pictures as they come, and add each to ``seen``."""
+    for number, sample in pictures:
+        seen.append(sample)
+        yield number, sample
+
+
+# --- warm start -----------------------------------------------------------------------------------
+
+# The weights with which the network of a new training begins: those of an earlier training, in
+# place of drawn ones.
+
+
+#: of a folder of results, the first that is there
+_FILES = ("best.safetensors", "network.safetensors")
+
+
+@dataclass(frozen=True)
+class WarmStart:
+    """A file of weights, and the digest of its content."""
+
+    file: Path
+    digest: str
+    source: str  #: place in the recipe that names the file
+
+    @classmethod
+    def of(cls, recipe: Recipe, settings: Training) -> WarmStart | None:
+        """Return the file of weights that ``train.start`` names, or None; raise ValueError if
+        there is no such file.
+        """
+        if settings.start is None:
+            return None
+        given = recipe.config.settings.get(f"{KEY}.start")
+        source = given.source if given else recipe.name
+        file = settings.start
+        if file.is_dir():
+            file = next(
+                (file / name for name in _FILES if (file / name).is_file()), file / _FILES[-1]
+            )
+        if file.suffix != ".safetensors" or not file.is_file():
+            text = (
+                f"{file} is no file of weights: give a .safetensors file, or the folder of a"
+                " training that ended"
+            )
+            raise ValueError(f"{source}   {KEY}.start   {text}")
+        return cls(
+            file, hashlib.sha256(bytes_of(file, parameter="train.start")).hexdigest(), source
+        )
+
+    def load_into(self, net: Restorer) -> None:
+        """Give the weights to a network; raise ValueError with the name of the first layer that
+        does not fit.
+        """
+        from safetensors.torch import load_file
+
+        safetensors_need(self.file, 2.0, "train.start")
+        options: Any = getattr(net, "options", {})
+        try:
+            fits(net.stored, self.file, "the network of this training", options)
+        except ParameterError as error:
+            raise ValueError(f"{self.source}   {KEY}.start   {error}") from error
+        net.stored.load_state_dict(load_file(self.file))
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """Return what `training.json` says of the start."""
+        return {"file": str(self.file), "sha256": self.digest}
+
+
+# --- training iteration ---------------------------------------------------------------------------
+
+# The trainable parts of a training (mask, restoration network, critics), and one training
+# iteration.
 
 
 class Scales(NamedTuple):

@@ -1,14 +1,9 @@
-"""The numbered training pictures, each with its own scene, laser, sensor parameters and noise.
-
-Steps that depend neither on the mask nor on a drawn value are computed once, steps that depend only
-on the mask once in each iteration, and steps that depend on a scene, a drawn value or noise once
-for each picture. Gradients of steps that depend only on the mask are summed over all pictures, so
-that one picture is in memory at a time.
-"""
+"""The numbered training pictures: scene, laser, camera and noise, and their stored pool."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,29 +12,263 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neusee.nodes.bicubic_resize import resize
+from neusee.nodes import restore
+from neusee.nodes.resampling import resize
 from neusee.nodes.scene import Change, Photographs, symmetry
+from neusee.nodes.values import FilterFacts, WienerProblem
 from neusee.workflows.engine.differentiable_function import as_function
-from neusee.workflows.graph.recipe_graph import Recipe, dependents, needed
-from neusee.workflows.graph.told_copies import TOLD
-from neusee.workflows.recipe.blocks.train_block import Training
+from neusee.workflows.engine.node_call import place
+from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.graph.recipe_graph import TOLD, Recipe, Step, dependents, needed
+from neusee.workflows.keys.cache_key import device_kind, digest, is_private, key_of
+from neusee.workflows.keys.code_digest import Code, engine
+from neusee.workflows.recipe.blocks.train_block import KEY, POSED, Training
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
-from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.result_store import Store, compute_once
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+from neusee.workflows.training.band_shards import Pictures, Shards, Shared
 from neusee.workflows.training.camera_mismatch import CameraMismatch
-from neusee.workflows.training.parallel.band_shards import Shards
-from neusee.workflows.training.parallel.picture_rounds import Pictures
-from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
-from neusee.workflows.training.parallel.shared_graph import Shared
-from neusee.workflows.training.posed_pictures import (
-    Given,
-    PosedPictures,
-    given_of,
-    tensors_of,
-    turned,
-)
-from neusee.workflows.training.stored_pool import StoredPool
-from neusee.workflows.training.training_recipe import frame_of, in_precision, require_steps
+from neusee.workflows.training.process_mesh import ALONE, Mesh, MeshError
+
+# --- training recipe ------------------------------------------------------------------------------
+
+# What a training asks of a recipe: steps that exist, a scene of stated size, and float64 where it
+# is wanted.
+
+
+def in_precision(recipe: Recipe, dtype: torch.dtype) -> Recipe:
+    """Return the recipe with steps in float64 if ``dtype`` is float64: steps with a choice of
+    precision are double.
+    """
+    if dtype != torch.float64:
+        return recipe
+    steps = {
+        name: _precise(step) if "precision" in step.params else step
+        for name, step in recipe.steps.items()
+    }
+    return replace(recipe, steps=steps)
+
+
+def _precise(step: Step) -> Step:
+    return replace(step, params={**step.params, "precision": "double"})
+
+
+def require_steps(recipe: Recipe, block: str, names: Sequence[str]) -> None:
+    """Raise ValueError unless the recipe has all steps ``names``, which the settings block
+    ``block`` names.
+    """
+    for name in names:
+        if name not in recipe.steps:
+            raise ValueError(
+                f"{block}: the recipe has no step {name}; {nearest(name, recipe.steps)}"
+            )
+
+
+def frame_of(recipe: Recipe, scene: str) -> tuple[int, int]:
+    """Return the sides of the scene in pixels (y, x); raise ValueError if the step ``scene``
+    does not state them.
+    """
+    shape = recipe.steps[scene].params.get("shape")
+    if shape is None:
+        raise ValueError(
+            f"train: the step {scene} has no shape: set {scene}.shape in pixels, such as [96, 96]"
+        )
+    return shape[0], shape[1]
+
+
+# --- posed pictures -------------------------------------------------------------------------------
+
+# Training pictures of a network that needs what the Wiener filter knows: the filter is solved once
+# for each picture.
+#
+# The networks `unrolled` and `informed` need the PSF, the glare, the clipped pixels and the noise
+# of a picture. The recipe gives them to the step of the filter, whose result `train.picture`
+# converts to colours. In the training the node of this step is `restore.wiener_problem` or
+# `restore.filter_facts`, with the same inputs, so that the answer of the filter is the input of the
+# network.
+
+
+Posed = WienerProblem | FilterFacts
+#: nothing, or what the filter poses and knows, and the colour matrix
+Given = tuple[()] | tuple[Posed, Tensor]
+_FILTERS = ("restore.wiener", "restore.unrolled", "restore.informed")
+_KNOWN: dict[str, Any] = {"unrolled": restore.wiener_problem, "informed": restore.filter_facts}
+_PARAMETERS = ("balance", "doubt", "least_doubt", "read_noise")
+
+
+@dataclass(frozen=True)
+class PosedPictures:
+    """The steps of a recipe that pose the problem of a picture, and that compute the colour
+    matrix.
+    """
+
+    filter: str
+    matrix: str
+    kind: str = "unrolled"  #: of the network
+
+    @classmethod
+    def of(cls, recipe: Recipe, settings: Training) -> PosedPictures | None:
+        """Return the steps of a training of such a network, or None for every other network.
+
+        Raises ValueError if the picture of the training is not that of the Wiener filter.
+        """
+        kind = settings.network.kind
+        if settings.network.architecture is not None or kind not in POSED:
+            return None
+        shown = recipe.steps[settings.picture]
+        channels, matrix = (str(shown.wires.get(name)) for name in ("channels", "matrix"))
+        if shown.node.path != "restore.colour" or recipe.steps[channels].node.path not in _FILTERS:
+            given = recipe.config.settings.get(f"{KEY}.picture")
+            text = (
+                f"{settings.picture} is {shown.node.path}, and the network {kind} starts from the"
+                f" Wiener filter: use restore: wiener and {KEY}.picture: restored"
+            )
+            raise ValueError(f"{given.source if given else recipe.name}   {KEY}.picture   {text}")
+        return cls(channels, matrix, kind)
+
+    @property
+    def steps(self) -> tuple[str, str]:
+        """Return the steps from which `read` makes the input of the network."""
+        return (self.filter, self.matrix)
+
+    def within(self, recipe: Recipe) -> Recipe:
+        """Return the recipe whose filter poses the problem and solves it."""
+        step = recipe.steps[self.filter]
+        params = {name: value for name, value in step.params.items() if name in _PARAMETERS}
+        posed = replace(step, node=_KNOWN[self.kind], params=params)
+        return replace(recipe, steps={**recipe.steps, self.filter: posed})
+
+    def read(self, values: Mapping[str, Any], dtype: torch.dtype) -> tuple[Tensor, Given]:
+        """Return the picture of the filter (3, y, x), and what the network needs beside it in the
+        given precision.
+
+        The filter solves small pictures in float64; the steps of a training take half the time in
+        float32.
+        """
+        posed, matrix = values[self.filter], values[self.matrix]
+        told: Tensor = restore.colour(posed.answer * posed.scale + posed.mean, matrix)
+        return told, (posed._make(part.to(dtype) for part in posed), matrix.to(dtype))
+
+
+def tensors_of(given: Given) -> dict[str, Tensor]:
+    """Return the tensors by name of what a network needs beside a picture."""
+    if not given:
+        return {}
+    posed, matrix = given
+    return {**{f"given.{name}": x for name, x in posed._asdict().items()}, "given.matrix": matrix}
+
+
+def given_of(tensors: Mapping[str, Tensor]) -> Given:
+    """Return what a network needs beside a picture, from its tensors by name."""
+    if "given.matrix" not in tensors:
+        return ()
+    kind = FilterFacts if "given.maps" in tensors else WienerProblem
+    return (
+        kind(**{name: tensors[f"given.{name}"] for name in kind._fields}),
+        tensors["given.matrix"],
+    )
+
+
+def turned(given: Given, seed: tuple[int, ...]) -> Given:
+    """Turn the maps that a network sees beside a picture, as `scene.symmetry` turns the picture
+    with the same seed.
+    """
+    known = given[0] if given else None
+    if not given or not isinstance(known, FilterFacts):
+        return given
+    seen = {name: symmetry(getattr(known, name), seed) for name in ("answer", "deviation", "maps")}
+    return known._replace(**seen), given[1]
+
+
+# --- stored pool ----------------------------------------------------------------------------------
+
+# Simulated training pictures in the store, so that a later training with the same pictures begins
+# at once.
+#
+# The key of a picture is made of the keys of its steps with the values that were drawn for it, of
+# the scene itself and of the noise. So a picture of another optics, sensor, laser, distribution or
+# code has another key.
+
+
+_ABOUT = {"step": "training picture"}
+_CODE = ("training.training_pictures", "training.training_pictures")
+
+
+class StoredPool:
+    """The pictures of a pool behind a fixed mask, each in the store under a key of its own."""
+
+    def __init__(
+        self, recipe: Recipe, settings: Training, outputs: Sequence[str], store: Store, device: str
+    ) -> None:
+        self.recipe, self.settings, self.store, self.device = recipe, settings, store, device
+        self._outputs = tuple(outputs)
+        self._order = [name for name in needed(recipe, self._outputs) if name != settings.scene]
+        self._code = Code(store.code_memo)
+        self._resize = self._code.digest("neusee.nodes.resampling")
+        #: pictures that came from the store, and pictures that were simulated
+        self.read, self.computed = 0, 0
+
+    def picture(
+        self,
+        scene: Tensor,
+        given: Mapping[str, Any],
+        noise: int,
+        compute: Callable[[], dict[str, Tensor]],
+    ) -> dict[str, Tensor]:
+        """Return the tensors of a picture from the store, or compute and store them before the
+        next picture.
+        """
+        key = self._key(scene, given, noise)
+        computed: list[bool] = []
+
+        def simulated() -> dict[str, Tensor]:
+            computed.append(True)
+            return compute()
+
+        kept: dict[str, Tensor] = (
+            simulated()
+            if is_private(key)
+            else compute_once(self.store, key, dict, simulated, _ABOUT)
+        )
+        self.computed, self.read = self.computed + bool(computed), self.read + (not computed)
+        return {name: x.to(self.device) for name, x in kept.items()}
+
+    def _key(self, scene: Tensor, given: Mapping[str, Any], noise: int) -> str:
+        settings, recipe = self.settings, self.recipe
+        pixels = scene.detach().cpu().contiguous()
+        keys = {settings.scene: hashlib.sha256(pixels.numpy().tobytes()).hexdigest()}
+        drawn: dict[str, dict[str, Any]] = {}
+        for reader, value in given.items():
+            reads, _, param = reader.rpartition(".")
+            drawn.setdefault(reads, {})[param] = value
+        for name in self._order:
+            step = recipe.steps[name]
+            step = replace(step, params={**step.params, **drawn.get(name, {})})
+            keys[name], _ = key_of(step, keys, recipe.seed, self._code, place(step, self.device))
+        own = [keys[name] for name in self._outputs]
+        if private := next(filter(is_private, own), None):
+            return private
+        cut = [settings.size, settings.patch, settings.patches, settings.precision, self._resize]
+        within = [
+            list(pixels.shape),
+            noise,
+            recipe.tolerance,
+            recipe.exact,
+            recipe.estimates,
+            device_kind(self.device),
+        ]
+        return digest("training picture", engine(*_CODE), own, cut, within)
+
+
+# --- training pictures ----------------------------------------------------------------------------
+
+# The numbered training pictures, each with its own scene, laser, sensor parameters and noise.
+#
+# Steps that depend neither on the mask nor on a drawn value are computed once, steps that depend
+# only on the mask once in each iteration, and steps that depend on a scene, a drawn value or noise
+# once for each picture. Gradients of steps that depend only on the mask are summed over all
+# pictures, so that one picture is in memory at a time.
+
 
 #: the node of a laser, and the parameter that is 0 without a laser
 _LASER = ("optics.laser_irradiance", "strength")
@@ -389,3 +618,91 @@ def _given(recipe: Recipe, name: str) -> Any:
 
 def _sources(recipe: Recipe, readers: Iterable[str]) -> set[str]:
     return {source for reader in readers for source in recipe.steps[reader].sources}
+
+
+# --- several cameras ------------------------------------------------------------------------------
+
+# Training pictures of several cameras in turn, so that one network learns to restore the pictures
+# of all of them.
+
+
+class SeveralCameras:
+    """The pictures of a training with the camera of its recipe and with each of ``train.cameras``.
+
+    The picture with the number n, or its number n in the pool, is of camera n modulo their count. A
+    held-out photograph is seen by every camera.
+    """
+
+    shared = None  #: no mask is trained, so that no result depends on one
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        settings: Training,
+        photographs: Photographs,
+        store: Store,
+        device: str,
+        held_out: Sequence[Path],
+    ) -> None:
+        recipes = (recipe, *recipe.cameras)
+        self.repeats, self._pool = len(recipes), settings.pool
+        seen = [path for path in held_out for _ in recipes]
+        parts = settings, photographs, store, device
+        self._streams = [TrainingStream(each, *parts, each, held_out=seen) for each in recipes]
+        self.psf = self._streams[0].psf
+
+    @property
+    def pool_counts(self) -> dict[str, int]:
+        """Return how many pictures of the pool came from the store, and how many were simulated."""
+        counts = [stream.pool_counts for stream in self._streams]
+        return {name: sum(each[name] for each in counts) for name in counts[0]}
+
+    def begin(self, height: Any) -> Shared:
+        """Return no results: none depends on a mask that is trained."""
+        return Shared.of({})
+
+    def counted(self, name: str, here: int) -> tuple[int, int]:
+        """Return the total number of spectral bands of a result, and how many processes compute
+        each: one.
+        """
+        return here, 1
+
+    def batch(
+        self, shared: Shared, stage: int, first: int, count: int
+    ) -> Iterator[tuple[int, Sample]]:
+        """Yield index and picture of each of the ``count`` pictures of a batch, from the picture
+        number ``first``.
+        """
+        for i in range(count):
+            number = first + i
+            within = number % self._pool if self._pool and stage != HELD_OUT else number
+            stream = self._streams[within % self.repeats]
+            yield i, stream.turned(stream(shared.seen, stage, number), stage, number)
+
+
+Samples = TrainingStream | SeveralCameras
+
+
+def samples_of(
+    recipe: Recipe,
+    settings: Training,
+    photographs: Photographs,
+    store: Store,
+    device: str,
+    frozen: Recipe | None,
+    mesh: Mesh,
+    held_out: Sequence[Path],
+) -> Samples:
+    """Return the pictures of a training, of one camera or of several in turn."""
+    if frozen is not None and frozen.cameras:
+        return SeveralCameras(frozen, settings, photographs, store, device, held_out)
+    return TrainingStream(recipe, settings, photographs, store, device, frozen, mesh, held_out)
+
+
+def require_alone(recipe: Recipe, mesh: Mesh) -> None:
+    """Raise an error for a training with several cameras in several processes."""
+    if recipe.cameras and mesh.size > 1:
+        raise MeshError(
+            f"{KEY}.cameras: a training with several cameras runs in a single process, without"
+            " torchrun"
+        )

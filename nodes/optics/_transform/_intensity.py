@@ -12,9 +12,8 @@ from torch import Tensor
 
 from neusee.nodes.optics._transform._fused import FusedPupil, available, operators
 from neusee.nodes.optics._transform._pupil_field import Field, Screens, View, refuse_too_many_turns
-from neusee.nodes.optics._transform._sample_axis import patch_of
+from neusee.nodes.optics._transform._sample_axis import Workspace, borrowed, patch_of
 from neusee.nodes.optics._transform._scaled_transform import Method, propagate
-from neusee.nodes.optics._transform._workspace import Workspace, borrowed
 from neusee.nodes.torch_func import one_by_one, transformed
 
 _ONCE = "the PSF has no second derivative here: differentiate without create_graph=True"

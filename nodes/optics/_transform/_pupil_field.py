@@ -10,9 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes._half_precision import refuse_not_finite
-from neusee.nodes.optics._transform._sample_axis import Axis, Source, centred
-from neusee.nodes.optics._transform._workspace import Workspace
+from neusee.nodes.optics._transform._sample_axis import Axis, Source, Workspace, centred
+from neusee.nodes.precision import refuse_not_finite
 
 _MOST_TURNS = 1e9  #: turns of phase that float64 holds to 2e-7 turn
 #: below this many turns a float32 phase is exact to 5e-7 rad, like a float64 phase after a cast

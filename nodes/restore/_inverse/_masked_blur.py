@@ -1,17 +1,120 @@
-"""The model of a blurred picture of which only some pixels are seen, and the prior of the picture
-before the blur.
-
-All spectra are half spectra of a torus: (channel, fy, fx) with fx >= 0, as `torch.fft.rfft2`
-returns them.
-"""
+"""The blur of a camera on a periodic grid, with hidden pixels and the prior of the picture."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
+
+from neusee.nodes.precision import single
+from neusee.nodes.values import Bands, Psf
+
+# --- grey psf -------------------------------------------------------------------------------------
+
+# What the channels of a sensor see of a grey scene: the PSF of each, shares of the bands, and the
+# white.
+
+
+def effective_psf(
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """Return the PSF of each channel of the sensor for a grey scene, (channel, y, x), in the more
+    precise of the types of the PSF and ``dtype``.
+    """
+    lengths = {len(psf.intensity), len(illuminant), responses.shape[-1], len(bands.centres)}
+    if len(lengths) > 1:
+        raise ValueError(
+            f"PSF, illuminant, responses and bands have {sorted(lengths)} bands: use one `bands`"
+            " step"
+        )
+    intensity = single(psf.intensity)
+    shares = grey_shares(illuminant, responses, bands).to(intensity.device)
+    if torch.promote_types(intensity.dtype, dtype) == intensity.dtype:
+        whole: Tensor = torch.tensordot(shares.to(intensity), intensity, 1)
+        return whole
+    # band by band, without a copy of all bands
+    planes = zip(shares.to(dtype).T, intensity, strict=True)
+    seen = torch.zeros(len(shares), *intensity.shape[-2:], dtype=dtype, device=intensity.device)
+    for share, plane in planes:
+        seen = seen + share[:, None, None] * plane.to(dtype)
+    return seen
+
+
+def grey_shares(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
+    """Return the share of each band in the signal of each channel from a grey scene: (channel,
+    band), float64.
+    """
+    share = responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()
+    blind = share.sum(-1, keepdim=True) <= 0  # a channel without response gets equal shares
+    share = share.where(~blind, 1.0)
+    return share / share.sum(-1, keepdim=True)
+
+
+def grey_white(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
+    """Return what each channel sees of a grey scene, (channel, 1, 1) float64, over what the best
+    channel sees.
+    """
+    light = (responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()).sum(-1)
+    return (light / light.max().clamp_min(1e-30)).clamp_min(1e-3)[:, None, None]
+
+
+# --- psf on grid ----------------------------------------------------------------------------------
+
+# A PSF on the periodic grid of a picture, and how far it reaches.
+
+
+_LIGHT = 0.999  #: share of the light that the unknown border around the picture is wide enough for
+
+
+def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
+    """Return the radii (y, x) that hold 99.9 % of the PSF, at most the larger of 256 pixels and
+    half the picture.
+    """
+    reach = []
+    for dim, size in ((-1, picture[0]), (-2, picture[1])):
+        profile = kernels.detach().sum((0, dim)).double()
+        radius = (torch.arange(len(profile), device=profile.device) - len(profile) // 2).abs()
+        inside = profile.new_zeros(int(radius.max()) + 1).index_add(0, radius, profile).cumsum(0)
+        reach.append(min(int((inside < _LIGHT * inside[-1]).sum()), max(256, size // 2), size))
+    return reach[0], reach[1]
+
+
+def bordered(reach: tuple[int, int], border: float) -> tuple[int, int]:
+    """Return the width (y, x) of the unknown border around a picture, ``border`` times the reach
+    of the PSF.
+    """
+    return math.ceil(border * reach[0]), math.ceil(border * reach[1])
+
+
+def wrapped(kernels: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return PSFs centred on the first sample of a periodic grid; a PSF wider than the grid
+    wraps around.
+    """
+    (m, n), (y, x) = kernels.shape[-2:], size
+    rows, columns = -(-m // y), -(-n // x)
+    around = pad(kernels, (0, columns * x - n, 0, rows * y - m))
+    if rows * columns > 1:
+        around = around.reshape(-1, rows, y, columns, x).sum((1, 3))
+    return around.roll((-(m // 2), -(n // 2)), (-2, -1))
+
+
+# --- masked blur ----------------------------------------------------------------------------------
+
+# The model of a blurred picture of which only some pixels are seen, and the prior of the picture
+# before the blur.
+#
+# All spectra are half spectra of a torus: (channel, fy, fx) with fx >= 0, as `torch.fft.rfft2`
+# returns them.
+
 
 Size = tuple[int, int]
 Map = Callable[[Tensor], Tensor]
@@ -196,3 +299,110 @@ def widened(spectrum: Tensor, size: Size, wide: Size) -> Tensor:
     whole[..., :up, :right] = 4.0 * spectrum[..., :up, :right]
     whole[..., wide[0] - down :, :right] = 4.0 * spectrum[..., size[0] - down :, :right]
     return whole
+
+
+# --- fft grid -------------------------------------------------------------------------------------
+
+# Size of the periodic grid on which a picture is deblurred: unknown pixels around the picture, and
+# fast FFTs.
+
+
+DENSE = 20  #: pixels a side, up to which a picture is solved exactly
+
+
+def torus(picture: Size, edge: Size) -> Size:
+    """Return the size of a periodic grid for the picture and `edge` unknown pixels on each side."""
+    whole = 2 ** halvings(picture)
+    y, x = (whole * _smooth(-(-(n + 2 * e) // whole)) for n, e in zip(picture, edge, strict=True))
+    return y, x
+
+
+def _smooth(n: int) -> int:
+    """Return the least whole number of at least ``n`` without prime factors above 7, for which
+    FFTs are fast.
+    """
+    while 210**32 % n:
+        n += 1
+    return n
+
+
+def halvings(picture: Size) -> int:
+    """Return how often the grid of a picture is halved until the picture is small enough to be
+    solved exactly.
+    """
+    return max(0, math.ceil(math.log2(max(picture) / DENSE)))
+
+
+# --- frame blur -----------------------------------------------------------------------------------
+
+# The blur of a camera as a linear operator, from a scene wider than the frame to the frame, and its
+# adjoint.
+
+
+class FrameBlur(NamedTuple):
+    """The blur from a scene (..., channel, *scene) to a frame (..., channel, *frame), and the
+    adjoint of this blur.
+
+    The frame is the middle of the scene. The border of the scene beyond the frame is as wide as the
+    radius that holds 99.9 % of the PSF, as in `restore.wiener`. Each pixel of the frame is thus a
+    sum over scene pixels that are unknowns themselves. Light from beyond the border is taken from
+    the opposite side of the scene.
+    """
+
+    #: (channel, fy, fx), half the spectrum of the PSF of each channel on the grid of the scene
+    transfer: Tensor
+    scene: Size
+    frame: Size
+
+    def seen(self, scene: Tensor) -> Tensor:
+        """Return the frame that the camera sees of a scene: blurred, and cropped to the sensor."""
+        spectrum = torch.fft.rfft2(scene.roll([-n for n in self.corner()], (-2, -1)))
+        return blurred(self._transfer(scene), spectrum, self.scene, self.frame)
+
+    def adjoint(self, frame: Tensor) -> Tensor:
+        """Return the adjoint of `seen`, applied to a frame."""
+        spectrum = gathered(self._transfer(frame), frame, self.scene)
+        gathered_light: Tensor = torch.fft.irfft2(spectrum, s=self.scene)
+        return gathered_light.roll(self.corner(), (-2, -1))
+
+    def cropped(self, scene: Tensor) -> Tensor:
+        """Return the part of a scene that lies in the frame."""
+        (top, left), (y, x) = self.corner(), self.frame
+        return scene[..., top : top + y, left : left + x]
+
+    def corner(self) -> Size:
+        """Return the place of the first pixel of the frame in the scene."""
+        y, x = ((wide - n) // 2 for wide, n in zip(self.scene, self.frame, strict=True))
+        return y, x
+
+    def gain(self) -> float:
+        """Return the largest gain at any frequency, which the norm of the blur does not exceed."""
+        return float(self.transfer.abs().max())
+
+    def _transfer(self, like: Tensor) -> Tensor:
+        """Return the transfer function in the precision of a picture, which the result then has
+        too.
+        """
+        return self.transfer.to(like.dtype.to_complex())
+
+
+def frame_blur(
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    frame: Size,
+    dtype: torch.dtype = torch.float32,
+) -> FrameBlur:
+    """Return the blur of a camera for a grey scene, whose frames have the size ``frame``.
+
+    Shapes: psf.intensity (band, any, any), illuminant (band,), responses (channel, band).
+    Units:  scene and frame in one unit: the electrons of a pixel behind a perfect lens without
+            losses, and behind the lens of the PSF.
+    Error:  a grey scene is assumed, as in `restore.wiener`. 0.1 % of the light, and what falls
+            beyond the window of the PSF, comes from the wrong place or from none.
+    Raises: ValueError where the number of bands differs.
+    """
+    kernels = effective_psf(psf, illuminant, responses, bands, torch.float64)
+    scene = torus(frame, edge(kernels, frame))
+    return FrameBlur(torch.fft.rfft2(wrapped(kernels, scene)).to(dtype.to_complex()), scene, frame)

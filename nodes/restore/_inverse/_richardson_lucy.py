@@ -10,10 +10,8 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes._half_precision import single
-from neusee.nodes.restore._inverse._fft_grid import torus
-from neusee.nodes.restore._inverse._grey_psf import effective_psf
-from neusee.nodes.restore._inverse._psf_on_grid import edge, wrapped
+from neusee.nodes.precision import single
+from neusee.nodes.restore._inverse._masked_blur import edge, effective_psf, torus, wrapped
 from neusee.nodes.restore._inverse._wiener import refuse_other_pictures
 from neusee.nodes.sensor._digitization import crop
 from neusee.nodes.units import Electrons

@@ -1,28 +1,128 @@
-"""The node that finds lasers in one frame of a known camera, without any knowledge of the
-lasers.
-"""
+"""The nodes that find lasers in a frame of a known camera, and the glare of those found."""
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
 import torch
 from pydantic import Field
-from torch import Tensor
+from torch import Generator, Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes._half_precision import refuse_not_finite
+from neusee.nodes.precision import refuse_not_finite, single
+from neusee.nodes.restore._inverse._glare import Patterns
 from neusee.nodes.restore._inverse._wiener import refuse_other_pictures
-from neusee.nodes.restore._lasers._beyond_scatter import without_scattered
 from neusee.nodes.restore._lasers._candidates import line_templates
-from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Laser
-from neusee.nodes.restore._lasers._greedy_search import Found, Known, search
-from neusee.nodes.restore._lasers._intervals import NORMAL, spreads
-from neusee.nodes.restore._lasers._lamp_light import lamp_light
-from neusee.nodes.restore._lasers._line_pattern import Lens, Sensor
-from neusee.nodes.restore._lasers._lost_light import at_the_aperture
+from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Laser, lamp_light
+from neusee.nodes.restore._lasers._greedy_search import Found, Known, search, without_scattered
+from neusee.nodes.restore._lasers._joint_fit import NORMAL, spreads
+from neusee.nodes.restore._lasers._line_pattern import Lens, Sensor, line_pattern
 from neusee.nodes.units import Electrons, FocalLength, PixelPitch, PositiveLength, Ratio
 from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil
+
+# --- lost light -----------------------------------------------------------------------------------
+
+# The light of a laser at the aperture, from the light that follows its pattern: dirt scatters and
+# absorbs the rest.
+#
+# No lens is as its recipe says. Dust, scratches, grease, dents and defocus take light out of the
+# pattern, and what they scatter makes the frame differ from the pattern. A fit then finds less
+# light in the pattern, and even less where bright pixels are clipped, because the pixels that are
+# seen are those that happen to be dark. The same difference makes the electrons of a fit scatter
+# more between parts of the frame than noise and scene do, and so tells of the light that is lost.
+#
+# The law: every second lens is as its recipe says. In the others the logarithm of light at the
+# aperture over light that follows the pattern is lognormal, about a power of that scatter and an
+# exponential of the clipped share. Power, exponential and width were learnt from fits in frames of
+# lenses with the dirt of `recipes/flare/dirty_windshield.yaml` (dust, scratches, grease and dents,
+# each 3 to 100 % of it) and the defocus of `recipes/mismatch/usual.yaml`. An even attenuation, as
+# by smudges, changes no pattern and is not part of it.
+
+
+#: growth of a standard deviation by the scatter of a residual, up to which a clean lens explains it
+_PLAIN = 1.05
+#: pixels a side of the frame for which a scatter counts, and of the largest frame of which all
+#: pixels tell of it
+_SIDE, _MOST = 64, 128
+#: relative scatter of electrons behind a dirty lens: median, factor of one deviation
+_USUAL, _FACTOR = 0.004, 2.0
+#: of the median logarithm that is lost: its value at scatter 1, the power of scatter, and its
+#: growth with clipping
+_LOST, _POWER, _CLIPPED = 2.10, 0.74, 2.15
+#: standard deviations of the logarithm of it, where the frame tells the scatter, and where not
+_WIDTHS = (0.7, 1.2)
+_ALL = 10.0  #: logarithm, beyond which nothing of a laser follows its pattern
+_NODES = 256  #: quantiles that stand for a law
+_ENDS = (0.5, 0.05, 0.95)  #: probabilities of an estimate and of the ends of a 90 % interval
+_HALVINGS = 60
+
+
+def at_the_aperture(
+    straight: Tensor, spread: Tensor, ideal: Tensor, seen: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the electrons that a laser would leave behind a clean lens, and the ends of a 90 %
+    interval.
+
+    ``straight`` are those that follow the pattern, with the standard deviation ``spread``; that of
+    a lens which is as its recipe says would be ``ideal``.
+
+    Shapes: each (channel,), seen (channel, y, x), 0 for clipped pixels -> (channel,), (channel, 2).
+    Units:  e-.
+    """
+    # the scatter is a mean over the frame, so that it falls as 1 / side
+    side = min(seen[0].numel() ** 0.5, _MOST)
+    clipped = 1.0 - seen.mean((-2, -1)).to(straight)
+    size = torch.maximum(straight, spread).clamp_min(1e-30) * (_SIDE / side)
+    scatter = (spread.square() - ideal.square()).clamp_min(0.0).sqrt() / size
+    faint = math.sqrt(_PLAIN**2 - 1.0) * ideal / size
+    told = scatter > faint
+    hidden = torch.special.ndtr((faint / _USUAL).log() / math.log(_FACTOR))
+    dirty = torch.ones_like(size) if bool(told.any()) else hidden / (1.0 + hidden)
+    scatter = torch.where(told, scatter, faint.clamp_max(_USUAL))
+    width = torch.where(told, _WIDTHS[0], _WIDTHS[1])
+    middle = math.log(_LOST) + _POWER * scatter.log() + _CLIPPED * clipped
+    lost = torch.exp(middle[:, None] + width[:, None] * _normal_quantiles().to(size)).clamp_max(
+        _ALL
+    )
+    return _quantiles(straight, spread, lost, dirty)
+
+
+def _normal_quantiles() -> Tensor:
+    quantiles: Tensor = torch.special.ndtri(
+        (torch.arange(_NODES, dtype=torch.float64) + 0.5) / _NODES
+    )
+    return quantiles
+
+
+def _quantiles(
+    straight: Tensor, spread: Tensor, lost: Tensor, dirty: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the median and a 90 % interval of straight light with its error, times the exponential
+    of what is lost.
+
+    ``lost`` (channel, node) are equally likely values for a dirty lens, ``dirty`` (channel,) is its
+    probability.
+    """
+    whole = straight[:, None] * torch.cat([torch.ones_like(lost[:, :1]), lost.exp()], 1)
+    weight = torch.cat([1.0 - dirty[:, None], (dirty / lost.shape[1])[:, None].expand_as(lost)], 1)
+    wanted = torch.tensor(_ENDS).to(whole).expand(len(whole), -1)
+    low = (whole.amin(1) - 8.0 * spread)[:, None].expand_as(wanted)
+    high = (whole.amax(1) + 8.0 * spread)[:, None].expand_as(wanted)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        below = torch.special.ndtr(
+            (middle[..., None] - whole[:, None]) / spread.clamp_min(1e-30)[:, None, None]
+        )
+        short = (weight[:, None] * below).sum(-1) < wanted
+        low, high = torch.where(short, middle, low), torch.where(short, high, middle)
+    return high[:, 0], high[:, 1:]
+
+
+# --- find lasers ----------------------------------------------------------------------------------
+
+# The node that finds lasers in one frame of a known camera, without any knowledge of the lasers.
+
 
 _WIDEST = (0.5, 10.0)  #: pixels and nm; half of a wider interval does not identify
 #: log likelihood by which the fit exceeds one at another place or wavelength, to identify
@@ -248,3 +348,130 @@ def _empty(most: int, channels: int) -> FoundLasers:
         spread,
         *straight,
     )
+
+
+# --- found glare ----------------------------------------------------------------------------------
+
+# The glare of a laser that was found in a frame, and other patterns that it may have.
+
+
+Rank = Annotated[int, Field(ge=1, le=8)]
+
+
+@node()
+def found_glare(
+    found: FoundLasers,
+    pupil: Pupil,
+    electrons: Tensor,
+    *,
+    rank: Rank = 1,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
+    sensor: Sensor = "point",
+) -> Tensor:
+    """Compute the glare of a laser that was found in a frame; 0 where fewer than ``rank`` lasers
+    were found.
+
+    The glare is the pattern of a spectral line at the direction and wavelength found, times the
+    electrons of each channel that follow it. `restore.wiener` takes it as ``glare``. Every tensor
+    of ``found`` and ``pupil`` receives a derivative. Of ``electrons``, the frame, only the shape is
+    used.
+
+    Shapes: found (laser,), pupil (v, u), electrons (channel, y, x) -> (channel, y, x).
+    Units:  e-; rank counts from 1, the laser of the largest gain.
+    Error:  the sums over the pupil are exact in the precision of the height: 1e-6 of the brightest
+            pixel for float32. The index of the mask is a cubic between the bands of the pupil.
+            Beyond half the alias-free field from the spot the glare is 0.
+    Raises: ValueError where the found lasers and the frame differ in the number of channels.
+    Source: Goodman, Introduction to Fourier Optics, 3rd edition, eq. 5-14 (field in the focal plane
+            of a lens).
+    """
+    _agree(found, electrons)
+    if rank > int(found.number):
+        return torch.zeros_like(single(electrons))
+    lens = Lens(focal_length, pixel_pitch, (electrons.shape[-2], electrons.shape[-1]), sensor)
+    row = rank - 1
+    pattern = line_pattern(
+        pupil, found.direction[row], found.wavelength[row], lens, found.fwhm[row]
+    )
+    glare: Tensor = found.straight[row].to(pattern)[:, None, None] * pattern
+    return glare.to(single(electrons))
+
+
+@node()
+def found_nearby(
+    found: FoundLasers,
+    pupil: Pupil,
+    electrons: Tensor,
+    *,
+    rank: Rank = 1,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
+    sensor: Sensor = "point",
+    patterns: Patterns = 12,
+    rng: Generator,
+) -> Tensor:
+    """Draw patterns that the glare of a found laser may have, from the joint normal law of what was
+    found.
+
+    Each pattern has its own direction, wavelength and electrons of each channel, drawn with the
+    covariance of the found laser. `restore.wiener` takes the patterns as ``nearby``. A laser that
+    was not found has patterns of 0.
+
+    Shapes: found (laser,), pupil (v, u), electrons (channel, y, x) -> (pattern, channel, y, x).
+    Units:  e-; rank counts from 1.
+    Error:  each pattern as `restore.found_glare`. The covariance of the patterns has the relative
+            error sqrt(2 / patterns), and at most ``patterns`` dimensions.
+    Raises: ValueError where the found lasers and the frame differ in the number of channels.
+    Source: sampled prior of a nuisance parameter as in Kaipio and Somersalo, Statistical and
+            Computational Inverse Problems, 2005, ch. 5 (approximation error).
+    """
+    _agree(found, electrons)
+    if rank > int(found.number):
+        return torch.zeros(patterns, *electrons.shape).to(single(electrons))
+    row, lens = (
+        rank - 1,
+        Lens(focal_length, pixel_pitch, (electrons.shape[-2], electrons.shape[-1]), sensor),
+    )
+    drawn = []
+    for values in _drawn(found, row, patterns, rng):
+        pattern = line_pattern(pupil, values[:2], values[2], lens, found.fwhm[row])
+        drawn.append(values[3:].clamp_min(0.0).to(pattern)[:, None, None] * pattern)
+    return torch.stack(drawn).to(single(electrons))
+
+
+@found_nearby.check
+@found_glare.check
+def _(
+    result: Tensor, found: FoundLasers, *inputs: Any, rank: int = 1, **params: Any
+) -> list[Check]:
+    if rank > int(found.number):
+        return [Check(f"no laser of rank {rank} was found, so there is no glare")]
+    return [Check(f"brightest pixel {float(result.max()):.3g} e-", bool(result.isfinite().all()))]
+
+
+def _drawn(found: FoundLasers, row: int, count: int, rng: Generator) -> Tensor:
+    """Return draws (draw, value) of direction, wavelength and the strength of each channel of
+    one found laser.
+    """
+    middle = torch.cat([found.direction[row], found.wavelength[row][None], found.straight[row]])
+    each = (found.direction_interval[row], found.wavelength_interval[row][None])
+    spread = torch.cat(
+        [*((ends[:, 1] - ends[:, 0]) / (2 * NORMAL) for ends in each), found.straight_spread[row]]
+    )
+    # the factor reads one triangle alone
+    even = (found.correlation[row] + found.correlation[row].mT) / 2
+    lower = torch.linalg.cholesky(even + 1e-9 * torch.eye(len(even)).to(even))
+    numbers = torch.randn(
+        count, len(middle), generator=rng, device=rng.device, dtype=torch.float64
+    ).to(middle)
+    draws: Tensor = middle + spread * (numbers @ lower.mT)
+    return draws
+
+
+def _agree(found: FoundLasers, electrons: Tensor) -> None:
+    if electrons.ndim != 3 or len(electrons) != found.strength.shape[-1]:
+        raise ValueError(
+            f"electrons {tuple(electrons.shape)} and found lasers of {found.strength.shape[-1]}"
+            " channels do not fit: give the frame in which the lasers were found, (channel, y, x)"
+        )

@@ -1,6 +1,4 @@
-"""The most likely values of all lasers and lamps of a frame at once, by steps of Gauss and
-Newton.
-"""
+"""The most likely values of all lasers and lamps of a frame at once, and their intervals."""
 
 from __future__ import annotations
 
@@ -9,10 +7,84 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from neusee.nodes.restore._lasers._censored import Censored
-from neusee.nodes.restore._lasers._components import Lamp, Laser
-from neusee.nodes.restore._lasers._whitening import Filter, Weights
+from neusee.nodes.restore._lasers._components import NANOMETRE, Lamp, Laser
+from neusee.nodes.restore._lasers._whitening import LOST, Filter, Weights, filled, masked_variance
+
+# --- censored -------------------------------------------------------------------------------------
+
+# Clipped pixels in a fit: each says that its light was at least full, and nothing more.
+#
+# The light of a clipped pixel is that of the lasers and lamps and that of the scene, which follows
+# the pixels around it. The probability that the sum is full is a normal survival function, of the
+# photons and of what the neighbours do not tell.
+
+
+_BRIGHT = 0.01  #: probability that the scene alone clips a pixel, so that no laser must explain it
+#: of a pixel, because pixels within about three share the error of what their neighbours tell
+_WORTH = 1 / 9
+
+
+class Censored(NamedTuple):
+    """The clipped pixels of a frame, and how well the light of each is known from its
+    neighbours.
+    """
+
+    seen: Tensor  #: (channel, y, x), 1 or 0
+    spread: Tensor  #: (pixel,), e-, standard deviation of the charge of each clipped pixel
+
+    def misfits(self, rest: Tensor) -> Tensor:
+        """Return numbers (pixel,) whose half square is minus the log likelihood, for the frame
+        less all parts, e-.
+        """
+        return _root(self._over(rest))[0]
+
+    def slopes(self, rest: Tensor, columns: Tensor) -> Tensor:
+        """Return how each number falls with each value (value, pixel); ``columns`` is what `lit`
+        makes of its light.
+        """
+        return _root(self._over(rest))[1] * columns / self.spread
+
+    def lit(self, pictures: Tensor) -> Tensor:
+        """Return of pictures (..., channel, y, x) the light of clipped pixels beyond that of
+        their neighbours.
+        """
+        return (pictures - filled(pictures, self.seen)) * (1.0 - self.seen)
+
+    def of(self, pictures: Tensor) -> Tensor:
+        """Return the clipped pixels of pictures: (..., pixel)."""
+        return pictures[..., self.seen == 0]
+
+    def _over(self, rest: Tensor) -> Tensor:
+        return self.of(filled(rest, self.seen) - rest) / self.spread
+
+
+def _root(over: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the root of twice the misfit of a pixel by so many deviations over full, and its
+    slope, downwards.
+    """
+    short = (1.0 - _BRIGHT) * torch.special.ndtr(-over)
+    root = (-2.0 * torch.log1p(-short)).sqrt()
+    density = torch.exp(-0.5 * over.square()) / (2.0 * torch.pi) ** 0.5
+    slope = (1.0 - _BRIGHT) * density / ((1.0 - short) * root.clamp_min(1e-6))
+    return _WORTH**0.5 * root, _WORTH**0.5 * slope
+
+
+def censored(electrons: Tensor, seen: Tensor, scene: Tensor, read_noise: float) -> Censored | None:
+    """Return the clipped pixels of a frame, of which ``scene`` is what the parts do not explain;
+    None without any.
+    """
+    if bool(seen.all()):
+        return None
+    variance = electrons.clamp_min(1.0) + read_noise**2 + LOST * masked_variance(scene, seen)
+    return Censored(seen, variance[seen == 0].sqrt())
+
+
+# --- joint fit ------------------------------------------------------------------------------------
+
+# The most likely values of all lasers and lamps of a frame at once, by steps of Gauss and Newton.
+
 
 Parts = tuple[Laser | Lamp, ...]
 #: factors of the diagonal, tried in this order until a step lowers the misfit
@@ -141,3 +213,83 @@ def _misfit(data: Data, parts: Parts) -> tuple[Tensor, Tensor, float]:
         rest = torch.cat([rest, data.clipped.misfits(left)])
     prior = sum(float((part.precision * part.values.square()).sum()) for part in parts)
     return left, rest, 0.5 * (float(rest.double().square().sum()) + prior)
+
+
+# --- intervals ------------------------------------------------------------------------------------
+
+# How well a frame tells the values of each laser: from the curvature of the fit and the scatter of
+# its residual.
+
+
+NORMAL = 1.6448536269514722  #: standard deviations on each side of a 90 % interval
+_BLOCK = 8  #: pixels a side of blocks whose residuals count as independent of one another
+#: pixels, pixels and nm, standard deviations of what dirt and defocus change
+_MODEL = (0.0036, 0.0036, 0.08)
+#: the same over the root of the number of pixels seen, whose scattered light is random
+_GRAINS = (0.23, 0.23, 5.9)
+#: standard deviation of the wavelength from the unknown shape of a line, over the width of the line
+_SHAPE = 0.03
+_AMOUNT = 0.0015  #: the same of the electrons of each channel, relative
+
+
+class Spread(NamedTuple):
+    """How well a frame tells the values of one laser."""
+
+    covariance: Tensor  #: (value, value), of y, x (pixels), nm, and the electrons of each channel
+    #: (channel,) e-, standard deviation of these electrons behind a lens that is as its recipe says
+    ideal: Tensor
+
+
+def spreads(fit: Fit, seen: Tensor) -> list[Spread]:
+    """Return for each laser how well its values are told.
+
+    ``seen`` (channel, y, x) is 0 for clipped pixels, which the fit has after all others, if at all.
+    The inverse of the second derivatives is enlarged where the slopes of blocks of the frame
+    scatter more than the model says.
+    """
+    count = len(fit.normal)
+    inverse = solved(fit.normal, torch.eye(count).to(fit.normal))
+    each = (fit.columns * fit.rest).double()
+    pictures = each[:, : seen.numel()].view(count, *seen.shape)
+    if each.shape[1] > seen.numel():
+        pictures[:, seen == 0] = each[:, seen.numel() :]  # a clipped pixel has no residual
+    scores = pictures.sum(1)
+    y, x = (-n % _BLOCK for n in seen.shape[-2:])
+    blocks = (
+        pad(scores, (0, x, 0, y))
+        .unfold(1, _BLOCK, _BLOCK)
+        .unfold(2, _BLOCK, _BLOCK)
+        .sum((-2, -1))
+        .flatten(1)
+    )
+    prior = fit.normal - products(fit.columns)
+    scattered = inverse @ (blocks @ blocks.T + prior) @ inverse
+    growth = (scattered.diagonal() / inverse.diagonal().clamp_min(1e-300)).clamp_min(1.0).sqrt()
+    whole = growth[:, None] * inverse * growth
+    found, first = [], 0
+    for part in fit.parts:
+        own = slice(first, first + len(part.values))
+        first += len(part.values)
+        if isinstance(part, Laser):
+            pixels = int(seen.amin(0).sum())
+            grown, ideal = (_of_channels(part, each[own, own], pixels) for each in (whole, inverse))
+            found.append(Spread(grown, ideal.diagonal()[3:].sqrt()))
+    return found
+
+
+def _of_channels(laser: Laser, own: Tensor, pixels: int) -> Tensor:
+    """Return the covariance of place, wavelength and electrons of each channel, with what the model
+    neglects.
+
+    ``pixels`` counts those that no channel clips.
+    """
+    slopes = laser.channel_slopes().to(own)
+    to = torch.zeros(3 + len(slopes), len(own)).to(own)
+    to[:3, :3] = torch.eye(3).to(own)
+    to[3:] = slopes
+    neglected = torch.zeros(len(to)).to(own)
+    grains = torch.tensor(_GRAINS).to(own).square() / max(pixels, 1)
+    neglected[:3] = torch.tensor(_MODEL).to(own).square() + grains
+    neglected[2] += (_SHAPE * laser.fwhm.to(own) / NANOMETRE).square()
+    neglected[3:] = (_AMOUNT * laser.channels()).square().to(own)
+    return to @ own @ to.T + neglected.diag()

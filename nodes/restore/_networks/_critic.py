@@ -11,7 +11,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from neusee.nodes._half_precision import single
+from neusee.nodes.precision import single
 from neusee.nodes.restore._networks._restorer import LEAK, LEAKY, start_network
 
 SMALLEST = 16  #: pixels a side, from which four halvings leave one

@@ -16,10 +16,9 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from neusee.nodes import ParameterError
-from neusee.nodes._mirror_padding import mirrored
-from neusee.nodes.bicubic_resize import resize
-from neusee.nodes.exact_convolution import exact_convolutions
-from neusee.nodes.network_classes import Architecture
+from neusee.nodes.own_modules import Architecture
+from neusee.nodes.precision import exact_convolutions
+from neusee.nodes.resampling import mirrored, resize
 from neusee.nodes.restore._networks._restorer import PictureRestorer
 
 _DRAWING = threading.Lock()  #: one thread at a time seeds the random numbers of the process

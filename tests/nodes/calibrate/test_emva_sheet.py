@@ -22,8 +22,8 @@ from neusee.nodes.calibrate import (
     without_trend,
 )
 from neusee.nodes.calibrate import levels as joined
-from neusee.nodes.calibrate._sheet._nonuniformity import nonuniformity, spatial_variances
-from neusee.nodes.calibrate._sheet._photon_transfer import photon_transfer, saturation_point
+from neusee.nodes.calibrate._emva_quantities import photon_transfer, saturation_point
+from neusee.nodes.calibrate._nonuniformity import nonuniformity, spatial_variances
 from neusee.nodes.values import Levels
 
 DATA = Path(

@@ -10,9 +10,9 @@ from safetensors.torch import save_file
 from torch.testing import assert_close
 
 from neusee.nodes import ParameterError, doe, optics
-from neusee.nodes.bicubic_resize import enlarge
 from neusee.nodes.doe._parametrisations import PARAMETRISATIONS
 from neusee.nodes.doe._unet_height_map import HeightNet, coordinates, fresh, height_of
+from neusee.nodes.resampling import enlarge
 
 STOP = optics.stop(samples=64, pitch=5e-6, diameter=320e-6)
 

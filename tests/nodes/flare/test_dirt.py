@@ -10,11 +10,18 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from neusee.nodes import flare, optics
-from neusee.nodes.flare._dirt import _dents, _grains, _scratches, _streams
-from neusee.nodes.flare._grains_and_scratches import Grain, Scratch, _distance, stamp
-from neusee.nodes.optics._phase_screen import screen
+from neusee.nodes.flare._dirt import (
+    Grain,
+    Scratch,
+    _dents,
+    _distance,
+    _grains,
+    _scratches,
+    _streams,
+    stamp,
+)
 from neusee.nodes.optics._pupil_grid import grid_of, inside, pupil_grid
-from neusee.nodes.optics._zernike import surface
+from neusee.nodes.optics._zernike import screen, surface
 
 STOP = optics.stop(samples=128, pitch=10e-6, diameter=1.28e-3)
 FILTHY = {"dust": 30.0, "scratches": 10.0, "grease": 0.2, "smudges": 0.5, "dents": 0.4}

@@ -6,7 +6,7 @@ import torch
 
 from neusee.nodes import doe, optics, spectra
 from neusee.nodes.metrics import spectral_error
-from neusee.nodes.metrics._spectral_error import _interpolated
+from neusee.nodes.metrics._psf_quality import _interpolated
 from tests.nodes.optics.independent_psf import window
 
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from neusee.nodes import ParameterError, optics
 from neusee.nodes.optics import _pixel_average, psf
-from neusee.nodes.optics._lens_band import cut_off, round_lens
-from neusee.nodes.optics._pixel_filter import averaged, fine_axis
+from neusee.nodes.optics._lens import cut_off, round_lens
+from neusee.nodes.optics._pixel_average import averaged, fine_axis
 from neusee.nodes.values import Pupil
 from tests.nodes.optics import own_pixel_average as own
 from tests.nodes.optics.random_pixel_cameras import compared, drawn, energy

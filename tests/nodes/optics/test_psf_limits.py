@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neusee.nodes import doe, optics
-from neusee.nodes.optics._psf_limits import refuse_gained_light
+from neusee.nodes.optics._psf import refuse_gained_light
 from neusee.nodes.values import Bands
 
 FOCAL, PIXEL, WAVELENGTH = 50e-3, 3e-6, 500e-9

@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from neusee.nodes import doe, optics
-from neusee.nodes.optics._phase_screen import screen
-from neusee.nodes.optics._phase_steps import phase_steps
+from neusee.nodes.optics._pupil import phase_steps
 from neusee.nodes.optics._pupil_grid import PupilGrid, axes, inside, polar, pupil_grid
-from neusee.nodes.optics._zernike import combine, noll, surface
+from neusee.nodes.optics._zernike import combine, noll, screen, surface
 from neusee.nodes.values import Bands, Dirt
 
 LENS = {"pitch": 10e-6, "diameter": 2e-3}

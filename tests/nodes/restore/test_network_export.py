@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from neusee.nodes import ParameterError, restore
-from neusee.nodes.network_classes import Architecture
+from neusee.nodes.own_modules import Architecture
 from neusee.nodes.restore import FFTMamba, NAFNet, UNet, export_network, own_network, start_network
 
 SIZES = ((64, 96), (48, 160))  #: multiples of 16

@@ -8,7 +8,7 @@ from scipy import stats
 
 from neusee.nodes import ErrorBound, TensorStats
 from neusee.nodes.sensor import dark_current, digitize, photon_noise, read_noise
-from neusee.nodes.sensor._draw_limits import (
+from neusee.nodes.sensor._noise import (
     SURE,
     amplitude_error_drawn,
     chi_square_limit,

@@ -7,7 +7,7 @@ import torch
 
 from neusee.nodes.spectra import _linear_lift as lifts
 from neusee.nodes.spectra import bands, lift_lmmse, lift_lmmse_mixture
-from neusee.nodes.spectra._linear_planes import linear_planes
+from neusee.nodes.spectra._low_rank_cube import linear_planes
 
 SCENE = bands(start=400e-9, stop=700e-9, count=31)
 

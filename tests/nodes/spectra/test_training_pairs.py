@@ -11,9 +11,9 @@ import torch
 
 from neusee.nodes import ParameterError
 from neusee.nodes.spectra import bands, grain, leaves, lift_lmmse, metamers, reflectances, render
+from neusee.nodes.spectra._cie_tables import paints, to_srgb
 from neusee.nodes.spectra._metamers import metameric_blacks
-from neusee.nodes.spectra._mst_lift_node import lift_pictures, start_mst_plus_plus
-from neusee.nodes.spectra._spectral_tables import paints, to_srgb
+from neusee.nodes.spectra._mst_plus_plus import lift_pictures, start_mst_plus_plus
 
 NM = 1e-9
 SCENE = bands(start=400 * NM, stop=700 * NM, count=31)

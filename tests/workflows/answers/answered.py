@@ -8,7 +8,9 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-from neusee.workflows.answers import installed_program, repeated_command, typed_command
+from neusee.workflows.answers import repeated_command
+from neusee.workflows.answers import repeated_command as installed_program
+from neusee.workflows.answers import repeated_command as typed_command
 from neusee.workflows.report.study_folder import StudyReport, StudyRun, as_json
 from neusee.workflows.report.study_page import Section, said
 from neusee.workflows.store.shared_folder import Disk

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.answers import opened_files
+from neusee.workflows.answers import witnesses as opened_files
 from neusee.workflows.engine.provenance import versions
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.answers import installed_program, repeated_command, stored_answer
+from neusee.workflows.answers import repeated_command, stored_answer
+from neusee.workflows.answers import repeated_command as installed_program
 from neusee.workflows.report.run_crate import CRATE
 
 
@@ -216,7 +217,7 @@ def test_a_command_with_a_warning_is_not_kept(place, monkeypatch):
 
 
 def test_a_command_that_has_printed_a_warning_is_not_kept(place, monkeypatch):
-    from neusee.workflows.cli.interruption import print_warning
+    from neusee.workflows.cli.command_frame import print_warning
 
     assert doubtful(place, monkeypatch, lambda: print_warning("something is odd"))
 

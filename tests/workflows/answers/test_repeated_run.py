@@ -11,12 +11,13 @@ import pytest
 import torch
 
 from neusee.nodes import node
-from neusee.workflows.answers import repeated_command, stored_results
-from neusee.workflows.answers.repeated_run import FOLDER, TOOK, RunResults
+from neusee.workflows.answers import repeated_command
+from neusee.workflows.answers import witnesses as stored_results
+from neusee.workflows.answers.results_folder import FOLDER, TOOK, RunResults
 from neusee.workflows.answers.stored_answer import read_answer
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step
-from neusee.workflows.report import run_html
+from neusee.workflows.report import run_folder as run_html
 from neusee.workflows.report.run_crate import CRATE
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store import metadata

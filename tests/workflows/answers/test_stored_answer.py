@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.answers import answer_upkeep, stored_answer
+from neusee.workflows.answers import stored_answer
+from neusee.workflows.answers import stored_answer as answer_upkeep
 from neusee.workflows.answers.stored_answer import (
     Answer,
     packed,
@@ -23,8 +24,8 @@ from neusee.workflows.answers.stored_answer import (
     write_answer,
 )
 from neusee.workflows.answers.witnesses import Witnesses
-from neusee.workflows.keys import seal
-from neusee.workflows.keys.seal import NotRead, OtherFormat, Unsigned, seal_file
+from neusee.workflows.keys import sealed_files as seal
+from neusee.workflows.keys.sealed_files import NotRead, OtherFormat, Unsigned, seal_file
 from neusee.workflows.store.shared_folder import Disk
 
 NAME, OTHER = "ab" + "0" * 30, "ab" + "1" * 30

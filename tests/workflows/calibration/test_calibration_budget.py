@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 
 from neusee.nodes.calibrate import STATISTICS, Laboratory
-from neusee.workflows.calibration.budget_page import two_digits
-from neusee.workflows.calibration.calibration_budget import budgets
 from neusee.workflows.calibration.calibration_page import CalibrationResult
 from neusee.workflows.calibration.emcee_sampler import Chains
 from neusee.workflows.calibration.identifiability import identify
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
+from neusee.workflows.calibration.log_posterior import SensorPosterior, find_mode, initial_theta
+from neusee.workflows.calibration.uncertainty_budget import budgets, two_digits
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 

@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neusee.workflows.calibration import calibration_figures, corner_figure, picture_sections
+from neusee.workflows.calibration import calibration_figures
+from neusee.workflows.calibration import calibration_figures as corner_figure
+from neusee.workflows.calibration import calibration_figures as picture_sections
 from neusee.workflows.calibration.calibration_page import CalibrationResult
 from neusee.workflows.calibration.emcee_sampler import Chains
 from neusee.workflows.calibration.identifiability import identify
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
+from neusee.workflows.calibration.log_posterior import SensorPosterior, find_mode, initial_theta
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 

@@ -13,11 +13,18 @@ import pytest
 import torch
 
 from neusee.nodes.calibrate import Nonuniformity, emva_sheet, levels, reduce, spatial_series
-from neusee.workflows.calibration import emva_figures, emva_pdf
-from neusee.workflows.calibration.emva_frames import EmvaFrames, descriptor_recipe, frames_of_recipe
-from neusee.workflows.calibration.emva_page import operating_point, requirements, sections
+from neusee.workflows.calibration import emva_figures
+from neusee.workflows.calibration import emva_figures as emva_pdf
+from neusee.workflows.calibration.emva_sheet import (
+    EmvaFrames,
+    descriptor_recipe,
+    frames_of_recipe,
+    operating_point,
+    requirements,
+    sections,
+)
 from neusee.workflows.cli import app
-from neusee.workflows.frames.descriptor_file import descriptor_of
+from neusee.workflows.frames.folder_recipe import descriptor_of
 from neusee.workflows.store.result_store import Store
 from tests.nodes.calibrate.numpy_emva import quantities
 

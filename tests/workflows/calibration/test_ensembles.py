@@ -4,7 +4,7 @@ import emcee
 import numpy as np
 import pytest
 
-from neusee.workflows.calibration.ensembles import Walk, walk_until
+from neusee.workflows.calibration.emcee_sampler import Walk, walk_until
 
 WALKERS, FREE = 16, 3
 MOVES = {

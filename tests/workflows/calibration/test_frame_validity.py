@@ -15,6 +15,8 @@ import torch
 from neusee.nodes.calibrate import FrameTest, Hidden, open_errors
 from neusee.workflows.calibration.emcee_sampler import Chains
 from neusee.workflows.calibration.frame_validity import (
+    IntervalEstimate,
+    ModelSpread,
     frame_checks,
     hidden_checks,
     hidden_faults,
@@ -25,9 +27,8 @@ from neusee.workflows.calibration.frame_validity import (
     widened_models,
 )
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.model_spread import IntervalEstimate, ModelSpread
 from neusee.workflows.cli import app
-from neusee.workflows.recipe.distributions.joint import Z_90
+from neusee.workflows.recipe.distributions.joint_distribution import Z_90
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 

@@ -11,12 +11,11 @@ import pytest
 from scipy.stats import multivariate_t
 
 from neusee.workflows.calibration import emcee_sampler
-from neusee.workflows.calibration.given_widths import GivenWidths
+from neusee.workflows.calibration.camera_density import GivenWidths
 from neusee.workflows.calibration.identifiability import identify
 from neusee.workflows.calibration.importance_sampling import draw_guide
-from neusee.workflows.calibration.log_posterior import SensorPosterior
+from neusee.workflows.calibration.log_posterior import SensorPosterior, search_mode
 from neusee.workflows.calibration.posterior_checks import checks, importance_samples
-from neusee.workflows.calibration.posterior_mode import search_mode
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 

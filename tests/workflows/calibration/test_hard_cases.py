@@ -10,13 +10,16 @@ import torch
 
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.identifiability import identify
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import LaplaceFit, find_mode, initial_theta
+from neusee.workflows.calibration.log_posterior import (
+    LaplaceFit,
+    SensorPosterior,
+    find_mode,
+    initial_theta,
+)
 from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.calibration.independent_draws import walk_draws
-from neusee.workflows.studies.calibration.simulated_sensors import SensorSimulator
+from neusee.workflows.studies.calibration.posterior_tests import SensorSimulator, walk_draws
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -11,10 +11,15 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from neusee.workflows.calibration.level_misfit import left_out, misfits, runs, waves
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_checks import goodness_of_fit, importance_samples
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
+from neusee.workflows.calibration.log_posterior import SensorPosterior, find_mode, initial_theta
+from neusee.workflows.calibration.posterior_checks import (
+    goodness_of_fit,
+    importance_samples,
+    left_out,
+    misfits,
+    runs,
+    waves,
+)
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 

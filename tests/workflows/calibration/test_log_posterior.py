@@ -12,9 +12,8 @@ import pytest
 
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.identifiability import identify
-from neusee.workflows.calibration.log_posterior import SensorPosterior
+from neusee.workflows.calibration.log_posterior import SensorPosterior, find_mode, initial_theta
 from neusee.workflows.calibration.posterior_checks import checks, importance_samples
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
 from neusee.workflows.cli import app
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store

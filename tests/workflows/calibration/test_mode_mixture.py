@@ -9,10 +9,9 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import multivariate_t
 
-from neusee.workflows.calibration.importance_sampling import weights
-from neusee.workflows.calibration.mode_mixture import fit_about_mode
+from neusee.workflows.calibration.camera_density import TailDensity, with_prior_tails
+from neusee.workflows.calibration.importance_sampling import fit_about_mode, weights
 from neusee.workflows.calibration.posterior_mixture import Mixture
-from neusee.workflows.calibration.tail_density import TailDensity, with_prior_tails
 
 #: a dark current and its standard error; the width of its prior, a logarithm
 FOUND, ERROR, WIDTH = 0.7, 0.25, 2.3

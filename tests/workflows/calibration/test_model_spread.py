@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from neusee.workflows.calibration.model_spread import width_of_mean
+from neusee.workflows.calibration.frame_validity import width_of_mean
 
 
 @pytest.mark.parametrize("terms", [1, 2, 3])

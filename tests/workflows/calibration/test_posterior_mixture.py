@@ -8,11 +8,10 @@ import pytest
 import torch
 from scipy.stats import multivariate_t
 
-from neusee.workflows.calibration.ensembles import Walk, walk_until
-from neusee.workflows.calibration.guided_move import GuidedMove
+from neusee.workflows.calibration.emcee_sampler import GuidedMove, Walk, walk_until
 from neusee.workflows.calibration.importance_sampling import draw_samples, weights
+from neusee.workflows.calibration.log_posterior import find_mode, initial_theta
 from neusee.workflows.calibration.posterior_mixture import Mixture
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
 from tests.workflows.calibration.simulated_lenses import (
     TRUTH,
     picture,

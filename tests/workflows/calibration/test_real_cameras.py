@@ -17,11 +17,10 @@ from scipy.stats import chi2
 
 from neusee.nodes.calibrate import Likelihood, least_squares, table
 from neusee.workflows.calibration import emcee_sampler, run_calibration
+from neusee.workflows.calibration.frame_validity import Z_90, compare_models, initial_theta
 from neusee.workflows.calibration.identifiability import identify
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.model_spread import Z_90, compare_models, initial_theta
+from neusee.workflows.calibration.log_posterior import SensorPosterior, find_mode
 from neusee.workflows.calibration.posterior_checks import goodness_of_fit
-from neusee.workflows.calibration.posterior_mode import find_mode
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store

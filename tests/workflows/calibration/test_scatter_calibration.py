@@ -15,12 +15,12 @@ from neusee.workflows.calibration import (
     importance_sampling,
     posterior_checks,
 )
+from neusee.workflows.calibration.calibration_figures import ring_radii
 from neusee.workflows.calibration.calibration_page import unit_of
 from neusee.workflows.calibration.identifiability import identify, identify_from_draws
 from neusee.workflows.calibration.importance_sampling import draw_guide, draw_samples, weights
-from neusee.workflows.calibration.picture_sections import ring_radii
+from neusee.workflows.calibration.log_posterior import find_mode, initial_theta
 from neusee.workflows.calibration.posterior_checks import importance_samples
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
 from tests.workflows.calibration.simulated_lenses import (
     CAMERA,
     LENS,

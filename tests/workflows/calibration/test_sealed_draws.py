@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from neusee.workflows.calibration import emcee_sampler
-from neusee.workflows.keys.seal import seal_file
+from neusee.workflows.keys.sealed_files import seal_file
 
 h5py = pytest.importorskip("h5py")
 WALKERS = 8

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from neusee.nodes.values import Levels
-from neusee.workflows.calibration.calibration_page import ParameterEstimate
-from neusee.workflows.calibration.standard_fit import (
+from neusee.workflows.calibration.calibration_page import (
+    ParameterEstimate,
     agreement,
     compared,
     comparisons,

@@ -8,7 +8,7 @@ import pytest
 
 from neusee.workflows.calibration import run_calibration
 from neusee.workflows.calibration.identifiability import Identifiability, withheld_electrons
-from neusee.workflows.recipe.distributions.joint import read_posterior
+from neusee.workflows.recipe.distributions.joint_distribution import read_posterior
 
 KINDS = {"gain": "estimate", "read_noise": "upper", "full_well": "none", "dark_current": "none"}
 

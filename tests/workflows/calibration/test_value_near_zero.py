@@ -11,10 +11,9 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import kstest, multivariate_t, norm
 
-from neusee.workflows.calibration.log_posterior import SensorPosterior
+from neusee.workflows.calibration.camera_density import NearZero
+from neusee.workflows.calibration.log_posterior import SensorPosterior, search_mode
 from neusee.workflows.calibration.posterior_checks import importance_samples
-from neusee.workflows.calibration.posterior_mode import search_mode
-from neusee.workflows.calibration.value_near_zero import NearZero
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 

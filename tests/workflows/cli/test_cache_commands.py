@@ -8,7 +8,7 @@ import torch
 from neusee.workflows.answers.stored_answer import Answer, write_answer
 from neusee.workflows.answers.witnesses import Witnesses
 from neusee.workflows.cli import cache_commands
-from neusee.workflows.store.byte_sizes import format_size
+from neusee.workflows.store.cache_settings import format_size
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 

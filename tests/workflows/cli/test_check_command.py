@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from neusee.workflows.cli.app import app
-from neusee.workflows.cli.new_command import KINDS
+from neusee.workflows.cli.project_commands import KINDS
 
 ZONE = """
 import time

@@ -66,7 +66,6 @@ def test_help_comes_at_once_and_without_torch():
         "click",
         "dataclasses",
         "inspect",
-        "pathlib",
         "json",
         "subprocess",
     }

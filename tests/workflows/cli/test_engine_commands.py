@@ -179,7 +179,7 @@ def test_what_no_machine_holds_is_refused_on_an_empty_cache_before_any_work(neus
 
 
 def test_a_plan_of_what_never_ran_has_numbers_and_names_the_guesses(neusee, here, monkeypatch):
-    from neusee.workflows.engine import cost_laws
+    from neusee.workflows.engine import cost_model as cost_laws
 
     code, out, _ = neusee("plan", "first_light")
     assert code == 0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from neusee.workflows.cli import app
-from neusee.workflows.recipe import known_before_run
+from neusee.workflows.recipe import step_checks as known_before_run
 
 OpenEXR = pytest.importorskip("OpenEXR")
 SMALL = (
@@ -564,7 +564,7 @@ def test_a_recipe_that_grows_beyond_a_limit_is_refused_with_the_limit(
 
 
 def test_the_limit_of_steps_counts_the_steps_and_their_copies(neusee, tmp_path, monkeypatch):
-    from neusee.workflows.recipe import step_declarations
+    from neusee.workflows.recipe import steps as step_declarations
 
     monkeypatch.setattr(step_declarations, "_MOST", 30)
     (tmp_path / "mine.yaml").write_text(many(29))
@@ -672,7 +672,7 @@ def test_a_file_of_ones_own_recipe_is_no_mistake_with_a_scene_that_has_no_file(n
 def test_the_guide_states_each_limit_as_the_program_has_it():
     from neusee.nodes import input_files
     from neusee.nodes.spectra import _bands
-    from neusee.workflows.recipe import step_declarations
+    from neusee.workflows.recipe import steps as step_declarations
     from neusee.workflows.recipe.text import references, yaml_values
     from neusee.workflows.recipe.text.composition import packaged
 

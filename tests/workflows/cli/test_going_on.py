@@ -106,7 +106,7 @@ def stopping_at(path, call):
 
 
 def test_ctrl_c_in_a_training_names_the_checkpoint(neusee, here, monkeypatch):
-    from neusee.workflows.training.loop.checkpoint import StateFile
+    from neusee.workflows.training.loop.resumable_loop import StateFile
 
     def trained(recipe, out, **options):
         StateFile(out / f"{recipe.name}_train_1a2b" / "state.pt").write(
@@ -362,7 +362,7 @@ def test_a_count_that_begins_again_takes_its_own_rate(capsys):
 
 
 def test_a_run_says_how_long_it_will_take(neusee, here):
-    from neusee.workflows.keys.seal import seal_record
+    from neusee.workflows.keys.sealed_files import seal_record
 
     assert "time " not in neusee("run", "night one.yaml")[1]
     journal = here / "cache" / "journal.jsonl"
@@ -374,7 +374,7 @@ def test_a_run_says_how_long_it_will_take(neusee, here):
 
 
 def test_a_live_table_says_what_is_left():
-    from neusee.workflows.graph.step_record import Event, StepRecord
+    from neusee.workflows.graph.recipe_graph import Event, StepRecord
     from neusee.workflows.recipe.loading import load
     from neusee.workflows.report.console import RunTable
 

@@ -12,7 +12,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from neusee.workflows.cli.app import app
-from neusee.workflows.cli.init_command import FILES, NEXT
+from neusee.workflows.cli.project_commands import FILES, NEXT
 from neusee.workflows.recipe.loading import load
 
 

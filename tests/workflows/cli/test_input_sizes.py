@@ -7,9 +7,9 @@ import os
 import numpy as np
 import pytest
 
-from neusee.nodes import input_size
+from neusee.nodes import input_files as input_size
 from neusee.workflows.cli import app
-from neusee.workflows.engine.memory_watch import limited
+from neusee.workflows.engine.memory_limits import limited
 from tests import file_bombs as bombs
 
 RECIPE = """# A picture.

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neusee.nodes import input_files
-from neusee.nodes.calibrate._frames import _damaged_frames
+from neusee.nodes.calibrate import _frame_files as _damaged_frames
 from neusee.workflows.cli import app
 
 HEAD = "# A limit.\noutputs: [{step}]\nfile: {{file: {file}}}\nsteps:\n"
@@ -225,7 +225,7 @@ def test_a_file_at_the_limit_is_read_and_a_larger_one_is_refused(
 def test_arrays_and_tables_at_the_shipped_limits(tmp_path):
     """Headers of 10^9 values on a disk that stores no zeros, and 10^6 rows."""
     from neusee.nodes import ParameterError
-    from neusee.nodes.scene._cube_files import size_and_type
+    from neusee.nodes.scene._hyperspectral import size_and_type
 
     def cube(*shape):
         with (tmp_path / "a.npy").open("wb") as file:
@@ -409,7 +409,7 @@ def test_a_height_network_and_a_lift_refuse_weights_that_are_not_finite(tmp_path
 
     from neusee.nodes import ParameterError, doe, spectra
     from neusee.nodes.doe._unet_height_map import HeightNet
-    from neusee.nodes.spectra._mst_lift_node import start_mst_plus_plus
+    from neusee.nodes.spectra._mst_plus_plus import start_mst_plus_plus
 
     nets = {"height": HeightNet(4), "lift": start_mst_plus_plus(torch.Generator().manual_seed(0))}
     for name, net in nets.items():

@@ -11,7 +11,7 @@ import pytest
 import typer
 from typer.models import OptionInfo
 
-from neusee.workflows.cli.typer_program import program
+from neusee.workflows.cli.program_options import program
 
 WITHOUT_GREATEST = {"fail_above"}  #: a limit that may be infinite, which is its default
 #: by the evaluation, which says what to write: its own tests try 0, 2 and nan

@@ -12,7 +12,9 @@ import pytest
 import typer
 
 import neusee
-from neusee.workflows.cli import app, command_list, typer_program
+from neusee.workflows.cli import app
+from neusee.workflows.cli import commands_and_exit_codes as command_list
+from neusee.workflows.cli import program_options as typer_program
 
 
 def commands(group, *before):

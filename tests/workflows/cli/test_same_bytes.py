@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from neusee.workflows.cli.command_list import COMMANDS as ALL_COMMANDS
+from neusee.workflows.cli.commands_and_exit_codes import COMMANDS as ALL_COMMANDS
 from neusee.workflows.studies.run_study import KINDS
 from tests.guide_commands import write_reader_files
 

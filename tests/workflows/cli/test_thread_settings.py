@@ -10,10 +10,10 @@ import sys
 
 import pytest
 
-from neusee.workflows.cli import thread_settings
-from neusee.workflows.cli.thread_settings import settle_threads
-from neusee.workflows.engine import processors
-from neusee.workflows.engine.processors import threads_for
+from neusee.workflows.cli import app as thread_settings
+from neusee.workflows.cli.app import settle_threads
+from neusee.workflows.engine import machine_resources as processors
+from neusee.workflows.engine.machine_resources import threads_for
 
 
 @pytest.fixture

@@ -13,11 +13,14 @@ import pytest
 from PIL import Image
 from safetensors.numpy import save_file
 
-from neusee.workflows.comparison.compare_runs import compare, document, write_comparison
-from neusee.workflows.comparison.comparison_page import summary
-from neusee.workflows.comparison.comparison_text import lines
-from neusee.workflows.comparison.differences import NumberDifference
-from neusee.workflows.comparison.picture_differences import data_files, figures
+from neusee.workflows.comparison.comparison_report import (
+    compare,
+    document,
+    lines,
+    summary,
+    write_comparison,
+)
+from neusee.workflows.comparison.differences import NumberDifference, data_files, figures
 from neusee.workflows.comparison.run_record import NotComparable, read_record
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.simulation.simulate_recipe import simulate

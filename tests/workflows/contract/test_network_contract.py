@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from neusee.workflows.cli.app import app
-from neusee.workflows.contract.network_contract import check_network, whole_networks
+from neusee.workflows.contract.node_contract import check_network, whole_networks
 from neusee.workflows.recipe.node_families import import_own
 
 START = (files("neusee.workflows.cli") / "starts" / "network.py.txt").read_text()

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from neusee.nodes import node, own_modules
 from neusee.workflows.cli.app import app
 from neusee.workflows.contract.node_contract import check_node, check_values
-from neusee.workflows.contract.value_rules import Call
+from neusee.workflows.contract.node_rules import Call
 from neusee.workflows.recipe import node_families
 from neusee.workflows.recipe.node_families import all_nodes, import_own, own_nodes
 

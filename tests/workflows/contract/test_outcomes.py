@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.workflows.contract.outcomes import difference, outcome_of
+from neusee.workflows.contract.node_rules import difference, outcome_of
 
 
 class Pair(NamedTuple):

@@ -12,9 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.engine.allocation_limit import refusing_allocations
-from neusee.workflows.engine.memory_use import process_memory
-from neusee.workflows.engine.memory_watch import MemoryLimit, limited
+from neusee.workflows.engine.machine_resources import process_memory
+from neusee.workflows.engine.memory_limits import MemoryLimit, limited, refusing_allocations
 
 ROOT = Path(__file__).parents[3]
 GB = 10**9

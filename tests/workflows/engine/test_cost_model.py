@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from neusee.nodes import doe, node, optics, registered_nodes, shape_rules
-from neusee.workflows.engine.cost_laws import (
+from neusee.workflows.engine.cost_model import (
+    _MOST,
+    Costs,
     Law,
     Loading,
     Size,
@@ -17,7 +19,6 @@ from neusee.workflows.engine.cost_laws import (
     size_of,
     sizes_of,
 )
-from neusee.workflows.engine.cost_model import _MOST, Costs
 from neusee.workflows.engine.placement_inputs import MOST_PARTS, parts_of, past_costs
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -211,8 +212,7 @@ def loading(memory=1e8, seconds=2.0):
 
 
 def test_a_library_costs_the_first_step_that_loads_it_and_counts_once_in_the_program(monkeypatch):
-    for module in ("cost_model", "cost_laws"):
-        monkeypatch.setattr(f"neusee.workflows.engine.{module}.shipped", loading)
+    monkeypatch.setattr("neusee.workflows.engine.cost_model.shipped", loading)
     names = {"a": blur, "b": optics.psf, "c": blur}
     costs = Costs([], dict.fromkeys(names, SMALL))
     found = costs.in_turn(((name, step(name, each), None) for name, each in names.items()), ["cpu"])

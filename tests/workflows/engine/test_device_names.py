@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neusee.nodes import node
-from neusee.workflows.engine.device_names import check_devices
+from neusee.workflows.engine.local_executor import check_devices
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step

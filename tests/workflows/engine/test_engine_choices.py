@@ -13,7 +13,7 @@ import torch
 from neusee.nodes import node
 from neusee.workflows.engine import step_job
 from neusee.workflows.engine.local_executor import program_memory
-from neusee.workflows.engine.memory_use import process_memory
+from neusee.workflows.engine.machine_resources import process_memory
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step

@@ -14,7 +14,7 @@ import torch
 from neusee.nodes import own_modules
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
-from neusee.workflows.keys import tainted_code
+from neusee.workflows.keys import user_code as tainted_code
 from neusee.workflows.keys.cache_key import is_private
 from neusee.workflows.store.result_store import Store
 
@@ -218,7 +218,7 @@ def test_the_order_of_a_mapping_counts_for_own_nodes(own):
 
 def test_the_folder_of_the_recipe_does_not_count(own, tmp_path):
     """The key has the path below the folder of the recipe."""
-    from neusee.workflows.keys.written_params import written
+    from neusee.workflows.keys.cache_key import written
 
     (tmp_path / "dark.txt").write_text("1")
     own("file: Path", "1", "file: dark.txt")

@@ -9,10 +9,16 @@ import pytest
 import torch
 
 from neusee.nodes import node
-from neusee.workflows.engine import memory_use, memory_watch
+from neusee.workflows.engine import machine_resources as memory_use
+from neusee.workflows.engine import memory_limits as memory_watch
 from neusee.workflows.engine.local_executor import program_memory
-from neusee.workflows.engine.memory_use import PeakMemory, free_memory, process_memory, process_peak
-from neusee.workflows.engine.memory_watch import MemoryLimit, guarded, limited
+from neusee.workflows.engine.machine_resources import (
+    PeakMemory,
+    free_memory,
+    process_memory,
+    process_peak,
+)
+from neusee.workflows.engine.memory_limits import MemoryLimit, guarded, limited
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -107,8 +113,8 @@ def test_an_error_that_comes_too_late_for_the_step_is_raised_at_its_end():
 
 TRACED = """
 import sys, threading
-from neusee.workflows.engine import memory_watch
-from neusee.workflows.engine.memory_watch import MemoryLimit, guarded, limited
+from neusee.workflows.engine import memory_limits
+from neusee.workflows.engine.memory_limits import MemoryLimit, guarded, limited
 
 def step():
     return lambda: here
@@ -116,7 +122,7 @@ def step():
 try:
     with limited(1e15), guarded():
         here = threading.get_ident()
-        memory_watch._inside[here] = True  # told to stop when the step has ended
+        memory_limits._inside[here] = True  # told to stop when the step has ended
 except MemoryLimit:
     sys.settrace(lambda *_: None)
     step()

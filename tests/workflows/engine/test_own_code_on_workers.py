@@ -45,7 +45,7 @@ WORKER = """
 import importlib, pickle, sys
 for module in sys.argv[3:]:
     importlib.import_module(module)
-from neusee.workflows.engine.dask_worker import _Here
+from neusee.workflows.engine.dask_executor import _Here
 work = pickle.load(open(sys.argv[1], "rb"))
 code = _Here(sys.argv[2], 0.0).code_for(work)
 print(work.step.node.path if code else "differs")
@@ -118,8 +118,8 @@ def test_a_changed_helper_is_refused(lab, tmp_path):
 def test_what_dask_draws_beside_a_step_is_no_draw_of_the_step(monkeypatch):
     sizeof = pytest.importorskip("dask.sizeof")
     monkeypatch.setattr(sizeof, "random", random)  # a worker in this process may have changed it
-    from neusee.workflows.engine.dask_worker import _chance_of_its_own
-    from neusee.workflows.observation.shared_generators import SharedGenerators
+    from neusee.workflows.engine.dask_executor import _chance_of_its_own
+    from neusee.workflows.observation.random_generators import SharedGenerators
 
     many = {number: number for number in range(1000)}
     before = SharedGenerators()

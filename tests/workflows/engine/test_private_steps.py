@@ -10,7 +10,7 @@ import pytest
 from neusee.nodes import own_modules
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
-from neusee.workflows.keys import tainted_code
+from neusee.workflows.keys import user_code as tainted_code
 from neusee.workflows.keys.cache_key import is_private
 from neusee.workflows.store.result_store import Store
 

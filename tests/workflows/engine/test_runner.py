@@ -17,7 +17,8 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.store import serialization, small_results
+from neusee.workflows.store import payload as small_results
+from neusee.workflows.store import serialization
 from neusee.workflows.store.result_store import Store
 
 CALLS: list[str] = []

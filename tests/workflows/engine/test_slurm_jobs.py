@@ -12,7 +12,7 @@ import time
 import pytest
 
 from neusee.workflows.cli import app
-from neusee.workflows.engine.slurm_options import SlurmOptions
+from neusee.workflows.engine.dask_cluster import SlurmOptions
 from tests.workflows.engine.cluster_processes import (
     PATIENCE,
     Command,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from neusee.nodes import node
-from neusee.workflows.engine.step_order import shortest_first
+from neusee.workflows.engine.runner import shortest_first
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 

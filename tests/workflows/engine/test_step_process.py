@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.workflows.engine.memory_use import process_memory
-from neusee.workflows.engine.memory_watch import MemoryLimit, limited
+from neusee.workflows.engine.machine_resources import process_memory
+from neusee.workflows.engine.memory_limits import MemoryLimit, limited
 from neusee.workflows.engine.step_process import ProcessEnded, call_in_fork
 from neusee.workflows.keys.user_code import OwnCode
 from neusee.workflows.observation import kernel_layer
-from neusee.workflows.observation.own_call import call_observed
+from neusee.workflows.observation.observed_call import call_observed
 
 NONE = frozenset()
 OWN = OwnCode(frozenset({__name__}), frozenset({__name__}), frozenset(), frozenset())

@@ -7,7 +7,7 @@ import torch
 
 from neusee.nodes import node
 from neusee.nodes.values import Bands
-from neusee.workflows.engine.cost_laws import measured_size, shipped, sizes_of
+from neusee.workflows.engine.cost_model import measured_size, shipped, sizes_of
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.graph.step_shapes import bytes_of, form_of, forms_of

@@ -5,8 +5,8 @@ asked for.
 from collections import Counter
 from types import SimpleNamespace
 
+from neusee.workflows.engine.execution import ValuesInMemory
 from neusee.workflows.engine.step_job import Outcome
-from neusee.workflows.engine.values_in_memory import ValuesInMemory
 
 
 def outcome(key, kept=False, waits=False):

@@ -13,7 +13,8 @@ import warnings
 import pytest
 import torch
 
-from neusee.workflows.engine import memory_watch, worker_processes
+from neusee.workflows.engine import memory_limits as memory_watch
+from neusee.workflows.engine import worker_processes
 from neusee.workflows.engine.worker_processes import shared, shared_in_order, workers_for
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="workers are forks")

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from neusee.workflows.engine import write_behind
+from neusee.workflows.engine import step_job as write_behind
 from neusee.workflows.engine.runner import run
-from neusee.workflows.engine.write_behind import WriteBehind
+from neusee.workflows.engine.step_job import WriteBehind
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
 

@@ -23,7 +23,7 @@ from neusee.workflows.evaluation.pipelines import (
     read_pipelines,
 )
 from neusee.workflows.evaluation.run_evaluation import evaluate
-from neusee.workflows.protection.equal_shade import EqualProtection
+from neusee.workflows.protection.equal_rivals import EqualProtection
 from neusee.workflows.store.result_store import Store
 
 SMALL = ["optics.samples=96", "optics.pitch=84.15 um", "optics.bands=3", "optics.window=[24, 24]"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from neusee.workflows.evaluation import evaluation_figures
+from neusee.workflows.evaluation import evaluation_page as evaluation_figures
 from neusee.workflows.evaluation.confidence_intervals import METRICS, MetricTable
 
 

@@ -9,14 +9,18 @@ import pytest
 
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
-from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
+from neusee.workflows.evaluation.evaluation_points import (
+    EvaluationPoints,
+    PointRequest,
+    errors_of,
+    mistold,
+)
+from neusee.workflows.evaluation.evaluation_result import told_with_errors
 from neusee.workflows.evaluation.evaluation_scenes import scenes
-from neusee.workflows.evaluation.mistold_filter import errors_of, mistold
-from neusee.workflows.evaluation.mistold_points import told_with_errors
 from neusee.workflows.evaluation.pipelines import CASES, compose_pipelines, read_pipelines
 from neusee.workflows.evaluation.run_evaluation import evaluate
 from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.graph.told_copies import TOLD
+from neusee.workflows.graph.recipe_graph import TOLD
 from neusee.workflows.recipe.blocks.evaluate_block import Mismatch
 from neusee.workflows.store.result_store import Store
 

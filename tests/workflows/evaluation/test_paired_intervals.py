@@ -11,9 +11,15 @@ import pytest
 from scipy.special import ndtr, ndtri
 from scipy.stats import t as student
 
-from neusee.workflows.evaluation import paired_intervals
-from neusee.workflows.evaluation.confidence_intervals import MetricTable, mean
-from neusee.workflows.evaluation.paired_intervals import gain, gains_by_strength, less, ratio
+from neusee.workflows.evaluation import confidence_intervals as paired_intervals
+from neusee.workflows.evaluation.confidence_intervals import (
+    MetricTable,
+    gain,
+    gains_by_strength,
+    less,
+    mean,
+    ratio,
+)
 
 PHOTOGRAPHS, PICTURES, TIMES = 12, 4, 400
 ROOM = 3 * math.sqrt(0.95 * 0.05 / TIMES)  #: three standard errors of the share that is counted

@@ -22,9 +22,8 @@ from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.evaluation import evaluation_scenes
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
+from neusee.workflows.evaluation.evaluation_result import _points, _variant
 from neusee.workflows.evaluation.evaluation_scenes import photographs, scenes, wavelengths
-from neusee.workflows.evaluation.measured_points import _points
-from neusee.workflows.evaluation.mistold_points import _variant
 from neusee.workflows.evaluation.pipelines import (
     DRAWN,
     SIX,
@@ -245,7 +244,7 @@ def test_a_killed_protocol_goes_on_and_its_tables_have_the_same_bytes(tmp_path, 
 
 @pytest.mark.slow
 def test_the_figure_has_six_lasers_and_the_pictures_of_the_sensors(store, folder):
-    from neusee.workflows.evaluation.comparison_pictures import panels
+    from neusee.workflows.evaluation.evaluation_result import panels
 
     each = [
         pipeline("flat+none"),

@@ -15,7 +15,11 @@ from typer.testing import CliRunner
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
 from neusee.workflows.evaluation.equal_protection import protect
-from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
+from neusee.workflows.evaluation.evaluation_points import (
+    EvaluationPoints,
+    PointCommands,
+    PointRequest,
+)
 from neusee.workflows.evaluation.evaluation_scenes import photographs, scenes
 from neusee.workflows.evaluation.pipelines import (
     CASES,
@@ -24,8 +28,7 @@ from neusee.workflows.evaluation.pipelines import (
     named_apart,
     read_pipelines,
 )
-from neusee.workflows.evaluation.point_commands import PointCommands
-from neusee.workflows.protection.equal_shade import EqualProtection
+from neusee.workflows.protection.equal_rivals import EqualProtection
 from neusee.workflows.store.result_store import Store
 
 SMALL = ["optics.samples=96", "optics.pitch=84.15 um", "optics.bands=3", "optics.window=[24, 24]"]

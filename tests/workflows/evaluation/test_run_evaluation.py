@@ -14,16 +14,15 @@ import torch
 from PIL import Image
 from typer.testing import CliRunner
 
-from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.metrics import quality
+from neusee.nodes.resampling import resize
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
 from neusee.workflows.engine.runner import run
 from neusee.workflows.evaluation import evaluation_points
-from neusee.workflows.evaluation.confidence_intervals import mean, metric_table
+from neusee.workflows.evaluation.confidence_intervals import gain, mean, metric_table
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
 from neusee.workflows.evaluation.evaluation_scenes import refuse_directions, scenes
-from neusee.workflows.evaluation.paired_intervals import gain
 from neusee.workflows.evaluation.pipelines import (
     CASES,
     EvaluationRefused,

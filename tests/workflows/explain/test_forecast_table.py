@@ -4,15 +4,16 @@ import json
 
 import pytest
 
-from neusee.workflows.engine.cost_laws import shipped
+from neusee.workflows.engine.cost_model import shipped
 from neusee.workflows.engine.local_executor import lanes_of
-from neusee.workflows.explain.forecast_table import (
+from neusee.workflows.explain.run_forecast import (
+    forecast,
     forecast_rows,
     memory_text,
+    planned,
     seconds_text,
     table_lines,
 )
-from neusee.workflows.explain.run_forecast import forecast, planned
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 

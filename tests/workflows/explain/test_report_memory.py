@@ -2,11 +2,10 @@
 
 import pytest
 
-from neusee.workflows.engine.cost_laws import libraries_of
+from neusee.workflows.engine.cost_model import libraries_of
 from neusee.workflows.engine.local_executor import lanes_of, program_memory
-from neusee.workflows.engine.memory_use import process_memory
-from neusee.workflows.explain.report_memory import shown_steps
-from neusee.workflows.explain.run_forecast import lanes_for, planned
+from neusee.workflows.engine.machine_resources import process_memory
+from neusee.workflows.explain.run_forecast import lanes_for, planned, shown_steps
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 

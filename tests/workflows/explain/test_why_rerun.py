@@ -11,8 +11,7 @@ import neusee.nodes
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.runner import run
 from neusee.workflows.explain import change_causes, stored_origin, why_rerun
-from neusee.workflows.explain.change_causes import Comparison, Pair
-from neusee.workflows.explain.code_changes import edits
+from neusee.workflows.explain.change_causes import Comparison, Pair, edits
 from neusee.workflows.explain.stored_origin import why_key_lines
 from neusee.workflows.explain.why_rerun import explained, why_lines
 from neusee.workflows.graph.diagnostics import Location

@@ -10,9 +10,7 @@ from PIL import Image, PngImagePlugin
 
 from neusee.nodes.calibrate import frame_header
 from neusee.workflows.cli import app
-from neusee.workflows.frames.frame_folder import FolderRefused, find_levels
-from neusee.workflows.frames.frame_names import read_name
-from neusee.workflows.frames.frame_table import read_table
+from neusee.workflows.frames.frame_folder import FolderRefused, find_levels, read_name, read_table
 from tests.workflows.frames.test_frame_folder import by_name, by_table, png, shots
 
 LAB = Path("lab")

@@ -12,18 +12,19 @@ from typer.main import get_command
 import neusee
 from neusee.workflows.cli import app
 from neusee.workflows.cli.handbook_reference import reference_pages
-from neusee.workflows.handbook import command_pictures
+from neusee.workflows.handbook import guide_pages as command_pictures
 from neusee.workflows.handbook import site_build as build
-from neusee.workflows.handbook.command_pictures import NoPicture, draw_pictures
 from neusee.workflows.handbook.guide_pages import (
     GUIDE,
+    NoPicture,
     Picture,
+    draw_pictures,
     pictures_of,
     read_pages,
     with_pictures,
     write_files,
 )
-from neusee.workflows.handbook.plain_markdown import escaped, prose, table
+from neusee.workflows.handbook.recipe_and_python_reference import escaped, prose, table
 from neusee.workflows.recipe.loading import groups
 from neusee.workflows.recipe.node_families import all_nodes
 

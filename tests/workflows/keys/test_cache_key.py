@@ -17,9 +17,8 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys import code_digest
-from neusee.workflows.keys.cache_key import digest, key_of, plain, stream_seed
+from neusee.workflows.keys.cache_key import digest, file_digest, key_of, plain, stream_seed
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.input_file_digest import file_digest
 from neusee.workflows.store.result_store import Store
 
 MARK = Location("trial.yaml", 1, 1)
@@ -434,7 +433,7 @@ def test_a_file_is_read_once_when_its_stamp_can_be_trusted(tmp_path, monkeypatch
     young = file_digest(file)
     file.write_bytes(b"y" * 100)
     assert file_digest(file) != young
-    monkeypatch.setattr("neusee.workflows.keys.input_file_digest._SETTLED", 0)
+    monkeypatch.setattr("neusee.workflows.keys.cache_key._SETTLED", 0)
     old = file_digest(file)
     monkeypatch.setattr("builtins.open", lambda *a: pytest.fail("read again"))
     assert file_digest(file) == old
@@ -462,10 +461,10 @@ def on_fat(tmp_path, monkeypatch):
             st_ctime_ns=clock.stamp,
         )
 
-    monkeypatch.setattr("neusee.workflows.keys.input_file_digest._files", {})
-    monkeypatch.setattr("neusee.workflows.keys.input_file_digest.os", SimpleNamespace(stat=stat))
+    monkeypatch.setattr("neusee.workflows.keys.cache_key._files", {})
+    monkeypatch.setattr("neusee.workflows.keys.cache_key.os", SimpleNamespace(stat=stat))
     monkeypatch.setattr(
-        "neusee.workflows.keys.input_file_digest.time", SimpleNamespace(time_ns=lambda: clock.now)
+        "neusee.workflows.keys.cache_key.time", SimpleNamespace(time_ns=lambda: clock.now)
     )
     return file, clock, write
 

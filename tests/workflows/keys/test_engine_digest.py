@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.keys import engine_digest
+from neusee.workflows.keys import code_digest as engine_digest
 
 ROOT = Path(engine_digest.__file__).parents[1]
 TEXTS = {

@@ -4,8 +4,8 @@ reads them is refused.
 
 import pytest
 
-from neusee.workflows.keys.declared_dependencies import refusal, uncovered
 from neusee.workflows.keys.source_summary import summarise
+from neusee.workflows.keys.user_code import refusal, uncovered
 
 STAMP = {
     "time": "def f(file):\n    return file.stat().st_mtime",

@@ -12,22 +12,27 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.keys import installed_content
-from neusee.workflows.keys.code_memo import known_contents, read_memo, write_memo
-from neusee.workflows.keys.installed_content import BY_VERSION, counted
+from neusee.workflows.keys import module_digest as installed_content
+from neusee.workflows.keys.module_digest import (
+    BY_VERSION,
+    counted,
+    known_contents,
+    read_memo,
+    write_memo,
+)
 from neusee.workflows.keys.module_origin import plain
 
 ROOT = Path(__file__).parents[3]
 ASK = """
 import json, sys
-from neusee.workflows.keys.installed_content import counted
+from neusee.workflows.keys.module_digest import counted
 from neusee.workflows.keys.module_origin import version_of
 print(json.dumps([counted(module, version_of(module)).parts for module in sys.argv[1:]]))
 """
 EDITED = """
 import thing
 from pathlib import Path
-from neusee.workflows.keys.installed_content import counted
+from neusee.workflows.keys.module_digest import counted
 {change}
 print(counted("thing", "thing 1.0").edited)
 """

@@ -16,9 +16,9 @@ import torch
 
 import neusee.nodes
 from neusee.nodes import metrics, restore
-from neusee.nodes.exact_convolution import exact_convolutions
+from neusee.nodes.precision import exact_convolutions
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.process_settings import settings
+from neusee.workflows.keys.loaded_state import settings
 from neusee.workflows.recipe.node_families import all_nodes
 
 

@@ -11,9 +11,9 @@ import pytest
 from neusee.nodes import node
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Step
-from neusee.workflows.keys import known_keys
+from neusee.workflows.keys import code_digest as known_keys
 from neusee.workflows.keys.cache_key import key_of
-from neusee.workflows.keys.known_keys import KnownKeys
+from neusee.workflows.keys.code_digest import KnownKeys
 
 CODE = SimpleNamespace(of=lambda node, classes=(): f"code of {node.path}")
 

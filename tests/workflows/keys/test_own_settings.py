@@ -16,7 +16,7 @@ import pytest
 
 from neusee.nodes import own_modules, scene
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.process_settings import own_settings
+from neusee.workflows.keys.loaded_state import own_settings
 from neusee.workflows.recipe.node_families import import_own
 
 ROOT = Path(__file__).parents[3]

@@ -11,8 +11,8 @@ import pytest
 import neusee.nodes
 from neusee.workflows.keys import code_digest
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.code_memo import read_parts
-from neusee.workflows.keys.seal import seal_file, seal_record, unseal_file, unseal_record
+from neusee.workflows.keys.module_digest import read_parts
+from neusee.workflows.keys.sealed_files import seal_file, seal_record, unseal_file, unseal_record
 
 NODE = (
     "import torch\nfrom neusee.nodes import node\n\n\n@node()\ndef value(*, k: float = 1.0):\n   "

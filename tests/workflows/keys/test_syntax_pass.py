@@ -5,10 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.keys import code_memo, engine_digest, source_summary
+from neusee.workflows.keys import code_digest as engine_digest
+from neusee.workflows.keys import module_digest as code_memo
+from neusee.workflows.keys import source_summary
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.source_summary import summarise
-from neusee.workflows.keys.syntax_pass import Syntax
+from neusee.workflows.keys.source_syntax import Syntax
 
 EVERYTHING = '''"""Words."""
 from __future__ import annotations
@@ -139,5 +141,6 @@ def test_a_source_of_the_program_is_parsed_once_and_then_read_from_the_memo(tmp_
     Code(tmp_path / "code.json")
     monkeypatch.setattr(engine_digest, "syntax_outline", lambda source: pytest.fail("parsed again"))
     assert engine_digest.outline(source) == first
-    assert ("neusee.workflows.keys.cache_key", ["digest"]) in first.imports
+    imports = {module: names for module, names, *_ in first.imports}
+    assert "digest" in imports["neusee.workflows.keys.cache_key"]
     assert first.digest == source_summary.summarise(source).tree

@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.observation import seccomp_filter, system_calls
+from neusee.workflows.observation import system_calls
+from neusee.workflows.observation import system_calls as seccomp_filter
 from neusee.workflows.observation.system_calls import CALLS, Condition, machine, numbers
 
 libc = ctypes.CDLL(None, use_errno=True)

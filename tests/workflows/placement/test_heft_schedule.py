@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.workflows.placement.heft_schedule import Cluster, Device, Link, Task, TooLarge, heft
-from neusee.workflows.placement.task_priorities import Graph, frugal, upward
+from neusee.workflows.placement.tasks_and_devices import Graph, frugal, upward
 
 
 def helper(name):

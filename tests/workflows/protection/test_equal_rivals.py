@@ -10,11 +10,15 @@ import pytest
 import torch
 
 from neusee.nodes import metrics
-from neusee.nodes.optics._lens_band import round_lens
+from neusee.nodes.optics._lens import round_lens
 from neusee.workflows import load
-from neusee.workflows.protection.camera_parts import ProtectionCamera
 from neusee.workflows.protection.equal_rivals import MEASURES, Candidate, best, quiet_picture
-from neusee.workflows.protection.front_optics import Front, FrontBench, FrontSettings
+from neusee.workflows.protection.protection_camera import (
+    Front,
+    FrontBench,
+    FrontSettings,
+    ProtectionCamera,
+)
 from neusee.workflows.protection.unknown_conditions import draw_conditions, usual_condition
 from neusee.workflows.store.result_store import Store
 

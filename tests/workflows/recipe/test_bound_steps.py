@@ -13,7 +13,8 @@ import torch
 from neusee import recipes
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.step_shapes import alike
-from neusee.workflows.recipe import bound_steps, graph_cache
+from neusee.workflows.recipe import step_checks as bound_steps
+from neusee.workflows.recipe import step_checks as graph_cache
 from neusee.workflows.recipe.loading import check
 from neusee.workflows.recipe.text.composition import Composer, compose
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.recipe.exported_files import NAMES
+from neusee.workflows.recipe.global_settings import NAMES
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.report import contents
 from neusee.workflows.report.data_exports import data_files

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.recipe import graph_cache, loading
+from neusee.workflows.recipe import loading
+from neusee.workflows.recipe import step_checks as graph_cache
 from neusee.workflows.recipe.text import composition
 
 RECIPE = """\

@@ -8,7 +8,8 @@ import pytest
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.recipe import loading
-from neusee.workflows.recipe.blocks import evaluate_block, train_block, train_lift_block
+from neusee.workflows.recipe.blocks import evaluate_block, train_block
+from neusee.workflows.recipe.blocks import train_block as train_lift_block
 from neusee.workflows.recipe.loading import groups, load, recipes
 from neusee.workflows.recipe.text.yaml_values import parse
 from neusee.workflows.store.result_store import Store
@@ -361,11 +362,11 @@ def test_the_settings_of_trainings_are_imported_for_recipes_that_have_one():
         for part in ast.parse(Path(loading.__file__).read_text()).body
         if isinstance(part, ast.ImportFrom)
     ]
-    assert "neusee.workflows.recipe.wiring" in tops
+    assert "neusee.workflows.recipe.steps" in tops
     assert not [name for name in tops if ".blocks" in name]
     assert loading.BLOCKS == (
         train_block.KEY,
-        train_lift_block.KEY,
+        train_lift_block.LIFT_KEY,
         evaluate_block.KEY,
         loading.TRACED,
     )

@@ -12,10 +12,10 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from neusee.nodes import restore
-from neusee.nodes.network_classes import Architecture
+from neusee.nodes.own_modules import Architecture
 from neusee.workflows import RecipeError, Store, load, run
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.recipe.own_families import VARIABLE
+from neusee.workflows.recipe.node_families import NO_CODE_VARIABLE
 
 NETWORK = '''\
 """Networks."""
@@ -365,7 +365,7 @@ def test_no_code_refuses_the_class_and_a_file_of_torch_export(mine, tmp_path, mo
         " restored: {node: restore.network, from: scene, with: {weights: whole.pt2}}\noutputs:"
         " [restored]\n"
     )
-    monkeypatch.setenv(VARIABLE, "1")
+    monkeypatch.setenv(NO_CODE_VARIABLE, "1")
     assert any(
         "names code, which NEUSEE_NO_CODE" in text for text in problems(recipe, (), tmp_path)
     )

@@ -12,10 +12,9 @@ import torch
 
 from neusee.nodes import Check, TensorStats, node
 from neusee.workflows.graph.diagnostics import Location
-from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.graph.step_record import Event, StepRecord
+from neusee.workflows.graph.recipe_graph import Event, Recipe, Step, StepRecord
 from neusee.workflows.report import console as console_room
-from neusee.workflows.report.next_commands import commands_to_try
+from neusee.workflows.report.terminal_text import commands_to_try
 
 
 @node()

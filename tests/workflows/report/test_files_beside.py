@@ -19,16 +19,14 @@ import pytest
 import torch
 
 from neusee.nodes import node
-from neusee.workflows.engine.memory_watch import MemoryLimit
+from neusee.workflows.engine.memory_limits import MemoryLimit
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
-from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.graph.step_record import StepRecord
-from neusee.workflows.report import drawing_process, files_beside
-from neusee.workflows.report.drawing_process import DrawingProcess, NotDrawn
-from neusee.workflows.report.files_beside import FilesBeside
-from neusee.workflows.report.graph_ahead import GraphAhead
-from neusee.workflows.report.requirements import Bound
+from neusee.workflows.graph.recipe_graph import Recipe, Step, StepRecord
+from neusee.workflows.report import files_beside
+from neusee.workflows.report import files_beside as drawing_process
+from neusee.workflows.report.contents import Bound
+from neusee.workflows.report.files_beside import DrawingProcess, FilesBeside, GraphAhead, NotDrawn
 from neusee.workflows.report.run_pictures import DerivedFile, Drawing, files_of, graphs, states_of
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
@@ -162,7 +160,7 @@ def test_what_is_large_or_no_data_is_not_sent(tmp_path, forks, monkeypatch):
 
 def test_the_process_that_draws_ends_with_a_run_that_is_killed(tmp_path, forks):
     code = (
-        "from neusee.workflows.report.drawing_process import DrawingProcess\n"
+        "from neusee.workflows.report.files_beside import DrawingProcess\n"
         "import time\nprint(DrawingProcess()._process.pid, flush=True)\ntime.sleep(60)"
     )
     with subprocess.Popen(
@@ -187,7 +185,7 @@ def _has_ended(pid: int) -> bool:
 
 def test_a_drawing_is_sent_by_its_name(tmp_path, forks):
     drawer = DrawingProcess()
-    drawing = Drawing("report.figures.recipe_graph:graph")
+    drawing = Drawing("report.figures.graph_and_timeline:graph")
     drawer.make(tmp_path / "g.png", drawing, {"sources": {"a": []}, "states": {"a": "run"}})
     drawer.close()
     assert (tmp_path / "g.png").read_bytes().startswith(b"\x89PNG")

@@ -8,8 +8,8 @@ from itertools import pairwise
 import pytest
 
 from neusee.workflows.placement.heft_schedule import Cluster, Device, Task, heft
-from neusee.workflows.report.figures import gantt
-from neusee.workflows.report.figures.gantt import timeline
+from neusee.workflows.report.figures import graph_and_timeline as gantt
+from neusee.workflows.report.figures.graph_and_timeline import timeline
 from neusee.workflows.report.figures.style import styled
 
 

@@ -10,9 +10,11 @@ import torch
 
 from neusee.nodes.values import Bands
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.report import console, mask_story, run_html
+from neusee.workflows.report import console
+from neusee.workflows.report import run_folder as run_html
+from neusee.workflows.report import run_summary as mask_story
 from neusee.workflows.report.contents import wanted
-from neusee.workflows.report.mask_story import sentences
+from neusee.workflows.report.run_summary import sentences
 
 PLAIN = {"peak/I_sat": 912.3, "LSR": 1.0, "PSNR (dB)": 27.07, "saturated px": 244.0}
 MASK = {"peak/I_sat": 3.867, "LSR": 0.00149, "PSNR (dB)": 14.59, "saturated px": 418.0}

@@ -5,7 +5,7 @@ its file.
 import numpy as np
 import pytest
 
-from neusee.workflows.report.figures import own_tables
+from neusee.workflows.report.figures import optics as own_tables
 
 draw = own_tables.tables.__wrapped__
 

@@ -18,17 +18,15 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.report import contents, run_pictures
-from neusee.workflows.report.figures import (
-    camera_overview,
-    frame_and_interval,
-    numerics,
-    optics,
-    own_tables,
-    photon_transfer,
-    recipe_graph,
-    scene_spectra,
-    shading_field,
-)
+from neusee.workflows.report.figures import camera_pictures as camera_overview
+from neusee.workflows.report.figures import camera_pictures as frame_and_interval
+from neusee.workflows.report.figures import camera_pictures as scene_spectra
+from neusee.workflows.report.figures import camera_pictures as shading_field
+from neusee.workflows.report.figures import graph_and_timeline as recipe_graph
+from neusee.workflows.report.figures import optics
+from neusee.workflows.report.figures import optics as own_tables
+from neusee.workflows.report.figures import verification as numerics
+from neusee.workflows.report.figures import verification as photon_transfer
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 

@@ -9,8 +9,13 @@ import itertools
 import numpy as np
 import pytest
 
-from neusee.workflows.report.figures.point_labels import PointLabel, place_labels, plain_ticks
-from neusee.workflows.report.figures.style import BLACK, canvas
+from neusee.workflows.report.figures.style import (
+    BLACK,
+    PointLabel,
+    canvas,
+    place_labels,
+    plain_ticks,
+)
 
 
 def labelled(points, note=""):

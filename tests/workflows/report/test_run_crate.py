@@ -9,9 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.report import crate_sources, run_crate
-from neusee.workflows.report.crate_sources import CREATOR, LICENCE
-from neusee.workflows.report.run_crate import CRATE, remove_crate, restore_crate, write_crate
+from neusee.workflows.report import run_crate
+from neusee.workflows.report import run_crate as crate_sources
+from neusee.workflows.report.run_crate import (
+    CRATE,
+    CREATOR,
+    LICENCE,
+    remove_crate,
+    restore_crate,
+    write_crate,
+)
 from neusee.workflows.report.run_folder import new_run
 from tests.workflows.crate_rules import faults
 
@@ -81,7 +88,7 @@ def test_what_did_not_complete_says_so(folder):
 
 
 def test_a_photograph_that_ships_has_its_licence(folder):
-    from neusee.workflows.keys.input_file_digest import file_digest
+    from neusee.workflows.keys.cache_key import file_digest
 
     row = {
         "parameter": "scene.file",

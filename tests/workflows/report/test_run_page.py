@@ -15,14 +15,9 @@ from neusee.nodes import Check, node
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step
 from neusee.workflows.placement.tasks_and_devices import Schedule, Slot
-from neusee.workflows.report import (
-    result_numbers,
-    run_folder,
-    run_html,
-    run_page,
-    run_pictures,
-    run_timing,
-)
+from neusee.workflows.report import result_numbers, run_folder, run_page, run_pictures
+from neusee.workflows.report import run_folder as run_html
+from neusee.workflows.report import run_page as run_timing
 from neusee.workflows.report.run_folder import find_run, new_run
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store

@@ -15,9 +15,9 @@ from neusee.workflows.engine.local_executor import program_memory
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.report import shown_values
+from neusee.workflows.report import run_pictures as shown_values
 from neusee.workflows.report.run_folder import NotWritten
-from neusee.workflows.report.shown_values import in_turn
+from neusee.workflows.report.run_pictures import in_turn
 from neusee.workflows.simulation import simulate_recipe
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store

@@ -6,9 +6,10 @@ import pytest
 
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
-from neusee.workflows.report import contents, run_html, run_page
+from neusee.workflows.report import contents, run_page
+from neusee.workflows.report import run_folder as run_html
 from neusee.workflows.report.console import closing
-from neusee.workflows.report.spectral_sampling import spectral_error
+from neusee.workflows.report.tolerance_spent import spectral_error
 from neusee.workflows.store.result_store import Store
 
 SMALL = [

@@ -11,11 +11,11 @@ from typer.testing import CliRunner
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
 from neusee.workflows.engine.runner import run
-from neusee.workflows.report import run_html
+from neusee.workflows.report import run_folder as run_html
 from neusee.workflows.report.tolerance_spent import said_of_errors, spent
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.leave_out.omission_rows import OmissionComparison
+from neusee.workflows.studies.leave_out.left_out_steps import OmissionComparison
 from neusee.workflows.tolerance import cheaper_steps
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_norm import error_of

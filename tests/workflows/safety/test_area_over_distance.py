@@ -12,9 +12,8 @@ from scipy.special import j0
 from neusee.nodes.laser import BrightPixels
 from neusee.workflows.recipe.blocks.safety_block import Laser, Safety, SafetySettings
 from neusee.workflows.safety.dazzled_area import Area, area_of
-from neusee.workflows.safety.exposures import Option, compute_exposures
-from neusee.workflows.safety.spots_along import Ranked
-from neusee.workflows.safety.uncertain_values import SettingDraws
+from neusee.workflows.safety.exposures import Option, SettingDraws, compute_exposures
+from neusee.workflows.safety.laser_spots import Ranked
 
 WAVELENGTH, FOCAL, DIAMETER, PITCH, HALF = 532e-9, 50e-3, 12e-3, 3.45e-6, 20
 WAIST = 2 * WAVELENGTH / (math.pi * 1e-3)

@@ -8,15 +8,14 @@ import torch
 
 from neusee.nodes.laser import BrightPixels
 from neusee.workflows.recipe.blocks.safety_block import Laser, Safety, SafetySettings
-from neusee.workflows.safety.counted_parts import (
+from neusee.workflows.safety.laser_spots import Peaks, Ranked, Veil
+from neusee.workflows.safety.safety_estimate import (
     counted,
     focus_text,
     ladder_text,
     near_text,
     scatter_text,
 )
-from neusee.workflows.safety.light_levels import Veil
-from neusee.workflows.safety.spots_along import Peaks, Ranked
 
 PIXELS = BrightPixels(*[torch.ones(1)] * 4, torch.ones(3))
 

@@ -9,9 +9,13 @@ from types import SimpleNamespace
 import pytest
 
 from neusee.workflows import load
-from neusee.workflows.safety.damage_verdict import DamageRow, DamageVerdict, state_of_finding
-from neusee.workflows.safety.distance_zones import Spread
-from neusee.workflows.safety.safety_estimate import estimate
+from neusee.workflows.safety.exposures import Spread
+from neusee.workflows.safety.safety_estimate import (
+    DamageRow,
+    DamageVerdict,
+    estimate,
+    state_of_finding,
+)
 
 QUICK = [
     "safety.draws=100",

@@ -7,7 +7,7 @@ import pytest
 
 from neusee.nodes.laser import beam
 from neusee.workflows.recipe.blocks.safety_block import Lens
-from neusee.workflows.safety.distance_ladder import (
+from neusee.workflows.safety.exposures import (
     FAR_WAVES,
     UNFOCUSED_WAVES,
     as_wide,

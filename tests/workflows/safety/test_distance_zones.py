@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from neusee.workflows.safety.distance_zones import Spread, crossings, sampled, zones_of
+from neusee.workflows.safety.exposures import Spread, crossings, sampled, zones_of
 
 AT = sampled(1.0, 1e4, (100.0,))
 

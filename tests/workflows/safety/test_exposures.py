@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 
 from neusee.workflows.recipe.blocks.safety_block import Laser, Safety, SafetySettings
-from neusee.workflows.safety.exposures import Option, asked_distances, compute_exposures, options_of
-from neusee.workflows.safety.uncertain_values import SettingDraws
+from neusee.workflows.safety.exposures import (
+    Option,
+    SettingDraws,
+    asked_distances,
+    compute_exposures,
+    options_of,
+)
 
 WAVELENGTH, DIAMETER, FOCAL, THETA = 532e-9, 12e-3, 50e-3, 1e-3
 WAIST = 2 * WAVELENGTH / (math.pi * THETA)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from neusee.workflows import RecipeError, Store, load
+from neusee.workflows.safety.exposure_limits import saturating
 from neusee.workflows.safety.safety_estimate import estimate, prepare
-from neusee.workflows.safety.sensor_limits import saturating
 
 PLANCK, LIGHT = 6.62607015e-34, 299792458.0
 WELL, OFFSET, GAIN, BITS, EXPOSURE, PITCH = 25500.0, 390.0, 1 / 0.37, 16, 0.1, 2.9e-6

@@ -12,8 +12,8 @@ from scipy.optimize import brentq
 
 from neusee.nodes.laser import BrightPixels
 from neusee.workflows.recipe.blocks.safety_block import Laser, Safety, SafetySettings
-from neusee.workflows.safety.light_levels import Grid, Levels, Veil, levels_of, veil_of
-from neusee.workflows.safety.uncertain_values import SettingDraws
+from neusee.workflows.safety.exposures import SettingDraws
+from neusee.workflows.safety.laser_spots import Grid, Levels, Veil, levels_of, veil_of
 
 SHAPE = (61, 81)
 Y, X = (np.arange(n) - n // 2 for n in SHAPE)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from neusee.workflows import Store, load
+from neusee.workflows.safety.laser_spots import peaks_of
 from neusee.workflows.safety.run_safety import document
 from neusee.workflows.safety.safety_estimate import estimate
-from neusee.workflows.safety.spots_along import peaks_of
 from tests.workflows.safety import own_mask_spot as own
 
 EFFICIENCY, WELL, EXPOSURE = 0.05, 30000, 1e-6

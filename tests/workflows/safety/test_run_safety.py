@@ -6,8 +6,8 @@ import pytest
 
 from neusee.workflows import Store, load
 from neusee.workflows.safety import run_safety
-from neusee.workflows.safety.distance_zones import Spread
-from neusee.workflows.safety.safety_words import metres, scaled, share, with_ends
+from neusee.workflows.safety.exposures import Spread
+from neusee.workflows.safety.safety_text import metres, scaled, share, with_ends
 
 QUICK = [
     "safety.draws=100",

@@ -2,8 +2,8 @@
 
 import pytest
 
-from neusee.workflows.safety.distance_zones import Spread, Zones
-from neusee.workflows.safety.safety_words import zones_text
+from neusee.workflows.safety.exposures import Spread, Zones
+from neusee.workflows.safety.safety_text import zones_text
 
 
 @pytest.mark.parametrize(

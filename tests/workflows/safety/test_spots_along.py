@@ -8,9 +8,9 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 
 from neusee.workflows import load
-from neusee.workflows.safety import spots_along
-from neusee.workflows.safety.distance_ladder import miss_between
-from neusee.workflows.safety.spots_along import at_distance
+from neusee.workflows.safety import laser_spots as spots_along
+from neusee.workflows.safety.exposures import miss_between
+from neusee.workflows.safety.laser_spots import at_distance
 
 STEP = "laser_pixels[mask,pointer]"
 DIAMETER, WAVELENGTH = 12e-3, 532e-9

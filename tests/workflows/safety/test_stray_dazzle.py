@@ -9,9 +9,8 @@ import pytest
 from scipy.special import j1
 
 from neusee.workflows import Store, load
-from neusee.workflows.safety.counted_parts import scatter_text
 from neusee.workflows.safety.run_safety import document
-from neusee.workflows.safety.safety_estimate import estimate
+from neusee.workflows.safety.safety_estimate import estimate, scatter_text
 
 SAMPLES, SENSOR, SCENE = 256, 96, 128
 FOCAL, DIAMETER, PITCH, WAVELENGTH = 0.11, SAMPLES * 31.55e-6, 2.9e-6, 532e-9

@@ -9,7 +9,7 @@ import pytest
 
 from neusee.nodes.laser import DamageLaw, counted_pixels, pixel_share, spot_in_pixels
 from neusee.workflows.recipe.blocks.safety_block import Laser, Safety, SafetySettings
-from neusee.workflows.safety.uncertain_values import SettingDraws
+from neusee.workflows.safety.exposures import SettingDraws
 from neusee.workflows.safety.what_helps import MET, crossing, remedies
 
 PLANCK_LIGHT = 6.62607015e-34 * 299792458.0
@@ -257,8 +257,8 @@ def test_a_grey_filter_does_not_lower_the_veil_over_the_scene_in_the_verdict():
     dimmed.
     """
     from neusee.workflows.safety.dazzled_area import area_of
+    from neusee.workflows.safety.exposure_limits import limit_ratio, limits_behind
     from neusee.workflows.safety.exposures import Option, compute_exposures
-    from neusee.workflows.safety.limit_ratios import limit_ratio, limits_behind
 
     safety = case(LASER, LENS, SENSOR, VEIL)
     ratios = []

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 
 from neusee.workflows import Store, load
 from neusee.workflows.safety.safety_estimate import CERTIFICATE, estimate
-from neusee.workflows.safety.safety_words import UNITS
+from neusee.workflows.safety.safety_text import UNITS
 from neusee.workflows.safety.worksheet import worksheet_page
 
 FEW = ["safety.draws=100", "safety.protection={}"]

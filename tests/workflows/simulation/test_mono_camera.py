@@ -10,8 +10,8 @@ import torch
 from PIL import Image
 from safetensors.torch import save_file
 
-from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
+from neusee.nodes.restore._networks._unet_and_nafnet import NAFNet
 from neusee.nodes.scene import grey
 from neusee.nodes.scene._spectral_exr import exr_parts
 from neusee.workflows import Store, load

@@ -11,11 +11,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neusee.workflows.store import budget_eviction, shared_folder
+from neusee.workflows.store import eviction as budget_eviction
+from neusee.workflows.store import shared_folder
 from neusee.workflows.store.band_files import Stacked
-from neusee.workflows.store.budget_eviction import Candidate, chosen
-from neusee.workflows.store.byte_sizes import parse_size
+from neusee.workflows.store.cache_settings import parse_size
 from neusee.workflows.store.derived_files import DerivedFiles
+from neusee.workflows.store.eviction import Candidate, chosen
 from neusee.workflows.store.result_store import Store
 
 N = 5000  #: numbers in a value: 20 kB

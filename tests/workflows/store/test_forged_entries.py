@@ -21,14 +21,14 @@ from neusee.nodes import node
 from neusee.nodes.values import Psf, Stop
 from neusee.workflows.cli import cache_commands
 from neusee.workflows.engine.cost_model import Costs
-from neusee.workflows.keys.seal import seal_record, unseal_record
+from neusee.workflows.keys.sealed_files import seal_record, unseal_record
 from neusee.workflows.recipe.node_families import all_nodes, find_node
-from neusee.workflows.store import garbage_files
+from neusee.workflows.store import eviction as garbage_files
 from neusee.workflows.store.band_files import Stacked
+from neusee.workflows.store.payload import SmallResults
 from neusee.workflows.store.remote_store import RemoteStore
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.store.small_results import SmallResults
-from neusee.workflows.store.stored_types import stored_type
+from neusee.workflows.store.serialization import stored_type
 
 KEY, OTHER = "ab" + "0" * 30, "cd" + "1" * 30
 BIG = torch.arange(3000, dtype=torch.float64)

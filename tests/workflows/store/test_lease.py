@@ -15,10 +15,11 @@ import pytest
 import torch
 
 from neusee.workflows.store import lease as lease_module
-from neusee.workflows.store import process_owner, shared_folder
+from neusee.workflows.store import shared_folder
+from neusee.workflows.store import shared_folder as process_owner
 from neusee.workflows.store.lease import Lease
-from neusee.workflows.store.process_owner import Owner, me, owner_of
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.shared_folder import Owner, me, owner_of
 
 KEY = "ab" + "0" * 30
 FAR = "0123456789ab-77-1234"  #: a process of another machine

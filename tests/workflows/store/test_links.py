@@ -7,7 +7,9 @@ import warnings
 import pytest
 import torch
 
-from neusee.workflows.store import budget_eviction, garbage_files, shared_folder
+from neusee.workflows.store import eviction as budget_eviction
+from neusee.workflows.store import eviction as garbage_files
+from neusee.workflows.store import shared_folder
 from neusee.workflows.store.result_store import Store
 
 KEY = "ab" + "0" * 30

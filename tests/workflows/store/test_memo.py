@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from neusee.workflows.store.memo import compute_once
-from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.result_store import Store, compute_once
 
 ABOUT = {"step": "a study"}
 

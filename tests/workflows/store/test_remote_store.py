@@ -16,9 +16,9 @@ import pytest
 import torch
 from fsspec.implementations.memory import MemoryFileSystem
 
-from neusee.workflows.keys.seal import seal_record as seal
-from neusee.workflows.keys.seal import unseal_record as unseal
-from neusee.workflows.store import remote_files
+from neusee.workflows.keys.sealed_files import seal_record as seal
+from neusee.workflows.keys.sealed_files import unseal_record as unseal
+from neusee.workflows.store import remote_store as remote_files
 from neusee.workflows.store.band_files import Stacked
 from neusee.workflows.store.remote_store import RemoteStore, local_layer, open_store
 from neusee.workflows.store.result_store import Store

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.keys import seal
+from neusee.workflows.keys import sealed_files as seal
 from neusee.workflows.store.journal import row_of
 from neusee.workflows.store.metadata import receipt
 from neusee.workflows.store.remote_store import RemoteStore

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from safetensors.torch import load_file
 
 from neusee.nodes.values import Bands, Pupil
-from neusee.workflows.keys.seal import seal_record, unseal_record
+from neusee.workflows.keys.sealed_files import seal_record, unseal_record
 from neusee.workflows.store import band_files, metadata, serialization
 from neusee.workflows.store import payload as payload_module
 from neusee.workflows.store.metadata import INLINE

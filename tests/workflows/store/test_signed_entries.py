@@ -8,7 +8,7 @@ import warnings
 import pytest
 import torch
 
-from neusee.workflows.keys.seal import OtherFormat, Unsigned, seal_record, unseal_record
+from neusee.workflows.keys.sealed_files import OtherFormat, Unsigned, seal_record, unseal_record
 from neusee.workflows.store.band_files import Stacked
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.remote_store import RemoteStore

@@ -11,11 +11,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.workflows.store import small_results
+from neusee.workflows.store import payload as small_results
 from neusee.workflows.store.metadata import INLINE
+from neusee.workflows.store.payload import SmallResults
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.shared_folder import Disk
-from neusee.workflows.store.small_results import SmallResults
 
 
 def key(i):

@@ -10,11 +10,10 @@ import torch
 
 from neusee.workflows.answers.stored_answer import Answer, read_answer, write_answer
 from neusee.workflows.answers.witnesses import Witnesses
-from neusee.workflows.keys.code_memo import read_memo, read_parts, write_memo, write_parts
+from neusee.workflows.keys.module_digest import read_memo, read_parts, write_memo, write_parts
 from neusee.workflows.store.band_files import Stacked
-from neusee.workflows.store.bandwidth import Speeds
 from neusee.workflows.store.derived_files import DerivedFiles
-from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.result_store import Speeds, Store
 
 KINDS = ("payload", "inline", "bands", "small", "receipt", "picture")
 ABOUT = {

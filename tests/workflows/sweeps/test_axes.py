@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.sweeps.axes import Axis, points, read_axes, read_words
-from neusee.workflows.sweeps.value_ranges import MOST, split, values_of
+from neusee.workflows.sweeps.axes import MOST, Axis, points, read_axes, read_words, split, values_of
 
 PLAIN = st.text("abcxyz019.-_ ", min_size=1, max_size=8).map(str.strip).filter(bool)
 QUOTED = st.text("ab,[]{}() '", max_size=8).map(lambda t: f'"{t}"')

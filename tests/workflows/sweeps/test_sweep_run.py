@@ -21,7 +21,8 @@ from neusee.workflows.engine import local_executor
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.sweeps import sweep_files, sweep_points
+from neusee.workflows.sweeps import sweep_points
+from neusee.workflows.sweeps import sweep_table as sweep_files
 from neusee.workflows.sweeps.sweep_run import sweep
 from tests.workflows.crate_rules import faults
 

@@ -8,10 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.engine import cost_laws, step_job
+from neusee.workflows.engine import cost_model as cost_laws
+from neusee.workflows.engine import step_job
 from neusee.workflows.graph import recipe_graph
-from neusee.workflows.keys import known_keys
-from neusee.workflows.recipe.text import composition, option_groups
+from neusee.workflows.keys import code_digest as known_keys
+from neusee.workflows.recipe.text import composition
+from neusee.workflows.recipe.text import composition as option_groups
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import points as points_of
 from neusee.workflows.sweeps.axes import read_axes, read_words

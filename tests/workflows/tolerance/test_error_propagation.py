@@ -12,12 +12,11 @@ from neusee.nodes import ErrorBound, TensorStats, node
 from neusee.workflows.engine import runner
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
-from neusee.workflows.graph.recipe_graph import Recipe, Step, Substitution
-from neusee.workflows.graph.step_record import StepRecord
+from neusee.workflows.graph.recipe_graph import Recipe, Step, StepRecord, Substitution
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.error_budget import ErrorBudget
 from neusee.workflows.tolerance.error_norm import largest_error
 from neusee.workflows.tolerance.error_propagation import proof
+from neusee.workflows.tolerance.skip_decision import ErrorBudget
 
 MARK = Location("recipe.yaml", 1, 1)
 

@@ -8,11 +8,11 @@ import pytest
 
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
-from neusee.workflows.recipe.changed_recipe import changed
+from neusee.workflows.recipe.loading import changed
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import stricter_scale, with_substitutions
 from neusee.workflows.tolerance.error_norm import error_of
-from neusee.workflows.tolerance.expected_errors import expected_excess
+from neusee.workflows.tolerance.error_propagation import expected_excess
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 import random_recipes

@@ -11,9 +11,9 @@ from neusee.nodes.scene import Photographs
 from neusee.workflows import RecipeError, Store, load
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.told_copies import TOLD
+from neusee.workflows.graph.recipe_graph import TOLD
+from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.held_out import HELD_OUT
-from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.run_training import train
 from neusee.workflows.training.training_pictures import TrainingStream
 from tests.workflows.training.noise_photographs import noise_photograph

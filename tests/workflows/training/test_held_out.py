@@ -13,11 +13,12 @@ from PIL import Image
 from safetensors.torch import load_file
 from scipy import stats
 
-from neusee.nodes.scene import Photographs, _photograph_folder
+from neusee.nodes.scene import Photographs
+from neusee.nodes.scene import _photograph as _photograph_folder
 from neusee.workflows import RecipeError, Store, load
+from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.held_out import COLUMNS, Validation, interval, split
-from neusee.workflows.training.parallel.process_mesh import ALONE
-from neusee.workflows.training.parallel.shared_graph import Shared
+from neusee.workflows.training.process_mesh import ALONE
 from neusee.workflows.training.run_training import train
 from neusee.workflows.training.training_pictures import TrainingStream
 

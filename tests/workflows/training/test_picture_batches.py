@@ -8,8 +8,7 @@ import torch
 from neusee.nodes import losses
 from neusee.nodes.restore import Informed, NAFNet, start_network
 from neusee.nodes.values import FilterFacts
-from neusee.workflows.training.picture_batches import joined, together
-from neusee.workflows.training.training_iteration import Learner, Scales, _apart
+from neusee.workflows.training.training_iteration import Learner, Scales, _apart, joined, together
 from neusee.workflows.training.training_pictures import Sample
 
 MAPS = 32

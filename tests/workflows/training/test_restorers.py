@@ -10,9 +10,8 @@ from safetensors.torch import save_file
 from torch.testing import assert_close
 
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba
-from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
-from neusee.nodes.restore._networks._unet import UNet
+from neusee.nodes.restore._networks._unet_and_nafnet import NAFNet, UNet
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import RecipeError

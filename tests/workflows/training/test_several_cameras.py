@@ -12,12 +12,16 @@ from neusee import recipes
 from neusee.nodes.scene import Photographs
 from neusee.workflows import RecipeError, Store, load
 from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.held_out import Split, _by_photograph
-from neusee.workflows.training.parallel.process_mesh import Mesh, MeshError
-from neusee.workflows.training.parallel.shared_graph import Shared
-from neusee.workflows.training.several_cameras import SeveralCameras, require_alone
+from neusee.workflows.training.process_mesh import Mesh, MeshError
 from neusee.workflows.training.training_inputs import inputs_of
-from neusee.workflows.training.training_pictures import HELD_OUT, TrainingStream
+from neusee.workflows.training.training_pictures import (
+    HELD_OUT,
+    SeveralCameras,
+    TrainingStream,
+    require_alone,
+)
 from tests.workflows.training.noise_photographs import noise_photograph
 from tests.workflows.training.test_posed_pictures import POSED
 from tests.workflows.training.test_warm_start import trained

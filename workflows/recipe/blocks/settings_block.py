@@ -9,7 +9,7 @@ from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import BaseModel, Field, ValidationError
 
-from neusee.nodes.parameter_model import ParameterModel
+from neusee.nodes.parameters import ParameterModel
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.recipe.text.composition import Composed
 from neusee.workflows.recipe.text.field_errors import message_of

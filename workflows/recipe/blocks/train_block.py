@@ -1,18 +1,41 @@
-"""Settings of the training of a network and a mask, which form the block ``train`` of a recipe."""
+"""Settings of trainings: the blocks train, train.mask and train_lift of a recipe."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import torch
 from pydantic import Field, model_validator
 
 from neusee.nodes import ParameterError
-from neusee.nodes.network_classes import NetworkClass
-from neusee.workflows.graph.diagnostics import Diagnostic
-from neusee.workflows.recipe.blocks.mask_design_block import MaskSettings, MaskTraining
+from neusee.nodes.doe import Material
+from neusee.nodes.losses import (
+    ContrastFloor,
+    ContrastVariance,
+    HighestFrequency,
+    NoiseVariance,
+    OneBandShare,
+    PeakLimit,
+    SceneLight,
+)
+from neusee.nodes.own_modules import NetworkClass
+from neusee.nodes.units import (
+    Angle,
+    Count,
+    DataFile,
+    Depth,
+    Electrons,
+    Layers,
+    Length,
+    PupilPitch,
+    Slope,
+    Wavelength,
+    Waves,
+)
+from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.recipe.blocks.settings_block import (
     Beta,
     GradientNorm,
@@ -23,11 +46,228 @@ from neusee.workflows.recipe.blocks.settings_block import (
     Weight,
     read_block,
 )
-from neusee.workflows.recipe.text.composition import Composed
-from neusee.workflows.recipe.text.named_files import refuse_outside
-from neusee.workflows.recipe.text.no_code import is_strange
-from neusee.workflows.recipe.text.option_groups import packaged
+from neusee.workflows.recipe.text.composition import Composed, is_strange, packaged, refuse_outside
 from neusee.workflows.recipe.text.yaml_values import Value
+
+# --- mask design block ----------------------------------------------------------------------------
+
+# Settings of the mask design, which optimises the point spread function of a mask without images.
+
+
+Kind = Literal[
+    "pixelwise",
+    "recipe_mask",
+    "zernike",
+    "polynomial",
+    "streak",
+    "rings",
+    "unet",
+    "five_half_rings",
+]
+_RATE = {
+    "pixelwise": 0.05,
+    "recipe_mask": 4e-3,
+    "zernike": 0.1,
+    "polynomial": 0.02,
+    "streak": 0.02,
+    "rings": 0.1,
+    "unet": 2e-3,
+    "five_half_rings": 1.0,
+}
+
+
+def half_cosine(angle: float) -> float:
+    """Return the factor (1 + cos(angle)) / 2 on a learning rate, which falls from 1 at 0 to 0 at
+    the angle pi.
+    """
+    return 0.5 * (1 + math.cos(angle))
+
+
+class Weights(SettingsBlock):
+    """Weights of the terms in the loss of the mask design; each term is a mean over the spectral
+    bands.
+    """
+
+    lsr: Weight = 1.0  #: `losses.suppression_loss`
+    #: `losses.background_loss` of a point on the axis: the light that left the field
+    bsr: Weight = 1.0
+    contrast: Weight = 0.0  #: `losses.contrast`
+    #: `losses.wiener` of all bands together: the error that remains after a Wiener filter
+    wiener: Weight = 0.0
+    #: `losses.filtered_error` behind the filter that keeps the peak at `limit`
+    filtered_error: Weight = 0.0
+    information: Weight = 0.0  #: `losses.information` behind the same filter, in bits per frequency
+
+    @model_validator(mode="after")
+    def _some(self) -> Weights:
+        if not any(getattr(self, name) for name in type(self).model_fields):
+            names = " or ".join(
+                [", ".join([*type(self).model_fields][:-1]), [*type(self).model_fields][-1]]
+            )
+            raise ValueError(f"every weight of the loss is 0: set {names} to a number above 0")
+        return self
+
+    @property
+    def protected(self) -> bool:
+        """Return True if a term of the loss is that of a picture behind a peak limit."""
+        return bool(self.filtered_error or self.information)
+
+    @property
+    def coloured(self) -> bool:
+        """Return True if a term of the loss depends on the light of the scene and the responses
+        of the channels.
+        """
+        return bool(self.wiener or self.protected)
+
+
+class MaskSettings(SettingsBlock):
+    """Settings of the mask design in the recipe key ``train.mask``: the kind of mask, the loss
+    and the duration.
+    """
+
+    #: `recipe_mask`: all samples of the recipe's own height map, from its formula or file
+    kind: Kind = "pixelwise"
+    iterations: Count = 300  #: iterations of Adam, or generations for five_half_rings
+    learning_rate: LearningRate | None = None  #: None: the default for the kind
+    #: `step`: halved at each fifth of the iterations
+    schedule: Literal["cosine", "step"] = "cosine"
+    weights: Weights = Weights(bsr=4.0, contrast=1.0)
+    #: exponent of the norm that replaces the peak
+    power: Annotated[float, Field(ge=8, le=64)] = 16.0
+    log: bool = True  #: whether the loss uses the logarithm of the LSR of each band
+    #: mean LSR below which the loss does not fall further
+    enough: Annotated[float, Field(gt=0, le=1)] | None = None
+    floor: ContrastFloor = 1e-4  #: contrast below which the loss hardly falls
+    #: cycles per pixel: higher frequencies do not affect the loss
+    up_to: HighestFrequency | None = None
+    noise_share: NoiseVariance = 1e-3  #: of `losses.wiener`: noise variance over signal variance
+    #: of `losses.wiener`: fraction of the variance that belongs to one band alone
+    colour: OneBandShare = 1.0
+    #: largest LSR behind mask and grey filter, for filtered_error and information
+    limit: PeakLimit | None = None
+    #: mean of the scene behind the clear lens, in each pixel, for these two terms
+    light: SceneLight = 30.0
+    read_noise: Electrons = 10.5
+    veil: Electrons = 0.0  #: even light of a laser behind the clear lens
+    contrast_variance: ContrastVariance = 0.1  #: of the scene, relative
+    #: standard deviation of the defocus, drawn at each iteration
+    defocus_spread: Annotated[Waves, Field(ge=0)] = 0.0
+    #: the same of all wavelengths together
+    wavelength_spread: Annotated[Length, Field(ge=0, le=1e-6)] = 0.0
+    #: the same of the direction of the laser, on each axis
+    direction_spread: Annotated[Angle, Field(ge=0)] = 0.0
+    learn_stop: bool = False  #: the diameter of `doe.shade` is learnt with the mask
+    bands: Count | None = 7  #: number of bands of the recipe in one iteration; None: all bands
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    starts: Count = 1  #: independent starts; the result is the best mask on all bands
+    #: recipe values that differ during training, such as a coarser pupil
+    at: dict[str, Any] = Field(default={})
+    save_every: Count = 50  #: iterations between two saved states
+
+    # parameters of the kinds of mask
+    max_height: Depth = 5 * 1e-6  #: pixelwise, unet; equal to `5 um` to the last bit
+    grid: Count = 270  #: pixelwise, unet: samples along an axis
+    #: pixelwise: feature size of the initial mask, in diameters
+    scale: Annotated[float, Field(gt=0, le=1)] = 0.04
+    #: pixelwise: a height map to start from, such as one of another kind
+    start: DataFile | None = None
+    width: Layers = 16  #: unet: channels of its first layer
+    modes: Count = 100  #: zernike: number of polynomials, from Noll's number 4 on
+    waves: Annotated[float, Field(gt=0, le=1e5)] = (
+        5.0  #: zernike, polynomial, streak: root mean square of the initial mask
+    )
+    degree: Annotated[int, Field(ge=2, le=30)] = 8  #: polynomial, streak: greatest degree
+    rings: Count = 40  #: rings: annuli of equal area
+    sided: bool = True  #: rings: heights are odd about the axis, like half-rings
+    noise: Annotated[float, Field(ge=0, le=1e5)] = (
+        1.0  #: rings: random part of each slope of the initial mask, in waves
+    )
+    #: five_half_rings: least and greatest slope, in waves at the rim
+    slopes: tuple[Slope, Slope] = (4.0, 48.0)
+    population: Annotated[int, Field(ge=5, le=10**6)] = 70  #: five_half_rings
+    polish: Annotated[int, Field(ge=0, le=10**9)] = (
+        300  #: five_half_rings: masks tried by descent from the best, on all bands
+    )
+    wavelength: Wavelength = 550e-9  #: reference wavelength of heights in waves
+    material: Material = "fused silica"  #: material of heights in waves
+    #: smallest feature (`doe.smooth`); the recipe sets depth and levels
+    feature: PupilPitch | None = None
+
+    plain: str = "psf[plain]"  #: the step of the lens without a mask
+    #: of `losses.wiener`, `losses.filtered_error` and `losses.information`
+    illuminant: str = "illuminant"
+    responses: str = "responses"
+
+    @model_validator(mode="after")
+    def _rising(self) -> Self:
+        if not self.slopes[0] < self.slopes[1]:
+            raise ValueError(f"slopes = {self.slopes}: give the smaller slope first")
+        if self.limit is not None and not self.weights.protected:
+            text = (
+                "set weights.filtered_error or weights.information, or remove limit; of"
+                " weights.lsr, `enough` is it"
+            )
+            raise ValueError(f"limit = {self.limit:g} acts on no term of the loss: {text}")
+        if self.learn_stop and not self.weights.protected:
+            text = (
+                "only weights.filtered_error and weights.information know what a stop costs: set"
+                " one, or remove it"
+            )
+            raise ValueError(f"learn_stop = true: {text}")
+        if self.learn_stop and self.kind == "five_half_rings":
+            raise ValueError(
+                "learn_stop = true: kind five_half_rings has no gradient: choose another kind, or"
+                " remove it"
+            )
+        return self
+
+    @property
+    def rate(self) -> float:
+        """Return the learning rate that the recipe sets, or the default rate for the kind of
+        mask.
+        """
+        return _RATE[self.kind] if self.learning_rate is None else self.learning_rate
+
+
+class MaskTraining(MaskSettings):
+    """Settings of the mask design, and the names of the recipe steps that the design uses."""
+
+    height: str = "height"  #: the step whose height map is designed
+    psf: str = "psf[mask]"
+
+
+class DesignError(ValueError):
+    """Error for settings with which no mask can be designed; the message names the setting and
+    the fix.
+    """
+
+
+def need_steps(recipe_steps: Any, settings: MaskTraining) -> None:
+    """Raise `DesignError` if a setting names a step that the recipe does not have."""
+    for setting in (
+        "height",
+        "psf",
+        "plain",
+        *(("illuminant", "responses") if settings.weights.coloured else ()),
+    ):
+        name = getattr(settings, setting)
+        if name not in recipe_steps:
+            raise DesignError(
+                f"{setting}: the recipe has no step {name!r}; {nearest(name, recipe_steps)}"
+            )
+
+
+def state_file(out: Path, recipe: str, key: str) -> Path:
+    """Return the path of the file with the state of an unfinished mask design; other runs do not
+    delete the file.
+    """
+    return out / f".{recipe}_mask_{key[:16]}.state"
+
+
+# --- train block ----------------------------------------------------------------------------------
+
+# Settings of the training of a network and a mask, which form the block ``train`` of a recipe.
+
 
 KEY = "train"  #: key of the block in a recipe
 #: kinds of networks that need what the Wiener filter knows of a picture
@@ -369,3 +609,59 @@ def _plain(block: Value) -> Any:
                 Path(value.mark.folder) / Path(value.data).expanduser()
             )
     return plain
+
+
+# --- train lift block -----------------------------------------------------------------------------
+
+# Settings of the block ``train_lift`` of a recipe: the training of a network that estimates spectra
+# from RGB.
+
+
+LIFT_KEY = "train_lift"  #: key of the block in a recipe
+
+
+class LiftTraining(SettingsBlock):
+    """Settings of the training of a network that estimates spectra from RGB."""
+
+    measured: str = "measured"
+    picture: str = "picture"
+    cube: str = "cube"
+    start: Literal["linear", "random"] = "linear"
+    iterations: Number
+    batch: Number = 4
+    rate: LearningRate = 4e-4
+    min_rate: Weight = 1e-6
+    betas: tuple[Beta, Beta] = (0.9, 0.999)
+    #: iterations in which the rate rises evenly
+    warmup: Annotated[int, Field(ge=0, le=10**9)] = 200
+    floor: Annotated[float, Field(gt=0, le=1)] = 0.02
+    clip: GradientNorm = 10.0  #: largest norm of the gradient of all weights
+    ema_decay: Beta = 0.998  #: of the moving average of the weights; 0: no average
+    #: number of pictures with which the network is validated at the end
+    validation_batches: Number = 32
+    keep: Number = 100
+    show: Number = 1000
+
+    def rate_at(self, iteration: int) -> float:
+        """Return the learning rate at an iteration: a linear warm-up, then half a cosine from
+        `rate` to `min_rate`.
+        """
+        least, rising = (
+            min(self.min_rate, self.rate),
+            min(1.0, (iteration + 1) / max(self.warmup, 1)),
+        )
+        return rising * (
+            least + (self.rate - least) * half_cosine(math.pi * iteration / self.iterations)
+        )
+
+
+def read_lift_training(composed: Composed) -> tuple[Composed, LiftTraining | None]:
+    """Return a recipe without its block ``train_lift``, and the settings from the block; report
+    mistakes.
+    """
+    block = composed.root.items.get(LIFT_KEY)
+    return (
+        (composed, None)
+        if block is None
+        else read_block(composed, LIFT_KEY, LiftTraining, block.plain)
+    )

@@ -15,7 +15,7 @@ from typing import Any
 
 from neusee.nodes.units import KNOWN_UNITS, read_any
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
-from neusee.workflows.recipe.distributions.joint import (
+from neusee.workflows.recipe.distributions.joint_distribution import (
     BARE_GAIN,
     GAIN_UNIT,
     Joint,
@@ -23,9 +23,8 @@ from neusee.workflows.recipe.distributions.joint import (
     read_posterior,
     summary,
 )
-from neusee.workflows.recipe.distributions.law_text import is_law, read_law
-from neusee.workflows.recipe.distributions.mismatch_laws import Difference
-from neusee.workflows.recipe.distributions.scalar import Law, written
+from neusee.workflows.recipe.distributions.law_text import Difference, is_law, read_law
+from neusee.workflows.recipe.distributions.shapes import Law, written
 from neusee.workflows.recipe.text.composition import Composed
 from neusee.workflows.recipe.text.references import BROKEN
 from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES

@@ -14,12 +14,12 @@ from typing import Any
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.recipe.changed_recipe import changed
+from neusee.workflows.keys.code_digest import engine
+from neusee.workflows.recipe.loading import changed
 from neusee.workflows.report.study_folder import Progress, StudyReport, StudyRun
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy import accuracy_report
-from neusee.workflows.studies.accuracy.accuracy_report import (
+from neusee.workflows.studies.accuracy import accuracy_page
+from neusee.workflows.studies.accuracy.accuracy_page import (
     KEEP_ALL,
     TOLERANCE,
     AccuracyResult,
@@ -119,7 +119,7 @@ def _measure(
     for number, trial in enumerate(todo, 1):
         left = time.monotonic() > until and _may_wait(trial, cache)
         points.append(cache.point(replace(trial, recipe=None, refused=_LEFT) if left else trial))
-        progress(f"{number}/{len(todo)}  {accuracy_report.summary_line(points[-1])}")
+        progress(f"{number}/{len(todo)}  {accuracy_page.summary_line(points[-1])}")
     # in turn, so that other work of the machine disturbs all points alike
     for number in range(2, TIMES + 1):
         points = [cache.time_again(point, number) for point in points]
@@ -163,20 +163,20 @@ def _document(result: AccuracyResult, cache: PointCache, quick: bool) -> dict[st
         "seeds": result.seeds,
         "quick": quick,
         "device": cache.device,
-        "machine": accuracy_report.machine_line(),
-        "failed": accuracy_report.count_missed(result.points),  # number of tolerances
+        "machine": accuracy_page.machine_line(),
+        "failed": accuracy_page.count_missed(result.points),  # number of tolerances
         "engine": engine(),
     }
 
 
 def _report(result: AccuracyResult, document: Mapping[str, Any]) -> StudyReport:
-    pictures = accuracy_report.pictures(result)
+    pictures = accuracy_page.pictures(result)
     return StudyReport(
         f"Accuracy of {result.recipe.name}",
-        accuracy_report.lead(result.recipe, result.points),
-        accuracy_report.sections(result, pictures),
+        accuracy_page.lead(result.recipe, result.points),
+        accuracy_page.sections(result, pictures),
         pictures,
-        tables={"table.csv": (accuracy_report.HEADER, accuracy_report.table(result))},
+        tables={"table.csv": (accuracy_page.HEADER, accuracy_page.table(result))},
         files={"recipe.yaml": result.recipe.config.to_yaml()},
         shown=[name for name in document if name != "config"],
     )

@@ -16,7 +16,7 @@ from typing import Any, Literal, get_args, get_origin
 
 from neusee.nodes.values import Bands, Psf
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
-from neusee.workflows.recipe.changed_recipe import changed
+from neusee.workflows.recipe.loading import changed
 
 _REFERENCE = re.compile(r"\$\{([\w.-]+)\??\}")
 _ONE_BY_ONE = ("item", "each")  #: first names of paths whose value differs from item to item

@@ -28,11 +28,9 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import digest, key_of, stream_seed
-from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.report.measured_variants import keep_variants
-from neusee.workflows.store.memo import compute_once
-from neusee.workflows.store.result_store import Store
+from neusee.workflows.keys.code_digest import Code, engine
+from neusee.workflows.report.contents import keep_variants
+from neusee.workflows.store.result_store import Store, compute_once
 from neusee.workflows.store.serialization import each_tensor, tensors_in
 from neusee.workflows.studies.accuracy.recipe_knobs import allowed_words
 from neusee.workflows.tolerance.error_norm import error_of

@@ -1,11 +1,9 @@
-"""Points of a diagram of error against run time: the time of a cold run and the errors of the
-outputs.
-"""
+"""Points of error against run time, their Pareto front, and the quickest settings."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from statistics import median
@@ -13,17 +11,20 @@ from typing import Any
 
 from neusee.workflows.engine.provenance import machine
 from neusee.workflows.engine.runner import run
-from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.recipe_graph import Event, Recipe, needed
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.graph.step_record import Event
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.store.memo import compute_once
-from neusee.workflows.store.result_store import Store
+from neusee.workflows.keys.code_digest import Code, engine
+from neusee.workflows.store.result_store import Store, compute_once
 from neusee.workflows.studies.cold_run import cold, key_parts, run_cold
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_norm import error_of
+
+# --- work precision points ------------------------------------------------------------------------
+
+# Points of a diagram of error against run time: the time of a cold run and the errors of the
+# outputs.
+
 
 TIMES = 3  #: cold runs of a point; the median of their times counts
 _QUICK = 5.0  #: s; a recipe that takes longer is run once
@@ -222,3 +223,61 @@ def compare_outputs(values: Mapping[str, Any], truth: Mapping[str, Any]) -> dict
         with suppress(ValueError):
             found[name] = [error_of(value, truth[name])]
     return found
+
+
+# --- pareto line ----------------------------------------------------------------------------------
+
+# The Pareto front of error and run time, and the engine's choices compared with the quickest
+# settings.
+
+
+Points = Sequence[WorkPrecisionPoint]
+
+
+@dataclass(frozen=True)
+class ToleranceChoice:
+    """The engine's choice for a tolerance, and the quickest measured setting within the
+    tolerance.
+    """
+
+    tolerance: float
+    chosen: WorkPrecisionPoint
+    cheapest: WorkPrecisionPoint | None  #: None where no point is within the tolerance
+
+    @property
+    def held(self) -> bool:
+        """Return True if the error of the engine's choice is within the tolerance."""
+        return self.chosen.most <= self.tolerance
+
+    @property
+    def ratio(self) -> float | None:
+        """Return the run time of the engine's choice divided by the run time of the quickest
+        setting.
+        """
+        return None if self.cheapest is None else self.chosen.seconds / self.cheapest.seconds
+
+
+def pareto_front(points: Points) -> list[WorkPrecisionPoint]:
+    """Return the Pareto front: settings that no other setting beats in both run time and error,
+    the quickest first.
+    """
+    line: list[WorkPrecisionPoint] = []
+    for point in sorted(points, key=lambda p: (p.seconds, p.most)):
+        if not line or point.most < line[-1].most:
+            line.append(point)
+    return line
+
+
+def cheapest(points: Points, tolerance: float) -> WorkPrecisionPoint | None:
+    """Return the quickest setting whose largest error is within ``tolerance``, or None if there
+    is no such setting.
+    """
+    return min((p for p in points if p.most <= tolerance), key=lambda p: p.seconds, default=None)
+
+
+def median_ratio(choices: Iterable[ToleranceChoice]) -> float | None:
+    """Return the median over all tolerances of the engine's run time divided by the quickest run
+    time.
+    """
+    ratios = [c.ratio for c in choices if c.ratio is not None]
+    return median(ratios) if ratios else None

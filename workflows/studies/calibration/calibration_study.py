@@ -13,21 +13,25 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from neusee.workflows.calibration.identifiability import KINDS, identify
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
+from neusee.workflows.calibration.log_posterior import SensorPosterior, find_mode, initial_theta
 from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport, StudyRun
 from neusee.workflows.report.study_page import Mark, Section
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.calibration.independent_draws import DRAWS, walk_draws
-from neusee.workflows.studies.calibration.prior_sensitivity import ENOUGH, Sensitivity, sensitivity
-from neusee.workflows.studies.calibration.rank_uniformity import RankTest, rank_tests, ranks
-from neusee.workflows.studies.calibration.simulated_sensors import (
+from neusee.workflows.studies.calibration.posterior_tests import (
+    DRAWS,
+    ENOUGH,
+    RankTest,
     Sampler,
+    Sensitivity,
     SensorSimulation,
     SensorSimulator,
+    rank_tests,
+    ranks,
+    sensitivity,
+    walk_draws,
 )
 
 PIXELS = 128

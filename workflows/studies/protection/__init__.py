@@ -2,5 +2,5 @@
 protection?
 
 The page, the table and the pictures of the comparison, with a paragraph to quote.
-Offers: `protection_study.study`, `protection_page.quotable`.
+Offers: `protection_study.study`, `protection_study.quotable`.
 """

@@ -1,19 +1,20 @@
-"""The outputs of a recipe for random values of its uncertain inputs; steps without these inputs
-run only once.
-"""
+"""The outputs of a recipe for random values of its uncertain inputs, and their scatter."""
 
 from __future__ import annotations
 
 import ctypes
+import math
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.workflows.engine.differentiable_function import as_function
@@ -21,15 +22,178 @@ from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.engine.node_call import place
 from neusee.workflows.engine.provenance import timestamp
 from neusee.workflows.engine.worker_processes import shared_in_order, workers_for
+from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.keys.cache_key import device_kind, digest, key_of
-from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
+from neusee.workflows.keys.code_digest import Code, engine
+from neusee.workflows.recipe.distributions.shapes import FloatArray as ShapesFloatArray
+from neusee.workflows.recipe.distributions.uncertain_inputs import InputDraws, Inputs
 from neusee.workflows.report.result_numbers import numbers_of
-from neusee.workflows.store.memo import compute_once
-from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.uncertainty.scatter_estimate import FloatArray
+from neusee.workflows.store.result_store import Store, compute_once
+
+# --- scatter estimate -----------------------------------------------------------------------------
+
+# Means and standard deviations of quantities over random draws, and standard errors of the standard
+# deviations.
+
+
+FloatArray = NDArray[np.float64]
+#: share of the largest value; a quantity with a smaller standard deviation is constant
+_CONSTANT = 1e-12
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """The mean, standard deviation and quantiles over all draws, for each element of one
+    quantity.
+    """
+
+    mean: FloatArray
+    sd: FloatArray
+    low: FloatArray  #: 5 %
+    high: FloatArray  #: 95 %
+    #: relative error of the greatest standard deviation; 0 if the quantity is constant
+    error: float
+
+    @property
+    def is_constant(self) -> bool:
+        """Return True if the quantity has the same finite value in all draws."""
+        return bool(np.isfinite(self.mean).all()) and not float(self.sd.max()) > 0
+
+
+def scatter(values: FloatArray, sequences: int = 0) -> Scatter:
+    """Return mean, standard deviation and quantiles of ``values`` (draw, element) over the draws.
+
+    With ``sequences``, draw i belongs to the scrambled Sobol sequence i % sequences; otherwise
+    draws are independent.
+    """
+    # a quantity that is infinite in a draw has no standard deviation
+    with np.errstate(invalid="ignore"):
+        mean, sd = values.mean(0), values.std(0, ddof=1)
+        low, high = np.quantile(values, [0.05, 0.95], axis=0)
+    sd = np.where(sd > _CONSTANT * np.abs(values).max(0), sd, 0.0)
+    worst = values[:, int(sd.argmax())]
+    error = (
+        0.0
+        if not sd.max() > 0
+        else _of_sequences(worst, sequences)
+        if sequences
+        else _jackknife(worst)
+    )
+    return Scatter(mean, sd, low, high, error)
+
+
+def _jackknife(x: FloatArray) -> float:
+    """Estimate the relative standard error of the standard deviation of independent draws ``x``
+    by the jackknife.
+    """
+    n = len(x)
+    apart = (x - x.mean()) ** 2
+    without = np.sqrt((apart.sum() - apart * n / (n - 1)).clip(0.0) / (n - 2))
+    error = math.sqrt((n - 1) / n * float(((without - without.mean()) ** 2).sum()))
+    return error / float(x.std(ddof=1))
+
+
+def _of_sequences(x: FloatArray, count: int) -> float:
+    """Estimate the relative standard error of the standard deviation from the variance in each
+    Sobol sequence.
+    """
+    squares = (x - x.mean()) ** 2
+    each = np.array([squares[i::count].mean() for i in range(count)])
+    return float(each.std(ddof=1) / math.sqrt(count) / each.mean() / 2)
+
+
+def worst_known(found: Mapping[str, Scatter]) -> str:
+    """Return the name of the quantity whose standard deviation has the largest relative error."""
+    return max(found, key=lambda each: found[each].error)
+
+
+# --- allowed draws --------------------------------------------------------------------------------
+
+# The draws of a study whose values the recipe allows together; other draws are left out, and their
+# number is stated.
+#
+# A value alone may be allowed, and two values may exclude each other, such as a full well below the
+# offset.
+
+
+class AllowedDraws:
+    """The allowed draws of the inputs, in order, of which a study takes more and more."""
+
+    def __init__(self, inputs: Inputs, draws: InputDraws, sequences: int) -> None:
+        self._inputs, self._draws = inputs, draws
+        #: draws that are left out together, so that Sobol sequences stay equally long
+        self._block = max(1, sequences)
+        self._allowed: list[int] = []
+        self.tried = 0
+        self.left_out = 0
+        self.reason = ""  #: why the last draw was left out
+
+    @property
+    def available(self) -> int:
+        """Return the largest number of draws that can be tried."""
+        return len(self._draws.z)
+
+    @property
+    def statement(self) -> str:
+        """Return how many draws were left out and why, or an empty text."""
+        return f"{self.left_out} of {self.tried} draws ({self.reason})" if self.left_out else ""
+
+    @property
+    def z(self) -> ShapesFloatArray:
+        """Return the standard normal numbers (draw, input) of the allowed draws so far."""
+        return self._draws.z[self._allowed]
+
+    @property
+    def values(self) -> ShapesFloatArray:
+        """Return the values (draw, input) of the allowed draws so far, in SI."""
+        return self._draws.values[self._allowed]
+
+    def extend(self, count: int) -> None:
+        """Try draws until ``count`` draws have been tried."""
+        while self.tried < min(count, self.available):
+            block = range(self.tried, min(self.tried + self._block, self.available))
+            problems = [self._inputs.problem(self._draws.values[i]) for i in block]
+            wrong = [problem for problem in problems if problem is not None]
+            if wrong:
+                self.left_out += len(block)
+                self.reason = _text(wrong[-1])
+            else:
+                self._allowed += block
+            self.tried = block.stop
+
+
+def refuse_combinations(inputs: Inputs, ends: ShapesFloatArray, draws: AllowedDraws) -> None:
+    """Raise `RecipeError` if values of ``ends`` (run, input), or of a draw, are not allowed
+    together.
+
+    The draws are those that have been tried before anything runs.
+    """
+    problems = [problem for problem in map(inputs.problem, ends) if problem is not None]
+    if problems:
+        raise RecipeError(problems)
+    if draws.left_out:
+        what = (
+            f"{draws.left_out} of the first {draws.tried} draws have values that are not allowed"
+            " together"
+        )
+        value = inputs.uncertain.composed.root.below(inputs.names[0].split("."))
+        assert value is not None
+        advice = "give narrower or truncated distributions"
+        raise RecipeError(
+            [Diagnostic(value.mark, ", ".join(inputs.names), f"{what} ({draws.reason}): {advice}")]
+        )
+
+
+def _text(problem: Diagnostic) -> str:
+    return f"{problem.path}: {problem.message}" if problem.path else problem.message
+
+
+# --- output draws ---------------------------------------------------------------------------------
+
+# The outputs of a recipe for random values of its uncertain inputs; steps without these inputs run
+# only once.
+
 
 Numbers = dict[str, list[float]]  #: elements of each quantity, such as ``restored_quality.psnr``
 #: M_ARENA_MAX, M_MMAP_MAX and M_TRIM_THRESHOLD of glibc's mallopt

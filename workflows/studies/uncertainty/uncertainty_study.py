@@ -15,18 +15,24 @@ import numpy as np
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.recipe.distributions.allowed_range import NEGLIGIBLE
-from neusee.workflows.recipe.distributions.joint import Z_90
+from neusee.workflows.recipe.distributions.joint_distribution import Z_90
 from neusee.workflows.recipe.distributions.nominal_values import told
-from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, InputDraws, Inputs
+from neusee.workflows.recipe.distributions.uncertain_inputs import (
+    NEGLIGIBLE,
+    SCRAMBLES,
+    InputDraws,
+    Inputs,
+)
 from neusee.workflows.report.study_folder import Content, Progress, StudyReport, StudyRun
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.study_refused import StudyRefused
-from neusee.workflows.studies.uncertainty.allowed_draws import AllowedDraws, refuse_combinations
-from neusee.workflows.studies.uncertainty.output_draws import Numbers, OutputDraws
-from neusee.workflows.studies.uncertainty.scatter_estimate import (
+from neusee.workflows.studies.run_study import StudyRefused
+from neusee.workflows.studies.uncertainty.output_draws import (
+    AllowedDraws,
     FloatArray,
+    Numbers,
+    OutputDraws,
     Scatter,
+    refuse_combinations,
     scatter,
     worst_known,
 )

@@ -23,10 +23,10 @@ from neusee.nodes.values import Bands
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import stream_seed
-from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
+from neusee.workflows.recipe.blocks.train_block import LiftTraining
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.loop.resumable_loop import Losses, averaged, require_finite
-from neusee.workflows.training.training_recipe import require_steps
+from neusee.workflows.training.training_pictures import require_steps
 
 
 class Pairs:

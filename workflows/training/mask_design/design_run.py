@@ -24,45 +24,37 @@ from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.final_values import flow
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.engine_digest import outline
-from neusee.workflows.recipe.blocks.mask_design_block import (
+from neusee.workflows.keys.code_digest import Code, outline
+from neusee.workflows.recipe.blocks.train_block import (
     DesignError,
     MaskTraining,
+    Training,
     Weights,
     need_steps,
     state_file,
 )
-from neusee.workflows.recipe.blocks.train_block import Training
-from neusee.workflows.recipe.changed_recipe import changed
+from neusee.workflows.recipe.loading import changed
 from neusee.workflows.report.run_crate import write_crate
 from neusee.workflows.report.run_folder import RunFolder, new_run
 from neusee.workflows.report.study_folder import StudyReport
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.loop.checkpoint import StateFile
 from neusee.workflows.training.loop.recorded_inputs import (
     CameraInputs,
     RecordedFile,
     RecordedInputs,
 )
-from neusee.workflows.training.loop.resumable_loop import Progress
-from neusee.workflows.training.mask_design.design_terms import Fabrication, Terms
-from neusee.workflows.training.mask_design.differential_evolution import evolve
-from neusee.workflows.training.mask_design.gradient_descent import descend
-from neusee.workflows.training.mask_design.learnt_mask import LearntMask
-from neusee.workflows.training.mask_design.learnt_shade import stopped
-from neusee.workflows.training.mask_design.peak_limit import against_stops, line
+from neusee.workflows.training.loop.resumable_loop import Progress, StateFile
+from neusee.workflows.training.mask_design.design_page import against_stops, line
+from neusee.workflows.training.mask_design.design_terms import Fabrication, Terms, stopped
+from neusee.workflows.training.mask_design.mask_optimisers import LearntMask, descend, evolve
 
 __all__ = ["DesignError", "MaskTraining", "Weights", "design", "mask_figures"]
 
 #: files of the program that decide the loss and the steps of the optimisers
 _OPTIMISES = (
-    "camera_laws",
     "design_terms",
-    "differential_evolution",
-    "gradient_descent",
-    "learnt_shade",
-    "peak_limit",
+    "mask_optimisers",
+    "design_page",
 )
 MASK = 0  #: the number of the stage that designs the mask, before stage 1
 _LEARNT_WITH = {

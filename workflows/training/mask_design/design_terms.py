@@ -1,4 +1,4 @@
-"""The loss function of a mask design and its terms, computed from the PSF of the mask."""
+"""The loss function of a mask design: its terms, the camera's laws and the shade."""
 
 from __future__ import annotations
 
@@ -11,16 +11,174 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import losses
-from neusee.nodes.values import Bands, Psf, Pupil, Stop, band_names
+from neusee.nodes.values import Bands, Psf, Pupil, Shade, Stop, band_names
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
-from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTraining, need_steps
+from neusee.workflows.recipe.blocks.train_block import DesignError, MaskTraining, need_steps
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.mask_design.camera_laws import NOMINAL, CameraLaws, State
-from neusee.workflows.training.mask_design.learnt_shade import LearntShade
+
+# --- camera laws ----------------------------------------------------------------------------------
+
+# What a mask design does not know for certain: laws of defocus, wavelength and direction, and how
+# they are drawn.
+
 
 _PRIME = 1_000_003
+_FAR = 3**0.5  #: standard deviations at which the outer points of a law lie
+
+#: defocus, wavelength, direction on y and on x, in standard deviations
+State = tuple[float, float, float, float]
+NOMINAL: State = (0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class CameraLaws:
+    """Normal laws of defocus, wavelength and direction around the values of the recipe, each
+    independent.
+    """
+
+    spreads: State  #: standard deviations in waves, m, rad and rad
+    defocus: Mapping[str, float]  #: the parameter of the pupil and its value in the recipe
+    #: the parameter of the PSF and its value in the recipe
+    angle: Mapping[str, tuple[float, float]]
+    seed: int
+
+    @classmethod
+    def of(cls, recipe: Recipe, settings: MaskTraining) -> CameraLaws:
+        """Read the laws of the settings, and the parameters of the recipe that they move.
+
+        Raises: `DesignError` if the PSF has no defocus or no direction that could be moved.
+        """
+        step, direction = recipe.steps[settings.psf], settings.direction_spread
+        pupil, defocus = step.wires.get("pupil"), dict[str, float]()
+        if settings.defocus_spread:
+            if not isinstance(pupil, str) or "defocus" not in recipe.steps[pupil].params:
+                text = f"the pupil of {settings.psf} has no defocus: remove it, or name another psf"
+                raise DesignError(f"defocus_spread: {text}")
+            defocus = {f"{pupil}.defocus": float(recipe.steps[pupil].params["defocus"])}
+        if direction and "angle" not in step.params:
+            raise DesignError(
+                f"direction_spread: {settings.psf} has no angle: remove it, or name an optics.psf"
+                " step"
+            )
+        angle = {f"{settings.psf}.angle": step.params["angle"]} if direction else {}
+        return cls(
+            (settings.defocus_spread, settings.wavelength_spread, direction, direction),
+            defocus,
+            angle,
+            settings.seed,
+        )
+
+    @property
+    def certain(self) -> bool:
+        """Return True if nothing is uncertain."""
+        return not any(self.spreads)
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Return the parameters of the recipe that the laws move."""
+        return (*self.defocus, *self.angle)
+
+    def values(self, state: State) -> dict[str, Any]:
+        """Return the parameters of the recipe in a state."""
+        defocus, _, *turns = (spread * x for spread, x in zip(self.spreads, state, strict=True))
+        found: dict[str, Any] = {name: at + defocus for name, at in self.defocus.items()}
+        return found | {
+            name: tuple(a + b for a, b in zip(at, turns, strict=True))
+            for name, at in self.angle.items()
+        }
+
+    def moved(self, bands: Bands, state: State) -> Bands:
+        """Return the bands with all their wavelengths moved together."""
+        return bands._replace(centres=bands.centres + self.spreads[1] * state[1])
+
+    def drawn(self, number: int) -> State:
+        """Draw the state of the iteration ``number``."""
+        rng = torch.Generator().manual_seed(self.seed * _PRIME - number - 1)
+        defocus, wavelength, y, x = torch.randn(4, generator=rng, dtype=torch.float64).tolist()
+        return defocus, wavelength, y, x
+
+    def points(self) -> list[tuple[State, float]]:
+        """Return 2 d + 1 states with their weights, for d uncertain numbers: exact for polynomials
+        of degree 3.
+
+        For d = 1 these are the points of Gauss-Hermite quadrature.
+        """
+        unknown = [place for place, spread in enumerate(self.spreads) if spread]
+        found = [(NOMINAL, 1 - len(unknown) / 3)]
+        for place in unknown:
+            for far in (-_FAR, _FAR):
+                state = [0.0] * len(self.spreads)
+                state[place] = far
+                found.append(((state[0], state[1], state[2], state[3]), 1 / 6))
+        return found
+
+
+# --- learnt shade ---------------------------------------------------------------------------------
+
+# The shade in front of a mask during its design: what it lets through, and a stop that is learnt
+# with the mask.
+
+
+@dataclass(frozen=True)
+class LearntShade:
+    """The step of a shade, its result as the recipe has it, and that with the stop of the shade
+    fully open.
+    """
+
+    step: str
+    own: Shade
+    wide: Shade
+    learnt: bool
+
+    @classmethod
+    def of(
+        cls, recipe: Recipe, settings: MaskTraining, store: Store | None, device: str
+    ) -> LearntShade | None:
+        """Return the shade in the pupil of the mask, or None for a pupil without one.
+
+        Raises: `DesignError` if a stop is to be learnt and the pupil has no shade of `doe.shade`.
+        """
+        pupil = recipe.steps[settings.psf].wires.get("pupil")
+        name = recipe.steps[pupil].wires.get("shade") if isinstance(pupil, str) else None
+        if not isinstance(name, str) or recipe.steps[name].node.path != "doe.shade":
+            if settings.learn_stop:
+                text = (
+                    f"the pupil of {settings.psf} has no shade whose stop could be learnt: use"
+                    " doe=shaded"
+                )
+                raise DesignError(f"learn_stop: {text}, or remove learn_stop")
+            return None
+        wide = run(stopped(recipe, name, 1.0), store, [name], device=device)[name]
+        own = run(recipe, store, [name], device=device)[name]
+        return cls(name, own, wide, settings.learn_stop)
+
+    def behind(self, stop: Tensor | None) -> Shade:
+        """Return the shade with the amplitude of a stop in place of its own stop, or as it is
+        for None.
+        """
+        return (
+            self.own if stop is None else self.wide._replace(amplitude=self.wide.amplitude * stop)
+        )
+
+    def passed(self, stop: Tensor | None) -> Tensor:
+        """Return the share of the light that the shade lets through, away from its notches."""
+        light = self.behind(stop).amplitude.double().square().sum()
+        return light / torch.count_nonzero(self.wide.amplitude)
+
+
+def stopped(recipe: Recipe, shade: str, diameter: float) -> Recipe:
+    """Return the recipe with another diameter of the stop in a shade."""
+    step = recipe.steps[shade]
+    changed = replace(step, params={**step.params, "diameter": diameter})
+    return replace(recipe, steps={**recipe.steps, shade: changed})
+
+
+# --- design terms ---------------------------------------------------------------------------------
+
+# The loss function of a mask design and its terms, computed from the PSF of the mask.
+
 _FREE = "not limited"
 
 

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from neusee.nodes.calibrate import levels, reduce
-from neusee.nodes.calibrate._frames import _frame_statistics
+from neusee.nodes.calibrate import _frame_statistics, levels, reduce
 
 STACKS = hnp.arrays(
     st.sampled_from([np.uint8, np.uint16, np.int32, np.float32, np.float64]),

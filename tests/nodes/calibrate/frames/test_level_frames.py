@@ -14,8 +14,8 @@ from PIL import Image
 from pydantic import ValidationError
 
 from neusee.nodes import ParameterError
+from neusee.nodes.calibrate import _frame_files as _damaged_frames
 from neusee.nodes.calibrate import frames
-from neusee.nodes.calibrate._frames import _damaged_frames
 
 NUMBERS = np.array([[0, 1, 255, 256], [32767, 32768, 65534, 65535]], np.uint16)
 

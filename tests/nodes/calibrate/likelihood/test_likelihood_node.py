@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.calibrate import Sufficient, density, expose, levels, reduce, sufficient
-from neusee.nodes.calibrate._likelihood._quantised_gaussian import log_cell
+from neusee.nodes.calibrate._sensor_likelihood import log_cell
 
 PAPER = {
     "gain": 0.37,

@@ -14,7 +14,7 @@ from scipy.integrate import quad
 from scipy.stats import cauchy, norm
 
 from neusee.nodes.calibrate import CLEAN_PAIRS, Hidden, Stack, inspect_frames, open_errors
-from neusee.nodes.calibrate._validity._hidden_faults import probably_sound
+from neusee.nodes.calibrate._frame_pairs import probably_sound
 
 DATA = Path(
     os.environ.get("NEUSEE_EMVA1288", Path(__file__).parents[4] / "../shared/data/emva1288")

@@ -8,14 +8,15 @@ import torch
 from scipy.fft import dctn
 from scipy.stats import chi2, kstest, kurtosis, kurtosistest, norm
 
-from neusee.nodes.calibrate._validity._block_test import _cosines, _kept_to, products
-from neusee.nodes.calibrate._validity._frame_pairs import (
-    normal_limit,
-    outcome,
-    strongest,
-    studentised,
+from neusee.nodes.calibrate._frame_pairs import normal_limit, outcome, strongest, studentised
+from neusee.nodes.calibrate._noise_tests import (
+    _core,
+    _cosines,
+    _glynn,
+    _hilferty,
+    _kept_to,
+    products,
 )
-from neusee.nodes.calibrate._validity._noise_tests import _core, _glynn, _hilferty
 
 
 def test_limits_are_those_of_the_normal_law():

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.optics import image
-from neusee.nodes.optics._imaging._band_image import smooth
+from neusee.nodes.optics._band_image import smooth
 from neusee.nodes.values import Psf
 
 

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.optics import image, image_channels
-from neusee.nodes.optics._imaging._band_thumbnail import share_of_bands
-from neusee.nodes.optics._imaging._summed_convolution import Mix, Where, summed
+from neusee.nodes.optics._convolution_plan import Mix, Where, summed
+from neusee.nodes.optics._few_bands import share_of_bands
 from neusee.nodes.spectra import (
     bands,
     compress,

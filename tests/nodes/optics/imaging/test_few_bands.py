@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from neusee.nodes import doe
+from neusee.nodes.optics import _few_bands as _band_thumbnail
 from neusee.nodes.optics import (
     few_bands,
     few_bands_checked,
@@ -16,8 +17,7 @@ from neusee.nodes.optics import (
     pupil_of_bands,
     stop,
 )
-from neusee.nodes.optics._imaging import _band_thumbnail
-from neusee.nodes.optics._imaging._band_thumbnail import share_of_bands
+from neusee.nodes.optics._few_bands import share_of_bands
 from neusee.nodes.spectra import bands, compress, responses, rows
 from neusee.nodes.values import FewBands, Psf
 

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.optics import image
-from neusee.nodes.optics._imaging._light_in_field import light_in_field
+from neusee.nodes.optics._band_image import light_in_field
 from neusee.nodes.values import Psf
 
 

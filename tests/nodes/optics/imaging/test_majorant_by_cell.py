@@ -5,10 +5,9 @@ border.
 import pytest
 import torch
 
-from neusee.nodes.optics._imaging._band_image import reach
-from neusee.nodes.optics._imaging._collapsed_plan import Given
-from neusee.nodes.optics._imaging._convolve_plan import majorant_by_cell
-from neusee.nodes.optics._imaging._psf_energy import passed
+from neusee.nodes.optics._band_image import reach
+from neusee.nodes.optics._channel_image import majorant_by_cell
+from neusee.nodes.optics._convolution_plan import Given, passed
 
 
 def image_of(off, kernel, reflect):

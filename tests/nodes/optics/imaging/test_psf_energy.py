@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.optics._imaging._psf_energy import by_window, centred, passed
+from neusee.nodes.optics._convolution_plan import by_window, centred, passed
 
 
 def outside(stack, window):

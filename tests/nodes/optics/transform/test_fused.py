@@ -14,7 +14,7 @@ from neusee.nodes.optics import psf, pupil, stop
 from neusee.nodes.optics._psf import _Camera, _focus
 from neusee.nodes.optics._psf_definition import by_definition
 from neusee.nodes.optics._transform import _fused
-from neusee.nodes.optics._transform._fused_plan import fused_axis
+from neusee.nodes.optics._transform._fused import fused_axis
 from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
 from neusee.nodes.optics._transform._pupil_field import View
 from neusee.nodes.optics._transform._sample_axis import Axis

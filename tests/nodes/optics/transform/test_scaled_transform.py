@@ -6,11 +6,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.optics._transform._banded_matrix import Banded
-from neusee.nodes.optics._transform._chirp_transform import smooth
-from neusee.nodes.optics._transform._sample_axis import Axis, centred, radians, unit_phasor
+from neusee.nodes.optics._transform._fft_transforms import Banded, smooth
+from neusee.nodes.optics._transform._sample_axis import (
+    Axis,
+    borrowed,
+    centred,
+    radians,
+    unit_phasor,
+)
 from neusee.nodes.optics._transform._scaled_transform import cheapest, transform
-from neusee.nodes.optics._transform._workspace import borrowed
 
 METHODS = ["direct", "folded", "bluestein", "kaiser_bessel", "auto"]
 CPU = torch.device("cpu")
@@ -193,7 +197,7 @@ def test_threads_never_share_a_workspace():
 
 
 def test_workspaces_are_kept_but_not_collected():
-    from neusee.nodes.optics._transform import _workspace
+    from neusee.nodes.optics._transform import _sample_axis as _workspace
 
     with borrowed(torch.float32, CPU) as first:
         memory = first.take("x", 100).data_ptr()

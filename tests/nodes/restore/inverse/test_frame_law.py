@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from neusee.nodes.restore import wiener_spread
-from neusee.nodes.restore._inverse._frame_spectrum import fitted_law
 from neusee.nodes.restore._inverse._masked_blur import Blurred
+from neusee.nodes.restore._inverse._wiener_prior import fitted_law
 from neusee.nodes.values import Bands, Psf
 
 SIDE, TORUS, WIDE = 64, 100, 256

@@ -8,18 +8,13 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from neusee.nodes.restore._inverse import (
-    _conjugate_gradients,
-    _fft_grid,
-    _hidden_pixels,
-    _lowest_frequencies,
-)
-from neusee.nodes.restore._inverse._conjugate_gradients import descend
-from neusee.nodes.restore._inverse._fft_grid import torus
+from neusee.nodes.restore._inverse import _conjugate_gradients, _hidden_pixels
+from neusee.nodes.restore._inverse import _conjugate_gradients as _lowest_frequencies
+from neusee.nodes.restore._inverse import _masked_blur as _fft_grid
+from neusee.nodes.restore._inverse._conjugate_gradients import Lowest, descend
 from neusee.nodes.restore._inverse._hidden_pixels import halved, most_likely
-from neusee.nodes.restore._inverse._lowest_frequencies import Lowest
-from neusee.nodes.restore._inverse._masked_blur import Blurred, variance
-from neusee.nodes.restore._inverse._picture_scale import fall
+from neusee.nodes.restore._inverse._masked_blur import Blurred, torus, variance
+from neusee.nodes.restore._inverse._wiener_prior import fall
 
 
 def problem(picture, size, channels=1, grey=0.0, seed=0, hidden=0.0):

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from neusee.nodes.restore._inverse._hidden_pixels import pulled
 from neusee.nodes.restore._inverse._masked_blur import Blurred
-from neusee.nodes.restore._inverse._pulled_answer import pulled
 
 GREY = 0.6
 SIZE, TORUS = (5, 4), (8, 6)

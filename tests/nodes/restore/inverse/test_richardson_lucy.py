@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from neusee.nodes import restore
-from neusee.nodes.restore._inverse._fft_grid import torus
-from neusee.nodes.restore._inverse._psf_on_grid import edge
+from neusee.nodes.restore._inverse._masked_blur import edge, torus
 from neusee.nodes.values import Bands, Psf
 
 ONE = torch.ones(1, dtype=torch.float64)

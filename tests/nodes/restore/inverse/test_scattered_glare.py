@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from neusee.nodes.restore import wiener, wiener_by_field, wiener_spread
-from neusee.nodes.restore._inverse._glare import visible
-from neusee.nodes.restore._inverse._picture_scale import shared_level
-from neusee.nodes.restore._inverse._scattered_glare import RADII, _likeliest, with_smooth
+from neusee.nodes.restore._inverse._glare import RADII, _likeliest, visible, with_smooth
+from neusee.nodes.restore._inverse._wiener_prior import shared_level
 from neusee.nodes.values import Bands, MeasuredPsf, Psf
 
 SIDE, READ, WELL = 96, 5.0, 25000.0

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.nodes.restore._inverse import _scene_level as module
-from neusee.nodes.restore._inverse._scene_level import Told, drawn_blotches, level_and_variance
+from neusee.nodes.restore._inverse import _wiener_prior as module
+from neusee.nodes.restore._inverse._wiener_prior import Told, drawn_blotches, level_and_variance
 
 WHITE = np.array([0.9, 1.0, 0.5])
 FULL = 25_000.0

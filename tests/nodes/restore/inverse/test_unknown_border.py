@@ -8,7 +8,7 @@ import torch
 
 from neusee.nodes.restore import wiener, wiener_spread
 from neusee.nodes.restore._inverse import _wiener
-from neusee.nodes.restore._inverse._picture_scale import about_mean, expected_variance, fall
+from neusee.nodes.restore._inverse._wiener_prior import about_mean, expected_variance, fall
 from neusee.nodes.values import Bands, Psf
 
 ONE = torch.ones(1, dtype=torch.float64)

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from neusee.nodes.optics import image
 from neusee.nodes.restore import wiener
 from neusee.nodes.restore._inverse import _wiener
-from neusee.nodes.restore._inverse._fft_grid import DENSE
 from neusee.nodes.restore._inverse._glare import strengths
-from neusee.nodes.restore._inverse._grey_psf import effective_psf
+from neusee.nodes.restore._inverse._masked_blur import DENSE, effective_psf
 from neusee.nodes.sensor import crop
 from neusee.nodes.spectra import bands, illuminant, leaves, reflectances, responses
 from neusee.nodes.values import Bands, Psf

@@ -8,7 +8,7 @@ import torch
 from scipy.stats import norm
 
 from neusee.nodes import restore
-from neusee.nodes.restore._lasers._censored import censored
+from neusee.nodes.restore._lasers._joint_fit import censored
 from neusee.nodes.restore._lasers._line_pattern import (
     Lens,
     grid_patterns,

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from neusee.nodes import optics
-from neusee.nodes.restore._lasers._components import Lamp
-from neusee.nodes.restore._lasers._lamp_light import lamp_light
+from neusee.nodes.restore._lasers._components import Lamp, lamp_light
 from neusee.nodes.restore._lasers._line_pattern import Lens
 from tests.nodes.restore.lasers import own_camera as own
 from tests.nodes.restore.lasers.as_inputs import BANDS, LENS, found_in, pupil_of, tensor

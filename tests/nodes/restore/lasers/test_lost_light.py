@@ -12,14 +12,17 @@ import pytest
 import torch
 from scipy.stats import norm
 
-from neusee.nodes.restore._lasers._beyond_scatter import without_scattered
-from neusee.nodes.restore._lasers._components import Camera, Laser
-from neusee.nodes.restore._lasers._greedy_search import Choice, Found, Known, _data
-from neusee.nodes.restore._lasers._intervals import NORMAL, spreads
-from neusee.nodes.restore._lasers._joint_fit import fitted, misfit_of
-from neusee.nodes.restore._lasers._lamp_light import lamp_light
+from neusee.nodes.restore._lasers._components import Camera, Laser, lamp_light
+from neusee.nodes.restore._lasers._find_lasers import at_the_aperture
+from neusee.nodes.restore._lasers._greedy_search import (
+    Choice,
+    Found,
+    Known,
+    _data,
+    without_scattered,
+)
+from neusee.nodes.restore._lasers._joint_fit import NORMAL, fitted, misfit_of, spreads
 from neusee.nodes.restore._lasers._line_pattern import Lens
-from neusee.nodes.restore._lasers._lost_light import at_the_aperture
 from tests.nodes.restore.lasers import own_camera as own
 from tests.nodes.restore.lasers.as_inputs import found_in, inputs
 

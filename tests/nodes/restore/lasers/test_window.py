@@ -5,7 +5,7 @@ for odd sides too.
 import pytest
 import torch
 
-from neusee.nodes.restore._lasers._nearest import _AROUND, _window
+from neusee.nodes.restore._lasers._candidates import _AROUND, _window
 
 
 @pytest.mark.parametrize("sides", [(640, 500), (641, 257), (90, 300)])

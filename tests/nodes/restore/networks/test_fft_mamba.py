@@ -13,18 +13,22 @@ from torch.testing import assert_close
 from neusee.nodes import ParameterError
 from neusee.nodes.network_weights import file_metadata
 from neusee.nodes.restore import fft_mamba
-from neusee.nodes.restore._networks._fft_mamba import FFTMamba
-from neusee.nodes.restore._networks._mamba_blocks import (
+from neusee.nodes.restore._networks._fft_mamba import (
     SMALL,
     Block,
+    BothWays,
+    DualScan,
+    FFTMamba,
     Frequency,
+    Scan,
     Spatial,
+    _decay,
     _Phase,
+    _step,
     radial_order,
 )
 from neusee.nodes.restore._networks._restorer import start_network
-from neusee.nodes.restore._networks._scan_layer import BothWays, DualScan, Scan, _decay, _step
-from neusee.nodes.restore._scan._one_decay_scan import dual_scan
+from neusee.nodes.restore._scan._torch_scan import dual_scan
 
 CPU = torch.device("cpu")
 SCANS = [

@@ -12,11 +12,10 @@ from torch import nn
 from torch.testing import assert_close
 
 from neusee.nodes import ParameterError, restore
-from neusee.nodes.bicubic_resize import resize
+from neusee.nodes.resampling import resize
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba
-from neusee.nodes.restore._networks._nafnet import NAFBlock, NAFNet
 from neusee.nodes.restore._networks._restorer import parameter_groups, start_network
-from neusee.nodes.restore._networks._unet import UNet
+from neusee.nodes.restore._networks._unet_and_nafnet import NAFBlock, NAFNet, UNet
 
 SMALL = {"width": 4, "blocks": 2, "states": 3}
 MAKE = {

@@ -10,9 +10,9 @@ import torch
 from torch import nn
 
 from neusee.nodes import ParameterError, restore
-from neusee.nodes.network_classes import Architecture, network_classes
+from neusee.nodes.own_modules import Architecture, network_classes
 from neusee.nodes.restore import own_network, try_network
-from neusee.workflows.contract.network_contract import whole_networks
+from neusee.workflows.contract.node_contract import whole_networks
 
 
 class Net(nn.Module):
@@ -137,4 +137,6 @@ def test_a_network_may_draw_in_training_and_compute_in_float64():
 def test_layers_of_a_file_that_builds_others_are_not_the_networks_of_a_family():
     found = network_classes(sys.modules[__name__])
     assert set(found) == {"Net"}
-    assert set(whole_networks(sys.modules["neusee.nodes.restore._networks._nafnet"])) == set()
+    assert (
+        set(whole_networks(sys.modules["neusee.nodes.restore._networks._unet_and_nafnet"])) == set()
+    )

@@ -11,10 +11,9 @@ from torch.nn import functional as F
 from torch.testing import assert_close
 
 from neusee.nodes import restore
-from neusee.nodes.bicubic_resize import resize
-from neusee.nodes.restore._networks._nafnet import NAFNet
-from neusee.nodes.restore._networks._restorer import start_network
-from neusee.nodes.restore._networks._tiles import tiled
+from neusee.nodes.resampling import resize
+from neusee.nodes.restore._networks._restorer import start_network, tiled
+from neusee.nodes.restore._networks._unet_and_nafnet import NAFNet
 
 
 def seeded():

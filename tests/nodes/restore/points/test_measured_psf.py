@@ -8,9 +8,15 @@ import torch
 
 from neusee.nodes import ParameterError
 from neusee.nodes.restore import measured_psf
-from neusee.nodes.restore._points._point_fit import gauged
-from neusee.nodes.restore._points._point_frames import read_points
-from neusee.nodes.restore._points._point_model import State, hats, linear, node_weights, shifting
+from neusee.nodes.restore._measured_psf import gauged
+from neusee.nodes.restore._point_frames import (
+    State,
+    hats,
+    linear,
+    node_weights,
+    read_points,
+    shifting,
+)
 from tests.nodes.restore.points.independent_camera import CAMERA, centred, numbers, place_in, points
 
 TRIPLE = torch.ones(3, 5)

@@ -6,7 +6,7 @@ import torch
 
 from neusee.nodes.restore import measured_psf, spread_by_field, wiener_by_field
 from neusee.nodes.values import MeasuredPsf
-from neusee.workflows.engine.cost_laws import measured_size, shipped, size_of
+from neusee.workflows.engine.cost_model import measured_size, shipped, size_of
 from neusee.workflows.graph.step_shapes import form_of, without_values
 from tests.nodes.restore.points.independent_camera import CAMERA, READ, points
 

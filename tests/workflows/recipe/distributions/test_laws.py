@@ -13,10 +13,10 @@ from scipy import stats
 from neusee.workflows import load
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.recipe.distributions.law_text import KINDS, read_law
-from neusee.workflows.recipe.distributions.scalar import draw_laws
 from neusee.workflows.recipe.distributions.shapes import (
     Discrete,
     Normal,
+    draw_laws,
     scores_between,
     share_between,
 )

@@ -7,9 +7,12 @@ import pytest
 from neusee.workflows.evaluation.pipelines import EvaluationRefused, read_pipelines
 from neusee.workflows.graph.diagnostics import Location, RecipeError
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.recipe.text.named_files import refuse_outside
-from neusee.workflows.recipe.text.no_code import VARIABLE
-from neusee.workflows.recipe.text.option_groups import packaged, user_folder
+from neusee.workflows.recipe.text.composition import (
+    NO_CODE_VARIABLE,
+    packaged,
+    refuse_outside,
+    user_folder,
+)
 
 OUTSIDE = "is not in the folder of "
 
@@ -17,7 +20,7 @@ OUTSIDE = "is not in the folder of "
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     """A folder of a stranger, with the switch that says so."""
-    monkeypatch.setenv(VARIABLE, "1")
+    monkeypatch.setenv(NO_CODE_VARIABLE, "1")
     (tmp_path / "his").mkdir()
     (tmp_path / "mine.csv").write_text("")
     (tmp_path / "his" / "link.csv").symlink_to(tmp_path / "mine.csv")
@@ -48,7 +51,7 @@ def test_what_the_reader_names_passes(place, monkeypatch):
     refuse_outside(place / "../mine.csv", mark(place, "--mask", 0))
     refuse_outside(place / "../mine.csv", mark(packaged() / "sensor"))
     refuse_outside(place / "../mine.csv", mark(user_folder() / "sensor"))
-    monkeypatch.delenv(VARIABLE)
+    monkeypatch.delenv(NO_CODE_VARIABLE)
     refuse_outside(place / "../mine.csv", mark(place))
 
 

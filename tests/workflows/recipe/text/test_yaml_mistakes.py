@@ -4,7 +4,7 @@ import pytest
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError, YAMLStreamError
 
-from neusee.workflows.recipe.text.yaml_mistakes import directive_mistake, explained
+from neusee.workflows.recipe.text.yaml_values import directive_mistake, explained
 
 MISTAKES = [
     # a quote or a bracket that never closes, or closes lines later

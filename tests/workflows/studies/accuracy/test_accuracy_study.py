@@ -14,36 +14,32 @@ import pytest
 import torch
 
 from neusee.workflows import load
-from neusee.workflows.recipe.changed_recipe import changed
+from neusee.workflows.recipe.loading import changed
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.accuracy_figures import (
+from neusee.workflows.studies.accuracy.accuracy_page import (
     EXACT,
+    AccuracyResult,
     Dot,
     Line,
+    count_missed,
+    lead,
     promises,
+    sections,
     steps,
     work_precision,
 )
-from neusee.workflows.studies.accuracy.accuracy_report import (
-    AccuracyResult,
-    count_missed,
-    lead,
-    sections,
-)
 from neusee.workflows.studies.accuracy.accuracy_study import study, trials
-from neusee.workflows.studies.accuracy.pareto_line import (
-    ToleranceChoice,
-    cheapest,
-    median_ratio,
-    pareto_front,
-)
 from neusee.workflows.studies.accuracy.recipe_knobs import finest, knobs
 from neusee.workflows.studies.accuracy.single_steps import cut_inputs, steps_that_matter, try_step
 from neusee.workflows.studies.accuracy.work_precision_points import (
     TIMES,
     PointCache,
+    ToleranceChoice,
     Trial,
     WorkPrecisionPoint,
+    cheapest,
+    median_ratio,
+    pareto_front,
 )
 from neusee.workflows.studies.run_study import count_failures
 

@@ -14,24 +14,25 @@ from emcee.moves import DESnookerMove
 from scipy.stats import binom
 from typer.testing import CliRunner
 
-from neusee.nodes.calibrate._likelihood import _linear_sensor
+from neusee.nodes.calibrate import _sensor_likelihood as _linear_sensor
 from neusee.workflows.calibration import emcee_sampler
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
+from neusee.workflows.calibration.log_posterior import SensorPosterior, find_mode, initial_theta
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.calibration import calibration_study, simulated_sensors
-from neusee.workflows.studies.calibration.independent_draws import DRAWS, PosteriorDraws, walk_draws
-from neusee.workflows.studies.calibration.prior_sensitivity import ENOUGH, sensitivity
-from neusee.workflows.studies.calibration.rank_uniformity import (
+from neusee.workflows.studies.calibration import calibration_study
+from neusee.workflows.studies.calibration import posterior_tests as simulated_sensors
+from neusee.workflows.studies.calibration.posterior_tests import (
+    DRAWS,
+    ENOUGH,
+    PosteriorDraws,
+    SensorSimulation,
+    SensorSimulator,
     chance_band,
     coverage_limits,
     rank_tests,
-)
-from neusee.workflows.studies.calibration.simulated_sensors import (
-    SensorSimulation,
-    SensorSimulator,
     rank_truth,
+    sensitivity,
+    walk_draws,
     with_narrow_prior,
 )
 from neusee.workflows.studies.run_study import count_failures, study_recipe

@@ -17,8 +17,10 @@ from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.leave_out import leave_out_study, omission_rows, scene_costs
-from neusee.workflows.studies.leave_out.omission_rows import OmissionComparison, least_error
+from neusee.workflows.studies.leave_out import leave_out_study
+from neusee.workflows.studies.leave_out import leave_out_study as scene_costs
+from neusee.workflows.studies.leave_out import left_out_steps as omission_rows
+from neusee.workflows.studies.leave_out.left_out_steps import OmissionComparison, least_error
 
 MARK = Location("recipe.yaml", 1, 1)
 SMALL = (

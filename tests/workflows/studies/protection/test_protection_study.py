@@ -11,14 +11,18 @@ from typer.testing import CliRunner
 
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
-from neusee.workflows.protection import front_optics
-from neusee.workflows.protection.camera_parts import ProtectionCamera
+from neusee.workflows.protection import protection_camera as front_optics
 from neusee.workflows.protection.equal_rivals import MEASURES
-from neusee.workflows.protection.front_optics import Front, FrontBench, FrontSettings
+from neusee.workflows.protection.protection_camera import (
+    Front,
+    FrontBench,
+    FrontSettings,
+    ProtectionCamera,
+)
 from neusee.workflows.protection.protection_result import LIGHTS
 from neusee.workflows.protection.unknown_conditions import usual_condition
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.protection.protection_page import crossing
+from neusee.workflows.studies.protection.protection_study import crossing
 from neusee.workflows.studies.run_study import study_recipe
 
 SMALL = ["optics.samples=128", "optics.pitch=63.125 um", "optics.bands=3", "optics.window=[64, 64]"]

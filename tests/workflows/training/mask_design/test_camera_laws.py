@@ -9,11 +9,10 @@ import torch
 
 from neusee.nodes import losses, metrics
 from neusee.workflows import load
-from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTraining
+from neusee.workflows.recipe.blocks.train_block import DesignError, MaskTraining
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.mask_design.camera_laws import NOMINAL, CameraLaws
-from neusee.workflows.training.mask_design.design_terms import Terms
-from neusee.workflows.training.mask_design.peak_limit import against_stops
+from neusee.workflows.training.mask_design.design_page import against_stops
+from neusee.workflows.training.mask_design.design_terms import NOMINAL, CameraLaws, Terms
 
 SMALL = [
     "optics.samples=48",

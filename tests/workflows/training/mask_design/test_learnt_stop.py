@@ -11,9 +11,10 @@ from safetensors.torch import load_file
 
 from neusee.nodes import losses
 from neusee.workflows import load
-from neusee.workflows.recipe.blocks.mask_design_block import MaskTraining
+from neusee.workflows.recipe.blocks.train_block import MaskTraining
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.mask_design import design_page, gradient_descent
+from neusee.workflows.training.mask_design import design_page
+from neusee.workflows.training.mask_design import mask_optimisers as gradient_descent
 from neusee.workflows.training.mask_design.design_run import design, mask_figures
 from neusee.workflows.training.mask_design.design_terms import Terms
 

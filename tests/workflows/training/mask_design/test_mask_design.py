@@ -15,8 +15,9 @@ from neusee.nodes.doe import half_rings
 from neusee.workflows import load
 from neusee.workflows.report.figures import optics
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.loop.checkpoint import StateFile
-from neusee.workflows.training.mask_design import design_page, gradient_descent
+from neusee.workflows.training.loop.resumable_loop import StateFile
+from neusee.workflows.training.mask_design import design_page
+from neusee.workflows.training.mask_design import mask_optimisers as gradient_descent
 from neusee.workflows.training.mask_design.design_run import (
     DesignError,
     MaskTraining,

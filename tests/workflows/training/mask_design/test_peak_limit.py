@@ -14,7 +14,8 @@ from safetensors.torch import load_file
 from neusee.nodes import losses
 from neusee.workflows import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.mask_design import design_page, gradient_descent
+from neusee.workflows.training.mask_design import design_page
+from neusee.workflows.training.mask_design import mask_optimisers as gradient_descent
 from neusee.workflows.training.mask_design.design_run import MaskTraining, design
 from neusee.workflows.training.mask_design.design_terms import Terms
 

@@ -16,8 +16,8 @@ from safetensors.torch import load_file
 
 from neusee.nodes import doe
 from neusee.workflows import Store, load
-from neusee.workflows.training.parallel.band_shards import Shards
-from neusee.workflows.training.parallel.process_mesh import Mesh, MeshError, shape_of
+from neusee.workflows.training.band_shards import Shards
+from neusee.workflows.training.process_mesh import Mesh, MeshError, shape_of
 from neusee.workflows.training.run_training import _photographs, train
 from neusee.workflows.training.training_pictures import TrainingStream
 from tests.workflows.training.noise_photographs import noise_photograph
@@ -276,7 +276,7 @@ import sys
 from pathlib import Path
 import torch
 import torch.distributed as dist
-from neusee.workflows.training.parallel.process_mesh import joined
+from neusee.workflows.training.process_mesh import joined
 
 def threads():
     return [path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm")]
