@@ -72,8 +72,8 @@ def _processor() -> str:
     return "\n".join([platform.platform(), platform.machine(), platform.processor(), *facts])
 
 
-def _compile(code: Path, rounding: str, where: Path) -> None:
-    """Compile the C++ source to the file ``where``; raise `NoCompilerError` if that fails."""
+def _compiler() -> str:
+    """Return the command of the C++ compiler; raise `NoCompilerError` if there is none."""
     compiler = (
         os.environ.get("CXX")
         or shutil.which("g++")
@@ -82,6 +82,20 @@ def _compile(code: Path, rounding: str, where: Path) -> None:
     )
     if compiler is None:
         raise NoCompilerError("no C++ compiler is installed: install g++, or set CXX to a compiler")
+    return compiler
+
+
+def _first_error(done: subprocess.CompletedProcess[str]) -> str:
+    """Return the first line of a compiler that names an error, or its exit status."""
+    for line in done.stderr.splitlines():
+        if "error" in line:
+            return line.strip()
+    return f"exit status {done.returncode}"
+
+
+def _compile(code: Path, rounding: str, where: Path) -> None:
+    """Compile the C++ source to the file ``where``; raise `NoCompilerError` if that fails."""
+    compiler = _compiler()
     try:
         where.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=where.parent) as aside:
@@ -91,11 +105,7 @@ def _compile(code: Path, rounding: str, where: Path) -> None:
             command = [*words, *FLAGS, rounding, *options, str(code), "-o", str(library)]
             done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
             if done.returncode:
-                reason = next(
-                    (x for x in done.stderr.splitlines() if "error" in x),
-                    f"exit status {done.returncode}",
-                )
-                raise NoCompilerError(f"{compiler} failed: {reason.strip()}")
+                raise NoCompilerError(f"{compiler} failed: {_first_error(done)}")
             os.replace(library, where)
     except (OSError, subprocess.SubprocessError) as error:
         raise NoCompilerError(f"{compiler} could not be run: {error}") from error
@@ -130,25 +140,25 @@ def load(*sources: Path, rounding: str = FUSED) -> ctypes.CDLL:
     bits for every width of a vector and every compiler. Raises `NoCompilerError` if the source
     cannot be compiled.
     """
-    found = _library(sources, rounding, folder(), os.environ.get("CXX"))
-    if isinstance(found, NoCompilerError):
-        raise found
-    return found
+    library = _library(sources, rounding, folder(), os.environ.get("CXX"))
+    if isinstance(library, NoCompilerError):
+        raise library
+    return library
 
 
-def compiled(what: str, *sources: Path, rounding: str = FUSED) -> bool:
-    """Return True if the library of ``what`` is available, compiled if needed; otherwise warn
+def compiled(task: str, *sources: Path, rounding: str = FUSED) -> bool:
+    """Return True if the library of ``task`` is available, compiled if needed; otherwise warn
     once and return False.
     """
     try:
         load(*sources, rounding=rounding)
     except NoCompilerError as error:
-        _say_once(what, str(error))
+        _say_once(task, str(error))
         return False
     return True
 
 
 @functools.cache
-def _say_once(what: str, why: str) -> None:
-    text = f"the C++ of the {what} is not compiled and torch computes the {what} more slowly: {why}"
+def _say_once(task: str, why: str) -> None:
+    text = f"the C++ of the {task} is not compiled and torch computes the {task} more slowly: {why}"
     warnings.warn(text, stacklevel=5)

@@ -104,19 +104,25 @@ def _measure(flat: Tensor) -> tuple[float, float, float, int]:
     import torch
 
     small = flat.dtype == torch.bool or (flat.is_floating_point() and flat.element_size() < 4)
-    parts = []
-    for part in torch.split(flat, _PART):
-        part = part.float() if small else part
-        rows = part.view(-1, _ROW) if part.numel() % _ROW == 0 else part[None]
-        parts.append(
-            (*torch.aminmax(part), rows.sum(1).sum(dtype=torch.float64), torch.count_nonzero(part))
-        )
-    lows, highs, sums, counts = (torch.stack(each) for each in zip(*parts, strict=True))
+    parts = [_measure_piece(piece, small) for piece in torch.split(flat, _PART)]
+    lows, highs, sums, counts = (torch.stack(values) for values in zip(*parts, strict=True))
     low, high, total = (float(x) for x in (lows.min(), highs.max(), sums.sum()))
     # the sum of a row overflowed
     if math.isinf(total) and math.isfinite(low) and math.isfinite(high):
-        total = float(sum(part.sum(dtype=torch.float64) for part in torch.split(flat, _PART)))
+        total = float(sum(piece.sum(dtype=torch.float64) for piece in torch.split(flat, _PART)))
     return low, high, total, int(counts.sum())
+
+
+def _measure_piece(piece: Tensor, small: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return minimum, maximum, sum and number of nonzero elements of a piece, in float32 if its
+    type is ``small``.
+    """
+    import torch
+
+    piece = piece.float() if small else piece
+    rows = piece.view(-1, _ROW) if piece.numel() % _ROW == 0 else piece[None]
+    low, high = torch.aminmax(piece)
+    return low, high, rows.sum(1).sum(dtype=torch.float64), torch.count_nonzero(piece)
 
 
 @dataclass(frozen=True, slots=True)
@@ -337,14 +343,28 @@ class Node:
         self.channel_sum_form: Node | None = None
         self.low_rank_form: Node | None = None
         self.hooks = Hooks()
-        pars = inspect.signature(fn).parameters.values()
+        self._read_signature()
+        self.bands = bands and self._declared(bands)
+        self.before_run = before_run
+        self._require_texts(depends)
+        self.depends = tuple(depends)
+        #: the declared variables of the environment at the import, which a module may read only
+        #: then
+        self.environment = {name: os.environ.get(name) for name in _variables(depends)}
+        self._refuse_inputs_before_run()
+        _registered[fn.__module__, fn.__name__] = self
+
+    def _read_signature(self) -> None:
+        """Read inputs, optional inputs, random numbers and parameters from the function."""
+        pars = inspect.signature(self.fn).parameters.values()
         data = [p for p in pars if p.kind is p.POSITIONAL_OR_KEYWORD]
         self.inputs = tuple(p.name for p in data)
         self.optional = frozenset(p.name for p in data if p.default is not p.empty)
         self.random = any(p.name == "rng" for p in pars)
         self._keyword_only = [p for p in pars if p.kind is p.KEYWORD_ONLY and p.name != "rng"]
-        self.bands = bands and self._declared(bands)
-        self.before_run = before_run
+
+    def _require_texts(self, depends: Sequence[str]) -> None:
+        """Raise ValueError for declared dependencies that are no list of texts."""
         if isinstance(depends, str) or not all(
             isinstance(entry, str) and entry for entry in depends
         ):
@@ -352,16 +372,14 @@ class Node:
                 f'{self.path}: depends={depends!r} must be a list of texts, such as ["table.csv",'
                 ' "env:X"]'
             )
-        self.depends = tuple(depends)
-        #: the declared variables of the environment at the import, which a module may read only
-        #: then
-        self.environment = {name: os.environ.get(name) for name in _variables(depends)}
-        if before_run and (self.inputs or self.random):
+
+    def _refuse_inputs_before_run(self) -> None:
+        """Raise ValueError for a node that a run computes first although it needs something."""
+        if self.before_run and (self.inputs or self.random):
             raise ValueError(
                 f"{self.path}: before_run needs a node without inputs and without rng: omit"
                 " before_run"
             )
-        _registered[fn.__module__, fn.__name__] = self
 
     def __call__(self, *inputs: Any, **params: Any) -> Any:
         """Call the function of the node directly, with gradients, without parameter validation and

@@ -55,12 +55,12 @@ def npy_needs(
             shape, dtype = _npy_header(raw)
         except (ValueError, EOFError, SyntaxError, TypeError):
             return  # NumPy says what a damaged file lacks
-        there = os.fstat(raw.fileno()).st_size - raw.tell()
+        after = os.fstat(raw.fileno()).st_size - raw.tell()
     count = math.prod(map(int, shape))
-    if not dtype.hasobject and count * dtype.itemsize > there:
+    if not dtype.hasobject and count * dtype.itemsize > after:
         text = (
             f"its header states {in_bytes(count * dtype.itemsize)} of numbers, and"
-            f" {in_bytes(there)} follow"
+            f" {in_bytes(after)} follow"
         )
         raise ParameterError(
             parameter, f"{file} cannot be read: {text}: copy or save the file again"
@@ -95,10 +95,10 @@ def npz_needs(
     """
     archive_needs(file, copies, parameter)
     total, count = 0.0, 0
-    for name, there, shape, dtype in _npz_headers(file, parameter):
+    for name, after, shape, dtype in _npz_headers(file, parameter):
         size = math.prod(map(int, shape))
-        if not dtype.hasobject and size * dtype.itemsize > there:
-            text = f"its array {name} states {_numbers(shape, dtype)}, and {in_bytes(there)} follow"
+        if not dtype.hasobject and size * dtype.itemsize > after:
+            text = f"its array {name} states {_numbers(shape, dtype)}, and {in_bytes(after)} follow"
             raise ParameterError(
                 parameter, f"{file} cannot be read: {text}: copy or save the file again"
             )
@@ -112,12 +112,12 @@ def _npz_headers(
     """Return name, stated bytes, shape and type of each array in a .npz file, as far as its
     headers can be read.
     """
-    found = []
+    headers = []
     with opened(file, parameter) as raw, suppress(*_BROKEN), zipfile.ZipFile(raw) as archive:
         for entry in archive.infolist():
             with archive.open(entry) as inner:
-                found.append((entry.filename, entry.file_size, *_npy_header(inner)))
-    return found
+                headers.append((entry.filename, entry.file_size, *_npy_header(inner)))
+    return headers
 
 
 def archive_needs(file: Path | str, copies: float, parameter: str = "file") -> None:
@@ -133,8 +133,8 @@ def archive_needs(file: Path | str, copies: float, parameter: str = "file") -> N
         needs(copies * packed, file, f"a file of {in_bytes(packed)}", parameter)
         with suppress(*_BROKEN), zipfile.ZipFile(raw) as archive:
             sizes = [entry.file_size for entry in archive.infolist()]
-    what = f"{len(sizes)} files of {in_bytes(sum(sizes))} in {in_bytes(packed)}"
-    needs(copies * sum(sizes), file, what, parameter)
+    content = f"{len(sizes)} files of {in_bytes(sum(sizes))} in {in_bytes(packed)}"
+    needs(copies * sum(sizes), file, content, parameter)
 
 
 # --- .safetensors ---------------------------------------------------------------------------------
@@ -193,14 +193,16 @@ def mat_needs(
     """
     with opened(file, parameter) as raw:
         size = os.fstat(raw.fileno()).st_size
-        total, most, asked = 0.0, 0.0, float(SMALL)
-        for begins, each in _mat_sizes(raw, size):
-            total = total + each if together or not begins else each
-            most = max(most, total)
-            if copies * most > asked:
-                needs(copies * most, file, f"variables of {in_bytes(most)} or more", parameter)
-                asked = copies * most + SMALL
-    needs(copies * most, file, f"variables of {in_bytes(most)}", parameter)
+        total, largest, asked = 0.0, 0.0, float(SMALL)
+        for begins, size_of_part in _mat_sizes(raw, size):
+            total = total + size_of_part if together or not begins else size_of_part
+            largest = max(largest, total)
+            if copies * largest > asked:
+                needs(
+                    copies * largest, file, f"variables of {in_bytes(largest)} or more", parameter
+                )
+                asked = copies * largest + SMALL
+    needs(copies * largest, file, f"variables of {in_bytes(largest)}", parameter)
 
 
 def _mat_sizes(raw: BinaryIO, size: int) -> Iterator[tuple[bool, int]]:
@@ -218,9 +220,9 @@ def _mat_sizes(raw: BinaryIO, size: int) -> Iterator[tuple[bool, int]]:
         after = raw.tell() + length
         if kind == _MAT_COMPRESSED:
             stored, stated = 0, 0
-            for part in _inflated(raw, length):
-                stated = stated or _mat_stated(part[8:], order)
-                before, stored = stored, stored + len(part)
+            for piece in _inflated(raw, length):
+                stated = stated or _mat_stated(piece[8:], order)
+                before, stored = stored, stored + len(piece)
                 yield before == 0, max(stored, stated) - (max(before, stated) if before else 0)
         elif kind == _MAT_MATRIX:
             yield True, max(min(length, size), _mat_stated(raw.read(min(length, 4096)), order))
@@ -229,18 +231,18 @@ def _mat_sizes(raw: BinaryIO, size: int) -> Iterator[tuple[bool, int]]:
         raw.seek(after)
 
 
-def _mat_stated(part: bytes, order: str) -> int:
+def _mat_stated(piece: bytes, order: str) -> int:
     """Return the bytes of the numbers of a variable as they are read, from its flags and
     dimensions; 0 if unknown.
     """
-    if len(part) < 24:
+    if len(piece) < 24:
         return 0
-    flags, _, kind, length = struct.unpack(f"{order}8x4I", part[:24])
-    each = _MAT_CLASSES.get(flags & 0xFF, 0) * (2 if flags & _MAT_COMPLEX else 1)
-    if kind != _MAT_INT32 or not each or length > len(part) - 24:
+    flags, _, kind, length = struct.unpack(f"{order}8x4I", piece[:24])
+    bytes_each = _MAT_CLASSES.get(flags & 0xFF, 0) * (2 if flags & _MAT_COMPLEX else 1)
+    if kind != _MAT_INT32 or not bytes_each or length > len(piece) - 24:
         return 0
-    return each * math.prod(
-        int(n) for n in struct.unpack(f"{order}{length // 4}i", part[24 : 24 + length // 4 * 4])
+    return bytes_each * math.prod(
+        int(n) for n in struct.unpack(f"{order}{length // 4}i", piece[24 : 24 + length // 4 * 4])
     )
 
 
@@ -293,9 +295,9 @@ def hdf5_needs(file: Path | str, groups: Any, copies: float = 1.0) -> None:
     """
     total = 0.0
     for group in groups:
-        for each in group.values():
-            if hasattr(each, "shape"):
-                total += math.prod(map(int, each.shape)) * each.dtype.itemsize
+        for data in group.values():
+            if hasattr(data, "shape"):
+                total += math.prod(map(int, data.shape)) * data.dtype.itemsize
     needs(copies * total, file, f"data of {in_bytes(total)}")
 
 
@@ -320,10 +322,13 @@ def picture_needs(file: Path, image: Any, beside: float, parameter: str = "file"
     """Ask for the memory of the first picture that Pillow has opened, with ``beside`` bytes for
     each of its pixels.
     """
-    each = _IN_MEMORY.get(image.mode, 4) + beside
-    each += _COEFFICIENTS if image.format in ("JPEG", "MPO") else 0
+    bytes_a_pixel = _IN_MEMORY.get(image.mode, 4) + beside
+    bytes_a_pixel += _COEFFICIENTS if image.format in ("JPEG", "MPO") else 0
     needs(
-        each * image.width * image.height, file, f"{image.width} x {image.height} pixels", parameter
+        bytes_a_pixel * image.width * image.height,
+        file,
+        f"{image.width} x {image.height} pixels",
+        parameter,
     )
 
 
@@ -338,9 +343,9 @@ def pages_need(
         tiff_needs(file, copies, beside, parameter)
         return
     pages, size = int(getattr(image, "n_frames", 1)), image.width * image.height
-    each = copies * _IN_MEMORY.get(image.mode, 4) + beside
+    bytes_a_pixel = copies * _IN_MEMORY.get(image.mode, 4) + beside
     needs(
-        pages * size * each,
+        pages * size * bytes_a_pixel,
         file,
         f"{pages} pages of {image.width} x {image.height} pixels",
         parameter,
@@ -398,9 +403,9 @@ def tiff_pages(raw: BinaryIO) -> Iterator[Page]:
     (place,) = (
         struct.unpack(f"{order}Q", head[8:16]) if big else struct.unpack(f"{order}I", head[4:8])
     )
-    seen, most = set[int](), os.fstat(raw.fileno()).st_size
-    while 0 < place < most and place not in seen:
-        seen.add(place)
+    visited, end = set[int](), os.fstat(raw.fileno()).st_size
+    while 0 < place < end and place not in visited:
+        visited.add(place)
         page, place = _tiff_page(raw, place, order, big)
         yield page
 
@@ -411,21 +416,21 @@ def _tiff_page(raw: BinaryIO, place: int, order: str, big: bool) -> tuple[Page, 
     raw.seek(place)
     (count,) = struct.unpack(f"{order}{counting}", raw.read(8 if big else 2))
     form = struct.Struct(f"{order}{entry}")
-    found: dict[int, int] = {}
+    values: dict[int, int] = {}
     for _ in range(min(count, 65536)):
         tag, kind, length, value = form.unpack(raw.read(form.size))
         if tag in _TIFF_TAGS and kind in _TIFF_SIZES:
-            found[tag] = _tiff_number(raw, order, _TIFF_SIZES[kind], length, value)
+            values[tag] = _tiff_number(raw, order, _TIFF_SIZES[kind], length, value)
     after = raw.read(8 if big else 4)
     (following,) = (
         struct.unpack(f"{order}{address}", after) if len(after) == (8 if big else 4) else (0,)
     )
     page = Page(
-        found.get(_WIDTH, 0),
-        found.get(_HEIGHT, 0),
-        found.get(_BITS, 8),
-        found.get(_SAMPLES, 1),
-        found.get(_TILE_WIDTH, 0) * found.get(_TILE_LENGTH, 0),
+        values.get(_WIDTH, 0),
+        values.get(_HEIGHT, 0),
+        values.get(_BITS, 8),
+        values.get(_SAMPLES, 1),
+        values.get(_TILE_WIDTH, 0) * values.get(_TILE_LENGTH, 0),
     )
     return page, following
 
@@ -469,15 +474,17 @@ def exr_needs(file: Path | str, beside: float = 8.0, parameter: str = "file") ->
             parts = list(exr_part_sizes(raw))
         except (struct.error, ValueError):
             return  # the library says what a damaged file lacks
-    if any(part.deep for part in parts):
+    if any(exr_part.deep for exr_part in parts):
         raise ParameterError(
             parameter, f"{file} has deep samples, several a pixel: flatten the picture"
         )
-    values = max((part.width * part.height * len(part.channels) for part in parts), default=0)
-    largest = max(parts, key=lambda part: part.bytes, default=ExrPart(0, 0, {}, False))
-    what = f"{largest.width} x {largest.height} pixels in {len(largest.channels)} channels"
-    what += f", and {len(parts) - 1} other parts" if len(parts) > 1 else ""
-    needs(sum(part.bytes for part in parts) + beside * values, file, what, parameter)
+    values = max(
+        (exr_part.width * exr_part.height * len(exr_part.channels) for exr_part in parts), default=0
+    )
+    largest = max(parts, key=lambda exr_part: exr_part.bytes, default=ExrPart(0, 0, {}, False))
+    content = f"{largest.width} x {largest.height} pixels in {len(largest.channels)} channels"
+    content += f", and {len(parts) - 1} other parts" if len(parts) > 1 else ""
+    needs(sum(exr_part.bytes for exr_part in parts) + beside * values, file, content, parameter)
 
 
 def exr_part_sizes(raw: BinaryIO) -> Iterator[ExrPart]:
@@ -487,32 +494,32 @@ def exr_part_sizes(raw: BinaryIO) -> Iterator[ExrPart]:
     magic, version = struct.unpack("<iI", raw.read(8))
     if magic != 20000630:
         return
-    most = os.fstat(raw.fileno()).st_size
+    end = os.fstat(raw.fileno()).st_size
     while True:
-        found = _exr_attributes(raw, most)
-        if not found:
+        attributes = _exr_attributes(raw, end)
+        if not attributes:
             return
-        left, top, right, bottom = struct.unpack("<4i", found.get("dataWindow", b""))
-        channels = dict(_exr_channels(found.get("channels", b"")))
-        deep = bool(version & _DEEP) or found.get("type", b"").startswith(b"deep")
+        left, top, right, bottom = struct.unpack("<4i", attributes.get("dataWindow", b""))
+        channels = dict(_exr_channels(attributes.get("channels", b"")))
+        deep = bool(version & _DEEP) or attributes.get("type", b"").startswith(b"deep")
         yield ExrPart(max(right - left + 1, 0), max(bottom - top + 1, 0), channels, deep)
         if not version & _MULTIPART:
             return
 
 
-def _exr_attributes(raw: BinaryIO, most: int) -> dict[str, bytes]:
+def _exr_attributes(raw: BinaryIO, end: int) -> dict[str, bytes]:
     """Return the attributes of a header that say its size; nothing at the end of the headers."""
-    found: dict[str, bytes] = {}
+    attributes: dict[str, bytes] = {}
     while name := _exr_text(raw):
         _exr_text(raw)  # the type
         (size,) = struct.unpack("<i", raw.read(4))
-        if not 0 <= size <= most - raw.tell():
+        if not 0 <= size <= end - raw.tell():
             raise ValueError("an attribute is longer than the file")
         if name in ("dataWindow", "channels", "type") and size <= _LONGEST:
-            found[name] = raw.read(size)
+            attributes[name] = raw.read(size)
         else:
             raw.seek(size, os.SEEK_CUR)
-    return found
+    return attributes
 
 
 def _exr_text(raw: BinaryIO) -> str:

@@ -51,25 +51,27 @@ class BeyondMemory(ParameterError):
     """Error of a reader whose file needs more memory than is left."""
 
 
-def needs(count: float, file: Path | str, what: str, parameter: str = "file") -> None:
+def needs(count: float, file: Path | str, content: str, parameter: str = "file") -> None:
     """Raise `BeyondMemory` if a reader would need more than the memory that is left: ``count``
     bytes.
 
-    ``what`` says what the bytes are, such as ``30 pages of 4000 x 3000 pixels``.
+    ``content`` says what the bytes are, such as ``30 pages of 4000 x 3000 pixels``.
     """
     if count <= SMALL:
         return
     room = _measures[-1]()
     if count <= room.free:
         return
-    least = max(room.free, 0.0)
+    free = max(room.free, 0.0)
     if room.limit is None:
-        there, more = f"the {in_bytes(least)} that are free", "free memory"
+        room_text, remedy = f"the {in_bytes(free)} that are free", "free memory"
     else:
-        there = f"the {in_bytes(least)} that are left of the limit of {in_bytes(room.limit)}"
-        more = "raise the limit by --memory"
-    text = f"{file} would need {in_bytes(count)} of memory to read ({what}), more than {there}"
-    raise BeyondMemory(parameter, f"{text}: {more}, crop the file, or give another file")
+        room_text = f"the {in_bytes(free)} that are left of the limit of {in_bytes(room.limit)}"
+        remedy = "raise the limit by --memory"
+    text = (
+        f"{file} would need {in_bytes(count)} of memory to read ({content}), more than {room_text}"
+    )
+    raise BeyondMemory(parameter, f"{text}: {remedy}, crop the file, or give another file")
 
 
 def measured_by(measure: Callable[[], Room]) -> None:
@@ -81,25 +83,31 @@ def free_memory() -> Room:
     """Return the memory that is free on this machine, in its control group, and below the limit
     of addresses.
     """
-    found = [float("inf")]
+    rooms = [float("inf")]
     with suppress(OSError, ValueError, StopIteration):
         lines = Path("/proc/meminfo").read_text().splitlines()
-        found.append(
+        rooms.append(
             1024.0
             * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
         )
     with suppress(OSError, ValueError):
-        most = int((_GROUP / "memory.max").read_text())
-        kept = dict(line.split() for line in (_GROUP / "memory.stat").read_text().splitlines())
-        found.append(
-            float(most - int((_GROUP / "memory.current").read_text()) + int(kept["inactive_file"]))
+        limit = int((_GROUP / "memory.max").read_text())
+        statistics = dict(
+            line.split() for line in (_GROUP / "memory.stat").read_text().splitlines()
+        )
+        rooms.append(
+            float(
+                limit
+                - int((_GROUP / "memory.current").read_text())
+                + int(statistics["inactive_file"])
+            )
         )
     addresses = resource.getrlimit(resource.RLIMIT_AS)[0]
     if addresses != resource.RLIM_INFINITY:
         with suppress(OSError, ValueError):
             pages = int(Path("/proc/self/statm").read_text().split()[0])
-            found.append(float(addresses - pages * resource.getpagesize()))
-    return Room(min(found))
+            rooms.append(float(addresses - pages * resource.getpagesize()))
+    return Room(min(rooms))
 
 
 _measures: list[Callable[[], Room]] = [free_memory]  #: the last one counts
@@ -172,19 +180,24 @@ def bytes_of(file: Path | str, copies: float = 1.0, parameter: str = "file") -> 
 
 
 def text_of(
-    file: Path | str, encoding: str = "utf-8", errors: str = "strict", most: int = TEXT
+    file: Path | str, encoding: str = "utf-8", errors: str = "strict", max_bytes: int = TEXT
 ) -> str:
-    """Return the text of a file of at most ``most`` bytes, with ``\\n`` at the end of each line."""
+    """Return the text of a file of at most ``max_bytes`` bytes, with ``\\n`` at the end of each
+    line.
+    """
     with opened(file) as bytes_in:
         size = os.fstat(bytes_in.fileno()).st_size
-        if size > most:
-            limit = f"more than the limit of {in_bytes(most)} for such a file"
+        if size > max_bytes:
+            limit = f"more than the limit of {in_bytes(max_bytes)} for such a file"
             raise ParameterError(
                 "file", f"{file} has {in_bytes(size)}, {limit}: give a shorter file"
             )
         needs(8.0 * size, file, f"a text of {in_bytes(size)}")
         return (
-            bytes_in.read(most).decode(encoding, errors).replace("\r\n", "\n").replace("\r", "\n")
+            bytes_in.read(max_bytes)
+            .decode(encoding, errors)
+            .replace("\r\n", "\n")
+            .replace("\r", "\n")
         )
 
 
@@ -244,7 +257,7 @@ def refuse_large_array(file: Path, shape: Sequence[int]) -> None:
     """Raise ParameterError for an array whose header states more values than the limit, before
     it is read.
     """
-    count = functools.reduce(lambda one, other: one * int(other), shape, 1)
+    count = functools.reduce(lambda product, other: product * int(other), shape, 1)
     if count > VALUES:
         sizes = " x ".join(map(str, shape))
         text = (
@@ -327,10 +340,10 @@ def csv_rows(file: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _refuse_separator(file: Path, header: list[str]) -> None:
-    found = next(
+    separator = next(
         (name for mark, name in _SEPARATORS.items() if len(header) == 1 and mark in header[0]), None
     )
-    if found:
+    if separator:
         raise ValueError(
-            f"{file.name} separates its columns by {found}: separate the columns by commas"
+            f"{file.name} separates its columns by {separator}: separate the columns by commas"
         )

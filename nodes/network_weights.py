@@ -88,8 +88,8 @@ def _not_finite(weights: Path) -> str:
 
     safetensors_need(weights, parameter="weights")
     with safe_open(weights, framework="pt") as tensors:
-        found = (wrong_weights(weights, name, tensors.get_tensor(name)) for name in tensors.keys())  # noqa: SIM118
-        return next(filter(None, found), "")
+        wrong = (wrong_weights(weights, name, tensors.get_tensor(name)) for name in tensors.keys())  # noqa: SIM118
+        return next(filter(None, wrong), "")
 
 
 def wrong_weights(weights: Path, name: str, tensor: Tensor) -> str:

@@ -9,7 +9,7 @@ import importlib.util
 import inspect
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -57,21 +57,23 @@ def import_file(
     if folder not in sys.path:
         sys.path.append(folder)
     importlib.invalidate_caches()
-    known = set(sys.modules)
+    before = set(sys.modules)
     try:
         module = load(name)
     except BaseException:
-        for added in [
-            module
-            for module in sys.modules
-            if module not in known and f"{module}.".startswith(f"{name}.")
-        ]:
-            del sys.modules[added]
+        _forget_modules(name, before)
         raise
     for helper, beside in _helpers(file, path.parent):
         _refuse_taken(helper, beside)
     _files[name] = path.absolute()
     return module
+
+
+def _forget_modules(name: str, before: Collection[str]) -> None:
+    """Forget a module and the modules inside it, but for those that were imported before."""
+    for module in list(sys.modules):
+        if module not in before and f"{module}.".startswith(f"{name}."):
+            del sys.modules[module]
 
 
 def note_module(name: str) -> None:
@@ -100,11 +102,11 @@ def import_missing(files: tuple[str, ...], needed: str) -> None:
     import. Only what the module ``needed`` raises is raised: `ImportError` for a missing file, and
     whatever its code raises.
     """
-    for each in files:
+    for file in files:
         try:
-            _import_if_missing(each)
+            _import_if_missing(file)
         except Exception:
-            if needed.partition(".")[0] == _top_name(each):
+            if needed.partition(".")[0] == _top_name(file):
                 raise
 
 
@@ -146,15 +148,20 @@ def _found(name: str) -> str | None:
 
 def _helpers(file: Path, folder: Path) -> Iterator[tuple[str, Path]]:
     """Yield name and file of each module beside ``file`` that ``file`` imports."""
+    for top in _imported_tops(file):
+        for beside in (folder / f"{top}.py", folder / top / "__init__.py"):
+            if beside.is_file():
+                yield top, beside
+                break
+
+
+def _imported_tops(file: Path) -> Iterator[str]:
+    """Yield the first part of the name of each module that a file imports."""
     for item in ast.walk(ast.parse(file.read_bytes())):
         names = [alias.name for alias in item.names] if isinstance(item, ast.Import) else []
         if isinstance(item, ast.ImportFrom) and item.module and not item.level:
             names = [item.module]
-        for top in {name.partition(".")[0] for name in names}:
-            for beside in (folder / f"{top}.py", folder / top / "__init__.py"):
-                if beside.is_file():
-                    yield top, beside
-                    break
+        yield from {name.partition(".")[0] for name in names}
 
 
 # --- network classes ------------------------------------------------------------------------------
@@ -197,58 +204,67 @@ class Architecture:
 
         Raises ValueError for an argument that the class does not take, or that is missing.
         """
-        given = dict(parameters or {})
+        written = dict(parameters or {})
         takes = inspect.signature(self.network).parameters.values()
-        any_name = any(one.kind is one.VAR_KEYWORD for one in takes)
         named = {
-            one.name: one for one in takes if one.kind not in (one.VAR_KEYWORD, one.VAR_POSITIONAL)
+            argument.name: argument
+            for argument in takes
+            if argument.kind not in (argument.VAR_KEYWORD, argument.VAR_POSITIONAL)
         }
-        for name in given:
-            if name not in named and not any_name:
+        if not any(argument.kind is argument.VAR_KEYWORD for argument in takes):
+            self._refuse_unknown(written, named)
+        defaults = {name: argument.default for name, argument in named.items()}
+        for name, default in defaults.items():
+            if name not in written and default is inspect.Parameter.empty:
+                raise ValueError(
+                    f"{self} needs the argument {name}: write parameters: {{{name}: VALUE}}"
+                )
+        return defaults | written
+
+    def _refuse_unknown(self, written: Collection[str], named: Collection[str]) -> None:
+        for name in written:
+            if name not in named:
                 raise ValueError(f"{self} takes no argument {name}; {_nearest(str(name), named)}")
-        defaults = {
-            name: one.default for name, one in named.items() if one.default is not one.empty
-        }
-        if missing := [name for name in named if name not in given and name not in defaults]:
-            raise ValueError(
-                f"{self} needs the argument {missing[0]}: write parameters: {{{missing[0]}: VALUE}}"
-            )
-        return defaults | given
 
 
-def _read(given: Any, info: ValidationInfo) -> Architecture:
+def _read(value: Any, info: ValidationInfo) -> Architecture:
     """Return the network class that a recipe or a caller names; raise ValueError with the most
     similar name.
     """
     from torch import nn
 
-    if isinstance(given, Architecture):
-        return given
-    if isinstance(given, type) and issubclass(given, nn.Module):
-        return Architecture(f"{given.__module__}.{given.__qualname__}", given)
-    family, _, name = given.partition(".") if isinstance(given, str) else ("", "", "")
+    if isinstance(value, Architecture):
+        return value
+    if isinstance(value, type) and issubclass(value, nn.Module):
+        return Architecture(f"{value.__module__}.{value.__qualname__}", value)
+    family, _, name = value.partition(".") if isinstance(value, str) else ("", "", "")
     if not family.isidentifier() or not name.isidentifier():
         raise ValueError(_FORM)
-    module_of: Callable[[str], ModuleType] | None = (info.context or {}).get(FAMILY)
-    if module_of is None:
-        raise ValueError(f"{_FORM}; here only a recipe can name a class: give the class itself")
-    try:
-        module = module_of(family)
-    except LookupError as error:
-        raise ValueError(
-            f"{error.args[0]}; list the file of the class, such as `nodes: [{family}.py]`"
-        ) from None
+    module = _module_of_family(family, info)
     classes = network_classes(module)
     if name in classes:
-        return Architecture(given, classes[name])
+        return Architecture(value, classes[name])
     if hasattr(module, name):
         kind = (
             "an abstract class"
             if inspect.isabstract(getattr(module, name))
             else "no class of torch.nn.Module"
         )
-        raise ValueError(f"{given} is {kind}; {_nearest(name, classes)}")
+        raise ValueError(f"{value} is {kind}; {_nearest(name, classes)}")
     raise ValueError(f"{family} has no network class {name}; {_nearest(name, classes)}")
+
+
+def _module_of_family(family: str, info: ValidationInfo) -> ModuleType:
+    """Return the module of a family; raise ValueError where no recipe says which module it is."""
+    module_of: Callable[[str], ModuleType] | None = (info.context or {}).get(FAMILY)
+    if module_of is None:
+        raise ValueError(f"{_FORM}; here only a recipe can name a class: give the class itself")
+    try:
+        return module_of(family)
+    except LookupError as error:
+        raise ValueError(
+            f"{error.args[0]}; list the file of the class, such as `nodes: [{family}.py]`"
+        ) from None
 
 
 #: a network class, which a recipe names as ``family.Class``
@@ -275,21 +291,17 @@ def network_classes(module: ModuleType) -> dict[str, type[nn.Module]]:
     }
 
 
-def _nearest(name: str, known: Any) -> str:
+def _nearest(name: str, candidates: Any) -> str:
     """Return a hint with the most similar of the known names, or with all of them."""
-    close = difflib.get_close_matches(name, list(known), 1)
-    return (
-        f"did you mean {close[0]}?"
-        if close
-        else f"there are {', '.join(known)}"
-        if known
-        else "there are none"
-    )
+    close = difflib.get_close_matches(name, list(candidates), 1)
+    if close:
+        return f"did you mean {close[0]}?"
+    return f"there are {', '.join(candidates)}" if candidates else "there are none"
 
 
 def _imported(name: str, module: str, qualname: str, files: tuple[str, ...]) -> Architecture:
     import_missing(files, module)
-    found: Any = importlib.import_module(module)
-    for part in qualname.split("."):
-        found = getattr(found, part)
-    return Architecture(name, found)
+    value: Any = importlib.import_module(module)
+    for attribute in qualname.split("."):
+        value = getattr(value, attribute)
+    return Architecture(name, value)

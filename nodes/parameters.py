@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -46,7 +47,7 @@ def _takes_truth(hint: Any) -> bool:
         return True
     if isinstance(hint, type) and issubclass(hint, BaseModel):
         return True  # a model checks its own values
-    return any(_takes_truth(part) for part in get_args(hint))
+    return any(_takes_truth(argument) for argument in get_args(hint))
 
 
 def _has_truth(value: Any) -> bool:
@@ -85,7 +86,7 @@ def texts_of(hint: Any) -> list[Any]:
     """Return the texts that a parameter takes beside a path, such as the names of known cameras."""
     if get_origin(hint) is Literal:
         return list(get_args(hint))
-    return [text for part in get_args(hint) for text in texts_of(part)]
+    return list(chain.from_iterable(texts_of(argument) for argument in get_args(hint)))
 
 
 def as_paths(hint: Any, value: Any) -> Any:

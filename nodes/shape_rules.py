@@ -38,10 +38,10 @@ def at_least_single(*tensors: Tensor) -> torch.dtype:
     """Return the type of a result that is computed in float32, or in the widest type of
     ``tensors`` if wider.
     """
-    found = torch.float32
+    dtype = torch.float32
     for x in tensors:
-        found = torch.promote_types(found, x.dtype)
-    return found
+        dtype = torch.promote_types(dtype, x.dtype)
+    return dtype
 
 
 def like_first(first: Tensor, *inputs: Any, **params: Any) -> Tensor:

@@ -26,7 +26,7 @@ def plain(constant: Tensor) -> Tensor:
 
 
 def one_by_one(
-    call: Callable[..., Any], count: int, in_dims: Sequence[int | None], given: Sequence[Any]
+    call: Callable[..., Any], count: int, in_dims: Sequence[int | None], inputs: Sequence[Any]
 ) -> Any:
     """Call a function ``count`` times with parts of the batched inputs; return the stacked results
     and their dimension.
@@ -37,7 +37,7 @@ def one_by_one(
     results = []
     for i in range(count):
         parts = [
-            x if dim is None else x.select(dim, i) for x, dim in zip(given, in_dims, strict=True)
+            x if dim is None else x.select(dim, i) for x, dim in zip(inputs, in_dims, strict=True)
         ]
         results.append(call(*parts))
     if isinstance(results[0], tuple):

@@ -17,6 +17,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from glob import glob
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
@@ -112,7 +113,7 @@ def read_written(text: Any) -> tuple[float, str, bool]:
     """
     match = _NUMBER.fullmatch(str(text).strip())
     unit = match[2].strip() if match else ""
-    si = next((si for si, known in _SCALE.items() if unit in known), "")
+    si = next((si for si, units in _SCALE.items() if unit in units), "")
     if isinstance(text, bool) or match is None or (unit and not si):
         raise ValueError(f"{text} is neither a number nor a quantity, such as 0.5 or '1 um'")
     if not math.isfinite(float(match[1])):
@@ -164,12 +165,12 @@ class ElectronsPerSecond(NamedTuple):
 def _read_dark_current(value: Any) -> float | ElectronsPerSecond:
     number, unit = str(value).strip(), "e-/s"
     by_time = not isinstance(value, bool) and number.endswith(tuple(_SCALE[unit]))
-    found = read_quantity(value, unit) if by_time else read_quantity(value, "e-")
-    if found < 0:
+    current = read_quantity(value, unit) if by_time else read_quantity(value, "e-")
+    if current < 0:
         raise ValueError("the dark current must be 0 or more")
-    if found > _MOST_DARK:
+    if current > _MOST_DARK:
         raise ValueError(f"the dark current must be at most {_MOST_DARK:.0e} e-")
-    return ElectronsPerSecond(found) if by_time else found
+    return ElectronsPerSecond(current) if by_time else current
 
 
 #: electrons of one exposure, or electrons per second
@@ -273,32 +274,35 @@ def _ranges(hint: Any, metadata: tuple[Any, ...]) -> Iterator[NumberRange]:
     if get_origin(hint) is Annotated:
         yield from _ranges(get_args(hint)[0], (*metadata, *_constraints(hint)))
     elif hint in (int, float):
-        limits = [
-            (name, getattr(part, name))
-            for part in metadata
-            for name in _LIMITS
-            if hasattr(part, name)
-        ]
-        least = [value for name, value in limits if name in ("ge", "gt")]
-        greatest = [value for name, value in limits if name in ("le", "lt")]
-        yield NumberRange(max(least, default=None), min(greatest, default=None), _unit_of(metadata))
+        lowest = max(_stated(metadata, "ge", "gt"), default=None)
+        greatest = min(_stated(metadata, "le", "lt"), default=None)
+        yield NumberRange(lowest, greatest, _unit_of(metadata))
     elif get_origin(hint) is not Literal:
-        for part in get_args(hint):
-            yield from _ranges(part, () if get_origin(hint) in _CONTAINERS else metadata)
+        for argument in get_args(hint):
+            yield from _ranges(argument, () if get_origin(hint) in _CONTAINERS else metadata)
 
 
-_LIMITS = ("ge", "gt", "le", "lt")
 _CONTAINERS = (tuple, list, dict)
+
+
+def _stated(metadata: tuple[Any, ...], *limits: str) -> list[Any]:
+    """Return the values of the named limits that constraints state."""
+    values = []
+    for constraint in metadata:
+        values += [getattr(constraint, name) for name in limits if hasattr(constraint, name)]
+    return values
 
 
 def _constraints(hint: Any) -> Iterator[Any]:
     """Yield the single constraints of an annotated type; `Field` holds several."""
-    for part in hint.__metadata__:
-        yield from getattr(part, "metadata", None) or (part,)
+    for constraint in hint.__metadata__:
+        yield from getattr(constraint, "metadata", None) or (constraint,)
 
 
 def _unit_of(metadata: tuple[Any, ...]) -> str:
-    readers = [part.func for part in metadata if isinstance(part, BeforeValidator)]
+    readers = [
+        constraint.func for constraint in metadata if isinstance(constraint, BeforeValidator)
+    ]
     return next((reader.si for reader in readers if isinstance(reader, QuantityReader)), "")
 
 
@@ -330,7 +334,7 @@ def files_of(written: Any) -> list[Path]:
     The files of a pattern or a folder are sorted by name.
     """
     if isinstance(written, list | tuple):
-        return [path for each in written for path in files_of(each)]
+        return list(chain.from_iterable(files_of(entry) for entry in written))
     path = Path(written)
     try:
         if path.is_file():
@@ -338,10 +342,14 @@ def files_of(written: Any) -> list[Path]:
     except OSError as error:
         raise ValueError(f"{str(path)[:40]}… cannot be read: {error.strerror}") from None
     inside = path.iterdir() if path.is_dir() else map(Path, glob(str(written)))
-    files = sorted(each for each in inside if each.is_file() and not each.name.startswith("."))
+    files = sorted(file for file in inside if _is_visible_file(file))
     if not files:
         raise ValueError(f"no such file, and no folder or pattern that matches a file: {path}")
     return files
+
+
+def _is_visible_file(path: Path) -> bool:
+    return path.is_file() and not path.name.startswith(".")
 
 
 #: one or more files: a path, a folder, a pattern such as ``dark/*.png``, or a list of these

@@ -129,6 +129,16 @@ def without_walk(problem: Any, mode: Any, seed: int, *_: Any, **how: Any) -> Any
 #: of the fine grid of the pupil in front of which `neusee safety` puts a laser, and the fewest
 #: draws that it takes
 SAFETY = ("safety.draws=100", "optics.samples=128", "optics.window=[128, 128]")
+#: spots behind an arm and behind a clear lens, irradiances of a curve, stops and exposures tried
+FEW_SPOTS = {
+    "safety.laser_spots:_MOST": 7,
+    "safety.dazzled_area:_STEP": 1.5,
+    "safety.dazzled_area:_WAVES": 2.0,
+    "safety.safety_estimate:_SAMPLES": 60,
+    "safety.what_helps:_HALF_STOP": 0.25,
+    "safety.what_helps:_SHORTER": (1.0, 1e-2),
+    "safety.what_helps:_LONGER": (1.0, 1e2),
+}
 #: behind the mask, with so few samples
 DAZZLE = ("wide.window=[99, 99]", "safety.dazzle.share=0.001")
 PROTECTION = (
@@ -151,11 +161,11 @@ CUT = {"calibration.emcee_sampler:_FIRST": 80, "calibration.emcee_sampler:_LONGE
 LABORATORY = "calibrate my/lab --sensor lab"
 DRAWN = {"calibration.emcee_sampler:sample": drawn_chains}
 ONE_PLOT = {"calibration.emva_figures:PICTURES": {"photon_transfer": PICTURES["photon_transfer"]}}
-#: two lasers of an evaluation's page, as weak as its points: each saturated pixel adds an unknown
+#: one laser of an evaluation's page, as weak as its points: each saturated pixel adds an unknown
 #: to the filter
 WEAK = {
-    "evaluation.evaluation_result:_WEAKEST": 30.0,
-    "evaluation.evaluation_result:CASES": {name: LASERS[name] for name in ("green", "red", NONE)},
+    "evaluation.evaluation_result:_WEAKEST": 3.0,
+    "evaluation.evaluation_result:CASES": {name: LASERS[name] for name in ("green", NONE)},
 }
 PROTOCOL = (
     "scene.shape=[28,28]",
@@ -163,16 +173,16 @@ PROTOCOL = (
     "--scenes",
     "1",
     "--strengths",
-    "0,30",
+    "0,3",
     "--pipelines",
     "flat+none, half_ring+none",
     "--equal-protection",
     "1e-5",
 )
-#: two of the six lasers of the protocol's page, and weak ones
-TWO_OF_SIX = {
-    "evaluation.evaluation_result:_WEAKEST": 30.0,
-    "evaluation.evaluation_result:SIX": {name: LASERS[name] for name in ("green", "red", NONE)},
+#: one of the six lasers of the protocol's page, and a weak one
+ONE_OF_SIX = {
+    "evaluation.evaluation_result:_WEAKEST": 3.0,
+    "evaluation.evaluation_result:SIX": {name: LASERS[name] for name in ("green", NONE)},
 }
 #: settings of an accuracy study, each measured once
 FEW_POINTS = {
@@ -211,8 +221,8 @@ STAND_INS = {
         more=("restore.most=1", "restore.lamps=0")),
     "run six_lasers": StandIn("two of the six lasers", more=TWO_LASERS),
     "run six_lasers --executor slurm:8": StandIn(
-        "two lasers, other noise, and one process in the place of jobs", more=(*TWO_LASERS, "seed=10"),
-        instead={"slurm:8": "dask:1"}),
+        "two lasers, other noise, and a scheduler on this machine in the place of jobs",
+        more=(*TWO_LASERS, "seed=10"), instead={"slurm:8": "LOCAL"}),
     "run six_lasers --executor dask:2": StandIn(
         "two lasers, other noise, and one process", more=(*TWO_LASERS, "seed=8"), instead={"dask:2": "dask:1"}),
     f"run six_lasers --executor {CLUSTER}": StandIn(
@@ -250,7 +260,7 @@ STAND_INS = {
     )),
     "evaluate train_informed --data photographs --scenes 8 --strengths 0,1e3,1e5 "
     '--pipelines "half_ring+wiener_uncertain, half_ring+informed@best.safetensors"': StandIn(
-        "8 scenes", instead={"8": "1", "0,1e3,1e5": "30"}, more=("+evaluate={mismatch: null}",), constants=WEAK),
+        "8 scenes", instead={"8": "1", "0,1e3,1e5": "3"}, more=("+evaluate={mismatch: null}",), constants=WEAK),
     "train my/train_smallnet.yaml train.start=smallnet.safetensors train.rates.weights=5e-5": StandIn(
         "minutes", more=SMALLNET),
     "train train_demonstration --stage mask": StandIn("half an hour", more=DEMONSTRATION),
@@ -286,18 +296,18 @@ STAND_INS = {
     "calibrate calibrate_camera table.file=my.csv": StandIn("minutes", more=FEW_DRAWS, constants=CUT, code=3),
     "calibrate calibrate_camera": StandIn("minutes", more=FEW_DRAWS, constants=CUT, code=3),
     "calibrate calibrate_stray_light": StandIn("minutes", more=FEW_DRAWS, constants=CUT, code=3),
-    **{f"safety {words}": StandIn("a fine grid of the spot, and a thousand draws", more=SAFETY) for words in (
+    **{f"safety {words}": StandIn("a fine grid of the spot, and a thousand draws", more=SAFETY, constants=FEW_SPOTS) for words in (
         "safety_car_lidar_1550", "safety_car_lidar_1550 --json")},
-    **{f"safety {words}": StandIn("fine grids, and a thousand draws", more=(*SAFETY, *DAZZLE)) for words in (
+    **{f"safety {words}": StandIn("fine grids, and a thousand draws", more=(*SAFETY, *DAZZLE), constants=FEW_SPOTS) for words in (
         "safety_pointer", "safety_car_lidar", "safety_drone_dazzler", "safety_laboratory", "safety_show",
         "my/pointer.yaml", 'safety_show safety.protection.filter=1e-3 "lasers.show.distance=20 m"',
         'safety_show safety.eye.dazzle.contrast=0.5 "safety.eye.dazzle.backgrounds=[1 cd/m2]"',
         "safety_car_lidar safety.damage.file=my/sensor/shots.csv")},
     "safety safety_pointer safety.protection.mask=null +safety.lens.focus=laser "
-    "+safety.lens.scatter.share=0.002": StandIn("a thousand draws", more=SAFETY[:1]),
-    "safety first_light laser=pointer +safety=camera": StandIn("a thousand draws", more=SAFETY[:1]),
+    "+safety.lens.scatter.share=0.002": StandIn("a thousand draws", more=SAFETY[:1], constants=FEW_SPOTS),
+    "safety first_light laser=pointer +safety=camera": StandIn("a thousand draws", more=SAFETY[:1], constants=FEW_SPOTS),
     'safety first_light laser=pointer +safety=camera doe=vortex "lasers.pointer.power=uniform(1 mW, 5 mW)"': StandIn(
-        "a thousand draws", more=SAFETY[:1]),
+        "a thousand draws", more=SAFETY[:1], constants=FEW_SPOTS),
     "study protection five_half_rings": StandIn("ten minutes: two draws", more=TWO, constants=FEW_STOPS),
     "study protection five_half_rings sensor=night": StandIn("ten minutes: two draws", more=TWO, constants=FEW_STOPS),
     "study protection five_half_rings --draws 6": StandIn(
@@ -307,25 +317,25 @@ STAND_INS = {
     "study protection axicon doe.waves=5 --light continuous --draws 6": StandIn(
         "minutes", more=PROTECTION, instead={"6": "2"}, constants=FEW_STOPS),
     "evaluate paper_protocol --data photographs": StandIn(
-        "days: the camera of the paper has 2160 x 2160 samples", more=PROTOCOL, constants=TWO_OF_SIX),
+        "days: the camera of the paper has 2160 x 2160 samples", more=PROTOCOL, constants=ONE_OF_SIX),
     f"{EVALUATE} --scenes 3 --strengths 0,1e3,1e6": StandIn(
-        "a minute", instead={**FIELD, "3": "1", "0,1e3,1e6": "0,30"}, constants=WEAK),
+        "a minute", instead={**FIELD, "3": "1", "0,1e3,1e6": "0,3"}, constants=WEAK),
     f"{EVALUATE} --scenes 3 --strengths 1e4,1e6 "
     '--pipelines "flat+wiener, half_ring+wiener, five_half_rings+wiener" --equal-protection 0.002': StandIn(
         "minutes", more=("--by", "filter"), constants=WEAK,
-        instead={**FIELD, "3": "1", "1e4,1e6": "100", "0.002": "1e-5",
+        instead={**FIELD, "3": "1", "1e4,1e6": "10", "0.002": "1e-5",
                  "flat+wiener, half_ring+wiener, five_half_rings+wiener": "flat+none, five_half_rings+none"}),
     f"{EVALUATE} --scenes 3 --strengths 1e2,1e4,1e6 "
     '--pipelines "flat+none, half_ring+none, five_half_rings+none"': StandIn(
-        "a minute", instead={**FIELD, "3": "1", "1e2,1e4,1e6": "10,100"}, constants=WEAK),
+        "a minute", instead={**FIELD, "3": "1", "1e2,1e4,1e6": "1,10"}, constants=WEAK),
     f'{EVALUATE} --data photographs --pipelines "flat+none, half_ring+wiener, pixelwise@mask.npy+wiener"': StandIn(
         "20 scenes, a mask of 540 samples", instead={**FIELD, PIPELINES: PIPELINES.replace("mask", "mask_128")},
-        more=("--scenes", "1", "--strengths", "30", "+evaluate={mismatch: null}"), constants=WEAK),
+        more=("--scenes", "1", "--strengths", "3", "+evaluate={mismatch: null}"), constants=WEAK),
     f'{EVALUATE} --pipelines "flat+none, five_half_rings+nafnet@net.safetensors" --reference flat+none': StandIn(
-        "20 scenes", instead=FIELD, more=("--scenes", "1", "--strengths", "30"), constants=WEAK),
+        "20 scenes", instead=FIELD, more=("--scenes", "1", "--strengths", "3"), constants=WEAK),
     "evaluate my/train_smallnet.yaml --scenes 3 --strengths 0,1e3 --pipelines "
     "flat+none,five_half_rings+smallnet@smallnet.safetensors": StandIn(
-        "three scenes", instead={"3": "1", "0,1e3": "30"}, constants=WEAK),
+        "three scenes", instead={"3": "1", "0,1e3": "3"}, constants=WEAK),
 }  # fmt: skip
 
 

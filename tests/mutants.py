@@ -50,7 +50,7 @@ EYE_FAULTS = (
     ("_eye_limits", "_BRIEF = 0.25", "_BRIEF = 0.30", "eye_trains"),
     ("_eye_limits", "5 * math.pow(groups, -0.25)", "math.pow(groups, -0.25)", "eye_trains"),
     ("_eye_limits", "5 * math.pow(groups, -0.25)", "5 * math.pow(groups, -0.5)", "eye_trains"),
-    ("_eye_limits", "one / together * factor", "one * factor", "eye_trains"),
+    ("_eye_limits", "group / together * factor", "group * factor", "eye_trains"),
     ("_eye_limits", "else math.pow(groups, -0.25)", "else math.pow(groups, -0.5)", "eye_trains"),
     ("_eye_limits", "min(self.single, self.mean, self.repeated)", "min(self.single, self.repeated)", "eye_trains"),
     ("_eye_limits", "18, absorbed, duration, 0.75", "18, absorbed, duration, 0.7", "eye_limits"),
@@ -92,7 +92,7 @@ EYE_FAULTS = (
     ("_protection", "math.log10(factor) if", "math.log(factor) if", "protection"),
     ("_protection", "(math.sin(angle) / index) ** 2", "math.sin(angle) ** 2 / index", "protection"),
     ("_protection", "longest / notch_wavelength(1.0, angle, index)", "longest", "protection"),
-    ("_protection", "at)[0] * at\n", "at)[0]\n", "protection"),
+    ("_protection", "wavelengths)[0] * wavelengths\n", "wavelengths)[0]\n", "protection"),
     ("_protection", "EDGE = 0.01", "EDGE = 0.001", "protection"),
     ("_protection", "min(1.0, stopped / diameter) ** 2", "min(1.0, stopped / diameter)", "protection"),
     (
@@ -183,8 +183,8 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/sensor/_digitization.py",
-        "flat[part].double() * gain",
-        "(flat[part] * gain).double()",
+        "flat[block].double() * gain",
+        "(flat[block] * gain).double()",
         within(
             "nodes/sensor",
             "digitization.py::test_no_number_is_further_from_the_exact_product_than_half",
@@ -257,9 +257,9 @@ MUTANTS = (
     ),
     Mutant(
         "nodes/optics/_pupil.py",
-        "    height, path = ((b - a)[inside] for a, b in zip(one[:2], other[:2], strict=True))",
-        "    height, path = (((b * 2e6 - a * 2e6) / 2e6)[inside] for a, b in zip(one[:2],"
-        " other[:2], strict=True))",
+        "    height, path = ((b - a)[inside] for a, b in zip(first[:2], second[:2], strict=True))",
+        "    height, path = (((b * 2e6 - a * 2e6) / 2e6)[inside] for a, b in zip(first[:2],"
+        " second[:2], strict=True))",
         within("nodes/optics", "pupil.py::test_phase_steps_on_a_thick_plate_are_exact"),
     ),
     Mutant(
@@ -406,7 +406,7 @@ MUTANTS = (
     ),
     Mutant(
         "workflows/evaluation/pipelines.py",
-        "    found = named_apart(found)\n",
+        "    pipelines = named_apart(pipelines)\n",
         "",
         within(
             "workflows/evaluation", "point_commands.py::test_two_files_of_one_name_are_two_masks"
@@ -605,14 +605,17 @@ MUTANTS = (
             'params.get("rule", "channel_sum") == "per_band":\n        return math.inf',
             "False:\n        return math.inf",
         ),
-        ("math.fsum(part.rms for part", "max(part.rms for part"),
+        ("math.fsum(error.rms for error", "max(error.rms for error"),
     ),
     *faults(
         "nodes/restore/_electrons_and_colour.py",
         within("nodes", "propagated_errors.py"),
         ("matrix.stats.shape[-1] * (", "("),
         ("(matrix.stats.largest_rms + matrix.rms)", "abs(matrix.stats.sum / 12)"),
-        ("    return raw.rms / gain / least", "    return raw.rms / gain * least"),
+        (
+            "    return raw.rms / gain / lowest_transmission",
+            "    return raw.rms / gain * lowest_transmission",
+        ),
     ),
     *faults(
         "nodes/doe/_shade.py",
@@ -633,7 +636,7 @@ MUTANTS = (
         ("middle + 1.0, dtype", "middle + 2.0, dtype"),
         ("float(above) > math.exp(-sure)", "float(above) > math.exp(sure)"),
         ("weights + 2.0 * math.sqrt(weights * largest * sure) + 2.0", "weights + 2.0"),
-        ("third = most**2 * sure / 3", "third = most * sure / 30"),
+        ("third = rare_number**2 * sure / 3", "third = rare_number * sure / 30"),
         ("math.log(pixels))", "0.0)"),
         (
             "largest, weights = min(largest, squares / darkest)",
@@ -680,8 +683,8 @@ MUTANTS = (
         ("_SMALL = 1e-4 ", "_SMALL = 1e-1 "),
         ("duration * rate >= 1:", "duration * rate > 1:"),
         ("m_squared < 1:", "m_squared <= 1:"),
-        ("found < 1 - _AGREE", "found < 1"),
-        ("max(found, 1.0)", "found"),
+        ("implied < 1 - _AGREE", "implied < 1"),
+        ("max(implied, 1.0)", "implied"),
         ("and value > 0)", "and value >= 0)"),
         ("else 1 - x * x / 12\n\n", "else 1 - x * x / 6\n\n"),
         ("math.expm1(x)", "math.exp(x) - 1"),
@@ -784,7 +787,7 @@ MUTANTS = (
             "nodes/laser",
             "damage_parts.py::test_states_are_ordered_so_that_nothing_unknown_reads_as_safe",
         ),
-        ("if least >= 1:", "if least > 1:"),
+        ("if smallest >= 1:", "if smallest > 1:"),
         ("if largest >= 1 else", "if largest > 1 else"),
         (
             '("above", "not judged", "within", "below")',
@@ -1111,7 +1114,7 @@ MUTANTS = (
             "workflows/safety",
             "damage_verdict.py::test_each_protection_has_the_findings_of_its_own_limits_of_damage",
         ),
-        ("each.option == option.name and ", ""),
+        ("finding.option == option.name and ", ""),
     ),
     *faults(
         "workflows/safety/safety_estimate.py",
@@ -1127,12 +1130,12 @@ MUTANTS = (
             "nodes/optics", "pixel_average.py::test_the_filter_averages_every_fringe_of_the_band"
         ),
         ("(14.36 * gap)", "(18.36 * gap)"),
-        ("(2 * at / width)", "(at / width)"),
+        ("(2 * distance / width)", "(distance / width)"),
         ("0.1102 *", "0.1202 *"),
         ("_PERIOD = 4", "_PERIOD = 2"),
         ("(grid.pixels - 1) / 2", "grid.pixels / 2"),
         ("12 + math.ceil(2 * grid.per_pixel)", "3 + math.ceil(grid.per_pixel)"),
-        ("math.floor(least / step) + 1", "math.floor(least / step)"),
+        ("math.floor(lowest / step) + 1", "math.floor(lowest / step)"),
     ),
     *faults(
         "nodes/optics/_psf.py",
@@ -1184,13 +1187,13 @@ MUTANTS = (
             "nodes/optics",
             "psf_limits.py::test_a_window_ends_where_the_furthest_pixel_reaches_the_alias",
         ),
-        ("abs(n - 1 - at)", "abs(n - at)"),
-        ("abs(n - 1 - at)", "abs(n - 2 - at)"),
-        ("abs(0 - at)", "abs(1 - at)"),
+        ("abs(n - 1 - place)", "abs(n - place)"),
+        ("abs(n - 1 - place)", "abs(n - 2 - place)"),
+        ("abs(0 - place)", "abs(1 - place)"),
         ('zip("yx", camera.shape', 'zip("yx", camera.shape[::-1]'),
         (
-            'n, at in zip("yx", camera.shape, spot(camera), strict',
-            'n, at in zip("yx", camera.shape, spot(camera)[::-1], strict',
+            'n, place in zip("yx", camera.shape, spot(camera), strict',
+            'n, place in zip("yx", camera.shape, spot(camera)[::-1], strict',
         ),
         ("reach > limit * (1 + 1e-9)", "reach > limit * (1 + 1e-2)"),
     ),
@@ -1331,8 +1334,8 @@ MUTANTS = (
             "veil_over_distance.py::test_the_veil_is_the_integral_of_the_law_over_the_pixel",
         ),
         (
-            "near[index - 1] * (1 - part) + near[index] * part)",
-            "near[index] * (1 - part) + near[index - 1] * part)",
+            "near[index - 1] * (1 - fraction) + near[index] * fraction)",
+            "near[index] * (1 - fraction) + near[index - 1] * fraction)",
         ),
         ("[left * _beyond(light, square) for", "[_beyond(light, square) for"),
         (
@@ -1356,10 +1359,10 @@ MUTANTS = (
             "exposures.py::test_the_peak_behind_a_mask_is_that_of_its_distance_and_1_nearer_than_the_first",
         ),
         (
-            "np.where(place < at[0] - _ROUNDED, 1.0, np.minimum(between, 1.0))",
+            "np.where(place < rungs[0] - _ROUNDED, 1.0, np.minimum(between, 1.0))",
             "np.minimum(between, 1.0)",
         ),
-        ("np.clip(place, at[0], at[-1])", "np.clip(place, at[0], None)"),
+        ("np.clip(place, rungs[0], rungs[-1])", "np.clip(place, rungs[0], None)"),
         (
             "place = np.log(as_wide(nominal, np.asarray(radius, np.float64)))",
             "place = np.log(np.asarray(radius, np.float64))",
@@ -1410,13 +1413,19 @@ MUTANTS = (
             'if lens.focus == "laser":\n        return torch',
             'if lens.focus == "infinity":\n        return torch',
         ),
-        ("_air(safety, draws, at) * _uneven(safety, draws, at)", "_air(safety, draws, at)"),
+        (
+            "_air(safety, draws, places) * _uneven(safety, draws, places)",
+            "_air(safety, draws, places)",
+        ),
         (
             "at_lens = axis_density(beam, where, air).numpy()",
             "at_lens = axis_density(beam, where).numpy()",
         ),
         ("passing = lens * option.passing * air", "passing = lens * option.passing"),
-        ("np.power(whole, at / laser.distance)", "whole * np.ones_like(at)"),
+        (
+            "np.power(transmittance, distances / laser.distance)",
+            "transmittance * np.ones_like(distances)",
+        ),
         (
             "aperture**2 / (4 * beam_radius(beam, where) ** 2)",
             "aperture**2 / beam_radius(beam, where) ** 2",
@@ -1437,8 +1446,8 @@ MUTANTS = (
             "exposures.py::test_air_of_a_visibility_leaves_two_per_cent_of_green_contrast_there",
         ),
         (
-            "np.power(np.array([known[v] for v in visible])[:, None], at)",
-            "np.array([known[v] for v in visible])[:, None] * at",
+            "np.power(np.array([per_metre[v] for v in visible])[:, None], distances)",
+            "np.array([per_metre[v] for v in visible])[:, None] * distances",
         ),
     ),
     *faults(
@@ -1465,11 +1474,11 @@ MUTANTS = (
         ),
         (
             (
-                'found.append(replace(found[1], name="mask and grey filter",'
+                'options.append(replace(options[1], name="mask and grey filter",'
                 " passing=protection.filter))"
             ),
             (
-                'found.append(Option("mask and grey filter", peak=mask, masked=True,'
+                'options.append(Option("mask and grey filter", peak=mask, masked=True,'
                 " passing=protection.filter))"
             ),
         ),
@@ -1609,7 +1618,7 @@ MUTANTS = (
             "workflows/safety",
             "light_levels.py::test_without_a_veil_there_is_one_row_of_the_core_and_the_veiled_feature_has_the_smooth_one",
         ),
-        ("(whole.smooth if smooth else whole.light)", "whole.light"),
+        ("(framed.smooth if smooth else framed.light)", "framed.light"),
     ),
     *faults(
         "workflows/safety/laser_spots.py",
@@ -1700,7 +1709,7 @@ MUTANTS = (
             "spots_along.py::test_spots_are_added_where_interpolation_misses_them_and_the_miss_is_said",
         ),
         ("and misses[gap] > close", "and misses[gap] < close"),
-        ("np.abs(known[middle] - guess).max())", "np.abs(known[middle] - guess).max()) / 1e9"),
+        ("np.abs(values[middle] - guess).max())", "np.abs(values[middle] - guess).max()) / 1e9"),
     ),
     *faults(
         "workflows/safety/dazzled_area.py",
@@ -1829,7 +1838,7 @@ MUTANTS = (
             "inner / np.where(other == column, 1.0, inner - outer)",
             "0.5 * inner / np.where(other == column, 1.0, inner - outer)",
         ),
-        ("_placed(at, height, begins, -1)", "_placed(at, height, begins, 1)"),
+        ("_placed(place, height, begins, -1)", "_placed(place, height, begins, 1)"),
     ),
     *faults(
         "workflows/safety/exposures.py",
@@ -1838,7 +1847,7 @@ MUTANTS = (
             "distance_zones.py::test_the_ends_and_the_probability_of_none_follow_the_law",
         ),
         (
-            "within = _at(distances, drawn, at) >= 1",
+            "within = _at(distances, drawn, distance) >= 1",
             "within = _at(distances, drawn, distances[0]) >= 1",
         ),
         ("near[i] <= distances[0] * (1 + _ROUNDED)", "near[i] < distances[0]"),
@@ -1882,7 +1891,7 @@ MUTANTS = (
         within(
             "nodes/laser", "round_spot.py::test_the_edge_of_a_wide_spot_is_that_of_the_integral"
         ),
-        ("lack = turn * root / (-2 * kappa * (one + place.sqrt()))", "lack = 0 * turn * root"),
+        ("lack = turn * root / (-2 * kappa * (unity + place.sqrt()))", "lack = 0 * turn * root"),
         ("side = torch.where(lit, -1.0, 1.0)", "side = torch.where(lit, 1.0, -1.0)"),
         ("beam = torch.where(lit, _geometric(v, kappa), 0.0)", "beam = _geometric(v, kappa)"),
     ),
@@ -1915,7 +1924,7 @@ MUTANTS = (
             "counted_parts.py::test_a_bound_is_said_only_where_nearer_distances_are_asked_for",
         ),
         ("peaks.along[0][0] > asked", "peaks.along[-1][0] > asked"),
-        ("each.distances[0] > asked", "each.distances[0] >= asked"),
+        ("spot.distances[0] > asked", "spot.distances[0] >= asked"),
     ),
     *faults(
         "workflows/safety/safety_estimate.py",
@@ -1952,7 +1961,7 @@ MUTANTS = (
             "faint = light * (distance / radius).pow(3)",
             "faint = light * (distance / radius).pow(3) / 2",
         ),
-        ("number * (rest / number.sum())", "number"),
+        ("number * (outer / number.sum())", "number"),
     ),
     *faults(
         "nodes/laser/_bright_pixels.py",
@@ -1963,7 +1972,7 @@ MUTANTS = (
         ("half = feature / math.sqrt(math.pi)", "half = feature / 2"),
         ("half = feature / math.sqrt(math.pi)", "half = feature"),
         ("right=True)] / feature**2", "right=True)] / feature"),
-        ("torch.where(at <= half, torch.maximum(spot, ring), ring)", "ring"),
+        ("torch.where(radii <= half, torch.maximum(spot, ring), ring)", "ring"),
     ),
     *faults(
         "workflows/safety/exposures.py",
@@ -1979,7 +1988,7 @@ MUTANTS = (
             "workflows/safety",
             "distance_ladder.py::test_a_lens_on_the_laser_has_no_defocus_that_would_need_more_rungs",
         ),
-        ("return 0.0 if follows else float(found)", "return float(found)"),
+        ("return 0.0 if follows else float(defocused)", "return float(defocused)"),
     ),
     *faults(
         "workflows/safety/laser_spots.py",
@@ -2241,7 +2250,7 @@ MUTANTS = (
             "nodes/metrics",
             "psf_contrast.py::test_a_contrast_is_at_most_one_and_light_below_the_darkest_has_none",
         ),
-        ("whole = otf[0, 0].abs()", "whole = otf.abs().max()"),
+        ("passed_light = otf[0, 0].abs()", "passed_light = otf.abs().max()"),
         ("passed.where(~dark, 0.0)", "passed.where(~dark, 1.0)"),
     ),
     *faults(
@@ -2351,7 +2360,7 @@ MUTANTS = (
         within(
             "nodes/sensor", "digitization.py::test_gradient_is_the_line_and_nothing_where_it_clips"
         ),
-        ("(whole - ideal).detach()", "(whole - ideal)"),
+        ("(numbers - ideal).detach()", "(numbers - ideal)"),
     ),
     *faults(
         "workflows/store/eviction.py",
@@ -2428,7 +2437,7 @@ MUTANTS = (
     *faults(
         "workflows/safety/what_helps.py",
         within("workflows/safety", "what_helps.py::test_few_draws_have_a_safe_value_too"),
-        ("min(len(known) - 1, math.ceil", "min(len(known), math.ceil"),
+        ("min(len(ordered) - 1, math.ceil", "min(len(ordered), math.ceil"),
     ),
     *faults(
         "workflows/safety/what_helps.py",

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.calibrate._emva_fit import Share, without_histograms
-from neusee.nodes.calibrate._sensor_likelihood import ROUNDED, Likelihood
+from neusee.nodes.calibrate._sensor_likelihood import ROUNDED, Likelihood, without_details
 from neusee.nodes.sensor._digitization import Rounding
 from neusee.nodes.units import Efficiency, Electrons, Exposure, Gain, Real
 from neusee.nodes.values import Levels
@@ -122,26 +122,28 @@ def camera(
     Source: EMVA Standard 1288, release 4.0 Linear, sections 2 and 6.6 (photon transfer); Janesick,
             Photon Transfer.
     """
-    seen, top, first = _used(levels, share)
+    fitted, top, first = _used(levels, share)
     dark = (dark_signal, temporal_dark_noise, dark_current)
     parameters = (gain, quantum_efficiency, *dark, scatter, lamp, drift, bend, twist)
     sensor = _Camera(*(torch.as_tensor(x, dtype=torch.float64)[..., None] for x in parameters))
     sensor = sensor._replace(current=sensor.current / dark_exposure)
     residuals = _residuals(
-        without_histograms(levels, seen), top, sensor, first, ROUNDED[rounding][1]
+        without_histograms(levels, fitted), top, sensor, first, ROUNDED[rounding][1]
     )
-    each = residuals.variance[0].square() + residuals.mean[0].square()
-    log = -0.5 * each - residuals.variance[1] - residuals.mean[1]
+    squared = residuals.variance[0].square() + residuals.mean[0].square()
+    log = -0.5 * squared - residuals.variance[1] - residuals.mean[1]
     total = log.where(residuals.possible, -torch.inf).sum(-1)
     if not told:
-        return Likelihood(total, *(torch.zeros(0, dtype=torch.float64) for _ in range(5)))
-    deviance = each.new_zeros(*each.shape[:-1], len(levels.mean)).index_copy(-1, seen, each)
-    freedom = torch.zeros_like(levels.mean).index_fill(0, seen, 2.0)
+        return without_details(total)
+    deviance = squared.new_zeros(*squared.shape[:-1], len(levels.mean)).index_copy(
+        -1, fitted, squared
+    )
+    freedom = torch.zeros_like(levels.mean).index_fill(0, fitted, 2.0)
     # squared derivatives of a residual and of its log width sum, on average, to the Fisher
     # information
-    mean = levels.mean.expand(*each.shape[:-1], -1)
+    mean = levels.mean.expand(*squared.shape[:-1], -1)
     # for the levels used
-    variance = torch.zeros_like(mean).index_copy(-1, seen, residuals.expected)
+    variance = torch.zeros_like(mean).index_copy(-1, fitted, residuals.expected)
     return Likelihood(
         total,
         deviance,
@@ -156,16 +158,16 @@ def camera(
 def _(result: Likelihood, levels: Levels, **params: Any) -> list[Check]:
     if not len(result.degrees_of_freedom):
         return []
-    off, used = float(result.deviance.sum()), result.degrees_of_freedom > 0
-    count, coarse = int(used.sum()), int((levels.variance[used] < _QUIET).sum())
+    off, fitted = float(result.deviance.sum()), result.degrees_of_freedom > 0
+    count, coarse = int(fitted.sum()), int((levels.variance[fitted] < _QUIET).sum())
     checks = [
         Check(
-            f"deviance {off:.4g} for {2 * count} means and variances, from {count} of {len(used)}"
+            f"deviance {off:.4g} for {2 * count} means and variances, from {count} of {len(fitted)}"
             " levels"
         )
     ]
     dark = levels.photons == 0
-    first, shortest = levels.exposure[used & dark].min(), levels.exposure[dark].min()
+    first, shortest = levels.exposure[fitted & dark].min(), levels.exposure[dark].min()
     if first > shortest:
         text = (
             f"the dark frames of {float(shortest):.4g} s pile up at an end: dark signal and dark"
@@ -194,24 +196,26 @@ def expected_levels(levels: Levels, params: Mapping[str, Any]) -> Levels:
     Raises: ValueError as `camera`.
     Source: the model of `camera`.
     """
-    seen, top, first = _used(levels, params["share"])
-    used = without_histograms(levels, seen)
+    fitted, top, first = _used(levels, params["share"])
+    fitted_levels = without_histograms(levels, fitted)
     numbers = {
         name: torch.as_tensor(params[name], dtype=torch.float64) for name in CAMERA_PARAMETERS
     }
     sensor = _Camera(*numbers.values())
     current = sensor.current / params["dark_exposure"]
-    electrons = sensor.efficiency * used.photons + current * (used.exposure - first)
+    electrons = sensor.efficiency * fitted_levels.photons + current * (
+        fitted_levels.exposure - first
+    )
     signal = sensor.gain * electrons
     for _ in range(_ITERATIONS):
         x = signal / top
         signal = sensor.gain * electrons * (1.0 + sensor.bend * x + sensor.twist * x.square())
     slope = _signal(signal, top, sensor).slope
     variance = slope.square() * (sensor.noise.square() + electrons) + ROUNDED[params["rounding"]][1]
-    whole = without_histograms(levels, torch.arange(len(levels.mean)))
-    return whole._replace(
-        mean=whole.mean.index_copy(0, seen, signal + sensor.signal),
-        variance=whole.variance.index_copy(0, seen, variance),
+    every_level = without_histograms(levels, torch.arange(len(levels.mean)))
+    return every_level._replace(
+        mean=every_level.mean.index_copy(0, fitted, signal + sensor.signal),
+        variance=every_level.variance.index_copy(0, fitted, variance),
     )
 
 
@@ -256,37 +260,37 @@ def _used(levels: Levels, share: float) -> tuple[Tensor, float, float]:
     """Return the indices of the light levels to fit, their largest signal in DN, and the
     shortest dark exposure.
     """
-    dark, whole = levels.photons == 0, ~_piled(levels)
-    if not bool((dark & whole).any()):
+    dark, unclipped = levels.photons == 0, ~_piled(levels)
+    if not bool((dark & unclipped).any()):
         raise ValueError(
             "no dark level is free of clipped numbers, so the offset of the camera is unknown: "
             "give frames without light"
         )
-    shortest = torch.where(dark & whole, levels.exposure, torch.inf).argmin()
+    shortest = torch.where(dark & unclipped, levels.exposure, torch.inf).argmin()
     signal = levels.mean - levels.mean[shortest]
     lit = ~dark
     if not bool(lit.any()):
         raise ValueError("there are no lit levels: give two or more different light levels")
     full = float(signal[lit][levels.variance[lit].argmax()])
-    used = whole & (dark | (signal <= share * full))
-    if len(set(levels.photons[used & lit].tolist())) < 2:
+    fitted = unclipped & (dark | (signal <= share * full))
+    if len(set(levels.photons[fitted & lit].tolist())) < 2:
         raise ValueError(
-            f"{int((used & lit).sum())} lit level(s) below {share:.0%} of saturation ({full:.4g} DN"
-            " above the dark level): give two or more different light levels there"
+            f"{int((fitted & lit).sum())} lit level(s) below {share:.0%} of saturation ({full:.4g}"
+            " DN above the dark level): give two or more different light levels there"
         )
-    top = float(signal[used].max())
+    top = float(signal[fitted].max())
     if top <= 0:
         raise ValueError(
             f"the brightest level is {top:.4g} DN above the dark level, which must be positive:"
             " check `photons` of each level"
         )
-    if bool((levels.variance[used] <= 0).any()):
-        at = int(used.nonzero().squeeze(1)[(levels.variance[used] <= 0).nonzero()[0]])
+    if bool((levels.variance[fitted] <= 0).any()):
+        wrong_level = int(fitted.nonzero().squeeze(1)[(levels.variance[fitted] <= 0).nonzero()[0]])
         raise ValueError(
-            f"level {at}, of {float(levels.mean[at]):.4g} DN, has no variance: give frames whose"
-            " noise exceeds rounding"
+            f"level {wrong_level}, of {float(levels.mean[wrong_level]):.4g} DN, has no variance:"
+            " give frames whose noise exceeds rounding"
         )
-    return used.nonzero().squeeze(1), top, float(levels.exposure[shortest])
+    return fitted.nonzero().squeeze(1), top, float(levels.exposure[shortest])
 
 
 def _piled(levels: Levels) -> Tensor:

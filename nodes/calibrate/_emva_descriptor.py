@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -68,7 +69,7 @@ def _with_images(file: Any) -> tuple[Path, ...]:
     path = Path(file)
     if not path.is_file():
         raise ValueError(f"no such file: {path}")
-    images = [image for level in _parsed(path).levels for image in level.images]
+    images = list(chain.from_iterable(level.images for level in _parsed(path).levels))
     for line, image in images:
         if not image.is_file():
             raise ValueError(
@@ -110,7 +111,7 @@ def descriptor(*, file: DescriptorFile, scatter: Temporal = "temporal") -> Level
 
 
 @descriptor.preflight
-def _(*, file: Sequence[Path], **rest: object) -> list[str]:
+def _(*, file: Sequence[Path], **params: object) -> list[str]:
     return refuse_unreadable("file", file[1:])
 
 
@@ -148,7 +149,7 @@ def descriptor_series(files: Sequence[Path]) -> Iterator[tuple[float, float, Ite
         yield (
             level.photons,
             level.exposure,
-            (f for _, image in level.images for f in torch.from_numpy(stack([image]))),
+            chain.from_iterable(torch.from_numpy(stack([image])) for _, image in level.images),
         )
 
 
@@ -189,9 +190,9 @@ def _reduced(name: str, measurement: _Measurement, level: _Level, scatter: Tempo
 def _parsed(path: Path) -> _Measurement:
     measurement = _Measurement()
     for number, line in _lines(path):
-        kind, _, rest = line.partition(" ")
+        kind, _, content = line.partition(" ")
         try:
-            _take(measurement, kind, rest.strip(), path.parent, number)
+            _take(measurement, kind, content.strip(), path.parent, number)
         except ValueError as why:
             raise ValueError(f"{path.name}:{number}: {why}") from None
     for level in measurement.levels:
@@ -216,18 +217,18 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
             yield number, line.strip().replace("\t", " ")
 
 
-def _take(measurement: _Measurement, kind: str, rest: str, folder: Path, line: int) -> None:
+def _take(measurement: _Measurement, kind: str, content: str, folder: Path, line: int) -> None:
     """Add the content of one line of a descriptor to the measurement."""
     if kind == "i":
         if not measurement.levels:
             raise ValueError(
                 "an image precedes the first light level: begin the level with a line 'b' or 'd'"
             )
-        measurement.levels[-1].images.append((line, folder / rest.replace("\\", "/")))
+        measurement.levels[-1].images.append((line, folder / content.replace("\\", "/")))
         return
     if kind not in _WORDS:
         raise ValueError(f"cannot read {kind!r}: begin the line with v, n, b, d, i or #")
-    words = rest.split()
+    words = content.split()
     try:
         # some laboratories write decimal commas
         numbers = [float(word.replace(",", ".")) for word in words]
@@ -238,7 +239,7 @@ def _take(measurement: _Measurement, kind: str, rest: str, folder: Path, line: i
         else:
             measurement.levels.append(_level(line, kind, numbers))
     except (ValueError, IndexError):
-        raise ValueError(f"cannot read {kind} {rest!r}: write {_WORDS[kind]}") from None
+        raise ValueError(f"cannot read {kind} {content!r}: write {_WORDS[kind]}") from None
 
 
 def _level(line: int, kind: str, numbers: list[float]) -> _Level:

@@ -69,22 +69,28 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
     below = without_histograms(levels, dark.nonzero().squeeze(1)[nearest])
     mean, variance = lit.mean - below.mean, lit.variance - below.variance
     full = mean[lit.variance.argmax()]
-    used = (mean <= share * full).nonzero().squeeze(1)
-    if len(set(lit.photons[used].tolist())) < 2:
+    fitted = (mean <= share * full).nonzero().squeeze(1)
+    if len(set(lit.photons[fitted].tolist())) < 2:
         raise ValueError(
-            f"{len(used)} lit level(s) below {share:.0%} of saturation ({float(full):.4g} DN above"
-            " the dark level) cannot define a line: give two or more different light levels there"
+            f"{len(fitted)} lit level(s) below {share:.0%} of saturation ({float(full):.4g} DN"
+            " above the dark level) cannot define a line: give two or more different light levels"
+            " there"
         )
-    gain, response = _slope(mean[used], variance[used]), _slope(lit.photons[used], mean[used])
+    gain, response = (
+        _slope(mean[fitted], variance[fitted]),
+        _slope(lit.photons[fitted], mean[fitted]),
+    )
     if not (float(gain) > 0 and float(response) > 0):
         raise ValueError(
             f"slopes {float(gain):.3g} DN/e- and {float(response):.3g} DN/photon are not positive:"
             " more light must raise mean and variance; check `photons` of each level"
         )
-    of_lit, of_dark = ((2 * x.variance.square() / x.degrees_of_freedom)[used] for x in (lit, below))
-    gain_error = _error(mean[used], of_lit, of_dark, nearest[used]) / gain
-    of_lit, of_dark = ((x.variance / x.pixels)[used] for x in (lit, below))
-    response_error = _error(lit.photons[used], of_lit, of_dark, nearest[used]) / response
+    of_lit, of_dark = (
+        (2 * x.variance.square() / x.degrees_of_freedom)[fitted] for x in (lit, below)
+    )
+    gain_error = _error(mean[fitted], of_lit, of_dark, nearest[fitted]) / gain
+    of_lit, of_dark = ((x.variance / x.pixels)[fitted] for x in (lit, below))
+    response_error = _error(lit.photons[fitted], of_lit, of_dark, nearest[fitted]) / response
     noise, noise_error = _dark_noise(levels, dark)
     efficiency = response / gain
     return LeastSquares(
@@ -97,7 +103,7 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
         gain_error * gain,
         efficiency * torch.hypot(gain_error, response_error),
         torch.hypot(noise_error, gain_error * noise) / gain,
-        torch.tensor(float(len(used)), dtype=torch.float64),
+        torch.tensor(float(len(fitted)), dtype=torch.float64),
     )
 
 

@@ -226,12 +226,12 @@ class Linearity:
 def gain(transfer: PhotonTransfer) -> Quantity:
     """Return K, DN/e-, from the levels up to 70 % of saturation."""
     blank = Quantity("K", "K", "overall system gain", "DN/e-")
-    used = transfer.fitted
-    if used.sum() < 2:
+    fitted = transfer.fitted
+    if fitted.sum() < 2:
         return blank.untold(
-            f"{int(used.sum())} lit levels lie below 70 % of saturation, and a line needs two"
+            f"{int(fitted.sum())} lit levels lie below 70 % of saturation, and a line needs two"
         )
-    slope = slope_through_origin(transfer.signal[used], transfer.excess[used])
+    slope = slope_through_origin(transfer.signal[fitted], transfer.excess[fitted])
     return (
         blank.told(slope)
         if slope > 0
@@ -250,15 +250,15 @@ def sensitivity(transfer: PhotonTransfer, photons_told: bool = True) -> list[Qua
     response = _responsivity(transfer, k, photons_told)
     eta = _efficiency(response, k, photons_told)
     noise, coarse = dark_noise(transfer)
-    least = _least(transfer, k, eta, noise, coarse)
+    thresholds = _least(transfer, k, eta, noise, coarse)
     return [
         eta,
         k,
         _inverse(k),
         response,
         *_dark(transfer, k, noise, coarse),
-        *least,
-        *_greatest(transfer, k, eta, least),
+        *thresholds,
+        *_greatest(transfer, k, eta, thresholds),
     ]
 
 
@@ -277,10 +277,10 @@ def linearity(transfer: PhotonTransfer) -> Linearity | None:
     """Return the deviation of the response from a line, or None with fewer than three levels in
     the range.
     """
-    used = transfer.linear
-    if used.sum() < 3 or len(np.unique(transfer.photons[used])) < 3:
+    linear = transfer.linear
+    if linear.sum() < 3 or len(np.unique(transfer.photons[linear])) < 3:
         return None
-    x, y = transfer.photons[used], transfer.signal[used]
+    x, y = transfer.photons[linear], transfer.signal[linear]
     slope, start = relative_line(x, y)
     fitted = slope * x + start
     return Linearity(slope, start, 100 * (y - fitted) / fitted)
@@ -293,14 +293,14 @@ def linearity_errors(transfer: PhotonTransfer) -> list[Quantity]:
         Quantity(key, symbol, f"linearity error, {name} deviation", "%")
         for key, symbol, name in ends
     ]
-    found = linearity(transfer)
-    if found is None:
+    line = linearity(transfer)
+    if line is None:
         count = int(transfer.linear.sum())
         return [
             b.untold(f"{count} levels lie from 5 to 95 % of saturation, and three are needed")
             for b in blanks
         ]
-    values = (float(found.deviation.min()), float(found.deviation.max()))
+    values = (float(line.deviation.min()), float(line.deviation.max()))
     return [blank.told(value) for blank, value in zip(blanks, values, strict=True)]
 
 
@@ -318,10 +318,10 @@ def dark_current(transfer: PhotonTransfer) -> list[Quantity]:
         why = f"dark frames at {count} exposure{'s' * (count > 1)}: three or more are needed"
     if why or not k:
         return [of_mean.untold(why), of_variance.untold(why)]
-    found = _slope(of_mean, times, transfer.dark_mean, k)
+    from_means = _slope(of_mean, times, transfer.dark_mean, k)
     if dark_noise(transfer)[1]:
-        return [found, of_variance.untold("rounding hides the variance of the dark")]
-    return [found, _slope(of_variance, times, transfer.dark_variance, k**2)]
+        return [from_means, of_variance.untold("rounding hides the variance of the dark")]
+    return [from_means, _slope(of_variance, times, transfer.dark_variance, k**2)]
 
 
 def _slope(blank: Quantity, times: FloatArray, values: FloatArray, scale: float) -> Quantity:
@@ -341,18 +341,18 @@ def _slope(blank: Quantity, times: FloatArray, values: FloatArray, scale: float)
     )
 
 
-def _responsivity(transfer: PhotonTransfer, k: Quantity, told: bool) -> Quantity:
+def _responsivity(transfer: PhotonTransfer, k: Quantity, photons_told: bool) -> Quantity:
     blank = Quantity("R", "R", "responsivity", "DN/photon")
-    used = transfer.fitted
-    if not told or used.sum() < 2:
-        return blank.untold(k.reason if told else _NO_LIGHT)
-    return blank.told(slope_through_origin(transfer.photons[used], transfer.signal[used]))
+    fitted = transfer.fitted
+    if not photons_told or fitted.sum() < 2:
+        return blank.untold(k.reason if photons_told else _NO_LIGHT)
+    return blank.told(slope_through_origin(transfer.photons[fitted], transfer.signal[fitted]))
 
 
-def _efficiency(response: Quantity, k: Quantity, told: bool) -> Quantity:
+def _efficiency(response: Quantity, k: Quantity, photons_told: bool) -> Quantity:
     blank = Quantity("eta", "η", "quantum efficiency", "%")
     if response.value is None or k.value is None:
-        return blank.untold(_NO_GAIN if told else _NO_LIGHT)
+        return blank.untold(_NO_GAIN if photons_told else _NO_LIGHT)
     return blank.told(100 * response.value / k.value)
 
 
@@ -396,17 +396,17 @@ def _least(
     value, bound = noise / k.value + 0.5, "<" if coarse else ""
     why = "a limit, as the dark noise is" if coarse else ""
     limit: Bound = "<" if bound else ""
-    found = electrons.told(value, limit, why)
+    threshold = electrons.told(value, limit, why)
     if eta.value is None:
-        return [photons.untold(eta.reason), found]
-    return [photons.told(100 * value / eta.value, limit, why), found]
+        return [photons.untold(eta.reason), threshold]
+    return [photons.told(100 * value / eta.value, limit, why), threshold]
 
 
 def _greatest(
-    transfer: PhotonTransfer, k: Quantity, eta: Quantity, least: list[Quantity]
+    transfer: PhotonTransfer, k: Quantity, eta: Quantity, thresholds: list[Quantity]
 ) -> list[Quantity]:
     """Return saturation in photons and in electrons, the greatest SNR, and the dynamic range."""
-    at = transfer.saturation
+    saturation = transfer.saturation
     bound: Bound = "" if transfer.saturated else ">"
     why = (
         ""
@@ -417,49 +417,44 @@ def _greatest(
     in_electrons = Quantity("mu_e_sat", "μ_e.sat", "saturation capacity", "e-")
     photons = in_photons.untold(eta.reason)
     if eta.value is not None:
-        photons = in_photons.told(float(transfer.photons[at]), bound, why)
+        photons = in_photons.told(float(transfer.photons[saturation]), bound, why)
     if k.value is None:
         electrons = in_electrons.untold(_NO_GAIN)
     elif eta.value is not None:
-        electrons = in_electrons.told(eta.value / 100 * float(transfer.photons[at]), bound, why)
+        electrons = in_electrons.told(
+            eta.value / 100 * float(transfer.photons[saturation]), bound, why
+        )
     else:
-        electrons = in_electrons.told(float(transfer.signal[at]) / k.value, bound, why)
-    return [photons, electrons, *_ratios(electrons, least)]
+        electrons = in_electrons.told(float(transfer.signal[saturation]) / k.value, bound, why)
+    return [photons, electrons, *_ratios(electrons, thresholds)]
 
 
-def _ratios(electrons: Quantity, least: list[Quantity]) -> list[Quantity]:
+def _ratios(electrons: Quantity, thresholds: list[Quantity]) -> list[Quantity]:
     """Return SNR_max and the dynamic range, each as a number, in dB and in bits."""
-    found = []
-    threshold = least[1]
-    best = None if electrons.value is None else math.sqrt(electrons.value)
-    span = (
-        None
-        if electrons.value is None or threshold.value is None
-        else electrons.value / threshold.value
-    )
-    limited: Bound = ">" if electrons.bound or threshold.bound else ""
+    threshold = thresholds[1]
+    best = Quantity("SNR_max", "SNR.max", "maximum signal-to-noise ratio", "")
+    if electrons.value is None:
+        best = best.untold(electrons.reason)
+    else:
+        best = best.told(math.sqrt(electrons.value), electrons.bound, electrons.reason)
+    span = Quantity("DR", "DR", "dynamic range", "")
     why = "; ".join(dict.fromkeys(q.reason for q in (electrons, threshold) if q.reason))
-    for key, symbol, name, value, bound, reason in (
-        (
-            "SNR_max",
-            "SNR.max",
-            "maximum signal-to-noise ratio",
-            best,
-            electrons.bound,
-            electrons.reason,
-        ),
-        ("DR", "DR", "dynamic range", span, limited, why),
-    ):
-        for suffix, unit, scaled in (
-            ("", "", lambda x: x),
-            ("_dB", "dB", _decibel),
-            ("_bit", "bit", math.log2),
-        ):
-            blank = Quantity(key + suffix, symbol, name, unit)
-            found.append(
-                blank.untold(reason) if value is None else blank.told(scaled(value), bound, reason)
-            )
-    return found
+    if electrons.value is None or threshold.value is None:
+        span = span.untold(why)
+    else:
+        limited: Bound = ">" if electrons.bound or threshold.bound else ""
+        span = span.told(electrons.value / threshold.value, limited, why)
+    return [*_on_three_scales(best), *_on_three_scales(span)]
+
+
+def _on_three_scales(ratio: Quantity) -> list[Quantity]:
+    """Return a ratio as a number, in dB and in bits."""
+    in_decibels = replace(ratio, key=f"{ratio.key}_dB", unit="dB")
+    in_bits = replace(ratio, key=f"{ratio.key}_bit", unit="bit")
+    if ratio.value is not None:
+        in_decibels = replace(in_decibels, value=_decibel(ratio.value))
+        in_bits = replace(in_bits, value=math.log2(ratio.value))
+    return [ratio, in_decibels, in_bits]
 
 
 def _decibel(ratio: float) -> float:

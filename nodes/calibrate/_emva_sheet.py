@@ -77,43 +77,43 @@ def general_quantities(transfer: PhotonTransfer, photons_told: bool = True) -> l
     Units:  photons; a number; dB.
     Source: EMVA Standard 1288, release 4.0 General.
     """
-    least = Quantity(
+    dimmest = Quantity(
         "mu_p_min_general", "μ_p.min", "absolute sensitivity threshold, no linear model", "photons"
     )
     best = Quantity("SNR_max_general", "SNR.max", "maximum SNR of the light, no linear model", "dB")
     span = Quantity("DR_general", "DR", "dynamic range, no linear model", "dB")
-    found = general_model(transfer)
-    if found is None or not (found.slope > 0).all():
+    model = general_model(transfer)
+    if model is None or not (model.slope > 0).all():
         why = (
             "three or more levels of different light up to saturation, all brighter than those"
             " below, are needed"
         )
-        return [blank.untold(why) for blank in (least, best, span)]
-    coarse = float(transfer.dark_variance[0]) < COARSE
-    top: Bound = "" if transfer.saturated else ">"
-    cut = "" if transfer.saturated else "saturation was not reached"
-    rounded = "rounding hides the dark noise" if coarse else ""
-    scatters = "the light scatters from level to level, so that the slope is known to {:.0%} only"
-    at_dark, at_best = float(found.error[0]), float(found.error[1 + int(found.ratio.argmax())])
-    first = best.untold(scatters.format(at_best))
+        return [blank.untold(why) for blank in (dimmest, best, span)]
+    at_dark, at_best = float(model.error[0]), float(model.error[1 + int(model.ratio.argmax())])
+    top, cut = _end_of_light(transfer)
+    first = best.untold(_SCATTERS.format(at_best))
     if at_best <= _KNOWN:
-        first = best.told(20 * math.log10(float(found.ratio.max())), top, cut)
+        first = best.told(20 * math.log10(float(model.ratio.max())), top, cut)
     if at_dark > _KNOWN:
-        why = scatters.format(at_dark)
-        return [least.untold(why), first, span.untold(why)]
-    threshold = _threshold(transfer, found)
-    bottom: Bound = "<" if coarse else ""
-    last = span.told(
-        20 * math.log10(float(found.photons[-1]) / threshold),
-        ">" if coarse else top,
-        rounded or cut,
-    )
-    low = (
-        least.told(threshold, bottom, rounded)
-        if photons_told
-        else least.untold("the photons are not told")
-    )
-    return [low, first, last]
+        why = _SCATTERS.format(at_dark)
+        return [dimmest.untold(why), first, span.untold(why)]
+    threshold = _threshold(transfer, model)
+    decibels = 20 * math.log10(float(model.photons[-1]) / threshold)
+    if float(transfer.dark_variance[0]) < COARSE:
+        rounded = "rounding hides the dark noise"
+        low, last = dimmest.told(threshold, "<", rounded), span.told(decibels, ">", rounded)
+    else:
+        low, last = dimmest.told(threshold), span.told(decibels, top, cut)
+    return [low if photons_told else dimmest.untold("the photons are not told"), first, last]
+
+
+#: why a slope of the general model is not told
+_SCATTERS = "the light scatters from level to level, so that the slope is known to {:.0%} only"
+
+
+def _end_of_light(transfer: PhotonTransfer) -> tuple[Bound, str]:
+    """Return the bound of what follows from the brightest level, and the reason of the bound."""
+    return ("", "") if transfer.saturated else (">", "saturation was not reached")
 
 
 def _slopes(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -122,35 +122,35 @@ def _slopes(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     count = min(len(x), max(_WINDOW, 2 * round(_SHARE * len(x) / 2) + 1))
     slopes, spreads, scatter = [], [], []
-    for at in range(len(x)):
-        first = min(max(0, at - count // 2), len(x) - count)
+    for index in range(len(x)):
+        first = min(max(0, index - count // 2), len(x) - count)
         near = slice(first, first + count)
         scale = float(np.ptp(x[near]))
-        fit = np.linalg.pinv(np.vander((x[near] - x[at]) / scale, 3, increasing=True))
+        fit = np.linalg.pinv(np.vander((x[near] - x[index]) / scale, 3, increasing=True))
         slopes.append(float(fit[1] @ y[near]) / scale)
         spreads.append(float(np.linalg.norm(fit[1] * y[near])) / scale)
         left = -fit[0]
-        left[at - first] += 1
+        left[index - first] += 1
         if weight := float(np.linalg.norm(left * y[near])):
             scatter.append(float(left @ y[near]) / weight)
     error = math.sqrt(float(np.mean(np.square(scatter)))) * np.array(spreads) / np.abs(slopes)
     return np.array(slopes), np.asarray(error)
 
 
-def _threshold(transfer: PhotonTransfer, found: GeneralModel) -> float:
+def _threshold(transfer: PhotonTransfer, model: GeneralModel) -> float:
     """Return the light whose signal equals its noise in time, in photons."""
     dark = max(float(transfer.variance_dark[0]), COARSE)
-    rise = max(0.0, float(transfer.excess[0]) / float(found.photons[0]))
-    slope = float(found.slope[0])
+    rise = max(0.0, float(transfer.excess[0]) / float(model.photons[0]))
+    slope = float(model.slope[0])
     near = (rise + math.sqrt(rise**2 + 4 * dark * slope**2)) / (2 * slope**2)
-    if near <= found.photons[0] or not (found.ratio < 1).any():
+    if near <= model.photons[0] or not (model.ratio < 1).any():
         return near
-    last = int(np.flatnonzero(found.ratio < 1).max())  # the brightest level below the threshold
-    if last + 1 == len(found.ratio):
-        return float(found.photons[last])
+    last = int(np.flatnonzero(model.ratio < 1).max())  # the brightest level below the threshold
+    if last + 1 == len(model.ratio):
+        return float(model.photons[last])
     ends = slice(last, last + 2)
     return float(
-        np.exp(np.interp(0.0, np.log(found.ratio[ends].clip(1e-300)), np.log(found.photons[ends])))
+        np.exp(np.interp(0.0, np.log(model.ratio[ends].clip(1e-300)), np.log(model.photons[ends])))
     )
 
 
@@ -187,11 +187,11 @@ def emva_sheet(
     Source: EMVA Standard 1288, release 4.0 Linear.
     """
     transfer, patterns = photon_transfer(levels), spatial or Nonuniformity(None, None)
-    found = [
+    quantities = [
         *sensitivity(transfer, photons_told),
         *general_quantities(transfer, photons_told),
         *linearity_errors(transfer),
         *dark_current(transfer),
         *nonuniformity(patterns, gain(transfer).value),
     ]
-    return EmvaSheet(transfer, linearity(transfer), patterns, tuple(found))
+    return EmvaSheet(transfer, linearity(transfer), patterns, tuple(quantities))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from neusee.nodes import ParameterError
 from neusee.nodes.file_headers import exr_needs, fits_needs, npy_needs, pages_need, refuse_packed
 from neusee.nodes.input_files import VALUES, head_of, once_per_version, refuse_other_than_file
+from neusee.nodes.scene._spectral_exr import exr_header
 
 # --- image files ----------------------------------------------------------------------------------
 
@@ -41,14 +42,14 @@ def read(file: Path) -> NDArray[np.int32]:
             f"{file}: shape {stack.shape} is neither (y, x) nor (frame, y, x): give raw frames"
         )
     with np.errstate(invalid="ignore"):
-        whole = stack.astype(np.int64)
-    bad = (whole != stack) | (whole < 0) | (whole >= _TOP)
+        numbers = stack.astype(np.int64)
+    bad = (numbers != stack) | (numbers < 0) | (numbers >= _TOP)
     if bad.any():
         raise ValueError(
             f"{file} holds {stack[bad][0]}, not a digital number: give raw frames, whole numbers "
             f"from 0 to {_TOP - 1}"
         )
-    return whole.astype(np.int32).reshape(-1, *stack.shape[-2:])
+    return numbers.astype(np.int32).reshape(-1, *stack.shape[-2:])
 
 
 def readable(file: Path) -> Callable[[Path], NDArray[Any]]:
@@ -158,9 +159,9 @@ def fits_image(file: Path) -> tuple[tuple[int, ...], int, bool]:
         image = _first_image(file, opened)
         header, about = image.header, image.fileinfo()
         bits, zero = int(header["BITPIX"]), float(header.get("BZERO", 0))
-        least = zero - (2 ** (bits - 1) if bits > 8 else 0)  # eight bits have no sign
+        lowest = zero - (2 ** (bits - 1) if bits > 8 else 0)  # eight bits have no sign
         scaled = float(header.get("BSCALE", 1)) != 1 or zero % 1 != 0 or "BLANK" in header
-        doubtful = scaled or bits < 0 or least < 0 or least + 2**bits > _TOP
+        doubtful = scaled or bits < 0 or lowest < 0 or lowest + 2**bits > _TOP
         # its blocks of 2880 bytes, of which the last one may be short
         packed = isinstance(image, fits.CompImageHDU)
         size = about["datSpan"] - 2879 if packed else math.prod(image.shape) * abs(bits) // 8
@@ -168,7 +169,7 @@ def fits_image(file: Path) -> tuple[tuple[int, ...], int, bool]:
 
 
 def _first_image(file: Path, opened: Any) -> Any:
-    image = next((part for part in opened if getattr(part, "is_image", False) and part.shape), None)
+    image = next((unit for unit in opened if getattr(unit, "is_image", False) and unit.shape), None)
     if image is None:
         raise ValueError(f"{file} holds no image: give a FITS file with an image")
     return image
@@ -291,8 +292,6 @@ def _wrong_numbers(file: Path, shape: tuple[int, ...], doubtful: bool) -> str:
 
 
 def _check_exr(file: Path) -> str:
-    from neusee.nodes.scene._spectral_exr import exr_header
-
     try:
         _, names, size = exr_header(file)
     except ParameterError as error:
@@ -363,13 +362,13 @@ def frame_header(file: Path) -> FrameHeader:
     count, shape, bits, said = _HEADERS.get(suffix, _header_of_fits if suffix in FITS else _plain)(
         file
     )
-    found = {re.sub(r"[^a-z]", "", str(key).lower()): value for key, value in said.items()}
-    light = next((_number(found[key], False) for key in _LIGHTS if key in found), None)
+    values = {re.sub(r"[^a-z]", "", str(key).lower()): value for key, value in said.items()}
+    light = next((_number(values[key], False) for key in _LIGHTS if key in values), None)
     return FrameHeader(
         count,
         shape,
         bits,
-        next((_number(found[key]) for key in _TIMES if key in found), None),
+        next((_number(values[key]) for key in _TIMES if key in values), None),
         light,
     )
 
@@ -430,7 +429,7 @@ def _header_of_fits(file: Path) -> _Found:
     refuse_packed(file)
     with fits.open(file) as opened:
         header = next(
-            part.header for part in opened if getattr(part, "is_image", False) and part.shape
+            unit.header for unit in opened if getattr(unit, "is_image", False) and unit.shape
         )
         said = {
             key: header[key] for key in header if key and isinstance(header[key], int | float | str)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Literal, NamedTuple
 
 import torch
@@ -220,8 +221,8 @@ def prepared(stack: Stack) -> Level:
     """Return the pairs and the histogram of a light level; frame 0 forms a pair with 1, 2 with
     3, and so on.
     """
-    kept = stack.frames if stack.mask is None else stack.frames[:, ~stack.mask]
-    value, count = histogram(kept)
+    pixels = stack.frames if stack.mask is None else stack.frames[:, ~stack.mask]
+    value, count = histogram(pixels)
     frames = _window(stack.frames)
     pairs = len(frames) // 2
     means, centred = _centred(frames, stack.mask)
@@ -329,9 +330,9 @@ def _centred(frames: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
     if mask is None:
         means = numbers.mean((1, 2))
         return means, (numbers - means[:, None, None]).float()
-    kept = ~_window(mask[None])[0]
-    means = (numbers * kept).sum((1, 2)) / kept.sum().clamp_min(1)
-    return means, ((numbers - means[:, None, None]) * kept).float()
+    unmasked = ~_window(mask[None])[0]
+    means = (numbers * unmasked).sum((1, 2)) / unmasked.sum().clamp_min(1)
+    return means, ((numbers - means[:, None, None]) * unmasked).float()
 
 
 def without_lines(x: Tensor) -> Tensor:
@@ -343,8 +344,8 @@ def _window(frames: Tensor) -> Tensor:
     """Return the middle of at most 16 frames, and fewer frames where they are large."""
     starts = [max(0, n - _WINDOW) // 2 // _BLOCK * _BLOCK for n in frames.shape[1:]]
     middle = frames[:, starts[0] : starts[0] + _WINDOW, starts[1] : starts[1] + _WINDOW]
-    most = _TESTED // max(1, middle[0].numel()) // 2 * 2
-    return middle[: min(_MOST, max(2, most))]
+    frame_count = _TESTED // max(1, middle[0].numel()) // 2 * 2
+    return middle[: min(_MOST, max(2, frame_count))]
 
 
 def _piled(level: Level, value: Tensor, count: Tensor) -> bool:
@@ -357,22 +358,24 @@ def _piled(level: Level, value: Tensor, count: Tensor) -> bool:
     counts = [float(count[value == last + i].sum()) for i in range(4)]
     if sum(counts) < _LEAST:
         return False
-    one, two = counts[:2], (counts[0] + counts[1], counts[2] + counts[3])
+    single_numbers, two = counts[:2], (counts[0] + counts[1], counts[2] + counts[3])
     wide = level.paired and level.variance > 1.0 and len(value) > 8
-    tests = [one] * (wide or at_zero) + [two] * wide
+    tests = [single_numbers] * (wide or at_zero) + [two] * wide
     return any(a >= _LEAST and a - b - 2 > _PILED * math.sqrt(a + b) for a, b in tests)
 
 
-def strongest(z: Sequence[Sequence[float]], more: Sequence[float] = (), sides: int = 1) -> Evidence:
+def strongest(
+    z: Sequence[Sequence[float]], others: Sequence[float] = (), sides: int = 1
+) -> Evidence:
     """Return the strongest evidence of independent standard normal numbers (statistic, level), and
     its limit.
 
     Each number counts alone, and all numbers of a statistic count together by their sum over the
-    square root of their count; ``more`` are further standard normal numbers. The limit is
+    square root of their count; ``others`` are further standard normal numbers. The limit is
     Bonferroni's for all of these, and for both signs with two ``sides``.
     """
     together = [sum(row) / math.sqrt(len(row)) for row in z if len(row) > 1]
-    every = [*(x for row in z for x in row), *together, *more]
+    every = [*chain.from_iterable(z), *together, *others]
     strengths = [abs(x) for x in every] if sides == 2 else every
     return Evidence(max(strengths, default=0.0), normal_limit(ALARM / sides / max(1, len(every))))
 

@@ -80,12 +80,14 @@ def reduce(
     else:
         freedom = total - total / len(frames) - (scatter == "steady") * (len(frames) - 1)
         variance = _within(frames, scatter == "steady") / freedom
-    kept = _kept(value.double(), count.double(), mean, math.sqrt(spread / total), scatter == "all")
+    keeps_histogram = _kept(
+        value.double(), count.double(), mean, math.sqrt(spread / total), scatter == "all"
+    )
     moments = (
         torch.tensor([x], dtype=torch.float64)
         for x in (photons, exposure, total, mean, variance, freedom)
     )
-    value, count = (value, count) if kept else (value[:0], count[:0])
+    value, count = (value, count) if keeps_histogram else (value[:0], count[:0])
     return Levels._make(
         [*moments, torch.zeros(len(value), dtype=torch.int64), value.double(), count.double()]
     )
@@ -138,9 +140,9 @@ def levels(parts: list[Levels]) -> Levels:
             "there are no light levels to join: connect at least one step that returns a light"
             " level"
         )
-    joined = [torch.cat(each) for each in zip(*parts, strict=True)]
-    starts = accumulate((len(part.mean) for part in parts), initial=0)
-    shifted = [part.cell_level + start for part, start in zip(parts, starts, strict=False)]
+    joined = [torch.cat(columns) for columns in zip(*parts, strict=True)]
+    starts = accumulate((len(level.mean) for level in parts), initial=0)
+    shifted = [level.cell_level + start for level, start in zip(parts, starts, strict=False)]
     return Levels(*joined)._replace(cell_level=torch.cat(shifted))
 
 
@@ -156,9 +158,9 @@ def histogram(frames: Tensor) -> tuple[Tensor, Tensor]:
     """
     counts = torch.zeros(0, dtype=torch.int64, device=frames.device)
     for piece in _pieces(frames.reshape(1, -1)):
-        more = torch.bincount(_whole(piece).reshape(-1), minlength=len(counts))
-        more[: len(counts)] += counts
-        counts = more
+        of_piece = torch.bincount(_whole(piece).reshape(-1), minlength=len(counts))
+        of_piece[: len(counts)] += counts
+        counts = of_piece
     value = counts.nonzero().squeeze(1)
     return value.cpu(), counts[value].cpu()
 
@@ -172,15 +174,19 @@ def _whole(piece: Tensor) -> Tensor:
     """Return pixel values as int64; raise ValueError for a value that no analogue-to-digital
     converter can give.
     """
-    whole = piece.to(torch.int64)
-    low, high = (int(end) for end in torch.aminmax(whole))
-    if low < 0 or high >= _TOP or (piece.is_floating_point() and not bool((whole == piece).all())):
-        bad = (whole < 0) | (whole >= _TOP) | (whole != piece)
+    numbers = piece.to(torch.int64)
+    low, high = (int(end) for end in torch.aminmax(numbers))
+    if (
+        low < 0
+        or high >= _TOP
+        or (piece.is_floating_point() and not bool((numbers == piece).all()))
+    ):
+        bad = (numbers < 0) | (numbers >= _TOP) | (numbers != piece)
         raise ValueError(
             f"frames hold {float(piece[bad][0]):g}, not a digital number: give whole numbers from 0"
             f" to {_TOP - 1}, as the camera gives them, neither corrected nor scaled"
         )
-    return whole
+    return numbers
 
 
 def _within(frames: Tensor, steady: bool) -> float:
@@ -232,8 +238,10 @@ class _End:
         """Return True if the numbers at the end are more than those beside them: towards a free
         end, counts fall.
         """
-        one, next_one, *two_beside = (float(self.count[self.away == i].sum()) for i in range(4))
-        pairs = ((one, next_one), (one + next_one, sum(two_beside)))
+        outermost, next_one, *two_beside = (
+            float(self.count[self.away == i].sum()) for i in range(4)
+        )
+        pairs = ((outermost, next_one), (outermost + next_one, sum(two_beside)))
         return any(at_end - beside > _SURE * math.sqrt(at_end + beside) for at_end, beside in pairs)
 
 
@@ -246,8 +254,8 @@ def _exceeds_gaussian(held: float, total: float, low: float, sigma: float, alike
         * 0.5
         * abs(math.erf((low + 2.0) / sigma / math.sqrt(2)) - math.erf(low / sigma / math.sqrt(2)))
     )
-    more = _SURE * math.sqrt(expected) if alike else (_RATIO - 1) * expected
-    return held >= _FEW and held - expected > more
+    margin = _SURE * math.sqrt(expected) if alike else (_RATIO - 1) * expected
+    return held >= _FEW and held - expected > margin
 
 
 # --- saturation signal ----------------------------------------------------------------------------

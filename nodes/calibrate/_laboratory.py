@@ -134,10 +134,10 @@ class Laboratory:
         """Return distribution and relative standard uncertainty of each stated source of the
         quantum efficiency.
         """
-        found = [(self.photons_distribution, self.photons), ("normal", self.drift)]
+        sources = [(self.photons_distribution, self.photons), ("normal", self.drift)]
         if self.wavelength is not None and self.slope is not None:
-            found.append(("normal", abs(self.slope) * self.wavelength))
-        return [(law, u) for law, u in found if u]
+            sources.append(("normal", abs(self.slope) * self.wavelength))
+        return [(law, u) for law, u in sources if u]
 
 
 def laboratory_contributions(

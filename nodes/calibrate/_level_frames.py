@@ -98,10 +98,10 @@ def stack(files: Sequence[Path]) -> np.ndarray[Any, np.dtype[np.int32]]:
     size.
     """
     stacks = [read(file) for file in files]
-    for file, each in zip(files, stacks, strict=True):
-        if each.shape[1:] != stacks[0].shape[1:]:
+    for file, frames in zip(files, stacks, strict=True):
+        if frames.shape[1:] != stacks[0].shape[1:]:
             raise ValueError(
-                f"{file} is {each.shape[1:]}, but {files[0]} is {stacks[0].shape[1:]}: give equal"
+                f"{file} is {frames.shape[1:]}, but {files[0]} is {stacks[0].shape[1:]}: give equal"
                 " sizes"
             )
     return np.concatenate(stacks)

@@ -103,10 +103,10 @@ def _wrong_cell(file: Path, *columns: tuple[str, str]) -> str:
     text.
     """
     try:
-        found = _rows(file, dict(columns))
+        rows = _rows(file, dict(columns))
     except ValueError as error:
         return str(error)
-    return "" if found else f"{file.name} has no line below the header: give one line per level"
+    return "" if rows else f"{file.name} has no line below the header: give one line per level"
 
 
 @table.check

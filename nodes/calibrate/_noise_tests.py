@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import chain
 
 import torch
 from torch import Tensor
@@ -52,7 +53,7 @@ def blocks(levels: Sequence[Level], white: Sequence[Tensor]) -> FrameTest:
     lags = (((0, 1), 2), ((1, 0), 1))
     across = [[abs(_across(products(x, lag), axis)) for x in large] for lag, axis in lags]
     bright = sorted(levels, key=lambda level: level.variance)[-_LEVELS:]
-    steps = [z for step in _STEPS for z in _kept_to(step, bright)]
+    steps = list(chain.from_iterable(_kept_to(step, bright) for step in _STEPS))
     evidence = strongest([[x] for x in [*across[0], *across[1], *steps]])
     sentence = (
         "neighbours correlate otherwise across the borders of blocks of 8 pixels, or the cosines of"
@@ -73,10 +74,10 @@ def products(x: Tensor, lag: tuple[int, int]) -> Tensor:
     """
     down, right = lag
     height, width = x.shape[1:]
-    one = x[:, : height - down, max(0, -right) : width - max(0, right)]
+    first = x[:, : height - down, max(0, -right) : width - max(0, right)]
     other = x[:, down:, max(0, right) : width - max(0, -right)]
     length = width if down == 0 else height if right == 0 else math.inf
-    return one * other + x.square().mean() / length
+    return first * other + x.square().mean() / length
 
 
 def _across(products: Tensor, axis: int) -> float:
@@ -85,7 +86,7 @@ def _across(products: Tensor, axis: int) -> float:
     """
     border = torch.arange(products.shape[axis]) % _BLOCK == _BLOCK - 1
     across, inside = (
-        products[(slice(None),) * axis + (at,)].reshape(-1) for at in (border, ~border)
+        products[(slice(None),) * axis + (places,)].reshape(-1) for places in (border, ~border)
     )
     error = (across.var() / len(across) + inside.var() / len(inside)).sqrt()
     return float((inside.mean() - across.mean()) / error.clamp_min(1e-12))
@@ -114,9 +115,11 @@ def _cosines(frame: Tensor) -> Tensor:
     k, x = (torch.arange(_BLOCK, dtype=torch.float64) for _ in range(2))
     basis = (math.pi / _BLOCK * k[:, None] * (x + 0.5)).cos() * math.sqrt(2 / _BLOCK)
     basis[0] /= math.sqrt(2)
-    part = frame.double()[: n * _BLOCK, : m * _BLOCK].reshape(n, _BLOCK, m, _BLOCK).transpose(1, 2)
-    found: Tensor = (basis @ part @ basis.T).reshape(n * m, -1)
-    return found
+    blocks = (
+        frame.double()[: n * _BLOCK, : m * _BLOCK].reshape(n, _BLOCK, m, _BLOCK).transpose(1, 2)
+    )
+    coefficients: Tensor = (basis @ blocks @ basis.T).reshape(n * m, -1)
+    return coefficients
 
 
 # --- noise tests ----------------------------------------------------------------------------------
@@ -182,7 +185,7 @@ def _whiteness(levels: Sequence[Level], white: Sequence[Tensor]) -> FrameTest:
     )
     evidence = strongest([near, corners, far], sides=2)
     darks, lit = (
-        [x for x, each in zip(white, levels, strict=True) if each.dark == dark]
+        [x for x, level in zip(white, levels, strict=True) if level.dark == dark]
         for dark in (True, False)
     )
     of_readout = _from_readout(darks, lit)
@@ -216,13 +219,13 @@ def _from_readout(darks: Sequence[Tensor], lit: Sequence[Tensor]) -> bool:
 
 
 def _of_mixing(
-    darks: Sequence[Tensor], lit: Sequence[Tensor], of_readout: bool, found: bool
+    darks: Sequence[Tensor], lit: Sequence[Tensor], of_readout: bool, alarm: bool
 ) -> Iterator[Hidden]:
     """Yield what a filter may have taken from the variance in light, and from that in the dark.
 
     A filter reaches the eight neighbours of a pixel; one that is found may reach farther.
     """
-    lags = (*_NEAR, *_CORNERS, *(_FAR if found else ()))
+    lags = (*_NEAR, *_CORNERS, *(_FAR if alarm else ()))
     sound = probably_sound(sum(x.numel() for x in lit))
     if lit:
         yield Hidden("mixing", *_missing(lit, lags), _MIXED, gain=1.0, sound=sound)
@@ -244,8 +247,8 @@ def _missing(levels: Sequence[Tensor], lags: Sequence[tuple[int, int]]) -> tuple
             product = products(x, lag)
             total += float(product.sum()) / power
             square += float(product.square().sum()) / power**2
-    whole = max(1 + 2 * total / len(levels), 1e-3)
-    return math.log(whole), max(2 * math.sqrt(square) / len(levels) / whole, 1e-9)
+    remaining = max(1 + 2 * total / len(levels), 1e-3)
+    return math.log(remaining), max(2 * math.sqrt(square) / len(levels) / remaining, 1e-9)
 
 
 def _lines(name: str, axis: int, levels: Sequence[Level], white: Sequence[Tensor]) -> FrameTest:
@@ -275,7 +278,7 @@ def _lines(name: str, axis: int, levels: Sequence[Level], white: Sequence[Tensor
         z.append(_hilferty(ratio / together, freedom))
         shares.append((ratio / together / freedom - 1) / level.apart.shape[axis])
     darks = [x for x, level in zip(z, levels, strict=True) if level.dark]
-    evidence = strongest([z], more=[sum(darks) / math.sqrt(len(darks))] if darks else [])
+    evidence = strongest([z], others=[sum(darks) / math.sqrt(len(darks))] if darks else [])
     dark = [s for s, level in zip(shares, levels, strict=True) if level.dark] or shares
     noise, gain = (abs(sum(s) / len(s)) / 2 for s in (dark, shares))
     sentence = (
@@ -394,10 +397,11 @@ def _core(x: Tensor) -> float:
 
 def _drift(levels: Sequence[Level]) -> FrameTest:
     """Test if the mean moves between the frames of a pair."""
-    evidence = strongest([[z] for level in levels for z in _drift_over_chance(level)], sides=2)
+    drifts = list(chain.from_iterable(_drift_over_chance(level) for level in levels))
+    evidence = strongest([[z] for z in drifts], sides=2)
     dark, lit = ([level for level in levels if level.dark == is_dark] for is_dark in (True, False))
     uneven = sum(level.flicker / (level.variance + _TINY) for level in lit) / max(1, len(lit))
-    moved = max((float(level.drift.abs().max()) for level in levels), default=0.0)
+    moved = _farthest_drift(levels)
     sentence = (
         f"the mean moves by up to {moved:.3g} DN between two frames of a level, as under a drifting"
         " lamp"
@@ -406,13 +410,19 @@ def _drift(levels: Sequence[Level]) -> FrameTest:
     if any(level.scatter != "steady" for level in levels):
         shifts = {"gain": _largest_drift(lit) + uneven, "noise": _largest_drift(dark) / 2}
         return outcome(_DRIFT, evidence, sentence, shifts, passed)
-    modelled = "`scatter: steady` removes it from the variance" if uneven < _STEADY else ""
-    if not modelled:
-        sentence += (
-            f", whose light is uneven: this adds {uneven:.2%} to the variance, which a mean cannot"
-            " remove"
-        )
-    return outcome(_DRIFT, evidence, sentence, {"gain": uneven}, passed, modelled)
+    if uneven < _STEADY:
+        modelled = "`scatter: steady` removes it from the variance"
+        return outcome(_DRIFT, evidence, sentence, {"gain": uneven}, passed, modelled)
+    sentence += (
+        f", whose light is uneven: this adds {uneven:.2%} to the variance, which a mean cannot"
+        " remove"
+    )
+    return outcome(_DRIFT, evidence, sentence, {"gain": uneven}, passed)
+
+
+def _farthest_drift(levels: Sequence[Level]) -> float:
+    """Return the largest drift between the two frames of a pair, in DN."""
+    return max((float(level.drift.abs().max()) for level in levels), default=0.0)
 
 
 def _drift_over_chance(level: Level) -> list[float]:

@@ -73,12 +73,12 @@ def spatial_series(photons: float, exposure: float, frames: Iterable[Tensor]) ->
     """
     total, squares, count = torch.zeros(0), torch.zeros(0), 0
     for frame in frames:
-        whole = frame.to(torch.int64)
-        if count and whole.shape != total.shape:
+        numbers = frame.to(torch.int64)
+        if count and numbers.shape != total.shape:
             raise ValueError(
-                f"frames of {tuple(total.shape)} and of {tuple(whole.shape)} are no series"
+                f"frames of {tuple(total.shape)} and of {tuple(numbers.shape)} are no series"
             )
-        total, squares = (total + whole, squares + whole**2) if count else (whole, whole**2)
+        total, squares = (total + numbers, squares + numbers**2) if count else (numbers, numbers**2)
         count += 1
     if count < 2:
         raise ValueError(f"{count} frame(s) are no series: give two or more")
@@ -104,19 +104,19 @@ def spatial_variances(series: SpatialSeries) -> SpatialVariances:
     """
     rows, columns = series.total.shape
     left = series.temporal / series.count
-    found = _measured(series)
+    measured = _measured(series)
     total, by_row, by_column = (
-        found.total - left,
-        found.row - left / columns,
-        found.column - left / rows,
+        measured.total - left,
+        measured.row - left / columns,
+        measured.column - left / rows,
     )
     pixels = rows * columns
-    rest = pixels - rows - columns
+    freedom = pixels - rows - columns
     return SpatialVariances(
         total,
-        ((pixels - columns) * by_row - rows * (total - by_column)) / rest,
-        ((pixels - rows) * by_column - columns * (total - by_row)) / rest,
-        pixels * (total - by_column - by_row) / rest,
+        ((pixels - columns) * by_row - rows * (total - by_column)) / freedom,
+        ((pixels - rows) * by_column - columns * (total - by_row)) / freedom,
+        pixels * (total - by_column - by_row) / freedom,
     )
 
 
@@ -125,10 +125,10 @@ def chance_of_variances(series: SpatialSeries) -> SpatialVariances:
     nonuniformity.
     """
     rows, columns = series.total.shape
-    found = _measured(series)
+    measured = _measured(series)
     noise = series.temporal / series.count * math.sqrt(2 / (rows * columns * (series.count - 1)))
-    pixel = math.hypot(found.total * math.sqrt(2 / (rows * columns)), noise)
-    row, column = found.row * math.sqrt(2 / rows), found.column * math.sqrt(2 / columns)
+    pixel = math.hypot(measured.total * math.sqrt(2 / (rows * columns)), noise)
+    row, column = measured.row * math.sqrt(2 / rows), measured.column * math.sqrt(2 / columns)
     return SpatialVariances(
         math.hypot(pixel, row, column),
         math.hypot(row, pixel / columns),
@@ -146,7 +146,7 @@ def _measured(series: SpatialSeries) -> SpatialVariances:
     return SpatialVariances(float(image.var(ddof=1)), rows, columns, math.nan)
 
 
-def nonuniformity(found: Nonuniformity, gain: float | None) -> list[Quantity]:
+def nonuniformity(patterns: Nonuniformity, gain: float | None) -> list[Quantity]:
     """Return DSNU1288 in DN and e-, PRNU1288 in percent, each in total and of rows, columns and
     pixels.
 
@@ -154,13 +154,13 @@ def nonuniformity(found: Nonuniformity, gain: float | None) -> list[Quantity]:
     Units:  as in each `Quantity`.
     Source: EMVA Standard 1288, release 4.0 Linear.
     """
-    return [*_dark(found.dark, gain), *_lit(found)]
+    return [*_dark(patterns.dark, gain), *_lit(patterns)]
 
 
 def _dark(series: SpatialSeries | None, gain: float | None) -> list[Quantity]:
     quantities: list[Quantity] = []
-    for i, part in enumerate(PARTS):
-        names = _names("DSNU", part, "dark signal nonuniformity")
+    for i, pattern in enumerate(PARTS):
+        names = _names("DSNU", pattern, "dark signal nonuniformity")
         in_numbers = Quantity(f"{names[0]}_DN", f"{names[1]}.DN", names[2], "DN")
         in_electrons = Quantity(names[0], names[1], names[2], "e-")
         if series is None:
@@ -182,30 +182,30 @@ def _dark(series: SpatialSeries | None, gain: float | None) -> list[Quantity]:
     return quantities
 
 
-def _lit(found: Nonuniformity) -> list[Quantity]:
+def _lit(patterns: Nonuniformity) -> list[Quantity]:
     blanks = [
-        Quantity(*_names("PRNU", part, "photo response nonuniformity"), "%") for part in PARTS
+        Quantity(*_names("PRNU", pattern, "photo response nonuniformity"), "%") for pattern in PARTS
     ]
-    if found.dark is None or found.lit is None:
-        which = "lit frames" if found.lit is None else "dark frames"
+    if patterns.dark is None or patterns.lit is None:
+        which = "lit frames" if patterns.lit is None else "dark frames"
         return [blank.untold(f"no series of {which} is given, only pairs") for blank in blanks]
-    signal = float(found.lit.average.mean() - found.dark.average.mean())
+    signal = float(patterns.lit.average.mean() - patterns.dark.average.mean())
     if not signal > 0:
         return [blank.untold("the lit series is no brighter than the dark one") for blank in blanks]
     scale = (100 / signal) ** 2
-    each = zip(spatial_variances(found.lit), spatial_variances(found.dark), strict=True)
-    chance = zip(chance_of_variances(found.lit), chance_of_variances(found.dark), strict=True)
-    both = zip(blanks, each, chance, strict=True)
+    variances = zip(spatial_variances(patterns.lit), spatial_variances(patterns.dark), strict=True)
+    chance = zip(chance_of_variances(patterns.lit), chance_of_variances(patterns.dark), strict=True)
+    both = zip(blanks, variances, chance, strict=True)
     return [
         _root(blank, (lit - dark) * scale, math.hypot(*errors) * scale)
         for blank, (lit, dark), errors in both
     ]
 
 
-def _names(kind: str, part: str, name: str) -> tuple[str, str, str]:
-    if part == "total":
+def _names(kind: str, pattern: str, name: str) -> tuple[str, str, str]:
+    if pattern == "total":
         return f"{kind}1288", f"{kind}1288", f"{name}, total"
-    return f"{kind}1288_{part}", f"{kind}1288.{part}", f"{name}, {part}s"
+    return f"{kind}1288_{pattern}", f"{kind}1288.{pattern}", f"{name}, {pattern}s"
 
 
 def _root(blank: Quantity, variance: float, error: float) -> Quantity:

@@ -33,8 +33,8 @@ def number_tests(levels: Sequence[Level], exact: bool) -> list[FrameTest]:
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.5 (bit depth, saturation) and 6.6
             (variance >= 0.24).
     """
-    used = [level for level in levels if level.fitted]
-    return [codes(used), _black(used, exact), _white(levels, exact), *_coarse(used, exact)]
+    fitted = [level for level in levels if level.fitted]
+    return [codes(fitted), _black(fitted, exact), _white(levels, exact), *_coarse(fitted, exact)]
 
 
 def codes(levels: Sequence[Level]) -> FrameTest:
@@ -79,10 +79,10 @@ def _expected(count: Tensor) -> Tensor:
     share = count.cumsum(0) / count.sum()
     inside = ((share > _TAIL) & (share < 1 - _TAIL)).double()
     sums, number = ((x * inside).cumsum(0) for x in (count, torch.ones_like(count)))
-    at = torch.arange(len(count))
-    before, after = (at - _REACH - 1).clamp_min(0), (at + _REACH).clamp_max(len(count) - 1)
-    left = (sums[(at - 1).clamp_min(0)] - sums[before]) / (
-        number[(at - 1).clamp_min(0)] - number[before]
+    index = torch.arange(len(count))
+    before, after = (index - _REACH - 1).clamp_min(0), (index + _REACH).clamp_max(len(count) - 1)
+    left = (sums[(index - 1).clamp_min(0)] - sums[before]) / (
+        number[(index - 1).clamp_min(0)] - number[before]
     ).clamp_min(1)
     right = (sums[after] - sums) / (number[after] - number).clamp_min(1)
     return torch.minimum(left, right) * inside
@@ -93,13 +93,13 @@ def _beside_cliff(total: Tensor) -> Tensor:
     often.
     """
     shifted = [torch.roll(total, i) for i in (1, 2, 3)], [torch.roll(total, -i) for i in (1, 2, 3)]
-    found = torch.zeros_like(total, dtype=torch.bool)
+    cliffs = torch.zeros_like(total, dtype=torch.bool)
     for three in shifted:
         stacked = torch.stack(three)
         low, high = stacked.amin(0), stacked.amax(0)
-        found |= (low >= _CLIFF) & (high <= _SIMILAR * low)
-    found[:3], found[-3:] = False, False
-    return found
+        cliffs |= (low >= _CLIFF) & (high <= _SIMILAR * low)
+    cliffs[:3], cliffs[-3:] = False, False
+    return cliffs
 
 
 def _black(levels: Sequence[Level], exact: bool) -> FrameTest:

@@ -63,15 +63,14 @@ def lag(levels: Sequence[Level]) -> list[FrameTest]:
     lit = torch.tensor([not level.dark for level in group])
     lit = lit if bool(lit.any()) else ~lit
     pairs = min(len(level.apart) for level in group)
+    first, second = [level.first for level in group], [level.second for level in group]
     products, powers = [], 0.0
     for pair in range(pairs):
-        u, v = (
-            _left(torch.stack([frames[pair].double() for frames in each]), weight, basis)[lit]
-            for each in ([level.first for level in group], [level.second for level in group])
-        )
-        kept = (u.abs() < _RARE * _width(u)) & (v.abs() < _RARE * _width(v))
-        products.append((u * v * kept).sum(0))
-        powers += 0.5 * float(((u.square() + v.square()) * kept).sum())
+        u = _noise_of_pair(first, pair, weight, basis)[lit]
+        v = _noise_of_pair(second, pair, weight, basis)[lit]
+        product_of_pair, power = _product_and_power(u, v)
+        products.append(product_of_pair)
+        powers += power
     product = torch.stack(products)
     evidence = strongest([[studentised(product)]], sides=2)
     share, error = float(product.sum()) / powers, math.sqrt(float(product.square().sum())) / powers
@@ -85,6 +84,20 @@ def lag(levels: Sequence[Level]) -> list[FrameTest]:
     return [bounded("no lag", evidence, hidden, sentence, passed)]
 
 
+def _noise_of_pair(frames: Sequence[Tensor], pair: int, weight: Tensor, basis: Tensor) -> Tensor:
+    """Return what the patterns leave of one frame of each level."""
+    return _left(torch.stack([of_level[pair].double() for of_level in frames]), weight, basis)
+
+
+def _product_and_power(u: Tensor, v: Tensor) -> tuple[Tensor, float]:
+    """Return the product of the noise of two frames, summed over the levels, and its mean power,
+    both without outliers.
+    """
+    inliers = (u.abs() < _RARE * _width(u)) & (v.abs() < _RARE * _width(v))
+    power = 0.5 * float(((u.square() + v.square()) * inliers).sum())
+    return (u * v * inliers).sum(0), power
+
+
 def _comparable(levels: Sequence[Level]) -> list[Level]:
     """Return the levels of frames of the most frequent shape, up to the level of the greatest
     variance.
@@ -92,9 +105,11 @@ def _comparable(levels: Sequence[Level]) -> list[Level]:
     shapes = [level.apart.shape[1:] for level in levels]
     common = max(shapes, key=shapes.count)
     top = max(levels, key=lambda level: level.variance).mean
-    chosen = zip(levels, shapes, strict=True)
+    candidates = zip(levels, shapes, strict=True)
     return [
-        level for level, shape in chosen if shape == common and (level.dark or level.mean <= top)
+        level
+        for level, shape in candidates
+        if shape == common and (level.dark or level.mean <= top)
     ]
 
 
@@ -235,16 +250,8 @@ def _pattern(levels: Sequence[Level]) -> FrameTest:
     """Test if the pixels of a level differ from each other in all frames, by DSNU and PRNU."""
     products = [level.first * level.second for level in levels]
     evidence = strongest([[studentised(x) for x in products]])
-    common = [float(x.mean()) for x in products]
-    of_dark = [c for c, level in zip(common, levels, strict=True) if level.dark]
-    dsnu = math.sqrt(max(0.0, min(of_dark, default=0.0)))
-    paired_lit = [level for level in levels if not level.dark]
-    lit = [(c - dsnu**2, level) for c, level in zip(common, levels, strict=True) if not level.dark]
     offset = min((level.mean for level in levels if level.dark), default=0.0)
-    relative = [
-        math.sqrt(max(0.0, c)) / (level.mean - offset) for c, level in lit if level.mean > offset
-    ]
-    prnu = sorted(relative)[len(relative) // 2] if relative else 0.0
+    dsnu, prnu = _dsnu_and_prnu(levels, [float(x.mean()) for x in products], offset)
     sentence = (
         f"pixels differ by {dsnu:.2g} DN in the dark (DSNU) and by {prnu:.2%} in light (PRNU and"
         " uneven light)"
@@ -252,7 +259,8 @@ def _pattern(levels: Sequence[Level]) -> FrameTest:
     passed = "the pixels are alike: the total variance is the temporal variance"
     if all(level.scatter != "all" for level in levels):
         modelled = "the temporal variance leaves these differences out"
-        shifts = {"gain": _pixel_response(paired_lit, offset) ** 2}
+        lit = [level for level in levels if not level.dark]
+        shifts = {"gain": _pixel_response(lit, offset) ** 2}
         return outcome(
             "total against temporal variance", evidence, sentence, shifts, passed, modelled
         )
@@ -263,6 +271,22 @@ def _pattern(levels: Sequence[Level]) -> FrameTest:
     return bounded("total against temporal variance", evidence, hidden, sentence, passed)
 
 
+def _dsnu_and_prnu(
+    levels: Sequence[Level], common: Sequence[float], offset: float
+) -> tuple[float, float]:
+    """Return how much pixels differ in the dark, in DN, and in light, relative to the signal, from
+    the variance of the pattern that is ``common`` to the frames of each level.
+    """
+    pairs = list(zip(common, levels, strict=True))
+    dark = min((variance for variance, level in pairs if level.dark), default=0.0)
+    dsnu = math.sqrt(max(0.0, dark))
+    lit = [(variance - dsnu**2, level.mean) for variance, level in pairs if not level.dark]
+    relative = [
+        math.sqrt(max(0.0, variance)) / (mean - offset) for variance, mean in lit if mean > offset
+    ]
+    return dsnu, sorted(relative)[len(relative) // 2] if relative else 0.0
+
+
 def _pixel_response(lit: Sequence[Level], offset: float) -> float:
     """Return by how much the responses of neighbouring pixels differ, relative to the mean; uneven
     light is smooth.
@@ -271,8 +295,10 @@ def _pixel_response(lit: Sequence[Level], offset: float) -> float:
     """
     shares = []
     for level in lit:
-        one, other = (frames.diff(dim=2) for frames in (level.first, level.second))
-        shares.append(max(0.0, float((one * other).mean()) / 2) / (level.mean - offset) ** 2)
+        first_frames, other = (frames.diff(dim=2) for frames in (level.first, level.second))
+        shares.append(
+            max(0.0, float((first_frames * other).mean()) / 2) / (level.mean - offset) ** 2
+        )
     return math.sqrt(sorted(shares)[len(shares) // 2]) if shares else 0.0
 
 
@@ -295,20 +321,20 @@ def _counted_as_noise(levels: Sequence[Level], products: Sequence[Tensor]) -> It
             float(slope @ pattern), float((slope * error).norm()), float(slope @ total), gain=-1.0
         )
     if bool((~lit).any()):
-        part, unsure, whole = (
+        pattern_variance, unsure, total_variance = (
             pattern[~lit].mean(),
             error[~lit].norm() / int((~lit).sum()),
             total[~lit].mean(),
         )
-        yield _share(float(part), float(unsure), float(whole), noise=-0.5)
+        yield _share(float(pattern_variance), float(unsure), float(total_variance), noise=-0.5)
 
 
 def _share(
-    part: float, error: float, whole: float, gain: float = 0.0, noise: float = 0.0
+    pattern: float, error: float, total: float, gain: float = 0.0, noise: float = 0.0
 ) -> Hidden:
     """Return the fault of a part of the variance that is no noise in time."""
-    left = max(1 - part / max(whole, 1e-12), 1e-3)
-    error = max(error / max(whole, 1e-12) / left, 1e-9)
+    left = max(1 - pattern / max(total, 1e-12), 1e-3)
+    error = max(error / max(total, 1e-12) / left, 1e-9)
     return Hidden("pattern", -math.log(left), error, _UNLIKE_PATTERN, gain, noise, positive=True)
 
 
@@ -319,7 +345,7 @@ def _uneven(levels: Sequence[Level], full: Sequence[Level]) -> Iterator[FrameTes
     variance of each pixel grow alike. It does not where the brightest part of the frame is full
     before the mean is, which ``full`` levels show.
     """
-    lit, dark = ([level for level in levels if level.dark == wanted] for wanted in (False, True))
+    lit, dark = ([level for level in levels if level.dark == is_dark] for is_dark in (False, True))
     bright = max(lit, key=lambda level: level.mean, default=None)
     if bright is None or not dark or min(bright.first.shape[1:]) < 2 * _BLOCKS:
         return

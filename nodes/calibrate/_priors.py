@@ -60,12 +60,14 @@ class Prior(NamedTuple):
         return tuple(fault for fault, may in zip(FAULTS, self.hidden.tolist(), strict=True) if may)
 
 
-def believed(pairs: Mapping[str, Pair | None], linear: frozenset[str], **known: Known) -> Prior:
+def believed(
+    pairs: Mapping[str, Pair | None], linear: frozenset[str], **faults_known: Known
+) -> Prior:
     """Build a prior from a pair of numbers for each free parameter, and None for each fixed
     parameter.
 
     The pair is median and factor, or mean and standard deviation for a parameter in ``linear``. A
-    fault of the frames that is ``known`` to be "none" cannot hide in them.
+    fault of the frames that is ``faults_known`` to be "none" cannot hide in them.
     """
     normals = [_normal(name, pair, name in linear) for name, pair in pairs.items()]
     if all(math.isnan(width) for _, width in normals):
@@ -73,7 +75,7 @@ def believed(pairs: Mapping[str, Pair | None], linear: frozenset[str], **known: 
             f"no parameter is free: give a prior of at least one of {', '.join(pairs)}"
         )
     centre, width = torch.tensor(normals, dtype=torch.float64).unbind(1)
-    hidden = [float(known.get(fault, "unknown") == "unknown") for fault in FAULTS]
+    hidden = [float(faults_known.get(fault, "unknown") == "unknown") for fault in FAULTS]
     return Prior(centre, width, torch.tensor(hidden, dtype=torch.float64))
 
 
@@ -263,12 +265,12 @@ class Coordinates(Free):
 
     def parameters(self, place: Tensor) -> dict[str, Tensor]:
         """Convert sampler coordinates (..., free parameter) to sensor parameters."""
-        at = dict(zip(self.names, place.unbind(-1), strict=True))
+        free = dict(zip(self.names, place.unbind(-1), strict=True))
         held = {name: math.log(self.held[name]) for name in ("gain", "spread") if name in self.held}
-        logs = {name: torch.tensor(x, dtype=torch.float64) for name, x in held.items()} | at
-        slope = logs["gain"] - 2.0 * logs["spread"] if "gain" in at else logs["gain"]
+        logs = {name: torch.tensor(x, dtype=torch.float64) for name, x in held.items()} | free
+        slope = logs["gain"] - 2.0 * logs["spread"] if "gain" in free else logs["gain"]
         parameters = {}
-        for name, x in at.items():
+        for name, x in free.items():
             if name == "gain":
                 parameters[name] = slope.exp()
             elif name == _LINEAR:
@@ -460,13 +462,13 @@ def _well(levels: Sufficient, values: Mapping[str, float], params: Mapping[str, 
         ROUNDED[params["rounding"]][0],
         float(values["gain"]),
     )
-    seen = levels.mean[levels.pixels > 0]
-    brightest = max([*seen.tolist(), *levels.cell_value.tolist()], default=0.0)
-    at = levels.cell_value >= brightest - 2
-    piled = bool(at.any()) and float(levels.cell_count[at].sum()) > 0.5 * float(
+    means = levels.mean[levels.pixels > 0]
+    brightest = max([*means.tolist(), *levels.cell_value.tolist()], default=0.0)
+    top_cells = levels.cell_value >= brightest - 2
+    piled = bool(top_cells.any()) and float(levels.cell_count[top_cells].sum()) > 0.5 * float(
         levels.cell_count.max()
     )
     if piled and brightest < top:
-        weight = levels.cell_count[at]
-        return float((levels.cell_value[at] * weight).sum() / weight.sum() - shift) / gain
+        weight = levels.cell_count[top_cells]
+        return float((levels.cell_value[top_cells] * weight).sum() / weight.sum() - shift) / gain
     return max(values["full_well"], _ABOVE * min(brightest + 1, torch.inf) / gain)

@@ -16,7 +16,7 @@ from torch.special import log_ndtr
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.calibrate._level_frames import refuse_unreadable, stack
-from neusee.nodes.calibrate._sensor_likelihood import Likelihood
+from neusee.nodes.calibrate._sensor_likelihood import Likelihood, without_details
 from neusee.nodes.flare._harvey_shack import lobe, on_far_pixels, scattered_share
 from neusee.nodes.sensor._digitization import Bits
 from neusee.nodes.sensor._saturation import Well, refuse_without_room, refuse_without_steps
@@ -147,14 +147,14 @@ def reduce_rings(frames: Numbers, camera: _Camera, centre: tuple[float, float] |
         )
     y, x = np.ogrid[: size[0], : size[1]]
     square = ((y - place[0]) ** 2 + (x - place[1]) ** 2).astype(np.float64)
-    part = _part(square)
+    sector = _part(square)
     signal = frames / camera.gain - camera.offset
     cut: NDArray[np.bool_] = np.asarray((frames >= camera.cut).any(0))
-    first = _first_ring(frames, part // _PARTS, camera)
-    used = (part >= first * _PARTS) & ~cut
-    hidden = _cut_rings(square, part // _PARTS, cut, first)
+    first = _first_ring(frames, sector // _PARTS, camera)
+    unsaturated = (sector >= first * _PARTS) & ~cut
+    hidden = _cut_rings(square, sector // _PARTS, cut, first)
     below = (hidden, camera.cut / camera.gain - camera.offset, place)
-    rings = _averaged(signal, square, part, used)
+    rings = _averaged(signal, square, sector, unsaturated)
     return Rings(*rings, *(torch.as_tensor(x, dtype=torch.float64) for x in below))
 
 
@@ -222,20 +222,22 @@ def _cut_rings(
         np.bincount(ring.ravel(), x.ravel()) for x in (np.ones_like(square), cut, square)
     )
     numbers = np.arange(len(count))
-    whole = (numbers < first) & (numbers >= _LEAST) & (count > 0) & (lost == count)
-    mean: Numbers = total[whole] / count[whole]
+    hidden = (numbers < first) & (numbers >= _LEAST) & (count > 0) & (lost == count)
+    mean: Numbers = total[hidden] / count[hidden]
     return mean
 
 
 def _averaged(
-    signal: Numbers, square: Numbers, part: NDArray[np.int64], used: NDArray[np.bool_]
+    signal: Numbers, square: Numbers, sector: NDArray[np.int64], unsaturated: NDArray[np.bool_]
 ) -> tuple[Tensor, ...]:
     """Return mean and number of pixels of each ring, and ring, mean squared distance and pixels
     of each part.
     """
-    numbers, at = np.unique(part[used], return_inverse=True)
-    count = np.bincount(at).astype(np.float64)
-    distance, mean = (np.bincount(at, values[used]) / count for values in (square, signal.mean(0)))
+    numbers, group = np.unique(sector[unsaturated], return_inverse=True)
+    count = np.bincount(group).astype(np.float64)
+    distance, mean = (
+        np.bincount(group, values[unsaturated]) / count for values in (square, signal.mean(0))
+    )
     ring, of = np.unique(numbers // _PARTS, return_inverse=True)
     if len(ring) < _RINGS:
         raise ValueError(
@@ -243,14 +245,14 @@ def _averaged(
             " frame: expose less, or give a larger frame with the source in it"
         )
     pixels = np.bincount(of, count)
-    found = (
+    columns = (
         np.bincount(of, count * mean) / pixels,
         pixels * len(signal),
         of.astype(np.int64),
         distance,
         count,
     )
-    return tuple(torch.as_tensor(x) for x in found)
+    return tuple(torch.as_tensor(x) for x in columns)
 
 
 # --- scatter likelihood ---------------------------------------------------------------------------
@@ -306,9 +308,10 @@ def stray_light(
             outside a radius for large radii.
     """
     source = {"electrons": electrons, "background": background, "core": core, "scatter": scatter}
-    given = {"b0": b0, "l": l, "s": s, **source}
+    scatter_values = {"b0": b0, "l": l, "s": s, **source}
     numbers = {
-        name: torch.as_tensor(x, dtype=torch.float64)[..., None] for name, x in given.items()
+        name: torch.as_tensor(x, dtype=torch.float64)[..., None]
+        for name, x in scatter_values.items()
     }
     lens = (wavelength * focal_length / (diameter * pixel_pitch), pixel_pitch / focal_length)
     mean = _averaged_rings(_light(numbers, rings.square, *lens), rings) + numbers["background"]
@@ -320,7 +323,7 @@ def stray_light(
     log = -0.5 * (away.square() + variance.log()).sum(-1) + above.sum(-1)
     total = log.where(_total(numbers)[..., 0] < 1, -torch.inf)
     if not told:
-        return Likelihood(total, *(torch.zeros(0, dtype=torch.float64) for _ in range(5)))
+        return without_details(total)
     # squared derivatives of a residual and of its log width sum, on average, to the Fisher
     # information
     rows = torch.cat(torch.broadcast_tensors(away, 0.5 * variance.log()), -1)  # type: ignore[no-untyped-call]
@@ -397,7 +400,7 @@ def guess_scatter(
     Error:  a start for a search, not an estimate.
     Source: linear least squares.
     """
-    scale, best, least = params["pixel_pitch"] / params["focal_length"], dict(believed), math.inf
+    scale, best, lowest = params["pixel_pitch"] / params["focal_length"], dict(believed), math.inf
     weight = (
         rings.pixels
         / (rings.mean.clamp_min(0) + params["read_noise"] ** 2 + 1 / params["gain"] ** 2)
@@ -417,16 +420,16 @@ def guess_scatter(
                 1,
             )
             rows[:, 0] *= believed["electrons"]
-            rest = rings.mean - believed["electrons"] * believed["core"] * _averaged_rings(
+            scattered = rings.mean - believed["electrons"] * believed["core"] * _averaged_rings(
                 wing, rings
             )
-            fit = torch.linalg.lstsq(rows * weight[:, None], (rest * weight)[:, None]).solution[
-                :, 0
-            ]
-            off = float(((rows @ fit - rest) * weight).square().sum())
+            fit = torch.linalg.lstsq(
+                rows * weight[:, None], (scattered * weight)[:, None]
+            ).solution[:, 0]
+            off = float(((rows @ fit - scattered) * weight).square().sum())
             share = float(fit[0]) * float(
                 scattered_share(*(torch.tensor(x, dtype=torch.float64) for x in (1.0, l, s)))
             )
-            if off < least and 0 < share < 1:
-                least, best = off, best | {"b0": float(fit[0]), "l": l, "s": s}
+            if off < lowest and 0 < share < 1:
+                lowest, best = off, best | {"b0": float(fit[0]), "l": l, "s": s}
     return best

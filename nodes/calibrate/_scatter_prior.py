@@ -79,7 +79,8 @@ class Sight(NamedTuple):
             lens["wavelength"] * lens["focal_length"] / (lens["diameter"] * lens["pixel_pitch"])
         )
         inner, outer = (
-            float(rings.square[rings.ring == at].mean()) ** 0.5 for at in (0, len(rings.mean) - 1)
+            float(rings.square[rings.ring == ring].mean()) ** 0.5
+            for ring in (0, len(rings.mean) - 1)
         )
         return cls(inner, outer, fringe, lens["pixel_pitch"] / lens["focal_length"])
 
@@ -196,38 +197,38 @@ class ScatterCoordinates(Free):
         """
         if not {"b0", "l"} <= set(self.names):
             return []
-        known = {
+        lobe_values = {
             **{name: torch.tensor(x) for name, x in self.held.items()},
             **self.parameters(place),
         }
-        l, s = known["l"], known["s"]  # noqa: E741
-        found = [
+        l, s = lobe_values["l"], lobe_values["s"]  # noqa: E741
+        ridges = [
             Ridge(
-                self._moved(known, 1.0, _FAR),
+                self._moved(lobe_values, 1.0, _FAR),
                 {"l": "lower"},
                 "l: only a lower limit, beyond the frame",
             )
         ]
         for factor in (_FAR, 10.0, 3.0):
             rise = float(factor ** -float(s))
-            if float(scattered_share(known["b0"] * rise, l / factor, s)) < _MOST:
+            if float(scattered_share(lobe_values["b0"] * rise, l / factor, s)) < _MOST:
                 text = "b0 and l only as b0 l^(-s): l lies within the saturated pixels"
-                narrow = self._moved(known, rise, 1 / factor)
-                return [*found, Ridge(narrow, {"l": "upper", "b0": "lower"}, text)]
-        return found
+                narrow = self._moved(lobe_values, rise, 1 / factor)
+                return [*ridges, Ridge(narrow, {"l": "upper", "b0": "lower"}, text)]
+        return ridges
 
-    def _moved(self, known: Mapping[str, Tensor], peak: float, width: float) -> Tensor:
+    def _moved(self, lobe_values: Mapping[str, Tensor], peak: float, width: float) -> Tensor:
         """Return the coordinates with b0 and l multiplied, and the brightness of core and
         scatter as before.
         """
-        b0, l, s = known["b0"] * peak, known["l"] * width, known["s"]  # noqa: E741
-        core, electrons = known["core"], known["electrons"]
+        b0, l, s = lobe_values["b0"] * peak, lobe_values["l"] * width, lobe_values["s"]  # noqa: E741
+        core, electrons = lobe_values["core"], lobe_values["electrons"]
         before, after = (
-            1 - scattered_share(*x) for x in ((known["b0"], known["l"], s), (b0, l, s))
+            1 - scattered_share(*x) for x in ((lobe_values["b0"], lobe_values["l"], s), (b0, l, s))
         )
         rise = before / after.clamp_min(1 - _MOST)
         if "core" in self.names:
             core = core * rise
         elif "electrons" in self.names:
             b0, electrons = b0 / rise, electrons * rise
-        return self.place({**known, "b0": b0, "l": l, "core": core, "electrons": electrons})
+        return self.place({**lobe_values, "b0": b0, "l": l, "core": core, "electrons": electrons})

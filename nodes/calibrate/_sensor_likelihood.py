@@ -65,13 +65,15 @@ def sufficient(levels: Levels, *, share: Share | None = None) -> Sufficient:
     moments = torch.stack(
         [levels.pixels, levels.mean, levels.variance, levels.degrees_of_freedom], 1
     )
-    kept = torch.ones(len(levels.cell_level), dtype=torch.bool)
+    outer = torch.ones(len(levels.cell_level), dtype=torch.bool)
     for level in sorted(set(levels.cell_level.tolist())):
-        at = levels.cell_level == level
+        cells_of_level = levels.cell_level == level
         sd = math.sqrt(float(levels.variance[level]))
-        inner, moments[level] = _inner(levels.cell_value[at], levels.cell_count[at], sd)
-        kept[at] = ~inner
-    cells = (x[kept] for x in (levels.cell_level, levels.cell_value, levels.cell_count))
+        inner, moments[level] = _inner(
+            levels.cell_value[cells_of_level], levels.cell_count[cells_of_level], sd
+        )
+        outer[cells_of_level] = ~inner
+    cells = (x[outer] for x in (levels.cell_level, levels.cell_value, levels.cell_count))
     return Sufficient(levels.photons, levels.exposure, *moments.T.contiguous(), *cells)
 
 
@@ -102,28 +104,33 @@ def _(levels: Levels, *, share: float | None = None) -> Sufficient:
     ).tolist()
     left = []
     for level in range(len(rows)):
-        own = [(v, n) for at, v, n in cells if at == level]
-        if not own:
-            continue
-        low, high = own[0][0] + _EDGE, own[-1][0] - _EDGE
-        inside = [(v, n) for v, n in own if low < v < high and rows[level][2] ** 0.5 >= _COARSE]
-        count: float = math.fsum(n for _, n in inside)
-        middle: float = math.fsum(v * n for v, n in inside) / count if count else 0.0
-        square = math.fsum((v - middle) ** 2 * n for v, n in inside)
-        if count < 2 or square < _COARSE**2 * (count - 1):
-            inside, count, middle, square = [], 0.0, 0.0, 0.0
-        rows[level] = [
-            count,
-            middle,
-            square / (count - 1) if count else 0.0,
-            count - 1 if count else 0.0,
-        ]
-        left += [(level, v, n) for v, n in own if (v, n) not in inside]
+        own = [(v, n) for cell_level, v, n in cells if cell_level == level]
+        if own:
+            rows[level], inside = _reference_inner(own, rows[level][2])
+            left += [(level, v, n) for v, n in own if (v, n) not in inside]
     cell = torch.tensor(left, dtype=torch.float64).reshape(-1, 3).unbind(1)
     numbers, mean, variance, freedom = torch.tensor(rows, dtype=torch.float64).unbind(1)
     return Sufficient(
         levels.photons, levels.exposure, numbers, mean, variance, freedom, cell[0].long(), *cell[1:]
     )
+
+
+def _reference_inner(
+    own: list[tuple[float, float]], variance: float
+) -> tuple[list[float], list[tuple[float, float]]]:
+    """Return number, mean, variance and degrees of freedom of the middle of a histogram of numbers
+    and counts, and this middle; zeros and nothing if the middle is too narrow.
+    """
+    low, high = own[0][0] + _EDGE, own[-1][0] - _EDGE
+    inside = [(v, n) for v, n in own if low < v < high and variance**0.5 >= _COARSE]
+    count = math.fsum(n for _, n in inside)
+    if count < 2:
+        return [0.0, 0.0, 0.0, 0.0], []
+    mean = math.fsum(v * n for v, n in inside) / count
+    square = math.fsum((v - mean) ** 2 * n for v, n in inside)
+    if square < _COARSE**2 * (count - 1):
+        return [0.0, 0.0, 0.0, 0.0], []
+    return [count, mean, square / (count - 1), count - 1], inside
 
 
 def _below(levels: Levels, share: float) -> Levels:
@@ -135,11 +142,11 @@ def _below(levels: Levels, share: float) -> Levels:
         )
     dark = float(levels.mean[~lit].min()) if bool((~lit).any()) else 0.0
     full = float(levels.mean[lit][levels.variance[lit].argmax()]) - dark
-    kept = ~lit | (levels.mean - dark <= share * full)
-    number, cells = kept.cumsum(0) - 1, kept[levels.cell_level]
-    each = [x[kept] for x in levels[:6]]
+    used_levels = ~lit | (levels.mean - dark <= share * full)
+    number, cells = used_levels.cumsum(0) - 1, used_levels[levels.cell_level]
+    columns = [x[used_levels] for x in levels[:6]]
     counts = (number[levels.cell_level[cells]], levels.cell_value[cells], levels.cell_count[cells])
-    return Levels._make([*each, *counts])
+    return Levels._make([*columns, *counts])
 
 
 def _inner(value: Tensor, count: Tensor, sd: float) -> tuple[Tensor, Tensor]:
@@ -295,12 +302,12 @@ class _Expected(NamedTuple):
 
 
 def likelihood(
-    levels: Sufficient, sensor: Sensor, rounding: Rounding, bits: int, told: bool
+    levels: Sufficient, sensor: Sensor, rounding: Rounding, bits: int, with_details: bool
 ) -> Likelihood:
     """Compute the likelihood of light levels from means, variances, and exact probabilities of
     histogram bins.
 
-    Without ``told`` only the logarithm is computed, because a sampler needs no other field.
+    Without ``with_details`` only the logarithm is computed, because a sampler needs no other field.
     """
     signal, (shift, spread), top = _expected(levels, sensor), ROUNDED[rounding], 2**bits - 1
     mean, variance = signal.mean + shift, signal.variance + spread
@@ -316,9 +323,8 @@ def likelihood(
     total = (log + below.where(~counted, 0.0)).where(measured, 0.0).sum(-1) + (
         levels.cell_count * cells
     ).sum(-1)
-    if not told:
-        none = torch.zeros(0, dtype=torch.float64)
-        return Likelihood(total, none, none, none, none, none)
+    if not with_details:
+        return without_details(total)
     ratio = levels.variance.where(measured, 1.0) / variance
     deviance, freedom = _deviance(
         levels,
@@ -342,14 +348,19 @@ def _cut_off(levels: Sufficient, signal: _Expected, sensor: Sensor, top: int) ->
     return clips
 
 
+def without_details(total: Tensor) -> Likelihood:
+    """Return a log likelihood whose other fields are empty."""
+    return Likelihood(total, *(torch.zeros(0, dtype=torch.float64) for _ in Likelihood._fields[1:]))
+
+
 def _scaled(levels: Sufficient, mean: Tensor, variance: Tensor) -> Tensor:
     """Return expected mean and log variance of each light level, in standard deviations of the
     measured values.
     """
-    known = levels.variance.where(levels.pixels > 0, 1.0)
+    measured = levels.variance.where(levels.pixels > 0, 1.0)
     return torch.cat(
         [
-            (levels.pixels / known).sqrt() * mean,
+            (levels.pixels / measured).sqrt() * mean,
             ((levels.degrees_of_freedom + 1) / 2).sqrt() * variance.log(),
         ],
         -1,
@@ -379,12 +390,15 @@ def _log_cells(
     levels: Sufficient, signal: _Expected, sensor: Sensor, rounding: Rounding, top: int
 ) -> Tensor:
     """Return the logarithm of the probability of each histogram bin (..., bin)."""
-    at = levels.cell_level
-    mean, variance = signal.mean.index_select(-1, at), signal.variance.index_select(-1, at)
+    cell_level = levels.cell_level
+    mean, variance = (
+        signal.mean.index_select(-1, cell_level),
+        signal.variance.index_select(-1, cell_level),
+    )
     continuous = log_cell(levels.cell_value, mean, variance.sqrt(), sensor.well, rounding, top)
-    coarse = (levels.pixels == 0)[at]
+    coarse = (levels.pixels == 0)[cell_level]
     electrons = (
-        mean - sensor.offset if sensor.counted else sensor.dark * levels.exposure[at]
+        mean - sensor.offset if sensor.counted else sensor.dark * levels.exposure[cell_level]
     ) / sensor.gain
     few = coarse & (electrons <= _FEW) & (sensor.gain.square() * electrons > _GRAIN * variance)
     if not bool(few.any()):
@@ -407,14 +421,18 @@ def _counted_out(
     """Return log probabilities of histogram bins, summed over Poisson-distributed numbers of
     electrons.
     """
-    at = levels.cell_level
+    cell_level = levels.cell_level
     count = torch.arange(_MOST + 1, dtype=torch.float64).view(-1, *(1 for _ in electrons.shape))
     expected = electrons.clamp_min(1e-300)
     weight = count * expected.log() - expected - torch.lgamma(count + 1)
-    mean = signal.mean[..., at] + sensor.gain * (count - electrons)
-    rest = (signal.variance[..., at] - sensor.gain.square() * electrons).clamp_min(0.0) + 1e-300
-    each = log_cell(levels.cell_value, mean, rest.sqrt(), sensor.well, rounding, top)
-    return torch.logsumexp(weight + each, 0)
+    mean = signal.mean[..., cell_level] + sensor.gain * (count - electrons)
+    other_variance = (
+        signal.variance[..., cell_level] - sensor.gain.square() * electrons
+    ).clamp_min(0.0) + 1e-300
+    log_probability = log_cell(
+        levels.cell_value, mean, other_variance.sqrt(), sensor.well, rounding, top
+    )
+    return torch.logsumexp(weight + log_probability, 0)
 
 
 def _deviance(
@@ -423,17 +441,17 @@ def _deviance(
     """Return deviance and degrees of freedom of each light level; both are 0 for a partly
     clipped level.
     """
-    whole = levels.pixels == 0
+    by_cells = levels.pixels == 0
     count, total = levels.cell_count, _pixels(levels)[levels.cell_level]
-    each = 2.0 * count * ((count / total).log() - cells)
+    of_cell = 2.0 * count * ((count / total).log() - cells)
     summed = torch.zeros_like(moments).index_add(
-        -1, levels.cell_level, each.expand(*moments.shape[:-1], -1)
+        -1, levels.cell_level, of_cell.expand(*moments.shape[:-1], -1)
     )
     distinct = torch.zeros_like(levels.pixels).index_add(
         0, levels.cell_level, torch.ones_like(count)
     )
-    freedom = torch.where(measured, 2.0, torch.where(whole, (distinct - 1).clamp_min(0.0), 0.0))
-    deviance = torch.where(measured, moments, torch.where(whole, summed, 0.0))
+    freedom = torch.where(measured, 2.0, torch.where(by_cells, (distinct - 1).clamp_min(0.0), 0.0))
+    deviance = torch.where(measured, moments, torch.where(by_cells, summed, 0.0))
     return torch.where(freedom > 0, deviance, 0.0), freedom
 
 
@@ -492,18 +510,18 @@ def density(
     columns = [torch.as_tensor(x, dtype=torch.float64)[..., None] for x in parameters]
     alike = torch.broadcast_tensors(*columns)  # type: ignore[no-untyped-call]
     k, efficiency, bias, read, dark, well, shift, c2 = alike
-    kept = shift + (mean == "additive")
+    mean_factor = shift + (mean == "additive")
     variance = c2.square() * (efficiency if drawn_in == "electrons" else efficiency.square())
-    whole = arrivals == "poisson" and (mean, drawn_in) == ("additive", "electrons")
+    poisson = arrivals == "poisson" and (mean, drawn_in) == ("additive", "electrons")
     sensor = Sensor(
         gain=k,
-        response=k * efficiency * kept,
+        response=k * efficiency * mean_factor,
         noise=k.square() * variance,
         offset=k * bias,
         read=k * read,
         dark=k * dark / dark_exposure,
         well=k * well,
-        counted=whole and bool(((c2 == 1) & (shift == 0)).all()),
+        counted=poisson and bool(((c2 == 1) & (shift == 0)).all()),
     )
     return likelihood(levels, sensor, rounding, bits, told)
 

@@ -52,22 +52,25 @@ def camera_sources(levels: Levels, params: Mapping[str, Any]) -> dict[str, Tenso
     Error:  exact for the model of `camera`.
     Source: the variance of a mean and of a log variance in `camera`, term by term.
     """
-    seen, top, _ = _used(levels, params["share"])
-    used = without_histograms(levels, seen)
+    fitted, top, _ = _used(levels, params["share"])
+    fitted_levels = without_histograms(levels, fitted)
     camera = _Camera(
         *(torch.as_tensor(params[name], dtype=torch.float64) for name in CAMERA_PARAMETERS)
     )
-    signal = _signal(used.mean - camera.signal, top, camera)
-    light = camera.lamp * camera.efficiency * used.photons * signal.slope
-    chance, drift = used.variance / used.pixels, camera.drift.square() * torch.ones_like(light)
+    signal = _signal(fitted_levels.mean - camera.signal, top, camera)
+    light = camera.lamp * camera.efficiency * fitted_levels.photons * signal.slope
+    chance, drift = (
+        fitted_levels.variance / fitted_levels.pixels,
+        camera.drift.square() * torch.ones_like(light),
+    )
     means = {STATISTICS: chance, LAMP: light.square(), DRIFT: drift}
     variances = {
-        STATISTICS: 2.0 / used.degrees_of_freedom,
+        STATISTICS: 2.0 / fitted_levels.degrees_of_freedom,
         SCATTER: camera.scatter.square() * torch.ones_like(light),
     }
-    parts = [_shares(each) for each in (variances, means)]
+    parts = [_shares(squares) for squares in (variances, means)]
     none = torch.zeros_like(light)
-    rows = {source: [part.get(source, none) for part in parts] for source in SOURCES}
+    rows = {source: [shares.get(source, none) for shares in parts] for source in SOURCES}
     return {source: torch.cat([a, a, b, b]) for source, (a, b) in rows.items()}
 
 
@@ -81,16 +84,16 @@ def source_freedom(
     Units:  none.
     Source: JCGM 100:2008 (GUM), section 4.2.6 and G.3.3.
     """
-    seen, _, _ = _used(levels, params["share"])
-    lit = int((levels.photons[seen] > 0).sum())
+    fitted, _, _ = _used(levels, params["share"])
+    lit = int((levels.photons[fitted] > 0).sum())
     response = [name in free for name in ("quantum_efficiency", "bend", "twist")]
     dark = [name in free for name in ("dark_signal", "dark_current")]
     noise = [name in free for name in ("gain", "temporal_dark_noise")]
     return {
-        STATISTICS: float(levels.degrees_of_freedom[seen].sum()),
+        STATISTICS: float(levels.degrees_of_freedom[fitted].sum()),
         LAMP: float(max(1, lit - sum(response))),
-        DRIFT: float(max(1, len(seen) - lit - sum(dark))),
-        SCATTER: float(max(1, len(seen) - sum(noise))),
+        DRIFT: float(max(1, len(fitted) - lit - sum(dark))),
+        SCATTER: float(max(1, len(fitted) - sum(noise))),
     }
 
 
@@ -117,12 +120,12 @@ def variance_shares(
     parts = {name: float((share * response.square()).sum()) for name, share in sources.items()}
     parts["prior"] = float(gradient @ gradient)
     total = math.fsum(parts.values())
-    return {name: part / total for name, part in parts.items()}
+    return {name: variance / total for name, variance in parts.items()}
 
 
 def _shares(parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
     total = torch.stack(list(parts.values())).sum(0)
-    return {name: part / total for name, part in parts.items()}
+    return {name: variance / total for name, variance in parts.items()}
 
 
 # --- sheet budget ---------------------------------------------------------------------------------
@@ -173,12 +176,12 @@ class _Propagation:
 
     levels: Levels
     sheet: EmvaSheet
-    told: bool  #: True if the photons are known
+    photons_told: bool  #: True if the photons are known
 
     def values(self, levels: Levels) -> Values:
         """Return the quantities of levels that have a value, without those of series of frames."""
-        found = emva_sheet(levels, None, photons_told=self.told).quantities
-        return {q.key: q.value for q in found if q.value is not None}
+        quantities = emva_sheet(levels, None, photons_told=self.photons_told).quantities
+        return {q.key: q.value for q in quantities if q.value is not None}
 
     @cached_property
     def statistics(self) -> dict[str, list[Contribution]]:
@@ -224,11 +227,11 @@ class _Propagation:
         """Return the quantities with lines that are fitted up to 35 % of saturation only."""
         levels, transfer = self.levels, self.sheet.transfer
         full = float(transfer.signal[transfer.saturation])
-        least = float(transfer.mean_dark.min())
-        above = levels.mean - least
-        kept = (levels.photons == 0) | (above <= _HALF * full) | (above > SENSITIVITY * full)
+        darkest = float(transfer.mean_dark.min())
+        above = levels.mean - darkest
+        used_levels = (levels.photons == 0) | (above <= _HALF * full) | (above > SENSITIVITY * full)
         try:
-            return self.values(without_histograms(levels, kept))
+            return self.values(without_histograms(levels, used_levels))
         except ValueError:
             return {}
 
@@ -237,16 +240,16 @@ class _Propagation:
         """Return the relative scatter of the light from level to level beyond chance, and its
         degrees of freedom.
         """
-        transfer, found = self.sheet.transfer, self.sheet.linearity
-        if found is None:
+        transfer, line = self.sheet.transfer, self.sheet.linearity
+        if line is None:
             return math.nan, math.nan
-        used = transfer.linear
+        linear_levels = transfer.linear
         order = _lit_order(self.levels)
-        chance = (self.levels.variance / self.levels.pixels).numpy()[order][used] / transfer.signal[
-            used
-        ] ** 2
-        freedom = len(found.deviation) - 2
-        square = float(((found.deviation / 100) ** 2).sum()) / freedom - float(chance.mean())
+        chance = (self.levels.variance / self.levels.pixels).numpy()[order][
+            linear_levels
+        ] / transfer.signal[linear_levels] ** 2
+        freedom = len(line.deviation) - 2
+        square = float(((line.deviation / 100) ** 2).sum()) / freedom - float(chance.mean())
         return math.sqrt(max(square, 0.0)), float(freedom)
 
     @cached_property
@@ -260,8 +263,8 @@ class _Propagation:
         around = photons[[max(0, top - 1), min(len(photons) - 1, top + 1)]]
         return float(np.abs(around - photons[top]).max() / photons[top] / math.sqrt(3))
 
-    def _slopes(self, at: Callable[[float], Levels], step: float) -> Values:
-        high, low = self.values(at(step)), self.values(at(-step))
+    def _slopes(self, levels_at: Callable[[float], Levels], step: float) -> Values:
+        high, low = self.values(levels_at(step)), self.values(levels_at(-step))
         return {key: (high[key] - low[key]) / (2 * step) for key in high.keys() & low.keys()}
 
     def _moved(self, name: str, i: int) -> Callable[[float], Levels]:
@@ -311,11 +314,11 @@ def sheet_budgets(
     moves = _Propagation(plain, sheet, photons_told)
     stated = [q for q in sheet.quantities if q.value is not None and not q.bound]
     gain = sheet["K"]
-    found = {}
+    of_measurement = {}
     for q in stated:
         own = list(_spatial(q, sheet, moves) if _is_spatial(q) else _of_levels(q, moves))
-        found[q.key] = own
-    return [_budget(q, found[q.key], moves, laboratory, gain) for q in stated]
+        of_measurement[q.key] = own
+    return [_budget(q, of_measurement[q.key], moves, laboratory, gain) for q in stated]
 
 
 def _budget(
@@ -330,8 +333,8 @@ def _budget(
     key = q.key if q.key in laboratory.coefficients else name
     photons = moves.photons.get(q.key, 0.0)
     photons = photons if abs(photons) > _NOTHING * abs(q.value) else 0.0
-    more = laboratory_contributions(key, sign * q.value, photons, laboratory)
-    return Budget(q.key, q.name, q.symbol, q.unit, q.value, (*own, *more))
+    of_laboratory = laboratory_contributions(key, sign * q.value, photons, laboratory)
+    return Budget(q.key, q.name, q.symbol, q.unit, q.value, (*own, *of_laboratory))
 
 
 def _of_levels(q: Quantity, moves: _Propagation) -> Iterator[Contribution]:
@@ -372,27 +375,27 @@ def _is_spatial(q: Quantity) -> bool:
     return q.key.startswith(("DSNU1288", "PRNU1288"))
 
 
+def _chance_of_pattern(q: Quantity, sheet: EmvaSheet) -> float:
+    """Return the standard error of the square of a quantity of series of frames, by chance."""
+    lit, dark = sheet.spatial.lit, sheet.spatial.dark
+    pattern = q.key.removesuffix("_DN").partition("_")[2]
+    index = ("", "row", "column", "pixel").index(pattern)
+    of_response = q.key.startswith("PRNU")
+    series = (dark, lit) if of_response else (dark,)
+    error = math.hypot(*(chance_of_variances(frames)[index] for frames in series if frames))
+    if of_response and lit is not None and dark is not None:
+        return error * (100 / float(lit.average.mean() - dark.average.mean())) ** 2
+    return error
+
+
 def _spatial(q: Quantity, sheet: EmvaSheet, moves: _Propagation) -> Iterator[Contribution]:
     """Yield the contributions of a quantity of series of frames; one in electrons has those of
     the gain too.
     """
     assert q.value is not None
-    lit, dark, part = (
-        sheet.spatial.lit,
-        sheet.spatial.dark,
-        q.key.removesuffix("_DN").partition("_")[2],
-    )
-    at = ("", "row", "column", "pixel").index(part)
-    errors = [
-        chance_of_variances(each)[at]
-        for each in ((dark, lit) if q.key.startswith("PRNU") else (dark,))
-        if each
-    ]
-    scale = 1.0
-    if q.key.startswith("PRNU") and lit is not None and dark is not None:
-        scale = (100 / float(lit.average.mean() - dark.average.mean())) ** 2
     gain = sheet["K"].value if q.unit == "e-" else None
-    own = math.hypot(*errors) * scale / (2 * q.value) / (gain or 1.0) ** 2
+    own = _chance_of_pattern(q, sheet) / (2 * q.value) / (gain or 1.0) ** 2
+    dark = sheet.spatial.dark
     pixels = float(dark.total.size if dark else 1) - 1
     if not gain:
         yield Contribution(STATISTICS, "A", "normal", own, q.unit, 1.0, pixels)

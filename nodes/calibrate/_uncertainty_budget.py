@@ -87,10 +87,10 @@ def welch_satterthwaite(contributions: Iterable[Contribution]) -> float:
     Units:  those of the quantity.
     Source: JCGM 100:2008 (GUM), equation G.2b.
     """
-    found = [(c.share, c.freedom) for c in contributions if c.share]
-    total = math.hypot(*(share for share, _ in found), 0.0)
-    rest = math.fsum((share / total) ** 4 / freedom for share, freedom in found)
-    return 1.0 / rest if rest > 0 else math.inf
+    shares = [(c.share, c.freedom) for c in contributions if c.share]
+    total = math.hypot(*(share for share, _ in shares), 0.0)
+    quotient = math.fsum((share / total) ** 4 / freedom for share, freedom in shares)
+    return 1.0 / quotient if quotient > 0 else math.inf
 
 
 def coverage_factor(freedom: float, probability: float = COVERAGE) -> float:
@@ -102,8 +102,12 @@ def coverage_factor(freedom: float, probability: float = COVERAGE) -> float:
     """
     from scipy.stats import norm, t
 
-    at = (1 + probability) / 2
-    return float(t.ppf(at, max(1, math.floor(freedom))) if math.isfinite(freedom) else norm.ppf(at))
+    quantile = (1 + probability) / 2
+    return float(
+        t.ppf(quantile, max(1, math.floor(freedom)))
+        if math.isfinite(freedom)
+        else norm.ppf(quantile)
+    )
 
 
 def _shares(contributions: Iterable[Contribution]) -> list[float]:

@@ -342,7 +342,9 @@ def height_error(
     if rms == 0:
         return deeper
     rows, columns = factors(grid, scale, rng, height.device)
-    bumps = torch.cat([(rms * (rows[part] @ columns)).to(height.dtype) for part in stripes(grid)])
+    bumps = torch.cat(
+        [(rms * (rows[stripe] @ columns)).to(height.dtype) for stripe in stripes(grid)]
+    )
     return deeper + bumps
 
 

@@ -89,36 +89,36 @@ def glass_index(glass: Path | Sellmeier, wavelengths: Tensor) -> Tensor:
         raise ValueError(
             f"the index of {_name(glass)} is known from {extent}, not at {outside}; {fix}"
         )
-    known = _from_file(glass) if isinstance(glass, Path) else glass
+    index_data = _from_file(glass) if isinstance(glass, Path) else glass
     return (
-        _interpolated(known, wavelengths)
-        if isinstance(known, Table)
-        else _formula(known, wavelengths)
+        _interpolated(index_data, wavelengths)
+        if isinstance(index_data, Table)
+        else _formula(index_data, wavelengths)
     )
 
 
 def glass_range(glass: Path | Sellmeier) -> tuple[float, float]:
     """Return the wavelengths in m between which the index of a glass is known."""
-    known = _from_file(glass) if isinstance(glass, Path) else glass
-    if isinstance(known, Table):
-        return float(known.wavelengths[0]), float(known.wavelengths[-1])
-    return known["range"]
+    index_data = _from_file(glass) if isinstance(glass, Path) else glass
+    if isinstance(index_data, Table):
+        return float(index_data.wavelengths[0]), float(index_data.wavelengths[-1])
+    return index_data["range"]
 
 
 def index_rows(file: Path) -> tuple[Tensor, Tensor] | None:
     """Return the wavelengths in m and the indices in the rows of a file, or None for a file of
     coefficients.
     """
-    known = _from_file(file)
-    return (known.wavelengths, known.values[0]) if isinstance(known, Table) else None
+    index_data = _from_file(file)
+    return (index_data.wavelengths, index_data.values[0]) if isinstance(index_data, Table) else None
 
 
 def refuse_glass(glass: Path | Sellmeier) -> None:
     """Raise ParameterError for a glass without a plausible index anywhere in its range."""
     try:
-        known = _from_file(glass) if isinstance(glass, Path) else glass
-        if not isinstance(known, Table):
-            _refuse_coefficients(known, _name(glass))
+        index_data = _from_file(glass) if isinstance(glass, Path) else glass
+        if not isinstance(index_data, Table):
+            _refuse_coefficients(index_data, _name(glass))
     except (OSError, ValueError) as error:
         if isinstance(glass, Path):
             raise refused("material", _COLUMNS, error) from None
@@ -164,12 +164,12 @@ def _interpolated(table: Table, wavelengths: Tensor) -> Tensor:
     if there are fewer.
     """
     count = min(4, len(table.wavelengths))
-    at, values = table.wavelengths.to(wavelengths), table.values[0].to(wavelengths)
+    table_wavelengths, values = table.wavelengths.to(wavelengths), table.values[0].to(wavelengths)
     flat = wavelengths.reshape(-1)
-    right = torch.searchsorted(at, flat.detach())
-    first = (right - count // 2).clamp(0, len(at) - count)
+    right = torch.searchsorted(table_wavelengths, flat.detach())
+    first = (right - count // 2).clamp(0, len(table_wavelengths) - count)
     rows = first[:, None] + torch.arange(count, device=flat.device)
-    x, y = at[rows], values[rows]
+    x, y = table_wavelengths[rows], values[rows]
     apart = x[:, :, None] - x[:, None, :]
     own = torch.eye(count, dtype=torch.bool, device=flat.device)
     ratios = (flat[:, None, None] - x[:, None, :]) / apart.masked_fill(own, 1.0)
@@ -183,40 +183,40 @@ def _from_file(file: Path) -> Table | Sellmeier:
     rows = table_rows(file)
     if rows.columns[0].quantity.upper() == "B":
         return _coefficients(file, rows)
-    found = curves(file, ("1",))
-    if len(found.values) != 1:
-        raise ValueError(f"{file.name} has {len(found.values) + 1} columns in place of 2")
-    low = (found.values <= _FROM_AIR) | (found.values >= _LARGEST)
-    found.refuse(
+    index_curve = curves(file, ("1",))
+    if len(index_curve.values) != 1:
+        raise ValueError(f"{file.name} has {len(index_curve.values) + 1} columns in place of 2")
+    low = (index_curve.values <= _FROM_AIR) | (index_curve.values >= _LARGEST)
+    index_curve.refuse(
         low,
         lambda n: (
             f"{n:g} is no refractive index: write n, between 1 and {_LARGEST:g}, and not n - 1"
         ),
     )
-    _refuse_gap(found)
-    return found.table()
+    _refuse_gap(index_curve)
+    return index_curve.table()
 
 
-def _refuse_gap(found: Curves) -> None:
+def _refuse_gap(index_curve: Curves) -> None:
     """Raise ValueError for a gap between two rows in which the cubic leaves the straight line by
     more than half a step.
 
     The step is the largest of the gap and its neighbours. A few rows close together decide the
     slope in a wide gap.
     """
-    table = found.table()
-    at, values = table.wavelengths, table.values[0]
-    middle = (at[1:] + at[:-1]) / 2
+    table = index_curve.table()
+    wavelengths, values = table.wavelengths, table.values[0]
+    middle = (wavelengths[1:] + wavelengths[:-1]) / 2
     off = (_interpolated(table, middle) - (values[1:] + values[:-1]) / 2).abs()
     steps = torch.nn.functional.pad(values.diff().abs(), (1, 1))
     wrong = (off > 1e-5 + torch.stack([steps[:-2], steps[1:-1], steps[2:]]).amax(0) / 2).nonzero()
     if len(wrong):
         row = int(wrong[0])
-        ends = f"{float(at[row]) * 1e9:g} and {float(at[row + 1]) * 1e9:g} nm"
+        ends = f"{float(wavelengths[row]) * 1e9:g} and {float(wavelengths[row + 1]) * 1e9:g} nm"
         fix = "give rows there, in steps as small as beside the gap"
         raise ValueError(
-            f"{found.file.name}:{found.lines[row + 1]}: the rows do not tell the index between"
-            f" {ends}: {fix}"
+            f"{index_curve.file.name}:{index_curve.lines[row + 1]}: the rows do not tell the"
+            f" index between {ends}: {fix}"
         )
 
 

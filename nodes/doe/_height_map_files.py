@@ -121,20 +121,20 @@ def _array(file: Path, suffix: str) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(_native(values)))
 
 
-def _stated(file: Path, found: dict[str, Any]) -> dict[str, float]:
+def _stated(file: Path, header: dict[str, Any]) -> dict[str, float]:
     """Return the lengths, in m, that the header of a file states as texts with a unit."""
     lengths = {}
     for word in _WORDS:
-        if word in found:
+        if word in header:
             try:
-                lengths[word] = read_quantity(found[word], "m")
+                lengths[word] = read_quantity(header[word], "m")
             except ValueError as error:
                 raise ParameterError(
-                    "file", f"{file.name}: {word} = {found[word]} in the header {error}"
+                    "file", f"{file.name}: {word} = {header[word]} in the header {error}"
                 ) from None
             if lengths[word] <= 0:
                 raise ParameterError(
-                    "file", f"{file.name}: {word} = {found[word]} in the header must be above 0"
+                    "file", f"{file.name}: {word} = {header[word]} in the header must be above 0"
                 )
     return lengths
 
@@ -224,9 +224,9 @@ def _levels(file: Path) -> "Image":
 def _name(file: Path, names: list[str]) -> str:
     if "height" in names or len(names) == 1:
         return "height" if "height" in names else names[0]
-    found = ", ".join(sorted(names)) or "nothing"
+    tensors = ", ".join(sorted(names)) or "nothing"
     raise ParameterError(
-        "file", f"{file.name} holds {found}: name the tensor of the height map 'height'"
+        "file", f"{file.name} holds {tensors}: name the tensor of the height map 'height'"
     )
 
 

@@ -19,13 +19,14 @@ def resampled(height: Tensor, pitch: float, grid: PupilGrid, between: Between = 
     The centre of the height map lies on the axis. Beyond the last samples, within half a pitch,
     their heights continue.
     """
-    at = [_positions(n, pitch, grid) for n in height.shape]
+    positions = [_positions(n, pitch, grid) for n in height.shape]
     if between == "nearest":
         rows, columns = (
-            x.add(0.5).floor().long().clamp(0, n - 1) for x, n in zip(at, height.shape, strict=True)
+            x.add(0.5).floor().long().clamp(0, n - 1)
+            for x, n in zip(positions, height.shape, strict=True)
         )
         return height[rows][:, columns].to(torch.float32)
-    return _interpolated(height, at, cubic=False).to(torch.float32)
+    return _interpolated(height, positions, cubic=False).to(torch.float32)
 
 
 def resampling_error(height: Tensor, pitch: float, grid: PupilGrid) -> float:
@@ -33,8 +34,10 @@ def resampling_error(height: Tensor, pitch: float, grid: PupilGrid) -> float:
 
     The estimate is the difference from cubic interpolation, whose error is of a higher order.
     """
-    at = [_positions(n, pitch, grid) for n in height.shape]
-    difference = _interpolated(height, at, cubic=True) - _interpolated(height, at, cubic=False)
+    positions = [_positions(n, pitch, grid) for n in height.shape]
+    difference = _interpolated(height, positions, cubic=True) - _interpolated(
+        height, positions, cubic=False
+    )
     return float(difference[inside(grid)].square().mean().sqrt())
 
 
@@ -71,10 +74,10 @@ def jump(height: Tensor, pitch: float, grid: PupilGrid) -> str:
         steps = clear.diff(dim=axis).abs().nan_to_num(0.0)
         if steps.numel() and float(steps.max()) > worst:
             worst = float(steps.max())
-            at = divmod(int(steps.argmax()), steps.shape[1])
+            worst_step = divmod(int(steps.argmax()), steps.shape[1])
             place = (
-                f"from {name} {at[axis]} to {at[axis] + 1}, at {('column', 'row')[axis]}"
-                f" {at[1 - axis]}"
+                f"from {name} {worst_step[axis]} to {worst_step[axis] + 1}, at"
+                f" {('column', 'row')[axis]} {worst_step[1 - axis]}"
             )
     if worst <= _JUMP * (high - low):
         return ""
@@ -89,24 +92,24 @@ def _positions(count: int, pitch: float, grid: PupilGrid) -> Tensor:
     return steps * (grid.pitch / pitch) + (count - 1) / 2
 
 
-def _interpolated(height: Tensor, at: list[Tensor], cubic: bool) -> Tensor:
-    rows, columns = (_weights(x, n, cubic) for x, n in zip(at, height.shape, strict=True))
+def _interpolated(height: Tensor, positions: list[Tensor], cubic: bool) -> Tensor:
+    rows, columns = (_weights(x, n, cubic) for x, n in zip(positions, height.shape, strict=True))
     return rows @ height.double() @ columns.T
 
 
-def _weights(at: Tensor, count: int, cubic: bool) -> Tensor:
+def _weights(position: Tensor, count: int, cubic: bool) -> Tensor:
     """Return the matrix (position, sample) of linear interpolation, or of the cubic through four
     samples.
     """
     points = min(4 if cubic else 2, count)
-    at = at.clamp(0, count - 1)
-    first = (at.floor().long() - (points - 2) // 2).clamp(0, count - points)
-    matrix = torch.zeros(len(at), count, dtype=torch.float64)
+    position = position.clamp(0, count - 1)
+    first = (position.floor().long() - (points - 2) // 2).clamp(0, count - points)
+    matrix = torch.zeros(len(position), count, dtype=torch.float64)
     for k in range(points):
         others = [j for j in range(points) if j != k]
-        parts = [(at - (first + j)) / (k - j) for j in others]
-        share = torch.stack(parts).prod(0) if parts else torch.ones_like(at)
-        matrix[torch.arange(len(at)), first + k] = share
+        parts = [(position - (first + j)) / (k - j) for j in others]
+        share = torch.stack(parts).prod(0) if parts else torch.ones_like(position)
+        matrix[torch.arange(len(position)), first + k] = share
     return matrix
 
 

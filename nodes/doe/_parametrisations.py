@@ -98,11 +98,11 @@ class Modes(nn.Module):
 
     def _polynomials_on(self, grid: PupilGrid) -> Tensor:
         v, u = axes(grid, self.waves.device)
-        each = [
+        polynomials = [
             combine({4 + k: 1.0}, v, u).expand(grid.samples, grid.samples)
             for k in range(len(self.waves))
         ]
-        return torch.stack(each).where(inside(grid, v.device), 0.0).to(torch.float32)
+        return torch.stack(polynomials).where(inside(grid, v.device), 0.0).to(torch.float32)
 
     def forward(self, stop: Stop) -> Tensor:
         """Return the height map (v, u) on the pupil grid of ``stop``."""
@@ -254,14 +254,14 @@ PARAMETRISATIONS: dict[str, Start] = {
 # any sampling.
 
 
-def legendre(at: Tensor, degree: int) -> list[Tensor]:
+def legendre(position: Tensor, degree: int) -> list[Tensor]:
     """Return the Legendre polynomials of degree 0 to ``degree``, with a root mean square of 1
     over [-1, 1].
     """
-    plain = [torch.ones_like(at), at]
+    plain = [torch.ones_like(position), position]
     for k in range(1, degree):
-        plain.append(((2 * k + 1) * at * plain[k] - k * plain[k - 1]) / (k + 1))
-    return [math.sqrt(2 * k + 1) * one for k, one in enumerate(plain[: degree + 1])]
+        plain.append(((2 * k + 1) * position * plain[k] - k * plain[k - 1]) / (k + 1))
+    return [math.sqrt(2 * k + 1) * polynomial for k, polynomial in enumerate(plain[: degree + 1])]
 
 
 class Polynomials(nn.Module):
@@ -288,7 +288,7 @@ class Polynomials(nn.Module):
                 yield i, total - i
 
     def _products_on(self, grid: PupilGrid) -> Tensor:
-        rows, columns = (legendre(one, self.degree) for one in axes(grid, self.waves.device))
+        rows, columns = (legendre(axis, self.degree) for axis in axes(grid, self.waves.device))
         return torch.stack([rows[i] * columns[j] for i, j in self._exponents()]).to(torch.float32)
 
     def forward(self, stop: Stop) -> Tensor:
@@ -323,8 +323,8 @@ class Streak(nn.Module):
         grid = grid_of(stop)
         v, u = axes(grid, self.waves.device)
         along = u * self.angle.cos() + v * self.angle.sin()
-        each = legendre(along, len(self.waves) + 1)[2:]
-        phase = torch.tensordot(2 * math.pi * self.waves.to(along), torch.stack(each), 1)
+        polynomials = legendre(along, len(self.waves) + 1)[2:]
+        phase = torch.tensordot(2 * math.pi * self.waves.to(along), torch.stack(polynomials), 1)
         return height_from_phase(phase, grid, self.wavelength, self.material)
 
 

@@ -97,8 +97,8 @@ def height_range(file: Path | None, depth: float | None) -> float:
     """
     if file is None:
         return _DEPTH if depth is None else depth
-    found: float = _lengths(file, depth, None, None)["depth"]
-    return found
+    depth_in_file: float = _lengths(file, depth, None, None)["depth"]
+    return depth_in_file
 
 
 def _lengths(
@@ -114,9 +114,10 @@ def _lengths(
         if value is None:
             continue
         if name in stated and abs(stated[name] / value - 1) > 1e-6:
-            here, there = (f"{x * 1e6:.6g} um" for x in (value, stated[name]))
+            here, stated_text = (f"{x * 1e6:.6g} um" for x in (value, stated[name]))
             raise ParameterError(
-                name, f"{here}, but the header of {file.name} says {there}: leave one of them out"
+                name,
+                f"{here}, but the header of {file.name} says {stated_text}: leave one of them out",
             )
         lengths[name] = value
     return lengths
@@ -248,11 +249,11 @@ def _wrong(file: Path, height: Tensor) -> str:
     finite = torch.isfinite(height)
     if not bool(finite.all()):
         row, column = (int(i) for i in (~finite).nonzero()[0])
-        found = (
+        bad_heights = (
             f"{int((~finite).sum())} heights are NaN or infinite, the first in row {row}, column"
             f" {column}"
         )
-        return f"{file.name}: {found}, but every height must be finite and at least 0"
+        return f"{file.name}: {bad_heights}, but every height must be finite and at least 0"
     low, high = (float(x) for x in torch.aminmax(height))
     if low < 0:
         return (

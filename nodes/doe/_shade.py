@@ -64,9 +64,9 @@ def _(
 ) -> list[str]:
     for centre in notches:
         if width >= centre:
-            found = f"{width * 1e9:.4g} nm about {centre * 1e9:.4g} nm"
+            notch = f"{width * 1e9:.4g} nm about {centre * 1e9:.4g} nm"
             raise ParameterError(
-                "width", f"a notch of {found} is wider than its centre: use a narrower notch"
+                "width", f"a notch of {notch} is wider than its centre: use a narrower notch"
             )
     return []
 
@@ -138,10 +138,10 @@ def transmittance(lsr: Tensor, bands: Bands, lines: list[Bands] | None) -> Tenso
             f"{len(lsr)} ratios and {len(bands.centres)} bands: compute the ratios from the same"
             " `bands`"
         )
-    found = lsr
+    ratios = lsr
     if lines:
         middles = torch.stack(
             [(line.centres * line.weights).sum() / line.weights.sum() for line in lines]
         )
-        found = lsr[(middles[:, None] - bands.centres).abs().argmin(-1).to(lsr.device)]
-    return found.amax().clamp(max=1.0)
+        ratios = lsr[(middles[:, None] - bands.centres).abs().argmin(-1).to(lsr.device)]
+    return ratios.amax().clamp(max=1.0)

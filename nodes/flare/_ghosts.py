@@ -80,15 +80,15 @@ def ghosts(
 def _draw(count: int, spread: float, radius: float, rng: torch.Generator) -> list[_Ghost]:
     draw = torch.rand(count, 5, generator=rng, device=rng.device, dtype=torch.float64).tolist()
     sizes = [math.exp(2 * row[2]) for row in draw]
-    found = []
+    drawn = []
     for (position, r, _, *coats), size in zip(draw, sizes, strict=True):
         first, second = (400e-9 + 300e-9 * coat for coat in coats)
         magnification, drawn_radius = (
             spread * (2 * position - 1),
             radius * (_SMALLEST + (1 - _SMALLEST) * r),
         )
-        found.append(_Ghost(magnification, drawn_radius, size / sum(sizes), (first, second)))
-    return found
+        drawn.append(_Ghost(magnification, drawn_radius, size / sum(sizes), (first, second)))
+    return drawn
 
 
 def _reflected(wavelengths: Tensor, tuned: float) -> Tensor:
@@ -108,8 +108,8 @@ def _colours(drawn: list[_Ghost], wavelengths: Tensor, flux: Tensor) -> list[Ten
     ]
     moved = torch.stack(raw).sum(0).mul(flux).sum() if raw else flux.sum()
     dark = moved <= 0  # false for NaN, so that NaN reaches the result
-    whole = torch.where(dark, 0.0, flux.sum() / moved.where(~dark, 1.0))
-    return [gain * whole for gain in raw]
+    scale = torch.where(dark, 0.0, flux.sum() / moved.where(~dark, 1.0))
+    return [gain * scale for gain in raw]
 
 
 def _in_pixels(radius: float, pixel_pitch: float) -> float:
@@ -127,11 +127,11 @@ def _add(total: Tensor, energy: Tensor, centre: tuple[float, float], radius: flo
     y, x = centre[0] + height // 2, centre[1] + width // 2
     rows, columns = _reach(y, radius), _reach(x, radius)
     disc = (radius + 0.5 - torch.hypot((rows - y)[:, None], (columns - x)[None, :])).clamp(0, 1)
-    seen = (disc / disc.sum())[_part(rows, height), _part(columns, width)].to(total)
-    if seen.numel():
+    inside = (disc / disc.sum())[_part(rows, height), _part(columns, width)].to(total)
+    if inside.numel():
         top, left = max(int(rows[0]), 0), max(int(columns[0]), 0)
-        total[:, top : top + seen.shape[0], left : left + seen.shape[1]] += (
-            energy[:, None, None] * seen
+        total[:, top : top + inside.shape[0], left : left + inside.shape[1]] += (
+            energy[:, None, None] * inside
         )
 
 
@@ -185,12 +185,13 @@ def _(
 
 @ghosts.check
 def _(result: Tensor, spot: Tensor, *_: Any, energy: float, **__: Any) -> list[Check]:
-    whole, moved = (float(x.sum(-1).sum(dtype=torch.float64)) for x in (spot, result))
-    seen = moved / whole if whole > 0 else 0.0
-    bounded = seen <= energy * (1 + 1e-3)
+    spot_energy, moved = (float(x.sum(-1).sum(dtype=torch.float64)) for x in (spot, result))
+    ghost_share = moved / spot_energy if spot_energy > 0 else 0.0
+    bounded = ghost_share <= energy * (1 + 1e-3)
     return [
         Check(
-            f"ghosts in the window have {seen:.3g} of the spot's energy; {energy:.3g} is reflected",
+            f"ghosts in the window have {ghost_share:.3g} of the spot's energy; {energy:.3g} is"
+            " reflected",
             bounded,
         )
     ]

@@ -233,7 +233,7 @@ def _(
     times its mean; a source of ``strength`` saturations, whose own picture is cut off, lacks a veil
     of ``strength`` times the pixel on the axis.
     """
-    if not any(each["b0"] for each in surfaces.values()):
+    if not any(surface["b0"] for surface in surfaces.values()):
         return 0.0
     if strength is None or params.get("scaling", "none") != "none" or not psf.max > 0:
         return math.inf
@@ -252,10 +252,10 @@ def _(
     result: Psf, psf: Psf, pupil: Pupil, *others: Any, surfaces: Mapping[str, Any], **params: Any
 ) -> list[Check]:
     names = ("focal_length", "pixel_pitch", "diameter", "wavelength", "scaling")
-    found = stray_shares(
+    light_shares = stray_shares(
         result, psf, pupil, surfaces=surfaces, **{n: params[n] for n in names if n in params}
     )
-    core, inside, outside = (float(x.detach().mean()) for x in found)
+    core, inside, outside = (float(x.detach().mean()) for x in light_shares)
     text = (
         f"light not scattered {core:.2%}, stray light inside the window {inside:.3%} and outside"
         f" {outside:.3%}"
@@ -267,14 +267,14 @@ def _lobes(lens: _Lens, colour: float) -> list[tuple[Tensor, Lobe, Tensor]]:
     """Return for each surface the light that reaches it, its lobe on the sensor, and its TIS, at
     one wavelength.
     """
-    found, left = [], torch.ones((), dtype=torch.float64)
+    scatterers, left = [], torch.ones((), dtype=torch.float64)
     for name, (b0, l, s, radius) in _scaled(lens, colour):  # noqa: E741
         scale = lens.diameter / (2 * lens.focal_length) * lens.pixel_pitch / radius
         light, share = lobe(b0, l, s, scale), scattered_share(b0, l, s)
         _refuse(name, colour, float(share.detach()), float(light.end.detach()), lens)
-        found.append((left, light, share))
+        scatterers.append((left, light, share))
         left = left * (1 - share)
-    return found
+    return scatterers
 
 
 def _scaled(lens: _Lens, colour: float) -> Iterator[tuple[str, tuple[Tensor, ...]]]:
@@ -282,9 +282,9 @@ def _scaled(lens: _Lens, colour: float) -> Iterator[tuple[str, tuple[Tensor, ...
     scalars.
     """
     ratio = lens.wavelength / colour if lens.scaling == "roughness" else 1.0
-    for name, each in lens.surfaces.items():
-        beam = lens.diameter / 2 if each.get("radius") is None else each["radius"]
-        numbers = (each["b0"], each["l"], each["s"], beam)
+    for name, surface in lens.surfaces.items():
+        beam = lens.diameter / 2 if surface.get("radius") is None else surface["radius"]
+        numbers = (surface["b0"], surface["l"], surface["s"], beam)
         b0, l, s, radius = (torch.as_tensor(x, dtype=torch.float64) for x in numbers)  # noqa: E741
         yield name, (b0 * ratio**4, l / ratio, s, radius)
 
@@ -355,8 +355,8 @@ def veil_at(
     """
     lobes = _lobes(_Lens(surfaces, focal_length, pixel_pitch, diameter, 1.0, "none"), 1.0)
     window = _veil(lobes, (float(NEAR), float(NEAR)), (2 * NEAR + 1, 2 * NEAR + 1)).flatten()
-    at = torch.arange(-NEAR, NEAR + 1, dtype=torch.float64)
-    places = (at[:, None].square() + at.square()).flatten()
+    offset = torch.arange(-NEAR, NEAR + 1, dtype=torch.float64)
+    places = (offset[:, None].square() + offset.square()).flatten()
     square = radius.double().square()
     distances, which = torch.unique(places, return_inverse=True)
     near = torch.zeros_like(distances).scatter_reduce_(0, which, window, "mean", include_self=False)
@@ -364,8 +364,8 @@ def veil_at(
         1, len(distances) - 1
     )
     low, high = distances[index - 1], distances[index]
-    part = ((square.flatten() - low) / (high - low)).clamp(0, 1)
-    inside = (near[index - 1] * (1 - part) + near[index] * part).reshape(square.shape)
+    fraction = ((square.flatten() - low) / (high - low)).clamp(0, 1)
+    inside = (near[index - 1] * (1 - fraction) + near[index] * fraction).reshape(square.shape)
     far = torch.stack([left * _beyond(light, square) for left, light, _ in lobes]).sum(0)
     return torch.where(square <= NEAR**2, inside, far), _total(lobes)
 

@@ -78,7 +78,7 @@ def beam(
     Raises ParameterError, with the name of the quantity, for negative values and for statements
     that differ by more than 2 %.
     """
-    given = {
+    stated = {
         "wavelength": wavelength,
         "power": power,
         "pulse_energy": pulse_energy,
@@ -88,17 +88,25 @@ def beam(
         "divergence": divergence,
         "m_squared": m_squared,
     }
-    for name, value in given.items():
+    for name, value in stated.items():
         if value is not None and not (math.isfinite(plain(value)) and value > 0):
             raise ParameterError(
                 name, f"{value:g} is no {name.replace('_', ' ')}: give a finite number above 0"
             )
     wider = math.sqrt(2) if convention == "1/e" else 1.0
-    shape = _shape(
+    width, angle, quality = _shape(
         wavelength, waist and waist * wider, divergence and divergence * wider, m_squared
     )
+    mean, energy, duration, rate = _emission(power, pulse_energy, pulse_duration, repetition_rate)
     return Beam(
-        wavelength, *_emission(power, pulse_energy, pulse_duration, repetition_rate), *shape
+        wavelength=wavelength,
+        power=mean,
+        pulse_energy=energy,
+        pulse_duration=duration,
+        repetition_rate=rate,
+        waist=width,
+        divergence=angle,
+        m_squared=quality,
     )
 
 
@@ -113,26 +121,41 @@ def _emission(
     if energy is None and duration is None and rate is None:
         return power, None, None, None
     if duration is None:
-        name = "repetition_rate" if energy is None else "pulse_energy"
-        raise ParameterError(name, "a pulse needs its duration: give pulse_duration")
-    if energy is None and rate is None:
+        raise _no_duration(energy)
+    if rate is None:
+        _refuse_single_pulse(power, energy)
+        return None, energy, duration, None
+    _refuse_long_pulse(duration, rate)
+    if energy is None:
+        assert power is not None
+        return power, power / rate, duration, rate
+    _refuse_other_power(power, energy, rate)
+    return energy * rate, energy, duration, rate
+
+
+def _no_duration(energy: float | None) -> ParameterError:
+    name = "repetition_rate" if energy is None else "pulse_energy"
+    return ParameterError(name, "a pulse needs its duration: give pulse_duration")
+
+
+def _refuse_single_pulse(power: float | None, energy: float | None) -> None:
+    """Raise ParameterError unless a single pulse is stated by its energy alone."""
+    if energy is None:
         text = (
             "the power of a pulse is not known: give pulse_energy, or repetition_rate with the mean"
             " power"
         )
         raise ParameterError("pulse_duration", text)
-    if rate is None:
-        if power is not None:
-            text = (
-                "a single pulse has no mean power: give repetition_rate for a pulse train, or leave"
-                " power out"
-            )
-            raise ParameterError("power", text)
-        return None, energy, duration, None
-    _refuse_long_pulse(duration, rate)
-    if energy is None and power is not None:
-        return power, power / rate, duration, rate
-    assert energy is not None
+    if power is not None:
+        text = (
+            "a single pulse has no mean power: give repetition_rate for a pulse train, or leave"
+            " power out"
+        )
+        raise ParameterError("power", text)
+
+
+def _refuse_other_power(power: float | None, energy: float, rate: float) -> None:
+    """Raise ParameterError for a mean power that is not pulse energy times repetition rate."""
     mean = energy * rate
     if power is not None and not math.isclose(plain(power), plain(mean), rel_tol=_AGREE):
         text = (
@@ -140,7 +163,6 @@ def _emission(
             f" {power:.4g} W"
         )
         raise ParameterError("power", f"{text}: leave one of the three out")
-    return mean, energy, duration, rate
 
 
 def _refuse_long_pulse(duration: float, rate: float) -> None:
@@ -159,7 +181,7 @@ def _shape(
     """Return waist, divergence and M2 of a beam at 1/e2 from two or three of them, or from the
     first or second.
     """
-    least = 2 * wavelength / math.pi  # waist x divergence of a perfect Gaussian beam
+    diffraction = 2 * wavelength / math.pi  # waist x divergence of a perfect Gaussian beam
     if m_squared is not None and m_squared < 1:
         raise ParameterError(
             "m_squared", f"M2 = {m_squared:g} is below 1, the M2 of a perfect Gaussian beam"
@@ -170,21 +192,31 @@ def _shape(
             "divergence", "the width of the beam is not known: give divergence, or waist"
         )
     if waist is None and divergence is not None:
-        return quality * least / divergence, divergence, quality
+        return quality * diffraction / divergence, divergence, quality
     assert waist is not None
     if divergence is None:
-        return waist, quality * least / waist, quality
-    found = waist * divergence / least
-    said = f"waist {waist:.4g} m and divergence {divergence:.4g} rad (1/e2) have M2 = {found:.4g}"
-    if found < 1 - _AGREE:
+        return waist, quality * diffraction / waist, quality
+    implied = _implied_quality(waist, divergence, diffraction, m_squared)
+    return waist, divergence, max(implied, 1.0)
+
+
+def _implied_quality(
+    waist: float, divergence: float, diffraction: float, m_squared: float | None
+) -> float:
+    """Return the M2 of waist and divergence; raise ParameterError where no beam has it, or where
+    another M2 is stated.
+    """
+    implied = waist * divergence / diffraction
+    said = f"waist {waist:.4g} m and divergence {divergence:.4g} rad (1/e2) have M2 = {implied:.4g}"
+    if implied < 1 - _AGREE:
         text = (
             f"{said}, but no beam has less than 1: at this waist the divergence is at least"
-            f" {least / waist:.4g} rad"
+            f" {diffraction / waist:.4g} rad"
         )
         raise ParameterError("divergence", text)
-    if m_squared is not None and not math.isclose(plain(found), plain(m_squared), rel_tol=_AGREE):
+    if m_squared is not None and not math.isclose(plain(implied), plain(m_squared), rel_tol=_AGREE):
         raise ParameterError("m_squared", f"{said}, not {m_squared:g}: leave one of the three out")
-    return waist, divergence, max(found, 1.0)
+    return implied
 
 
 def plain(value: float | Tensor) -> float:

@@ -128,7 +128,9 @@ def _grouped(image: Tensor, smooth: Tensor) -> tuple[Tensor, Tensor, Tensor, Ten
     """Return radius, pixels, light and smoothed light of groups of pixels, `PARTS` in each ring."""
     rows, columns = image.shape
     rings = _rings(rows, columns)
-    light = [_quantiles(part.double().numpy().ravel(), rings).ravel() for part in (image, smooth)]
+    light = [
+        _quantiles(picture.double().numpy().ravel(), rings).ravel() for picture in (image, smooth)
+    ]
     radius, pixels = np.repeat(rings.radius, PARTS), np.repeat(rings.pixels / PARTS, PARTS)
     groups = [torch.from_numpy(column) for column in (radius, pixels, *light)]
     return groups[0], groups[1], groups[2], groups[3]
@@ -172,9 +174,9 @@ def _quantiles(light: np.ndarray, rings: _Rings) -> np.ndarray:
     level = np.minimum(depth, _LEVELS).astype(np.int64)
     table = np.bincount(rings.number + level, minlength=RINGS * (_LEVELS + 1)).reshape(RINGS, -1)
     rising = table.cumsum(1)
-    wanted = (np.arange(PARTS) + 0.5) / PARTS * rings.pixels[:, None]
-    found = np.stack([np.searchsorted(row, want) for row, want in zip(rising, wanted, strict=True)])
-    return np.where(found < _LEVELS, top * np.exp(-(found + 0.5) * step), 0.0)
+    ranks = (np.arange(PARTS) + 0.5) / PARTS * rings.pixels[:, None]
+    levels = np.stack([np.searchsorted(row, want) for row, want in zip(rising, ranks, strict=True)])
+    return np.where(levels < _LEVELS, top * np.exp(-(levels + 0.5) * step), 0.0)
 
 
 def _rim(image: Tensor, narrow: list[bool]) -> Tensor:
@@ -308,8 +310,8 @@ def _shells(shape: tuple[int, int], counted: float, places: Tensor) -> tuple[Ten
     """Return radii beyond the inner pixels, and the number of pixels of the sensor about each of
     them.
     """
-    rest = shape[0] * shape[1] - counted
-    if rest <= 0:
+    outer = shape[0] * shape[1] - counted
+    if outer <= 0:
         return torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64)
     half = torch.tensor(shape, dtype=torch.float64) / 2
     taken = places.amax(0) + 0.5
@@ -321,7 +323,7 @@ def _shells(shape: tuple[int, int], counted: float, places: Tensor) -> tuple[Ten
     number = (_arc(middle, half) - _arc(middle, taken)).clamp_min(0) * edges.diff()
     shown = number > 0
     middle, number = middle[shown], number[shown]
-    return middle, number * (rest / number.sum())
+    return middle, number * (outer / number.sum())
 
 
 def _arc(radius: Tensor, half: Tensor) -> Tensor:
@@ -336,30 +338,33 @@ def _over_squares(places: Tensor, fill: float, waves: float, spread: float) -> T
     """Return the mean irradiance of the pixels at ``places``, from a table over the radius."""
     reach = float(places.square().sum(1).max().sqrt()) + 0.75
     steps = math.ceil(reach * math.pi / spread / _FRINGE)
-    at = torch.linspace(0.0, reach, min(max(steps, 400), 40_000), dtype=torch.float64)
-    table = round_spot(at * (math.pi / spread), fill, waves)
+    radii = torch.linspace(0.0, reach, min(max(steps, 400), 40_000), dtype=torch.float64)
+    table = round_spot(radii * (math.pi / spread), fill, waves)
     total = torch.zeros(len(places), dtype=torch.float64)
     near = places.amax(1) <= 2
-    for group, most in ((near, 4 * _FINEST * 4), (~near, _FINEST)):
+    for group, node_limit in ((near, 4 * _FINEST * 4), (~near, _FINEST)):
         points, weights = (
-            torch.from_numpy(each) for each in legendre(min(most, 3 + math.ceil(5 / spread)))
+            torch.from_numpy(values)
+            for values in legendre(min(node_limit, 3 + math.ceil(5 / spread)))
         )
-        total[group] = _mean_of_squares(places[group], points / 2, weights / 2, at, table)
+        total[group] = _mean_of_squares(places[group], points / 2, weights / 2, radii, table)
     return total
 
 
 def _mean_of_squares(
-    places: Tensor, points: Tensor, weights: Tensor, at: Tensor, table: Tensor
+    places: Tensor, points: Tensor, weights: Tensor, radii: Tensor, table: Tensor
 ) -> Tensor:
     """Return the weighted mean over points of each square of a function of the radius, which a
     table gives.
     """
     total = torch.zeros(len(places), dtype=torch.float64)
-    step, values = at[1].item(), table.numpy()
+    step, values = radii[1].item(), table.numpy()
     for y, weight in zip(points.tolist(), weights.tolist(), strict=True):
         radius = torch.hypot(places[:, :1] + y, places[:, 1:] + points)
-        found = torch.from_numpy(np.interp(radius.numpy() / step, np.arange(len(values)), values))
-        total += weight * (found @ weights)
+        irradiance = torch.from_numpy(
+            np.interp(radius.numpy() / step, np.arange(len(values)), values)
+        )
+        total += weight * (irradiance @ weights)
     return total
 
 
@@ -391,16 +396,18 @@ def _smoothed(radius: Tensor, pixels: Tensor, light: Tensor, feature: float) -> 
     disc covers counts.
     """
     order = radius.argsort()
-    at = radius[order]
+    radii = radius[order]
     enclosed = torch.cat([torch.zeros(1, dtype=torch.float64), (light * pixels)[order].cumsum(0)])
     number = torch.cat([torch.zeros(1, dtype=torch.float64), pixels[order].cumsum(0)])
     half = feature / math.sqrt(math.pi)
-    low = torch.searchsorted(at, (at - half).clamp_min(-1.0))
-    high = torch.searchsorted(at, at + half, right=True)
+    low = torch.searchsorted(radii, (radii - half).clamp_min(-1.0))
+    high = torch.searchsorted(radii, radii + half, right=True)
     ring = (enclosed[high] - enclosed[low]) / (number[high] - number[low]).clamp_min(1e-300)
-    spot = enclosed[torch.searchsorted(at, torch.full_like(at, half), right=True)] / feature**2
+    spot = (
+        enclosed[torch.searchsorted(radii, torch.full_like(radii, half), right=True)] / feature**2
+    )
     smooth = torch.empty_like(light)
-    smooth[order] = torch.where(at <= half, torch.maximum(spot, ring), ring)
+    smooth[order] = torch.where(radii <= half, torch.maximum(spot, ring), ring)
     return smooth
 
 

@@ -96,13 +96,13 @@ def distance_intervals(
         )
 
     def value(distance: float) -> float:
-        found = float(margin(distance))
-        if math.isnan(found):
+        at_distance = float(margin(distance))
+        if math.isnan(at_distance):
             raise ValueError(f"the margin at {distance:g} m is not a number")
-        return found
+        return at_distance
 
-    at = [near * (far / near) ** (i / (samples - 1)) for i in range(samples - 1)] + [far]
-    points = _with_extrema(value, at, [value(distance) for distance in at])
+    distances = [near * (far / near) ** (i / (samples - 1)) for i in range(samples - 1)] + [far]
+    points = _with_extrema(value, distances, [value(distance) for distance in distances])
     ends: list[float] = [near] if points[0][1] > 0 else []
     for (a, first), (b, last) in itertools.pairwise(points):
         if (first > 0) != (last > 0):
@@ -113,20 +113,20 @@ def distance_intervals(
 
 
 def _with_extrema(
-    value: Callable[[float], float], at: list[float], found: list[float]
+    value: Callable[[float], float], distances: list[float], values: list[float]
 ) -> list[tuple[float, float]]:
     """Return the samples with one more for each local extremum that may cross 0 between the
     samples.
     """
-    points = list(zip(at, found, strict=True))
-    more = []
-    for i in range(1, len(at) - 1):
+    points = list(zip(distances, values, strict=True))
+    extrema = []
+    for i in range(1, len(distances) - 1):
         # a hidden zone is a maximum below 0, a hidden gap a minimum above 0
-        sign = 1.0 if found[i] <= 0 else -1.0
-        one, here, other = (sign * x for x in found[i - 1 : i + 2])
-        if here >= max(one, other) and here > min(one, other):
-            more.append(_extremum(value, at[i - 1], at[i + 1], sign))
-    return sorted({*points, *more})
+        sign = 1.0 if values[i] <= 0 else -1.0
+        before, here, after = (sign * x for x in values[i - 1 : i + 2])
+        if here >= max(before, after) and here > min(before, after):
+            extrema.append(_extremum(value, distances[i - 1], distances[i + 1], sign))
+    return sorted({*points, *extrema})
 
 
 def _extremum(
@@ -137,11 +137,11 @@ def _extremum(
     """
     low, high = math.log(a), math.log(b)
     for _ in range(_ROUNDS):
-        one, other = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-        if sign * value(math.exp(one)) > sign * value(math.exp(other)):
-            high = other
+        lower, upper = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        if sign * value(math.exp(lower)) > sign * value(math.exp(upper)):
+            high = upper
         else:
-            low = one
+            low = lower
     place = math.exp((low + high) / 2)
     return place, value(place)
 
@@ -234,19 +234,19 @@ def _heat_table() -> Tensor:
     fills = torch.linspace(0, _TABLE_FILL, _FILL_STEPS, dtype=torch.float64)
     reach = (torch.arange(round(_EDGE / _STEP), dtype=torch.float64) + 0.5) * _STEP
     inverse = _mean_inverse_distance(reach)
-    at, weights = (torch.from_numpy(x) for x in legendre(_NODES))
-    square = (at + 1) / 2
+    node, weights = (torch.from_numpy(x) for x in legendre(_NODES))
+    square = (node + 1) / 2
     bessel = torch.special.bessel_j0(reach[:, None] * square.sqrt())
     taper = torch.exp(-fills[:, None] * square) * weights / 4
     # mean of 4 exp(-2 fill) J1(v)^2 / v^2 from there on
     wings = 4 * torch.exp(-2 * fills) / (math.pi * _EDGE**2) * 0.5
     rows = []
-    for each in waves.tolist():
-        turns = 2 * math.pi * each * square
+    for wave_count in waves.tolist():
+        turns = 2 * math.pi * wave_count * square
         parts = [(taper * wave) @ bessel.T for wave in (torch.cos(turns), torch.sin(turns))]
         irradiance = 4 * (parts[0].square() + parts[1].square())
         hottest = (irradiance @ inverse.T).amax(1) + wings
-        rows.append(hottest / _even_disc(fills, torch.full_like(fills, each)))
+        rows.append(hottest / _even_disc(fills, torch.full_like(fills, wave_count)))
     last_wave = rows[-round(_WAVE_STEPS / _TABLE_WAVES) :]
     return torch.stack([*rows, torch.stack(last_wave).amax(0)])
 

@@ -128,13 +128,13 @@ class DamagePart:
         return self.threshold is not None and bool((self.threshold.low <= 0).any())
 
 
-def state_of(least: float, largest: float, open_below: bool = False) -> State:
+def state_of(smallest: float, largest: float, open_below: bool = False) -> State:
     """Return where an exposure is, from its ratios to the upper and to the lower end of a
     threshold.
     """
-    if math.isnan(least) or math.isnan(largest):
+    if math.isnan(smallest) or math.isnan(largest):
         return "not judged"
-    if least >= 1:
+    if smallest >= 1:
         return "above"
     if open_below:
         return "not judged"
@@ -173,8 +173,8 @@ def damage_parts(
     means = [*_own_parts(light, device, own, "mean")] or [_first_part(light, curve, "mean")]
     pulse, mean = _lowest(pulses), _lowest(means)
     sums = [_accumulation(light, pulse, mean), _incubation(light, pulse)]
-    others = [part for part in (*pulses, *means) if part is not pulse and part is not mean]
-    is_own = any(part.note.startswith(_OWN) for part in pulses)
+    others = [judged for judged in (*pulses, *means) if judged is not pulse and judged is not mean]
+    is_own = any(judged.note.startswith(_OWN) for judged in pulses)
     further = () if is_own else _further(light, device, curve, published)
     return (pulse, mean, *sums, *others, *further)
 
@@ -183,7 +183,9 @@ def _lowest(parts: Sequence[DamagePart]) -> DamagePart:
     """Return the part whose middle threshold is lowest."""
     return min(
         parts,
-        key=lambda part: math.inf if part.threshold is None else float(part.threshold.middle.min()),
+        key=lambda judged: (
+            math.inf if judged.threshold is None else float(judged.threshold.middle.min())
+        ),
     )
 
 
@@ -211,20 +213,20 @@ def _first_law(device: str, quantity: Quantity, published: Sequence[DamageLaw]) 
     return next((law for law in first if law.device.casefold() == device.casefold()), None)
 
 
-def _first_part(light: LightInTime, curve: CurveEnds | str, part: Part) -> DamagePart:
+def _first_part(light: LightInTime, curve: CurveEnds | str, share_of_light: Part) -> DamagePart:
     """Return one pulse, or the mean, judged by the published curve of the first damage, or the
     reason why not.
     """
-    as_pulse = part == "pulse" and light.pulse_duration is not None
+    as_pulse = share_of_light == "pulse" and light.pulse_duration is not None
     quantity: Quantity = "fluence" if as_pulse else "irradiance"
     if isinstance(curve, str):
-        return DamagePart(part, "point", quantity, None, reason=curve)
+        return DamagePart(share_of_light, "point", quantity, None, reason=curve)
     duration = light.duration if as_pulse else double(light.dwell)
     bracket = first_damage(curve, duration, light.spot, light.small_spot_exponent)
     bracket = bracket.times(1 / light.caught) if as_pulse else bracket.times(1 / duration)
     factors, named = _wavelength(light, curve.pulse)
     return DamagePart(
-        part=part,
+        part=share_of_light,
         kind="point",
         quantity=quantity,
         threshold=bracket.times(factors),
@@ -316,10 +318,10 @@ def _further(
 
 
 def _own_parts(
-    light: LightInTime, device: str, own: Sequence[DamageLaw], part: Part
+    light: LightInTime, device: str, own: Sequence[DamageLaw], share_of_light: Part
 ) -> Iterator[DamagePart]:
     """Yield one pulse, or the mean, judged by each law of the user that holds for it."""
-    as_pulse = part == "pulse" and light.pulse_duration is not None
+    as_pulse = share_of_light == "pulse" and light.pulse_duration is not None
     duration = light.duration if as_pulse else double(light.dwell)
     nominal = float(duration.flatten()[0])
     quantities: tuple[Quantity, ...] = ("fluence", "irradiance")
@@ -329,7 +331,7 @@ def _own_parts(
             scale = scale / light.caught if as_pulse else scale
             note = _OWN if law.spot is None else f"{_OWN}, for a spot of {law.spot * 1e6:.3g} um"
             yield DamagePart(
-                part=part,
+                part=share_of_light,
                 kind=law.damage,
                 quantity="fluence" if as_pulse else "irradiance",
                 threshold=_own_bracket(law).times(scale),
@@ -426,11 +428,13 @@ def _incubation(light: LightInTime, pulse: DamagePart) -> DamagePart:
         return DamagePart("incubation", pulse.kind, pulse.quantity, None, reason=pulse.reason)
     count = light.pulses
     duty = (light.duration * light.rate).clamp_max(1.0)
-    least, middle, largest = (
+    smallest, middle, largest = (
         1 / ((1 - duty) * count ** (1 - exponent) + duty) for exponent in INCUBATION
     )
     bracket = Bracket(
-        pulse.threshold.low * least, pulse.threshold.middle * middle, pulse.threshold.high * largest
+        pulse.threshold.low * smallest,
+        pulse.threshold.middle * middle,
+        pulse.threshold.high * largest,
     )
     many = bool((count > 1).any())
     note = f"{_INCUBATED}; {float(count.max()):.3g} pulses" if many else pulse.note

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -139,27 +140,32 @@ def damage(
     missed = exposed.fluence is not None and light is not None and _caught(light) <= 0
     pattern = torch.zeros(spot.shape[-2:], dtype=torch.uint8, device=spot.device)
     rows = []
-    for part in parts:
-        fluence = part.quantity == "fluence"
+    for damage_part in parts:
+        fluence = damage_part.quantity == "fluence"
         image = exposed.fluence if fluence and exposed.fluence is not None else exposed.irradiance
-        rows.append(_row(part, math.nan if missed else float(image.max())))
-        if part.threshold is not None and not missed:
-            above = image >= float(part.threshold.middle) * resilience
-            pattern |= above.to(torch.uint8) << KINDS.index(part.kind)
+        rows.append(_row(damage_part, math.nan if missed else float(image.max())))
+        if damage_part.threshold is not None and not missed:
+            above = image >= float(damage_part.threshold.middle) * resilience
+            pattern |= above.to(torch.uint8) << KINDS.index(damage_part.kind)
     columns = torch.tensor(rows, dtype=torch.float64).reshape(-1, 8).T.contiguous()
     return SpotDamage._make([*columns, pattern])
 
 
-def _row(part: DamagePart, peak: float) -> tuple[float, ...]:
+def _row(damage_part: DamagePart, peak: float) -> tuple[float, ...]:
     """Return ratios, probability with its ends, peak and threshold of one part of the light."""
     none = (-1.0, -1.0, -1.0)
-    if part.threshold is None or math.isnan(peak):
+    if damage_part.threshold is None or math.isnan(peak):
         return (math.nan, math.nan, math.nan, *none, peak, math.nan)
     low, middle, high = (
-        float(end) for end in (part.threshold.low, part.threshold.middle, part.threshold.high)
+        float(end)
+        for end in (
+            damage_part.threshold.low,
+            damage_part.threshold.middle,
+            damage_part.threshold.high,
+        )
     )
-    if part.law is not None:
-        of_law = damage_at(part.law, peak / middle * part.law.median)
+    if damage_part.law is not None:
+        of_law = damage_at(damage_part.law, peak / middle * damage_part.law.median)
         none = (of_law.probability, of_law.low, of_law.high)  # type: ignore[assignment]
     return (peak / middle, peak / high, peak / low if low > 0 else math.inf, *none, peak, middle)
 
@@ -234,39 +240,48 @@ def _(
         return []
     parts = parts_before(line, light, exposure=exposure, thresholds=thresholds, **params)
     continuous = params.get("pulse_duration") is None
-    return [_threshold_text(part, continuous) for part in parts if _has_sentence(part, continuous)]
+    return [
+        _threshold_text(damage_part, continuous)
+        for damage_part in parts
+        if _has_sentence(damage_part, continuous)
+    ]
 
 
-def _has_sentence(part: DamagePart, continuous: bool) -> bool:
+def _has_sentence(damage_part: DamagePart, continuous: bool) -> bool:
     """Return True for a part with a sentence of its own: of continuous light, which has equal
     parts, the mean alone.
     """
-    return part.part == "mean" or not continuous
+    return damage_part.part == "mean" or not continuous
 
 
-def _name(part: DamagePart, continuous: bool) -> str:
+def _name(damage_part: DamagePart, continuous: bool) -> str:
     """Return the part of the light and the kind of damage, as sentences name them."""
-    return f"{'continuous light' if continuous else part.part}, {part.kind}"
+    return f"{'continuous light' if continuous else damage_part.part}, {damage_part.kind}"
 
 
-def _threshold_text(part: DamagePart, continuous: bool) -> str:
+def _threshold_text(damage_part: DamagePart, continuous: bool) -> str:
     """Return the threshold of a part of the light in one sentence, or why the part is not
     judged.
     """
-    name = _name(part, continuous)
-    if part.threshold is None:
-        return f"{name}: not judged: {part.reason}"
+    name = _name(damage_part, continuous)
+    if damage_part.threshold is None:
+        return f"{name}: not judged: {damage_part.reason}"
     low, middle, high = (
-        float(end) / 1e4 for end in (part.threshold.low, part.threshold.middle, part.threshold.high)
-    )
-    unit = _UNITS[part.quantity]
-    if part.open_below:
-        return (
-            f"{name}: at most {high:.3g} {unit}, not judged from below: {part.reason};"
-            f" {part.source}"
+        float(end) / 1e4
+        for end in (
+            damage_part.threshold.low,
+            damage_part.threshold.middle,
+            damage_part.threshold.high,
         )
-    note = f" ({part.note})" if part.note else ""
-    return f"{name}: {middle:.3g} ({low:.3g} to {high:.3g}) {unit}{note}, {part.source}"
+    )
+    unit = _UNITS[damage_part.quantity]
+    if damage_part.open_below:
+        return (
+            f"{name}: at most {high:.3g} {unit}, not judged from below: {damage_part.reason};"
+            f" {damage_part.source}"
+        )
+    note = f" ({damage_part.note})" if damage_part.note else ""
+    return f"{name}: {middle:.3g} ({low:.3g} to {high:.3g}) {unit}{note}, {damage_part.source}"
 
 
 @damage.check
@@ -282,30 +297,34 @@ def _(
     parts = parts_before(line, light, exposure=exposure, **params)
     rows = list(zip(*(column.tolist() for column in result[:8]), strict=True))
     states = [
-        state_of(row[1], row[2], part.open_below) for part, row in zip(parts, rows, strict=True)
+        state_of(row[1], row[2], damage_part.open_below)
+        for damage_part, row in zip(parts, rows, strict=True)
     ]
     verdict = worst_state(states)
     checks = [Check(_VERDICTS[verdict], verdict == "below")]
     continuous = params.get("pulse_duration") is None
-    for part, row, state in zip(parts, rows, states, strict=True):
-        if _has_sentence(part, continuous):
-            checks.append(Check(_sentence(part, row, continuous), state == "below"))
+    for damage_part, row, state in zip(parts, rows, states, strict=True):
+        if _has_sentence(damage_part, continuous):
+            checks.append(Check(_sentence(damage_part, row, continuous), state == "below"))
     return checks
 
 
-def _sentence(part: DamagePart, row: tuple[float, ...], continuous: bool) -> str:
+def _sentence(damage_part: DamagePart, row: tuple[float, ...], continuous: bool) -> str:
     """Return what is said of one part of the light: exposure, threshold, ratio with its bracket,
     and probability.
     """
-    ratio, least, most, chance, low, high, peak, threshold = row
-    name = _name(part, continuous)
+    ratio, lowest, highest, chance, low, high, peak, threshold = row
+    name = _name(damage_part, continuous)
     if math.isnan(ratio):
-        return f"{name}: not judged: {part.reason or _NO_PULSE}"
-    unit = _UNITS[part.quantity]
-    if part.open_below:
-        at_least = f"at least {least:.3g} times the threshold"
-        return f"{name}: {peak / 1e4:.3g} {unit}, {at_least}; not judged from below: {part.reason}"
-    bracket = f" ({least:.3g} to {most:.3g})" if most > least else ""
+        return f"{name}: not judged: {damage_part.reason or _NO_PULSE}"
+    unit = _UNITS[damage_part.quantity]
+    if damage_part.open_below:
+        at_least = f"at least {lowest:.3g} times the threshold"
+        return (
+            f"{name}: {peak / 1e4:.3g} {unit}, {at_least}; not judged from below:"
+            f" {damage_part.reason}"
+        )
+    bracket = f" ({lowest:.3g} to {highest:.3g})" if highest > lowest else ""
     text = (
         f"{name}: {peak / 1e4:.3g} of {threshold / 1e4:.3g} {unit}, {ratio:.3g}{bracket} times the"
         " threshold"
@@ -355,7 +374,8 @@ def steady_heat(image: Tensor, pitch: float) -> Tensor:
     """
     rows, columns = image.shape
     y, x = (torch.arange(n + 1, dtype=torch.float64, device=image.device) for n in (rows, columns))
-    corners = [(y[:, None] + j, x + i, 4 * i * j) for j in (-0.5, 0.5) for i in (-0.5, 0.5)]
+    halves = itertools.product((-0.5, 0.5), repeat=2)
+    corners = [(y[:, None] + j, x + i, 4 * i * j) for j, i in halves]
     quarter = sum(
         sign * (u * torch.asinh(v / u.abs()) + v * torch.asinh(u / v.abs()))
         for u, v, sign in corners
@@ -418,8 +438,8 @@ def damaged_pixels(
     """
     shape = (raw.shape[-2], raw.shape[-1])
     pattern = torch.zeros(shape, dtype=torch.uint8, device=raw.device)
-    for each in damages or ():
-        pattern |= crop(each.pattern, shape=shape).to(raw.device)
+    for damage_of_laser in damages or ():
+        pattern |= crop(damage_of_laser.pattern, shape=shape).to(raw.device)
     white = float(max(1, min(2**bits - 1, int(full_well * gain - 0.5))))
     drawn = (
         single(raw)

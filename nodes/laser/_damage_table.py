@@ -263,9 +263,9 @@ def _heading(file: Path, line: int, index: int, cell: str) -> Column:
         )
     units = _UNITS[column.quantity]
     if units and column.unit not in units:
-        what = f"has the unit {column.unit}" if column.unit else "has no unit"
-        known = ", ".join(f"({unit})" for unit in units if unit.isascii())
-        raise ValueError(f"{place(file, line, index, column)} {what}: write one of {known}")
+        fault = f"has the unit {column.unit}" if column.unit else "has no unit"
+        unit_names = ", ".join(f"({unit})" for unit in units if unit.isascii())
+        raise ValueError(f"{place(file, line, index, column)} {fault}: write one of {unit_names}")
     return column
 
 

@@ -139,12 +139,12 @@ def _airy_over_pixels(spread: float, count: int, sampling: Sampling = "integrate
     points, weights = np.zeros(1), np.full(1, 2.0)
     if sampling == "integrated":
         points, weights = np.polynomial.legendre.leggauss(3 + math.ceil(4 / spread))
-    at = torch.arange(count, dtype=torch.float64)
+    pixel = torch.arange(count, dtype=torch.float64)
     total = torch.zeros(count, count, dtype=torch.float64)
-    for y, one in zip(points.tolist(), weights.tolist(), strict=True):
-        for x, other in zip(points.tolist(), weights.tolist(), strict=True):
-            reach = torch.hypot((at + y / 2)[:, None], at + x / 2) * (math.pi / spread)
-            total += one * other / 4 * _airy(reach)
+    for y, weight_y in zip(points.tolist(), weights.tolist(), strict=True):
+        for x, weight_x in zip(points.tolist(), weights.tolist(), strict=True):
+            reach = torch.hypot((pixel + y / 2)[:, None], pixel + x / 2) * (math.pi / spread)
+            total += weight_y * weight_x / 4 * _airy(reach)
     return total
 
 
@@ -208,13 +208,15 @@ def dazzle_curve(
     peak = float((weights * psf.clear_peak.detach().cpu()).sum())
     if not transformed():
         refuse_not_finite("its pixels cannot be counted", psf=light.sum(), clear_peak=peak)
-    at = torch.tensor(strengths, dtype=torch.float64)
+    multiples = torch.tensor(strengths, dtype=torch.float64)
     ordered = light.sort().values.cpu()
-    pixels = (len(ordered) - torch.searchsorted(ordered, level * peak / at)).double()
+    pixels = (len(ordered) - torch.searchsorted(ordered, level * peak / multiples)).double()
     cut = float(cut_off(psf).mean())
     averaged_away = math.pi / 4 * cut**2 / float(psf.clear_peak.detach().mean())
-    clear = (4 / math.pi * at / level * averaged_away).pow(2 / 3) / (math.pi * cut**2)
-    return DazzleCurve(at, pixels, pixels / len(ordered), clear.where(at > level, 0.0))
+    clear = (4 / math.pi * multiples / level * averaged_away).pow(2 / 3) / (math.pi * cut**2)
+    return DazzleCurve(
+        multiples, pixels, pixels / len(ordered), clear.where(multiples > level, 0.0)
+    )
 
 
 @dazzle_curve.check
@@ -292,7 +294,7 @@ def dazzle(
     room = full_well - offset
     lost, filled = (scene >= room).any(-3), (scene + veil >= room).any(-3)
     background, mean = _over_feature(scene, feature), _over_feature(veil, feature)
-    most = veil_limit(
+    limit = veil_limit(
         background,
         contrast=contrast,
         feature=feature,
@@ -300,9 +302,9 @@ def dazzle(
         rule=rule,
         read_noise=read_noise,
     )
-    visible = (most >= 0).any(-3) & ~lost
+    visible = (limit >= 0).any(-3) & ~lost
     saturated = filled & ~lost
-    veiled = visible & ~filled & ~(mean <= most).any(-3)
+    veiled = visible & ~filled & ~(mean <= limit).any(-3)
     pixels = visible.numel()
     counts = [x.sum().double() for x in (saturated, veiled, visible)]
     return Dazzle(counts[0], counts[1], (counts[0] + counts[1]) / pixels, counts[2] / pixels)

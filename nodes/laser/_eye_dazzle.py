@@ -53,8 +53,8 @@ def luminous_efficiency(wavelength: float) -> float:
         return 0.0
     import torch
 
-    at = torch.tensor([wavelength], dtype=torch.float64)
-    return float(observer().at(at)[1, 0])
+    place = torch.tensor([wavelength], dtype=torch.float64)
+    return float(observer().at(place)[1, 0])
 
 
 def veil_per_lux(angle: float, age: float, pigmentation: float) -> float:

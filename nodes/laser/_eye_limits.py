@@ -306,8 +306,8 @@ def train_limit(
         if rule == "IEC 60825-1:2014"
         else math.pow(groups, -0.25)
     )
-    one = eye_mpe(wavelength, max(summed, pulse_duration) if together > 1 else pulse_duration)
-    return TrainLimit(single, mean, one / together * factor, together, groups, factor)
+    group = eye_mpe(wavelength, max(summed, pulse_duration) if together > 1 else pulse_duration)
+    return TrainLimit(single, mean, group / together * factor, together, groups, factor)
 
 
 def _summed_time(wavelength: float) -> float:

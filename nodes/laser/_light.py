@@ -7,6 +7,7 @@ from typing import Annotated, Any, NamedTuple
 
 import torch
 from pydantic import Field
+from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.laser._beam import (
@@ -86,9 +87,10 @@ def wavefront(
     """
     if distance is None:
         return Wavefront(*torch.zeros(2, dtype=torch.float64))
-    found = _shaped(line, _Geometry(waist, divergence, m_squared, convention, distance))
-    values = beam_radius(found, distance) ** -2, 1 / curvature_radius(found, distance)
-    return Wavefront(*(torch.as_tensor(value, dtype=torch.float64) for value in values))
+    beam = _shaped(line, _Geometry(waist, divergence, m_squared, convention, distance))
+    return Wavefront(
+        _scalar(beam_radius(beam, distance) ** -2), _scalar(1 / curvature_radius(beam, distance))
+    )
 
 
 @wavefront.check
@@ -151,34 +153,37 @@ def light(
     if distance is None:
         raise ParameterError("distance", "the distance of the laser is not known: give distance")
     geometry = _Geometry(waist, divergence, m_squared, convention, distance)
-    found = _shaped(line, geometry, power, pulse_energy, pulse_duration, repetition_rate)
-    air = _air(found.wavelength, distance, air_transmittance, visibility, haze)
-    pulses = pulses_within(found, exposure, pulse_delay)
-    mean = found.power if found.pulse_energy is None else found.pulse_energy * pulses / exposure
+    beam = _shaped(line, geometry, power, pulse_energy, pulse_duration, repetition_rate)
+    air = _air(beam.wavelength, distance, air_transmittance, visibility, haze)
+    pulses = pulses_within(beam, exposure, pulse_delay)
+    mean = beam.power if beam.pulse_energy is None else beam.pulse_energy * pulses / exposure
     assert mean is not None
-    irradiance = mean * axis_density(found, distance, air)
+    irradiance = mean * axis_density(beam, distance, air)
     flux = irradiance * clear_area(stop) * lens_transmittance
-    spot, width = (found.wavelength * focal_length) ** 2, beam_radius(found, distance)
+    spot, width = (beam.wavelength * focal_length) ** 2, beam_radius(beam, distance)
     even = flux * clear_area(stop) / spot
     # of the irradiance of a Gaussian beam
     through = irradiance * gaussian_over(stop, width / math.sqrt(2))
     # its field
     peak = (
-        axis_density(found, distance, air)
+        axis_density(beam, distance, air)
         * lens_transmittance
         * gaussian_over(stop, width) ** 2
         / spot
     )
-    values = (
-        even,
-        flux,
-        irradiance,
-        through,
-        mean * peak,
-        pulses,
-        (found.pulse_energy or 0.0) * peak,
+    return LaserLight(
+        even_peak=_scalar(even),
+        flux=_scalar(flux),
+        irradiance=_scalar(irradiance),
+        power=_scalar(through),
+        peak=_scalar(mean * peak),
+        pulses=_scalar(pulses),
+        pulse_fluence=_scalar((beam.pulse_energy or 0.0) * peak),
     )
-    return LaserLight(*(torch.as_tensor(value, dtype=torch.float64) for value in values))
+
+
+def _scalar(value: float | Tensor) -> Tensor:
+    return torch.as_tensor(value, dtype=torch.float64)
 
 
 @light.check
@@ -214,8 +219,8 @@ def pulses_within(beam: Beam, exposure: float, delay: float) -> float:
         assert beam.pulse_duration is not None
         if beam.repetition_rate is None:
             return min(max(time / beam.pulse_duration, 0.0), 1.0)
-        whole = math.floor(plain(time * beam.repetition_rate))
-        return whole + min(max(time - whole / beam.repetition_rate, 0.0) / beam.pulse_duration, 1.0)
+        ended = math.floor(plain(time * beam.repetition_rate))
+        return ended + min(max(time - ended / beam.repetition_rate, 0.0) / beam.pulse_duration, 1.0)
 
     return begun(exposure - delay) - begun(-delay)
 
@@ -339,11 +344,11 @@ def _out_of_focus(line: Bands, stop: Stop, params: dict[str, Any]) -> list[str]:
     return [f'{text} ({off}): optics.defocus="-{waves:.3g} waves" focuses it']
 
 
-def _pulse_notes(found: LaserLight, params: dict[str, Any]) -> list[str]:
+def _pulse_notes(light_of_laser: LaserLight, params: dict[str, Any]) -> list[str]:
     """Return a note on the pulses that an exposure catches."""
     if not params["pulse_duration"]:
         return []
-    count = float(found.pulses)
+    count = float(light_of_laser.pulses)
     missed = (
         "no pulse falls into the exposure"
         if count == 0

@@ -71,15 +71,19 @@ def white_share(low: float, high: float, edge: float = EDGE) -> float:
     """
     import torch
 
-    at = torch.arange(_WHITE[0] * 1e9, _WHITE[1] * 1e9 + 0.25, 0.5, dtype=torch.float64) * 1e-9
-    photons = daylight(_DAYLIGHT).at(at)[0] * at
-    whole = torch.trapezoid(photons, at)
+    wavelengths = (
+        torch.arange(_WHITE[0] * 1e9, _WHITE[1] * 1e9 + 0.25, 0.5, dtype=torch.float64) * 1e-9
+    )
+    photons = daylight(_DAYLIGHT).at(wavelengths)[0] * wavelengths
+    total = torch.trapezoid(photons, wavelengths)
     first, last = max(low * (1 - edge), _WHITE[0]), min(high * (1 + edge), _WHITE[1])
     if not last > first:
         return 0.0
     ends = torch.tensor([first, last], dtype=torch.float64)
-    inside = torch.cat([ends[:1], at[(at > first) & (at < last)], ends[1:]])
-    return float(torch.trapezoid(daylight(_DAYLIGHT).at(inside)[0] * inside, inside) / whole)
+    inside = torch.cat(
+        [ends[:1], wavelengths[(wavelengths > first) & (wavelengths < last)], ends[1:]]
+    )
+    return float(torch.trapezoid(daylight(_DAYLIGHT).at(inside)[0] * inside, inside) / total)
 
 
 def field_angle(shape: tuple[int, int], pixel_pitch: float, focal_length: float) -> float:

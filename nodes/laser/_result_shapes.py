@@ -26,16 +26,16 @@ dazzle.shape(scalars(Dazzle))
 
 @wavefront.shape
 def _(line: Bands, **params: Any) -> Wavefront:
-    found: Wavefront = wavefront(line, **params) if known(line.centres) else scalars(Wavefront)()
-    return found
+    result: Wavefront = wavefront(line, **params) if known(line.centres) else scalars(Wavefront)()
+    return result
 
 
 @light.shape
 def _(line: Bands, stop: Stop, **params: Any) -> LaserLight:
-    found: LaserLight = (
+    result: LaserLight = (
         light(line, stop, **params) if known(line.centres) else scalars(LaserLight)()
     )
-    return found
+    return result
 
 
 @damage.shape

@@ -90,16 +90,16 @@ def _beyond(v: Tensor, kappa: complex) -> Tensor:
     """
     field = torch.empty(len(v), dtype=torch.complex128)
     ratio = 2 * abs(kappa) / v
-    for most, least in itertools.pairwise((math.inf, *_RATIOS, -1.0)):
-        part = (ratio <= most) & (ratio > least)
-        if bool(part.any()):
-            largest = float(ratio[part].max())
+    for upper, lower in itertools.pairwise((math.inf, *_RATIOS, -1.0)):
+        in_range = (ratio <= upper) & (ratio > lower)
+        if bool(in_range.any()):
+            largest = float(ratio[in_range].max())
             terms = (
                 _TERMS
                 if largest > 1 / _APART
                 else math.ceil(_SMALLEST / math.log(max(largest, 1e-9))) + 1
             )
-            field[part] = _far_series(v[part], kappa, min(terms, _TERMS))
+            field[in_range] = _far_series(v[in_range], kappa, min(terms, _TERMS))
     return field
 
 
@@ -143,10 +143,10 @@ def _integrated(v: Tensor, kappa: complex) -> Tensor:
     if not len(v):
         return torch.zeros(0, dtype=torch.complex128)
     cycles = abs(kappa) / math.pi + float(v.max()) / (2 * math.pi)
-    at, weights = (
+    nodes, weights = (
         torch.from_numpy(x) for x in legendre(1 << math.ceil(math.log2(24 + 2.2 * cycles)))
     )
-    square = (at + 1) / 2
+    square = (nodes + 1) / 2
     pupil = torch.exp(-kappa * square) * weights / 4
     root, rows = square.sqrt(), max(1, _PIECE // len(square))
     pieces = torch.split(v, rows)
@@ -172,8 +172,8 @@ def _at_the_edge(v: Tensor, kappa: complex) -> Tensor:
     edge = torch.from_numpy(wofz(1j * side.numpy() * depth)) * side / (4 * kappa)
     turn = complex(math.cos(math.pi / 4), math.sin(math.pi / 4))
     root, wave = 1 / torch.sqrt(2 * math.pi * v), torch.exp(-1j * v)
-    one = torch.ones_like(place)
-    lack = turn * root / (-2 * kappa * (one + place.sqrt()))
+    unity = torch.ones_like(place)
+    lack = turn * root / (-2 * kappa * (unity + place.sqrt()))
     other = root / turn / (1j * v - 2 * kappa) * wave.conj()
     beam = torch.where(lit, _geometric(v, kappa), 0.0)
     return beam + _exp(-kappa) * ((edge + lack) * wave + other)
@@ -221,8 +221,8 @@ def spot_peak(fill: Tensor, waves: Tensor, within: float = 0.0) -> Tensor:
         trough = math.pi * (2 * torch.ceil(low / (2 * math.pi) - 0.5) + 1)
         # the maximum, as 1 / |kappa|^2 falls
         before = trough - (1 + rim).square() / (rim * trough).clamp_min(1e-12)
-        for each in (low, high, trough, before):
-            largest = torch.maximum(largest, _on_axis(fill, rim, each.clamp(low, high)))
+        for angle in (low, high, trough, before):
+            largest = torch.maximum(largest, _on_axis(fill, rim, angle.clamp(low, high)))
     ringed = (high > 2 * math.pi * _FIRST) & (fill < _TABLE_FILL)
     if bool(ringed.any()):
         largest = largest.clone()
@@ -313,16 +313,16 @@ def _ring_table() -> Tensor:
     waves = torch.linspace(_FIRST, _TABLE_WAVES, _WAVE_STEPS, dtype=torch.float64)
     fills = torch.linspace(0, _TABLE_FILL, _FILL_STEPS, dtype=torch.float64)
     reach = torch.linspace(1.5, _WIDEST, 436, dtype=torch.float64)
-    at, weights = (torch.from_numpy(x) for x in legendre(64))
-    square = (at + 1) / 2
+    nodes, weights = (torch.from_numpy(x) for x in legendre(64))
+    square = (nodes + 1) / 2
     bessel = torch.special.bessel_j0(reach[:, None] * square.sqrt())
     taper = torch.exp(-fills[:, None] * square) * weights / 4
     rows = []
-    for each in waves.tolist():
-        turns = 2 * math.pi * each * square
+    for wave_count in waves.tolist():
+        turns = 2 * math.pi * wave_count * square
         parts = [(taper * wave) @ bessel.T for wave in (torch.cos(turns), torch.sin(turns))]
         brightest = _summit(4 * (parts[0].square() + parts[1].square()))
-        phase = torch.full_like(fills, 2 * math.pi * each)
+        phase = torch.full_like(fills, 2 * math.pi * wave_count)
         size = fills.square() + phase.square()
         cosine = torch.cos(phase + phase * _RING**2 / (4 * size))
         rows.append(brightest * size / _ring_limit(torch.exp(-fills), fills, phase, cosine))

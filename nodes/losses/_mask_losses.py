@@ -150,8 +150,10 @@ def _(psf: Psf, *, floor: float = 1e-4, up_to: float | None = None) -> Tensor:
         inside = fy[:, None].square() + fx.square() <= cut**2
         if up_to is not None:
             inside &= fy[:, None].square() + fx.square() <= up_to**2
-        whole = otf[0, 0].real
-        dark = bool(whole.detach() <= _DARK)
-        passed = torch.zeros(int(inside.sum())) if dark else otf[inside].abs().square() / whole**2
+        passed_light = otf[0, 0].real
+        dark = bool(passed_light.detach() <= _DARK)
+        passed = (
+            torch.zeros(int(inside.sum())) if dark else otf[inside].abs().square() / passed_light**2
+        )
         total = total - (passed + floor**2).sqrt().log().mean()
     return total

@@ -50,10 +50,10 @@ def natural_spectrum(size: tuple[int, int], contrast: float, like: Tensor) -> Te
     """Return the power 1 / frequency^2 of the contrast of a scene; its mean over all frequencies
     is ``contrast``.
     """
-    at = frequencies(size, like)
-    power = torch.where(at > 0, at, torch.inf).pow(-2.0)
-    whole = (power.sum(0) * times(size, power)).sum() / (size[0] * size[1])
-    return power * (contrast / whole.where(whole > 0, 1.0))
+    frequency = frequencies(size, like)
+    power = torch.where(frequency > 0, frequency, torch.inf).pow(-2.0)
+    mean_power = (power.sum(0) * times(size, power)).sum() / (size[0] * size[1])
+    return power * (contrast / mean_power.where(mean_power > 0, 1.0))
 
 
 def quanta(passed: Tensor, exposure: Exposure, filtered: Tensor) -> Tensor:
@@ -113,9 +113,9 @@ def filter_of(peak: Tensor, limit: float | None) -> Tensor:
     return (limit / peak.clamp_min(_DARK)).clamp_max(1.0)
 
 
-def round_mtf(at: Tensor, cuts: Tensor, shares: Tensor) -> Tensor:
-    """Return the MTF of a round aperture for each channel, at the frequencies ``at``, from the
-    cut-offs of its bands.
+def round_mtf(frequency: Tensor, cuts: Tensor, shares: Tensor) -> Tensor:
+    """Return the MTF of a round aperture for each channel, at the frequencies ``frequency``, from
+    the cut-offs of its bands.
 
     ``shares`` (channel, band) are those of the bands in the channels. Between radii of a fine table
     it is linear.
@@ -123,10 +123,10 @@ def round_mtf(at: Tensor, cuts: Tensor, shares: Tensor) -> Tensor:
     radii = torch.linspace(0.0, 0.75, _RADII, dtype=torch.float64)
     share = (radii / cuts[:, None]).clamp_max(1.0)
     table = shares @ ((torch.acos(share) - share * (1 - share.square()).sqrt()) * (2 / math.pi))
-    place = at * ((_RADII - 1) / 0.75)
+    place = frequency * ((_RADII - 1) / 0.75)
     below = place.long().clamp_max(_RADII - 2)
     return torch.lerp(
-        table[:, below], table[:, below + 1], (place - below).expand(len(shares), *at.shape)
+        table[:, below], table[:, below + 1], (place - below).expand(len(shares), *frequency.shape)
     )
 
 
@@ -246,8 +246,8 @@ def _behind(
 
 
 def _counted(size: tuple[int, int], up_to: float | None, like: Tensor) -> Tensor:
-    at = frequencies(size, like)
-    return (at > 0) & (at <= (1.0 if up_to is None else up_to))
+    frequency = frequencies(size, like)
+    return (frequency > 0) & (frequency <= (1.0 if up_to is None else up_to))
 
 
 def _size(psf: Psf) -> tuple[int, int]:
@@ -265,9 +265,9 @@ def _(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, **settings:
 
 @information.reference
 def _(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, **settings: Any) -> Tensor:
-    each = _by_definition(psf, illuminant, responses, bands, **settings)
+    channels = _by_definition(psf, illuminant, responses, bands, **settings)
     return -torch.stack(
-        [snr[counted].log1p().mean() / math.log(2) for snr, _, counted in each]
+        [snr[counted].log1p().mean() / math.log(2) for snr, _, counted in channels]
     ).mean()
 
 
@@ -299,8 +299,8 @@ def _by_definition(
         else (power * lsr.clamp_min(1e-300).log()).logsumexp(0).div(power).exp()
     )
     passed = torch.minimum(torch.ones(()), limit / worst) if limit is not None else torch.ones(())
-    seen = responses.double() * (illuminant.double() * bands.centres)
-    for share in seen / seen.sum(-1, keepdim=True):
+    sensitivity = responses.double() * (illuminant.double() * bands.centres)
+    for share in sensitivity / sensitivity.sum(-1, keepdim=True):
         mtf = torch.fft.fft2(torch.tensordot(share, psf.intensity.double(), 1)).abs()
         noise = passed * (light * transmittance + veil) + read_noise**2
         counted = (square > 0) & (square <= (up_to or 1.0) ** 2)
@@ -333,14 +333,16 @@ def best_stop(
     cuts, sides = cut_off(plain).cpu(), averaging(plain).cpu()
     blur = _pixel_contrast(size, float(sides.max()))
     spectrum = natural_spectrum(size, contrast, cuts)
-    counted, at = _counted(size, up_to, cuts), frequencies(size, cuts)
+    counted, frequency = _counted(size, up_to, cuts), frequencies(size, cuts)
 
     def loss_of(width: float) -> tuple[float, float, float]:
         filtered = filter_of(_stop_peak(width, cuts, sides), limit)
         exposure = Exposure(light, read_noise, veil, width**2)
         snr = (
             quanta(
-                (width**2 * blur * round_mtf(at, width * cuts, grey)).square(), exposure, filtered
+                (width**2 * blur * round_mtf(frequency, width * cuts, grey)).square(),
+                exposure,
+                filtered,
             )
             * spectrum
         )

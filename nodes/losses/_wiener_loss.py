@@ -53,14 +53,14 @@ def wiener(
     effective = effective_psf(psf, illuminant, responses, bands).to(intensity)
     shares = grey_shares(illuminant, responses, bands).to(intensity)
     signal = (fall((y, x)) / noise).to(intensity)  # signal over noise, by frequency
-    known = signal * _counted((y, x), up_to).to(signal)
-    each, lost = torch.fft.rfft2(intensity), list[Tensor]()
+    counted_signal = signal * _counted((y, x), up_to).to(signal)
+    bands_otf, lost = torch.fft.rfft2(intensity), list[Tensor]()
     for channel, share in zip(torch.fft.rfft2(effective), shares, strict=True):
         passed = signal * _square(channel)
         filtered = signal * passed / (passed + 1).square()  # signal times the square of the filter
-        apart = torch.tensordot(share, _square(each - channel), 1)
+        apart = torch.tensordot(share, _square(bands_otf - channel), 1)
         wrong = 1 / (passed + 1) + colour * filtered * apart
-        lost.append(variance(wrong * known, (y, x)) / variance(known, (y, x)))
+        lost.append(variance(wrong * counted_signal, (y, x)) / variance(counted_signal, (y, x)))
     result: Tensor = torch.stack(lost).clamp_min(1e-30).log().mean()
     return result
 
@@ -99,14 +99,14 @@ def _(
     power = (square + 1 / (x * y)) ** -1.5
     signal = power / power.mean() / noise
     counted = (square > 0) & (square <= (up_to or 1.0) ** 2)
-    each = torch.fft.fft2(psf.intensity.double())
-    seen = responses.double() * (illuminant.double() * bands.centres)
+    bands_otf = torch.fft.fft2(psf.intensity.double())
+    sensitivity = responses.double() * (illuminant.double() * bands.centres)
     logs = []
-    for share in seen / seen.sum(-1, keepdim=True):
-        channel = (share[:, None, None] * each).sum(0)
+    for share in sensitivity / sensitivity.sum(-1, keepdim=True):
+        channel = (share[:, None, None] * bands_otf).sum(0)
         filtered = signal * channel.conj() / (signal * channel.abs().square() + 1)
         wrong = signal * (1 - filtered * channel).abs().square() + filtered.abs().square()
-        for weight, band in zip(share, each, strict=True):
+        for weight, band in zip(share, bands_otf, strict=True):
             wrong = wrong + colour * weight * signal * (filtered * (band - channel)).abs().square()
         logs.append((wrong[counted].sum() / signal[counted].sum()).clamp_min(1e-30).log())
     return torch.stack(logs).mean()

@@ -79,7 +79,7 @@ def detail_energy(
     target.
     """
     otf = torch.fft.fft2(channel_psf(psf, illuminant, responses, bands))
-    found = {}
+    energies = {}
     for name, target in detail_targets(size).items():
         if max(target.shape) > min(otf.shape[-2:]):
             text = (
@@ -87,9 +87,9 @@ def detail_energy(
                 f" {tuple(otf.shape[-2:])}"
             )
             raise ValueError(f"{text}: choose smaller targets, or a wider window")
-        seen = otf.abs() * torch.fft.fft2(target, s=otf.shape[-2:]).abs()
-        found[name] = seen.square().mean((-2, -1))  # Parseval
-    return found
+        spectrum = otf.abs() * torch.fft.fft2(target, s=otf.shape[-2:]).abs()
+        energies[name] = spectrum.square().mean((-2, -1))  # Parseval
+    return energies
 
 
 def detection_snr(energy: Tensor, amplitude: float, contrast: float, noise: Tensor) -> Tensor:
@@ -103,5 +103,5 @@ def detection_snr(energy: Tensor, amplitude: float, contrast: float, noise: Tens
     Source: Barrett and Myers, Foundations of Image Science, section 13.2.8 (ideal observer for a
             known signal).
     """
-    seen = (amplitude * contrast) ** 2 * energy / noise
-    return seen.sum(-1).sqrt()
+    contributions = (amplitude * contrast) ** 2 * energy / noise
+    return contributions.sum(-1).sqrt()

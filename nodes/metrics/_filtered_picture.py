@@ -109,7 +109,8 @@ def _(
     for response in responses.double():
         share = response * photons / (response * photons).sum()
         otf = sum(
-            w * torch.fft.fft2(one.double()) for w, one in zip(share, psf.intensity, strict=True)
+            w * torch.fft.fft2(band_psf.double())
+            for w, band_psf in zip(share, psf.intensity, strict=True)
         )
         passed = float(abs(otf[0, 0]))
         noise = (
@@ -162,8 +163,8 @@ def channel_psf(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands) -
             " step"
         )
     shares = grey_shares(illuminant, responses, bands).to(psf.intensity.device)
-    whole: Tensor = torch.tensordot(shares, psf.intensity.double(), 1)
-    return whole
+    kernels: Tensor = torch.tensordot(shares, psf.intensity.double(), 1)
+    return kernels
 
 
 def noise_variance(
@@ -175,8 +176,8 @@ def noise_variance(
     light + glare + read_noise**2 + (prnu (light + glare))**2 + (residual_glare glare)**2, with
     light and glare in e-.
     """
-    whole = light + glare
-    return whole + read_noise**2 + (prnu * whole) ** 2 + (residual_glare * glare) ** 2
+    signal = light + glare
+    return signal + read_noise**2 + (prnu * signal) ** 2 + (residual_glare * glare) ** 2
 
 
 def natural_power(shape: tuple[int, ...], variance: float) -> Tensor:
@@ -244,33 +245,33 @@ class PictureSpectrum(NamedTuple):
 
 def picture_spectrum(
     true: Psf,
-    known: Psf,
+    assumed: Psf,
     illuminant: Tensor,
     responses: Tensor,
     bands: Bands,
     variance: float = 0.1,
     up_to: float = 0.12,
 ) -> PictureSpectrum:
-    """Sort the frequencies of a picture by their power; ``known`` is the PSF that the filter
+    """Sort the frequencies of a picture by their power; ``assumed`` is the PSF that the filter
     takes for the true one.
     """
     otf, guess = (
-        torch.fft.fft2(channel_psf(one, illuminant, responses, bands)) for one in (true, known)
+        torch.fft.fft2(channel_psf(psf, illuminant, responses, bands)) for psf in (true, assumed)
     )
     scene = natural_power(tuple(otf.shape[-2:]), variance)
     low = low_frequencies(tuple(otf.shape[-2:]), up_to)
     share = scene / scene.sum()
     rows = []
-    for one, other in zip(otf, guess, strict=True):
+    for channel_otf, other in zip(otf, guess, strict=True):
         square = other.abs().square()
-        ratio = torch.where(square > 0, one * other.conj() / square.clamp_min(1e-300), 0.0)
+        ratio = torch.where(square > 0, channel_otf * other.conj() / square.clamp_min(1e-300), 0.0)
         weights = (share, share * ratio.real, share * ratio.abs().square())
         power, *sums = _binned(scene * square, *weights)
         strength, count = _binned(
-            scene * one.abs().square(), torch.full_like(scene, 1.0 / scene.numel())
+            scene * channel_otf.abs().square(), torch.full_like(scene, 1.0 / scene.numel())
         )
-        contrast = one.abs().square()[low].clamp_min(1e-30).log().mean()
-        rows.append((power, *sums, strength, count, contrast, one[0, 0].real))
+        contrast = channel_otf.abs().square()[low].clamp_min(1e-30).log().mean()
+        rows.append((power, *sums, strength, count, contrast, channel_otf[0, 0].real))
     return PictureSpectrum(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
@@ -278,16 +279,16 @@ def _binned(value: Tensor, *weights: Tensor) -> list[Tensor]:
     """Return the mean of ``value`` in each bin, weighted by the first of ``weights``, and the
     sums of all weights.
     """
-    at = (
+    bin_index = (
         ((value.clamp_min(1e-300).log10() - _LEAST_FREQUENCY) * _EACH)
         .long()
         .clamp(0, (_MOST - _LEAST_FREQUENCY) * _EACH - 1)
         .flatten()
     )
     empty = torch.zeros((_MOST - _LEAST_FREQUENCY) * _EACH, dtype=torch.float64)
-    sums = [empty.index_add(0, at, weight.flatten()) for weight in weights]
-    whole = empty.index_add(0, at, (value * weights[0]).flatten())
-    return [torch.where(sums[0] > 0, whole / sums[0].clamp_min(1e-300), 0.0), *sums]
+    sums = [empty.index_add(0, bin_index, weight.flatten()) for weight in weights]
+    weighted_sum = empty.index_add(0, bin_index, (value * weights[0]).flatten())
+    return [torch.where(sums[0] > 0, weighted_sum / sums[0].clamp_min(1e-300), 0.0), *sums]
 
 
 def remaining_error(spectrum: PictureSpectrum, amplitude: float, noise: Tensor) -> Tensor:
@@ -334,11 +335,11 @@ def radial_contrast(
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in square.shape)
     radius = torch.hypot(fy[:, None], fx)
     inside = (radius > 0) & (radius < 0.5)
-    at = (radius[inside] * 2 * rings).long()
+    ring = (radius[inside] * 2 * rings).long()
     empty = torch.zeros(rings, dtype=torch.float64)
-    count = empty.index_add(0, at, torch.ones_like(radius[inside])).clamp_min(1)
+    count = empty.index_add(0, ring, torch.ones_like(radius[inside])).clamp_min(1)
     middle = (torch.arange(rings, dtype=torch.float64) + 0.5) / (2 * rings)
-    return middle, empty.index_add(0, at, square[inside]) / count
+    return middle, empty.index_add(0, ring, square[inside]) / count
 
 
 # --- attacked picture -----------------------------------------------------------------------------
@@ -385,7 +386,7 @@ class Attacked(NamedTuple):
 def glare_levels(light: Tensor, clear_peak: float) -> GlareLevels:
     """Sort the pixels of a field by the light (y, x) that a laser sends to each pixel."""
     relative = light.double().flatten() / clear_peak
-    at = (
+    bin_index = (
         ((relative.clamp_min(1e-300).log10() - _LEAST_ATTACK) * _ATTACKS_EACH)
         .long()
         .clamp(0, (_MOST_ATTACK - _LEAST_ATTACK) * _ATTACKS_EACH - 1)
@@ -394,8 +395,8 @@ def glare_levels(light: Tensor, clear_peak: float) -> GlareLevels:
         (_MOST_ATTACK - _LEAST_ATTACK) * _ATTACKS_EACH,
         dtype=torch.float64,
     )
-    count = empty.index_add(0, at, torch.ones_like(relative))
-    mean = empty.index_add(0, at, relative) / count.clamp_min(1)
+    count = empty.index_add(0, bin_index, torch.ones_like(relative))
+    mean = empty.index_add(0, bin_index, relative) / count.clamp_min(1)
     held = count > 0
     return GlareLevels(mean[held], count[held] / len(relative))
 
@@ -421,16 +422,18 @@ def attacked_picture(
     amplitude = electrons * transmittance
     light = amplitude * spectrum.light
     full = noise.full_well * strengths[:, None, None] * transmittance
-    each = full * glare.level[:, None] * colour  # (strength, bin, channel)
-    free = (each + light) < noise.full_well
+    laser_light = full * glare.level[:, None] * colour  # (strength, bin, channel)
+    free = (laser_light + light) < noise.full_well
     quiet = noise_variance(light, 0.0, noise.read_noise, noise.prnu, noise.residual_glare)
-    most = noise_variance(
+    loudest = noise_variance(
         light, noise.full_well, noise.read_noise, noise.prnu, noise.residual_glare
     )
     steps = torch.linspace(0, 1, _NOISES, dtype=torch.float64)[:, None]
-    table = quiet.log() + steps * (most / quiet).log()  # (noise, channel)
-    here = noise_variance(light, each, noise.read_noise, noise.prnu, noise.residual_glare).log()
-    place = ((here - quiet.log()) / (most / quiet).log() * (_NOISES - 1)).clamp(
+    table = quiet.log() + steps * (loudest / quiet).log()  # (noise, channel)
+    here = noise_variance(
+        light, laser_light, noise.read_noise, noise.prnu, noise.residual_glare
+    ).log()
+    place = ((here - quiet.log()) / (loudest / quiet).log() * (_NOISES - 1)).clamp(
         0, _NOISES - 1 - 1e-9
     )
     error, bits = (
@@ -438,8 +441,8 @@ def attacked_picture(
         for f in (remaining_error, information_bits)
     )
     weights = glare.share[:, None]
-    found = (torch.where(free, error, 1.0), torch.where(free, bits, 0.0), free.double())
-    return Attacked(*((weights * one).sum(1).mean(-1) for one in found))
+    means = (torch.where(free, error, 1.0), torch.where(free, bits, 0.0), free.double())
+    return Attacked(*((weights * mean).sum(1).mean(-1) for mean in means))
 
 
 def _between(table: Tensor, place: Tensor) -> Tensor:

@@ -59,8 +59,8 @@ def quality(
         )
     absolute, square, alike = _sums(a, b, domain)
     psnr = -10.0 * (square / a.numel()).clamp_min(1e-20).log10()
-    seen = a[..., _WINDOW - 1 :, _WINDOW - 1 :].numel()
-    return Quality(absolute / a.numel(), psnr, alike / seen)
+    windows = a[..., _WINDOW - 1 :, _WINDOW - 1 :].numel()
+    return Quality(absolute / a.numel(), psnr, alike / windows)
 
 
 @quality.check

@@ -81,10 +81,10 @@ def protection_bounds(
     peak = psf.intensity.amax((-2, -1)).double().cpu()
     cuts, sides = cut_off(psf).cpu(), averaging(psf).cpu()
     rows = [
-        _contrast(one.double(), float(cut))
-        for one, cut in zip(psf.intensity.cpu(), cuts, strict=True)
+        _contrast(kernel.double(), float(cut))
+        for kernel, cut in zip(psf.intensity.cpu(), cuts, strict=True)
     ]
-    power, whole, logs = (torch.stack(column) for column in zip(*rows, strict=True))
+    power, mean_square, logs = (torch.stack(column) for column in zip(*rows, strict=True))
     lsr, noise = peak / p0, electrons + glare + read_noise**2
     lens = round_lens(cuts, sides)
     clear = torch.where(sides > 0, lens.power, CLEAR / 4)
@@ -95,21 +95,21 @@ def protection_bounds(
     grey = _rival(lsr**2 * clear, lsr, electrons, read_noise)
     stop = _rival(narrow, width.square(), electrons, read_noise)
     largest = lsr * lens.peak / 4  # mean of |OTF|**2 over the lens band, by Parseval
-    mask, most = electrons**2 * whole / noise, electrons**2 * largest / noise
+    mask, mask_bound = electrons**2 * mean_square / noise, electrons**2 * largest / noise
     better = torch.maximum(grey, stop)
-    contrast = whole / clear
+    contrast = mean_square / clear
     scale = math.log(electrons**2 / noise)
-    each = (
+    indicators = (
         power,
         peak,
         contrast,
         largest / clear,
         mask / grey,
-        most / grey,
+        mask_bound / grey,
         mask / better,
-        most / better,
+        mask_bound / better,
     )
-    return ProtectionBounds(*each, logs + scale, most.log())
+    return ProtectionBounds(*indicators, logs + scale, mask_bound.log())
 
 
 def _rival(power: Tensor, passed: Tensor, electrons: float, read_noise: float) -> Tensor:
@@ -157,10 +157,10 @@ def largest_glare(lsr: float, electrons: float, read_noise: float) -> float:
 @protection_bounds.check
 def _(result: ProtectionBounds, *inputs: Any, **params: Any) -> list[Check]:
     broken = result.broken()
-    gain, most = float(result.over_both.mean()), float(result.over_both_bound.mean())
+    gain, bound = float(result.over_both.mean()), float(result.over_both_bound.mean())
     return [
         Check(
-            f"mean NEQ {gain:.3g} times that of the better of filter and stop, at most {most:.3g}",
+            f"mean NEQ {gain:.3g} times that of the better of filter and stop, at most {bound:.3g}",
             not broken,
         )
     ]

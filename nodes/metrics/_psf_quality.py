@@ -52,7 +52,8 @@ def mtf(psf: Psf) -> Mtf:
             pupil).
     """
     rows = [
-        _contrast(one, cut) for one, cut in zip(psf.intensity, cut_off(psf).tolist(), strict=True)
+        _contrast(kernel, cut)
+        for kernel, cut in zip(psf.intensity, cut_off(psf).tolist(), strict=True)
     ]
     return Mtf(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
@@ -62,9 +63,9 @@ def _contrast(kernel: Tensor, cut: float) -> tuple[Tensor, Tensor, Tensor]:
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64, device=kernel.device) for n in (y, x))
     inside = torch.hypot(fy[:, None], fx[None, : x // 2 + 1]) <= cut
     otf = torch.fft.rfft2(kernel.double())
-    whole = otf[0, 0].abs()
-    dark = whole <= _DARK
-    passed = otf[inside].abs() / whole.where(~dark, 1.0)
+    passed_light = otf[0, 0].abs()
+    dark = passed_light <= _DARK
+    passed = otf[inside].abs() / passed_light.where(~dark, 1.0)
     contrast = passed.where(~dark, 0.0).clamp_max(1.0)
     ordered = contrast.detach().sort().values
     rms: Tensor = torch.linalg.vector_norm(contrast) / math.sqrt(len(contrast))
@@ -175,18 +176,18 @@ def spectral_error(
         raise ValueError(
             f"pupil, bands and weights have {counts} bands: compute all from the same `bands` step"
         )
-    more, difference = _finer(bands, weights)
+    finer_wavelengths, difference = _finer(bands, weights)
     few = _in_double(_thinned(pupil))
-    index = torch.cat([few.index, _interpolated(pupil.wavelengths, pupil.index, more)])
-    few = few._replace(index=index, wavelengths=torch.cat([few.wavelengths, more]))
+    index = torch.cat([few.index, _interpolated(pupil.wavelengths, pupil.index, finer_wavelengths)])
+    few = few._replace(index=index, wavelengths=torch.cat([few.wavelengths, finer_wavelengths]))
     limit = float(few.wavelengths.min()) * focal_length / (2 * float(few.pitch) * pixel_pitch)
     side = max(1, min(_SIDE, math.floor(2 * limit)))
     lens = {"focal_length": focal_length, "pixel_pitch": pixel_pitch, "sensor": sensor}
-    found: Psf = focus(few, **lens, shape=(side, side), precision="double")
-    light = found.intensity.flatten(1)
-    whole, off = (_norms(w.to(light) @ light[: w.shape[1]]) for w in (weights, difference))
-    dark = whole <= _DARK
-    share: Tensor = torch.where(dark, 0.0, off / whole.where(~dark, 1.0))
+    band_psf: Psf = focus(few, **lens, shape=(side, side), precision="double")
+    light = band_psf.intensity.flatten(1)
+    white, off = (_norms(w.to(light) @ light[: w.shape[1]]) for w in (weights, difference))
+    dark = white <= _DARK
+    share: Tensor = torch.where(dark, 0.0, off / white.where(~dark, 1.0))
     return share
 
 
@@ -216,12 +217,12 @@ def _finer(bands: Bands, weights: Tensor) -> tuple[Tensor, Tensor]:
     return halves, torch.cat([weights, -weights / 2, -weights / 2], 1)
 
 
-def _interpolated(at: Tensor, values: Tensor, where: Tensor) -> Tensor:
+def _interpolated(points: Tensor, values: Tensor, where: Tensor) -> Tensor:
     """Interpolate by the polynomial through the four nearest points, or through all points if
     there are fewer.
     """
-    near = (where[:, None] - at).abs().argsort(1)[:, : min(4, len(at))]
-    x, y = at[near], values[near]
+    near = (where[:, None] - points).abs().argsort(1)[:, : min(4, len(points))]
+    x, y = points[near], values[near]
     apart = x[:, :, None] - x[:, None, :] + torch.eye(x.shape[1], dtype=x.dtype)
     ratio = (where[:, None, None] - x[:, None, :]) / apart
     own = torch.eye(x.shape[1], dtype=torch.bool)

@@ -234,18 +234,20 @@ def heat_ratio(
     )
     spectrum = torch.fft.rfft2(kernel)
     hottest = [
-        torch.stack([_warmed(one, spectrum).amax() for one in each.intensity.double()])
-        for each in (psf, plain_psf)
+        torch.stack(
+            [_warmed(band_light, spectrum).amax() for band_light in light.intensity.double()]
+        )
+        for light in (psf, plain_psf)
     ]
     return hottest[0] / hottest[1]
 
 
 def _warmed(light: Tensor, spectrum: Tensor) -> Tensor:
     y, x = light.shape
-    whole: Tensor = torch.fft.irfft2(
+    padded: Tensor = torch.fft.irfft2(
         torch.fft.rfft2(light, s=(2 * y, 2 * x)) * spectrum, s=(2 * y, 2 * x)
     )
-    return whole[:y, :x]
+    return padded[:y, :x]
 
 
 def _kernel(shape: tuple[int, int], pitch: float, reach: float) -> Tensor:
@@ -274,12 +276,12 @@ def _(
     # 2 pi r erfc / r over the area of the disc
     middle = float(2 * torch.special.erfc(fine / reach).mean() / disc)
     y, x = psf.intensity.shape[-2:]
-    at = torch.cartesian_prod(torch.arange(y), torch.arange(x)).double() * pixel_pitch
-    apart = torch.cdist(at, at, compute_mode="donot_use_mm_for_euclid_dist")
+    position = torch.cartesian_prod(torch.arange(y), torch.arange(x)).double() * pixel_pitch
+    apart = torch.cdist(position, position, compute_mode="donot_use_mm_for_euclid_dist")
     heat = torch.where(
         apart > 0, torch.special.erfc(apart / reach) / apart.where(apart > 0, 1.0), middle
     )
-    hottest = [(one.intensity.double().flatten(1) @ heat).amax(1) for one in (psf, plain_psf)]
+    hottest = [(light.intensity.double().flatten(1) @ heat).amax(1) for light in (psf, plain_psf)]
     return hottest[0] / hottest[1]
 
 

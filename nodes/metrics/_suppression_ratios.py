@@ -54,7 +54,7 @@ def limits(psf: Psf) -> Limits:
             Without light (1e-30) all five bounds are 0.
     Source: Parseval's theorem; the cut-off of the clear aperture as in `metrics.mtf`.
     """
-    rows = [_contrast_bound(one.double()) for one in psf.intensity]
+    rows = [_contrast_bound(kernel.double()) for kernel in psf.intensity]
     light, rms, bound = (torch.stack(column) for column in zip(*rows, strict=True))
     passed = bound / shares(psf).to(bound).sqrt()
     return Limits(light * least_lsr(psf).to(light), rms, bound, passed, math.sqrt(2.0) * passed)
@@ -186,9 +186,9 @@ def bsr(psf: Psf, radiance: Tensor | None = None) -> Tensor:
     """
     if radiance is None:
         return single(psf.intensity).sum(-1).sum(-1, dtype=torch.float64)
-    kept, whole = light_in_field(psf.intensity, radiance)
-    dark = whole <= _DARK  # false for NaN, so that NaN reaches the result
-    ratio: Tensor = torch.where(dark, 1.0, kept / whole.where(~dark, 1.0))
+    passed, scene_light = light_in_field(psf.intensity, radiance)
+    dark = scene_light <= _DARK  # false for NaN, so that NaN reaches the result
+    ratio: Tensor = torch.where(dark, 1.0, passed / scene_light.where(~dark, 1.0))
     return ratio
 
 
@@ -205,12 +205,12 @@ def _(psf: Psf, radiance: Tensor | None = None) -> Tensor:
     (m, n), (y, x) = kernel.shape[-2:], scene.shape[-2:]
     around = (n - 1, n - 1, m - 1, m - 1)
     full = conv2d(pad(scene, around), kernel.flip(-1, -2)[:, None], groups=len(kernel))
-    kept, whole = (
+    passed, scene_light = (
         full[..., m // 2 : m // 2 + y, n // 2 : n // 2 + x].sum((-2, -1)),
         scene.sum((-2, -1)),
     )
-    dark = whole <= _DARK
-    return torch.where(dark, 1.0, kept / whole.where(~dark, 1.0)).reshape(cube.shape[:-2])
+    dark = scene_light <= _DARK
+    return torch.where(dark, 1.0, passed / scene_light.where(~dark, 1.0)).reshape(cube.shape[:-2])
 
 
 @bsr.check
@@ -242,9 +242,9 @@ def peak_bsr(image: Tensor, plain_image: Tensor) -> Tensor:
     if image.shape != plain_image.shape:
         shapes = f"{tuple(image.shape)} with and {tuple(plain_image.shape)} without mask"
         raise ValueError(f"image {shapes} differ in shape: use one scene for both")
-    kept, plain = (single(x).amax((-2, -1)).double() for x in (image, plain_image))
+    masked, plain = (single(x).amax((-2, -1)).double() for x in (image, plain_image))
     dark = plain <= _DARK  # false for NaN, so that NaN reaches the result
-    ratio: Tensor = torch.where(dark, 1.0, kept / plain.where(~dark, 1.0))
+    ratio: Tensor = torch.where(dark, 1.0, masked / plain.where(~dark, 1.0))
     return ratio
 
 

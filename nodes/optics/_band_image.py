@@ -38,10 +38,10 @@ def image(radiance: Tensor, psf: Psf, *, border: Border = "zero") -> Tensor:
     Raises: ValueError where scene and PSF have different bands.
     Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (incoherent imaging).
     """
-    scene, kernel, at = _fitted(radiance, psf.intensity, border)
+    scene, kernel, corner = _fitted(radiance, psf.intensity, border)
     size = (radiance.shape[-2], radiance.shape[-1])
     flat = scene.reshape(-1, *scene.shape[-3:])
-    done = [_by_contrast(one, kernel, at, size) for one in flat]
+    done = [_by_contrast(scene_of_batch, kernel, corner, size) for scene_of_batch in flat]
     return (
         done[0].reshape(radiance.shape)
         if len(done) == 1
@@ -66,11 +66,11 @@ def _(result: Tensor, radiance: Tensor, psf: Psf, **params: Any) -> list[Check]:
     before, after = (float(x.sum(-1).sum(dtype=torch.float64)) for x in (radiance, result))
     if before <= 0:
         return [Check("the scene holds no light")]
-    most = float(psf.intensity.sum(-1).sum(-1, dtype=torch.float64).amax())
+    largest_sum = float(psf.intensity.sum(-1).sum(-1, dtype=torch.float64).amax())
     return [
         Check(
             f"flux kept in the image {after / before:.2%}",
-            ok=params.get("border") == "reflect" or after <= before * most * 1.001,
+            ok=params.get("border") == "reflect" or after <= before * largest_sum * 1.001,
         )
     ]
 
@@ -103,21 +103,21 @@ def reach(kernel: Tensor, dim: int, size: int) -> Tensor:
     return kernel.narrow(dim, low, high - low)
 
 
-def _by_contrast(scene: Tensor, kernel: Tensor, at: Corner, size: Corner) -> Tensor:
+def _by_contrast(scene: Tensor, kernel: Tensor, corner: Corner, size: Corner) -> Tensor:
     """Convolve each band of the scene with its PSF, in float64 if the contrast of the band is
     too high for float32.
     """
     deep = _deep(scene) if scene.dtype == torch.float32 else []
     if not any(deep):
-        return _convolve(scene, kernel, at, size)
+        return _convolve(scene, kernel, corner, size)
     if all(deep):
-        return _convolve(scene.double(), kernel.double(), at, size).to(scene.dtype)
+        return _convolve(scene.double(), kernel.double(), corner, size).to(scene.dtype)
     wide = (torch.float64 if d else scene.dtype for d in deep)
-    each = [
-        _convolve(s[None].to(d), k[None].to(d), at, size)
+    images = [
+        _convolve(s[None].to(d), k[None].to(d), corner, size)
         for s, k, d in zip(scene, kernel, wide, strict=True)
     ]
-    return torch.cat([band.to(scene.dtype) for band in each])
+    return torch.cat([band.to(scene.dtype) for band in images])
 
 
 def _deep(scene: Tensor) -> list[bool]:
@@ -132,15 +132,17 @@ def _deep(scene: Tensor) -> list[bool]:
     return deep
 
 
-def _convolve(scene: Tensor, kernel: Tensor, at: Corner, size: Corner) -> Tensor:
+def _convolve(scene: Tensor, kernel: Tensor, corner: Corner, size: Corner) -> Tensor:
     """Return a window of the convolution of scene and PSF, by the shortest FFT without
     wrap-around in the window.
     """
     length = [
         smooth(max(s, a + w, s + k - 1 - a))
-        for s, k, a, w in zip(scene.shape[1:], kernel.shape[1:], at, size, strict=True)
+        for s, k, a, w in zip(scene.shape[1:], kernel.shape[1:], corner, size, strict=True)
     ]
-    result: Tensor = _Product.apply(scene, kernel, (0, 0), (0, 0), at, size, False, tuple(length))  # type: ignore[no-untyped-call]
+    result: Tensor = _Product.apply(
+        scene, kernel, (0, 0), (0, 0), corner, size, False, tuple(length)
+    )  # type: ignore[no-untyped-call]
     return result
 
 
@@ -153,11 +155,13 @@ class _Product(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(a: Tensor, b: Tensor, *how: Any) -> Tensor:
-        at_a, at_b, at, size, conjugate, length = how
+    def forward(a: Tensor, b: Tensor, *settings: Any) -> Tensor:
+        at_a, at_b, corner, size, conjugate, length = settings
         plane, result = _Plane(length, a), a.new_empty(len(a), *size)
-        for one, two, out in zip(a, b, result, strict=True):
-            out.copy_(plane.window(plane.product(one, at_a, two, at_b, conjugate), at, size))
+        for picture, kernel, out in zip(a, b, result, strict=True):
+            out.copy_(
+                plane.window(plane.product(picture, at_a, kernel, at_b, conjugate), corner, size)
+            )
         return result
 
     @staticmethod
@@ -165,35 +169,41 @@ class _Product(torch.autograd.Function):
         """Save the inputs for the backward pass outside of `forward`, as `torch.func` requires."""
         ctx.save_for_backward(*inputs[:2])
         ctx.save_for_forward(*inputs[:2])
-        ctx.how = inputs[2:]
+        ctx.settings = inputs[2:]
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
-        (a, b), (at_a, at_b, at, _, conjugate, length), grad = ctx.saved_tensors, ctx.how, grads[0]
+        (a, b), (at_a, at_b, corner, _, conjugate, length), grad = (
+            ctx.saved_tensors,
+            ctx.settings,
+            grads[0],
+        )
         of_a = of_b = None
         if ctx.needs_input_grad[0]:
             of_a = _Product.apply(
-                grad, b, at, at_b, at_a, tuple(a.shape[1:]), not conjugate, length
+                grad, b, corner, at_b, at_a, tuple(a.shape[1:]), not conjugate, length
             )  # type: ignore[no-untyped-call]
         if ctx.needs_input_grad[1]:
-            first, second, here, there = (a, grad, at_a, at) if conjugate else (grad, a, at, at_a)
+            first, second, first_corner, second_corner = (
+                (a, grad, at_a, corner) if conjugate else (grad, a, corner, at_a)
+            )
             of_b = _Product.apply(
-                first, second, here, there, at_b, tuple(b.shape[1:]), True, length
+                first, second, first_corner, second_corner, at_b, tuple(b.shape[1:]), True, length
             )  # type: ignore[no-untyped-call]
-        return of_a, of_b, *(None for _ in ctx.how)
+        return of_a, of_b, *(None for _ in ctx.settings)
 
     @staticmethod
     def jvp(ctx: Any, a: Tensor | None, b: Tensor | None, *_: None) -> Any:
         """Return the change of a product: that by the first factor, and that by the second."""
         first, second = ctx.saved_tensors
         pairs = [(x, y) for x, y in ((a, second), (first, b)) if x is not None and y is not None]
-        changes = [_Product.apply(x, y, *ctx.how) for x, y in pairs]  # type: ignore[no-untyped-call]
+        changes = [_Product.apply(x, y, *ctx.settings) for x, y in pairs]  # type: ignore[no-untyped-call]
         return sum(changes[1:], changes[0])
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> Any:
         return one_by_one(
-            _Product.apply, info.batch_size, (*in_dims[:2], *(None for _ in given[2:])), given
+            _Product.apply, info.batch_size, (*in_dims[:2], *(None for _ in inputs[2:])), inputs
         )
 
 
@@ -215,11 +225,11 @@ class _Plane:
         both: Tensor = first.mul_(second.conj_physical_() if conjugate else second)
         return both
 
-    def _spectrum(self, x: Tensor, at: Corner) -> Tensor:
+    def _spectrum(self, x: Tensor, corner: Corner) -> Tensor:
         """Return the FFT of a zero-padded picture: first along the rows that hold samples, then
         along all columns.
         """
-        (y, left), (h, w) = at, x.shape
+        (y, left), (h, w) = corner, x.shape
         for edge in (
             self.rows[:y],
             self.rows[y + h :],
@@ -232,8 +242,8 @@ class _Plane:
         spectrum: Tensor = torch.fft.fft(self.rows, dim=0)
         return spectrum
 
-    def window(self, spectrum: Tensor, at: Corner, size: Corner) -> Tensor:
-        (top, left), (h, w) = at, size
+    def window(self, spectrum: Tensor, corner: Corner, size: Corner) -> Tensor:
+        (top, left), (h, w) = corner, size
         columns = torch.fft.ifft(spectrum, dim=0)
         torch.fft.irfft(columns[top : top + h], n=self.length[1], out=self.real[:h])
         return self.real[:h, left : left + w]
@@ -264,14 +274,12 @@ def light_in_field(intensity: Tensor, radiance: Tensor) -> tuple[Tensor, Tensor]
         )
     kernel, size = reach(reach(intensity, -2, shape[-2]), -1, shape[-1]), (shape[-2], shape[-1])
     scene, kernel = _alike(radiance, kernel)
-    pairs = [
-        pair for each in scene.reshape(-1, *shape[-3:]) for pair in zip(each, kernel, strict=True)
-    ]
-    kept = [
-        (_boxes(plane, band.shape, size) * band).sum(-1).sum(-1, dtype=torch.float64)
-        for plane, band in pairs
-    ]
-    return torch.stack(kept).reshape(shape[:-2]), scene.sum(-1).sum(-1, dtype=torch.float64)
+    in_field = []
+    for planes in scene.reshape(-1, *shape[-3:]):
+        for plane, band in zip(planes, kernel, strict=True):
+            light = _boxes(plane, band.shape, size) * band
+            in_field.append(light.sum(-1).sum(-1, dtype=torch.float64))
+    return torch.stack(in_field).reshape(shape[:-2]), scene.sum(-1).sum(-1, dtype=torch.float64)
 
 
 def _alike(scene: Tensor, kernel: Tensor) -> tuple[Tensor, Tensor]:

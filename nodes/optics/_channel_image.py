@@ -11,7 +11,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d, pad
 from neusee.nodes import Check, ErrorBound, TensorStats, node
 from neusee.nodes.optics._band_image import Border, image, reach
 from neusee.nodes.optics._convolution_plan import (
-    Given,
+    ImageFacts,
     Mix,
     Passed,
     Plan,
@@ -36,57 +36,57 @@ _CELL = 8  #: pixels along the side of the cells in which the largest error of a
 _SOME = 16  #: rows of the PSF summed at a time; these rows of 31 bands fit in the cache
 
 
-def convolved(planes: Tensor, intensity: Tensor, given: Given, plan: Plan) -> Tensor:
+def convolved(planes: Tensor, intensity: Tensor, facts: ImageFacts, plan: Plan) -> Tensor:
     """Return weighted sums (row, y, x) over the bands of the image, from the basis images and
     kernels of ``plan``.
     """
-    scene = bordered(planes[: plan.planes], given, plan.window)
-    return summed(scene, _kernels(intensity, given, plan), plan.mix, _where(given, plan.window))
+    scene = bordered(planes[: plan.planes], facts, plan.window)
+    return summed(scene, _kernels(intensity, facts, plan), plan.mix, _where(facts, plan.window))
 
 
-def _where(given: Given, window: tuple[int, int]) -> Where:
+def _where(facts: ImageFacts, window: tuple[int, int]) -> Where:
     """Return the zero padding of scene and kernel, and the window of their convolution that is
     the image.
     """
     (m, n), zero = window, (0, 0)
-    at = (m - 1, n - 1) if given.reflect else (m // 2, n // 2)
-    return Where(zero, zero, at, given.size, transform(given, window))
+    corner = (m - 1, n - 1) if facts.reflect else (m // 2, n // 2)
+    return Where(zero, zero, corner, facts.size, transform(facts, window))
 
 
-def majorant(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
+def majorant(off: Tensor, intensity: Tensor, facts: ImageFacts) -> Tensor:
     """Return an upper bound (y, x) of the image error from an error ``off`` (y, x) in every band
     of the scene.
     """
-    window, kernel = (intensity.shape[1], intensity.shape[2]), _heaviest(intensity, given)
+    window, kernel = (intensity.shape[1], intensity.shape[2]), _heaviest(intensity, facts)
     reached = summed(
-        bordered(off[None], given, window), kernel, Mix(None, None, None), _where(given, window)
+        bordered(off[None], facts, window), kernel, Mix(None, None, None), _where(facts, window)
     )
     return reached[0].clamp_min_(0)
 
 
-def majorant_by_cell(off: Tensor, intensity: Tensor, given: Given) -> Tensor:
+def majorant_by_cell(off: Tensor, intensity: Tensor, facts: ImageFacts) -> Tensor:
     """Return an upper bound of `majorant` over cells of 8 x 8 pixels: (cell, cell) float64, far
     faster.
 
     A part of the kernel in one cell takes light to the pixels of a cell from four neighbouring
     cells of the scene, and from none of their pixels more than from the one with the largest error.
     """
-    window, kernel = (intensity.shape[1], intensity.shape[2]), _heaviest(intensity, given)[0]
-    at = _where(given, window).at
-    before = [-k % _CELL for k in at]  # so that the middle of the kernel begins a cell
+    window, kernel = (intensity.shape[1], intensity.shape[2]), _heaviest(intensity, facts)[0]
+    corner = _where(facts, window).at
+    before = [-k % _CELL for k in corner]  # so that the middle of the kernel begins a cell
     around = [-(k + b) % _CELL for k, b in zip(window, before, strict=True)]
     wide = pad(kernel.double(), (before[1], around[1], before[0], around[0]))
     light = avg_pool2d(wide[None], _CELL)[0] * _CELL**2
-    worst = max_pool2d(pad(cells(bordered(off[None], given, window))[None], (1, 1, 1, 1)), 2, 1)[
+    worst = max_pool2d(pad(cells(bordered(off[None], facts, window))[None], (1, 1, 1, 1)), 2, 1)[
         0, 0
     ].to(light)
     length = [a + b for a, b in zip(light.shape, worst.shape, strict=True)]
-    whole = torch.fft.irfft2(
+    product = torch.fft.irfft2(
         torch.fft.rfft2(light, length) * torch.fft.rfft2(worst, length), length
     )
-    first = [(k + b) // _CELL for k, b in zip(at, before, strict=True)]
-    y, x = (slice(f, f + -(-n // _CELL)) for f, n in zip(first, given.size, strict=True))
-    inside: Tensor = whole[y, x]
+    first = [(k + b) // _CELL for k, b in zip(corner, before, strict=True)]
+    y, x = (slice(f, f + -(-n // _CELL)) for f, n in zip(first, facts.size, strict=True))
+    inside: Tensor = product[y, x]
     return inside.clamp_min_(0)
 
 
@@ -98,18 +98,18 @@ def cells(planes: Tensor) -> Tensor:
     return largest[0]
 
 
-def _heaviest(intensity: Tensor, given: Given) -> Tensor:
+def _heaviest(intensity: Tensor, facts: ImageFacts) -> Tensor:
     """Return the PSF (1, y, x) of all bands together, each with its largest weight in any row."""
-    heaviest = given.rows.abs().amax(0).to(intensity)
-    weights = heaviest[None] if given.share is None else heaviest[None] @ given.share.to(heaviest)
-    return _summed_bands(weights, intensity, given.passed.signed)
+    heaviest = facts.rows.abs().amax(0).to(intensity)
+    weights = heaviest[None] if facts.share is None else heaviest[None] @ facts.share.to(heaviest)
+    return _summed_bands(weights, intensity, facts.passed.signed)
 
 
-def bordered(planes: Tensor, given: Given, window: tuple[int, int]) -> Tensor:
+def bordered(planes: Tensor, facts: ImageFacts, window: tuple[int, int]) -> Tensor:
     """Return the basis images of the scene, with a mirrored border if the convolution with the
     PSF needs a border.
     """
-    if not given.reflect:
+    if not facts.reflect:
         return planes
     m, n = window
     around = (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2)
@@ -117,13 +117,13 @@ def bordered(planes: Tensor, given: Given, window: tuple[int, int]) -> Tensor:
     return wide
 
 
-def _kernels(intensity: Tensor, given: Given, plan: Plan) -> Tensor:
+def _kernels(intensity: Tensor, facts: ImageFacts, plan: Plan) -> Tensor:
     stack = centred(intensity, plan.window)
     if plan.kernels is None:
         return stack if plan.number == len(stack) else stack[plan.bands.to(stack.device)]
-    weights = plan.kernels.new_zeros(len(plan.kernels), len(given.basis))
+    weights = plan.kernels.new_zeros(len(plan.kernels), len(facts.basis))
     weights = weights.index_copy_(1, plan.bands, plan.kernels)
-    weights = weights if given.share is None else weights @ given.share
+    weights = weights if facts.share is None else weights @ facts.share
     return _summed_bands(weights.to(stack), stack)
 
 
@@ -143,23 +143,23 @@ def _summed_bands(weights: Tensor, stack: Tensor, absolute: bool = False) -> Ten
     return sums
 
 
-def guessed(planes: Tensor, given: Given) -> Tensor:
+def guessed(planes: Tensor, facts: ImageFacts) -> Tensor:
     """Return an estimate of the brightest pixel of each weighted sum over the image bands.
 
     The estimate is the smaller of two numbers: a quarter of the brightest pixel without blur, and
     half of an upper bound of the brightest pixel with blur.
     """
-    through = given.passed.total
-    room, sharp = planes.new_empty(planes[0].numel()), torch.zeros_like(given.rows[:, 0])
-    for i, weights in enumerate((given.rows * through @ given.basis).to(planes)):
+    through = facts.passed.total
+    room, sharp = planes.new_empty(planes[0].numel()), torch.zeros_like(facts.rows[:, 0])
+    for i, weights in enumerate((facts.rows * through @ facts.basis).to(planes)):
         bright = torch.mv(planes.flatten(1).T, weights, out=room)
         sharp[i] = torch.maximum(bright.amax(), -bright.amin())
-    power = ((given.basis @ given.gram) * given.basis).sum(1).clamp_min(0) * given.copies
-    blurred = given.rows.abs() @ (power * through * given.passed.peak).sqrt()
+    power = ((facts.basis @ facts.gram) * facts.basis).sum(1).clamp_min(0) * facts.copies
+    blurred = facts.rows.abs() @ (power * through * facts.passed.peak).sqrt()
     return torch.minimum(sharp / 4, blurred / 2)
 
 
-def rounding(given: Given, plan: Plan, found: Tensor, eps: float) -> Tensor:
+def rounding(facts: ImageFacts, plan: Plan, brightest: Tensor, eps: float) -> Tensor:
     """Return an estimate of the largest FFT round-off in each weighted sum over the image bands.
 
     The round-off is close to white: a share eps sqrt(log2 N) / 2 of the power, spread over all N
@@ -167,17 +167,17 @@ def rounding(given: Given, plan: Plan, found: Tensor, eps: float) -> Tensor:
     the brightest pixel for errors that are not spread: sums over the bands, planes and rows of a
     PSF, of which five roundings were measured.
     """
-    count = math.prod(transform(given, plan.window))
+    count = math.prod(transform(facts, plan.window))
     u, x, y, _ = plan.mix
-    plane = given.gram.diagonal()[: plan.planes].clamp_min(0).sqrt() * math.sqrt(given.copies)
-    kernel = (given.passed.total * given.passed.peak).sqrt()
+    plane = facts.gram.diagonal()[: plan.planes].clamp_min(0).sqrt() * math.sqrt(facts.copies)
+    kernel = (facts.passed.total * facts.passed.peak).sqrt()
     if plan.kernels is not None:
         kernel = plan.kernels.abs() @ kernel[plan.bands]
     else:  # the band of each PSF, or the band in which a PSF has the weight 1
-        kernel = kernel[plan.bands if given.share is None else given.share.argmax(0)]
+        kernel = kernel[plan.bands if facts.share is None else facts.share.argmax(0)]
     terms = (plane if x is None else x.abs() @ plane) * (kernel if y is None else y.abs() @ kernel)
     white = terms[None].sum(1) if u is None else u.abs() @ terms
-    return eps * (8 * math.sqrt(math.log2(count + 1)) * white / math.sqrt(count) + 10 * found)
+    return eps * (8 * math.sqrt(math.log2(count + 1)) * white / math.sqrt(count) + 10 * brightest)
 
 
 # --- channel image --------------------------------------------------------------------------------
@@ -241,11 +241,11 @@ def image_channels(
     unit = rows.detach().abs().amax(1).double().cpu()
     unit = unit.where(unit > 0, 1.0)
     scaled = rows.detach().double().cpu() / unit[:, None]
-    given = _given(
+    facts = _given(
         radiance, planes, scaled, border, spread(passed(intensity.detach()), share), share
     )
-    result, bound, kept = _formed(planes, intensity, given, 0.0 if largest else within)
-    top = _top(result, radiance, intensity, given, within * _QUICKLY) if largest else math.inf
+    result, bound, sizes = _formed(planes, intensity, facts, 0.0 if largest else within)
+    top = _top(result, radiance, intensity, facts, within * _QUICKLY) if largest else math.inf
     brightest = torch.tensor(top, dtype=torch.float64)
     scale = unit.to(result)[:, None, None]
     result = result * scale if result.requires_grad else result.mul_(scale)
@@ -254,7 +254,7 @@ def image_channels(
         if few is None
         else torch.stack([few.error, few.largest]).cpu()
     )
-    return Channels(result, rows.detach().double(), bound, kept, brightest, estimated)
+    return Channels(result, rows.detach().double(), bound, sizes, brightest, estimated)
 
 
 @image_channels.reference
@@ -333,8 +333,8 @@ def _fitted(
     the same precision.
     """
     count = len(psf.intensity)
-    known = count if share is None else len(share) if share.shape[1] == count else -1
-    bands = {len(radiance.basis), known, rows.shape[-1]}
+    psf_bands = count if share is None else len(share) if share.shape[1] == count else -1
+    bands = {len(radiance.basis), psf_bands, rows.shape[-1]}
     if len(bands) > 1 or radiance.planes.ndim != 3 or psf.intensity.ndim != 3 or rows.ndim != 2:
         raise ValueError(
             f"radiance of {len(radiance.basis)} bands in planes {tuple(radiance.planes.shape)}, PSF"
@@ -354,23 +354,23 @@ def _given(
     border: Border,
     through: Passed,
     share: Tensor | None,
-) -> Given:
+) -> ImageFacts:
     flat = planes.detach().flatten(1)
     gram = (flat @ flat.T).double().cpu()
     copies = 9 if border == "reflect" else 1
     if radiance.residual_rms.numel():
-        rest = radiance.residual_rms.double().cpu() * math.sqrt(copies)
-        most = (gram.diagonal() * (1.001 * copies / flat.shape[1])).clamp_min(0).sqrt()
+        residual = radiance.residual_rms.double().cpu() * math.sqrt(copies)
+        norm = (gram.diagonal() * (1.001 * copies / flat.shape[1])).clamp_min(0).sqrt()
     else:
-        rest, most = (
+        residual, norm = (
             radiance.residual_max.double().cpu(),
             torch.maximum(flat.amax(1), -flat.amin(1)).double().cpu(),
         )
-    return Given(
+    return ImageFacts(
         rows,
         radiance.basis.detach().double().cpu(),
-        rest,
-        most,
+        residual,
+        norm,
         gram,
         copies,
         through,
@@ -381,31 +381,31 @@ def _given(
 
 
 def _formed(
-    planes: Tensor, intensity: Tensor, given: Given, within: float
+    planes: Tensor, intensity: Tensor, facts: ImageFacts, within: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the summed image, its error bound, and the sizes of the first convolution plan of
     error at most ``within``.
     """
     eps = torch.finfo(planes.dtype).eps
-    brightest, allowed = given.rows.new_zeros(len(given.rows)), within / (1 + within) - 16 * eps
+    brightest, allowed = facts.rows.new_zeros(len(facts.rows)), within / (1 + within) - 16 * eps
     if within > 0:
-        brightest = guessed(planes.detach(), given)
-        given = with_windows(given, intensity.detach(), brightest, allowed)
+        brightest = guessed(planes.detach(), facts)
+        facts = with_windows(facts, intensity.detach(), brightest, allowed)
     for attempt in range(_TRIES):
-        plan = choose(given, brightest, allowed if attempt < _TRIES - 1 else 0.0)
-        result = convolved(planes, intensity, given, plan)
-        found = result.detach().abs().amax((1, 2)).double().cpu()
-        lost = rounding(given, plan, found, eps)
-        bound = _share(plan.off + lost, found)
+        plan = choose(facts, brightest, allowed if attempt < _TRIES - 1 else 0.0)
+        result = convolved(planes, intensity, facts, plan)
+        brightest_found = result.detach().abs().amax((1, 2)).double().cpu()
+        lost = rounding(facts, plan, brightest_found, eps)
+        bound = _share(plan.off + lost, brightest_found)
         if plan.whole or bound <= within:
             break
-        brightest = (found - plan.off - lost).clamp_min(0)
-        allowed = within / (1 + within) - _share(lost, found) - eps
+        brightest = (brightest_found - plan.off - lost).clamp_min(0)
+        allowed = within / (1 + within) - _share(lost, brightest_found) - eps
     return result, torch.tensor(bound, dtype=torch.float64), torch.tensor(plan.kept)
 
 
 def _top(
-    result: Tensor, radiance: LowRankCube, intensity: Tensor, given: Given, quickly: float
+    result: Tensor, radiance: LowRankCube, intensity: Tensor, facts: ImageFacts, quickly: float
 ) -> float:
     """Return the largest relative error of the brightest pixel over all weighted sums of the image
     bands.
@@ -418,34 +418,37 @@ def _top(
     """
     if not radiance.residual_map.numel():
         return math.inf
-    found, rest = result.detach(), radiance.residual_map.to(result)
-    low, most = (
-        torch.stack(ends).double().cpu() for ends in zip(*map(torch.aminmax, found), strict=True)
+    image, residual = result.detach(), radiance.residual_map.to(result)
+    low, highest = (
+        torch.stack(ends).double().cpu() for ends in zip(*map(torch.aminmax, image), strict=True)
     )
     lost = rounding(
-        given, choose(given, most, 0.0), torch.maximum(most, -low), torch.finfo(found.dtype).eps
+        facts,
+        choose(facts, highest, 0.0),
+        torch.maximum(highest, -low),
+        torch.finfo(image.dtype).eps,
     )
-    if quickly > 0 and min(found.shape[1:]) >= _LARGE:
+    if quickly > 0 and min(image.shape[1:]) >= _LARGE:
         above = (
-            (cells(found) + majorant_by_cell(rest, intensity.detach(), given))
+            (cells(image) + majorant_by_cell(residual, intensity.detach(), facts))
             .amax((1, 2))
             .double()
             .cpu()
         )
-        if (top := _share(above - most + lost, most)) <= quickly:
+        if (top := _share(above - highest + lost, highest)) <= quickly:
             return top
-    lacks = majorant(rest, intensity.detach(), given)
+    lacks = majorant(residual, intensity.detach(), facts)
     room = torch.empty_like(lacks)
-    above = torch.stack([torch.add(row, lacks, out=room).amax() for row in found]).double().cpu()
-    return _share(above - most + lost, most)
+    above = torch.stack([torch.add(row, lacks, out=room).amax() for row in image]).double().cpu()
+    return _share(above - highest + lost, highest)
 
 
-def _share(off: Tensor, found: Tensor) -> float:
-    """Return the largest relative error of the brightest pixels, given computed values ``found``
+def _share(off: Tensor, peak: Tensor) -> float:
+    """Return the largest relative error of the brightest pixels, given computed values ``peak``
     and error bounds ``off``.
     """
-    share = torch.where(off > 0, torch.where(off < found, off / (found - off), math.inf), 0.0)
-    worst = float(share.amax()) if bool(torch.isfinite(off + found).all()) else math.inf
+    share = torch.where(off > 0, torch.where(off < peak, off / (peak - off), math.inf), 0.0)
+    worst = float(share.amax()) if bool(torch.isfinite(off + peak).all()) else math.inf
     return worst
 
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any, NamedTuple
 
 import torch
@@ -38,7 +38,7 @@ def passed(intensity: Tensor) -> Passed:
     """Return the sums and maxima of PSFs (band, y, x), with the whole PSF as the only window."""
     # a maximum over several dimensions takes three times as long
     ends = [torch.aminmax(band) for band in intensity]
-    low, high = (torch.stack(found).double().cpu() for found in zip(*ends, strict=True))
+    low, high = (torch.stack(columns).double().cpu() for columns in zip(*ends, strict=True))
     signed = not bool((low >= 0).all())  # True for NaN too
     rows = (intensity.abs() if signed else intensity).sum(2)
     total = rows.sum(1, dtype=torch.float64).cpu() * (1 + _ROUNDED)
@@ -54,7 +54,7 @@ def by_window(intensity: Tensor, signed: bool) -> Passed:
     """
     m, n = intensity.shape[1:]
     windows = list(dict.fromkeys((max(1, round(m * f)), max(1, round(n * f))) for f in _LADDER))
-    tall, wide = ([_inside(whole, w[axis]) for w in windows] for axis, whole in enumerate((m, n)))
+    tall, wide = ([_inside(length, w[axis]) for w in windows] for axis, length in enumerate((m, n)))
     sums, tops = _pieces(intensity.abs() if signed else intensity, _cuts(tall), _cuts(wide))
     beyond, above = torch.zeros(2, len(windows), len(intensity), dtype=torch.float64)
     for j, (y, x) in enumerate(zip(tall, wide, strict=True)):
@@ -82,13 +82,13 @@ def centred(stack: Tensor, window: tuple[int, int]) -> Tensor:
     return stack[:, top:bottom, left:right]
 
 
-def _inside(whole: int, window: int) -> tuple[int, int]:
-    first = whole // 2 - window // 2
+def _inside(length: int, window: int) -> tuple[int, int]:
+    first = length // 2 - window // 2
     return first, first + window
 
 
 def _cuts(spans: list[tuple[int, int]]) -> list[int]:
-    return sorted({edge for span in spans for edge in span})
+    return sorted(set(chain.from_iterable(spans)))
 
 
 def _covered(span: tuple[int, int], cuts: list[int]) -> Tensor:
@@ -104,7 +104,9 @@ def _pieces(size: Tensor, rows: list[int], columns: list[int]) -> tuple[Tensor, 
     machine.
     """
     along = [(size[:, a:b].sum(1), size[:, a:b].amax(1)) for a, b in pairwise(rows)]
-    sums, tops = (torch.stack(found, 1).double().cpu() for found in zip(*along, strict=True))
+    sums, tops = (
+        torch.stack(row_parts, 1).double().cpu() for row_parts in zip(*along, strict=True)
+    )
     total = torch.stack([sums[..., a:b].sum(-1) for a, b in pairwise(columns)], -1) * (1 + _ROUNDED)
     return total, torch.stack([tops[..., a:b].amax(-1) for a, b in pairwise(columns)], -1)
 
@@ -205,8 +207,8 @@ class Summed(torch.autograd.Function):
         return sum(changes[1:], changes[0])
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
-        return one_by_one(Summed.apply, info.batch_size, (*in_dims[:2], None, None), given)
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> Any:
+        return one_by_one(Summed.apply, info.batch_size, (*in_dims[:2], None, None), inputs)
 
 
 def summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
@@ -221,14 +223,14 @@ def _summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
     mix, (high, wide) = mix.to(a), where.length
     columns = wide // 2 + 1
     step = columns if a.is_cuda else min(columns, _COLUMNS)
-    one = _Columns(_rows(a, where.at_a[1], wide, step), where.at_a[0], high)
-    two = _Columns(_rows(b, where.at_b[1], wide, step), where.at_b[0], high)
-    result = one.room.new_empty(_results(mix, a), where.size[0], columns)
+    pictures = _Columns(_rows(a, where.at_a[1], wide, step), where.at_a[0], high)
+    kernels = _Columns(_rows(b, where.at_b[1], wide, step), where.at_b[0], high)
+    result = pictures.room.new_empty(_results(mix, a), where.size[0], columns)
     for i, c in enumerate(range(0, columns, step)):
-        x, y = one.spectra(i), _times(mix.y, two.spectra(i))
-        found = torch.fft.ifft(_mixed(mix, x, y.conj() if where.conjugate else y))
-        found = found[:, : columns - c, where.at[0] : where.at[0] + where.size[0]]
-        result[:, :, c : c + step] = found.transpose(1, 2)
+        x, y = pictures.spectra(i), _times(mix.y, kernels.spectra(i))
+        block = torch.fft.ifft(_mixed(mix, x, y.conj() if where.conjugate else y))
+        block = block[:, : columns - c, where.at[0] : where.at[0] + where.size[0]]
+        result[:, :, c : c + step] = block.transpose(1, 2)
     return _pixels(result, wide, slice(where.at[1], where.at[1] + where.size[1]))
 
 
@@ -242,10 +244,10 @@ def _mixed(mix: Mix, x: Tensor, y: Tensor) -> Tensor:
     """
     if not mix.results:
         return _times(mix.u, _times(mix.x, x) * y)
-    each = y.view(mix.results, len(x), *y.shape[1:])
-    total = x[0] * each[:, 0]
+    kernels = y.view(mix.results, len(x), *y.shape[1:])
+    total = x[0] * kernels[:, 0]
     for k in range(1, len(x)):
-        total.addcmul_(x[k], each[:, k])
+        total.addcmul_(x[k], kernels[:, k])
     return total
 
 
@@ -257,22 +259,26 @@ def _rows(x: Tensor, left: int, wide: int, step: int) -> Tensor:
     page.
     """
     count, tall, broad = x.shape
-    whole, more = divmod(wide // 2 + 1, step)
+    full_blocks, remainder = divmod(wide // 2 + 1, step)
     some = _few_rows(x, tall)
     room = x.new_zeros(some, wide)
-    blocks = room.new_empty(count, whole + (more > 0), tall, step, dtype=x.dtype.to_complex())
-    if more:
-        blocks[:, whole, :, more:] = 0.0
+    blocks = room.new_empty(
+        count, full_blocks + (remainder > 0), tall, step, dtype=x.dtype.to_complex()
+    )
+    if remainder:
+        blocks[:, full_blocks, :, remainder:] = 0.0
     for plane, block in zip(x, blocks, strict=True):
         for y in range(0, tall, some):
             rows = slice(y, min(y + some, tall))
             inside = room[: rows.stop - y]
             inside[:, left : left + broad] = plane[rows]
             spectrum: Tensor = torch.fft.rfft(inside)
-            block[:whole, rows] = (
-                spectrum[:, : whole * step].view(len(inside), whole, step).transpose(0, 1)
+            block[:full_blocks, rows] = (
+                spectrum[:, : full_blocks * step]
+                .view(len(inside), full_blocks, step)
+                .transpose(0, 1)
             )
-            block[whole:, rows, :more] = spectrum[:, whole * step :]
+            block[full_blocks:, rows, :remainder] = spectrum[:, full_blocks * step :]
     return blocks
 
 
@@ -331,7 +337,7 @@ _FARTHER = 6  #: numbers of planes that are tried, from the least sufficient num
 _EVERY = 8  #: one band of this many is tested first for a smaller window
 
 
-class Given(NamedTuple):
+class ImageFacts(NamedTuple):
     """The properties of scene, PSF and weights from which a convolution plan is chosen; float64,
     on the CPU.
     """
@@ -339,8 +345,8 @@ class Given(NamedTuple):
     rows: Tensor  #: (row, band)
     basis: Tensor  #: (band, k)
     #: (k + 1, band) norm of the residual of each band after the first 0, 1, ... k planes
-    rest: Tensor
-    most: Tensor  #: (k,) the same norm of each plane
+    residual: Tensor
+    norm: Tensor  #: (k,) the same norm of each plane
     gram: Tensor  #: (k, k) products of the planes
     copies: int  #: the largest number of copies of a scene point: 9 where the border reflects
     passed: Passed
@@ -383,52 +389,54 @@ class Fewer(NamedTuple):
     off: Tensor  #: (q - 1, row) upper bound of the light that the first 1, 2, ... kernels omit
 
 
-def with_windows(given: Given, intensity: Tensor, brightest: Tensor, within: float) -> Given:
-    """Return ``given`` with the light that smaller PSF windows omit, or unchanged if these
+def with_windows(
+    facts: ImageFacts, intensity: Tensor, brightest: Tensor, within: float
+) -> ImageFacts:
+    """Return ``facts`` with the light that smaller PSF windows omit, or unchanged if these
     windows omit too much.
     """
-    few, signed = slice(_EVERY // 2, None, _EVERY), given.passed.signed
-    if given.share is None and len(intensity) > _EVERY:
-        some = given._replace(
-            rows=given.rows[:, few], basis=given.basis[few], rest=given.rest[:, few]
+    few, signed = slice(_EVERY // 2, None, _EVERY), facts.passed.signed
+    if facts.share is None and len(intensity) > _EVERY:
+        some = facts._replace(
+            rows=facts.rows[:, few], basis=facts.basis[few], residual=facts.residual[:, few]
         )
         if not _narrow(some._replace(passed=by_window(intensity[few], signed)), within * brightest):
-            return given
-    return given._replace(passed=spread(by_window(intensity, signed), given.share))
+            return facts
+    return facts._replace(passed=spread(by_window(intensity, signed), facts.share))
 
 
-def _narrow(given: Given, limit: Tensor) -> bool:
+def _narrow(facts: ImageFacts, limit: Tensor) -> bool:
     """Return True if the second largest PSF window omits little enough light for some number of
     basis images.
     """
-    bands, planes = torch.arange(len(given.basis)), range(1, len(given.most) + 1)
-    return len(given.passed.windows) > 1 and any(
-        bool((given.rows.abs() @ _tail(given, bands, k, 1) <= limit).all()) for k in planes
+    bands, planes = torch.arange(len(facts.basis)), range(1, len(facts.norm) + 1)
+    return len(facts.passed.windows) > 1 and any(
+        bool((facts.rows.abs() @ _tail(facts, bands, k, 1) <= limit).all()) for k in planes
     )
 
 
-def choose(given: Given, brightest: Tensor, within: float) -> Plan:
+def choose(facts: ImageFacts, brightest: Tensor, within: float) -> Plan:
     """Return the cheapest convolution plan that omits at most ``within`` of the brightest pixel,
     or a complete plan.
     """
-    bands, lost = _strong(given, brightest, within)
-    whole = min(_plans(given, bands, lost, len(given.most), 0), key=lambda plan: plan.cost)
-    best = whole._replace(whole=True)
+    bands, lost = _strong(facts, brightest, within)
+    complete = min(_plans(facts, bands, lost, len(facts.norm), 0), key=lambda plan: plan.cost)
+    best = complete._replace(whole=True)
     if within <= 0:
         return best
-    for k in _enough(given, bands, lost, brightest, within):
-        fewer = _fewer(given, bands, k, brightest)
-        for j in range(len(given.passed.windows)):
-            found = _plans(given, bands, lost, k, j, (within * brightest, fewer))
-            best = min([best, *found], key=lambda plan: plan.cost)
+    for k in _enough(facts, bands, lost, brightest, within):
+        fewer = _fewer(facts, bands, k, brightest)
+        for j in range(len(facts.passed.windows)):
+            plans = _plans(facts, bands, lost, k, j, (within * brightest, fewer))
+            best = min([best, *plans], key=lambda plan: plan.cost)
     return best
 
 
-def _strong(given: Given, brightest: Tensor, within: float) -> tuple[Tensor, Tensor]:
+def _strong(facts: ImageFacts, brightest: Tensor, within: float) -> tuple[Tensor, Tensor]:
     """Return the bands to convolve, and an upper bound of the light that the omitted bands add
     to each weighted sum.
     """
-    may = given.rows.abs() * (given.rest[0] * given.passed.total)
+    may = facts.rows.abs() * (facts.residual[0] * facts.passed.total)
     share = torch.where(may > 0, may / brightest.clamp_min(1e-300)[:, None], 0.0).amax(0)
     order = share.argsort()
     weak = order[share[order].cumsum(0) <= _SMALL * max(within, 0.0)]
@@ -439,18 +447,20 @@ def _strong(given: Given, brightest: Tensor, within: float) -> tuple[Tensor, Ten
 
 
 def _enough(
-    given: Given, bands: Tensor, lost: Tensor, brightest: Tensor, within: float
+    facts: ImageFacts, bands: Tensor, lost: Tensor, brightest: Tensor, within: float
 ) -> list[int]:
     """Return how many basis images each picture needs for an error of at most ``within`` times
     the brightest pixel.
     """
-    off = lost + (given.rest[:, bands] * given.passed.total[bands]) @ given.rows[:, bands].abs().T
-    fits = [k for k in range(1, len(given.most) + 1) if bool((off[k] <= within * brightest).all())]
+    off = (
+        lost + (facts.residual[:, bands] * facts.passed.total[bands]) @ facts.rows[:, bands].abs().T
+    )
+    fits = [k for k in range(1, len(facts.norm) + 1) if bool((off[k] <= within * brightest).all())]
     return fits[:_FARTHER]
 
 
 def _plans(
-    given: Given,
+    facts: ImageFacts,
     bands: Tensor,
     lost: Tensor,
     k: int,
@@ -463,11 +473,11 @@ def _plans(
     The kernels of the three plans are one for each plane and row, one for each PSF, and fewer
     kernels to mix.
     """
-    rows, basis, through = given.rows[:, bands], given.basis[bands, :k], given.passed.total[bands]
+    rows, basis, through = facts.rows[:, bands], facts.basis[bands, :k], facts.passed.total[bands]
     off = (
         lost
-        + rows.abs() @ (given.rest[k, bands] * through)
-        + rows.abs() @ _tail(given, bands, k, j)
+        + rows.abs() @ (facts.residual[k, bands] * through)
+        + rows.abs() @ _tail(facts, bands, k, j)
     )
     if within is not None and not bool((off <= within[0]).all()):
         return
@@ -477,9 +487,9 @@ def _plans(
     sums = _sums(rows, basis)
 
     def plan(kernels: Tensor | None, mix: Mix, off: Tensor) -> Plan:
-        window = given.passed.windows[j]
-        each = len(bands) if given.share is None else given.share.shape[1]
-        cost = _cost(given, window, k, each, kernels, mix)
+        window = facts.passed.windows[j]
+        psfs = len(bands) if facts.share is None else facts.share.shape[1]
+        cost = _cost(facts, window, k, psfs, kernels, mix)
         return Plan(
             k,
             bands,
@@ -487,16 +497,16 @@ def _plans(
             kernels,
             mix,
             off,
-            each if kernels is None else len(kernels),
+            psfs if kernels is None else len(kernels),
             cost,
             False,
         )
 
     yield plan(sums, Mix(u, x, None, count), off)
-    if given.share is None:
+    if facts.share is None:
         yield plan(None, Mix(rows, basis, None), off)
     else:
-        yield plan(None, Mix(u, x, sums @ given.share[bands], count), off)
+        yield plan(None, Mix(u, x, sums @ facts.share[bands], count), off)
     if within is not None:
         limit, few = within
         for q in (few.off + off <= limit).all(1).nonzero()[:1, 0].tolist():
@@ -505,13 +515,13 @@ def _plans(
             )
 
 
-def _fewer(given: Given, bands: Tensor, k: int, brightest: Tensor) -> Fewer:
+def _fewer(facts: ImageFacts, bands: Tensor, k: int, brightest: Tensor) -> Fewer:
     """Return a small set of kernels: singular vectors of the matrix that sums the bands of the
     PSF to kernels.
     """
-    rows, band = given.rows[:, bands], given.passed.total[bands]
-    plane = torch.where(brightest[:, None] > 0, given.most[:k] / brightest[:, None], 0.0).flatten()
-    scaled = plane[:, None] * _sums(rows, given.basis[bands, :k]) * band
+    rows, band = facts.rows[:, bands], facts.passed.total[bands]
+    plane = torch.where(brightest[:, None] > 0, facts.norm[:k] / brightest[:, None], 0.0).flatten()
+    scaled = plane[:, None] * _sums(rows, facts.basis[bands, :k]) * band
     a, s, b = torch.linalg.svd(scaled, full_matrices=False)
     off = [
         (scaled - (a[:, :q] * s[:q]) @ b[:q]).abs().sum(1).reshape(len(rows), -1).sum(1)
@@ -533,42 +543,42 @@ def _sums(rows: Tensor, basis: Tensor) -> Tensor:
     return (rows[:, None, :] * basis.T).flatten(0, 1)
 
 
-def _tail(given: Given, bands: Tensor, k: int, j: int) -> Tensor:
+def _tail(facts: ImageFacts, bands: Tensor, k: int, j: int) -> Tensor:
     """Return, for each band, an upper bound of the light that the PSF outside the window adds to an
     image pixel.
 
     The bound is Young's inequality in three norms.
     """
-    basis = given.basis[bands, :k]
-    beyond, above = given.passed.beyond[j, bands], given.passed.above[j, bands]
-    top = given.rest[0, bands] + given.rest[k, bands]
-    power = ((basis @ given.gram[:k, :k]) * basis).sum(1).clamp_min(0) * given.copies
+    basis = facts.basis[bands, :k]
+    beyond, above = facts.passed.beyond[j, bands], facts.passed.above[j, bands]
+    top = facts.residual[0, bands] + facts.residual[k, bands]
+    power = ((basis @ facts.gram[:k, :k]) * basis).sum(1).clamp_min(0) * facts.copies
     return torch.minimum(top * beyond, (power * beyond * above).sqrt() * (1 + 1e-6))
 
 
 def _cost(
-    given: Given, window: tuple[int, int], k: int, bands: int, kernels: Tensor | None, mix: Mix
+    facts: ImageFacts, window: tuple[int, int], k: int, bands: int, kernels: Tensor | None, mix: Mix
 ) -> float:
     """Return the seconds that a convolution plan is expected to take on two cores: FFTs,
     products and kernel sums.
     """
-    area = math.prod(transform(given, window))
+    area = math.prod(transform(facts, window))
     count = bands if kernels is None else len(kernels)
     terms = len(mix.x) if mix.x is not None else k
-    products = terms * (k + len(given.rows) + (count if mix.y is not None else 0) + 8)
+    products = terms * (k + len(facts.rows) + (count if mix.y is not None else 0) + 8)
     sums = 0 if kernels is None else count * bands * math.prod(window)
-    return area * (2e-9 * (k + count + len(given.rows)) + 3e-11 * products) + 1.4e-11 * sums
+    return area * (2e-9 * (k + count + len(facts.rows)) + 3e-11 * products) + 1.4e-11 * sums
 
 
-def transform(given: Given, window: tuple[int, int]) -> tuple[int, int]:
+def transform(facts: ImageFacts, window: tuple[int, int]) -> tuple[int, int]:
     """Return the shortest FFT lengths (y, x) for which the convolution has no wrap-around within
     the image.
     """
-    if given.reflect:
-        y, x = (smooth(s + w - 1) for s, w in zip(given.size, window, strict=True))
+    if facts.reflect:
+        y, x = (smooth(s + w - 1) for s, w in zip(facts.size, window, strict=True))
     else:
         y, x = (
             smooth(max(s + w // 2, s + w - 1 - w // 2))
-            for s, w in zip(given.size, window, strict=True)
+            for s, w in zip(facts.size, window, strict=True)
         )
     return y, x

@@ -92,13 +92,13 @@ def thumbnail(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> Thumbnail | N
         * lens["focal_length"]
         / (float(small.pitch) * lens["pixel_pitch"])
     )
-    clear, whole = small.aperture.double().square().sum(), small.amplitude.double().square().sum()
+    clear, through = small.aperture.double().square().sum(), small.amplitude.double().square().sum()
     for pixels in _BINS:
         side = pixels * SIDE
         if side > reach or side**2 * _GAIN > shape[0] * shape[1]:
             return None
         if float(focused(some, (side, side), lens).sum((1, 2)).min()) >= _HELD * float(
-            whole / clear
+            through / clear
         ):
             return Thumbnail(small, pixels, lens)
     return None
@@ -106,8 +106,8 @@ def thumbnail(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> Thumbnail | N
 
 def focused(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> Tensor:
     """Return the PSFs (band, y, x) of a pupil in a window."""
-    found: Psf = psf(pupil, **lens, shape=shape)
-    return found.intensity
+    result: Psf = psf(pupil, **lens, shape=shape)
+    return result.intensity
 
 
 def binned(stack: Tensor, pixels: int) -> Tensor:
@@ -121,10 +121,10 @@ def bins_of(stack: Tensor) -> int:
     """Return the least number of pixels along the side of a cell at which the cells hold the
     light of the PSFs.
     """
-    whole = stack.sum((1, 2))
+    total = stack.sum((1, 2))
     for pixels in _BINS:
         if bool(
-            (centred(stack, (pixels * SIDE, pixels * SIDE)).sum((1, 2)) >= _HELD * whole).all()
+            (centred(stack, (pixels * SIDE, pixels * SIDE)).sum((1, 2)) >= _HELD * total).all()
         ):
             break
     return pixels
@@ -147,18 +147,18 @@ def _every(pupil: Pupil, step: int) -> Pupil:
     )
 
 
-def share_of_bands(used: Tensor, count: int) -> Tensor:
-    """Return the weights (band, j) float64 that interpolate linearly between the bands ``used``,
+def share_of_bands(bands: Tensor, count: int) -> Tensor:
+    """Return the weights (band, j) float64 that interpolate linearly between the bands ``bands``,
     which rise.
     """
-    at = torch.arange(count, dtype=torch.float64)
-    if len(used) == 1:
+    band = torch.arange(count, dtype=torch.float64)
+    if len(bands) == 1:
         return torch.ones(count, 1, dtype=torch.float64)
-    high = torch.searchsorted(used.double(), at).clamp(1, len(used) - 1)
+    high = torch.searchsorted(bands.double(), band).clamp(1, len(bands) - 1)
     low = high - 1
-    part = ((at - used[low]) / (used[high] - used[low])).clamp(0.0, 1.0)[:, None]
-    share = torch.zeros(count, len(used), dtype=torch.float64)
-    return share.scatter_(1, low[:, None], 1 - part).scatter_(1, high[:, None], part)
+    weight = ((band - bands[low]) / (bands[high] - bands[low])).clamp(0.0, 1.0)[:, None]
+    share = torch.zeros(count, len(bands), dtype=torch.float64)
+    return share.scatter_(1, low[:, None], 1 - weight).scatter_(1, high[:, None], weight)
 
 
 def parts_of(radiance: LowRankCube, rows: Tensor, light: Tensor, pixels: int) -> Parts:
@@ -173,10 +173,12 @@ def parts_of(radiance: LowRankCube, rows: Tensor, light: Tensor, pixels: int) ->
     tile = (min(_TILE, white.shape[1]), min(_TILE, white.shape[2]))
     mean = avg_pool2d(white[None], tile)[0, 0]
     spread = avg_pool2d(white[None].square(), tile)[0, 0] - mean.square()
-    found = [divmod(int(x.argmax()), x.shape[1]) for x in (mean, spread)]
-    about = [(y * tile[0] + tile[0] // 2, x * tile[1] + tile[1] // 2) for y, x in found]
+    tiles = [divmod(int(x.argmax()), x.shape[1]) for x in (mean, spread)]
+    about = [(y * tile[0] + tile[0] // 2, x * tile[1] + tile[1] // 2) for y, x in tiles]
     middle = (white.shape[1] // 2, white.shape[2] // 2)
-    scene = torch.stack([_cut(planes, at) for at in dict.fromkeys([*about, middle])]).to(light)
+    scene = torch.stack([_cut(planes, place) for place in dict.fromkeys([*about, middle])]).to(
+        light
+    )
     weights = (rows[:, None, :] * basis.T).flatten(0, 1)
     kernels = weights.to(light) @ light.flatten(1)
     spectra = torch.fft.rfft2(scene)
@@ -184,15 +186,15 @@ def parts_of(radiance: LowRankCube, rows: Tensor, light: Tensor, pixels: int) ->
     return Parts(spectra, weights, kernels, image, image.amax((0, 2, 3)))
 
 
-def _cut(planes: Tensor, at: tuple[int, int]) -> Tensor:
+def _cut(planes: Tensor, place: tuple[int, int]) -> Tensor:
     """Return a part of the scene about a pixel; a smaller scene is filled up with zeros."""
     spans = []
-    for middle, size in zip(at, planes.shape[1:], strict=True):
+    for middle, size in zip(place, planes.shape[1:], strict=True):
         side = min(_PART, size)
         first = min(max(middle - side // 2, 0), size - side)
         spans.append(slice(first, first + side))
-    part = planes[:, spans[0], spans[1]]
-    return pad(part, (0, _PART - part.shape[2], 0, _PART - part.shape[1]))
+    cut = planes[:, spans[0], spans[1]]
+    return pad(cut, (0, _PART - cut.shape[2], 0, _PART - cut.shape[1]))
 
 
 def estimated(parts: Parts, share: Tensor, light: Tensor) -> tuple[float, float]:
@@ -217,9 +219,9 @@ def _imaged(spectra: Tensor, kernels: Tensor, like: Tensor) -> Tensor:
     """
     rows = kernels.view(-1, spectra.shape[1], *like.shape[1:])
     size = (_PART, _PART)
-    whole = torch.fft.irfft2((spectra[:, None] * torch.fft.rfft2(rows, size)).sum(2), size)
+    image = torch.fft.irfft2((spectra[:, None] * torch.fft.rfft2(rows, size)).sum(2), size)
     spans = [slice(m - 1, _PART) for m in like.shape[1:]]
-    inner: Tensor = whole[..., spans[0], spans[1]]
+    inner: Tensor = image[..., spans[0], spans[1]]
     return inner
 
 
@@ -329,11 +331,11 @@ def _fewest(
     """Return the first number of bands whose estimated error is within the limit, or None."""
     count = len(light)
     for few in rungs:
-        used = _evenly(few, count)
-        share = share_of_bands(used, count)
-        error, top = (_SAFETY * x for x in estimated(parts, share, light[used]))
+        computed = _evenly(few, count)
+        share = share_of_bands(computed, count)
+        error, top = (_SAFETY * x for x in estimated(parts, share, light[computed]))
         if max(error, top if largest else 0.0) <= within:
-            return FewBands(share, used, _number(error), _number(top))
+            return FewBands(share, computed, _number(error), _number(top))
     return None
 
 
@@ -367,8 +369,8 @@ def pupil_of_bands(pupil: Pupil, few: FewBands) -> Pupil:
     Error:  exact.
     Source: the pupil function of `optics.pupil`, band by band.
     """
-    at = few.used.to(pupil.index.device)
-    return pupil._replace(index=pupil.index[at], wavelengths=pupil.wavelengths[at])
+    bands = few.used.to(pupil.index.device)
+    return pupil._replace(index=pupil.index[bands], wavelengths=pupil.wavelengths[bands])
 
 
 @node(rtol=1e-5)
@@ -398,8 +400,8 @@ def few_bands_checked(
     Source: comparison of two composite rules: Dahlquist and Bjorck, Numerical Methods, section 7.2
             (1974).
     """
-    count, used = len(few.share), few.used.tolist()
-    between = [(a + b) // 2 for a, b in pairwise(used) if b - a > 1]
+    count, computed = len(few.share), few.used.tolist()
+    between = [(a + b) // 2 for a, b in pairwise(computed) if b - a > 1]
     if not between:
         return few
     pupil, radiance, rows = without_gradients(pupil, radiance, rows)
@@ -409,13 +411,13 @@ def few_bands_checked(
         "pixel": pixel,
         "sensor": sensor,
     }
-    more, pixels = few._replace(used=torch.tensor(between)), bins_of(psf.intensity)
+    between_bands, pixels = few._replace(used=torch.tensor(between)), bins_of(psf.intensity)
     window = (pixels * SIDE, pixels * SIDE)
     own = binned(centred(psf.intensity.detach(), window), pixels)
-    added = binned(focused(pupil_of_bands(pupil, more), window, lens), pixels)
-    order = sorted(range(len(used) + len(between)), key=[*used, *between].__getitem__)
+    added = binned(focused(pupil_of_bands(pupil, between_bands), window, lens), pixels)
+    order = sorted(range(len(computed) + len(between)), key=[*computed, *between].__getitem__)
     light = torch.cat([own, added])[order]
-    finer = share_of_bands(torch.tensor(sorted([*used, *between])), count).to(
+    finer = share_of_bands(torch.tensor(sorted([*computed, *between])), count).to(
         light
     ) @ light.flatten(1)
     parts = parts_of(radiance, rows, finer.view(count, *light.shape[1:]), pixels)

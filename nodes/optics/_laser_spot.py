@@ -125,9 +125,9 @@ def _(
     result: Tensor, *, focal_length: float, pixel_pitch: float, shape: tuple[int, int], **_: Any
 ) -> list[Check]:
     y, x = (float(n) * focal_length / pixel_pitch for n in result)
-    seen = abs(y) <= shape[0] / 2 and abs(x) <= shape[1] / 2
+    inside = abs(y) <= shape[0] / 2 and abs(x) <= shape[1] / 2
     off = math.degrees(math.hypot(*(float(n) for n in result)))
-    beyond = "" if seen else ": beyond the sensor, where only glare reaches the picture"
+    beyond = "" if inside else ": beyond the sensor, where only glare reaches the picture"
     return [Check(f"spot {y:+.1f}, {x:+.1f} px (y, x) off the axis, {off:.3g} deg{beyond}")]
 
 
@@ -208,18 +208,18 @@ def unit(
 
     ``wells`` are the full wells of one W/m2 in each band.
     """
-    each = bands.weights * clear_peak * wells
+    by_band = bands.weights * clear_peak * wells
     if meaning == "irradiance":
-        return each.sum()
-    if responses is None or responses.shape[-1] != len(each):
+        return by_band.sum()
+    if responses is None or responses.shape[-1] != len(by_band):
         raise ValueError(
             "strength counts the channel that saturates first: give `responses` for the bands of"
             " the line"
         )
-    most = (responses.to(each) * each).sum(-1).amax()
-    if not bool(most > 0):
+    largest = (responses.to(by_band) * by_band).sum(-1).amax()
+    if not bool(largest > 0):
         raise ValueError(_no_channel(bands))
-    return most
+    return largest
 
 
 @laser_irradiance.preflight
@@ -277,13 +277,13 @@ def _(
         )
     if strength == 0:
         return 0.0
-    least = 1.0
+    response = 1.0
     if meaning == "first_channel":
-        least = responses.min if responses else 0.0
+        response = responses.min if responses else 0.0
     # the saturation irradiance falls with wavelength
     ends = torch.tensor([bands.min], dtype=torch.float64)
     saturating: Tensor = saturation(Bands(ends, ends, ends), **sensor)
-    return _LSR * strength * float(saturating) / least if least > 0 else math.inf
+    return _LSR * strength * float(saturating) / response if response > 0 else math.inf
 
 
 @laser_irradiance.expected_range
@@ -320,16 +320,16 @@ def _(
 ) -> list[Check]:
     wells = 1.0 / saturation(bands, **sensor)
     peak = float(result.sum(0).max())
-    watts, at = (
+    watts, when = (
         f"peak of the spot {peak:.4g} W/m2",
         f"at the nominal exposure of {sensor['exposure']:g} s",
     )
     if strength is not None:
-        return [Check(f"{watts}, strength {strength:g} {at}", math.isfinite(peak))]
+        return [Check(f"{watts}, strength {strength:g} {when}", math.isfinite(peak))]
     if light is None or (
         meaning == "first_channel" and (responses is None or not float(responses.max()) > 0)
     ):
         return [Check(watts, math.isfinite(peak))]
     clear = light.peak / light.even_peak.clamp_min(1e-300) * light.flux / sensor["pixel_pitch"] ** 2
     strength = float(clear * unit(psf.clear_peak, bands, wells, responses, meaning))
-    return [Check(f"{watts}, which is a strength of {strength:.4g} {at}", math.isfinite(peak))]
+    return [Check(f"{watts}, which is a strength of {strength:.4g} {when}", math.isfinite(peak))]

@@ -128,7 +128,7 @@ def stop_width(lsr: Tensor, frequency: Tensor, side: Tensor) -> Tensor:
     away. ``frequency`` is the cut-off of the lens, and ``side`` that of the square over which a
     pixel averages, as in `round_lens`.
     """
-    whole, width = round_lens(frequency, side).peak, lsr**0.25
+    clear_peak, width = round_lens(frequency, side).peak, lsr**0.25
     for _ in range(_STEPS):
-        width = (lsr * whole / round_lens(width * frequency, side).peak) ** 0.25
+        width = (lsr * clear_peak / round_lens(width * frequency, side).peak) ** 0.25
     return width

@@ -71,10 +71,10 @@ def fine_axis(pixels: int, bandwidth: float, error: float) -> FineAxis:
     return min(grids, key=lambda grid: grid.samples + grid.taps)
 
 
-def _samples_per_pixel(least: float) -> list[float]:
-    step = _STEP if least < _WHOLE else 1.0
-    first = max(math.floor(least / step) + 1, math.ceil(1 / step))
-    count = 8 + math.ceil(0.5 * least / step)
+def _samples_per_pixel(lowest: float) -> list[float]:
+    step = _STEP if lowest < _WHOLE else 1.0
+    first = max(math.floor(lowest / step) + 1, math.ceil(1 / step))
+    count = 8 + math.ceil(0.5 * lowest / step)
     return [step * (first + i) for i in range(count)]
 
 
@@ -102,9 +102,11 @@ def _weights(grid: FineAxis, away: Tensor) -> Tensor:
     nodes, shares = unit_nodes(12 + math.ceil(2 * grid.per_pixel))
     width = _width(grid.per_pixel - 2 * grid.bandwidth, grid.error)
     beta = 0.1102 * (_decibels(grid.error) - 8.7)
-    at = away[..., None] + nodes
-    window = torch.special.i0(beta * (1 - (2 * at / width).square()).clamp_min(0).sqrt())
-    low_pass = torch.sinc(grid.per_pixel * at) * window.where(at.abs() <= width / 2, 0.0)
+    distance = away[..., None] + nodes
+    window = torch.special.i0(beta * (1 - (2 * distance / width).square()).clamp_min(0).sqrt())
+    low_pass = torch.sinc(grid.per_pixel * distance) * window.where(
+        distance.abs() <= width / 2, 0.0
+    )
     weights: Tensor = (
         low_pass @ shares / float(torch.special.i0(torch.tensor(beta, dtype=torch.float64)))
     )
@@ -350,8 +352,8 @@ def strips(rows: FineAxis, columns: FineAxis) -> list[tuple[int, int]]:
     """Return the first and the last row, exclusive, of each strip of pixels whose fine grid is
     computed at a time.
     """
-    most = FINE_SAMPLES // columns.samples - rows.taps
-    height = max(1, math.floor(most / rows.per_pixel))
+    room = FINE_SAMPLES // columns.samples - rows.taps
+    height = max(1, math.floor(room / rows.per_pixel))
     count = -(-rows.pixels // height)
     ends = [rows.pixels * i // count for i in range(count + 1)]
     return list(pairwise(ends))
@@ -372,17 +374,17 @@ def band_average(
 ) -> list[Tensor]:
     """Return the share of the light in each pixel of one band, in strips of rows (y, x)."""
     rows, columns = fine_grid(pupil, camera, band, optics.dtype)
-    middles = [(n - 1) / 2 - at for n, at in zip(camera.shape, spot(camera), strict=True)]
+    middles = [(n - 1) / 2 - place for n, place in zip(camera.shape, spot(camera), strict=True)]
     across = GridAxis(columns.samples, columns.per_pixel, middles[1])
     averages = []
     for start, stop in strips(rows, columns):
-        part = rows.part(stop - start)
+        strip = rows.part(stop - start)
         below = (start + stop - camera.shape[0]) / 2
-        along = GridAxis(part.samples, part.per_pixel, middles[0] + below)
+        along = GridAxis(strip.samples, strip.per_pixel, middles[0] + below)
         view = view_of(pupil, camera, band, (along, across), light, optics.dtype)
         sampling = Sampling((replace(view, band=0),), optics.dtype, optics.method, optics.keep)
         fine = intensity_of(pupil.amplitude, pupil.height, pupil.path, sampling)[0]
-        averages.append(averaged(fine, part, columns))
+        averages.append(averaged(fine, strip, columns))
     return averages
 
 
@@ -433,8 +435,8 @@ def _polynomials(samples: int, degrees: int, device: torch.device) -> Tensor:
     """Return orthonormal polynomials (sample, degree) on the samples of the pupil."""
     import numpy as np
 
-    at = (np.arange(samples) - (samples - 1) / 2) * (2 / samples)
-    polynomials: Tensor = torch.from_numpy(np.polynomial.legendre.legvander(at, degrees - 1)).to(
+    place = (np.arange(samples) - (samples - 1) / 2) * (2 / samples)
+    polynomials: Tensor = torch.from_numpy(np.polynomial.legendre.legvander(place, degrees - 1)).to(
         device
     )
     orthonormal: Tensor = torch.linalg.qr(polynomials).Q
@@ -445,8 +447,8 @@ def _projected(aperture: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     step = max(1, _STRIPE // aperture.shape[1])
     moments = rows.new_zeros(rows.shape[1], columns.shape[1])
     for start in range(0, len(aperture), step):
-        part = slice(start, start + step)
-        moments += rows[part].T @ (aperture[part].detach().double() @ columns)
+        stripe = slice(start, start + step)
+        moments += rows[stripe].T @ (aperture[stripe].detach().double() @ columns)
     return moments
 
 

@@ -50,8 +50,8 @@ def refuse_aliases(pupil: Pupil, camera: Geometry) -> None:
         return
     shortest, pitch = float(pupil.wavelengths.min()), float(pupil.pitch)
     limit = shortest * camera.focal_length / (2 * pitch)
-    for axis, n, at in zip("yx", camera.shape, spot(camera), strict=True):
-        reach = max(abs(0 - at), abs(n - 1 - at)) * camera.pixel_pitch
+    for axis, n, place in zip("yx", camera.shape, spot(camera), strict=True):
+        reach = max(abs(0 - place), abs(n - 1 - place)) * camera.pixel_pitch
         if reach > limit * (1 + 1e-9):
             raise ValueError(
                 f"the window reaches {reach * 1e3:.3g} mm from the spot along {axis}, but at"
@@ -135,8 +135,8 @@ def _diameter(pupil: Pupil, widest: float) -> float:
 
 
 def _extent(open_: Tensor) -> int:
-    at = open_.nonzero()
-    return int(at[-1] - at[0]) + 1 if len(at) else 0
+    open_places = open_.nonzero()
+    return int(open_places[-1] - open_places[0]) + 1 if len(open_places) else 0
 
 
 def fast_lens_notes(pupil: Pupil, camera: Geometry) -> list[str]:
@@ -322,7 +322,7 @@ def _points(
     pupil: Pupil, camera: _Camera, lights: list[float], dtype: torch.dtype, method: Method
 ) -> Tensor:
     """Return the intensity (band, y, x) at the middle of each pixel, times the area of a pixel."""
-    middles = [(n - 1) / 2 - at for n, at in zip(camera.shape, spot(camera), strict=True)]
+    middles = [(n - 1) / 2 - place for n, place in zip(camera.shape, spot(camera), strict=True)]
     y, x = (GridAxis(n, 1.0, middle) for n, middle in zip(camera.shape, middles, strict=True))
     views = (
         view_of(pupil, camera, band, (y, x), light, dtype) for band, light in enumerate(lights)
@@ -336,8 +336,8 @@ def _averages(
     pupil: Pupil, camera: _Camera, lights: list[float], dtype: torch.dtype, method: Method
 ) -> Tensor:
     """Return the intensity (band, y, x) averaged over each pixel, times the area of a pixel."""
-    kept = 2 * fine_samples(pupil, camera, dtype) * dtype.itemsize
-    optics = Optics(dtype, method, kept <= KEPT_FIELD_BYTES)
+    field_bytes = 2 * fine_samples(pupil, camera, dtype) * dtype.itemsize
+    optics = Optics(dtype, method, field_bytes <= KEPT_FIELD_BYTES)
     factors = (pupil.amplitude, pupil.height, pupil.path)
     if transformed() or (torch.is_grad_enabled() and any(x.requires_grad for x in factors)):
         bands = [

@@ -82,8 +82,8 @@ def _axis(camera: Geometry, axis: int, shift: float, samples: int, reach: float)
         - camera.shape[axis] // 2
         + (shift - spot)
     )
-    at = torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2
-    phasors = torch.exp(-2j * math.pi * _reduced(reach * pixels[:, None] * at))
+    sample = torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2
+    phasors = torch.exp(-2j * math.pi * _reduced(reach * pixels[:, None] * sample))
     return phasors * torch.sinc(reach * pixels)[:, None] if camera.pixel == "zoh" else phasors
 
 

@@ -66,15 +66,15 @@ def pupil_has_large_steps(pupil: Pupil) -> bool:
     return phase_steps(pupil)[1] > LARGE_STEPS
 
 
-def _steps(pupil: Pupil, band: int, one: list[Tensor], other: list[Tensor]) -> Tensor:
+def _steps(pupil: Pupil, band: int, first: list[Tensor], second: list[Tensor]) -> Tensor:
     """Return the absolute phase difference in turns, between neighbours that are both inside the
     stop.
 
     Differences are taken before the phase: in float32, a phase of thousands of turns has no digits
     left for its steps.
     """
-    inside = one[2] & other[2]
-    height, path = ((b - a)[inside] for a, b in zip(one[:2], other[:2], strict=True))
+    inside = first[2] & second[2]
+    height, path = ((b - a)[inside] for a, b in zip(first[:2], second[:2], strict=True))
     steps: Tensor = (float(pupil.index[band]) * height + path).abs() / float(
         pupil.wavelengths[band]
     )
@@ -235,9 +235,9 @@ def _shapes(
         )
     for name, screen in (("dirt", dirt), ("shade", shade)):
         if screen is not None and screen.amplitude.shape != height.shape:
-            found, wanted = tuple(screen.amplitude.shape), tuple(height.shape)
+            shape, height_shape = tuple(screen.amplitude.shape), tuple(height.shape)
             raise ValueError(
-                f"{name} is {found} and height is {wanted}: compute both from one `stop` step"
+                f"{name} is {shape} and height is {height_shape}: compute both from one `stop` step"
             )
 
 

@@ -127,8 +127,8 @@ def gaussian_over(stop: Stop, width: Number) -> Number:
         * sum(weight * _share_within(edge, width) for edge, weight in _edges(half, corner))
     )
     curved = (math.pi / 4 - corner) * _share_within(radius, width)
-    whole: Number = 4 * width**2 * (straight + curved)
-    return whole
+    integral: Number = 4 * width**2 * (straight + curved)
+    return integral
 
 
 def _share_within(radius: float, width: Number) -> Number:
@@ -194,10 +194,10 @@ def stripes(grid: PupilGrid) -> Iterator[slice]:
 
 def refuse_other_grid(height: Tensor, grid: PupilGrid) -> None:
     """Raise ValueError unless the height map has the shape of the pupil grid."""
-    wanted = (grid.samples, grid.samples)
-    if tuple(height.shape) != wanted:
+    grid_shape = (grid.samples, grid.samples)
+    if tuple(height.shape) != grid_shape:
         raise ValueError(
-            f"height is {tuple(height.shape)}, not the square pupil grid {wanted} of `stop`:"
+            f"height is {tuple(height.shape)}, not the square pupil grid {grid_shape} of `stop`:"
             " resample the height, or compute the height from the same `stop` step"
         )
 

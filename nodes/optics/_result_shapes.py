@@ -139,8 +139,8 @@ def _(result: FewBands, *inputs: Any, **params: Any) -> tuple[float, float]:
 def _(radiance: LowRankCube, psf: Psf, rows: Tensor, *few: Any, **params: Any) -> Channels:
     dtype = at_least_single(radiance.planes, psf.intensity)
     planes = blank(len(rows), *radiance.planes.shape[1:], dtype=dtype)
-    kept = blank(5, dtype=torch.int64)
-    return Channels(planes, double(*rows.shape), double(), kept, double(), double(2))
+    sizes = blank(5, dtype=torch.int64)
+    return Channels(planes, double(*rows.shape), double(), sizes, double(), double(2))
 
 
 @image_channels.work

@@ -84,7 +84,7 @@ def _(
 ) -> list[str]:
     if illuminance is None and luminance is None:
         return []
-    given = "illuminance" if illuminance is not None else "luminance"
+    stated = "illuminance" if illuminance is not None else "luminance"
     if illuminance is not None and luminance is not None:
         text = (
             "the brightness of white is stated twice: leave scene.illuminance or"
@@ -96,7 +96,7 @@ def _(
         and not bands.widths.is_meta
         and float(bands.widths.max() / bands.widths.min()) > 1 + _EQUAL
     ):
-        raise ParameterError(given, _WIDTHS)
+        raise ParameterError(stated, _WIDTHS)
     if isinstance(kind, Path):
         luminous_share(bands, kind, temperature)
     return []

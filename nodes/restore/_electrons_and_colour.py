@@ -50,8 +50,8 @@ def electrons(
             itself is float32, within 1.2e-7 of raw / gain.
     Source: NeuSee, Eq. (SensorImage), inverted.
     """
-    found = single(raw) / gain - (offset if offset_subtracted else 0.0)
-    return found if shading is None else found / shading.transmission.to(found)
+    light = single(raw) / gain - (offset if offset_subtracted else 0.0)
+    return light if shading is None else light / shading.transmission.to(light)
 
 
 @electrons.preflight
@@ -68,8 +68,8 @@ def _(*, offset: float, offset_subtracted: bool = True, **params: object) -> lis
 def _(raw: ErrorBound, shading: ErrorBound | None = None, *, gain: float, **params: Any) -> float:
     if shading is None:
         return raw.rms / gain
-    least = shading.stats.min if shading.stats and not shading.rms else 0.0
-    return raw.rms / gain / least if least > 0 else math.inf
+    lowest_transmission = shading.stats.min if shading.stats and not shading.rms else 0.0
+    return raw.rms / gain / lowest_transmission if lowest_transmission > 0 else math.inf
 
 
 @electrons.expected_range
@@ -218,11 +218,11 @@ def colour_matrix(
     pixel = {"pixel_pitch": pixel_pitch, "exposure": exposure}
     counts = _counts(bands, illuminant, responses, level, quantum_efficiency, **pixel)
     rgb = _target(bands.centres, len(counts))
-    seen = counts @ second @ counts.T
-    ridge = (1e-12 * seen.diagonal().mean()).clamp_min(1e-200) * torch.eye(
-        len(seen), dtype=torch.float64
+    moments = counts @ second @ counts.T
+    ridge = (1e-12 * moments.diagonal().mean()).clamp_min(1e-200) * torch.eye(
+        len(moments), dtype=torch.float64
     )
-    matrix: Tensor = torch.linalg.solve(seen + ridge, counts @ second @ rgb.T).T
+    matrix: Tensor = torch.linalg.solve(moments + ridge, counts @ second @ rgb.T).T
     return matrix
 
 
@@ -237,8 +237,8 @@ def _(result: Tensor, *inputs: Any, **params: float) -> list[Check]:
         .mean()
         .sqrt()
     )
-    what = "colour" if len(result[0]) > 1 else "luminance"
-    return [Check(f"rms {what} error {float(off):.3f} on colour charts", float(off) < 0.1)]
+    quantity = "colour" if len(result[0]) > 1 else "luminance"
+    return [Check(f"rms {quantity} error {float(off):.3f} on colour charts", float(off) < 0.1)]
 
 
 @colour_matrix.propagate_error
@@ -255,7 +255,7 @@ def _(
     it has no bound.
     """
     result: TensorStats = params["result"]
-    if any(given.rms for given in (bands, illuminant, responses)) or level.share >= 1.0:
+    if any(bound.rms for bound in (bands, illuminant, responses)) or level.share >= 1.0:
         return math.inf
     if level.rms and (level.stats is None or level.stats.min < level.stats.max):
         return math.inf
@@ -345,27 +345,27 @@ def white_level(
     Source: white-patch assumption, Land and McCann, J. Opt. Soc. Am. 61, 1 (1971), with a quantile
             for the maximum.
     """
-    one = torch.ones(len(bands.centres), dtype=torch.float64)
-    lit = one * illuminant.cpu().double()
+    equal_energy = torch.ones(len(bands.centres), dtype=torch.float64)
+    lit = equal_energy * illuminant.cpu().double()
     weights = channel_weights(
         bands, responses.cpu(), lit, pixel_pitch=pixel_pitch, exposure=exposure
     )
     counts = weights.sum(-1) * quantum_efficiency
     if white is not None:
-        return one * (white * full_well / float(counts.max()))
+        return equal_energy * (white * full_well / float(counts.max()))
     if restored is not None:
         light_of = {
             "pixel_pitch": pixel_pitch,
             "exposure": exposure,
             "quantum_efficiency": quantum_efficiency,
         }
-        matrix = colour_matrix(bands, illuminant, responses, one, **light_of)
+        matrix = colour_matrix(bands, illuminant, responses, equal_energy, **light_of)
         brightness = (matrix.to(restored.device) @ single(restored).double().flatten(-2)).amax(-2)
-        return one * _bright_quantile(brightness.reshape(restored.shape[-2:]), clipped)
+        return equal_energy * _bright_quantile(brightness.reshape(restored.shape[-2:]), clipped)
     passed = _passed(psf, bands, illuminant, responses)
-    whole = (counts * passed).clamp_min(1e-300).to(signal.device)
-    return one * _bright_quantile(
-        (single(signal).double() / whole[:, None, None]).amax(-3), clipped
+    white_counts = (counts * passed).clamp_min(1e-300).to(signal.device)
+    return equal_energy * _bright_quantile(
+        (single(signal).double() / white_counts[:, None, None]).amax(-3), clipped
     )
 
 

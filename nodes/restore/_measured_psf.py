@@ -15,6 +15,7 @@ from torch.nn.functional import avg_pool2d, conv2d, pad
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.restore._point_frames import (
     Camera,
+    Layout,
     Linear,
     Seen,
     State,
@@ -65,34 +66,27 @@ class Fit(NamedTuple):
     inflation: Tensor  #: (node,)
 
 
-def fitted(
-    seen: Seen,
-    shape: tuple[int, int],
-    zones: tuple[int, int],
-    window: tuple[int, int],
-    count: int,
-    rng: Generator,
-) -> Fit:
+def fitted(pixels: Seen, layout: Layout, count: int, rng: Generator) -> Fit:
     """Return the PSFs at the nodes and draws of them; raise ValueError where no pixel tells of a
     part of a PSF.
     """
-    share = node_weights(seen.middle, shape, zones)
-    state, weight = _start(seen, share, window)
-    hold = _hold(linear(seen, state, share), state.kernels, weight)
-    _refuse_unseen(linear(seen, state, share), weight)
+    share = node_weights(pixels.middle, layout.shape, layout.zones)
+    state, weight = _start(pixels, share, layout.window)
+    hold = _hold(linear(pixels, state, share), state.kernels, weight)
+    _refuse_unseen(linear(pixels, state, share), weight)
     for _ in range(_STEPS):
-        near = linear(seen, state, share)
-        residual = seen.light - near.model(state.background)
+        near = linear(pixels, state, share)
+        residual = pixels.light - near.model(state.background)
         step = _solved(near, hold, weight, _slope(near, state, weight, residual))
         before = state.offset
         state = _ahead(
-            seen, state, share, weight, step._replace(offset=step.offset.clamp(-_MOST, _MOST))
+            pixels, state, share, weight, step._replace(offset=step.offset.clamp(-_MOST, _MOST))
         )
-        weight = _weight(seen, linear(seen, state, share).model(state.background))
+        weight = _weight(pixels, linear(pixels, state, share).model(state.background))
         if float((state.offset - before).abs().max()) < _ENOUGH:
             break
-    near = linear(seen, state, share)
-    residual = seen.light - near.model(state.background)
+    near = linear(pixels, state, share)
+    residual = pixels.light - near.model(state.background)
     _refuse_unseen(near, weight)
     kernels = gauged(state.kernels)
     local = _misfit(near, weight, residual)
@@ -101,7 +95,7 @@ def fitted(
         noise = _normal(weight, rng) * weight.sqrt()
         slope = near.slope(noise)
         slope = slope._replace(
-            background=slope.background + _normal(seen.doubt, rng) / seen.doubt.sqrt()
+            background=slope.background + _normal(pixels.doubt, rng) / pixels.doubt.sqrt()
         )
         other = gauged(state.plus(_solved(near, hold, weight, slope)).kernels)
         draws.append((kernels + local * (other - kernels)).float())
@@ -117,41 +111,41 @@ def gauged(kernels: Tensor) -> Tensor:
     wings hardly moves it.
     """
     offset = kernels.new_zeros(len(kernels), 2)
-    found = kernels
+    centred = kernels
     for _ in range(6):
-        offset = offset - centre(found)
-        found = moved(kernels, offset)
-    return found / found.sum((-2, -1), keepdim=True)
+        offset = offset - centre(centred)
+        centred = moved(kernels, offset)
+    return centred / centred.sum((-2, -1), keepdim=True)
 
 
 def centre(kernels: Tensor) -> Tensor:
     """Return the centre (node, 2) of kernels (node, channel, y, x), from the middle pixel."""
     power = kernels.mean(1).square()
     y, x = (torch.arange(n, dtype=power.dtype) - n // 2 for n in power.shape[-2:])
-    whole = power.sum((-2, -1))
+    power_sum = power.sum((-2, -1))
     return torch.stack(
-        [(power.sum(-1) * y).sum(-1) / whole, (power.sum(-2) * x).sum(-1) / whole], -1
+        [(power.sum(-1) * y).sum(-1) / power_sum, (power.sum(-2) * x).sum(-1) / power_sum], -1
     )
 
 
 # --- start ----------------------------------------------------------------------------------------
 
 
-def _start(seen: Seen, share: Tensor, window: tuple[int, int]) -> tuple[State, Tensor]:
+def _start(pixels: Seen, share: Tensor, window: tuple[int, int]) -> tuple[State, Tensor]:
     """Return a first guess: one PSF for all nodes, from the points that are not saturated."""
-    points, channels, nodes = len(seen.owner), len(seen.light), share.shape[1]
-    kernels = seen.light.new_zeros(nodes, channels, *window)
+    points, channels, nodes = len(pixels.owner), len(pixels.light), share.shape[1]
+    kernels = pixels.light.new_zeros(nodes, channels, *window)
     state = State(
         kernels,
-        seen.light.new_zeros(points, channels),
-        seen.light.new_zeros(points, 2),
-        seen.background,
+        pixels.light.new_zeros(points, channels),
+        pixels.light.new_zeros(points, 2),
+        pixels.background,
     )
-    near = linear(seen, state, share)
-    stamps = near.stamps_of(seen.light - seen.background.T[:, seen.frame])
-    weight = _weight(seen, seen.light)
+    near = linear(pixels, state, share)
+    stamps = near.stamps_of(pixels.light - pixels.background.T[:, pixels.frame])
+    weight = _weight(pixels, pixels.light)
     weights = near.stamps_of(weight)
-    good = (near.stamps_of(seen.clipped.double()) == 0).all(1).flatten(1).all(1)
+    good = (near.stamps_of(pixels.clipped.double()) == 0).all(1).flatten(1).all(1)
     valid = (weights[good] > 0).double()
     guess = (stamps[good] * valid).sum(0) / (valid * stamps[good].sum((-2, -1), keepdim=True)).sum(
         0
@@ -160,7 +154,7 @@ def _start(seen: Seen, share: Tensor, window: tuple[int, int]) -> tuple[State, T
     guess = guess / guess.sum((-2, -1), keepdim=True).clamp_min(1e-9)
     for _ in range(2):
         offset, signal = _registered(stamps, weights, guess)
-    return State(guess.expand_as(kernels).contiguous(), signal, offset, seen.background), weight
+    return State(guess.expand_as(kernels).contiguous(), signal, offset, pixels.background), weight
 
 
 def _registered(stamps: Tensor, weights: Tensor, guess: Tensor) -> tuple[Tensor, Tensor]:
@@ -168,11 +162,11 @@ def _registered(stamps: Tensor, weights: Tensor, guess: Tensor) -> tuple[Tensor,
     signal of each channel.
     """
     channels, wide = len(guess), (_SEARCH,) * 4
-    found = conv2d(pad(weights * stamps, wide), guess[:, None], groups=channels)
-    there = conv2d(pad(weights, wide), guess.square()[:, None], groups=channels).clamp_min(1e-30)
-    best = (found.clamp_min(0.0).square() / there).sum(1).flatten(1).argmax(1)
+    product = conv2d(pad(weights * stamps, wide), guess[:, None], groups=channels)
+    norm = conv2d(pad(weights, wide), guess.square()[:, None], groups=channels).clamp_min(1e-30)
+    best = (product.clamp_min(0.0).square() / norm).sum(1).flatten(1).argmax(1)
     signal = (
-        (found / there).flatten(2).gather(2, best[:, None, None].expand(-1, channels, 1))[..., 0]
+        (product / norm).flatten(2).gather(2, best[:, None, None].expand(-1, channels, 1))[..., 0]
     )
     side = 2 * _SEARCH + 1
     offset = torch.stack([best // side, best % side], 1).double() - _SEARCH
@@ -182,37 +176,39 @@ def _registered(stamps: Tensor, weights: Tensor, guess: Tensor) -> tuple[Tensor,
 # --- steps ----------------------------------------------------------------------------------------
 
 
-def _weight(seen: Seen, expected: Tensor) -> Tensor:
+def _weight(pixels: Seen, expected: Tensor) -> Tensor:
     """Return 1 / variance of each pixel; 0 where it is clipped, or may be clipped by chance."""
-    ground = seen.background.T[:, seen.frame]
-    variance = seen.floor.T[:, seen.frame] + (expected - ground).clamp_min(0.0)
-    censored = seen.clipped | (expected > seen.level - _SURE * variance.sqrt())
+    ground = pixels.background.T[:, pixels.frame]
+    variance = pixels.floor.T[:, pixels.frame] + (expected - ground).clamp_min(0.0)
+    censored = pixels.clipped | (expected > pixels.level - _SURE * variance.sqrt())
     return torch.where(censored, 0.0, 1.0 / variance)
 
 
 def _slope(near: Linear, state: State, weight: Tensor, residual: Tensor) -> State:
     slope = near.slope(weight * residual)
-    known = (near.seen.background - state.background) / near.seen.doubt
-    return slope._replace(background=slope.background + known)
+    pull_to_background = (near.seen.background - state.background) / near.seen.doubt
+    return slope._replace(background=slope.background + pull_to_background)
 
 
-def _ahead(seen: Seen, state: State, share: Tensor, weight: Tensor, step: State) -> State:
+def _ahead(pixels: Seen, state: State, share: Tensor, weight: Tensor, step: State) -> State:
     """Return the state after a step, halved until the frames fit better; the state itself if
     none does.
     """
-    worst = _square(seen, state, linear(seen, state, share), weight)
+    worst = _square(pixels, state, linear(pixels, state, share), weight)
     for _ in range(_HALVED):
         ahead = state.plus(step)
-        if float(_square(seen, ahead, linear(seen, ahead, share), weight)) < float(worst):
+        if float(_square(pixels, ahead, linear(pixels, ahead, share), weight)) < float(worst):
             return ahead
-        step = State(*(0.5 * part for part in step))
+        step = State(*(0.5 * entry for entry in step))
     return state
 
 
-def _square(seen: Seen, state: State, near: Linear, weight: Tensor) -> Tensor:
+def _square(pixels: Seen, state: State, near: Linear, weight: Tensor) -> Tensor:
     """Return chi-square of the frames and of what is known of their backgrounds."""
-    known = (seen.background - state.background).square() / seen.doubt
-    return (weight * (seen.light - near.model(state.background)).square()).sum() + known.sum()
+    background_misfit = (pixels.background - state.background).square() / pixels.doubt
+    return (
+        weight * (pixels.light - near.model(state.background)).square()
+    ).sum() + background_misfit.sum()
 
 
 def _curvature(near: Linear, weight: Tensor) -> State:
@@ -228,8 +224,8 @@ def _curvature(near: Linear, weight: Tensor) -> State:
     count = weight.new_zeros(len(near.seen.background), len(weight)).index_add(
         0, near.seen.frame, weight.T
     )
-    found = State(kernels, signal, offset, count + 1.0 / near.seen.doubt)
-    return State(*(x + 1e-3 * x.amax() * (x <= 0) + _CALM * x.amax() for x in found))
+    diagonal = State(kernels, signal, offset, count + 1.0 / near.seen.doubt)
+    return State(*(x + 1e-3 * x.amax() * (x <= 0) + _CALM * x.amax() for x in diagonal))
 
 
 def _solved(near: Linear, hold: Hold, weight: Tensor, right: State) -> State:
@@ -242,10 +238,10 @@ def _solved(near: Linear, hold: Hold, weight: Tensor, right: State) -> State:
     diagonal = _curvature(near, weight)
     inverse = State(*(1.0 / x for x in diagonal))
     calm = State(*(_CALM * x.amax() * torch.ones_like(x) for x in diagonal))
-    x = State(*(torch.zeros_like(part) for part in right))
-    rest = _free(right, hold)
-    way = _free(rest.times(inverse), hold)
-    size = rest.dot(way)
+    x = State(*(torch.zeros_like(entry) for entry in right))
+    residual = _free(right, hold)
+    way = _free(residual.times(inverse), hold)
+    size = residual.dot(way)
     first = size
     for _ in range(_ITERATIONS):
         if float(size) <= _RESIDUAL * float(first):
@@ -254,9 +250,9 @@ def _solved(near: Linear, hold: Hold, weight: Tensor, right: State) -> State:
         image = image._replace(background=image.background + way.background / near.seen.doubt)
         image = _free(image, hold)
         step = size / way.dot(image)
-        x, rest = x.plus(way, step), rest.plus(image, -step)
-        turned = _free(rest.times(inverse), hold)
-        size, before = rest.dot(turned), size
+        x, residual = x.plus(way, step), residual.plus(image, -step)
+        turned = _free(residual.times(inverse), hold)
+        size, before = residual.dot(turned), size
         way = turned.plus(way, size / before)
     return x
 
@@ -293,19 +289,23 @@ def _ways(kernels: Tensor) -> Tensor:
     """Return two changes (2, node, channel, y, x) of each PSF, of unit length, that move it down
     and to the right.
     """
-    found = list[Tensor]()
+    directions = list[Tensor]()
     for way in torch.gradient(kernels, dim=(-2, -1)):
         way = way - way.mean((-2, -1), keepdim=True)
-        for other in found:
+        for other in directions:
             way = way - (way * other).sum((-3, -2, -1), keepdim=True) * other
-        found.append(way / way.square().sum((-3, -2, -1), keepdim=True).sqrt().clamp_min(1e-30))
-    return torch.stack(found)
+        directions.append(
+            way / way.square().sum((-3, -2, -1), keepdim=True).sqrt().clamp_min(1e-30)
+        )
+    return torch.stack(directions)
 
 
 def _refuse_unseen(near: Linear, weight: Tensor) -> None:
     """Raise ValueError where a pixel of a PSF is saturated or beyond the frame in all frames."""
-    seen = torch.tensordot(near.share.square(), (near.stamps_of(weight) > 0).double(), ([0], [0]))
-    if missing := int((seen <= 0).any(1).sum()):
+    information = torch.tensordot(
+        near.share.square(), (near.stamps_of(weight) > 0).double(), ([0], [0])
+    )
+    if missing := int((information <= 0).any(1).sum()):
         raise ValueError(
             f"{missing} pixels of the PSF are saturated, or beyond the edge, in every frame: add"
             " frames of a shorter exposure, move points from the edge, or choose a smaller window"
@@ -318,12 +318,12 @@ def _refuse_unseen(near: Linear, weight: Tensor) -> None:
 
 def _misfit(near: Linear, weight: Tensor, residual: Tensor) -> Tensor:
     """Return the root of chi-square around each pixel of the window (y, x), at least 1."""
-    square, known = (
+    square, count = (
         near.stamps_of(x).sum((0, 1)) for x in (weight * residual.square(), (weight > 0).double())
     )
     mean = [
         avg_pool2d(x[None, None], _LOCAL, 1, _LOCAL // 2, count_include_pad=False)[0, 0]
-        for x in (square, known)
+        for x in (square, count)
     ]
     free = 1.0 - _unknowns(near) / float((weight > 0).sum())
     return (mean[0] / (free * mean[1]).clamp_min(1e-9)).clamp_min(1.0).sqrt()
@@ -357,8 +357,8 @@ def _unknowns(near: Linear) -> float:
     """Return the number of fitted values, at most nine tenths of the pixels."""
     points, channels = near.signal.shape
     window = near.patterns.shape[-2] * near.patterns.shape[-1]
-    whole = near.share.shape[1] * channels * window + points * (channels + 2)
-    return min(float(whole), 0.9 * near.seen.light.numel())
+    number = near.share.shape[1] * channels * window + points * (channels + 2)
+    return min(float(number), 0.9 * near.seen.light.numel())
 
 
 def _normal(like: Tensor, rng: Generator) -> Tensor:
@@ -435,17 +435,16 @@ def measured_psf(
             undersampled stars; Papandreou and Yuille, NIPS 23 (2010), for the draws.
     """
     camera = gain, offset, full_well, bits, read_noise
-    refuse_bad_frames(
-        files or (), len(responses), _two(shape), _two(window), _two(zones), camera, curve
-    )
-    seen = read_points(files or (), _two(window), camera)
-    fit = fitted(seen, _two(shape), _two(zones), _two(window), draws, rng)
+    layout = Layout(_two(shape), _two(window), _two(zones))
+    refuse_bad_frames(files or (), len(responses), layout, camera, curve)
+    pixels = read_points(files or (), layout.window, camera)
+    fit = fitted(pixels, layout, draws, rng)
     kernels = fit.kernels.reshape(*zones, *fit.kernels.shape[1:])
     drawn = fit.draws.reshape(-1, *kernels.shape)
     deviation = (drawn.double() - kernels).square().mean(0).sqrt()
-    places = seen.middle + fit.state.offset
+    places = pixels.middle + fit.state.offset
     points = torch.cat(
-        [seen.owner[:, None].double(), places, fit.state.signal.sum(1, keepdim=True)], 1
+        [pixels.owner[:, None].double(), places, fit.state.signal.sum(1, keepdim=True)], 1
     )
     counts = (x.reshape(*zones) for x in (fit.support, fit.inflation))
     return MeasuredPsf(
@@ -471,9 +470,8 @@ def _(
     refuse_without_steps(full_well, gain=gain, bits=bits)
     camera: Camera = gain, offset, full_well, bits, read_noise
     channels = None if responses is None else len(responses)
-    refuse_bad_frames(
-        files, channels, _two(shape), _two(window), _two(zones), camera, params.get("curve")
-    )
+    layout = Layout(_two(shape), _two(window), _two(zones))
+    refuse_bad_frames(files, channels, layout, camera, params.get("curve"))
     return []
 
 
@@ -481,14 +479,14 @@ def _(
 def _(result: MeasuredPsf, *inputs: Any, **params: Any) -> list[Check]:
     peak = (result.deviation.amax((-2, -1)) / result.kernels.amax((-2, -1))).max()
     fit = ", ".join(f"{x:.2f}" for x in result.fit.tolist())
-    whole = all(math.isfinite(float(x.sum())) for x in result)
+    finite = all(math.isfinite(float(x.sum())) for x in result)
     return [
         Check(
             f"{len(result.places)} points; chi-square per pixel {fit}",
             float(result.fit.max()) < _GOOD,
         ),
         _counted(result),
-        Check(f"deviation at most {float(peak):.2g} of the peak", whole),
+        Check(f"deviation at most {float(peak):.2g} of the peak", finite),
         Check(
             f"light beyond the window at most {float(result.outside.max()):.2g}, if it falls as 1 /"
             " r^3 or faster"
@@ -500,10 +498,10 @@ def _counted(result: MeasuredPsf) -> Check:
     """Return how many points tell each PSF, and the zone in which they tell several PSFs at
     once.
     """
-    least, worst = float(result.support.min()), float(result.inflation.max())
+    fewest, worst = float(result.support.min()), float(result.inflation.max())
     row, column = divmod(int(result.inflation.argmax()), result.inflation.shape[1])
     text = (
-        f"each zone has {least:.2g} points or more in effect, inflation of variance at most"
+        f"each zone has {fewest:.2g} points or more in effect, inflation of variance at most"
         f" {worst:.3g}"
     )
     if worst <= _INFLATED:
@@ -528,9 +526,9 @@ def _outside(kernels: Tensor, draws: Tensor) -> Tensor:
     y, x = kernels.shape[-2:]
     rim = torch.ones(y, x, dtype=torch.bool)
     rim[2:-2, 2:-2] = False
-    at, spread = (
+    rim_level, spread = (
         kernels[..., rim].mean(-1),
         (draws - kernels)[..., rim].mean(-1).square().mean(0).sqrt(),
     )
-    bound = 2.0 * math.pi * (min(y, x) / 2.0) ** 2 * (at.clamp_min(0.0) + 2.0 * spread)
+    bound = 2.0 * math.pi * (min(y, x) / 2.0) ** 2 * (rim_level.clamp_min(0.0) + 2.0 * spread)
     return bound.amax((0, 1))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,12 +56,18 @@ def lit_and_dark(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     return [file for file in files if file not in dark], dark
 
 
+class Layout(NamedTuple):
+    """Sizes of the PSFs that are measured, and where, (y, x) each."""
+
+    shape: tuple[int, int]  #: pixels of a frame
+    window: tuple[int, int]  #: pixels of a PSF
+    zones: tuple[int, int]
+
+
 def refuse_bad_frames(
     files: Sequence[Path],
     channels: int | None,
-    shape: tuple[int, int],
-    window: tuple[int, int],
-    zones: tuple[int, int],
+    layout: Layout,
     camera: Camera,
     curve: Curve | None = None,
 ) -> None:
@@ -72,20 +79,37 @@ def refuse_bad_frames(
         raise ParameterError(
             "files", "there is no frame with points: only names that begin with dark"
         )
-    problems = [
-        p for file in [*lit, *dark] if (p := frame_problem(file, channels, shape, camera[3], curve))
-    ]
-    found = {}
-    if not problems:
-        found = {file: _found(file, window, camera) for file in lit}
-        problems = [text for file in lit if (text := _unusable(file, found[file], shape, window))]
-    if problems:
-        head = f"{len(problems)} of {len(files)} frames cannot be used: " if len(files) > 1 else ""
-        raise ParameterError("files", head + "; ".join(problems))
-    full = {_zone(p, shape, zones) for points in found.values() for p, sharp in points if sharp}
-    empty = [(i + 1, j + 1) for i in range(zones[0]) for j in range(zones[1]) if (i, j) not in full]
+    shape, window, zones = layout
+    bits = camera[3]
+    _refuse_problems(
+        files, [frame_problem(file, channels, shape, bits, curve) for file in [*lit, *dark]]
+    )
+    points = {file: _found(file, window, camera) for file in lit}
+    _refuse_problems(files, [_unusable(file, points[file], shape, window) for file in lit])
+    empty = _empty_zones(points.values(), shape, zones)
     if empty:
         raise ParameterError("zones", _without_point(empty, zones))
+
+
+def _refuse_problems(files: Sequence[Path], problems: Sequence[str]) -> None:
+    """Raise ParameterError with the problems of all frames that have one."""
+    stated = [problem for problem in problems if problem]
+    if stated:
+        head = f"{len(stated)} of {len(files)} frames cannot be used: " if len(files) > 1 else ""
+        raise ParameterError("files", head + "; ".join(stated))
+
+
+def _empty_zones(
+    points_by_file: Iterable[Sequence[tuple[tuple[int, int], bool]]],
+    shape: tuple[int, int],
+    zones: tuple[int, int],
+) -> list[tuple[int, int]]:
+    """Return the zones without a sharp point, (row, column) from 1."""
+    full = set()
+    for points in points_by_file:
+        full |= {_zone(place, shape, zones) for place, sharp in points if sharp}
+    every = itertools.product(range(zones[0]), range(zones[1]))
+    return [(row + 1, column + 1) for row, column in every if (row, column) not in full]
 
 
 def points_in(files: Sequence[Path], window: tuple[int, int], camera: Camera) -> int:
@@ -117,8 +141,8 @@ def read_points(files: Sequence[Path], window: tuple[int, int], camera: Camera) 
     )
     index, ground = torch.cat(indices), torch.stack(background)
     level = min(full_well, (2.0**bits - 1) / gain) - float(np.mean(base))
-    least = read_noise**2 * (1 + (1 / len(dark) if dark else 0)) + 1 / (12 * gain**2)
-    floor = torch.maximum(torch.stack(spread), least + ground.clamp_min(0.0))
+    read_variance = read_noise**2 * (1 + (1 / len(dark) if dark else 0)) + 1 / (12 * gain**2)
+    floor = torch.maximum(torch.stack(spread), read_variance + ground.clamp_min(0.0))
     return Seen(
         torch.cat(lights, 1),
         torch.cat(cut, 1),
@@ -150,19 +174,19 @@ def _kept(
     columns = middle[:, 1:] + torch.arange(window[1]) - window[1] // 2
     inside = ((rows >= 0) & (rows < y))[:, :, None] & ((columns >= 0) & (columns < x))[:, None]
     flat = rows.clamp(0, y - 1)[:, :, None] * x + columns.clamp(0, x - 1)[:, None]
-    used = _covered((y, x), places, window).flatten()
+    covered = _covered((y, x), places, window).flatten()
     wide = _covered((y, x), places, (2 * window[0], 2 * window[1])).flatten()
-    lit = wide if int((~wide).sum()) >= _AROUND else used
-    order = used.cumsum(0) - 1 + first
+    lit = wide if int((~wide).sum()) >= _AROUND else covered
+    order = covered.cumsum(0) - 1 + first
     index = torch.where(inside, order[flat], -1).flatten(1)
     pairs = zip(light.flatten(1), ends.flatten(1), strict=True)
     level, doubt, spread = map(
         torch.stack, zip(*(_average(c[~lit & ~e]) for c, e in pairs), strict=True)
     )
     return (
-        light.flatten(1)[:, used],
-        ends.flatten(1)[:, used],
-        torch.full((int(used.sum()),), number),
+        light.flatten(1)[:, covered],
+        ends.flatten(1)[:, covered],
+        torch.full((int(covered.sum()),), number),
         index,
         middle,
         torch.full((len(places),), number),
@@ -176,10 +200,10 @@ def _covered(
     shape: tuple[int, int], places: list[tuple[int, int]], window: tuple[int, int]
 ) -> Tensor:
     """Return True for the pixels (y, x) in windows around places."""
-    used, (down, right) = torch.zeros(shape, dtype=torch.bool), (n // 2 for n in window)
+    covered, (down, right) = torch.zeros(shape, dtype=torch.bool), (n // 2 for n in window)
     for y, x in places:
-        used[max(y - down, 0) : y + down + 1, max(x - right, 0) : x + right + 1] = True
-    return used
+        covered[max(y - down, 0) : y + down + 1, max(x - right, 0) : x + right + 1] = True
+    return covered
 
 
 def _average(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -311,11 +335,11 @@ def node_weights(places: Tensor, shape: tuple[int, int], zones: tuple[int, int])
     return (down[:, :, None] * right[:, None]).flatten(1)
 
 
-def hats(at: Tensor, size: int, count: int) -> Tensor:
+def hats(position: Tensor, size: int, count: int) -> Tensor:
     """Return the linear weights (place, node) of ``count`` nodes in the middles of equal parts
     of ``size`` pixels.
     """
-    along = ((at.double() + 0.5) * count / size - 0.5).clamp(0, count - 1)
+    along = ((position.double() + 0.5) * count / size - 0.5).clamp(0, count - 1)
     return (1.0 - (along[:, None] - torch.arange(count, dtype=torch.float64)).abs()).clamp_min(0.0)
 
 
@@ -327,8 +351,8 @@ def shifting(offset: Tensor, size: int) -> tuple[Tensor, Tensor]:
     in a pixel. The slope of the samples is continued beyond their ends.
     """
     apart = torch.arange(size)[:, None] - torch.arange(size + 2 * _REACH) + _REACH
-    at = apart.double() - offset[:, None, None]
-    inside = (1.0 - (at / (_REACH + 1.0)).square()).clamp_min(0.0)
+    distance = apart.double() - offset[:, None, None]
+    inside = (1.0 - (distance / (_REACH + 1.0)).square()).clamp_min(0.0)
     root = inside.sqrt()
     taper = torch.special.i0(_BETA * root) / torch.special.i0(
         torch.tensor(_BETA, dtype=torch.float64)
@@ -336,12 +360,12 @@ def shifting(offset: Tensor, size: int) -> tuple[Tensor, Tensor]:
     bent = torch.special.i1(_BETA * root) / torch.special.i0(
         torch.tensor(_BETA, dtype=torch.float64)
     )
-    wave, x = torch.sinc(at), math.pi * at
-    small = at.abs() < 1e-4
+    wave, x = torch.sinc(distance), math.pi * distance
+    small = distance.abs() < 1e-4
     rise = torch.where(
-        small, -math.pi * x / 3.0, (torch.cos(x) - wave) / torch.where(small, 1.0, at)
+        small, -math.pi * x / 3.0, (torch.cos(x) - wave) / torch.where(small, 1.0, distance)
     )
-    fall = -_BETA * at / (_REACH + 1.0) ** 2 * bent / root.clamp_min(1e-6)
+    fall = -_BETA * distance / (_REACH + 1.0) ** 2 * bent / root.clamp_min(1e-6)
     outside = inside <= 0
     value = (wave * taper).masked_fill(outside, 0.0)
     slope = -(rise * taper + wave * fall).masked_fill(outside, 0.0)
@@ -414,8 +438,10 @@ class Linear(NamedTuple):
     def _scattered(self, stamps: Tensor) -> Tensor:
         flat = stamps.transpose(0, 1).flatten(1)
         count = self.seen.light.shape[-1]
-        whole = flat.new_zeros(len(flat), count + 1).index_add(1, self.seen.pixels.flatten(), flat)
-        return whole[:, :count]
+        with_outside = flat.new_zeros(len(flat), count + 1).index_add(
+            1, self.seen.pixels.flatten(), flat
+        )
+        return with_outside[:, :count]
 
     def model(self, background: Tensor) -> Tensor:
         """Return the expected frames (channel, pixel)."""
@@ -425,7 +451,7 @@ class Linear(NamedTuple):
         )
 
 
-def linear(seen: Seen, state: State, share: Tensor) -> Linear:
+def linear(pixels: Seen, state: State, share: Tensor) -> Linear:
     """Return the frames near a state."""
     y, x = state.kernels.shape[-2:]
     (down, steep), (right, steep_x) = (
@@ -433,14 +459,14 @@ def linear(seen: Seen, state: State, share: Tensor) -> Linear:
         shifting(state.offset[:, 1], x),
     )
     kernels, size = torch.tensordot(share, state.kernels, 1), state.signal[..., None, None]
-    there = _applied(down, kernels, right)
+    patterns = _applied(down, kernels, right)
     slopes = size * _applied(steep, kernels, right), size * _applied(down, kernels, steep_x)
-    return Linear(seen, share, state.signal, down, right, torch.stack([there, *slopes]))
+    return Linear(pixels, share, state.signal, down, right, torch.stack([patterns, *slopes]))
 
 
 def _applied(down: Tensor, kernels: Tensor, right: Tensor) -> Tensor:
     """Return kernels (point, channel, y, x), multiplied from both sides by the matrices of each
     point.
     """
-    there: Tensor = down[:, None] @ kernels @ right.mT[:, None]
-    return there
+    products: Tensor = down[:, None] @ kernels @ right.mT[:, None]
+    return products

@@ -120,9 +120,11 @@ def _(bands: Any, illuminant: Any, responses: Tensor, *inputs: Any, **params: An
 @shading.shape
 def _(responses: Any, *, shape: Sequence[int], **params: Any) -> Shading:
     y, x = shape
-    knots, one = grid((y, x)), double()
+    knots, scalar = grid((y, x)), double()
     counts = blank(dtype=torch.bool), blank(dtype=torch.int64)
-    return Shading(blank(y, x), blank(y, x), double(*knots), double(*knots), one, one, *counts, one)
+    return Shading(
+        blank(y, x), blank(y, x), double(*knots), double(*knots), scalar, scalar, *counts, scalar
+    )
 
 
 @shading.work
@@ -193,7 +195,7 @@ def _(found: Any, pupil: Any, electrons: Tensor, *, patterns: int = 12, **params
 
 
 def _summed(
-    result: Tensor, found: Any, pupil: Pupil, electrons: Tensor, **params: Any
+    result: Tensor, lasers: Any, pupil: Pupil, electrons: Tensor, **params: Any
 ) -> tuple[float, float]:
     """Return the work of sums over all samples of the pupil, for each row and column of pixels."""
     side, (y, x) = max(pupil.height.shape), electrons.shape[-2:]
@@ -218,7 +220,9 @@ def _(
     largest = max(unknowns, _WHITENED * side)
     nearby = (
         _MODE
-        * sum(len(each) for each in (others[5] if len(others) > 5 else None) or ())
+        * sum(
+            len(patterns_drawn) for patterns_drawn in (others[5] if len(others) > 5 else None) or ()
+        )
         * electrons.numel()
     )
     return max(31.0 * len(electrons) * y * x, _SYSTEM * largest**2) + nearby, operations
@@ -250,8 +254,8 @@ def _(
 def _(
     result: Tensor, electrons: Tensor, psf: Psf, *others: Any, draws: int = 8, **params: Any
 ) -> tuple[float, float]:
-    told = (*others[:4], *others[5:])  # without the matrix
-    memory, operations = wiener.hooks.work(result, electrons, psf, *told, **params)  # type: ignore[misc]
+    inputs_of_filter = (*others[:4], *others[5:])  # without the matrix
+    memory, operations = wiener.hooks.work(result, electrons, psf, *inputs_of_filter, **params)  # type: ignore[misc]
     return 1.5 * memory, draws * operations
 
 
@@ -270,10 +274,10 @@ def _(
 ) -> WienerProblem:
     fine = torch.float64 if max(electrons.shape[-2:]) <= PRECISE else at_least_single(electrons)
     doubts = sum(len(other) for other in nearby or ())
-    count, frame, one = len(electrons), tuple(electrons.shape), (len(electrons), 1, 1)
+    count, frame, by_channel = len(electrons), tuple(electrons.shape), (len(electrons), 1, 1)
     kernels = (count, *psf.intensity.shape[-2:])
     patterns = [(number, *frame) for number in (len(glare or ()) + len(ghosts or ()), doubts)]
-    shapes = (frame, frame, kernels, *patterns, frame, frame, one, one)
+    shapes = (frame, frame, kernels, *patterns, frame, frame, by_channel, by_channel)
     return WienerProblem._make(blank(*shape, dtype=fine) for shape in shapes)
 
 
@@ -286,9 +290,11 @@ def _(result: WienerProblem, *inputs: Any, **params: Any) -> tuple[float, float]
 @filter_facts.shape
 def _(electrons: Tensor, *inputs: Any, **params: Any) -> FilterFacts:
     fine = torch.float64 if max(electrons.shape[-2:]) <= PRECISE else at_least_single(electrons)
-    frame, one = tuple(electrons.shape), (len(electrons), 1, 1)
+    frame, by_channel = tuple(electrons.shape), (len(electrons), 1, 1)
     maps = (MAPS + EACH * (len(electrons) - 3), *frame[1:])
-    return FilterFacts._make(blank(*shape, dtype=fine) for shape in (frame, frame, maps, one, one))
+    return FilterFacts._make(
+        blank(*shape, dtype=fine) for shape in (frame, frame, maps, by_channel, by_channel)
+    )
 
 
 @filter_facts.work
@@ -424,7 +430,7 @@ def _(
     channels, (y, x), (rows, columns) = len(responses), window, zones
     kernels = rows, columns, channels, y, x
     points = points_in(files, (y, x), (gain, offset, full_well, bits, read_noise))
-    each = [double(rows, columns) for _ in range(2)]
+    per_zone = [double(rows, columns) for _ in range(2)]
     return MeasuredPsf(
         double(*kernels),
         double(*kernels),
@@ -432,7 +438,7 @@ def _(
         double(points, 4),
         double(channels),
         double(channels),
-        *each,
+        *per_zone,
     )
 
 
@@ -479,9 +485,11 @@ def _(
     psf, memory, operations = Psf(measured.kernels[0, 0], measured.fit), 0.0, 0.0
     for y in rows:
         for x in columns:
-            part = blank(len(electrons), y, x)
-            doubts = [blank(len(each), *part.shape) for each in nearby or ()]
-            held, taken = wiener.hooks.work(part, part, psf, None, None, None, None, None, doubts)  # type: ignore[misc]
+            window = blank(len(electrons), y, x)
+            doubts = [blank(len(patterns_drawn), *window.shape) for patterns_drawn in nearby or ()]
+            held, taken = wiener.hooks.work(
+                window, window, psf, None, None, None, None, None, doubts
+            )  # type: ignore[misc]
             memory, operations = max(memory, held), operations + taken
     return memory, operations
 

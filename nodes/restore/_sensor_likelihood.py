@@ -61,7 +61,7 @@ class MeasuringSensor:
         return self.spread**2 * expected.clamp_min(floor) + still
 
     def surprise(
-        self, expected: Tensor, measured: Tensor, known: Tensor, floor: float = 0.0
+        self, expected: Tensor, measured: Tensor, unsaturated: Tensor, floor: float = 0.0
     ) -> Tensor:
         """Return the negative log-likelihood of each pixel.
 
@@ -73,11 +73,13 @@ class MeasuringSensor:
         variance = self.variance(expected, floor)
         normal = (measured - expected).square() / variance + (2.0 * math.pi * variance).log()
         return torch.where(
-            known > 0, 0.5 * normal, -torch.special.log_ndtr(-self._distance(expected, variance))
+            unsaturated > 0,
+            0.5 * normal,
+            -torch.special.log_ndtr(-self._distance(expected, variance)),
         )
 
     def surprise_slope(
-        self, expected: Tensor, measured: Tensor, known: Tensor, floor: float = 0.0
+        self, expected: Tensor, measured: Tensor, unsaturated: Tensor, floor: float = 0.0
     ) -> Tensor:
         """Return the derivative of `surprise` with respect to the expected electrons, in
         nats/e-.
@@ -85,11 +87,11 @@ class MeasuringSensor:
         variance = self.variance(expected, floor)
         # of the variance, relative
         growth = self.spread**2 * (expected > floor).to(expected) / variance
-        rest = measured - expected
-        normal = -rest / variance + 0.5 * growth * (1.0 - rest.square() / variance)
+        error = measured - expected
+        normal = -error / variance + 0.5 * growth * (1.0 - error.square() / variance)
         distance = self._distance(expected, variance)
         approach = -variance.rsqrt() - 0.5 * distance * growth
-        return torch.where(known > 0, normal, _hazard(distance) * approach)
+        return torch.where(unsaturated > 0, normal, _hazard(distance) * approach)
 
     def measured(self, expected: Tensor, rng: Generator) -> Tensor:
         """Return one measurement of expected electrons without dark electrons, in e- without the
@@ -135,7 +137,7 @@ def measuring_sensor(
     Raises ValueError for readings of the paper in which the mean of a measurement is not the
     expected electrons.
     """
-    wanted = {
+    settings = {
         "mean": (charge["mean"], "additive"),
         "mean_shift": (charge["mean_shift"], 0.0),
         "drawn_in": (charge["drawn_in"], "electrons"),
@@ -143,9 +145,9 @@ def measuring_sensor(
         "offset_subtracted": (signal["offset_subtracted"], True),
     }
     wrong = [
-        f"{name} {found!r} (must be {right!r})"
-        for name, (found, right) in wanted.items()
-        if found != right
+        f"{name} {setting!r} (must be {right!r})"
+        for name, (setting, right) in settings.items()
+        if setting != right
     ]
     if wrong:
         raise ValueError(

@@ -55,18 +55,18 @@ def cells_of(electrons: Tensor, clipped: Tensor, read_noise: float) -> Cells:
     open_ = (~clipped).double()
     light = electrons.double().sum(0) * open_
     noise = (light.clamp_min(0.0) + len(electrons) * read_noise**2) * open_
-    count, total, variance = (_summed(each, cells) for each in (open_, light, noise))
-    whole = _summed(torch.ones_like(open_), cells)
-    seen = (count >= _SEEN * whole) & (total > _DARK * variance.sqrt()) & (count > 0)
-    log = torch.where(seen, (total / count.clamp_min(1.0)).clamp_min(1e-300).log(), 0.0)
-    return Cells(log.flatten(), seen.flatten())
+    count, total, variance = (_summed(picture, cells) for picture in (open_, light, noise))
+    pixels_in_cell = _summed(torch.ones_like(open_), cells)
+    usable = (count >= _SEEN * pixels_in_cell) & (total > _DARK * variance.sqrt()) & (count > 0)
+    log = torch.where(usable, (total / count.clamp_min(1.0)).clamp_min(1e-300).log(), 0.0)
+    return Cells(log.flatten(), usable.flatten())
 
 
 def _summed(values: Tensor, cells: tuple[int, int]) -> Tensor:
     """Sum a picture (y, x) over its cells."""
     rows, columns = (_numbers(n, k, values) for n, k in zip(values.shape, cells, strict=True))
-    found = values.new_zeros(cells[0], values.shape[1]).index_add_(0, rows, values)
-    return values.new_zeros(cells).index_add_(1, columns, found)
+    row_sums = values.new_zeros(cells[0], values.shape[1]).index_add_(0, rows, values)
+    return values.new_zeros(cells).index_add_(1, columns, row_sums)
 
 
 def _numbers(pixels: int, cells: int, like: Tensor) -> Tensor:
@@ -93,10 +93,10 @@ def _spline(cells: int, pixels: int) -> Tensor:
     edges = torch.arange(cells + 1, dtype=torch.float64) * pixels / cells
     centres = (edges.ceil()[1:] + edges.ceil()[:-1] - 1) / 2
     places = torch.arange(pixels, dtype=torch.float64).clamp(centres[0], centres[-1])
-    found = CubicSpline(
+    weights = CubicSpline(
         centres.numpy(), torch.eye(cells, dtype=torch.float64).numpy(), bc_type="clamped"
     )(places)
-    return torch.from_numpy(found)
+    return torch.from_numpy(weights)
 
 
 # --- scene spectra --------------------------------------------------------------------------------
@@ -141,39 +141,39 @@ def likelihoods(frame: Cells, grid: tuple[int, int]) -> Likelihood:
     stretch.
     """
     base, y, x = cosines(grid)
-    seen = frame.seen
+    usable = frame.seen
     precisions, roots = [], []
     for exponent, stretch in itertools.product(EXPONENTS, STRETCHES):
         power = ((stretch * y).square() + x.square()).clamp_min(1e-9).pow(-exponent / 2)
         power[0] = 0.0
         power = power / power.sum()
         power[0] = _FREE
-        rows = base[seen]
+        rows = base[usable]
         lower = torch.linalg.cholesky((rows * power) @ rows.mT)
         inverse = torch.cholesky_inverse(lower)
         level = inverse.sum(0)
         inverse = inverse - torch.outer(level, level) / level.sum()
-        full = torch.zeros(len(seen), len(seen), dtype=torch.float64)
-        full[seen.nonzero(), seen.nonzero().mT] = inverse
+        full = torch.zeros(len(usable), len(usable), dtype=torch.float64)
+        full[usable.nonzero(), usable.nonzero().mT] = inverse
         precisions.append(full)
         roots.append(-lower.diagonal().log().sum() - 0.5 * level.sum().log())
     return Likelihood(torch.stack(precisions), torch.stack(roots))
 
 
-def shared_detail(logs: Sequence[Tensor], seen: Sequence[Tensor], grid: tuple[int, int]) -> float:
+def shared_detail(logs: Sequence[Tensor], usable: Sequence[Tensor], grid: tuple[int, int]) -> float:
     """Return the correlation of the details of two frames, which are too fine to be dirt."""
     base, y, x = cosines(grid)
     fine = torch.hypot(y, x) >= max(grid) / 2
     details = []
-    for log, known in zip(logs, seen, strict=True):
-        flat = torch.where(known, log - log[known].mean(), 0.0)
+    for log, usable_cells in zip(logs, usable, strict=True):
+        flat = torch.where(usable_cells, log - log[usable_cells].mean(), 0.0)
         detail = base[:, fine].mT @ flat
         details.append(detail / detail.norm().clamp_min(1e-300))
     total, count = torch.stack(details).sum(0), len(details)
     if count < 2:
         return 0.0
-    found = (float(total.square().sum()) - count) / (count * (count - 1))
-    return min(1.0, max(0.0, found))
+    correlation = (float(total.square().sum()) - count) / (count * (count - 1))
+    return min(1.0, max(0.0, correlation))
 
 
 def habits(precision: Tensor, frames: float, grid: tuple[int, int]) -> Tensor:
@@ -227,8 +227,8 @@ def shared_field(frames: Sequence[Cells], grid: tuple[int, int]) -> Field:
     field, by variational Bayes.
     """
     laws = {bytes(frame.seen.tolist()): frame for frame in frames}
-    known = {seen: likelihoods(frame, grid) for seen, frame in laws.items()}
-    found = [known[bytes(frame.seen.tolist())] for frame in frames]
+    likelihood_of = {usable: likelihoods(frame, grid) for usable, frame in laws.items()}
+    frame_likelihoods = [likelihood_of[bytes(frame.seen.tolist())] for frame in frames]
     alike = shared_detail([frame.log for frame in frames], [frame.seen for frame in frames], grid)
     single = 1.0 + (len(frames) - 1) * alike  # frames that tell as much as one frame
     modes = [_modes(grid, length) for length in LENGTHS]
@@ -242,8 +242,8 @@ def shared_field(frames: Sequence[Cells], grid: tuple[int, int]) -> Field:
     )
     for _ in range(_ROUNDS):
         precision, pull = torch.zeros(size, size).double(), torch.zeros(size).double()
-        for picture, each in zip(frames, found, strict=True):
-            own = _expected(each, picture, field)
+        for picture, likelihood in zip(frames, frame_likelihoods, strict=True):
+            own = _expected(likelihood, picture, field)
             precision += own / single
             pull += own @ picture.log / single
         common = torch.eye(size).double() + precision @ habits(
@@ -255,17 +255,17 @@ def shared_field(frames: Sequence[Cells], grid: tuple[int, int]) -> Field:
     return field
 
 
-def _expected(found: Likelihood, frame: Cells, field: Field) -> Tensor:
+def _expected(likelihood: Likelihood, frame: Cells, field: Field) -> Tensor:
     """Return the expected precision (cell, cell) of one frame, given the field that is assumed
     at present.
     """
     left = torch.where(frame.seen, frame.log - field.mean, 0.0)
-    misfit = torch.einsum("a,kab,b->k", left, found.precision, left)
-    misfit = misfit + torch.einsum("kab,ab->k", found.precision, field.covariance)
+    misfit = torch.einsum("a,kab,b->k", left, likelihood.precision, left)
+    misfit = misfit + torch.einsum("kab,ab->k", likelihood.precision, field.covariance)
     freedom = max(int(frame.seen.sum()) - 1, 1)
-    weight = torch.softmax(found.log_root - 0.5 * freedom * misfit.clamp_min(1e-300).log(), 0)
+    weight = torch.softmax(likelihood.log_root - 0.5 * freedom * misfit.clamp_min(1e-300).log(), 0)
     precision: Tensor = torch.einsum(
-        "k,kab->ab", weight * freedom / misfit.clamp_min(1e-300), found.precision
+        "k,kab->ab", weight * freedom / misfit.clamp_min(1e-300), likelihood.precision
     )
     return precision
 
@@ -281,8 +281,8 @@ def _modes(grid: tuple[int, int], length: float) -> Tensor:
         covariance - covariance.mean(0) - covariance.mean(1, keepdim=True) + covariance.mean()
     )
     values, vectors = torch.linalg.eigh(covariance / covariance.diagonal().mean())
-    kept = values > _LEAST * values[-1]
-    factor: Tensor = vectors[:, kept] * values[kept].sqrt()
+    significant = values > _LEAST * values[-1]
+    factor: Tensor = vectors[:, significant] * values[significant].sqrt()
     return factor
 
 
@@ -294,11 +294,13 @@ def _posterior(precision: Tensor, pull: Tensor, modes: Sequence[Tensor], last: F
     gains, parts = [], []
     for factor in modes:
         inner = factor.mT @ precision @ factor
-        known, turned = torch.linalg.eigh((inner + inner.mT) / 2)
-        known, seen = known.clamp_min(0.0), turned.mT @ (factor.mT @ pull)
-        left = 1.0 / (deviations**-2 + known)
-        gains.append(0.5 * (left * seen.square() - torch.log1p(deviations**2 * known)).sum(1))
-        parts.append((factor @ turned, left, left * seen))
+        information, turned = torch.linalg.eigh((inner + inner.mT) / 2)
+        information, projection = information.clamp_min(0.0), turned.mT @ (factor.mT @ pull)
+        left = 1.0 / (deviations**-2 + information)
+        gains.append(
+            0.5 * (left * projection.square() - torch.log1p(deviations**2 * information)).sum(1)
+        )
+        parts.append((factor @ turned, left, left * projection))
     gain = torch.stack(gains) - math.log(len(gains) * len(DEVIATIONS))
     share = torch.softmax(gain.flatten(), 0).view_as(gain)
     middles = torch.cat([moved @ shapes.mT for shapes, _, moved in parts])
@@ -376,11 +378,11 @@ def shading(
 
 def _estimated(frames: Sequence[Cells], shape: tuple[int, int]) -> Shading:
     cells = grid(shape)
-    field = shared_field([each for each in frames if int(each.seen.sum()) > 1], cells)
+    field = shared_field([frame for frame in frames if int(frame.seen.sum()) > 1], cells)
     variance = field.covariance.diagonal().clamp_min(0.0)
     power = float(field.mean.square().mean())
-    told = power / (power + float(variance.mean()))
-    certain = told >= TOLD and field.clean <= DOUBT and field.scenes >= SCENES
+    share_told = power / (power + float(variance.mean()))
+    certain = share_told >= TOLD and field.clean <= DOUBT and field.scenes >= SCENES
     wide = variance if certain else variance + field.mean.square()
     applied = field.mean if certain else torch.zeros_like(field.mean)
     return Shading(
@@ -388,7 +390,7 @@ def _estimated(frames: Sequence[Cells], shape: tuple[int, int]) -> Shading:
         spread=at_pixels(wide.sqrt().view(cells), shape).clamp_min(0.0).float(),
         estimate=field.mean.view(cells),
         deviation=variance.sqrt().view(cells),
-        told=torch.tensor(told).double(),
+        told=torch.tensor(share_told).double(),
         clean=torch.tensor(field.clean).double(),
         identifiable=torch.tensor(certain),
         frames=torch.tensor(len(frames)),
@@ -424,13 +426,13 @@ def _(
 
 @shading.check
 def _(result: Shading, *inputs: Any, **params: Any) -> list[Check]:
-    count, told = int(result.frames), float(result.told)
+    count, share_told = int(result.frames), float(result.told)
     frames = "one frame" if count == 1 else f"{count} frames"
     low, high = (float(x) for x in torch.aminmax(result.transmission))
-    found = (
+    result_text = (
         f"transmission from {low:.3g} to {high:.3g}"
         if bool(result.identifiable)
         else "not identifiable"
     )
-    text = f"{found}: {frames} tell {told:.0%} of the field"
+    text = f"{result_text}: {frames} tell {share_told:.0%} of the field"
     return [Check(text, bool(result.transmission.isfinite().all()) and low > 0)]

@@ -19,6 +19,7 @@ from neusee.nodes.restore._inverse._posterior_spread import Draws, frame_deviati
 from neusee.nodes.restore._inverse._wiener import (
     PRECISE,
     Doubt,
+    LaserLight,
     LeastDoubt,
     Scaled,
     Settings,
@@ -72,12 +73,12 @@ def wiener_by_field(
     """
     _refuse_other(electrons, measured)
     total = torch.zeros_like(single(electrons))
-    light = _glare(electrons, measured, clipped, (glare, nearby), doubt, scatter)
+    light = _glare(electrons, measured, clipped, LaserLight(glare, nearby), doubt, scatter)
     settings = Settings(balance, read_noise, doubt, least_doubt, scatter)
-    for part in _parts(electrons, measured):
-        scaled = _problem(electrons, clipped, part, light, settings)
-        found = scaled.pixels(most_likely(scaled.problem, coarser=True)) + scaled.mean
-        total[:, part.rows, part.columns] += (part.weight.to(found) * found).to(total)
+    for zone in _parts(electrons, measured):
+        scaled = _problem(electrons, clipped, zone, light, settings)
+        restored = scaled.pixels(most_likely(scaled.problem, coarser=True)) + scaled.mean
+        total[:, zone.rows, zone.columns] += (zone.weight.to(restored) * restored).to(total)
     return total
 
 
@@ -122,15 +123,14 @@ def spread_by_field(
     total = torch.zeros(
         len(matrix), *electrons.shape[-2:], dtype=single(electrons).dtype, device=electrons.device
     )
-    settings = Settings(balance, read_noise, doubt, least_doubt, scatter)
     with torch.no_grad():
-        light = _glare(electrons, measured, clipped, (glare, nearby), doubt, scatter)
+        light = _glare(electrons, measured, clipped, LaserLight(glare, nearby), doubt, scatter)
     settings = Settings(balance, read_noise, doubt, least_doubt, scatter)
-    for part in _parts(electrons, measured):
+    for zone in _parts(electrons, measured):
         with torch.no_grad():
-            scaled = _problem(electrons, clipped, part, light, settings)
-        found = frame_deviation(scaled, matrix, draws, rng, part.draws)
-        total[:, part.rows, part.columns] += part.weight.to(total) * found.to(total)
+            scaled = _problem(electrons, clipped, zone, light, settings)
+        deviation = frame_deviation(scaled, matrix, draws, rng, zone.draws)
+        total[:, zone.rows, zone.columns] += zone.weight.to(total) * deviation.to(total)
     return with_shading(total, restored, shading)
 
 
@@ -144,8 +144,12 @@ def _(
 
 @spread_by_field.check
 def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
-    least, most = float(result.min()), float(result.max())
-    return [Check(f"deviation from {least:.2g} to {most:.2g}", math.isfinite(most) and least >= 0)]
+    lowest, highest = float(result.min()), float(result.max())
+    return [
+        Check(
+            f"deviation from {lowest:.2g} to {highest:.2g}", math.isfinite(highest) and lowest >= 0
+        )
+    ]
 
 
 class _Part(NamedTuple):
@@ -179,36 +183,36 @@ def _glare(
     electrons: Tensor,
     measured: MeasuredPsf,
     clipped: Tensor,
-    lights: tuple[list[Tensor] | None, list[Tensor] | None],
+    lights: LaserLight,
     doubt: float | None,
     scatter: bool,
 ) -> Glare:
     """Return the glare of the whole frame, with what a doubt and ``scatter`` need of it."""
     kernel = _channelwise(measured.kernels[0, 0])
-    light = known_and_light(kernel[0], kernel[2], single(electrons), clipped, *lights, None)[2]
+    light = known_and_light(kernel[0], kernel[2], single(electrons), clipped, lights)[2]
     light = light if doubt == 0 else with_light_around(light)
     return with_smooth(light) if scatter else light
 
 
 def _problem(
-    electrons: Tensor, clipped: Tensor, part: _Part, light: Glare, settings: Settings
+    electrons: Tensor, clipped: Tensor, zone: _Part, light: Glare, settings: Settings
 ) -> Scaled:
     """Return the deconvolution of a part of a frame."""
-    inside = (slice(None), part.rows, part.columns)
+    inside = (slice(None), zone.rows, zone.columns)
     fine = single(electrons)[inside]
     fine = fine.double() if max(fine.shape[-2:]) <= PRECISE else fine
-    known, kernels = (~clipped[inside]).to(fine), part.kernels.to(fine)
+    unclipped, kernels = (~clipped[inside]).to(fine), zone.kernels.to(fine)
 
     def cut(pictures: list[Tensor]) -> list[Tensor]:
-        return [x[..., part.rows, part.columns].to(fine) for x in pictures]
+        return [x[..., zone.rows, zone.columns].to(fine) for x in pictures]
 
     nearby = [None if x is None else cut([x])[0] for x in light.nearby]
     around, smooth = (
         light.around and cut(light.around),
-        light.smooth and [cut(each) for each in light.smooth],
+        light.smooth and [cut(patterns) for patterns in light.smooth],
     )
     here = Glare(cut(light.patterns), nearby, around, light.peaks, smooth)
-    return posed(fine, known, kernels, here, settings)
+    return posed(fine, unclipped, kernels, here, settings)
 
 
 def _around(weight: Tensor, reach: int) -> slice:
@@ -220,18 +224,18 @@ def _channelwise(kernels: Tensor) -> tuple[Psf, Tensor, Tensor, Bands]:
     """Return PSF, illuminant, responses and bands of a camera whose channels each see one band
     with its own PSF.
     """
-    one = torch.ones(len(kernels), dtype=torch.float64)
+    ones = torch.ones(len(kernels), dtype=torch.float64)
     return (
-        Psf(kernels, one),
-        one,
+        Psf(kernels, ones),
+        ones,
         torch.eye(len(kernels), dtype=torch.float64),
-        Bands(one, one, one),
+        Bands(ones, ones, ones),
     )
 
 
 def _refuse_other(electrons: Tensor, measured: MeasuredPsf) -> None:
-    if (found := measured.kernels.shape[2]) != electrons.shape[-3]:
+    if (channels := measured.kernels.shape[2]) != electrons.shape[-3]:
         raise ValueError(
-            f"the measured PSF has {found} channels and the picture {electrons.shape[-3]}: use"
+            f"the measured PSF has {channels} channels and the picture {electrons.shape[-3]}: use"
             " frames of one camera"
         )

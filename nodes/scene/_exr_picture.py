@@ -1,6 +1,7 @@
 """Scene-linear OpenEXR pictures, converted to linear sRGB."""
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -59,63 +60,77 @@ def exr(
 def _(
     *, file: Path, shape: Shape | None = None, part: str | None = None, **params: Any
 ) -> list[str]:
-    _, found, channels = _chosen(file, part)
-    refuse_large_picture(file, *found.size)
+    _, header, channels = _chosen(file, part)
+    refuse_large_picture(file, *header.size)
     if problem := _damage(file, part):
         raise ParameterError("file", problem)
     notes = [f"{file.name}: only luminance; the picture is grey"] if channels == ["Y"] else []
-    ratio = float(found.header.get("pixelAspectRatio", 1.0))
+    ratio = float(header.header.get("pixelAspectRatio", 1.0))
     if abs(ratio - 1) > 1e-3:
         notes += [f"{file.name}: pixels are not square ({ratio:.3f}), but are read as square"]
-    return notes + enlarged(found.size, shape)
+    return notes + enlarged(header.size, shape)
 
 
 @exr.check
 def _(result: Tensor, *, file: Path, part: str | None = None, **params: Any) -> list[Check]:
     pixels, linear = _linear_pixels(file, part)
-    below, least = 0, math.inf
+    below, lowest = 0, math.inf
     for rows in bands_of(pixels.shape[:2]):
         light = linear(pixels[rows])
-        below, least = below + int((light < 0).sum()), min(least, float(light.min()))
+        below, lowest = below + int((light < 0).sum()), min(lowest, float(light.min()))
     text = f"peak {float(result.max()):.4g}, mean {float(result.mean()):.3g}"
     values = 3 * pixels.shape[0] * pixels.shape[1]
     return [
         Check(
             text
-            + (f"; {below} of {values} values were negative, down to {least:.2g}" if below else "")
+            + (f"; {below} of {values} values were negative, down to {lowest:.2g}" if below else "")
         )
     ]
 
 
-def picture_size(file: Path, part: str | None) -> tuple[int, int]:
+def picture_size(file: Path, part_name: str | None) -> tuple[int, int]:
     """Return the numbers of rows and columns of the picture in an OpenEXR file, from the header
     of its part.
     """
-    return _chosen(file, part)[1].size
+    return _chosen(file, part_name)[1].size
 
 
-def _chosen(file: Path, part: str | None) -> tuple[int, PartHeader, list[str]]:
+def _chosen(file: Path, part_name: str | None) -> tuple[int, PartHeader, list[str]]:
     """Return the number and the header of the part with the picture, and the names of the
     channels to read.
     """
     parts = part_headers(file)
-    names = ", ".join(each.name or "unnamed" for each in parts)
-    if part is not None and part not in [each.name for each in parts]:
-        raise ParameterError("part", f"{file.name} has no part {part!r}: name one of {names}")
-    named = [(i, each) for i, each in enumerate(parts) if part in (None, each.name)]
-    found = [
-        (i, each, channels) for i, each in named if (channels := _colour_channels(each.channels))
-    ]
-    if len(found) > 1:
-        several = ", ".join(each.name or "unnamed" for _, each, _ in found)
+    named = [(i, header) for i, header in enumerate(parts) if part_name in (None, header.name)]
+    if part_name is not None and not named:
+        names = _joined_names(parts)
+        raise ParameterError("part", f"{file.name} has no part {part_name!r}: name one of {names}")
+    pictures = _with_picture(named)
+    if len(pictures) > 1:
+        several = _joined_names([header for _, header, _ in pictures])
         raise ParameterError(
             "file", f"{file.name} has a picture in the parts {several}: set part to one of them"
         )
-    if not found:
-        there = "; ".join(", ".join(each.channels) for _, each in named)
+    if not pictures:
+        channel_names = "; ".join(", ".join(header.channels) for _, header in named)
         fix = "but R, G and B, or X, Y and Z, or Y alone, are needed: save the picture as RGB"
-        raise ParameterError("file", f"{file} has the channels {there}, {fix}")
-    return found[0]
+        raise ParameterError("file", f"{file} has the channels {channel_names}, {fix}")
+    return pictures[0]
+
+
+def _with_picture(
+    parts: Sequence[tuple[int, PartHeader]],
+) -> list[tuple[int, PartHeader, list[str]]]:
+    """Return the numbered parts that have a picture, and the names of its channels."""
+    pictures = []
+    for number, header in parts:
+        channels = _colour_channels(header.channels)
+        if channels:
+            pictures.append((number, header, channels))
+    return pictures
+
+
+def _joined_names(parts: Sequence[PartHeader]) -> str:
+    return ", ".join(header.name or "unnamed" for header in parts)
 
 
 def _colour_channels(names: list[str]) -> list[str]:
@@ -126,31 +141,33 @@ def _colour_channels(names: list[str]) -> list[str]:
         return []
     return next(
         (
-            wanted
-            for wanted in (["R", "G", "B"], ["X", "Y", "Z"], ["Y"])
-            if set(wanted) <= set(names)
+            colours
+            for colours in (["R", "G", "B"], ["X", "Y", "Z"], ["Y"])
+            if set(colours) <= set(names)
         ),
         [],
     )
 
 
 @once_per_version
-def _damage(file: Path, part: str | None) -> str:
+def _damage(file: Path, part_name: str | None) -> str:
     """Return a message for a file that cannot be read to its end or has values that are not
     finite, or nothing.
     """
     try:
-        pixels = _pixels(file, part)[2]
+        pixels = _pixels(file, part_name)[2]
     except (RuntimeError, OSError, ValueError) as error:
         return f"{file.name} is damaged ({error}): copy or save the file again"
     return not_finite(file, int((~np.isfinite(pixels)).sum()))
 
 
-def _pixels(file: Path, part: str | None) -> tuple[dict[str, Any], list[str], NDArray[np.float32]]:
+def _pixels(
+    file: Path, part_name: str | None
+) -> tuple[dict[str, Any], list[str], NDArray[np.float32]]:
     """Read the header, the names of the channels and the values (channel, y, x) of a picture in
     an OpenEXR file.
     """
-    number, _, names = _chosen(file, part)
+    number, _, names = _chosen(file, part_name)
     with exr_parts(file) as opened:
         header, channels = dict(opened.header(number)), opened.channels(number)
         return (
@@ -160,11 +177,11 @@ def _pixels(file: Path, part: str | None) -> tuple[dict[str, Any], list[str], ND
         )
 
 
-def _linear_pixels(file: Path, part: str | None) -> tuple[NDArray[np.float32], Linear]:
+def _linear_pixels(file: Path, part_name: str | None) -> tuple[NDArray[np.float32], Linear]:
     """Read the values (y, x, channel) of an OpenEXR file; return them and their conversion to
     linear sRGB (3, y, x).
     """
-    header, names, pixels = _pixels(file, part)
+    header, names, pixels = _pixels(file, part_name)
     if problem := not_finite(file, int((~np.isfinite(pixels)).sum())):
         raise ValueError(problem)
     if names == ["Y"]:

@@ -39,8 +39,8 @@ def cube_and_wavelengths(
 ) -> tuple[Tensor, Tensor]:
     """Read a spectral cube (band, y, x) float32 and its wavelengths in m from a file."""
     if file.suffix == ".exr":
-        cube, known, _ = read_spectral(file)
-        return cube, known
+        cube, wavelengths, _ = read_spectral(file)
+        return cube, wavelengths
     if start is None or stop is None:
         raise ValueError(
             f"{file.name} has no wavelengths: give the first and the last wavelength in start and"
@@ -200,14 +200,14 @@ def hyperspectral(
             the file or values are not finite.
     Source: layout of spectral OpenEXR: Fichet, Pacanowski, Wilkie, JCGT 10(3), 2021.
     """
-    cube, known = cube_and_wavelengths(file, variable, start, stop, layout)
-    require_range(bands.centres, known, f"{file.name} holds")
+    cube, wavelengths = cube_and_wavelengths(file, variable, start, stop, layout)
+    require_range(bands.centres, wavelengths, f"{file.name} holds")
     if wrong := int((~torch.isfinite(cube)).sum()):
         raise ValueError(
             f"{file.name} holds {wrong} values that are not finite: replace NaN and infinity by"
             " numbers"
         )
-    mixed = (_interpolation(known, bands.centres).float() @ cube.flatten(1)).reshape(
+    mixed = (_interpolation(wavelengths, bands.centres).float() @ cube.flatten(1)).reshape(
         -1, *cube.shape[1:]
     )
     return framed(mixed, shape).clamp_min_(0).to(bands.centres.device)
@@ -248,16 +248,19 @@ def rows_and_columns(file: Path, variable: str | None, layout: Layout) -> tuple[
 
 @hyperspectral.check
 def _(result: Tensor, bands: Bands, **params: Any) -> list[Check]:
-    most = float(result.max())
+    highest = float(result.max())
     return [
-        Check(f"reflectance of the scene from {float(result.min()):.3g} to {most:.3g}", most <= 1.5)
+        Check(
+            f"reflectance of the scene from {float(result.min()):.3g} to {highest:.3g}",
+            highest <= 1.5,
+        )
     ]
 
 
-def _interpolation(known: Tensor, wavelengths: Tensor) -> Tensor:
-    """Return the matrix that interpolates spectra linearly from the ``known`` wavelengths to
+def _interpolation(own: Tensor, wavelengths: Tensor) -> Tensor:
+    """Return the matrix that interpolates spectra linearly from the ``own`` wavelengths to
     ``wavelengths``.
     """
-    if len(known) == 1:
+    if len(own) == 1:
         return torch.ones(len(wavelengths), 1, dtype=torch.float64)
-    return Table(known, torch.eye(len(known), dtype=torch.float64)).at(wavelengths).T
+    return Table(own, torch.eye(len(own), dtype=torch.float64)).at(wavelengths).T

@@ -133,15 +133,15 @@ def is_large(pixels: float) -> bool:
 def _in_bands(codes: Codes, linear: Linear, shape: Shape | None) -> Tensor:
     size = (codes.shape[0], codes.shape[1])
     if shape is None or size == tuple(shape):
-        whole = torch.empty(3, *size)
+        picture = torch.empty(3, *size)
         for rows in bands_of(size, _SMALL_BAND):
-            whole[:, rows] = linear(codes[rows])
-        return whole
+            picture[:, rows] = linear(codes[rows])
+        return picture
     scaled = covering(size, shape)
     antialias = max(old / new for old, new in zip(size, scaled, strict=True)) > 1
     down, across = (
-        resampling(old, new, antialias)[(new - kept) // 2 :][:kept]
-        for old, new, kept in zip(size, scaled, shape, strict=True)
+        resampling(old, new, antialias)[(new - size_of_cut) // 2 :][:size_of_cut]
+        for old, new, size_of_cut in zip(size, scaled, shape, strict=True)
     )
     result = np.zeros((3, *shape), np.float32)
     for rows in bands_of(size):

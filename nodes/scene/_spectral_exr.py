@@ -170,7 +170,7 @@ def part_headers(file: Path) -> list[PartHeader]:
     exr_needs(file)
     try:
         with OpenEXR.File(str(file), header_only=True) as opened:
-            headers = [dict(part.header) for part in opened.parts]
+            headers = [dict(exr_part.header) for exr_part in opened.parts]
     except (RuntimeError, OSError, ValueError) as why:
         text = f"{file} cannot be read as OpenEXR ({str(why).strip()}): give an .exr file"
         raise ParameterError("file", text) from None
@@ -191,7 +191,7 @@ def exr_header(file: Path) -> tuple[dict[str, Any], list[str], tuple[int, int]]:
     """
     parts = part_headers(file)
     if len(parts) > 1:
-        names = ", ".join(part.name for part in parts)
+        names = ", ".join(exr_part.name for exr_part in parts)
         raise ParameterError(
             "file", f"{file.name} has {len(parts)} parts ({names}): save one part alone"
         )

@@ -45,11 +45,11 @@ def _(*, low: float = 0.0, high: float = 1.0, **params: Any) -> list[str]:
 
 @targets.check
 def _(result: Tensor, *, low: float = 0.0, high: float = 1.0, **params: Any) -> list[Check]:
-    least, most = float(result.min()), float(result.max())
+    lowest, highest = float(result.min()), float(result.max())
     return [
         Check(
-            f"light of the target from {least:.3g} to {most:.3g}",
-            least >= low - 1e-6 and most <= high + 1e-6,
+            f"light of the target from {lowest:.3g} to {highest:.3g}",
+            lowest >= low - 1e-6 and highest <= high + 1e-6,
         )
     ]
 

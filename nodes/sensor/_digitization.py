@@ -118,12 +118,12 @@ def digitize(
     if rounding == "dithered_floor" and rng is None:
         raise ValueError("rounding dithered_floor needs random numbers: give rng=torch.Generator()")
     electrons = single(electrons)
-    whole = _whole_numbers(electrons.detach(), gain, 2**bits - 1, rounding, rng)
+    numbers = _whole_numbers(electrons.detach(), gain, 2**bits - 1, rounding, rng)
     if not (electrons.requires_grad or transformed()):
-        return whole
+        return numbers
     ideal = (electrons * gain).clamp(0, 2**bits - 1)
     # the sum is exact: the difference is a multiple of the last bit of `ideal`
-    return ideal + (whole - ideal).detach()
+    return ideal + (numbers - ideal).detach()
 
 
 def _whole_numbers(
@@ -135,18 +135,18 @@ def _whole_numbers(
     The product is float64: in float32, one number in a thousand would be off by one.
     """
     result = torch.empty_like(electrons, memory_format=torch.contiguous_format)
-    flat, whole, dither = electrons.reshape(-1), result.view(-1), None
+    flat, numbers, dither = electrons.reshape(-1), result.view(-1), None
     if rounding == "dithered_floor" and rng is not None:
         dither = (
             torch.rand(electrons.shape, generator=rng, device=rng.device, dtype=torch.float32) - 0.5
         )
         dither = dither.to(electrons.device).reshape(-1)
-    for at in range(0, flat.numel(), _BLOCK):
-        part = slice(at, at + _BLOCK)
-        line = flat[part].double() * gain
-        line = line if dither is None else line.add_(dither[part])
+    for start in range(0, flat.numel(), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        line = flat[block].double() * gain
+        line = line if dither is None else line.add_(dither[block])
         line = line.round_() if rounding == "nearest" else line.floor_()
-        whole[part] = line.clamp_(0, top)
+        numbers[block] = line.clamp_(0, top)
     return result
 
 
@@ -162,15 +162,15 @@ def _(
     top, electrons = 2**bits - 1, single(electrons)
     line = [float(Fraction(x) * Fraction(gain)) for x in electrons.flatten().tolist()]
     if rounding == "nearest":
-        whole = [round(min(max(x, 0.0), float(top))) for x in line]
+        numbers = [round(min(max(x, 0.0), float(top))) for x in line]
     elif rounding == "truncation":
-        whole = [min(max(math.floor(x), 0), top) for x in line]
+        numbers = [min(max(math.floor(x), 0), top) for x in line]
     else:
         dither = torch.rand(electrons.shape, generator=rng, dtype=torch.float32).flatten().tolist()
-        whole = [
+        numbers = [
             min(max(math.floor(x + (d - 0.5)), 0), top) for x, d in zip(line, dither, strict=True)
         ]
-    return torch.tensor(whole, dtype=electrons.dtype).reshape(electrons.shape)
+    return torch.tensor(numbers, dtype=electrons.dtype).reshape(electrons.shape)
 
 
 @digitize.propagate_error

@@ -57,7 +57,7 @@ def _(
 @add_photons.expected_range
 def _(photons: TensorStats, *added: Iterable[TensorStats] | None) -> Range:
     others = list(chain.from_iterable(filter(None, added)))
-    return photons.min, math.fsum(part.max for part in (photons, *others))
+    return photons.min, math.fsum(light.max for light in (photons, *others))
 
 
 @photon_noise.expected_range
@@ -71,8 +71,8 @@ def _(
     **params: Any,
 ) -> Range:
     counts = photons.max * quantum_efficiency
-    kept = mean_shift + (mean == "additive")
-    return 0.0, max(0.0, kept * counts + _SIGMAS * spread * math.sqrt(counts))
+    mean_factor = mean_shift + (mean == "additive")
+    return 0.0, max(0.0, mean_factor * counts + _SIGMAS * spread * math.sqrt(counts))
 
 
 @dark_current.expected_range

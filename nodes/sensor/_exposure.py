@@ -56,18 +56,20 @@ def _of_rows(weights: Tensor, rows: Tensor) -> Tensor:
 
     The gradient reaches the weights.
     """
-    known = rows.detach().cpu().double()
-    scale = known.abs().amax(1, keepdim=True)
-    inverse = torch.linalg.pinv(known / scale.where(scale > 0, 1.0)) / scale.where(scale > 0, 1.0).T
+    image_rows = rows.detach().cpu().double()
+    scale = image_rows.abs().amax(1, keepdim=True)
+    inverse = (
+        torch.linalg.pinv(image_rows / scale.where(scale > 0, 1.0)) / scale.where(scale > 0, 1.0).T
+    )
     exact = weights.cpu().double()
-    if exact.shape[-1] != known.shape[1]:
+    if exact.shape[-1] != image_rows.shape[1]:
         counts = (
-            f"the weights have {exact.shape[-1]} bands and the sums of the image {known.shape[1]}"
-            " bands"
+            f"the weights have {exact.shape[-1]} bands and the sums of the image"
+            f" {image_rows.shape[1]} bands"
         )
         raise ValueError(f"{counts}: compute weights and image from the same `bands` step")
     matrix: Tensor = exact @ inverse
-    _require_combination(exact.detach(), matrix.detach() @ known)
+    _require_combination(exact.detach(), matrix.detach() @ image_rows)
     return matrix
 
 
@@ -75,9 +77,9 @@ def _require_combination(exact: Tensor, combined: Tensor) -> None:
     """Raise ValueError unless the weights ``combined`` equal ``exact`` within 1e-9 of the
     largest weight.
     """
-    off, most = (exact - combined).abs().flatten(0, -2), exact.abs().flatten(0, -2).amax(-1)
-    if not bool((off.amax(-1) <= _OFF * most).all()):
-        worst = float((off.amax(-1) / most.clamp_min(1e-300)).max())
+    off, largest = (exact - combined).abs().flatten(0, -2), exact.abs().flatten(0, -2).amax(-1)
+    if not bool((off.amax(-1) <= _OFF * largest).all()):
+        worst = float((off.amax(-1) / largest.clamp_min(1e-300)).max())
         raise ValueError(
             "the image was summed over its bands with other weights: the weights of this step"
             f" differ by {worst:.2g} (relative error; at most 1e-9) from every combination of these"
@@ -339,7 +341,7 @@ def add_photons(
 
 @add_photons.propagate_error
 def _(photons: ErrorBound, *added: list[ErrorBound] | None, **params: Any) -> float:
-    return math.fsum(part.rms for part in (photons, *chain.from_iterable(filter(None, added))))
+    return math.fsum(error.rms for error in (photons, *chain.from_iterable(filter(None, added))))
 
 
 @add_photons.check

@@ -184,14 +184,14 @@ def frame_problem(
         values, depth = read_frame(file)
     except ParameterError as error:
         return str(error)
-    name, found = file.name, values.shape[1:]
+    name, size_of_frame = file.name, values.shape[1:]
     if channels is not None and len(values) != channels:
         return _other_channels(name, len(values), channels)
-    if found != shape:
-        size = f"[{found[0]}, {found[1]}]"
+    if size_of_frame != shape:
+        size = f"[{size_of_frame[0]}, {size_of_frame[1]}]"
         return (
-            f"{name} has {found[0]} x {found[1]} pixels (y, x), but sensor.shape is {list(shape)}:"
-            " give the whole "
+            f"{name} has {size_of_frame[0]} x {size_of_frame[1]} pixels (y, x), but sensor.shape"
+            f" is {list(shape)}: give the whole "
             f'frame of this sensor, or "sensor.shape={size}" if this window around its centre was'
             " read out"
         )
@@ -202,16 +202,16 @@ def frame_problem(
     )
 
 
-def _other_channels(name: str, found: int, channels: int) -> str:
-    if found == 1:
+def _other_channels(name: str, frame_channels: int, channels: int) -> str:
+    if frame_channels == 1:
         return (
             f"{name} has one channel, but the camera has {channels}: it may be a raw colour filter"
             " array, which is not handled yet; develop it to three channels without a tone curve,"
             " or name a sensor.camera of one channel"
         )
     return (
-        f"{name} has {found} channels, but the camera has {channels}: give a frame of the channels"
-        " of sensor.camera"
+        f"{name} has {frame_channels} channels, but the camera has {channels}: give a frame of the"
+        " channels of sensor.camera"
     )
 
 
@@ -251,19 +251,20 @@ def _other_numbers(name: str, values: NDArray[Any], bits: int) -> str:
                 f"{name} holds {values[broken][0]:g}, no whole number: give the digital numbers of"
                 f" the camera, from 0 to {top}, without a tone curve and without scaling"
             )
-    least, most = int(values.min()), int(values.max())
-    if least < 0:
+    lowest, highest = int(values.min()), int(values.max())
+    if lowest < 0:
         return (
-            f"{name} holds {least}, below 0: give the numbers of the camera with its offset, not"
+            f"{name} holds {lowest}, below 0: give the numbers of the camera with its offset, not"
             " subtracted"
         )
-    if most > top:
+    if highest > top:
         return (
-            f"{name} holds {most} DN, but {bits} bits end at {top}: set sensor.bits to the depth of"
-            " the converter, or shift the numbers down if the camera moved them to the upper bits"
+            f"{name} holds {highest} DN, but {bits} bits end at {top}: set sensor.bits to the"
+            " depth of the converter, or shift the numbers down if the camera moved them to the"
+            " upper bits"
         )
-    if most == least:
-        return f"{name} has the same number, {most}, in every pixel: there is no picture in it"
+    if highest == lowest:
+        return f"{name} has the same number, {highest}, in every pixel: there is no picture in it"
     return ""
 
 
@@ -276,8 +277,8 @@ def read_frame(file: Path) -> FrameNumbers:
     """
     reader = _READERS.get(file.suffix.lower())
     if reader is None:
-        known = ", ".join(_READERS)
-        raise ParameterError("file", f"{file.name} is no frame that can be read: give {known}")
+        suffixes = ", ".join(_READERS)
+        raise ParameterError("file", f"{file.name} is no frame that can be read: give {suffixes}")
     refuse_other_than_file(file)
     try:
         return reader(file)

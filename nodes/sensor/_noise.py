@@ -56,7 +56,7 @@ def rare_events(mean: float, sure: float = SURE) -> int:
 def poisson_rms(mean: float, pixels: int) -> float:
     """Return what the rms of Poisson numbers in ``pixels`` exceeds in one of 10 000 draws at most.
 
-    Half of the probability is for a pixel above ``most``, half for the sum of squares of the
+    Half of the probability is for a pixel above ``rare_number``, half for the sum of squares of the
     others, whose variance is at most the fourth moment of the distribution.
 
     Source: Bernstein's inequality: Boucheron, Lugosi and Massart, Concentration Inequalities,
@@ -65,11 +65,11 @@ def poisson_rms(mean: float, pixels: int) -> float:
     if mean == 0:
         return 0.0
     sure = SURE + math.log(2.0)
-    most = rare_events(mean, sure + math.log(pixels))
+    rare_number = rare_events(mean, sure + math.log(pixels))
     fourth = mean + 7 * mean**2 + 6 * mean**3 + mean**4
-    third = most**2 * sure / 3
+    third = rare_number**2 * sure / 3
     excess = third + math.sqrt(third**2 + 2 * pixels * fourth * sure)
-    return min(float(most), math.sqrt((pixels * (mean + mean**2) + excess) / pixels))
+    return min(float(rare_number), math.sqrt((pixels * (mean + mean**2) + excess) / pixels))
 
 
 def chi_square_limit(weights: float, largest: float, sure: float = SURE) -> float:
@@ -152,12 +152,12 @@ def photon_noise(
     Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 (variance = mean, in
             electrons).
     """
-    kept = mean_shift if mean == "literal" else 1.0 + mean_shift
+    mean_factor = mean_shift if mean == "literal" else 1.0 + mean_shift
 
-    def detected(part: Tensor) -> Tensor:
-        counts = part.clamp_min(0) * (quantum_efficiency if drawn_in == "electrons" else 1.0)
+    def detected(piece: Tensor) -> Tensor:
+        counts = piece.clamp_min(0) * (quantum_efficiency if drawn_in == "electrons" else 1.0)
         fluctuation = _poisson(counts, rng) if distribution == "poisson" else _gaussian(counts, rng)
-        drawn = (kept * counts).add_(spread * fluctuation).clamp_min(0)
+        drawn = (mean_factor * counts).add_(spread * fluctuation).clamp_min(0)
         return drawn if drawn_in == "electrons" else drawn * quantum_efficiency
 
     return _by_parts(detected, single(photons), rng)
@@ -208,10 +208,10 @@ def _electrons_error(
     if params["distribution"] == "poisson" and photons.rms > 0:
         return math.inf
     drawn = photons.rms * (quantum_efficiency if params["drawn_in"] == "electrons" else 1.0)
-    kept = params["mean_shift"] + (params["mean"] == "additive")
+    mean_factor = params["mean_shift"] + (params["mean"] == "additive")
     electrons: float = 1.0 if params["drawn_in"] == "electrons" else quantum_efficiency
     darkest = photons.stats.min * drawn / photons.rms if photons.stats and photons.rms > 0 else 0.0
-    total: float = electrons * (abs(kept) * drawn + spread * amplitude(drawn, darkest))
+    total: float = electrons * (abs(mean_factor) * drawn + spread * amplitude(drawn, darkest))
     return total
 
 
@@ -229,21 +229,21 @@ def _poisson(counts: Tensor, rng: Generator) -> Tensor:
     return torch.poisson(still.to(rng.device), generator=rng).to(counts) - still
 
 
-def _by_parts(compute: Callable[[Tensor], Tensor], whole: Tensor, rng: Generator) -> Tensor:
+def _by_parts(compute: Callable[[Tensor], Tensor], numbers: Tensor, rng: Generator) -> Tensor:
     """Apply ``compute`` to parts of a tensor that fit into the CPU cache, with the same result as
     for the whole.
 
     The random numbers must not depend on the parts. Torch draws fewer than 16 normal numbers by
     another method, so no part is that short.
     """
-    count = whole.numel()
+    count = numbers.numel()
     if (
         torch.is_grad_enabled()
-        or {whole.device.type, rng.device.type} != {"cpu"}
+        or {numbers.device.type, rng.device.type} != {"cpu"}
         or count < 2 * _PART
     ):
-        return compute(whole)
-    result, flat = torch.empty(whole.shape, dtype=whole.dtype), whole.reshape(-1)
+        return compute(numbers)
+    result, flat = torch.empty(numbers.shape, dtype=numbers.dtype), numbers.reshape(-1)
     ends = [*range(_PART, count - _PART, _PART), count]
     for first, last in pairwise([0, *ends]):
         result.view(-1)[first:last] = compute(flat[first:last])
@@ -289,9 +289,9 @@ def dark_current(
     total = dark_electrons(mean, exposure)
     expected = total if mean_of == "sensor" else _sampled_mean(total, rng)
 
-    def with_dark_current(part: Tensor) -> Tensor:
-        rate = torch.full(part.shape, expected, dtype=part.dtype, device=rng.device)
-        return part + torch.poisson(rate, generator=rng).to(part)
+    def with_dark_current(piece: Tensor) -> Tensor:
+        rate = torch.full(piece.shape, expected, dtype=piece.dtype, device=rng.device)
+        return piece + torch.poisson(rate, generator=rng).to(piece)
 
     return _by_parts(with_dark_current, single(electrons), rng)
 
@@ -340,8 +340,8 @@ def _(
     mean_of: str = "sensor",
 ) -> float:
     total = dark_electrons(mean, exposure)
-    most = total if mean_of == "sensor" else _MOST * total
-    return _share(most, math.sqrt(most), electrons, full_well)
+    largest_mean = total if mean_of == "sensor" else _MOST * total
+    return _share(largest_mean, math.sqrt(largest_mean), electrons, full_well)
 
 
 @dark_current.skip_draw
@@ -354,9 +354,11 @@ def _(
     **params: Any,
 ) -> float:
     total = dark_electrons(mean, exposure)
-    most = total if mean_of == "sensor" else _MOST * total
-    usual = math.sqrt(most + most**2)
-    return poisson_rms(most, max(1, math.prod(electrons.shape))) / usual if usual > 0 else 1.0
+    largest_mean = total if mean_of == "sensor" else _MOST * total
+    usual = math.sqrt(largest_mean + largest_mean**2)
+    return (
+        poisson_rms(largest_mean, max(1, math.prod(electrons.shape))) / usual if usual > 0 else 1.0
+    )
 
 
 @node()
@@ -382,8 +384,8 @@ def read_noise(
             Transfer, SPIE PM170 (2007).
     """
 
-    def with_read_noise(part: Tensor) -> Tensor:
-        return part + normal(part, rng).mul_(read_noise).add_(offset)
+    def with_read_noise(piece: Tensor) -> Tensor:
+        return piece + normal(piece, rng).mul_(read_noise).add_(offset)
 
     return _by_parts(with_read_noise, single(electrons), rng)
 

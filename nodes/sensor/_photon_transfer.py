@@ -90,11 +90,11 @@ def _rise(top: float, first: float, levels: int) -> list[float]:
     return [0.0, *(first * ratio ** (i / steps) for i in range(levels - 1))]
 
 
-def _pair(one: Tensor, two: Tensor) -> tuple[float, float]:
+def _pair(first: Tensor, second: Tensor) -> tuple[float, float]:
     """Return the mean of two frames, and the temporal variance from the difference of the
     frames.
     """
-    return float((one + two).mean() / 2), float((one - two).square().mean() / 2)
+    return float((first + second).mean() / 2), float((first - second).square().mean() / 2)
 
 
 @photon_transfer.preflight

@@ -53,10 +53,10 @@ def line_saturation(
             at the line.
     """
     share = line.weights.double() / line.weights.double().sum()
-    each = (responses.double() * (share * photons_per_joule(line.centres))).sum(
+    by_channel = (responses.double() * (share * photons_per_joule(line.centres))).sum(
         -1
     ) * quantum_efficiency
-    largest = float(each.amax())
+    largest = float(by_channel.amax())
     return electrons / (largest * exposure * pixel_pitch**2) if largest > 0 else math.inf
 
 

@@ -296,34 +296,34 @@ def laser_table(file: Path) -> LaserTable:
 
 @once_per_version
 def _laser_table(file: Path) -> LaserTable:
-    found = curves(file, None, least=1)
-    power, *others = found.columns
+    table = curves(file, None, fewest=1)
+    power, *others = table.columns
     if not power.unit:
         raise ValueError(f"{file.name}: column 2, {power.quantity}, has no unit")
     spectrum = _PER_LENGTH.search(power.unit) is not None
     if len(others) > (0 if spectrum else 1):
         raise ValueError(
-            f"{file.name} has {len(found.columns) + 1} columns in place of"
+            f"{file.name} has {len(table.columns) + 1} columns in place of"
             f" {'2' if spectrum else '2 or 3'}"
         )
-    found.refuse(found.values < 0, lambda value: f"a laser has no power or width of {value:g}")
-    if not found.values[0].any():
+    table.refuse(table.values < 0, lambda value: f"a laser has no power or width of {value:g}")
+    if not table.values[0].any():
         raise ValueError(f"{file.name} has no power at any wavelength")
-    if spectrum and len(found.wavelengths) < 2:
+    if spectrum and len(table.wavelengths) < 2:
         raise ValueError(f"{file.name} holds one wavelength: a spectrum needs at least two")
-    alone = found._replace(columns=(power,), values=found.values[:1])
-    return LaserTable(alone, None if spectrum else _widths(found))
+    alone = table._replace(columns=(power,), values=table.values[:1])
+    return LaserTable(alone, None if spectrum else _widths(table))
 
 
-def _widths(found: Curves) -> Numbers:
+def _widths(table: Curves) -> Numbers:
     """Return the widths of separate lines in m; lines without widths are 0 wide."""
-    if len(found.columns) == 1:
-        return np.zeros(len(found.wavelengths))
-    unit = found.columns[1].unit
+    if len(table.columns) == 1:
+        return np.zeros(len(table.wavelengths))
+    unit = table.columns[1].unit
     if unit not in LENGTHS:
-        heading = found.columns[1].heading
-        raise ValueError(f"{found.file.name}: column 3, {heading}, has no widths: write fwhm (nm)")
-    widths: Numbers = found.values[1] * LENGTHS[unit]
+        heading = table.columns[1].heading
+        raise ValueError(f"{table.file.name}: column 3, {heading}, has no widths: write fwhm (nm)")
+    widths: Numbers = table.values[1] * LENGTHS[unit]
     return widths
 
 
@@ -340,11 +340,11 @@ def _divided(table: Table, count: int) -> Bands:
 def _reached(table: Table, share: float) -> float:
     """Return the wavelength up to which a spectrum has a share of its energy, by bisection."""
     first, low, high = (float(table.wavelengths[i]) for i in (0, 0, -1))
-    whole = _energy(table, first, high)
+    total = _energy(table, first, high)
     for _ in range(60):
         middle = (low + high) / 2
         low, high = (
-            (middle, high) if _energy(table, first, middle) < share * whole else (low, middle)
+            (middle, high) if _energy(table, first, middle) < share * total else (low, middle)
         )
     return (low + high) / 2
 

@@ -90,14 +90,14 @@ def _(
     centres = bands.centres * 1e9
     if low <= float(centres.min()) and float(centres.max()) <= high:
         return notes  # most recipes: colour-science, whose import takes a second, is not needed
-    most = responses(bands, camera=camera).amax(0)
-    unseen = centres[most < _UNSEEN]
+    strongest = responses(bands, camera=camera).amax(0)
+    unseen = centres[strongest < _UNSEEN]
     if not len(unseen):
         return notes
     which = f"{float(unseen.min()):.5g} nm" + (
         f" to {float(unseen.max()):.5g} nm" if len(unseen) > 1 else ""
     )
-    largest = float(most[most < _UNSEEN].max())
+    largest = float(strongest[strongest < _UNSEEN].max())
     return [
         *notes,
         (
@@ -139,37 +139,48 @@ def camera_curves(file: Path) -> tuple[Curves, bool]:
 
 
 def _camera_curves(file: Path) -> tuple[Curves, bool]:
-    found = curves(file, None, assumed="nm")
-    if len(found.values) not in (1, 3):
-        count = f"{len(found.values) + 1} columns in place of 4"
+    table = curves(file, None, assumed="nm")
+    if len(table.values) not in (1, 3):
+        count = f"{len(table.values) + 1} columns in place of 4"
         raise ValueError(
             f"{file.name}: the file has {count} for red, green and blue, or 2 for one channel"
         )
-    units = {column.unit for column in found.columns}
-    if len(units) > 1:
-        raise ValueError(
-            f"{file.name}: the channels have the units {', '.join(sorted(units))}: give all the"
-            " same unit"
-        )
-    (unit,) = units
-    absolute = unit == "A/W" or any(_is_efficiency(column.quantity) for column in found.columns)
-    dark = found.values.max(1) <= 0
-    if dark.any():
-        name = found.columns[int(dark.argmax())].heading
-        raise ValueError(f"{file.name}: a channel has no sensitivity at any wavelength, {name}")
-    least = found.values.min()
-    if least < -0.01 * found.values.max():
-        found.refuse(found.values == least, _negative)
+    unit = _only_unit(table)
+    absolute = unit == "A/W" or any(_is_efficiency(column.quantity) for column in table.columns)
+    _refuse_no_sensitivity(table)
     if absolute and unit not in ("1", "%", "A/W"):
         raise ValueError(
-            f"{file.name}: {found.columns[0].heading} needs the unit (1), (%) or (A/W)"
+            f"{file.name}: {table.columns[0].heading} needs the unit (1), (%) or (A/W)"
         )
-    shares = found.values * (
-        _ELECTRON_VOLT_METRES / found.wavelengths if unit == "A/W" else 0.01 if unit == "%" else 1
-    )
+    factor = 0.01 if unit == "%" else 1
+    shares = table.values * (_ELECTRON_VOLT_METRES / table.wavelengths if unit == "A/W" else factor)
     if absolute:
-        found.refuse(shares > 1, lambda value: _above_one(value, unit))
-    return found._replace(values=shares), absolute
+        table.refuse(shares > 1, lambda value: _above_one(value, unit))
+    return table._replace(values=shares), absolute
+
+
+def _only_unit(table: Curves) -> str:
+    """Return the unit of all channels; raise ValueError if they have several."""
+    units = {column.unit for column in table.columns}
+    if len(units) > 1:
+        raise ValueError(
+            f"{table.file.name}: the channels have the units {', '.join(sorted(units))}: give all"
+            " the same unit"
+        )
+    return units.pop()
+
+
+def _refuse_no_sensitivity(table: Curves) -> None:
+    """Raise ValueError for a channel without sensitivity, or with a negative one."""
+    dark = table.values.max(1) <= 0
+    if dark.any():
+        name = table.columns[int(dark.argmax())].heading
+        raise ValueError(
+            f"{table.file.name}: a channel has no sensitivity at any wavelength, {name}"
+        )
+    lowest = table.values.min()
+    if lowest < -0.01 * table.values.max():
+        table.refuse(table.values == lowest, _negative)
 
 
 def _is_efficiency(quantity: str) -> bool:
@@ -191,19 +202,19 @@ def _peak_note(file: Path, quantum_efficiency: float | None) -> list[str]:
 
     Without a quantum efficiency of the sensor, responses are relative.
     """
-    found, absolute = camera_curves(file)
+    table, absolute = camera_curves(file)
     if not absolute:
         return []
-    largest = found.values.max()
-    at = found.wavelengths[found.values.max(0).argmax()] * 1e9
-    peak = f"{file.name}: the largest QE is {largest:.4g}, at {at:g} nm"
+    largest = table.values.max()
+    peak_nm = table.wavelengths[table.values.max(0).argmax()] * 1e9
+    peak = f"{file.name}: the largest QE is {largest:.4g}, at {peak_nm:g} nm"
     if quantum_efficiency is not None:
-        told = f"sensor.quantum_efficiency={quantum_efficiency:.4g}"
+        stated = f"sensor.quantum_efficiency={quantum_efficiency:.4g}"
         same = abs(quantum_efficiency / largest - 1) < 1e-3
         return (
-            [f"{peak}, as {told}"]
+            [f"{peak}, as {stated}"]
             if same
-            else [f"{peak}, and the QE of the table counts for electrons, not {told}"]
+            else [f"{peak}, and the QE of the table counts for electrons, not {stated}"]
         )
     return [
         f"{peak}, and responses are relative to it: electrons are right with"
@@ -228,8 +239,8 @@ def seen_range(camera: str | Path) -> tuple[float, float]:
     if not isinstance(camera, Path):
         return _SEEN[camera]
     table = _from_file(camera)
-    seen = table.wavelengths[table.values.amax(0) >= _UNSEEN * table.values.max()] * 1e9
-    return float(seen[0]), float(seen[-1])
+    sensitive = table.wavelengths[table.values.amax(0) >= _UNSEEN * table.values.max()] * 1e9
+    return float(sensitive[0]), float(sensitive[-1])
 
 
 @once_per_version

@@ -58,11 +58,11 @@ class Table(NamedTuple):
         """
         steps = self.wavelengths.diff()
         areas = ((self.values[:, 1:] + self.values[:, :-1]) / 2 * steps).cumsum(1)
-        whole = torch.cat([torch.zeros_like(areas[:, :1]), areas], 1)
+        full_steps = torch.cat([torch.zeros_like(areas[:, :1]), areas], 1)
         x = limits.clamp(self.wavelengths[0], self.wavelengths[-1])
         left = (torch.searchsorted(self.wavelengths, x) - 1).clamp(0, len(steps) - 1)
-        part = (self.values[:, left] + self.at(x)) / 2 * (x - self.wavelengths[left])
-        return whole[:, left] + part
+        last_step = (self.values[:, left] + self.at(x)) / 2 * (x - self.wavelengths[left])
+        return full_steps[:, left] + last_step
 
 
 @functools.cache
@@ -122,9 +122,10 @@ def paints() -> tuple[Table, ...]:
     """
     colour = colour_science()
 
-    return tuple(
-        _table(sd) for chart in _CHARTS for sd in colour.SDS_COLOURCHECKERS[chart].values()
-    )
+    patches: list[Table] = []
+    for chart in _CHARTS:
+        patches += map(_table, colour.SDS_COLOURCHECKERS[chart].values())
+    return tuple(patches)
 
 
 @functools.cache
@@ -158,17 +159,17 @@ def to_srgb(centres: Tensor) -> Tensor:
 
 def require_range(
     wavelengths: Tensor,
-    known: Tensor | tuple[float, float],
+    covered: Tensor | tuple[float, float],
     source: str,
     fix: str = "choose bands inside that range",
 ) -> None:
     """Raise ValueError if the wavelengths of bands lie outside the range of a table or file of
     spectra.
 
-    ``known`` has the range in m. ``source`` starts the message, such as "D65 is tabulated from".
+    ``covered`` has the range in m. ``source`` starts the message, such as "D65 is tabulated from".
     """
     low, high, first, last = (
-        float(x) * 1e9 for x in (wavelengths.min(), wavelengths.max(), known[0], known[-1])
+        float(x) * 1e9 for x in (wavelengths.min(), wavelengths.max(), covered[0], covered[-1])
     )
     if low < first - _ROUNDING or high > last + _ROUNDING:
         raise ValueError(

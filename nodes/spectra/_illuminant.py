@@ -100,8 +100,10 @@ def luminous_share(bands: Bands | None, kind: str | Path, temperature: float) ->
     and 0 for no bands.
     """
     table, eye = _light(kind, temperature), observer()
-    seen = (eye.wavelengths >= table.wavelengths[0]) & (eye.wavelengths <= table.wavelengths[-1])
-    curve = eye.values[1] * seen
+    in_table = (eye.wavelengths >= table.wavelengths[0]) & (
+        eye.wavelengths <= table.wavelengths[-1]
+    )
+    curve = eye.values[1] * in_table
     if float(curve.sum() / eye.values[1].sum()) < _VISIBLE:
         low, high = float(table.wavelengths[0]) * 1e9, float(table.wavelengths[-1]) * 1e9
         text = (
@@ -133,22 +135,22 @@ def light_curve(file: Path) -> Curves:
 
 @once_per_version
 def _light_curve(file: Path) -> Curves:
-    found = curves(file, None)
-    if len(found.values) != 1:
-        raise ValueError(f"{file.name} has {len(found.values) + 1} columns in place of 2")
-    heading = found.columns[0].heading
+    table = curves(file, None)
+    if len(table.values) != 1:
+        raise ValueError(f"{file.name} has {len(table.values) + 1} columns in place of 2")
+    heading = table.columns[0].heading
     if re.search(r"photon|mol|%", heading):
         fix = "divide photons by the wavelength, and write a unit of power, such as W/nm or 1"
         raise ValueError(f"{file.name}: {heading} is no spectral power: {fix}")
-    if not found.columns[0].unit:
+    if not table.columns[0].unit:
         raise ValueError(
             f"{file.name}: column 2, {heading}, has no unit: write power (W/nm), or power (1) if"
             " relative"
         )
-    found.refuse(found.values < 0, lambda value: f"a light cannot have the power {value:g}")
-    if not found.values.any():
+    table.refuse(table.values < 0, lambda value: f"a light cannot have the power {value:g}")
+    if not table.values.any():
         raise ValueError(f"{file.name} has no power at any wavelength")
-    return found
+    return table
 
 
 def _light(kind: str | Path, temperature: float) -> Table:
@@ -222,13 +224,13 @@ def _(
         basis = torch.stack(
             [row.double() * p for row, p in zip(reflectance.basis, power, strict=True)]
         )
-        most = torch.stack(
+        residual = torch.stack(
             [column * p for column, p in zip(reflectance.residual_max.T, power, strict=True)], 1
         )
         columns = [column * p for column, p in zip(reflectance.residual_rms.T, power, strict=False)]
-        rms = torch.stack(columns, 1) if columns else most[:0, :0]
+        rms = torch.stack(columns, 1) if columns else residual[:0, :0]
         largest = reflectance.residual_map.double() * max(power)
-        return LowRankCube(reflectance.planes.double(), basis, most, rms, largest)
+        return LowRankCube(reflectance.planes.double(), basis, residual, rms, largest)
     return torch.stack([reflectance[..., b, :, :].double() * p for b, p in enumerate(power)], -3)
 
 

@@ -181,11 +181,11 @@ def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> LowRankCube:
     """
     needs_rgb(rgb)
     flat, exact = rgb.detach().flatten(1), matrix.to(rgb.device)
-    if (found := linear_planes(flat, exact, within)) is not None:
-        return as_low_rank_cube(found, _lifted(rgb, matrix) if rgb.requires_grad else rgb)
+    if (cube := linear_planes(flat, exact, within)) is not None:
+        return as_low_rank_cube(cube, _lifted(rgb, matrix) if rgb.requires_grad else rgb)
     dtype = rgb.dtype if rgb.dtype == torch.float64 else torch.float32
     source = Source(
-        lambda part: (exact @ flat[:, part].double()).clamp_min_(0),
+        lambda pixels: (exact @ flat[:, pixels].double()).clamp_min_(0),
         len(exact),
         flat.shape[1],
         dtype,
@@ -210,19 +210,19 @@ def _solved(centres: tuple[float, ...]) -> Tensor:
     """Return the matrix (band, 3) float64 of `lift_lmmse` for bands with the given centre
     wavelengths in m.
     """
-    at = torch.tensor(centres, dtype=torch.float64)
-    return lift_matrix(torch.cat([paint.at(at) for paint in paints()]), at)
+    wavelengths = torch.tensor(centres, dtype=torch.float64)
+    return lift_matrix(torch.cat([paint.at(wavelengths) for paint in paints()]), wavelengths)
 
 
-def lift_matrix(known: Tensor, centres: Tensor) -> Tensor:
+def lift_matrix(measured: Tensor, centres: Tensor) -> Tensor:
     """Return the matrix that estimates reflectance from linear sRGB, fitted to the measured spectra
-    ``known``.
+    ``measured``.
 
     Shapes: known (spectrum, band) -> (band, 3) float64.
     """
-    second, rgb = known.T @ known / len(known), to_srgb(centres)
-    seen = rgb @ second @ rgb.T
-    if len(centres) < 3 or not float(torch.linalg.cond(seen)) < 1e10:
+    second, rgb = measured.T @ measured / len(measured), to_srgb(centres)
+    second_of_rgb = rgb @ second @ rgb.T
+    if len(centres) < 3 or not float(torch.linalg.cond(second_of_rgb)) < 1e10:
         ends = (
             f"{len(centres)} bands from {float(centres[0]) * 1e9:.4g} to"
             f" {float(centres[-1]) * 1e9:.4g} nm"
@@ -231,7 +231,7 @@ def lift_matrix(known: Tensor, centres: Tensor) -> Tensor:
             f"{ends} cannot distinguish three colours: use more bands, such as 31 from 400 to"
             " 700 nm"
         )
-    weights: Tensor = torch.linalg.solve(seen, rgb @ second).T
+    weights: Tensor = torch.linalg.solve(second_of_rgb, rgb @ second).T
     return weights
 
 

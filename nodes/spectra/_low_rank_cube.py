@@ -42,8 +42,8 @@ def few_planes(source: Source, within: float) -> LowRankCube:
     The bound ``within`` is relative to the largest element. The planes and the map of errors are
     flat, with all pixels in one row. Raises ValueError for NaN.
     """
-    most, gram = _largest_and_products(source)
-    scale = float(most.max())
+    largest, gram = _largest_and_products(source)
+    scale = float(largest.max())
     scaled = scale > 0 and not 1e-280 < float(gram.amax()) < 1e280
     if scaled:
         gram = _largest_and_products(source, scale)[1]
@@ -55,10 +55,10 @@ def few_planes(source: Source, within: float) -> LowRankCube:
         1, next((k for k, left in enumerate(spread) if float(left.max()) <= target), source.bands)
     )
     planes, last, off = _projected(source, axes[:, :count])
-    rest = bound_by_planes(most, planes, axes[:, :count], last)
+    residual = bound_by_planes(largest, planes, axes[:, :count], last)
     # no more than was measured
-    spread = torch.cat([spread[:count], torch.minimum(spread[count], rest[count])[None]])
-    return LowRankCube(planes, axes[:, :count], rest, spread, off)
+    spread = torch.cat([spread[:count], torch.minimum(spread[count], residual[count])[None]])
+    return LowRankCube(planes, axes[:, :count], residual, spread, off)
 
 
 def _largest_and_products(source: Source, scale: float = 1.0) -> tuple[Tensor, Tensor]:
@@ -73,13 +73,13 @@ def _largest_and_products(source: Source, scale: float = 1.0) -> tuple[Tensor, T
         x = source.part(piece).div_(scale) if scale != 1.0 else source.part(piece)
         gram = x @ x.T if gram is None else gram.addmm_(x, x.T)
         tops.append(x.abs_().amax(1))
-    most = torch.stack(tops).amax(0) * scale
-    if gram is None or not bool(torch.isfinite(most).all()):
+    largest = torch.stack(tops).amax(0) * scale
+    if gram is None or not bool(torch.isfinite(largest).all()):
         raise ValueError(
             "the cube holds NaN or infinite values: replace these values, or do not compress the"
             " cube"
         )
-    return most, gram
+    return largest, gram
 
 
 def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -107,8 +107,8 @@ def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
     components plus the round-off of the basis images. ``power`` holds the mean products of the
     bands. The round-off of these products counts as part of the error.
     """
-    each = axes.square() * ((power @ axes) * axes).sum(0).clamp_min(0)
-    after = torch.cat([each.flip(1).cumsum(1).flip(1), torch.zeros_like(each[:, :1])], 1)[
+    powers = axes.square() * ((power @ axes) * axes).sum(0).clamp_min(0)
+    after = torch.cat([powers.flip(1).cumsum(1).flip(1), torch.zeros_like(powers[:, :1])], 1)[
         :, : count + 1
     ].T
     total = power.diagonal()
@@ -117,7 +117,7 @@ def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
     return (after + double).sqrt() + eps * (planes * total).sqrt()
 
 
-def bound_by_planes(most: Tensor, planes: Tensor, basis: Tensor, last: Tensor) -> Tensor:
+def bound_by_planes(largest: Tensor, planes: Tensor, basis: Tensor, last: Tensor) -> Tensor:
     """Return a bound of the largest error of each band if a cube is approximated by its first k
     principal components.
 
@@ -125,11 +125,11 @@ def bound_by_planes(most: Tensor, planes: Tensor, basis: Tensor, last: Tensor) -
     components are measured. In between, the bound adds the omitted components to the error with all
     components.
     """
-    each = basis.abs() * torch.maximum(planes.amax(1), -planes.amin(1)).double()
+    by_plane = basis.abs() * torch.maximum(planes.amax(1), -planes.amin(1)).double()
     # round-off of the measurement
-    last = last + 4 * torch.finfo(torch.float64).eps * (most + each.sum(1))
-    after = each.flip(1).cumsum(1).flip(1).T
-    return torch.cat([most[None], last + after[1:], last[None]])
+    last = last + 4 * torch.finfo(torch.float64).eps * (largest + by_plane.sum(1))
+    after = by_plane.flip(1).cumsum(1).flip(1).T
+    return torch.cat([largest[None], last + after[1:], last[None]])
 
 
 # --- low rank cube --------------------------------------------------------------------------------
@@ -191,12 +191,14 @@ def _(cube: Tensor, *, within: float = 1e-6) -> LowRankCube:
     axes = torch.linalg.svd(flat, full_matrices=False)[0]
     errors = [flat - axes[:, :r] @ (axes[:, :r].T @ flat) for r in range(axes.shape[1] + 1)]
     spread = torch.stack([error.square().mean(1).sqrt() for error in errors])
-    most = within * float(flat.abs().max())
-    count = max(1, next((r for r, x in enumerate(spread) if float(x.max()) <= most), axes.shape[1]))
+    limit = within * float(flat.abs().max())
+    count = max(
+        1, next((r for r, x in enumerate(spread) if float(x.max()) <= limit), axes.shape[1])
+    )
     planes = (axes[:, :count].T @ flat).reshape(-1, *cube.shape[1:])
-    rest = torch.stack([error.abs().amax(1) for error in errors])
+    residual = torch.stack([error.abs().amax(1) for error in errors])
     off = errors[count].abs().amax(0).reshape(cube.shape[1:])
-    return LowRankCube(planes, axes[:, :count], rest[: count + 1], spread[: count + 1], off)
+    return LowRankCube(planes, axes[:, :count], residual[: count + 1], spread[: count + 1], off)
 
 
 @compress.check
@@ -204,15 +206,15 @@ def plane_checks(result: LowRankCube, *inputs: object, **params: object) -> list
     """Report the number of basis images of a low-rank cube, and the error relative to the full
     spectral cube.
     """
-    rms, most = (
+    rms, largest = (
         float(x[-1].max()) / max(float(result.residual_max[0].max()), 1e-300)
         for x in (result.residual_rms, result.residual_max)
     )
     count = f"{len(result.planes)} basis images for {len(result.basis)} bands"
     return [
         Check(
-            f"{count}: error {rms:.2g} rms, {most:.2g} at most, relative to the largest element of"
-            " the cube"
+            f"{count}: error {rms:.2g} rms, {largest:.2g} at most, relative to the largest element"
+            " of the cube"
         )
     ]
 
@@ -265,18 +267,18 @@ def linear_planes(picture: Tensor, matrix: Tensor, within: float) -> LowRankCube
     )
     if not count or float(some.clamp_max(0).square().mean(1).max()) >= target**2:
         return None
-    found = _measured(picture, matrix, axes, count)
+    cube = _measured(picture, matrix, axes, count)
     return (
-        found
-        if float(found.residual_rms[-1].max()) <= within * float(found.residual_max[0].max())
+        cube
+        if float(cube.residual_rms[-1].max()) <= within * float(cube.residual_max[0].max())
         else None
     )
 
 
 def _axes(picture: Tensor, matrix: Tensor) -> _Axes:
     gram = matrix.new_zeros(len(picture), len(picture))
-    for at in range(0, picture.shape[1], _PLANES_PIECE):
-        x = picture[:, at : at + _PLANES_PIECE].double()
+    for start in range(0, picture.shape[1], _PLANES_PIECE):
+        x = picture[:, start : start + _PLANES_PIECE].double()
         gram.addmm_(x, x.T)
     values, vectors = torch.linalg.eigh(gram / picture.shape[1])
     root = vectors * values.clamp_min(0).sqrt()  # root @ root.T is the mean product of the channels
@@ -296,25 +298,25 @@ def _measured(picture: Tensor, matrix: Tensor, axes: _Axes, count: int) -> LowRa
     leave.
     """
     basis, weights = axes.basis[:, :count], axes.weights[:count]
-    light, kept = (
+    light, reduced = (
         matrix.to(picture),
         None if count == len(axes.power) else (basis @ weights).to(picture),
     )
     planes, off = picture.new_empty(count, picture.shape[1]), picture.new_empty(picture.shape[1])
     tops, lasts, squares = [], [], matrix.new_zeros(len(matrix))
-    for at in range(0, picture.shape[1], _PLANES_PIECE):
-        part = slice(at, at + _PLANES_PIECE)
-        x = picture[:, part]
-        planes[:, part] = weights @ x.double()
+    for start in range(0, picture.shape[1], _PLANES_PIECE):
+        columns = slice(start, start + _PLANES_PIECE)
+        x = picture[:, columns]
+        planes[:, columns] = weights @ x.double()
         bands = light @ x
         tops.append(bands.amax(1))
-        if kept is None:  # what is clipped is all that is lost
+        if reduced is None:  # what is clipped is all that is lost
             lost = bands.amin(0).neg_().clamp_min_(0)
-            off[part], at_loss = lost, lost.nonzero()[:, 0]
+            off[columns], at_loss = lost, lost.nonzero()[:, 0]
             left = bands[:, at_loss].clamp_max_(0)
         else:
-            left = bands.clamp_min_(0).sub_(kept @ x)
-            off[part] = left.abs().amax(0)
+            left = bands.clamp_min_(0).sub_(reduced @ x)
+            off[columns] = left.abs().amax(0)
         if left.shape[1]:
             lasts.append(left.abs().amax(1))
             squares += left.square().sum(1)
@@ -327,18 +329,18 @@ def _bounded(
     basis: Tensor,
     axes: _Axes,
     off: Tensor,
-    found: tuple[Tensor, list[Tensor], Tensor],
+    measured: tuple[Tensor, list[Tensor], Tensor],
 ) -> LowRankCube:
     """Return the low-rank cube with the bounds of its errors, to which the rounding of float32
     is added.
     """
-    tops, lasts, rms = found
-    most = tops.amax(0).double().clamp_min(0)
+    tops, lasts, rms = measured
+    largest = tops.amax(0).double().clamp_min(0)
     sizes = torch.maximum(planes.amax(1), -planes.amin(1)).double()
     rounding = 4 * torch.finfo(planes.dtype).eps * float((basis.abs() @ sizes).max())
-    last = (torch.stack(lasts).amax(0).double() if lasts else torch.zeros_like(most)) + rounding
+    last = (torch.stack(lasts).amax(0).double() if lasts else torch.zeros_like(largest)) + rounding
     before = [_omitted(axes, k) + rms for k in range(planes.shape[0])]
     spread = torch.stack([*before, rms]) + rounding
     return LowRankCube(
-        planes, basis, bound_by_planes(most, planes, basis, last), spread, off.add_(rounding)
+        planes, basis, bound_by_planes(largest, planes, basis, last), spread, off.add_(rounding)
     )

@@ -97,7 +97,9 @@ def reflectances(
     """
     if sets:
         inside_charts(bands)
-    tables = [table for name in sets for table in _SETS[name]()]
+    tables: list[Table] = []
+    for name in sets:
+        tables += _SETS[name]()
     for file in files or ():
         tables.append(_read(file))
         fix = "leave the file out, or choose bands inside that range"

@@ -59,15 +59,16 @@ def metamers(
             f" {len(bands.centres)} bands are needed: compute reflectances and bands from the same"
             " `bands` step"
         )
-    known = reflectances.double()
-    base = _mixtures(known, count, mixed, thickness, rng)
+    measured = reflectances.double()
+    base = _mixtures(measured, count, mixed, thickness, rng)
     black = metameric_blacks(
-        known[_drawn(len(known), (count,), rng)] - known[_drawn(len(known), (count,), rng)],
-        known,
+        measured[_drawn(len(measured), (count,), rng)]
+        - measured[_drawn(len(measured), (count,), rng)],
+        measured,
         bands,
     )
     normal = torch.randn(count, 1, generator=rng, device=rng.device, dtype=torch.float64)
-    share = blacks * normal * base.mean(1, keepdim=True) / known.mean()
+    share = blacks * normal * base.mean(1, keepdim=True) / measured.mean()
     low, high = _limits(base, black)
     return (base + share.maximum(low).minimum(high) * black).clamp(0.0, 1.0)
 
@@ -94,7 +95,7 @@ def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
     ]
 
 
-def metameric_blacks(spectra: Tensor, known: Tensor, bands: Bands) -> Tensor:
+def metameric_blacks(spectra: Tensor, measured: Tensor, bands: Bands) -> Tensor:
     """Return the part of each spectrum that does not contribute to the colour, called metameric
     black.
 
@@ -102,12 +103,12 @@ def metameric_blacks(spectra: Tensor, known: Tensor, bands: Bands) -> Tensor:
     band) both.
     """
     centres = bands.centres.detach().cpu().double()
-    estimate = lift_matrix(known.cpu(), centres) @ to_srgb(centres)
+    estimate = lift_matrix(measured.cpu(), centres) @ to_srgb(centres)
     return spectra - spectra @ estimate.T.to(spectra)
 
 
 def _mixtures(
-    known: Tensor, count: int, mixed: int, thickness: tuple[float, float], rng: torch.Generator
+    measured: Tensor, count: int, mixed: int, thickness: tuple[float, float], rng: torch.Generator
 ) -> Tensor:
     """Mix measured spectra at random, and apply a random layer thickness to each mixture (Beer and
     Lambert).
@@ -118,7 +119,7 @@ def _mixtures(
     weights = -torch.rand(count, mixed, **options).clamp_min(1e-12).log()  # type: ignore[call-overload]
     weights = weights.square()
     weights = weights / weights.sum(1, keepdim=True)
-    sums = (weights[..., None] * known[_drawn(len(known), (count, mixed), rng)]).sum(1)
+    sums = (weights[..., None] * measured[_drawn(len(measured), (count, mixed), rng)]).sum(1)
     even: Tensor = torch.rand(count, 1, **options)  # type: ignore[call-overload]
     power: Tensor = thickness[0] * (thickness[1] / thickness[0]) ** even
     layers: Tensor = sums.clamp(_DARKEST, 1.0) ** power

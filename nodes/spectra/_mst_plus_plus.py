@@ -1,6 +1,6 @@
 """Estimates of 31 bands from RGB by the neural network MST++."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -319,23 +319,26 @@ def _fitting(weights: Path) -> dict[str, Tensor]:
     """Read the tensors of a checkpoint file, and raise ParameterError unless they fit MST++ and
     are finite.
     """
-    found = {name.removeprefix("module."): tensor for name, tensor in _read(weights).items()}
-    network = _empty().state_dict()
-    wrong = [
-        name for name in network if name not in found or found[name].shape != network[name].shape
-    ]
-    wrong += [name for name in found if name not in network]
+    tensors = {name.removeprefix("module."): tensor for name, tensor in _read(weights).items()}
+    wrong = _not_fitting(tensors)
     if wrong:
         text = (
-            f"{weights} holds {len(found)} tensors, and {len(wrong)} tensors do not fit MST++, such"
-            f" as {wrong[0]}"
+            f"{weights} holds {len(tensors)} tensors, and {len(wrong)} tensors do not fit MST++,"
+            f" such as {wrong[0]}"
         )
         raise ParameterError("weights", text)
-    if problem := next(
-        filter(None, (wrong_weights(weights, name, each) for name, each in found.items())), ""
-    ):
-        raise ParameterError("weights", problem)
-    return {name: tensor.float() for name, tensor in found.items()}
+    for name, values in tensors.items():
+        if problem := wrong_weights(weights, name, values):
+            raise ParameterError("weights", problem)
+    return {name: tensor.float() for name, tensor in tensors.items()}
+
+
+def _not_fitting(tensors: Mapping[str, Tensor]) -> list[str]:
+    """Return the names of tensors that MST++ needs in another shape, or does not have."""
+    network = _empty().state_dict()
+    shapes = {name: tensor.shape for name, tensor in tensors.items()}
+    wrong = [name for name in network if shapes.get(name) != network[name].shape]
+    return wrong + [name for name in tensors if name not in network]
 
 
 def _read(weights: Path) -> dict[str, Tensor]:

@@ -36,8 +36,8 @@ def _(bands: Bands, *, camera: str | Path = "CIE 1931", **params: Any) -> Tensor
     run, or their shape.
     """
     if known(bands.centres) and _beyond(bands, camera):
-        found: Tensor = responses(bands, camera=camera, **params)
-        return found
+        channels: Tensor = responses(bands, camera=camera, **params)
+        return channels
     return double(channel_count(camera), len(bands.centres))
 
 
@@ -72,9 +72,11 @@ def _mixture(rgb: Tensor, bands: Bands, **params: Any) -> LowRankCube:
 
 def _low_rank(planes: int, bands: int, like: Tensor) -> LowRankCube:
     dtype = torch.float64 if like.dtype == torch.float64 else torch.float32
-    whole, off = (blank(*shape, *like.shape[-2:], dtype=dtype) for shape in ((planes,), ()))
-    most, spread = (double(planes + 1, bands) for _ in range(2))
-    return LowRankCube(whole, double(bands, planes), most, spread, off)
+    planes_of_cube, off = (
+        blank(*shape, *like.shape[-2:], dtype=dtype) for shape in ((planes,), ())
+    )
+    largest, spread = (double(planes + 1, bands) for _ in range(2))
+    return LowRankCube(planes_of_cube, double(bands, planes), largest, spread, off)
 
 
 for node in (lift_lmmse, lift_mallett, lift_mst_plus_plus):

@@ -91,21 +91,12 @@ def table_rows(file: Path) -> Rows:
     if not rows:
         raise ValueError(f"{file.name} has no columns of numbers below a header")
     (first, header), body = rows[0], rows[1:]
-    if all(_is_number(cell) for cell in header):
-        raise ValueError(
-            f"{file.name}:{first}: the first row holds numbers: begin with a header, such as"
-            " wavelength (nm),QE (%)"
-        )
+    _refuse_only_numbers(file, first, header)
     columns = tuple(_column(cell) for cell in header)
     if not body or len(columns) < 2:
         raise ValueError(f"{file.name} has no columns of numbers below a header")
     for line, row in body:
-        if len(row) != len(columns):
-            count = f"{len(row)} column{'s' * (len(row) != 1)} in place of {len(columns)}"
-            raise ValueError(
-                f"{file.name}:{line}: {count}, the number of headings: write one number for each"
-                " heading"
-            )
+        _refuse_other_length(file, line, row, len(columns))
     numbers = [
         [_number(file, line, i, columns[i], cell) for i, cell in enumerate(row)]
         for line, row in body
@@ -113,11 +104,30 @@ def table_rows(file: Path) -> Rows:
     return Rows(columns, tuple(line for line, _ in body), np.array(numbers, np.float64))
 
 
-def curves(file: Path, units: Sequence[str] | None, assumed: str = "", least: int = 2) -> Curves:
+def _refuse_only_numbers(file: Path, line: int, header: Sequence[str]) -> None:
+    """Raise ValueError for a first row of numbers in place of a header."""
+    if all(_is_number(cell) for cell in header):
+        raise ValueError(
+            f"{file.name}:{line}: the first row holds numbers: begin with a header, such as"
+            " wavelength (nm),QE (%)"
+        )
+
+
+def _refuse_other_length(file: Path, line: int, row: Sequence[str], length: int) -> None:
+    """Raise ValueError for a row that has not one number for each heading."""
+    if len(row) != length:
+        count = f"{len(row)} column{'s' * (len(row) != 1)} in place of {length}"
+        raise ValueError(
+            f"{file.name}:{line}: {count}, the number of headings: write one number for each"
+            " heading"
+        )
+
+
+def curves(file: Path, units: Sequence[str] | None, assumed: str = "", fewest: int = 2) -> Curves:
     """Read the curves of a CSV file over the wavelength, whose unit is in the first heading.
 
     ``units`` are the units that the other columns may have, None for any. A file without any unit
-    has wavelengths in the unit ``assumed``; without such a unit, units are necessary. ``least`` is
+    has wavelengths in the unit ``assumed``; without such a unit, units are necessary. ``fewest`` is
     the least number of rows.
 
     Raises ValueError where `table_rows` does, for a unit that is missing or unknown, and for
@@ -133,7 +143,7 @@ def curves(file: Path, units: Sequence[str] | None, assumed: str = "", least: in
         for number, column in enumerate(others, 1):
             _refuse_unit(file, number, column, units)
     nm = rows.values[:, 0] * (LENGTHS[unit] / 1e-9)
-    if len(nm) < least:
+    if len(nm) < fewest:
         raise ValueError(f"{file.name} holds one wavelength: at least two wavelengths are needed")
     for problem in _wrong_order(file, rows.lines, nm):
         raise ValueError(problem)
@@ -179,19 +189,19 @@ def _number(file: Path, line: int, index: int, column: Column, cell: str) -> flo
 
 def _refuse_first(file: Path, first: Column) -> None:
     """Raise ValueError for a first column without wavelengths in a known unit."""
-    known = ", ".join(unit for unit in LENGTHS if unit.isascii())
+    unit_names = ", ".join(unit for unit in LENGTHS if unit.isascii())
     if not first.unit:
         fix = f"write the unit in brackets, such as {first.quantity or 'wavelength'} (nm)"
         raise ValueError(f"{file.name}: the first column, {first.quantity}, has no unit: {fix}")
-    fix = f"write wavelength (nm) there, or another of {known}"
+    fix = f"write wavelength (nm) there, or another of {unit_names}"
     raise ValueError(f"{file.name}: the first column, {first.heading}, has no wavelengths: {fix}")
 
 
 def _refuse_unit(file: Path, number: int, column: Column, units: Sequence[str]) -> None:
     if column.unit not in units:
-        what = f"has the unit {column.unit}" if column.unit else "has no unit"
+        fault = f"has the unit {column.unit}" if column.unit else "has no unit"
         fix = f"write one of {', '.join(f'({unit})' for unit in units)}"
-        raise ValueError(f"{file.name}: column {number + 1}, {column.quantity}, {what}: {fix}")
+        raise ValueError(f"{file.name}: column {number + 1}, {column.quantity}, {fault}: {fix}")
 
 
 def _wrong_order(file: Path, lines: Sequence[int], nm: Numbers) -> Iterator[str]:

@@ -109,7 +109,7 @@ def simulated(mode, number, move):
             guide = draw_guide(problem, best, np.random.default_rng(number))
             emcee_sampler._FIRST = emcee_sampler._LONGEST = STEPS
             chains = emcee_sampler.sample(
-                problem, best, folder / "c.h5", seed=number, how=move, guide=guide
+                problem, best, folder / "c.h5", seed=number, move_name=move, guide=guide
             )
             rng = np.random.default_rng([number, 3])
             flat = chains.flat[rng.choice(len(chains.flat), DRAWS, replace=False)]
@@ -117,7 +117,7 @@ def simulated(mode, number, move):
                 flat, chains.tau, chains.steps > 10 * chains.tau, emcee_sampler.stranded(chains.log)
             )
         else:
-            found = walk_draws(problem, best, number, how=move)
+            found = walk_draws(problem, best, number, move_name=move)
         row = rank_truth(problem, truth, found)
     return {"number": number, **vars(row), "seconds": time.process_time() - began}
 

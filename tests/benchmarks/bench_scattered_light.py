@@ -84,12 +84,13 @@ def restored(found, optics, scatter, interval):
     """
     bands = Bands(*(optics[f"bands.{name}"] for name in Bands._fields))
     psf = Psf(optics["psf[mask].intensity"], optics["psf[mask].clear_peak"])
-    light = [
-        [found[name] for name in names] for names in (FOUND[: len(RANKS)], FOUND[len(RANKS) :])
-    ]
+    light = filters.LaserLight(
+        glare=[found[name] for name in FOUND[: len(RANKS)]],
+        nearby=[found[name] for name in FOUND[len(RANKS) :]],
+    )
     camera = (found["illuminant"], found["responses"], bands)
     fine, known, glare = filters.known_and_light(
-        psf, camera[1], found["signal[mask]"], found["clipped[mask]"].bool(), *light, None
+        psf, camera[1], found["signal[mask]"], found["clipped[mask]"].bool(), light
     )
     kernels = effective_psf(psf, *camera, fine.dtype).to(fine)
     settings = filters.Settings(1.0, own.READ, None, 0.3, scatter)

@@ -17,7 +17,7 @@ from neusee.nodes.laser import light
 
 ROUNDING = 1e-9  #: of a bound, in float64
 SINGLE = 1e-5  #: the same, of results in float32
-DRAWS = [30, pytest.param(1000, marks=pytest.mark.slow)]
+DRAWS = [30, pytest.param(300, marks=pytest.mark.slow)]
 FURTHEST = 100.0  #: times the change that a bound may be, at the median
 
 

@@ -143,13 +143,13 @@ def program_state(root: Path = ROOT) -> ProgramState:
 
 def _source_files(root: Path) -> list[str]:
     """Return the paths of all source files relative to the package, sorted."""
-    found = [name for name in ("__init__.py", "__main__.py") if (root / name).is_file()]
+    files = [name for name in ("__init__.py", "__main__.py") if (root / name).is_file()]
     for folder in SOURCES:
         inside = [os.path.join(folder, name) for name in _below(os.fspath(root / folder))]
         if not inside:
             raise FileNotFoundError(f"{root / folder} has no source files")
-        found += inside
-    return sorted(found)
+        files += inside
+    return sorted(files)
 
 
 def _below(folder: str, above: str = "") -> Iterator[str]:
@@ -176,12 +176,14 @@ def _importable(folder: str) -> list[tuple[str, int]]:
         return []
     try:
         with os.scandir(where) as entries:
-            kept = [
-                each
-                for each in entries
-                if (each.name.endswith(_ABOUT) if installed else _is_code(each))
+            code = [
+                entry
+                for entry in entries
+                if (entry.name.endswith(_ABOUT) if installed else _is_code(entry))
             ]
-            return sorted((each.name, each.stat().st_mtime_ns if installed else 0) for each in kept)
+            return sorted(
+                (entry.name, entry.stat().st_mtime_ns if installed else 0) for entry in code
+            )
     except OSError as error:
         return [(type(error).__name__, 0)]
 
@@ -359,9 +361,18 @@ class Command:
             written = results if results and results.out else None
             if self._is_doubtful() or not (written or os.path.isdir(self._disk.folder)):
                 return
-            place = (str(written.out), *_parts(written.folder.name)) if written else ("", "", "")
+            label, key = _parts(written.folder.name) if written else ("", "")
             fields = results.fields() if results else {"files": {}}
-            answer = Answer(self._state.digest, witnesses, text, as_json, *place, **fields)
+            answer = Answer(
+                self._state.digest,
+                witnesses,
+                text,
+                as_json,
+                out=str(written.out) if written else "",
+                label=label,
+                key=key,
+                **fields,
+            )
             if write_answer(self._disk, self.name, answer):
                 make_room(self._disk, budget_bytes(None))
 
@@ -444,10 +455,10 @@ def _parts(folder: str) -> tuple[str, str]:
 
     Raises `ValueError` for another name.
     """
-    found = _NAME.fullmatch(folder)
-    if not found:
+    match = _NAME.fullmatch(folder)
+    if not match:
         raise ValueError(f"{folder} is not the name of a folder of results")
-    return found["label"], found["key"]
+    return match["label"], match["key"]
 
 
 def _recipe_folders(words: Sequence[str]) -> set[str]:
@@ -467,16 +478,16 @@ def _input_files(recipe: Recipe) -> set[str]:
     refused later.
     """
     values: list[Any] = list(recipe.config.values.values())
-    found = set()
+    paths = set()
     while values:
         value = values.pop()
         if isinstance(value, Path):
-            found.add(os.path.abspath(value))
+            paths.add(os.path.abspath(value))
         elif isinstance(value, dict):
             values += [*value, *value.values()]
         elif isinstance(value, list | tuple | set | frozenset):
             values += value
-    return found
+    return paths
 
 
 def _installed() -> list[str]:
@@ -493,13 +504,13 @@ def _own_code() -> Iterable[str]:
     """Yield the modules of this process that are neither neusee nor installed: a recipe names
     code of its own.
     """
-    known = Folders([*_installed(), ROOT])
+    covered = Folders([*_installed(), ROOT])
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)  # of torch.ops it is a name without a folder
         if (
             file
             and name not in _MAIN
             and os.path.isfile(file)
-            and os.path.abspath(file) not in known
+            and os.path.abspath(file) not in covered
         ):
             yield name

@@ -128,7 +128,7 @@ class RunResults(NamedTuple):
         """
         document, folder = self.document, self.folder
         if (
-            {each["state"] for each in document["steps"]} - _SERVED
+            {step["state"] for step in document["steps"]} - _SERVED
             or document["warnings"]
             or document["missed"]
         ):

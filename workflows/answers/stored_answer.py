@@ -81,12 +81,12 @@ def write_answer(disk: Disk, name: str, answer: Answer) -> bool:
     raw, path = packed(name, answer), answer_path(disk, name)
     if len(raw) > MOST:
         return False
-    with disk.temporary(f"{name[:8]}{SUFFIX}") as (part, file):
+    with disk.temporary(f"{name[:8]}{SUFFIX}") as (temporary, file):
         file.write(raw)
         file.flush()
         disk.make_folder(f"{disk.folder}/{FOLDER}")
-        disk.share(part)
-        disk.rename(part, path)
+        disk.share(temporary)
+        disk.rename(temporary, path)
     return True
 
 
@@ -117,13 +117,13 @@ def unpacked(name: str, raw: bytes) -> Answer:
     `TypeError`, `KeyError` or `AttributeError` for any other content.
     """
     seal, _, content = raw.partition(b"\n")
-    head, _, rest = unseal_file("answer", f"{FOLDER}/{name}", seal, content).partition(b"\n")
+    head, _, body = unseal_file("answer", f"{FOLDER}/{name}", seal, content).partition(b"\n")
     fields: dict[str, Any] = json.loads(head)
-    files, at = {}, 0
+    files, offset = {}, 0
     for file, size in fields.pop("files"):
-        files[_checked(_FILE, file)] = rest[at : at + abs(size)]
-        at += abs(size)
-    if at != len(rest):
+        files[_checked(_FILE, file)] = body[offset : offset + abs(size)]
+        offset += abs(size)
+    if offset != len(body):
         raise ValueError("the files of the answer are not as long as it says")
     witnesses = Witnesses(**fields.pop("witnesses"))
     stored = checked(fields.pop("stored"))
@@ -175,7 +175,7 @@ class Kept(NamedTuple):
 
 def answers(disk: Disk) -> list[Kept]:
     """Return all stored answers, the one that was used last first."""
-    return sorted(_found(disk), key=lambda each: (-each.used, each.name))
+    return sorted(_found(disk), key=lambda answer: (-answer.used, answer.name))
 
 
 def _found(disk: Disk) -> Iterator[Kept]:
@@ -191,39 +191,39 @@ def make_room(disk: Disk, budget: int | None = None) -> None:
 
     With a ``budget`` of the store in bytes, at most a twentieth of it is left.
     """
-    size, most = 0, BYTES if budget is None else min(BYTES, budget // 20)
-    for number, each in enumerate(answers(disk)):
-        size += each.size
-        if number >= COUNT or size > most:
-            _remove(disk, each)
+    size, limit = 0, BYTES if budget is None else min(BYTES, budget // 20)
+    for number, answer in enumerate(answers(disk)):
+        size += answer.size
+        if number >= COUNT or size > limit:
+            _remove(disk, answer)
 
 
 def sweep(disk: Disk, dry: bool = False, everything: bool = False) -> list[Kept]:
     """Remove the answers that nobody used for a week, or ``everything``, or only list them if
     ``dry``; return them.
     """
-    old = [each for each in answers(disk) if everything or time.time() - each.used > _WEEK]
-    return old if dry else [each for each in old if _remove(disk, each)]
+    old = [answer for answer in answers(disk) if everything or time.time() - answer.used > _WEEK]
+    return old if dry else [answer for answer in old if _remove(disk, answer)]
 
 
 def check(disk: Disk) -> tuple[list[Kept], list[Kept]]:
     """Return the answers that are as written, and those that are not, which are moved to the
     folder ``bad/``.
     """
-    whole, damaged = [], []
-    for each in answers(disk):
-        there = read_answer(disk, each.name) is not None
+    right, damaged = [], []
+    for answer in answers(disk):
+        is_readable = read_answer(disk, answer.name) is not None
         # one of another format or without a signature stays where it is
-        if there or os.path.lexists(each.path):
-            whole.append(each)
+        if is_readable or os.path.lexists(answer.path):
+            right.append(answer)
         else:
-            damaged.append(each)
-    return whole, damaged
+            damaged.append(answer)
+    return right, damaged
 
 
-def _remove(disk: Disk, each: Kept) -> bool:
+def _remove(disk: Disk, answer: Kept) -> bool:
     try:
-        disk.unlink(each.path)
+        disk.unlink(answer.path)
     except OSError:
         return False
     return True

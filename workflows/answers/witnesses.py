@@ -75,23 +75,28 @@ def witnesses_of(
     folder in place of a file.
     """
     for folder, then in listed.items():
-        own = os.path.relpath(made, folder).partition(os.sep)[0] if made else ""
-        now = [name for name in all_names(folder) if name != own or name in then.names]
+        now = _names_but(folder, then, made)
         if then.changed > before or now != then.names:
             raise Unsettled(f"{folder} changed while the command ran")
-    found: dict[str, str] = {}
+    digests: dict[str, str] = {}
     absent = []
     for path in sorted(set(files)):
         try:
-            found[path] = file_digest(path, before)
+            digests[path] = file_digest(path, before)
         except FileNotFoundError:
             absent.append(path)
         except OSError as error:
             raise Unsettled(f"{path} cannot be read: {error}") from None
     names = {folder: _digest(recipe_names(folder)) for folder in sorted(set(recipes))}
     return Witnesses(
-        found, absent, names, {folder: _digest(all_names(folder)) for folder in sorted(listed)}
+        digests, absent, names, {folder: _digest(all_names(folder)) for folder in sorted(listed)}
     )
+
+
+def _names_but(folder: str, then: Listing, made: str | None) -> list[str]:
+    """Return the names in a folder as it is now, without the folder ``made`` if it is new."""
+    own = os.path.relpath(made, folder).partition(os.sep)[0] if made else ""
+    return [name for name in all_names(folder) if name != own or name in then.names]
 
 
 def hold(witnesses: Witnesses) -> bool:
@@ -138,8 +143,8 @@ def recipe_names(folder: str) -> list[str]:
 
 def _yaml_in(folder: str, groups: bool) -> Iterator[str]:
     try:
-        with os.scandir(folder) as found:
-            entries = list(found)
+        with os.scandir(folder) as scan:
+            entries = list(scan)
     except OSError:
         return
     for entry in entries:
@@ -225,17 +230,17 @@ class Folders:
     """Some folders with all that is below them."""
 
     def __init__(self, roots: Iterable[str | os.PathLike[str]]) -> None:
-        named = (
-            str(each) for root in roots for each in (os.path.abspath(root), os.path.realpath(root))
-        )
-        self._starts = tuple(f"{each.rstrip('/')}/" for each in named)
+        named: list[str] = []
+        for root in roots:
+            named += [str(os.path.abspath(root)), str(os.path.realpath(root))]
+        self._starts = tuple(f"{path.rstrip('/')}/" for path in named)
 
     def __contains__(self, path: object) -> bool:
         """Return True if a path is one of the folders or below one of them, whatever links lead
         there.
         """
         return any(
-            f"{each}/".startswith(self._starts) for each in (str(path), os.path.realpath(str(path)))
+            f"{form}/".startswith(self._starts) for form in (str(path), os.path.realpath(str(path)))
         )
 
 
@@ -290,10 +295,10 @@ def taken_from(store: Store, taken: Mapping[str, Path]) -> StoredResults:
     bands = (
         f"bands/{name[:2]}/{name}" for key in loaded for name in metadata.bands(asked[key] or {})
     )
-    used = sorted({*paths.values(), *bands})
-    if outside := [path for path in used if not _FILE.fullmatch(path)]:
+    read_files = sorted({*paths.values(), *bands})
+    if outside := [path for path in read_files if not _FILE.fullmatch(path)]:
         raise Unsettled(f"{outside[0]} is not in the folders of a store")
-    files = {path: _digest_of_results(f"{store.disk.folder}/{path}") for path in used}
+    files = {path: _digest_of_results(f"{store.disk.folder}/{path}") for path in read_files}
     results = {key: _said(about) for key, about in sorted(asked.items())}
     return StoredResults(results, tuple(loaded), files, paths)
 
@@ -304,10 +309,10 @@ def still_there(disk: Disk, then: StoredResults) -> bool:
     """
     small = SmallResults(disk)
     try:
-        found = {key: _about(disk, small, key) for key in then.results}
+        abouts = {key: _about(disk, small, key) for key in then.results}
         return (
-            all(_said(found[key]) == digest for key, digest in then.results.items())
-            and all(_is_whole(disk, found[key]) for key in then.loaded)
+            all(_said(abouts[key]) == digest for key, digest in then.results.items())
+            and all(_is_whole(disk, abouts[key]) for key in then.loaded)
             and all(
                 _digest_of_results(f"{disk.folder}/{path}") == digest
                 for path, digest in then.files.items()
@@ -328,23 +333,25 @@ def checked(fields: Mapping[str, Any]) -> StoredResults:
 
     Raises `ValueError` or `TypeError` for what `taken_from` never gives.
     """
-    found = StoredResults(**{**fields, "loaded": tuple(fields.get("loaded", ()))})
-    if not all(isinstance(each, dict) for each in (found.results, found.files, found.taken)):
+    results = StoredResults(**{**fields, "loaded": tuple(fields.get("loaded", ()))})
+    if not all(
+        isinstance(field, dict) for field in (results.results, results.files, results.taken)
+    ):
         raise ValueError("a field of the answer is not of its type")
     names = [
-        (_KEY, [*found.results, *found.loaded]),
-        (_FILE, [*found.files, *found.taken.values()]),
+        (_KEY, [*results.results, *results.loaded]),
+        (_FILE, [*results.files, *results.taken.values()]),
     ]
     if any(not form.fullmatch(name) for form, many in names for name in many):
         raise ValueError("the answer names what is no result and no file of a cache")
-    digests = [*found.results.values(), *found.files.values()]
-    if not all(isinstance(text, str) for text in digests) or not {*found.taken.values()} <= {
-        *found.files
+    digests = [*results.results.values(), *results.files.values()]
+    if not all(isinstance(text, str) for text in digests) or not {*results.taken.values()} <= {
+        *results.files
     }:
         raise ValueError("a field of the answer is not of its type")
-    if not {*found.loaded} <= {*found.results}:
+    if not {*results.loaded} <= {*results.results}:
         raise ValueError("a result was loaded and is not named")
-    return found
+    return results
 
 
 def _about(disk: Disk, small: SmallResults, key: str) -> Metadata | None:
@@ -370,8 +377,8 @@ def _is_whole(disk: Disk, about: Metadata | None) -> bool:
     payload = about.get("payload")
     if not payload:
         return True
-    how, name = (hashlib.sha256, "sha256") if secrets() else (xxhash.xxh3_128, "xxh3")
-    return bool(_digest_by(disk.path(about["key"], "safetensors"), how) == payload.get(name))
+    algorithm, name = (hashlib.sha256, "sha256") if secrets() else (xxhash.xxh3_128, "xxh3")
+    return bool(_digest_by(disk.path(about["key"], "safetensors"), algorithm) == payload.get(name))
 
 
 def _digest_of_results(path: str) -> str:
@@ -379,8 +386,8 @@ def _digest_of_results(path: str) -> str:
     return _digest_by(path, hashlib.sha256 if secrets() else xxhash.xxh3_128)
 
 
-def _digest_by(path: str, how: Any) -> str:
+def _digest_by(path: str, algorithm: Any) -> str:
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise Unsettled(f"{path} is not a file")
-        return hashlib.file_digest(file, how).hexdigest()
+        return hashlib.file_digest(file, algorithm).hexdigest()

@@ -38,7 +38,7 @@ COUNTED = "clipped or coarse: numbers counted one by one; variance at most as dr
 def transfer(
     measured: FloatArray,
     predicted: FloatArray,
-    whole: NDArray[np.bool_],
+    unclipped: NDArray[np.bool_],
     other: str,
     means: FloatArray | None = None,
 ) -> Any:
@@ -46,16 +46,16 @@ def transfer(
     prediction.
 
     ``measured`` (2, level) has mean and variance, and ``predicted`` (2, draw, level) mean and
-    variance of a repeated measurement. ``whole`` (level,) is False for levels without a prediction,
-    which the label ``other`` describes. ``means`` (level,) are the deviations of the means from the
-    light in standard deviations, if the light is uncertain.
+    variance of a repeated measurement. ``unclipped`` (level,) is False for levels without a
+    prediction, which the label ``other`` describes. ``means`` (level,) are the deviations of the
+    means from the light in standard deviations, if the light is uncertain.
     """
     rows = 2 if means is None else 3
     figure, axes = canvas(
         9.0, 4.8 + 1.2 * rows, rows, 1, sharex=True, height_ratios=(2.2, *(rows - 1) * (1.0,))
     )
     above = axes[0, 0]
-    order = np.flatnonzero(whole)[np.argsort(predicted[0].mean(0)[whole])]
+    order = np.flatnonzero(unclipped)[np.argsort(predicted[0].mean(0)[unclipped])]
     mean, (low, middle, high) = (
         predicted[0].mean(0)[order],
         np.percentile(predicted[1], _BAND, axis=0)[:, order],
@@ -64,35 +64,41 @@ def transfer(
         mean, low, high, color=BLUE, alpha=0.25, linewidth=0, label="predicted, 90 %"
     )
     above.plot(mean, middle, color=BLUE, linewidth=1.2, label="predicted, median")
-    lowest = max(_LEAST, 0.5 * float(min([*measured[1, whole], *middle], default=_LEAST)))
-    for at, style in (
-        (whole, {"marker": "o", "color": BLACK, "label": "measured"}),
-        (~whole, {**_CLIPPED, "label": other}),
+    lowest = max(_LEAST, 0.5 * float(min([*measured[1, unclipped], *middle], default=_LEAST)))
+    for shown, style in (
+        (unclipped, {"marker": "o", "color": BLACK, "label": "measured"}),
+        (~unclipped, {**_CLIPPED, "label": other}),
     ):
-        if at.any():
+        if shown.any():
             above.plot(
-                measured[0, at], measured[1, at].clip(lowest), linestyle="", markersize=5, **style
+                measured[0, shown],
+                measured[1, shown].clip(lowest),
+                linestyle="",
+                markersize=5,
+                **style,
             )
     above.set(
         xscale="log", yscale="log", ylabel="temporal variance (DN²)", title="Photon-transfer curve"
     )
     above.set_ylim(bottom=lowest / 2)  # a clipped level does not stretch the axis
     above.legend(loc="upper left")
-    distance = (measured[1, whole] - predicted[1].mean(0)[whole]) / predicted[1].std(0)[whole]
-    _distances(axes[1, 0], measured[0, whole], distance, "variance: distance\nin sd")
+    distance = (measured[1, unclipped] - predicted[1].mean(0)[unclipped]) / predicted[1].std(0)[
+        unclipped
+    ]
+    _distances(axes[1, 0], measured[0, unclipped], distance, "variance: distance\nin sd")
     if means is not None:
-        _distances(axes[2, 0], measured[0, whole], means[whole], "mean: distance\nin sd")
+        _distances(axes[2, 0], measured[0, unclipped], means[unclipped], "mean: distance\nin sd")
     axes[-1, 0].set_xlabel("mean (DN)")
     return figure
 
 
-def _distances(ax: Any, at: FloatArray, distance: FloatArray, label: str) -> None:
+def _distances(ax: Any, places: FloatArray, distance: FloatArray, label: str) -> None:
     """Draw distances from a prediction in standard deviations, over a band of two standard
     deviations.
     """
     ax.axhspan(-2, 2, color=BLUE, alpha=0.12, linewidth=0)
     ax.axhline(0, color=BLUE, linewidth=1.0)
-    ax.plot(at, distance, "o", color=BLACK, markersize=5)
+    ax.plot(places, distance, "o", color=BLACK, markersize=5)
     reach = max(3.5, 1.1 * float(np.abs(distance).max(initial=0.0)))
     ax.set(ylabel=label, ylim=(-reach, reach))
 
@@ -118,8 +124,10 @@ def rings(
         radius, low, high, color=BLUE, alpha=0.25, linewidth=0, label="predicted, 90 %"
     )
     above.plot(radius, middle, color=BLUE, linewidth=1.2, label="predicted, median")
-    seen = measured > 0
-    above.plot(radius[seen], measured[seen], "o", color=BLACK, markersize=4, label="measured")
+    positive = measured > 0
+    above.plot(
+        radius[positive], measured[positive], "o", color=BLACK, markersize=4, label="measured"
+    )
     if len(cut):
         ends = float(cut.min()) - 0.5, float(cut.max()) + 0.5  # a ring is one pixel wide
         above.axvspan(*ends, color=VERMILION, alpha=0.3, linewidth=0, label="cut off")
@@ -243,8 +251,8 @@ def _heights(counts: FloatArray) -> FloatArray:
     different.
     """
     rising = np.sort(counts.ravel())[::-1]
-    at = np.searchsorted(np.cumsum(rising), _LEVELS * rising.sum())
-    heights = np.unique(rising[at.clip(max=len(rising) - 1)])
+    index = np.searchsorted(np.cumsum(rising), _LEVELS * rising.sum())
+    heights = np.unique(rising[index.clip(max=len(rising) - 1)])
     inside: FloatArray = heights[(heights > 0) & (heights < rising[0])]
     return inside
 
@@ -318,13 +326,15 @@ def curve_section(result: CalibrationResult) -> Section:
         return _rings(result, result.problem.levels)
     levels: Any = result.problem.levels
     mean, variance, away = _repeated(result)
-    whole: NDArray[np.bool_] = np.asarray((variance > 0).all(0))
-    whole[levels.cell_level.numpy()] = False
+    unclipped: NDArray[np.bool_] = np.asarray((variance > 0).all(0))
+    unclipped[levels.cell_level.numpy()] = False
     text, label = _COUNTED, COUNTED
     if is_camera(result.problem):
         share = f"{result.params['share']:.0%} of saturation"
         text, label = _EXCLUDED.format(share=share), f"not used: above {share}, or clipped"
-    picture = transfer(np.stack(_moments(levels)), np.stack([mean, variance]), whole, label, away)
+    picture = transfer(
+        np.stack(_moments(levels)), np.stack([mean, variance]), unclipped, label, away
+    )
     return Section("Photon-transfer curve", text, picture=picture)
 
 
@@ -369,8 +379,8 @@ def ring_radii(rings: Rings) -> tuple[FloatArray, FloatArray]:
     """Return the root mean square radius of each averaged ring, and of each ring that is cut
     off, in pixels.
     """
-    at, count = rings.ring.numpy(), rings.weight.numpy()
-    square = np.bincount(at, count * rings.square.numpy()) / np.bincount(at, count)
+    ring, count = rings.ring.numpy(), rings.weight.numpy()
+    square = np.bincount(ring, count * rings.square.numpy()) / np.bincount(ring, count)
     return np.sqrt(square), np.sqrt(rings.cut_square.numpy())
 
 
@@ -380,9 +390,9 @@ def _moments(levels: Sufficient | Levels) -> tuple[FloatArray, FloatArray]:
     """
     if isinstance(levels, Levels):
         return levels.mean.numpy(), levels.variance.numpy()
-    at, value, count = (x.numpy() for x in levels[-3:])
+    level, value, count = (x.numpy() for x in levels[-3:])
     total, mean, variance = (x.numpy() for x in (levels.pixels, levels.mean, levels.variance))
-    sums = [np.bincount(at, count * value**n, minlength=len(total)) for n in range(3)]
+    sums = [np.bincount(level, count * value**n, minlength=len(total)) for n in range(3)]
     every = total + sums[0]
     middle = (total * mean + sums[1]) / every
     square = total * (variance + mean**2) + sums[2]
@@ -392,12 +402,12 @@ def _moments(levels: Sufficient | Levels) -> tuple[FloatArray, FloatArray]:
 def corner_section(result: CalibrationResult) -> Section:
     """Return the section with the distribution of every pair of parameters."""
     every = max(1, result.chains.flat.shape[0] // _CORNER)
-    told = [r for r in result.rows() if r.kind != "none"]
-    shown = np.stack([result.draws[r.name].reshape(-1)[::every] for r in told], -1)
+    determined = [r for r in result.rows() if r.kind != "none"]
+    shown = np.stack([result.draws[r.name].reshape(-1)[::every] for r in determined], -1)
     text = """Every pair of parameters of which the frames tell a value or a limit; the recipe's own
         values are orange. Gain, offset, noise and efficiency correlate."""
     picture = corners(
-        shown, [f"{words(r.name)}\n{r.unit}" for r in told], [r.nominal for r in told]
+        shown, [f"{words(r.name)}\n{r.unit}" for r in determined], [r.nominal for r in determined]
     )
     return Section("Parameters in pairs", text, picture=picture)
 

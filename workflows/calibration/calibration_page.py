@@ -94,13 +94,13 @@ def comparisons(
     return [_compared(row, fit, own) for row in rows]
 
 
-def agreement(found: Sequence[Comparison]) -> list[Check]:
+def agreement(comparisons: Sequence[Comparison]) -> list[Check]:
     """Return if posterior and least squares agree, as a check that refuses the posterior; none
     without a comparison.
     """
-    if not found:
+    if not comparisons:
         return []
-    worst = max(found, key=lambda one: abs(one.apart))
+    worst = max(comparisons, key=lambda comparison: abs(comparison.apart))
     label = QUANTITIES[worst.name][1]
     text = (
         f"{label}: least squares {worst.value:.5g}, by the posterior {worst.predicted:.5g},"
@@ -121,7 +121,7 @@ def agreement(found: Sequence[Comparison]) -> list[Check]:
 
 
 def least_squares_section(
-    measured: Levels, estimates: Sequence[ParameterEstimate], found: Sequence[Comparison]
+    measured: Levels, estimates: Sequence[ParameterEstimate], comparisons: Sequence[Comparison]
 ) -> Section:
     """Return the comparison of the standard's least squares with the posterior, or the reason why
     there is none.
@@ -135,7 +135,7 @@ def least_squares_section(
         return Section(
             heading, "The frames determine none of the quantities that the standard fits."
         )
-    if not found:
+    if not comparisons:
         return Section(heading, f"The standard's fit is not possible: {_reason(measured)}.")
     columns = (
         "quantity",
@@ -146,15 +146,21 @@ def least_squares_section(
         "difference / sd",
     )
     return Section(
-        heading, _TEXT, columns, [_row(rows[comparison.name], comparison) for comparison in found]
+        heading,
+        _TEXT,
+        columns,
+        [_row(rows[comparison.name], comparison) for comparison in comparisons],
     )
 
 
-def compared(found: Sequence[Comparison]) -> Mapping[str, Mapping[str, float]]:
+def compared(comparisons: Sequence[Comparison]) -> Mapping[str, Mapping[str, float]]:
     """Return value and standard error of the standard's fit for each parameter that the section
     compares.
     """
-    return {one.name: {"value": one.value, "error": one.error} for one in found}
+    return {
+        comparison.name: {"value": comparison.value, "error": comparison.error}
+        for comparison in comparisons
+    }
 
 
 def _own_fit(
@@ -185,9 +191,19 @@ def _reason(measured: Levels) -> str:
     return "it gives no value"
 
 
-def _row(row: ParameterEstimate, one: Comparison) -> tuple[str, str, str, str, str, float]:
-    value, posterior = with_uncertainty(one.value, one.error), with_uncertainty(row.mean, row.sd)
-    return QUANTITIES[row.name][1], value, f"{one.predicted:.5g}", posterior, row.unit, one.apart
+def _row(row: ParameterEstimate, comparison: Comparison) -> tuple[str, str, str, str, str, float]:
+    value, posterior = (
+        with_uncertainty(comparison.value, comparison.error),
+        with_uncertainty(row.mean, row.sd),
+    )
+    return (
+        QUANTITIES[row.name][1],
+        value,
+        f"{comparison.predicted:.5g}",
+        posterior,
+        row.unit,
+        comparison.apart,
+    )
 
 
 def _value(fit: LeastSquares, name: str) -> tuple[float, float]:
@@ -383,9 +399,9 @@ def sections(result: CalibrationResult) -> list[Section]:
     parts = (_checks, *frames, _not_determined, curve_section, corner_section, chains_section)
     budget = budget_sections(result.budgets, stated(result.problem.recipe), result.budget_picture)
     return [
-        *(part(result) for part in (_parameters, *standard, *models)),
+        *(section(result) for section in (_parameters, *standard, *models)),
         *budget,
-        *(part(result) for part in parts),
+        *(section(result) for section in parts),
     ]
 
 

@@ -77,12 +77,12 @@ class CameraDensity:
         ``own`` over that there.
         """
         widths = np.concatenate([own[:, self.others.at], self.widths.draw(len(own), rng)])
-        law, here, there = self.others.law(widths), slice(None, len(own)), slice(len(own), None)
-        drawn = self.others.draw(widths[there], tuple(part[there] for part in law), rng)
+        law, here, added = self.others.law(widths), slice(None, len(own)), slice(len(own), None)
+        drawn = self.others.draw(widths[added], tuple(array[added] for array in law), rng)
         log = self.widths.log_density(widths) + self.others.log_density(
             np.concatenate([own, drawn]), law
         )
-        return drawn, log[here] - log[there]
+        return drawn, log[here] - log[added]
 
 
 # --- given widths ---------------------------------------------------------------------------------
@@ -256,21 +256,21 @@ class NearZero:
         other) of their precision. All are in units of the prior.
         """
         slope, precision = self._others.information(widths)
-        own, rest = self._own, ~self._own
+        own, others = self._own, ~self._own
         # the prior of the parameter is that of its logarithm and joins on the grid
         slope_own, own_own = (
             slope[:, own][:, 0] + self._middle,
             precision[:, own][:, :, own][:, 0, 0] - 1,
         )
         across, root = (
-            precision[:, rest][:, :, own],
-            np.linalg.cholesky(precision[:, rest][:, :, rest]),
+            precision[:, others][:, :, own],
+            np.linalg.cholesky(precision[:, others][:, :, others]),
         )
-        both = np.concatenate([slope[:, rest][..., None], across], -1)
-        whole = np.linalg.solve(root, both)
-        steps, pull = np.moveaxis(np.linalg.solve(np.swapaxes(root, 1, 2), whole), -1, 0)
-        curve = (own_own - (whole[..., 1] ** 2).sum(1)).clip(0)
-        tilt = slope_own - (whole[..., 0] * whole[..., 1]).sum(1)
+        both = np.concatenate([slope[:, others][..., None], across], -1)
+        solved = np.linalg.solve(root, both)
+        steps, pull = np.moveaxis(np.linalg.solve(np.swapaxes(root, 1, 2), solved), -1, 0)
+        curve = (own_own - (solved[..., 1] ** 2).sum(1)).clip(0)
+        tilt = slope_own - (solved[..., 0] * solved[..., 1]).sum(1)
         log = tilt[:, None] * self._value - 0.5 * curve[:, None] * self._value**2 + self._prior
         log -= log.max(1, keepdims=True)
         density = (1 - _SAFE) * self._normalised(np.exp(log)) + _SAFE * self._normalised(
@@ -400,22 +400,22 @@ def hardly_told(problem: SensorPosterior, mode: LaplaceFit, doubt: float = _DOUB
     """
     spread = np.sqrt(np.diagonal(mode.covariance))
     other = problem.coordinates.linear | problem.coordinates.widths
-    found = [i for i, name in enumerate(problem.names) if name not in other and spread[i] > doubt]
-    return sorted(found, key=lambda i: -spread[i])
+    numbers = [i for i, name in enumerate(problem.names) if name not in other and spread[i] > doubt]
+    return sorted(numbers, key=lambda i: -spread[i])
 
 
-def with_tails(body: Density, found: Sequence[int], mode: LaplaceFit) -> Density:
-    """Return a density with a part for the tail of each parameter in ``found``, or ``body`` without
-    one.
+def with_tails(body: Density, numbers: Sequence[int], mode: LaplaceFit) -> Density:
+    """Return a density with a part for the tail of each parameter in ``numbers``, or ``body``
+    without one.
 
     In such a part all other parameters lie where a line through the mode leads them, with the
     deviations that they have for a known value, because the levels depend on the parameter itself
     and not on its logarithm.
     """
-    if not found:
+    if not numbers:
         return body
-    centres, roots = zip(*(_tail(mode.theta, mode.covariance, i) for i in found), strict=True)
-    shares = np.full(len(found), 1 / len(found))
+    centres, roots = zip(*(_tail(mode.theta, mode.covariance, i) for i in numbers), strict=True)
+    shares = np.full(len(numbers), 1 / len(numbers))
     return TailDensity(body, Mixture(shares, np.stack(centres), np.stack(roots), _TAIL_SHARE))
 
 
@@ -423,18 +423,20 @@ def with_prior_tails(
     body: Mixture,
     problem: SensorPosterior,
     mode: LaplaceFit,
-    at: NDArray[np.bool_],
-    known: tuple[FloatArray, ...],
+    is_width: NDArray[np.bool_],
+    weighted: tuple[FloatArray, ...],
 ) -> Mixture:
-    """Return a density of the widths ``at`` (free,) with a part for each width, in which this width
-    has its prior.
+    """Return a density of the parameters ``is_width`` (free,) with a part for each width, in which
+    this width has its prior.
 
     Below some width the levels see none, and the prior alone decides. All other widths lie as in
-    ``body``. The shares of the parts follow from ``known``: samples (draw, width) of the posterior
-    and their weights (draw,).
+    ``body``. The shares of the parts follow from ``weighted``: samples (draw, width) of the
+    posterior and their weights (draw,).
     """
     middle = problem.whitened(mode.theta[None])[0]
-    units = (1 / (problem.whitened(mode.theta + np.eye(len(mode.theta))) - middle).diagonal())[at]
+    units = (1 / (problem.whitened(mode.theta + np.eye(len(mode.theta))) - middle).diagonal())[
+        is_width
+    ]
     mean = body.shares @ body.centres
     away = body.centres - mean
     covariance = np.einsum("k,kij,klj->il", body.shares, body.roots, body.roots) + away.T @ (
@@ -442,13 +444,13 @@ def with_prior_tails(
     )
     centres, roots = np.repeat(mean[None], len(mean), 0), []
     for i, unit in enumerate(units):
-        centres[i, i] = mode.theta[at][i] - middle[at][i] * unit
+        centres[i, i] = mode.theta[is_width][i] - middle[is_width][i] * unit
         roots.append(_root(_given(covariance, i), i, unit))
     parts = [
         Mixture(np.ones(1), centre[None], root[None], _TAIL_SHARE)
         for centre, root in zip(centres, roots, strict=True)
     ]
-    first, *shares = _shares([body, *parts], *known)
+    first, *shares = _shares([body, *parts], *weighted)
     tails = np.broadcast_to(body.tails, body.shares.shape)
     return Mixture(
         np.concatenate([first * body.shares, shares]),
@@ -462,11 +464,11 @@ def _shares(parts: Sequence[Mixture], samples: FloatArray, weight: FloatArray) -
     """Return the share of each part with which a density is most like weighted samples; no part
     has less than a few.
     """
-    logs = np.stack([part.log_density(samples) for part in parts], -1)
+    logs = np.stack([mixture.log_density(samples) for mixture in parts], -1)
     shares = np.full(len(parts), 1 / len(parts))
     for _ in range(_STEPS):
-        each = logs + np.log(shares)
-        shares = np.maximum(weight @ np.exp(each - log_sum(each)[:, None]), _LEAST)
+        joint = logs + np.log(shares)
+        shares = np.maximum(weight @ np.exp(joint - log_sum(joint)[:, None]), _LEAST)
         shares /= shares.sum()
     return shares
 
@@ -480,14 +482,16 @@ def _tail(theta: FloatArray, covariance: FloatArray, i: int) -> tuple[FloatArray
 
 def _given(covariance: FloatArray, i: int) -> FloatArray:
     """Return the covariance of all others for a known value of ``i``."""
-    given: FloatArray = covariance - np.outer(covariance[:, i], covariance[i]) / covariance[i, i]
-    return given
+    conditional: FloatArray = (
+        covariance - np.outer(covariance[:, i], covariance[i]) / covariance[i, i]
+    )
+    return conditional
 
 
-def _root(given: FloatArray, i: int, spread: float) -> FloatArray:
-    """Return the root of a covariance ``given`` the value of ``i``, to which ``i`` joins with
+def _root(covariance: FloatArray, i: int, spread: float) -> FloatArray:
+    """Return the root of a ``covariance`` given the value of ``i``, to which ``i`` joins with
     its own ``spread``.
     """
-    given[i], given[:, i] = 0.0, 0.0
-    given[i, i] = spread**2
-    return np.linalg.cholesky(firm(given)).astype(np.float64)
+    covariance[i], covariance[:, i] = 0.0, 0.0
+    covariance[i, i] = spread**2
+    return np.linalg.cholesky(firm(covariance)).astype(np.float64)

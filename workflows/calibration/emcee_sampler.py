@@ -78,22 +78,25 @@ class Walk:
             self.random.shuffle(self._part)
         self._accepted = np.zeros(len(self._part), dtype=bool)
 
-    def propose(self, part: int) -> FloatArray:
+    def propose(self, split: int) -> FloatArray:
         """Return the proposed coordinates (walker, free parameter) for one part of the walkers."""
         sets = [self._state.coords[self._part == other] for other in range(self.move.nsplits)]
-        others = sets[:part] + sets[part + 1 :]
-        self._proposed, self._factors = self.move.get_proposal(sets[part], others, self.random)
+        others = sets[:split] + sets[split + 1 :]
+        self._proposed, self._factors = self.move.get_proposal(sets[split], others, self.random)
         proposed: FloatArray = self._proposed
         return proposed
 
-    def decide(self, part: int, log: FloatArray) -> None:
+    def decide(self, split: int, log: FloatArray) -> None:
         """Accept or reject the proposed coordinates of one part of the walkers."""
-        own = np.flatnonzero(self._part == part)
+        own = np.flatnonzero(self._part == split)
         gain = self._factors + log - self._state.log_prob[own]
         accepted = gain > np.log(self.random.rand(len(own)))
-        at = own[accepted]
-        self._state.coords[at], self._state.log_prob[at] = self._proposed[accepted], log[accepted]
-        self._accepted[at] = True
+        moved = own[accepted]
+        self._state.coords[moved], self._state.log_prob[moved] = (
+            self._proposed[accepted],
+            log[accepted],
+        )
+        self._accepted[moved] = True
 
     def end_step(self) -> None:
         """Add the walkers' coordinates after this step to the draws."""
@@ -122,10 +125,10 @@ def _together(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
     for _ in range(steps):
         for walk in walks:
             walk.begin_step()
-        for part in range(walks[0].move.nsplits):
-            log = weigh(np.concatenate([walk.propose(part) for walk in walks]))
+        for split in range(walks[0].move.nsplits):
+            log = weigh(np.concatenate([walk.propose(split) for walk in walks]))
             for walk, own in zip(walks, np.split(log, len(walks)), strict=True):
-                walk.decide(part, own)
+                walk.decide(split, own)
         for walk in walks:
             walk.end_step()
     for walk in walks:
@@ -231,37 +234,35 @@ def sample(
     *,
     seed: int,
     walkers: int = 64,
-    how: str = "de",
-    wanted: int = 1000,
+    move_name: str = "de",
+    effective_size: int = 1000,
     progress: Progress = silent,
     guide: Guide | None = None,
 ) -> Chains:
     """Sample until each chain is 50 autocorrelation times long and the effective sample size is at
-    least ``wanted``.
+    least ``effective_size``.
 
     ``file`` keeps the draws; if the file exists, the chains continue from its last step. With a
     ``guide`` the walkers start at its samples, and most of their proposals are from its density.
     """
-    moves = GuidedMove(move(how), guide.density) if guide else move(how)
+    moves = GuidedMove(move(move_name), guide.density) if guide else move(move_name)
     runs = [
         start_ensemble(problem, mode, file, index, seed, walkers, moves, guide)
         for index in range(ENSEMBLES)
     ]
     before, steps = _round(min(run.iteration for run in runs))
-    tau_before, kept = _longest_time(runs, before) if before else np.inf, True
+    tau_before, stored = _longest_time(runs, before) if before else np.inf, True
     while True:
         walk_until(runs, steps, problem.log_posterior)
-        kept = _keep(file, [run.backend for run in runs], progress if kept else silent)
+        stored = _keep(file, [run.backend for run in runs], progress if stored else silent)
         tau = _longest_time(runs)
-        change = abs(tau - tau_before) / tau
-        long = steps >= (_TAUS + _BURN) * tau and (
-            change < _CHANGE or steps >= (_SURELY + _BURN) * tau
-        )
-        chains = _gathered(runs, tau, steps, long)
+        chains = _gathered(runs, tau, steps, _are_long(steps, tau, tau_before))
         size = chains.flat.shape[0] / tau
-        ends = (long and size >= wanted) or steps >= _LONGEST
+        ends = _are_enough(chains, size, effective_size)
         needed = (
-            steps if ends else max(int(_GROWTH * steps), _steps_needed(steps, tau, size, wanted))
+            steps
+            if ends
+            else max(int(_GROWTH * steps), _steps_needed(steps, tau, size, effective_size))
         )
         where = f"{steps} of about {needed} steps of {ENSEMBLES} x {walkers} walkers"
         progress(f"{where}: tau {tau:.1f}, effective sample size {size:.0f}")
@@ -270,11 +271,22 @@ def sample(
         tau_before, steps = tau, int(_GROWTH * steps)
 
 
-def _steps_needed(steps: int, tau: float, size: float, wanted: int) -> int:
+def _are_long(steps: int, tau: float, tau_before: float) -> bool:
+    """Return True if the chains are many autocorrelation times long, and this time is settled."""
+    change = abs(tau - tau_before) / tau
+    return steps >= (_TAUS + _BURN) * tau and (change < _CHANGE or steps >= (_SURELY + _BURN) * tau)
+
+
+def _are_enough(chains: Chains, size: float, effective_size: int) -> bool:
+    """Return True if the sampling ends: chains are long and draws many, or nothing helps."""
+    return (chains.long and size >= effective_size) or chains.steps >= _LONGEST
+
+
+def _steps_needed(steps: int, tau: float, size: float, effective_size: int) -> int:
     """Return how many steps the chains need in all, if autocorrelation time and rate of draws
     stay as they are.
     """
-    return min(int(max((_TAUS + _BURN) * tau, steps * wanted / max(size, 1.0))), _LONGEST)
+    return min(int(max((_TAUS + _BURN) * tau, steps * effective_size / max(size, 1.0))), _LONGEST)
 
 
 def _longest_time(runs: Sequence[Walk], steps: int | None = None) -> float:
@@ -381,14 +393,14 @@ def _read(file: Path, index: int) -> Any:
 
 
 def _unpacked(file: Path, index: int) -> Any:
-    kept = emcee.backends.HDFBackend(str(file), name=f"ensemble{index}", read_only=True)
+    stored = emcee.backends.HDFBackend(str(file), name=f"ensemble{index}", read_only=True)
     memory = emcee.backends.Backend()
-    with kept.open() as opened:
-        hdf5_needs(file, [opened[kept.name]])
-    memory.reset(*kept.shape)
-    memory.chain, memory.log_prob = kept.get_chain(), kept.get_log_prob()
-    memory.accepted, memory.iteration = kept.accepted, kept.iteration
-    memory.random_state = kept.random_state
+    with stored.open() as opened:
+        hdf5_needs(file, [opened[stored.name]])
+    memory.reset(*stored.shape)
+    memory.chain, memory.log_prob = stored.get_chain(), stored.get_log_prob()
+    memory.accepted, memory.iteration = stored.accepted, stored.iteration
+    memory.random_state = stored.random_state
     np.random.RandomState().set_state(memory.random_state)
     return memory
 
@@ -426,19 +438,19 @@ def _write(file: Path, backends: Sequence[Any]) -> None:
     close its file.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_suffix(f".{os.getpid()}.part")
+    temporary = file.with_suffix(f".{os.getpid()}.part")
     try:
         with TemporaryDirectory(prefix="neusee-") as folder:
-            whole = Path(folder) / "draws.h5"
-            _write_draws(whole, backends)
-            content = whole.read_bytes()[_SEAL:]
-        with open(part, "wb") as written:
+            draws_file = Path(folder) / "draws.h5"
+            _write_draws(draws_file, backends)
+            content = draws_file.read_bytes()[_SEAL:]
+        with open(temporary, "wb") as written:
             written.write(seal_file("draws", file.stem, content).ljust(_SEAL, b"\0") + content)
             written.flush()
             os.fsync(written.fileno())
-        os.replace(part, file)
+        os.replace(temporary, file)
     finally:
-        part.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def _write_draws(path: Path, backends: Sequence[Any]) -> None:
@@ -448,11 +460,11 @@ def _write_draws(path: Path, backends: Sequence[Any]) -> None:
     with h5py.File(path, "w", userblock_size=_SEAL):
         pass
     for index, memory in enumerate(backends):
-        kept = emcee.backends.HDFBackend(str(path), name=f"ensemble{index}")
-        kept.reset(*memory.shape)
-        kept.grow(memory.iteration, None)
-        with kept.open("a") as opened:
-            group = opened[kept.name]
+        backend = emcee.backends.HDFBackend(str(path), name=f"ensemble{index}")
+        backend.reset(*memory.shape)
+        backend.grow(memory.iteration, None)
+        with backend.open("a") as opened:
+            group = opened[backend.name]
             group["chain"][...], group["log_prob"][...] = memory.chain, memory.log_prob
             group["accepted"][...] = memory.accepted
             group.attrs["iteration"] = memory.iteration

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -39,15 +40,15 @@ def photon_transfer(sheet: EmvaSheet) -> Any:
     and saturation.
     """
     figure, axes = canvas(_WIDTH, _HEIGHT)
-    ax, found, k = axes[0, 0], sheet.transfer, sheet["K"].value
-    ax.plot(found.signal, found.excess, label="measured", **_DOTS)
-    limit = 0.7 * float(found.signal[found.saturation])
+    ax, transfer, k = axes[0, 0], sheet.transfer, sheet["K"].value
+    ax.plot(transfer.signal, transfer.excess, label="measured", **_DOTS)
+    limit = 0.7 * float(transfer.signal[transfer.saturation])
     if k is not None:
         ax.plot([0, limit], [0, k * limit], color=BLUE, label=f"0 to 70 %: K = {k:.4g} DN/e-")
         ax.plot([limit, limit / 0.7], [k * limit, k * limit / 0.7], color=BLUE, linestyle=":")
-    _saturation(ax, sheet, float(found.signal[found.saturation]))
+    _saturation(ax, sheet, float(transfer.signal[transfer.saturation]))
     ax.set(xlabel="μ_y - μ_y.dark (DN)", ylabel="σ²_y - σ²_y.dark (DN²)", title="Photon transfer")
-    ax.set_ylim(bottom=min(0.0, 1.1 * float(found.excess.min())))
+    ax.set_ylim(bottom=min(0.0, 1.1 * float(transfer.excess.min())))
     ax.legend(loc="upper left")
     return figure
 
@@ -55,14 +56,14 @@ def photon_transfer(sheet: EmvaSheet) -> Any:
 def sensitivity(sheet: EmvaSheet) -> Any:
     """Draw the signal above the dark over the photons, with the line of the responsivity."""
     figure, axes = canvas(_WIDTH, _HEIGHT)
-    ax, found, slope = axes[0, 0], sheet.transfer, sheet["R"].value
-    ax.plot(found.photons, found.signal, label="measured", **_DOTS)
+    ax, transfer, slope = axes[0, 0], sheet.transfer, sheet["R"].value
+    ax.plot(transfer.photons, transfer.signal, label="measured", **_DOTS)
     if slope is not None:
-        end = 0.7 * float(found.signal[found.saturation]) / slope
+        end = 0.7 * float(transfer.signal[transfer.saturation]) / slope
         ax.plot(
             [0, end], [0, slope * end], color=BLUE, label=f"0 to 70 %: R = {slope:.4g} DN/photon"
         )
-    _saturation(ax, sheet, float(found.photons[found.saturation]))
+    _saturation(ax, sheet, float(transfer.photons[transfer.saturation]))
     ax.set(xlabel=_light(sheet), ylabel="μ_y - μ_y.dark (DN)", title="Sensitivity")
     ax.legend(loc="upper left")
     return figure
@@ -73,39 +74,41 @@ def signal_to_noise(sheet: EmvaSheet) -> Any:
     and ideal.
     """
     figure, axes = canvas(_WIDTH, _HEIGHT)
-    ax, found = axes[0, 0], sheet.transfer
-    seen = (
-        (found.signal > 0)
-        & (found.variance > 0)
-        & (np.arange(len(found.signal)) <= found.saturation)
+    ax, transfer = axes[0, 0], sheet.transfer
+    shown = (
+        (transfer.signal > 0)
+        & (transfer.variance > 0)
+        & (np.arange(len(transfer.signal)) <= transfer.saturation)
     )
     ax.plot(
-        found.photons[seen],
-        found.signal[seen] / np.sqrt(found.variance[seen]),
+        transfer.photons[shown],
+        transfer.signal[shown] / np.sqrt(transfer.variance[shown]),
         label="measured",
         **_DOTS,
     )
-    eta, k, least, most = (sheet[key].value for key in ("eta", "K", "mu_p_min", "mu_p_sat"))
-    if eta is not None and k is not None and least is not None and most is not None:
-        light = np.geomspace(least, most, _BINS)
+    eta, k, threshold, saturation = (
+        sheet[key].value for key in ("eta", "K", "mu_p_min", "mu_p_sat")
+    )
+    if eta is not None and k is not None and threshold is not None and saturation is not None:
+        light = np.geomspace(threshold, saturation, _BINS)
         electrons = eta / 100 * light
         noise = (sheet["sigma_y_dark"].value or 0.0) ** 2 / k**2 + electrons
         ax.plot(light, electrons / np.sqrt(noise), color=BLUE, label="linear model")
         ax.plot(light, np.sqrt(light), color=GREEN, linestyle="-.", label="ideal sensor")
         dsnu, prnu = sheet["DSNU1288"].value, sheet["PRNU1288"].value
         if dsnu is not None and prnu is not None:
-            whole = noise + dsnu**2 + (prnu / 100 * electrons) ** 2
+            total = noise + dsnu**2 + (prnu / 100 * electrons) ** 2
             ax.plot(
                 light,
-                electrons / np.sqrt(whole),
+                electrons / np.sqrt(total),
                 color=ORANGE,
                 linestyle="--",
                 label="total SNR, with DSNU and PRNU",
             )
         ax.axvline(
-            least, color=VERMILION, linestyle=":", label=f"μ_p.min: {sheet['mu_p_min'].text}"
+            threshold, color=VERMILION, linestyle=":", label=f"μ_p.min: {sheet['mu_p_min'].text}"
         )
-    _saturation(ax, sheet, float(found.photons[found.saturation]))
+    _saturation(ax, sheet, float(transfer.photons[transfer.saturation]))
     ax.set(
         xscale="log",
         yscale="log",
@@ -122,18 +125,18 @@ def general(sheet: EmvaSheet) -> Any:
     """Draw the local slope of the response and the signal-to-noise ratio of the light; None with
     too few levels.
     """
-    found = general_model(sheet.transfer)
-    if found is None:
+    model = general_model(sheet.transfer)
+    if model is None:
         return None
     figure, axes = canvas(_WIDTH, _HEIGHT, 1, 2)
     left, right = axes[0]
     left.errorbar(
-        found.photons, found.slope[1:], found.slope[1:] * found.error[1:], ecolor="#777777", **_DOTS
+        model.photons, model.slope[1:], model.slope[1:] * model.error[1:], ecolor="#777777", **_DOTS
     )
     left.set(xlabel=_light(sheet), ylabel="slope (DN per photon)", title="Slope of the response")
-    left.set_ylim(0, 1.15 * float((found.slope * (1 + found.error)).max()))
+    left.set_ylim(0, 1.15 * float((model.slope * (1 + model.error)).max()))
     left.locator_params(axis="x", nbins=5)
-    right.plot(found.photons, found.ratio, **_DOTS)
+    right.plot(model.photons, model.ratio, **_DOTS)
     right.set(
         xscale="log",
         yscale="log",
@@ -150,24 +153,26 @@ def linearity(sheet: EmvaSheet) -> Any:
     of saturation.
     """
     figure, axes = canvas(_WIDTH, 6.0, 2, 1, sharex=True, height_ratios=(1.4, 1.0))
-    above, below, found, used = axes[0, 0], axes[1, 0], sheet.transfer, sheet.transfer.linear
-    above.plot(found.photons, found.signal, label="measured", **_DOTS)
+    above, below, transfer, linear = axes[0, 0], axes[1, 0], sheet.transfer, sheet.transfer.linear
+    above.plot(transfer.photons, transfer.signal, label="measured", **_DOTS)
     above.set(ylabel="μ_y - μ_y.dark (DN)", title="Linearity")
     if sheet.linearity is not None:
-        ends = np.array([found.photons[used].min(), found.photons[used].max()])
+        ends = np.array([transfer.photons[linear].min(), transfer.photons[linear].max()])
         fitted = sheet.linearity.start + sheet.linearity.slope * ends
         above.plot(ends, fitted, color=BLUE, label="line of least relative deviation, 5 to 95 %")
-        below.plot(found.photons[used], sheet.linearity.deviation, **_DOTS)
+        below.plot(transfer.photons[linear], sheet.linearity.deviation, **_DOTS)
         for key in ("LE_min", "LE_max"):
             below.axhline(sheet[key].value, color=VERMILION, linestyle=":")
             text = f"{sheet[key].symbol} = {sheet[key].text}"
             side, up = ("top", -4) if key == "LE_min" else ("bottom", 4)
-            at: Any = {
+            placement: Any = {
                 "xy": (1, sheet[key].value),
                 "xycoords": ("axes fraction", "data"),
                 "xytext": (0, up),
             }
-            below.annotate(text, **at, textcoords="offset points", ha="right", va=side, fontsize=9)
+            below.annotate(
+                text, **placement, textcoords="offset points", ha="right", va=side, fontsize=9
+            )
         below.margins(y=0.35)
     else:
         below.text(0.5, 0.5, sheet["LE_min"].reason, transform=below.transAxes, ha="center")
@@ -181,16 +186,16 @@ def dark_current(sheet: EmvaSheet) -> Any:
     """Draw mean and variance of the dark over the exposure; None where all darks have one
     exposure.
     """
-    found = sheet.transfer
-    if len(np.unique(found.dark_exposure)) < 2:
+    transfer = sheet.transfer
+    if len(np.unique(transfer.dark_exposure)) < 2:
         return None
     figure, axes = canvas(_WIDTH, _HEIGHT, 1, 2)
     for ax, values, key, label in (
-        (axes[0, 0], found.dark_mean, "mu_I_mean", "μ_y.dark (DN)"),
-        (axes[0, 1], found.dark_variance, "mu_I_var", "σ²_y.dark (DN²)"),
+        (axes[0, 0], transfer.dark_mean, "mu_I_mean", "μ_y.dark (DN)"),
+        (axes[0, 1], transfer.dark_variance, "mu_I_var", "σ²_y.dark (DN²)"),
     ):
-        ax.plot(1e3 * found.dark_exposure, values, **_DOTS)
-        ax.plot(1e3 * found.dark_exposure, _straight(found.dark_exposure, values), color=BLUE)
+        ax.plot(1e3 * transfer.dark_exposure, values, **_DOTS)
+        ax.plot(1e3 * transfer.dark_exposure, _straight(transfer.dark_exposure, values), color=BLUE)
         ax.set(
             xlabel="exposure (ms)", ylabel=label, title=f"{sheet[key].symbol}: {sheet[key].text}"
         )
@@ -206,10 +211,13 @@ def spectrograms(sheet: EmvaSheet) -> Any:
     figure, axes = canvas(_WIDTH, 3.4 * len(images), len(images), 2)
     for row, ((name, unit), directions) in zip(axes, images.items(), strict=True):
         quantity = sheet[f"{name}1288_DN" if name == "DSNU" else f"{name}1288"]
-        one, average = emva_sheet.noise_in_time(sheet, name)
-        for ax, (direction, found) in zip(row, directions.items(), strict=True):
+        single, average = emva_sheet.noise_in_time(sheet, name)
+        for ax, (direction, spectrogram) in zip(row, directions.items(), strict=True):
             ax.plot(
-                found.frequency[1:], found.amplitude[1:].clip(1e-12), color=BLACK, linewidth=0.8
+                spectrogram.frequency[1:],
+                spectrogram.amplitude[1:].clip(1e-12),
+                color=BLACK,
+                linewidth=0.8,
             )
             if quantity.value is not None:
                 ax.axhline(
@@ -218,7 +226,7 @@ def spectrograms(sheet: EmvaSheet) -> Any:
                     linestyle="--",
                     label=f"{quantity.symbol}: {quantity.text}",
                 )
-            ax.axhline(one, color=GREEN, linestyle="-.", label="noise in time of one frame")
+            ax.axhline(single, color=GREEN, linestyle="-.", label="noise in time of one frame")
             ax.axhline(average, color=BLUE, linestyle=":", label="noise in time of the average")
             ax.set(
                 yscale="log",
@@ -240,9 +248,9 @@ def line_profiles(sheet: EmvaSheet) -> Any:
         return None
     figure, axes = canvas(_WIDTH, 3.4 * len(images), len(images), 2)
     for row, (name, directions) in zip(axes, images.items(), strict=True):
-        for ax, (direction, found) in zip(row, directions.items(), strict=True):
+        for ax, (direction, profile) in zip(row, directions.items(), strict=True):
             for values, label, colour in zip(
-                found, found._fields, (GREEN, BLACK, BLUE, ORANGE), strict=True
+                profile, profile._fields, (GREEN, BLACK, BLUE, ORANGE), strict=True
             ):
                 ax.plot(values, color=colour, linewidth=0.8, label=label)
             pixel = "row" if direction == "vertical" else "column"
@@ -255,17 +263,22 @@ def defect_pixels(sheet: EmvaSheet) -> Any:
     """Draw the logarithmic and the accumulated histograms of DSNU and PRNU; None without a
     series.
     """
-    found = emva_sheet.defect_histograms(sheet)
-    if not found:
+    histograms = emva_sheet.defect_histograms(sheet)
+    if not histograms:
         return None
-    figure, axes = canvas(_WIDTH, 3.4 * len(found), len(found), 2)
-    for (left, right), ((name, unit), each) in zip(axes, found.items(), strict=True):
+    figure, axes = canvas(_WIDTH, 3.4 * len(histograms), len(histograms), 2)
+    for (left, right), ((name, unit), histogram) in zip(axes, histograms.items(), strict=True):
         left.step(
-            each.deviation, each.pixels, where="post", color=BLACK, linewidth=0.9, label="pixels"
+            histogram.deviation,
+            histogram.pixels,
+            where="post",
+            color=BLACK,
+            linewidth=0.9,
+            label="pixels",
         )
         left.plot(
-            each.deviation,
-            each.normal,
+            histogram.deviation,
+            histogram.normal,
             color=VERMILION,
             linestyle="--",
             label="normal distribution",
@@ -274,9 +287,9 @@ def defect_pixels(sheet: EmvaSheet) -> Any:
             yscale="log", xlabel=f"deviation from the mean ({unit})", ylabel="pixels of a class"
         )
         left.set(title=f"{name}: logarithmic histogram")
-        left.set_ylim(0.5, 8 * float(each.pixels.max()))
+        left.set_ylim(0.5, 8 * float(histogram.pixels.max()))
         left.legend(loc="upper right")
-        right.plot(each.distance, each.beyond, color=BLACK)
+        right.plot(histogram.distance, histogram.beyond, color=BLACK)
         right.set(
             yscale="log",
             xlabel=f"deviation from the mean, amount ({unit})",
@@ -303,17 +316,20 @@ PICTURES: Mapping[str, Draw] = {
 def pictures(sheet: EmvaSheet) -> dict[str, bytes]:
     """Return the PNG bytes of each picture that the frames allow, by name."""
 
-    def kept(draw: Draw) -> bytes | None:
-        with styled():
-            figure = draw(sheet)
-        return None if figure is None else drawn(lambda: figure)()
-
-    return {name: png for name, draw in PICTURES.items() if (png := kept(draw)) is not None}
+    images = {name: _picture(draw, sheet) for name, draw in PICTURES.items()}
+    return {name: png for name, png in images.items() if png is not None}
 
 
-def _saturation(ax: Any, sheet: EmvaSheet, at: float) -> None:
+def _picture(draw: Draw, sheet: EmvaSheet) -> bytes | None:
+    """Return the PNG bytes of a picture; None where the frames do not allow it."""
+    with styled():
+        figure = draw(sheet)
+    return None if figure is None else drawn(lambda: figure)()
+
+
+def _saturation(ax: Any, sheet: EmvaSheet, level: float) -> None:
     label = "saturation" if sheet.transfer.saturated else "brightest level: saturation not reached"
-    ax.axvline(at, color=VERMILION, linestyle="--", label=label)
+    ax.axvline(level, color=VERMILION, linestyle="--", label=label)
 
 
 def _light(sheet: EmvaSheet) -> str:
@@ -366,7 +382,7 @@ def _summary(sheet: EmvaSheet, title: str, lines: list[str], budgets: Mapping[st
     axes[0, 0].text(
         0, 1, title, fontsize=14, fontweight="bold", va="top", transform=axes[0, 0].transAxes
     )
-    shown = "\n".join(part for text in lines for part in textwrap.wrap(text, _LINE))
+    shown = "\n".join(itertools.chain(*(textwrap.wrap(text, _LINE) for text in lines)))
     axes[0, 0].text(
         0, 0.86, shown, fontsize=9, va="top", linespacing=1.4, transform=axes[0, 0].transAxes
     )

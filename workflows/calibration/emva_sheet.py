@@ -114,24 +114,31 @@ def frames_of_recipe(recipe: Recipe, store: Store, release: Release | None = Non
     descriptor states one.
     Raises: ValueError for a recipe that reads neither frames, a descriptor nor a table.
     """
-    steps = {path: [s for s in recipe.steps.values() if s.node.path == path] for path in _READERS}
-    if described := steps["calibrate.descriptor"]:
+    if described := _steps_of(recipe, "calibrate.descriptor"):
         stated = descriptor_release(described[0].params["file"])
         release = release or ("3" if stated and float(stated) < _STEADY else "4")
         return _described(described[0], _SCATTER[release])._replace(release=release, stated=stated)
     release = release or "4"
-    if reduced := steps["calibrate.reduce"]:
+    if reduced := _steps_of(recipe, "calibrate.reduce"):
         return _reduced(recipe, store, reduced, _SCATTER[release])._replace(release=release)
-    if tables := steps["calibrate.table"]:
-        found = run(recipe, store, (tables[0].name,)).values[tables[0].name]
-        dark = found.variance[found.photons == 0]
-        tests = [coarse(float(dark.min()), exact=False)] if len(dark) else []
-        return EmvaFrames(found, Nonuniformity(None, None), 2, tests)
+    if tables := _steps_of(recipe, "calibrate.table"):
+        return _tabled(recipe, store, tables[0].name)
     raise ValueError(
-        f"{recipe.name} has no step of the nodes {', '.join(_READERS)}, so that it has no frames "
-        "of a "
-        "sheet of EMVA 1288: give a descriptor, or a recipe as in `neusee run calibrate`"
+        f"{recipe.name} has no step of the nodes {', '.join(_READERS)}, so that it has no frames"
+        " of a sheet of EMVA 1288: give a descriptor, or a recipe as in `neusee run calibrate`"
     )
+
+
+def _steps_of(recipe: Recipe, node: str) -> list[Step]:
+    return [step for step in recipe.steps.values() if step.node.path == node]
+
+
+def _tabled(recipe: Recipe, store: Store, name: str) -> EmvaFrames:
+    """Return the levels of a table of moments, which has no series."""
+    measured = run(recipe, store, (name,)).values[name]
+    dark = measured.variance[measured.photons == 0]
+    tests = [coarse(float(dark.min()), exact=False)] if len(dark) else []
+    return EmvaFrames(measured, Nonuniformity(None, None), 2, tests)
 
 
 _READERS = ("calibrate.descriptor", "calibrate.reduce", "calibrate.table")
@@ -142,14 +149,14 @@ _SCATTER: dict[Release, Any] = {"4": "steady", "3": "temporal"}
 
 def _described(step: Step, scatter: Any) -> EmvaFrames:
     files = step.params["file"]
-    found = descriptor(file=files, scatter=scatter)
-    series = [spatial_series(*each) for each in descriptor_series(files)]
+    measured = descriptor(file=files, scatter=scatter)
+    series = [spatial_series(*entry) for entry in descriptor_series(files)]
     stacks = (
         Stack(name, light, time, scatter, frames)
         for name, light, time, frames in descriptor_frames(files)
     )
     return EmvaFrames(
-        found, _nearest_half(series, found), 2, inspect_frames(stacks, False, _FITTED)
+        measured, _nearest_half(series, measured), 2, inspect_frames(stacks, False, _FITTED)
     )
 
 
@@ -162,13 +169,13 @@ def _reduced(recipe: Recipe, store: Store, steps: Sequence[Step], scatter: Any) 
         frames = _frames(recipe, store, step)
         parts.append(reduce(frames, photons=_of(step)[0], exposure=_of(step)[1], scatter=scatter))
         counts.append(len(frames))
-    found: Levels = levels(parts)
-    most = max(counts)
-    chosen = [step for step, count in zip(steps, counts, strict=True) if count == most]
-    pair = _dark_and_half([_of(step) for step in chosen], found)
-    series = (spatial_series(*_of(chosen[i]), _frames(recipe, store, chosen[i])) for i in pair)
+    measured: Levels = levels(parts)
+    largest = max(counts)
+    fullest = [step for step, count in zip(steps, counts, strict=True) if count == largest]
+    pair = _dark_and_half([_of(step) for step in fullest], measured)
+    series = (spatial_series(*_of(fullest[i]), _frames(recipe, store, fullest[i])) for i in pair)
     stacks = (Stack(step.name, *_of(step), scatter, _frames(recipe, store, step)) for step in steps)
-    return EmvaFrames(found, _pair(series), min(counts), inspect_frames(stacks, False, _FITTED))
+    return EmvaFrames(measured, _pair(series), min(counts), inspect_frames(stacks, False, _FITTED))
 
 
 def _of(step: Step) -> tuple[float, float]:
@@ -180,36 +187,47 @@ def _frames(recipe: Recipe, store: Store, step: Step) -> Any:
     return run(recipe, store, (source,)).values[source]
 
 
-def _nearest_half(series: Sequence[SpatialSeries], found: Levels) -> Nonuniformity:
+def _nearest_half(series: Sequence[SpatialSeries], measured: Levels) -> Nonuniformity:
     return _pair(
-        series[i] for i in _dark_and_half([(s.photons, s.exposure) for s in series], found)
+        series[i] for i in _dark_and_half([(s.photons, s.exposure) for s in series], measured)
     )
 
 
 def _pair(series: Iterator[SpatialSeries]) -> Nonuniformity:
     dark: SpatialSeries | None = None
     lit: SpatialSeries | None = None
-    for each in series:
-        dark, lit = (dark, each) if each.photons else (each, lit)
+    for averaged in series:
+        dark, lit = (dark, averaged) if averaged.photons else (averaged, lit)
     return Nonuniformity(dark, lit)
 
 
-def _dark_and_half(light: Sequence[tuple[float, float]], found: Levels) -> list[int]:
+def _dark_and_half(light: Sequence[tuple[float, float]], measured: Levels) -> list[int]:
     """Return the indices of the dark and of the lit series nearest to half of saturation, with one
     exposure if can be.
 
     ``light`` has photons and exposure of each series.
     """
-    top = float(found.photons[found.variance.argmax()])
-    lit = [i for i, (photons, _) in enumerate(light) if photons > 0]
     dark = [i for i, (photons, _) in enumerate(light) if photons == 0]
-    both = [i for i in lit if any(light[j][1] == light[i][1] for j in dark)]
-    half = min(both or lit, key=lambda i: abs(light[i][0] - _HALF * top), default=None)
-    if not dark:
-        return [] if half is None else [half]
-    times = np.array([light[j][1] for j in dark])
-    own = dark[int(np.abs(times - (times.min() if half is None else light[half][1])).argmin())]
-    return [own] if half is None else [own, half]
+    dark_times = [light[i][1] for i in dark]
+    top = float(measured.photons[measured.variance.argmax()])
+    half = _half_of_saturation(light, top, dark_times)
+    indices = [] if half is None else [half]
+    if dark:
+        time = min(dark_times) if half is None else light[half][1]
+        nearest = int(np.abs(np.array(dark_times) - time).argmin())
+        indices.insert(0, dark[nearest])
+    return indices
+
+
+def _half_of_saturation(
+    light: Sequence[tuple[float, float]], top: float, dark_times: Sequence[float]
+) -> int | None:
+    """Return the index of the lit series nearest to half of ``top``, if can be among those with
+    the exposure of a dark one; None without a lit series.
+    """
+    lit = [i for i, (photons, _) in enumerate(light) if photons > 0]
+    with_dark = [i for i in lit if light[i][1] in dark_times]
+    return min(with_dark or lit, key=lambda i: abs(light[i][0] - _HALF * top), default=None)
 
 
 # --- emva patterns --------------------------------------------------------------------------------
@@ -261,16 +279,16 @@ def defect_histograms(sheet: EmvaSheet) -> dict[tuple[str, str], DefectHistogram
     the signal.
     """
     dark, lit = sheet.spatial
-    found = {}
+    histograms = {}
     if dark is not None:
-        found["DSNU", "DN"] = defects(dark.total, 1 / dark.count)
+        histograms["DSNU", "DN"] = defects(dark.total, 1 / dark.count)
     if dark is not None and lit is not None and (signal := signal_of(dark, lit)) > 0:
         parts = math.gcd(dark.count, lit.count)
         trendless = without_trend((lit.total * dark.count - dark.total * lit.count) // parts)
-        found["PRNU", "%"] = defects(
+        histograms["PRNU", "%"] = defects(
             trendless, 100 * parts / (_HIGHPASS * dark.count * lit.count * signal)
         )
-    return found
+    return histograms
 
 
 def noise_in_time(sheet: EmvaSheet, name: str) -> tuple[float, float]:
@@ -294,42 +312,38 @@ def signal_of(dark: SpatialSeries, lit: SpatialSeries) -> float:
 
 def pattern_tables(sheet: EmvaSheet) -> Mapping[str, CsvTable]:
     """Return the curves as tables by file name; without a series there is none."""
-    if not (found := defect_histograms(sheet)):
+    if not (histograms := defect_histograms(sheet)):
         return {}
     return {
         "spectrograms.csv": (_SPECTROGRAMS, _spectrogram_rows(sheet)),
         "profiles.csv": (_PROFILES, _profile_rows(sheet)),
-        "defects.csv": (
-            _DEFECTS,
-            (
-                (*key, *row)
-                for key, h in found.items()
-                for row in zip(*map(_plain, h[:3]), strict=True)
-            ),
-        ),
-        "defects_accumulated.csv": (
-            _BEYOND,
-            (
-                (*key, *row)
-                for key, h in found.items()
-                for row in zip(*map(_plain, h[3:]), strict=True)
-            ),
-        ),
+        "defects.csv": (_DEFECTS, _histogram_rows(histograms, slice(3))),
+        "defects_accumulated.csv": (_BEYOND, _histogram_rows(histograms, slice(3, None))),
     }
+
+
+def _histogram_rows(
+    histograms: Mapping[tuple[str, str], DefectHistogram], fields: slice
+) -> Iterator[tuple[Any, ...]]:
+    """Yield name, unit and some fields of each class of each histogram."""
+    for key, histogram in histograms.items():
+        yield from ((*key, *row) for row in zip(*map(_plain, histogram[fields]), strict=True))
 
 
 def _spectrogram_rows(sheet: EmvaSheet) -> Iterator[tuple[Any, ...]]:
     for key, directions in spectrograms(sheet).items():
-        for direction, found in directions.items():
-            yield from ((*key, direction, *row) for row in zip(*map(_plain, found), strict=True))
+        for direction, transform in directions.items():
+            yield from (
+                (*key, direction, *row) for row in zip(*map(_plain, transform), strict=True)
+            )
 
 
 def _profile_rows(sheet: EmvaSheet) -> Iterator[tuple[Any, ...]]:
     for key, directions in line_profiles(sheet).items():
-        for direction, found in directions.items():
+        for direction, profile in directions.items():
             yield from (
-                (key, direction, at, *row)
-                for at, row in enumerate(zip(*map(_plain, found), strict=True))
+                (key, direction, position, *row)
+                for position, row in enumerate(zip(*map(_plain, profile), strict=True))
             )
 
 
@@ -475,14 +489,14 @@ def banner(sheet: EmvaSheet, tests: Sequence[FrameTest] = ()) -> str:
     return f"Not fit for use: {'; '.join(reasons)}." if reasons else ""
 
 
-def temporal_variance(frames: EmvaFrames, chosen: bool) -> str:
-    """Return which variance in time the sheet has, and why; ``chosen`` is True if the user chose
+def temporal_variance(frames: EmvaFrames, by_user: bool) -> str:
+    """Return which variance in time the sheet has, and why; ``by_user`` is True if the user chose
     the release.
     """
     text = f"The variance of a level {_VARIANCE[frames.release]}"
     if not frames.stated:
         return f"{text}."
-    if chosen:
+    if by_user:
         return (
             f"{text}: `--release {frames.release}`. The descriptor states release {frames.stated}."
         )
@@ -505,16 +519,16 @@ def lead(sheet: EmvaSheet, variance: str) -> str:
         "DSNU1288",
         "PRNU1288",
     )
-    told = "; ".join(
+    quantities = "; ".join(
         f"{sheet[key].symbol} {sheet[key].text}" for key in named if sheet[key].value is not None
     )
-    return f"The quantities of EMVA 1288, release 4.0 Linear: {told}. {variance}"
+    return f"The quantities of EMVA 1288, release 4.0 Linear: {quantities}. {variance}"
 
 
 def sections(
     sheet: EmvaSheet,
     frames: EmvaFrames,
-    told: Mapping[str, Any],
+    statements: Mapping[str, Any],
     pictures: Mapping[str, bytes],
     budget: Sequence[Section] = (),
 ) -> list[Section]:
@@ -523,21 +537,21 @@ def sections(
 
     The sections ``budget`` have the uncertainty of the quantities.
     """
-    found = (
+    candidates = (
         _section(sheet, heading, text, pictures.get(name)) for heading, name, text in _SECTIONS
     )
-    kept = (s for s in found if s.rows or s.picture)
+    filled = (s for s in candidates if s.rows or s.picture)
     tested = replace(
         frame_section(frames.tests), text=_TESTED if len(frames.tests) > 1 else _MOMENTS
     )
-    return [*kept, *budget, tested, _compliance(sheet, frames, told)]
+    return [*filled, *budget, tested, _compliance(sheet, frames, statements)]
 
 
 def requirements(
-    sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any]
+    sheet: EmvaSheet, frames: EmvaFrames, statements: Mapping[str, Any]
 ) -> list[Requirement]:
     """Return each demand of the standard on the frames and on what is told of them."""
-    return [*_of_transfer(sheet, frames), *_of_series(sheet), *_of_told(told), *_elsewhere()]
+    return [*_of_transfer(sheet, frames), *_of_series(sheet), *_of_told(statements), *_elsewhere()]
 
 
 def operating_point(
@@ -549,28 +563,28 @@ def operating_point(
     What the recipe states in the block ``traceability`` counts where no statement says otherwise.
     Raises: ValueError for a statement that is not a key of `OPERATING_POINT`, ``=`` and a text.
     """
-    told: dict[str, str | None] = {
+    point: dict[str, str | None] = {
         **dict.fromkeys(OPERATING_POINT),
         **(of_traceability(traced) if traced else {}),
     }
     for statement in statements:
-        key, sign, value = (part.strip() for part in statement.partition("="))
-        if key not in told or not sign or not value:
+        key, sign, value = (text.strip() for text in statement.partition("="))
+        if key not in point or not sign or not value:
             raise ValueError(
-                f"--state {statement!r}: write one of {', '.join(told)}, then = and a text"
+                f"--state {statement!r}: write one of {', '.join(point)}, then = and a text"
             )
-        told[key] = value
-    return told
+        point[key] = value
+    return point
 
 
 def group_of(quantity: Quantity, sheet: EmvaSheet) -> str:
     """Return the heading under which the sheet has a quantity."""
-    keys = [each.key for each in sheet.quantities]
-    at = keys.index(quantity.key)
+    keys = [row.key for row in sheet.quantities]
+    position = keys.index(quantity.key)
     return next(
         name
         for name, (first, last) in _TABLES.items()
-        if keys.index(first) <= at <= keys.index(last)
+        if keys.index(first) <= position <= keys.index(last)
     )
 
 
@@ -589,11 +603,11 @@ def _section(sheet: EmvaSheet, heading: str, text: str, picture: bytes | None) -
     return Section(heading, text, columns if rows else (), rows, picture, marks)
 
 
-def _compliance(sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any]) -> Section:
-    found = requirements(sheet, frames, told)
-    marks: dict[tuple[int, int], Mark] = {(i, 2): row.mark for i, row in enumerate(found)}
-    rows = [(row.demand, row.found, "yes" if row.mark == "pass" else "no") for row in found]
-    open_ones = sum(row.mark != "pass" for row in found)
+def _compliance(sheet: EmvaSheet, frames: EmvaFrames, statements: Mapping[str, Any]) -> Section:
+    demands = requirements(sheet, frames, statements)
+    marks: dict[tuple[int, int], Mark] = {(i, 2): row.mark for i, row in enumerate(demands)}
+    rows = [(row.demand, row.found, "yes" if row.mark == "pass" else "no") for row in demands]
+    open_ones = sum(row.mark != "pass" for row in demands)
     text = f"""The quantities are computed as EMVA 1288, release 4.0 Linear, says. This is a
         computation from frames and no certificate: geometry, homogeneity and calibration of the
         light are the laboratory's part, and frames do not show them.
@@ -610,10 +624,10 @@ def _compliance(sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any]) -
 
 
 def _of_transfer(sheet: EmvaSheet, frames: EmvaFrames) -> Iterator[Requirement]:
-    found, noise = sheet.transfer, sheet["sigma_y_dark"]
-    count, times = len(found.photons), len(np.unique(found.dark_exposure))
-    pairs = set(found.exposure.tolist()) <= set(found.dark_exposure.tolist())
-    top = "reached" if found.saturated else "not reached"
+    transfer, noise = sheet.transfer, sheet["sigma_y_dark"]
+    count, times = len(transfer.photons), len(np.unique(transfer.dark_exposure))
+    pairs = set(transfer.exposure.tolist()) <= set(transfer.dark_exposure.tolist())
+    top = "reached" if transfer.saturated else "not reached"
     yield _asked(f"{_LEVELS} or more lit levels", f"{count}", count >= _LEVELS)
     yield _asked("two frames or more at each level", f"{frames.frames}", frames.frames >= 2)
     yield _asked(
@@ -621,7 +635,7 @@ def _of_transfer(sheet: EmvaSheet, frames: EmvaFrames) -> Iterator[Requirement]:
         "yes" if pairs else "of the nearest exposure",
         pairs,
     )
-    yield _asked("levels from dark to saturation", f"saturation {top}", found.saturated)
+    yield _asked("levels from dark to saturation", f"saturation {top}", transfer.saturated)
     yield Requirement(
         "temporal dark noise of 0.49 DN or more", noise.text, "fail" if noise.bound else "pass"
     )
@@ -648,9 +662,9 @@ def _of_series(sheet: EmvaSheet) -> Iterator[Requirement]:
         )
 
 
-def _of_told(told: Mapping[str, Any]) -> Iterator[Requirement]:
+def _of_told(statements: Mapping[str, Any]) -> Iterator[Requirement]:
     for key, name in OPERATING_POINT.items():
-        value = told.get(key)
+        value = statements.get(key)
         yield _asked(
             f"stated: {name}", "not stated" if value is None else str(value), value is not None
         )
@@ -669,8 +683,8 @@ def _elsewhere() -> Iterator[Requirement]:
     )
 
 
-def _asked(demand: str, found: str, met: bool) -> Requirement:
-    return Requirement(demand, found, "pass" if met else "warn")
+def _asked(demand: str, text: str, met: bool) -> Requirement:
+    return Requirement(demand, text, "pass" if met else "warn")
 
 
 def _exposures(dark: SpatialSeries, lit: SpatialSeries) -> str:

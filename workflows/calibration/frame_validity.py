@@ -118,8 +118,8 @@ def _check_levels(problem: SensorPosterior, levels: Levels, terms: list[str]) ->
     For 60 simulated cameras and two terms, 90 % intervals contained the truth in 93 % with 4 lit
     levels, and in 58 % with 2 lit levels.
     """
-    used = problem.likelihood(initial_theta(problem)[None]).degrees_of_freedom > 0
-    lit = len(set(levels.photons[used & (levels.photons > 0)].tolist()))
+    fitted = problem.likelihood(initial_theta(problem)[None]).degrees_of_freedom > 0
+    lit = len(set(levels.photons[fitted & (levels.photons > 0)].tolist()))
     if lit < len(terms) + 2:
         raise ValueError(
             f"{lit} lit levels do not separate a response of {len(terms)} terms from a drifting"
@@ -164,11 +164,11 @@ def _spread(name: str, problem: SensorPosterior, posteriors: list[_Posterior]) -
     )
 
 
-def width_of_mean(fewer: float, more: float) -> float:
+def width_of_mean(fewer: float, richer: float) -> float:
     """Return the standard deviation of the mean of the values that two nested models give for the
     same levels.
 
-    ``fewer`` and ``more`` are the widths of the posteriors with fewer and with more terms. An
+    ``fewer`` and ``richer`` are the widths of the posteriors with fewer and with more terms. An
     efficient estimate and its difference to any other unbiased estimate of the same data are
     independent, so that the difference has the variance more^2 - fewer^2, and the mean has fewer^2
     and a quarter of that. The wider posterior alone was too wide: for 24 simulated cameras the
@@ -176,7 +176,7 @@ def width_of_mean(fewer: float, more: float) -> float:
 
     Source: Hausman, Econometrica 46, 1251 (1978), for the variance of the difference.
     """
-    difference = max(0.0, more**2 - fewer**2)
+    difference = max(0.0, richer**2 - fewer**2)
     return math.sqrt(fewer**2 + difference / 4)
 
 
@@ -239,7 +239,7 @@ def _upstream(recipe: Recipe, step: Step) -> Iterator[Step]:
         sources = recipe.steps[new.pop()].sources
         new += [name for name in sources if name not in names]
         names.update(sources)
-    return (each for name, each in recipe.steps.items() if name in names)
+    return (source for name, source in recipe.steps.items() if name in names)
 
 
 def _stacks(recipe: Recipe, store: Store, steps: Sequence[Step]) -> Iterator[Stack]:
@@ -276,15 +276,17 @@ def lines(tests: Sequence[FrameTest]) -> Iterator[str]:
         yield f"frames: {len(passed)} of {len(tests)} tests passed"
 
 
-def frame_checks(tests: Sequence[FrameTest], given: bool = True) -> list[Check]:
+def frame_checks(tests: Sequence[FrameTest], has_frames: bool = True) -> list[Check]:
     """Return each test of frames as a check of the posterior, which fails if the frames are
     refused.
     """
-    found = [Check(t.name, f"{t.verdict}: {t.sentence}", _bar(t), _MARKS[t.verdict]) for t in tests]
-    if len(tests) < 2 and given:
+    checks = [
+        Check(t.name, f"{t.verdict}: {t.sentence}", _bar(t), _MARKS[t.verdict]) for t in tests
+    ]
+    if len(tests) < 2 and has_frames:
         text = "only moments are given: noise, patterns and numbers of the frames are not tested"
-        found.append(Check("the frames are tested", text, "frames in the recipe", "warn"))
-    return found
+        checks.append(Check("the frames are tested", text, "frames in the recipe", "warn"))
+    return checks
 
 
 def hidden_checks(tests: Sequence[FrameTest], may_hide: Container[str]) -> list[Check]:
@@ -360,9 +362,11 @@ def hidden_faults(tests: Iterable[FrameTest], may_hide: Container[str]) -> list[
     """Return the faults that change gain and noise: those that a test found, and those that
     ``may_hide`` from it.
     """
-    return [
-        h for test in tests for h in test.hidden if test.verdict != "passed" or h.fault in may_hide
-    ]
+    faults: list[Hidden] = []
+    for test in tests:
+        failed = test.verdict != "passed"
+        faults += [hidden for hidden in test.hidden if failed or hidden.fault in may_hide]
+    return faults
 
 
 def relative_shifts(tests: Iterable[FrameTest]) -> dict[str, float]:

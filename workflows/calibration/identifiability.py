@@ -81,16 +81,7 @@ def identify(problem: SensorPosterior, mode: LaplaceFit) -> Identifiability:
         n: "estimate" if own else "none" for n, own in zip(problem.names, _own(s, v), strict=True)
     }
     weak = _sorted_out(v[s < WEAK])
-    sentences = []
-    for row in weak:
-        parts = [(n, x) for n, x in zip(problem.names, row, strict=True) if abs(x) >= _PART]
-        if len(parts) == 1 or max(abs(x) for _, x in parts) > _ALONE:
-            name = max(parts, key=lambda part: abs(part[1]))[0]
-            kinds[name] = _limit(problem, mode, name)
-            reason = _REASONS.get((name, kinds[name]), "")
-            sentences.append(f"{_plain(name)}: {KINDS[kinds[name]]}{reason}")
-        else:
-            sentences.append(_together(parts))
+    sentences = [_weak_direction(problem, mode, row, kinds) for row in weak]
     for ridge in problem.coordinates.ridges(torch.from_numpy(mode.theta)):
         if _as_good(problem, mode, ridge):
             kinds |= ridge.kinds
@@ -101,10 +92,25 @@ def identify(problem: SensorPosterior, mode: LaplaceFit) -> Identifiability:
     return Identifiability(kinds, sentences, s.tolist(), refused)
 
 
+def _weak_direction(
+    problem: SensorPosterior, mode: LaplaceFit, direction: FloatArray, kinds: dict[str, str]
+) -> str:
+    """Return a text about a direction that the light levels do not determine; set the kind of its
+    parameter in ``kinds`` if it is nearly that of one parameter.
+    """
+    parts = [(n, x) for n, x in zip(problem.names, direction, strict=True) if abs(x) >= _PART]
+    if len(parts) > 1 and max(abs(x) for _, x in parts) <= _ALONE:
+        return _together(parts)
+    name = max(parts, key=lambda pair: abs(pair[1]))[0]
+    kinds[name] = _limit(problem, mode, name)
+    reason = _REASONS.get((name, kinds[name]), "")
+    return f"{_plain(name)}: {KINDS[kinds[name]]}{reason}"
+
+
 def identify_from_draws(
     problem: SensorPosterior,
     mode: LaplaceFit,
-    known: Identifiability,
+    about_mode: Identifiability,
     samples: FloatArray,
     weight: FloatArray,
 ) -> Identifiability:
@@ -118,28 +124,36 @@ def identify_from_draws(
     """
     z, alone = problem.whitened(samples), _possible(problem)
     kinds = {}
-    for at, name in enumerate(problem.names):
-        low, high = weighted_quantiles(z[:, at], weight, _ENDS)
-        low_alone, high_alone = np.quantile(alone[:, at], _ENDS)
-        tells = bool(low > low_alone + _TELLS), bool(high < high_alone - _TELLS)
-        limit = {(True, False): "lower", (False, True): "upper", (True, True): "between"}.get(
-            tells, "none"
-        )
-        width = float(np.sqrt(weight @ (z[:, at] - weight @ z[:, at]) ** 2))
-        kinds[name] = "estimate" if width < 1 / WEAK else limit
+    for index, name in enumerate(problem.names):
+        kinds[name] = _kind_from_draws(z[:, index], alone[:, index], weight)
     sentences, named = [], set()
     for ridge in problem.coordinates.ridges(torch.from_numpy(mode.theta)):
-        if ridge.text in known.directions and "estimate" not in {
-            kinds[name] for name in ridge.kinds
-        }:
+        estimated = "estimate" in [kinds.get(name) for name in ridge.kinds]
+        if ridge.text in about_mode.directions and not estimated:
             # the data alone give no limit along the ridge, whatever the priors say
             kinds |= ridge.kinds
             sentences.append(ridge.text)
             named |= set(ridge.kinds)
-    rest = [name for name, kind in kinds.items() if kind != "estimate" and name not in named]
-    sentences += [f"{_plain(name)}: {KINDS[kinds[name]]}" for name in rest]
+    undetermined = [
+        name for name, kind in kinds.items() if kind != "estimate" and name not in named
+    ]
+    sentences += [f"{_plain(name)}: {KINDS[kinds[name]]}" for name in undetermined]
     sentences = withheld_electrons(kinds, sentences)
-    return replace(known, kinds=kinds, directions=sentences)
+    return replace(about_mode, kinds=kinds, directions=sentences)
+
+
+def _kind_from_draws(z: FloatArray, alone: FloatArray, weight: FloatArray) -> str:
+    """Return if the data give a parameter a value, or on which sides a limit.
+
+    ``z`` has its weighted draws, ``alone`` those of its prior, both in units of the prior.
+    """
+    if float(np.sqrt(weight @ (z - weight @ z) ** 2)) < 1 / WEAK:
+        return "estimate"
+    low, high = weighted_quantiles(z, weight, _ENDS)
+    low_alone, high_alone = np.quantile(alone, _ENDS)
+    tells = bool(low > low_alone + _TELLS), bool(high < high_alone - _TELLS)
+    limits = {(True, False): "lower", (False, True): "upper", (True, True): "between"}
+    return limits.get(tells, "none")
 
 
 def withheld_electrons(kinds: dict[str, str], sentences: Sequence[str]) -> list[str]:
@@ -148,23 +162,23 @@ def withheld_electrons(kinds: dict[str, str], sentences: Sequence[str]) -> list[
 
     The frames are in digital numbers: without a gain, electrons come from its prior.
     """
-    known = [
+    withheld = [
         name
         for name in _ELECTRONS
         if kinds.get("gain") == "none" and kinds.get(name, "none") != "none"
     ]
-    kinds |= dict.fromkeys(known, "none")
-    kept = [
+    kinds |= dict.fromkeys(withheld, "none")
+    others = [
         text
         for text in sentences
-        if not text.startswith(tuple(f"{_plain(name)}: " for name in known))
+        if not text.startswith(tuple(f"{_plain(name)}: " for name in withheld))
     ]
     return [
         *(
             f"{_plain(name)}: {KINDS['none']}: no value in electrons without the gain"
-            for name in known
+            for name in withheld
         ),
-        *kept,
+        *others,
     ]
 
 
@@ -173,8 +187,8 @@ def weighted_quantiles(
 ) -> FloatArray:
     """Return the values below which the ``shares`` of the weights lie."""
     order = np.argsort(values)
-    at = np.searchsorted(np.cumsum(weight[order]), shares).clip(0, len(values) - 1)
-    quantiles: FloatArray = values[order][at]
+    index = np.searchsorted(np.cumsum(weight[order]), shares).clip(0, len(values) - 1)
+    quantiles: FloatArray = values[order][index]
     return quantiles
 
 
@@ -229,9 +243,9 @@ def _limit(problem: SensorPosterior, mode: LaplaceFit, name: str) -> str:
     """Return the limit that the light levels set on a parameter (upper, lower, none), with all
     others at the mode.
     """
-    at = problem.names.index(name)
+    index = problem.names.index(name)
     z = np.repeat(problem.whitened(mode.theta)[None], 2, 0)
-    z[:, at] = _FAR, -_FAR
+    z[:, index] = _FAR, -_FAR
     samples = problem.theta(problem.coordinates.from_whitened(torch.from_numpy(z)))
     likelihood = problem.likelihood(np.concatenate([samples, mode.theta[None]]))
     above, below, best = likelihood.log.nan_to_num(nan=-np.inf, neginf=-np.inf).tolist()
@@ -243,10 +257,14 @@ def _together(parts: Sequence[tuple[str, float]]) -> str:
     """Return a text about several parameters that the light levels determine only in
     combination.
     """
-    first = max(parts, key=lambda part: abs(part[1]))
-    rest = [(name, bool(x * first[1] > 0)) for name, x in parts if name != first[0]]
-    more, less = ([_plain(name) for name, same in rest if same is up] for up in (True, False))
-    changes = [f"more {_listed(more)}"] * bool(more) + [f"less {_listed(less)}"] * bool(less)
+    first = max(parts, key=lambda pair: abs(pair[1]))
+    others = [(name, bool(x * first[1] > 0)) for name, x in parts if name != first[0]]
+    raised, lowered = (
+        [_plain(name) for name, same in others if same is up] for up in (True, False)
+    )
+    changes = [f"more {_listed(raised)}"] * bool(raised) + [f"less {_listed(lowered)}"] * bool(
+        lowered
+    )
     names = _listed([_plain(name) for name, _ in parts])
     return f"{names} only together: more {_plain(first[0])} with {_listed(changes)}"
 

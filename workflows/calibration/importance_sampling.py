@@ -77,40 +77,40 @@ def fit_about_mode(
         if problem.coordinates.widths.intersection(problem.names)
         else None
     )
-    at = others.at if others else np.ones(len(mode.theta), dtype=bool)
+    in_mixture = others.at if others else np.ones(len(mode.theta), dtype=bool)
     mixture = Mixture(
         np.ones(1),
-        mode.theta[None, at],
-        _root(mode.covariance[at][:, at])[None],
+        mode.theta[None, in_mixture],
+        _root(mode.covariance[in_mixture][:, in_mixture])[None],
         np.array([_START]),
     )
     mixtures: list[Mixture] = []
     samples: list[FloatArray] = []
     logs: list[FloatArray] = []
-    best, kept = -1.0, mixture
+    best, best_mixture = -1.0, mixture
     for number in range(1, _ROUNDS + 1):
         drawn, log = weighed(
             problem, CameraDensity(mixture, others) if others else mixture, _TRIED, rng
         )
         mixtures.append(mixture)
-        samples.append(drawn[:, at])
-        logs.append(log + mixture.log_density(drawn[:, at]))
+        samples.append(drawn[:, in_mixture])
+        logs.append(log + mixture.log_density(drawn[:, in_mixture]))
         fraction = effective(log)
         if fraction > best:
-            best, kept = fraction, mixture
+            best, best_mixture = fraction, mixture
         if number >= _LEAST and best >= _ENOUGH:
             break
         mixture = _next(mixtures, np.concatenate(samples), np.concatenate(logs), rng)
     if others:
-        known = (
+        weighted = (
             np.concatenate(samples),
             normalised(_logs(mixtures, np.concatenate(samples), np.concatenate(logs))),
         )
-        widths = with_prior_tails(kept, problem, mode, at, known)
-        whole = with_tails(CameraDensity(widths, others), tailed[1:], mode)
+        widths = with_prior_tails(best_mixture, problem, mode, in_mixture, weighted)
+        density = with_tails(CameraDensity(widths, others), tailed[1:], mode)
     else:
-        whole = with_tails(kept, tailed, mode)
-    return whole, *weighed(problem, whole, count, rng)
+        density = with_tails(best_mixture, tailed, mode)
+    return density, *weighed(problem, density, count, rng)
 
 
 def _given_widths(problem: SensorPosterior, mode: LaplaceFit) -> Others:
@@ -154,14 +154,18 @@ def _logs(mixtures: list[Mixture], samples: FloatArray, log: FloatArray) -> Floa
 
 def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -> Mixture:
     """Return the normal mixture that expectation and maximisation find for weighted samples."""
-    _, whole = moments(samples, weight)
-    at = rng.choice(len(samples), size=_PARTS, p=weight)
-    found = Mixture(
-        np.full(_PARTS, 1 / _PARTS), samples[at], np.repeat(0.7 * _root(whole)[None], _PARTS, 0)
+    _, covariance = moments(samples, weight)
+    starts = rng.choice(len(samples), size=_PARTS, p=weight)
+    mixture = Mixture(
+        np.full(_PARTS, 1 / _PARTS),
+        samples[starts],
+        np.repeat(0.7 * _root(covariance)[None], _PARTS, 0),
     )
     for _ in range(_STEPS):
-        found = maximised(samples, weight[:, None] * found.normal_shares(samples), whole, _BORROWED)
-    return found
+        mixture = maximised(
+            samples, weight[:, None] * mixture.normal_shares(samples), covariance, _BORROWED
+        )
+    return mixture
 
 
 def _root(covariance: FloatArray) -> FloatArray:
@@ -192,10 +196,10 @@ class Guide(NamedTuple):
         start.
         """
         weight = weights(self.log)
-        chosen = rng.choice(
+        numbers = rng.choice(
             len(weight), size=count, p=weight, replace=int((weight > 0).sum()) < count
         )
-        starts: FloatArray = self.samples[chosen]
+        starts: FloatArray = self.samples[numbers]
         return starts
 
 

@@ -53,22 +53,24 @@ def laboratory_of(recipe: Recipe) -> Laboratory:
     """Return the uncertainties that a recipe states; raise ValueError for a coefficient of an
     unknown quantity.
     """
-    told = stated(recipe)
-    if wrong := [name for name in told.temperature.coefficients if name not in WITH_COEFFICIENT]:
+    statements = stated(recipe)
+    if wrong := [
+        name for name in statements.temperature.coefficients if name not in WITH_COEFFICIENT
+    ]:
         hint = nearest(wrong[0], WITH_COEFFICIENT)
         raise ValueError(
             f"traceability.temperature.coefficients: {wrong[0]} has no coefficient; {hint}"
         )
-    width = told.lamp.centroid_uncertainty
+    width = statements.lamp.centroid_uncertainty
     return Laboratory(
-        photons=told.photons.relative_uncertainty,
-        photons_distribution=told.photons.distribution,
-        photons_freedom=told.photons.degrees_of_freedom,
-        drift=told.lamp.drift,
+        photons=statements.photons.relative_uncertainty,
+        photons_distribution=statements.photons.distribution,
+        photons_freedom=statements.photons.degrees_of_freedom,
+        drift=statements.lamp.drift,
         wavelength=None if width is None else 1e9 * width,
-        slope=told.lamp.efficiency_per_nm,
-        temperature=told.temperature.uncertainty,
-        coefficients=told.temperature.coefficients,
+        slope=statements.lamp.efficiency_per_nm,
+        temperature=statements.temperature.uncertainty,
+        coefficients=statements.temperature.coefficients,
     )
 
 
@@ -77,14 +79,16 @@ def is_relative(recipe: Recipe) -> bool:
     return stated(recipe).photons.known == "relative"
 
 
-def without_efficiency(found: Identifiability) -> Identifiability:
+def without_efficiency(identifiability: Identifiability) -> Identifiability:
     """Return what frames determine whose photons are known up to a factor: no quantum
     efficiency.
     """
-    if EFFICIENCY not in found.kinds:
-        return found
+    if EFFICIENCY not in identifiability.kinds:
+        return identifiability
     return replace(
-        found, kinds={**found.kinds, EFFICIENCY: "none"}, directions=[*found.directions, RELATIVE]
+        identifiability,
+        kinds={**identifiability.kinds, EFFICIENCY: "none"},
+        directions=[*identifiability.directions, RELATIVE],
     )
 
 

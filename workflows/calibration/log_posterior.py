@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -77,12 +77,12 @@ class SensorPosterior:
         prior_node, kind = _KINDS[density.node.path]
         prior = only_step(recipe, prior_node)
         source = str(density.wires[density.node.inputs[0]])
-        whole = (
+        levels_step = (
             str(recipe.steps[source].wires["levels"])
             if recipe.steps[source].node.path == "calibrate.sufficient"
             else source
         )
-        done = run(recipe, store, (density.name, prior.name, source, whole))
+        done = run(recipe, store, (density.name, prior.name, source, levels_step))
         coordinates = kind.of(done[prior.name], density.params)
         if isinstance(coordinates, ScatterCoordinates):
             coordinates = coordinates.seen_by(done[source], density.params)
@@ -94,7 +94,7 @@ class SensorPosterior:
             return as_function(changed, *free, outputs=[step.name], store=store)
 
         key = digest(*(done.keys[step.name] for step in (density, prior)))
-        measured = done[whole] if isinstance(done[whole], Levels) else None
+        measured = done[levels_step] if isinstance(done[levels_step], Levels) else None
         return cls(
             recipe,
             density.name,
@@ -257,19 +257,26 @@ def search_mode(problem: SensorPosterior) -> LaplaceFit:
     """
     fits = [find_mode(problem, initial_theta(problem))]
     for starts in (_TRIED, 4 * _TRIED):
-        drawn = problem.theta(
-            problem.coordinates.draw(starts, torch.Generator().manual_seed(starts))
-        )
-        drawn = drawn[np.isfinite(drawn).all(1)]
-        logs = problem.log_posterior(drawn)
-        best = [at for at in np.argsort(-logs)[:_BEST] if np.isfinite(logs[at])]
-        fits += [find_mode(problem, drawn[at]) for at in best]
+        fits += [find_mode(problem, theta) for theta in _best_draws(problem, starts)]
         settled = [fit for fit in fits if fit.settled]
-        if settled and max(fit.log for fit in fits) <= max(fit.log for fit in settled) + _HIGHER:
-            return max(settled, key=lambda fit: fit.log)
+        if settled and _highest(fits).log <= _highest(settled).log + _HIGHER:
+            return _highest(settled)
     if problem.coordinates.bent:
-        return max(fits, key=lambda fit: fit.log)
+        return _highest(fits)
     raise ValueError(_unsettled(problem, fits))
+
+
+def _highest(fits: Sequence[LaplaceFit]) -> LaplaceFit:
+    return max(fits, key=lambda fit: fit.log)
+
+
+def _best_draws(problem: SensorPosterior, starts: int) -> list[FloatArray]:
+    """Return the draws of the prior with the highest density of the posterior, of ``starts``."""
+    random = torch.Generator().manual_seed(starts)
+    drawn = problem.theta(problem.coordinates.draw(starts, random))
+    drawn = drawn[np.isfinite(drawn).all(1)]
+    logs = problem.log_posterior(drawn)
+    return [drawn[row] for row in np.argsort(-logs)[:_BEST] if np.isfinite(logs[row])]
 
 
 def _unsettled(problem: SensorPosterior, fits: list[LaplaceFit]) -> str:
@@ -379,9 +386,9 @@ def _slopes(
     rounded = problem.recipe.steps[problem.step].params.get("rounding") in ("nearest", "truncation")
     for name in problem.coordinates.edged.intersection(problem.names) if rounded else ():
         # levels depend on this parameter only at edges, where they have no derivative
-        at = problem.names.index(name)
-        rows[:, at] = 0.0
-        rows[-1, at] = float(problem.likelihood(theta[None]).scaled[0, -1])
+        column = problem.names.index(name)
+        rows[:, column] = 0.0
+        rows[-1, column] = float(problem.likelihood(theta[None]).scaled[0, -1])
     return rows, _differences(problem.whitened, theta, step, np.ones((2, len(step))))
 
 

@@ -79,10 +79,13 @@ def misfits(
     so that the deviance finds no misfit. What remains is the order of the deviations along the
     levels, a level that the others do not predict, and widths that no lamp and no electronics have.
     """
-    found = left_out(problem, samples, weights)
-    yield _prediction(found)
-    if found.lit.sum() >= _LEAST:
-        for name, z in (("variances", found.variance[found.lit]), ("means", found.mean[found.lit])):
+    deviations = left_out(problem, samples, weights)
+    yield _prediction(deviations)
+    if deviations.lit.sum() >= _LEAST:
+        for name, z in (
+            ("variances", deviations.variance[deviations.lit]),
+            ("means", deviations.mean[deviations.lit]),
+        ):
             p = min(1.0, 2 * min(runs(z), waves(z)))
             text = (
                 f"{_signs(z)} runs of sign over {len(z)} levels, waves of {_strength(z):.1f}; p ="
@@ -94,23 +97,28 @@ def misfits(
     yield from _widths(problem, theta)
 
 
-def _prediction(found: Deviations) -> Misfit:
+def _prediction(deviations: Deviations) -> Misfit:
     """Return the test of the level that deviates most from its prediction by the others."""
-    limit = _limit(ALARM / (4 * len(found.variance)))
-    what, z = max(
-        (("variance", found.variance), ("mean", found.mean)), key=lambda each: np.abs(each[1]).max()
+    limit = _limit(ALARM / (4 * len(deviations.variance)))
+    quantity, z = max(
+        (("variance", deviations.variance), ("mean", deviations.mean)),
+        key=lambda pair: np.abs(pair[1]).max(),
     )
-    at = int(np.abs(z).argmax())
-    light = f"of {found.photons[at]:.5g} photons" if found.photons[at] else "without light"
+    worst = int(np.abs(z).argmax())
+    light = (
+        f"of {deviations.photons[worst]:.5g} photons"
+        if deviations.photons[worst]
+        else "without light"
+    )
     text = (
-        f"the {what} of the level {light} and {found.exposure[at]:.4g} s deviates by {z[at]:+.1f}"
-        " sd from its "
+        f"the {quantity} of the level {light} and {deviations.exposure[worst]:.4g} s deviates by"
+        f" {z[worst]:+.1f} sd from its "
     )
-    text, good = f"{text}prediction by the other levels", abs(z[at]) <= limit
+    text, good = f"{text}prediction by the other levels", abs(z[worst]) <= limit
     if not good:
         why = (
             "its light or exposure may not be as stated"
-            if what == "mean"
+            if quantity == "mean"
             else "its frames may be disturbed"
         )
         text += f": {why}; measure it again, or leave it out"
@@ -153,10 +161,10 @@ def left_out(problem: SensorPosterior, samples: FloatArray, weights: FloatArray)
     z = [ndtri(np.clip((weight * ndtr(x)).sum(0), tiny, 1 - tiny)) for x in (variance, mean)]
     levels = problem.levels
     assert isinstance(levels, Levels)
-    used = look.degrees_of_freedom.numpy() > 0
-    order = np.argsort(levels.mean.numpy()[used])
+    fitted = look.degrees_of_freedom.numpy() > 0
+    order = np.argsort(levels.mean.numpy()[fitted])
     return Deviations(
-        *(x[order] for x in (*z, levels.photons.numpy()[used], levels.exposure.numpy()[used]))
+        *(x[order] for x in (*z, levels.photons.numpy()[fitted], levels.exposure.numpy()[fitted]))
     )
 
 
@@ -332,8 +340,8 @@ def _of_chains(chains: Chains) -> Iterator[Check]:
     rhat = max(map(_rhat, coordinates))
     yield Check("ensembles agree", f"R-hat {rhat:.4f}", f"at most {_RHAT}", _mark(rhat <= _RHAT))
     bulk, tail = (
-        min(_effective_sample_size(draws, part) for draws in coordinates)
-        for part in ("bulk", "tail")
+        min(_effective_sample_size(draws, method) for draws in coordinates)
+        for method in ("bulk", "tail")
     )
     size, enough = (
         f"effective sample size {bulk:.0f}, {tail:.0f} in the tails",
@@ -377,27 +385,27 @@ def _of_peak(
         _mark(abs(below) <= _BELOW),
     )
     bent = problem.coordinates.bent
-    at = [
+    columns = [
         i
         for i, name in enumerate(problem.names)
         if bent or identifiability.kinds[name] == "estimate"
     ]
-    if not at:
+    if not columns:
         return
     if bent:
         size = 1 / float((law.weights**2).sum())
-        text, least = (
+        text, enough = (
             f"effective sample size {size:.0f} of {len(law.weights)}",
             _WEIGHTED * len(law.weights),
         )
         yield Check(
             "weighted draws are numerous enough",
             text,
-            f"at least {least:.0f}",
-            _mark(size >= least, "warn"),
+            f"at least {enough:.0f}",
+            _mark(size >= enough, "warn"),
         )
-    sd, mean = law.sd()[at], law.mean()[at]
-    flat = chains.flat[:, at]
+    sd, mean = law.sd()[columns], law.mean()[columns]
+    flat = chains.flat[:, columns]
     apart, off = np.abs(flat.std(0) / sd - 1), np.max(np.abs(flat.mean(0) - mean) / sd)
     allowed = np.maximum(_SD, _LUCK * law.doubt(flat))
     worst = int(np.argmax(apart / allowed))
@@ -431,8 +439,8 @@ def _of_data(
             _mark(fit.good),
         )
     if is_camera(problem):
-        for found in misfits(problem, law.samples, law.weights, mode.theta):
-            yield Check(found.name, found.found, found.bar, _mark(found.good))
+        for misfit in misfits(problem, law.samples, law.weights, mode.theta):
+            yield Check(misfit.name, misfit.found, misfit.bar, _mark(misfit.good))
     if isinstance(problem.levels, Rings):
         yield from _of_rings(problem, law, law.guide)
     count = len(identifiability.directions)
@@ -525,14 +533,14 @@ def _rhat(draws: FloatArray) -> float:
     return float(arviz().rhat(draws.reshape(len(draws), -1)))
 
 
-def _effective_sample_size(draws: FloatArray, part: str) -> float:
+def _effective_sample_size(draws: FloatArray, method: str) -> float:
     """Return the effective sample size of draws (ensemble, step, walker) in the ``bulk`` or in
     the ``tail``.
     """
     chains = draws.transpose(0, 2, 1).reshape(-1, draws.shape[1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # short chains fail by their effective sample size
-        return float(arviz().ess(chains, method=part))
+        return float(arviz().ess(chains, method=method))
 
 
 def count_failures(checks: Sequence[Check]) -> int:

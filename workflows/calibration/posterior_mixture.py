@@ -42,9 +42,13 @@ class _Particles:
     prior: FloatArray  #: (particle,) log prior
     log: FloatArray  #: (particle,) log posterior
 
-    def take(self, at: FloatArray) -> None:
-        """Replace the particles by those with the numbers ``at``."""
-        self.place, self.prior, self.log = self.place[at], self.prior[at], self.log[at]
+    def take(self, numbers: FloatArray) -> None:
+        """Replace the particles by those with these ``numbers``."""
+        self.place, self.prior, self.log = (
+            self.place[numbers],
+            self.prior[numbers],
+            self.log[numbers],
+        )
 
 
 def follow_posterior(
@@ -59,10 +63,10 @@ def follow_posterior(
         before, power = power, _next_power(gain, power)
         weight = np.exp((power - before) * (gain - gain.max()))
         edges = np.cumsum(weight / weight.sum())
-        chosen = np.searchsorted(edges, (rng.random() + np.arange(len(gain))) / len(gain)).clip(
+        numbers = np.searchsorted(edges, (rng.random() + np.arange(len(gain))) / len(gain)).clip(
             0, len(gain) - 1
         )
-        particles.take(rng.permutation(chosen))
+        particles.take(rng.permutation(numbers))
         moved = 0.0
         for _ in range(_SWEEPS):
             moved += _sweep(problem, particles, power, rng)
@@ -101,8 +105,8 @@ def _next_power(gain: FloatArray, power: float) -> float:
     effective samples.
     """
 
-    def left(more: float) -> float:
-        weight = np.exp(more * (gain - gain.max()))
+    def left(step: float) -> float:
+        weight = np.exp(step * (gain - gain.max()))
         return float(weight.sum() ** 2 / (weight**2).sum() / len(weight))
 
     if left(1.0 - power) >= _KEPT:
@@ -134,8 +138,8 @@ def _sweep(
         with np.errstate(invalid="ignore"):
             rise = (1 - power) * (prior - particles.prior[own]) + power * (log - particles.log[own])
         accepted = np.log(rng.random(len(own))) < np.where(np.isfinite(rise), rise, -np.inf)
-        at = own[accepted]
-        particles.place[at], particles.prior[at], particles.log[at] = (
+        replaced = own[accepted]
+        particles.place[replaced], particles.prior[replaced], particles.log[replaced] = (
             new[accepted],
             prior[accepted],
             log[accepted],
@@ -190,11 +194,13 @@ class Mixture:
 
     def draw(self, count: int, rng: Random) -> FloatArray:
         """Draw samples (count, free)."""
-        part = rng.choice(len(self.shares), size=count, p=self.shares)
+        component = rng.choice(len(self.shares), size=count, p=self.shares)
         normal = rng.standard_normal((count, self.centres.shape[1]))
-        tail = np.broadcast_to(self.tails, self.shares.shape)[part]
+        tail = np.broadcast_to(self.tails, self.shares.shape)[component]
         off = normal / np.sqrt(rng.chisquare(tail) / tail)[:, None]
-        samples: FloatArray = self.centres[part] + np.einsum("nij,nj->ni", self.roots[part], off)
+        samples: FloatArray = self.centres[component] + np.einsum(
+            "nij,nj->ni", self.roots[component], off
+        )
         return samples
 
     def log_density(self, samples: FloatArray) -> FloatArray:
@@ -264,24 +270,25 @@ def fit_mixture(
     sample size the caller must check.
     """
     points = _start(problem, mode, rng)
-    first = mixture = kept = _fitted(points, np.full(len(points), 1 / len(points)), rng)
+    first = mixture = best_mixture = _fitted(points, np.full(len(points), 1 / len(points)), rng)
     best = -1.0
     for _ in range(_ROUNDS):
         samples, log = weighed(problem, mixture, _TRIED, rng)
         fraction = effective(log)
         if fraction > best:
-            best, kept = fraction, mixture
+            best, best_mixture = fraction, mixture
         if fraction >= _ENOUGH:
             break
         mixture = _joined(first, _fitted(samples, normalised(softened(log)), rng))
-    return kept, *weighed(problem, kept, count, rng)
+    return best_mixture, *weighed(problem, best_mixture, count, rng)
 
 
-def _joined(one: Mixture, other: Mixture) -> Mixture:
+def _joined(first: Mixture, second: Mixture) -> Mixture:
     """Return the mixture of two mixtures in equal parts."""
-    shares = 0.5 * np.concatenate([one.shares, other.shares])
+    shares = 0.5 * np.concatenate([first.shares, second.shares])
     centres, roots = (
-        np.concatenate([a, b]) for a, b in ((one.centres, other.centres), (one.roots, other.roots))
+        np.concatenate([a, b])
+        for a, b in ((first.centres, second.centres), (first.roots, second.roots))
     )
     return Mixture(shares, centres, roots)
 
@@ -311,19 +318,19 @@ def _fitted(samples: FloatArray, weight: FloatArray, rng: np.random.Generator) -
     """Return the mixture that expectation and maximisation find for weighted samples, and a
     broad component.
     """
-    centre, whole = moments(samples, weight)
-    root = np.linalg.cholesky(firm(whole))
-    at = _apart(np.linalg.solve(root, (samples - centre).T).T, weight, rng)
-    found = Mixture(
-        np.full(_PARTS, 1 / _PARTS), samples[at], np.repeat(0.5 * root[None], _PARTS, 0)
+    centre, covariance = moments(samples, weight)
+    root = np.linalg.cholesky(firm(covariance))
+    starts = _apart(np.linalg.solve(root, (samples - centre).T).T, weight, rng)
+    mixture = Mixture(
+        np.full(_PARTS, 1 / _PARTS), samples[starts], np.repeat(0.5 * root[None], _PARTS, 0)
     )
     for _ in range(_STEPS):
-        parts = weight[:, None] * found.normal_shares(samples)
-        found = maximised(samples, parts, whole)
+        parts = weight[:, None] * mixture.normal_shares(samples)
+        mixture = maximised(samples, parts, covariance)
     return Mixture(
-        np.append((1 - _BROAD) * found.shares, _BROAD),
-        np.concatenate([found.centres, centre[None]]),
-        np.concatenate([found.roots, _WIDER * root[None]]),
+        np.append((1 - _BROAD) * mixture.shares, _BROAD),
+        np.concatenate([mixture.centres, centre[None]]),
+        np.concatenate([mixture.roots, _WIDER * root[None]]),
     )
 
 
@@ -332,29 +339,29 @@ def _apart(places: FloatArray, weight: FloatArray, rng: np.random.Generator) -> 
     those before.
     """
     pool = rng.choice(len(places), size=4 * _PARTICLES // 10, p=weight)
-    chosen, away = [int(pool[0])], ((places[pool] - places[pool[0]]) ** 2).sum(1)
+    starts, away = [int(pool[0])], ((places[pool] - places[pool[0]]) ** 2).sum(1)
     for number in range(1, _PARTS):
         far = number % 2 and away.sum() > 0
-        chosen.append(int(rng.choice(pool, p=away / away.sum()) if far else rng.choice(pool)))
-        away = np.minimum(away, ((places[pool] - places[chosen[-1]]) ** 2).sum(1))
-    return chosen
+        starts.append(int(rng.choice(pool, p=away / away.sum()) if far else rng.choice(pool)))
+        away = np.minimum(away, ((places[pool] - places[starts[-1]]) ** 2).sum(1))
+    return starts
 
 
 def maximised(
-    samples: FloatArray, parts: FloatArray, whole: FloatArray, borrowed: float = _BORROWED
+    samples: FloatArray, parts: FloatArray, overall: FloatArray, borrowed: float = _BORROWED
 ) -> Mixture:
     """Return the mixture of normal components with the moments of samples, by their shares
     ``parts``.
 
-    ``borrowed`` is the share of samples with the covariance ``whole`` that is added to all
+    ``borrowed`` is the share of samples with the covariance ``overall`` that is added to all
     components together.
     """
     shares = parts.sum(0)
     centres = parts.T @ samples / shares.clip(1e-300)[:, None]
     away = samples[None] - centres[:, None]
     sums = np.swapaxes(away * parts.T[:, :, None], 1, 2) @ away
-    each = borrowed / len(shares)
-    covariance = (sums + each * whole) / (shares + each)[:, None, None]
+    added = borrowed / len(shares)
+    covariance = (sums + added * overall) / (shares + added)[:, None, None]
     roots = np.linalg.cholesky(firm(covariance)).astype(np.float64)
     return Mixture(shares / shares.sum(), centres, roots)
 
@@ -369,8 +376,8 @@ def moments(samples: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatA
 def firm(covariance: FloatArray) -> FloatArray:
     """Return covariances (..., free, free) whose rounding cannot make a variance negative."""
     firm = covariance.copy()
-    at = np.arange(covariance.shape[-1])
-    firm[..., at, at] *= 1 + 1e-9
+    diagonal = np.arange(covariance.shape[-1])
+    firm[..., diagonal, diagonal] *= 1 + 1e-9
     return firm
 
 
@@ -402,8 +409,8 @@ def effective(log: FloatArray) -> float:
 def normalised(log: FloatArray) -> FloatArray:
     """Return weights with a sum of 1 from the logarithms of unnormalised weights."""
     weight = np.exp(log - log.max())
-    whole: FloatArray = weight / weight.sum()
-    return whole
+    weights: FloatArray = weight / weight.sum()
+    return weights
 
 
 def finite(log: FloatArray) -> FloatArray:

@@ -165,8 +165,8 @@ def find_posterior(
         file,
         seed=recipe.seed,
         walkers=walkers,
-        how=move,
-        wanted=draws,
+        move_name=move,
+        effective_size=draws,
         progress=progress,
         guide=law.guide,
     )
@@ -194,12 +194,15 @@ def _data_checks(
     """Return what the frames may hide, and if they have the least data of a clean statement;
     none without frames.
     """
-    found = hidden_checks(tests, problem.coordinates.prior.may_hide)
-    if not found or not isinstance(problem.levels, Levels):
-        return found
+    checks = hidden_checks(tests, problem.coordinates.prior.may_hide)
+    if not checks or not isinstance(problem.levels, Levels):
+        return checks
     levels = problem.levels
-    used = problem.likelihood(mode.theta[None]).degrees_of_freedom > 0
-    return [*found, data_check(float(levels.degrees_of_freedom[used & (levels.photons > 0)].sum()))]
+    fitted = problem.likelihood(mode.theta[None]).degrees_of_freedom > 0
+    return [
+        *checks,
+        data_check(float(levels.degrees_of_freedom[fitted & (levels.photons > 0)].sum())),
+    ]
 
 
 def _widened(result: CalibrationResult, laboratory: Laboratory) -> CalibrationResult:
@@ -207,12 +210,14 @@ def _widened(result: CalibrationResult, laboratory: Laboratory) -> CalibrationRe
     states, and its budgets.
     """
     problem, tests = result.problem, result.frames
-    told = result.identifiability
+    identifiability = result.identifiability
     chains = widened(problem, result.chains, tests, problem.recipe.seed)
     models = widened_models(result.models, tests, problem.coordinates.prior.may_hide)
     result = replace(
         result,
-        identifiability=without_efficiency(told) if is_relative(problem.recipe) else told,
+        identifiability=without_efficiency(identifiability)
+        if is_relative(problem.recipe)
+        else identifiability,
         chains=with_laboratory(problem, chains, laboratory, problem.recipe.seed),
         models=with_laboratory_models(models, laboratory),
         walk=result.chains,
@@ -236,12 +241,12 @@ def _refused_document(refused: FramesRefused) -> dict[str, Any]:
     """Return the document of a calibration whose frames are refused, without a value of any
     parameter.
     """
-    found = frame_checks(refused.tests)
+    checks = frame_checks(refused.tests)
     return {
-        "failed": count_failures(found),
+        "failed": count_failures(checks),
         "parameters": {},
         "frames": as_rows(refused.tests),
-        "checks": [asdict(check) for check in found],
+        "checks": [asdict(check) for check in checks],
     }
 
 
@@ -266,14 +271,14 @@ def _refused_report(
 def _document(result: CalibrationResult) -> dict[str, Any]:
     """Return the results of a calibration for ``posterior.json``."""
     problem, flat = result.problem, result.chains.flat
-    told = [i for i, name in enumerate(problem.names) if name in result.identifiability.told]
+    determined = [i for i, name in enumerate(problem.names) if name in result.identifiability.told]
     return {
         "failed": count_failures(result.checks),
         "parameters": {row.name: _plain(asdict(row)) for row in result.rows()},
         "gaussian": {
-            "coordinates": [problem.coordinates.labels[i] for i in told],
-            "mean": flat[:, told].mean(0).tolist(),
-            "covariance": np.cov(flat[:, told].T).reshape(len(told), -1).tolist(),
+            "coordinates": [problem.coordinates.labels[i] for i in determined],
+            "mean": flat[:, determined].mean(0).tolist(),
+            "covariance": np.cov(flat[:, determined].T).reshape(len(determined), -1).tolist(),
         },
         "stated": {model.name: asdict(model.stated) for model in estimated_models(result)},
         "least_squares": compared(result.beside),
@@ -286,10 +291,10 @@ def _document(result: CalibrationResult) -> dict[str, Any]:
 def _plain(row: Mapping[str, Any]) -> dict[str, Any]:
     """Return the results of a parameter, without the numbers that the frames do not give."""
     not_told = NOT_TOLD[row["kind"]]
-    kept = {name: value for name, value in row.items() if name not in not_told}
+    determined = {name: value for name, value in row.items() if name not in not_told}
     return {
         name: None if isinstance(x, float) and not math.isfinite(x) else x
-        for name, x in kept.items()
+        for name, x in determined.items()
     }
 
 
@@ -297,8 +302,8 @@ def _report(result: CalibrationResult, document: Mapping[str, Any]) -> StudyRepo
     parts = sections(result)
     curve = "rings" if isinstance(result.problem.levels, Rings) else "transfer"
     pictures: dict[str, bytes | None] = {
-        name: part.picture
-        for name, part in zip((curve, "corner", "chains"), parts[-3:], strict=True)
+        name: section.picture
+        for name, section in zip((curve, "corner", "chains"), parts[-3:], strict=True)
     }
     pictures["budget"] = result.budget_picture
     files: dict[str, Content] = {

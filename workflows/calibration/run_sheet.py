@@ -69,30 +69,35 @@ def write_sheet(
             and for a wrong
     statement.
     """
-    study_run, told = StudyRun("sheet", recipe, command), operating_point(state, stated(recipe))
+    study_run, statements = (
+        StudyRun("sheet", recipe, command),
+        operating_point(state, stated(recipe)),
+    )
     laboratory, photons_told = laboratory_of(recipe), not (relative or is_relative(recipe))
     frames = frames_of_recipe(recipe, store, release)
     sheet = emva_sheet(frames.levels, frames.spatial, photons_told=photons_told)
     budgets = sheet_budgets(frames.levels, sheet, laboratory, photons_told)
-    document = study_run.document(_document(sheet, frames, told, release is not None))
-    report = _report(recipe, sheet, frames, told, document, budgets)
+    document = study_run.document(_document(sheet, frames, statements, release is not None))
+    report = _report(recipe, sheet, frames, statements, document, budgets)
     return study_run.write(runs, digest(document["quantities"]), document, report, "emva1288")
 
 
 def _document(
-    sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any], chosen: bool
+    sheet: EmvaSheet, frames: EmvaFrames, statements: Mapping[str, Any], by_user: bool
 ) -> dict[str, Any]:
-    """Return the content of ``emva1288.json``; ``chosen`` is True if the user chose the release."""
+    """Return the content of ``emva1288.json``; ``by_user`` is True if the user chose the
+    release.
+    """
     return {
         "standard": "EMVA 1288, release 4.0 Linear",
-        "temporal variance": temporal_variance(frames, chosen),
+        "temporal variance": temporal_variance(frames, by_user),
         "fails": banner(sheet, frames.tests),
         "quantities": {
             q.key: {"section": group_of(q, sheet), **asdict(q)} for q in sheet.quantities
         },
-        "operating point": dict(told),
+        "operating point": dict(statements),
         "frames": as_rows(frames.tests),
-        "demands": [each._asdict() for each in requirements(sheet, frames, told)],
+        "demands": [demand._asdict() for demand in requirements(sheet, frames, statements)],
         "deviation": None if sheet.linearity is None else sheet.linearity.deviation.tolist(),
     }
 
@@ -101,7 +106,7 @@ def _report(
     recipe: Recipe,
     sheet: EmvaSheet,
     frames: EmvaFrames,
-    told: Mapping[str, Any],
+    statements: Mapping[str, Any],
     document: Mapping[str, Any],
     budgets: Sequence[Budget],
 ) -> StudyReport:
@@ -110,14 +115,14 @@ def _report(
     budget = {"budget": budget_picture(named)} if named else {}
     traced = budget_sections(named, stated(recipe), budget.get("budget"), _MORE)
     summary = [
-        f"{name}: {'not stated' if told[key] is None else told[key]}"
+        f"{name}: {'not stated' if statements[key] is None else statements[key]}"
         for key, name in OPERATING_POINT.items()
     ]
     summary += [document["temporal variance"], _PLUS, document["fails"]]
     return StudyReport(
         title,
         lead(sheet, document["temporal variance"]),
-        sections(sheet, frames, told, pictures, traced),
+        sections(sheet, frames, statements, pictures, traced),
         pictures | budget,
         tables={
             "emva1288.csv": (_COLUMNS, _rows(sheet)),

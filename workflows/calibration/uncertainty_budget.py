@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -104,17 +105,17 @@ _LINES = """Each source with its type (A: from a series of observations; B: by o
 
 
 def budget_sections(
-    budgets: Sequence[Budget], told: Traceability, picture: bytes | None, more: str = ""
+    budgets: Sequence[Budget], traceability: Traceability, picture: bytes | None, note: str = ""
 ) -> list[Section]:
     """Return the sections of a page with the budgets, their sources, and what the laboratory
     states.
 
-    ``more`` is a sentence on where other budgets are.
+    ``note`` is a sentence on where other budgets are.
     """
     if not budgets:
         return [
             Section("Uncertainty budget", "No quantity has a value, so that none has a budget."),
-            *_traced(told),
+            *_traced(traceability),
         ]
     columns = (
         "quantity",
@@ -132,14 +133,14 @@ def budget_sections(
         (i, 8): "warn" for i, budget in enumerate(budgets) if budget.missing
     }
     return [
-        Section("Uncertainty budget", _TEXT + more, columns, rows, picture, marks),
+        Section("Uncertainty budget", _TEXT + note, columns, rows, picture, marks),
         Section(
             "Sources of uncertainty",
             _LINES,
             _LINE_COLUMNS,
-            [line for b in budgets for line in _lines(b)],
+            list(itertools.chain(*map(_lines, budgets))),
         ),
-        *_traced(told),
+        *_traced(traceability),
     ]
 
 
@@ -181,7 +182,7 @@ def _lines(budget: Budget) -> Iterator[tuple[Any, ...]]:
         if c.share is None:
             yield name, c.source, c.kind, c.reason, None, "", None, "", None, ""
         else:
-            part = (c.share / budget.combined) ** 2 if budget.combined else 0.0
+            variance_share = (c.share / budget.combined) ** 2 if budget.combined else 0.0
             yield (
                 name,
                 c.source,
@@ -192,7 +193,7 @@ def _lines(budget: Budget) -> Iterator[tuple[Any, ...]]:
                 c.sensitivity,
                 _freedom(c.freedom),
                 c.share,
-                f"{part:.1%}",
+                f"{variance_share:.1%}",
             )
 
 
@@ -204,19 +205,21 @@ def _freedom(freedom: float) -> str:
     return f"{freedom:.3g}" if freedom < 1e4 else "∞" if math.isinf(freedom) else f"{freedom:.0e}"
 
 
-def _traced(told: Traceability) -> list[Section]:
+def _traced(traceability: Traceability) -> list[Section]:
     text = """What the block `traceability` of the recipe states of the light and of the
         temperature, so that a value can be traced to a standard."""
-    rows = [(name, "not stated" if value is None else value) for name, value in statements(told)]
+    rows = [
+        (name, "not stated" if value is None else value) for name, value in statements(traceability)
+    ]
     marks: dict[tuple[int, int], Mark] = {
         (i, 1): "warn" for i, (_, value) in enumerate(rows) if value == "not stated"
     }
     return [Section("Traceability", text, ("statement", "value"), rows, marks=marks)]
 
 
-def statements(told: Traceability) -> list[tuple[str, str | None]]:
+def statements(traceability: Traceability) -> list[tuple[str, str | None]]:
     """Return each statement of a laboratory by its name, with None for what is not stated."""
-    photons, lamp, temperature = told.photons, told.lamp, told.temperature
+    photons, lamp, temperature = traceability.photons, traceability.lamp, traceability.temperature
     relative = photons.relative_uncertainty
     coefficients = "; ".join(f"{name} {x:g} /K" for name, x in temperature.coefficients.items())
     return [
@@ -241,11 +244,11 @@ def statements(told: Traceability) -> list[tuple[str, str | None]]:
     ]
 
 
-def of_traceability(told: Traceability) -> dict[str, str | None]:
+def of_traceability(traceability: Traceability) -> dict[str, str | None]:
     """Return what a laboratory states of the operating point of a sheet, by the keys of its
     statements.
     """
-    photons, lamp, temperature = told.photons, told.lamp, told.temperature
+    photons, lamp, temperature = traceability.photons, traceability.lamp, traceability.temperature
     return {
         "wavelength": _nm(lamp.centroid, lamp.centroid_uncertainty),
         "bandwidth": _nm(lamp.fwhm),
@@ -288,7 +291,7 @@ def budget_rows(budgets: Sequence[Budget]) -> Iterator[tuple[Any, ...]]:
             )
 
 
-def budget_document(budgets: Sequence[Budget], told: Traceability) -> dict[str, Any]:
+def budget_document(budgets: Sequence[Budget], traceability: Traceability) -> dict[str, Any]:
     """Return the content of ``budget.json``; infinite degrees of freedom are the text
     ``infinite``.
     """
@@ -296,7 +299,8 @@ def budget_document(budgets: Sequence[Budget], told: Traceability) -> dict[str, 
         "guide": "JCGM 100:2008 (GUM)",
         "coverage probability": COVERAGE,
         "traceability": {
-            name: "not stated" if value is None else value for name, value in statements(told)
+            name: "not stated" if value is None else value
+            for name, value in statements(traceability)
         },
         "quantities": {b.key: _budget(b) for b in budgets},
     }
@@ -320,8 +324,8 @@ def _budget(b: Budget) -> dict[str, Any]:
 def _contribution(c: Contribution) -> dict[str, Any]:
     if c.share is None:
         return {"source": c.source, "kind": c.kind, "reason": c.reason}
-    kept = {name: value for name, value in asdict(c).items() if name != "reason"}
-    return {**kept, "freedom": _finite(c.freedom), "contribution": c.share}
+    values = {name: value for name, value in asdict(c).items() if name != "reason"}
+    return {**values, "freedom": _finite(c.freedom), "contribution": c.share}
 
 
 def _finite(freedom: float) -> float | str:
@@ -339,26 +343,41 @@ def budget_figure(budgets: Sequence[Budget]) -> Any:
     """Draw the share of each source in the variance of each quantity, as bars that add up to 100
     %.
     """
-    sources = list(dict.fromkeys(c.source for b in budgets for c in b.contributions if c.share))
+    sources = _shown_sources(budgets)
     colours = {source: _COLOURS[i % len(_COLOURS)] for i, source in enumerate(sources)}
     figure, axes = canvas(9.0, 1.5 + 0.36 * len(budgets) + 0.24 * len(sources))
     ax, shown = axes[0, 0], set[str]()
-    for i, b in enumerate(budgets):
+    for i, budget in enumerate(budgets):
         left = 0.0
-        for c in b.contributions:
-            part = 100 * ((c.share or 0.0) / b.combined) ** 2 if b.combined else 0.0
-            if part > 100 * _LEAST:
-                label = None if c.source in shown else c.source
-                shown.add(c.source)
-                ax.barh(i, part, left=left, color=colours[c.source], label=label, height=0.7)
-                left += part
-        ax.text(101, i, f"U = {two_digits(b.expanded)} {b.unit}".rstrip(), va="center", fontsize=9)
+        for source, percent in _percentages(budget):
+            label = None if source in shown else source
+            shown.add(source)
+            ax.barh(i, percent, left=left, color=colours[source], label=label, height=0.7)
+            left += percent
+        text = f"U = {two_digits(budget.expanded)} {budget.unit}".rstrip()
+        ax.text(101, i, text, va="center", fontsize=9)
     ax.set_yticks(range(len(budgets)), [b.symbol or b.name for b in budgets])
     ax.set(xlim=(0, 100), xlabel="share of the variance (%)", title="Sources of uncertainty")
     ax.invert_yaxis()
     ax.grid(axis="y", visible=False)
     figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
+
+
+def _shown_sources(budgets: Sequence[Budget]) -> list[str]:
+    """Return the sources with a share in any budget, each once."""
+    sources = dict[str, None]()
+    for budget in budgets:
+        sources |= dict.fromkeys(c.source for c in budget.contributions if c.share)
+    return list(sources)
+
+
+def _percentages(budget: Budget) -> Iterator[tuple[str, float]]:
+    """Yield each source that is wide enough to be drawn, with its share of the variance in %."""
+    for c in budget.contributions:
+        percent = 100 * ((c.share or 0.0) / budget.combined) ** 2 if budget.combined else 0.0
+        if percent > 100 * _LEAST:
+            yield c.source, percent
 
 
 #: from budgets to the PNG bytes of the picture
@@ -406,33 +425,33 @@ def _calibration_budget(
     freedom: Mapping[str, float],
     laboratory: Laboratory,
 ) -> Budget:
-    found = _estimate(result, row)
-    photons = -found.value if row.name == EFFICIENCY else 0.0
+    estimate = _estimate(result, row)
+    photons = -estimate.value if row.name == EFFICIENCY else 0.0
     lines = (
-        *_of_posterior(found, row.unit, shares, freedom),
-        _of_model(row.name, found, row.unit),
-        _of_tests(result, row, found.value),
-        *laboratory_contributions(row.name, found.value, photons, laboratory),
+        *_of_posterior(estimate, row.unit, shares, freedom),
+        _of_model(row.name, estimate, row.unit),
+        _of_tests(result, row, estimate.value),
+        *laboratory_contributions(row.name, estimate.value, photons, laboratory),
     )
-    return Budget(row.name, row.name.replace("_", " "), "", row.unit, found.value, lines)
+    return Budget(row.name, row.name.replace("_", " "), "", row.unit, estimate.value, lines)
 
 
 def _of_posterior(
-    found: _Estimate, unit: str, shares: Mapping[str, float], freedom: Mapping[str, float]
+    estimate: _Estimate, unit: str, shares: Mapping[str, float], freedom: Mapping[str, float]
 ) -> Iterator[Contribution]:
     for source, share in shares.items():
         kind: Literal["A", "B"] = "B" if source == _PRIOR else "A"
         nu = math.inf if source == _PRIOR else freedom.get(source, math.inf)
-        deviation = found.posterior * math.sqrt(share)
+        deviation = estimate.posterior * math.sqrt(share)
         yield Contribution(source, kind, "normal", deviation, unit, 1.0, nu)
 
 
-def _of_model(name: str, found: _Estimate, unit: str) -> Contribution:
+def _of_model(name: str, estimate: _Estimate, unit: str) -> Contribution:
     if name in TERMS:
         return Contribution(MODEL, "B", reason=NOT_INVOLVED)
-    if found.model is None:
+    if estimate.model is None:
         return Contribution(MODEL, "B", reason=f"{NOT_STATED}: one model only")
-    return Contribution(MODEL, "B", "two points", found.model, unit)
+    return Contribution(MODEL, "B", "two points", estimate.model, unit)
 
 
 def _of_tests(result: CalibrationResult, row: ParameterEstimate, value: float) -> Contribution:
@@ -452,11 +471,12 @@ def _estimate(result: CalibrationResult, row: ParameterEstimate) -> _Estimate:
     model = models[row.name]
     linear = row.name in result.problem.coordinates.linear
     pairs = [
-        _centre_and_width(each.value, each.low, each.high, linear) for each in model.models[-2:]
+        _centre_and_width(variant.value, variant.low, variant.high, linear)
+        for variant in model.models[-2:]
     ]
-    (fewer, narrow), (more, wide) = pairs[0], pairs[-1]
+    (fewer, narrow), (richer, wide) = pairs[0], pairs[-1]
     scale = 1.0 if linear else model.stated.value
-    apart = abs(fewer - more) / 2
+    apart = abs(fewer - richer) / 2
     return _Estimate(model.stated.value, scale * width_of_mean(narrow, wide), scale * apart)
 
 
@@ -470,15 +490,15 @@ def _shares(result: CalibrationResult) -> dict[str, dict[str, float]]:
     """Return the share of each source in the variance of the posterior of each parameter."""
     problem, mode = result.problem, result.mode
     slopes = torch.from_numpy(mode.scaled_slopes)
-    found = {STATISTICS: torch.ones(len(slopes), dtype=torch.float64)}
+    sources = {STATISTICS: torch.ones(len(slopes), dtype=torch.float64)}
     if isinstance(problem.levels, Levels):
         values = {name: float(x) for name, x in problem.parameters(mode.theta).items()}
-        found = camera_sources(problem.levels, {**result.params, **values})
+        sources = camera_sources(problem.levels, {**result.params, **values})
     z = torch.from_numpy(problem.whitened(mode.theta))
     return {
         name: {
             (_PRIOR if source == "prior" else source): share
-            for source, share in variance_shares(slopes, found, torch.from_numpy(along)).items()
+            for source, share in variance_shares(slopes, sources, torch.from_numpy(along)).items()
         }
         for name, along in _derivatives(result, z.numpy()).items()
     }

@@ -93,7 +93,7 @@ def main(arguments: list[str] | None = None) -> None:
         interrupts.watch()
         # a search for garbage among imported modules takes a tenth of the start-up time
         gc.disable()
-    arguments = sys.argv[1:] if arguments is None else arguments
+        arguments = sys.argv[1:]
     TYPED[:] = arguments
     said.clear()
     _print_any_character()

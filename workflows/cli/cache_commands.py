@@ -18,7 +18,7 @@ from neusee.workflows.store.cache_settings import format_size, parse_size
 from neusee.workflows.store.metadata import is_kept
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from neusee.workflows.store.derived_files import DerivedFiles
     from neusee.workflows.store.result_store import Store
@@ -37,7 +37,7 @@ Key = Annotated[
 
 @cache.command("ls")
 def ls(
-    whole: Annotated[
+    every: Annotated[
         bool, typer.Option("--all", help="List every stored result, the newest last.")
     ] = False,
 ) -> None:
@@ -46,7 +46,7 @@ def ls(
     For each result: when it was computed, its bytes and seconds, its step and the recipe that first
     needed it.
     """
-    for line in ls_lines(the_store(), whole):
+    for line in ls_lines(the_store(), every):
         print(line)
 
 
@@ -109,27 +109,27 @@ def why(key: Key) -> None:
 # --- what the commands print ----------------------------------------------------------------------
 
 
-def ls_lines(store: Store, whole: bool = False) -> Iterator[str]:
+def ls_lines(store: Store, every: bool = False) -> Iterator[str]:
     """Yield a line for each cached result with its date, bytes, seconds, step, recipe and key, the
     newest last.
 
-    Without ``whole``, these are the newest 50. In a long journal their number and bytes are those
+    Without ``every``, these are the newest 50. In a long journal their number and bytes are those
     that it tells, so that the time does not grow with each result. Of each result, one short text
     is held in memory.
     """
     pins = store.pinned()
-    if whole or not store.journal.is_long():
-        rows, kept, size = _every_row(store, pins)
-        receipts, by = len(rows) - kept, ""
+    if every or not store.journal.is_long():
+        rows, values, size = _every_row(store, pins)
+        receipts, by = len(rows) - values, ""
     else:
         rows = _newest_rows(store, pins)
-        kept, size, receipts = store.journal.totals()
+        values, size, receipts = store.journal.totals()
         by = " by the journal"
-    shown = rows if whole else rows[-_PAGE:]
+    shown = rows if every else rows[-_PAGE:]
     yield from _aligned(shown)
-    if kept + receipts > len(shown):
+    if values + receipts > len(shown):
         yield f"the newest {len(shown)}; `neusee cache ls --all` lists all"
-    last = f"{_count(kept, 'result')}, {format_size(size)}{by}, in {store.root}"
+    last = f"{_count(values, 'result')}, {format_size(size)}{by}, in {store.root}"
     if receipts:
         last += f"; of {_count(receipts, 'more result')} the receipt alone"
     last += _answers_text(stored_answer.answers(store.disk))
@@ -142,12 +142,12 @@ def _every_row(store: Store, pins: set[str]) -> tuple[list[str], int, int]:
     """Return the row of each result in order of time, the number of stored values and their
     bytes.
     """
-    rows, kept, size = list[str](), 0, 0
+    rows, values, size = list[str](), 0, 0
     for key, about in store.entries():
         rows.append("\0".join(_row(key, about, key in pins)))
         if is_kept(about):
-            kept, size = kept + 1, size + _size(about)
-    return sorted(rows, key=_row_date), kept, size
+            values, size = values + 1, size + _size(about)
+    return sorted(rows, key=_row_date), values, size
 
 
 def _newest_rows(store: Store, pins: set[str]) -> list[str]:
@@ -155,8 +155,8 @@ def _newest_rows(store: Store, pins: set[str]) -> list[str]:
     time.
     """
     newest = dict.fromkeys(row["key"] for row in reversed(store.journal.latest()))
-    found = ((key, store.about(key)) for key in newest)
-    some = itertools.islice(((key, about) for key, about in found if about is not None), _PAGE)
+    entries = ((key, store.about(key)) for key in newest)
+    some = itertools.islice(((key, about) for key, about in entries if about is not None), _PAGE)
     return sorted(("\0".join(_row(key, about, key in pins)) for key, about in some), key=_row_date)
 
 
@@ -192,7 +192,8 @@ def verify_lines(store: Store) -> tuple[list[str], int]:
             sizes.append(_size(about))
     answers, broken = stored_answer.check(store.disk)
     damaged += [
-        f"{each.name}  the answer of a command, which is not what was written" for each in broken
+        f"{answer.name}  the answer of a command, which is not what was written"
+        for answer in broken
     ]
     last = (
         f"{_count(len(sizes), 'result')}, {format_size(sum(sizes))}{_answers_text(answers)}, as"
@@ -213,9 +214,7 @@ def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list
     Raises `ValueError` for a budget that is not a size.
     """
     swept = store.gc(None if budget is None else parse_size(budget), dry)
-    full = budget is not None and swept.left + sum(
-        map(_bytes, stored_answer.answers(store.disk))
-    ) > parse_size(budget)
+    full = budget is not None and _is_beyond(store, swept.left, parse_size(budget))
     old = stored_answer.sweep(store.disk, dry, everything=full)
     abouts = ((key, store.about(key)) for key in swept.evicted)  # the receipts of what went
     rows = [[*_row(key, about, False)[1:4], key[:8]] for key, about in abouts if about is not None]
@@ -224,33 +223,46 @@ def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list
         " to no result"
     )
     freed, left = format_size(swept.freed), format_size(swept.left)
-    last = f"{went} {'would go' if dry else 'went'}: {freed}; {left} stay in {store.root}"
-    refused = f"{_count(len(swept.refused), 'value')} of other users could not be removed"
-    of_answers = f"{_answers_text(old)[2:]} {'would go' if dry else 'went'}"
-    more = [*([refused] if swept.refused else []), *([of_answers] if old else [])]
-    return [*(columns(rows) if rows else []), *more, last]
+    verb = "would go" if dry else "went"
+    last = f"{went} {verb}: {freed}; {left} stay in {store.root}"
+    lines = list(columns(rows)) if rows else []
+    if swept.refused:
+        lines.append(f"{_count(len(swept.refused), 'value')} of other users could not be removed")
+    if old:
+        lines.append(f"{_answers_text(old)[2:]} {verb}")
+    return [*lines, last]
+
+
+def _is_beyond(store: Store, left: int, budget: int) -> bool:
+    """Return True if the values that are left and the stored answers need more than a budget."""
+    return left + sum(map(_bytes, stored_answer.answers(store.disk))) > budget
 
 
 def pin_lines(store: Store, prefix: str, pin: bool = True) -> list[str]:
     """Pin or unpin the cached value whose key begins with ``prefix``; raise `ValueError` for no
     or several matches.
     """
-    keys = {key for key, about in store.entries() if is_kept(about)} if pin else store.pinned()
+    if pin:
+        keys = {key for key, about in store.entries() if is_kept(about)}
+        key = _only_key(keys, prefix, "value")
+        store.pin(key)
+    else:
+        key = _only_key(store.pinned(), prefix, "pinned value")
+        store.unpin(key)
+    step = (store.about(key) or {}).get("step") or "a value that is not here"
+    return [f"{'pinned' if pin else 'no longer pinned'}: {key}  {step}"]
+
+
+def _only_key(keys: Iterable[str], prefix: str, noun: str) -> str:
+    """Return the key that begins with ``prefix``; raise `ValueError` for no or several matches."""
     named = sorted(key for key in keys if key.startswith(prefix.lower()))
-    if len(named) != 1:
-        what = "value" if pin else "pinned value"
-        few = (
-            f"it matches {', '.join(key[:12] for key in named[:5])}"
-            if named
-            else "it matches no key"
-        )
-        raise ValueError(
-            f"{prefix!r} must be the start of the key of one {what}: {few} (`neusee cache ls` lists"
-            " keys)"
-        )
-    (store.pin if pin else store.unpin)(named[0])
-    step = (store.about(named[0]) or {}).get("step") or "a value that is not here"
-    return [f"{'pinned' if pin else 'no longer pinned'}: {named[0]}  {step}"]
+    if len(named) == 1:
+        return named[0]
+    few = f"it matches {', '.join(key[:12] for key in named[:5])}" if named else "it matches no key"
+    raise ValueError(
+        f"{prefix!r} must be the start of the key of one {noun}: {few} (`neusee cache ls` lists"
+        " keys)"
+    )
 
 
 def _picture_problem(files: DerivedFiles, key: str, about: dict[str, Any]) -> str:
@@ -304,5 +316,5 @@ def _bytes(answer: stored_answer.Kept) -> int:
     return answer.size
 
 
-def _count(count: int, what: str) -> str:
-    return f"{count} {what}{'s' * (count != 1)}"
+def _count(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' * (count != 1)}"

@@ -146,8 +146,8 @@ def _loaded(words: list[str] | None, store: Store, quiet: bool) -> tuple[Recipe,
     from neusee.workflows.report.study_folder import silent
 
     with failing(ValueError, before="nothing was drawn: "), refusing():
-        told = silent if quiet else say_line
-        recipe = recipe_of_folder(Path(name), store, changes, told)
+        report = silent if quiet else say_line
+        recipe = recipe_of_folder(Path(name), store, changes, report)
         return recipe, ["neusee", "calibrate", name, *changes], True
 
 
@@ -240,26 +240,32 @@ def sheet(
     from neusee.workflows.graph.run_error import RunError
 
     recipe, command = _loaded_camera(words, quiet or as_json)
-    said = [word for fact in state or () for word in ("--state", fact)]
-    chosen: Release | None = (
-        None if release is None else "3" if release is StandardRelease.three else "4"
-    )
-    command += [*option_words({"release": chosen, "relative": relative}), *said]
+    facts, edition = state or (), _edition(release)
+    command += option_words({"release": edition, "relative": relative})
+    for fact in facts:
+        command += ["--state", fact]
     with failing(RunError, code=FAILED), failing(ValueError):
         folder = write_sheet(
-            recipe, the_store(), out, command, release=chosen, relative=relative, state=state or ()
+            recipe, the_store(), out, command, release=edition, relative=relative, state=facts
         )
     document = json.loads(text_of(folder / "emva1288.json"))
     if not quiet and not as_json:
         say(
             [
-                *(_line(each) for each in document["quantities"].values()),
+                *(_line(quantity) for quantity in document["quantities"].values()),
                 document["temporal variance"],
             ]
         )
     say_folder(folder, as_json)
     if document["fails"]:
         fail(f"{document['fails']} See {folder / 'report.html'}", MISSED)
+
+
+def _edition(release: StandardRelease | None) -> Release | None:
+    """Return the release of the standard as the sheet names it."""
+    if release is None:
+        return None
+    return "3" if release is StandardRelease.three else "4"
 
 
 def _loaded_camera(words: list[str] | None, quiet: bool) -> tuple[Recipe, list[str]]:
@@ -277,8 +283,8 @@ def _loaded_camera(words: list[str] | None, quiet: bool) -> tuple[Recipe, list[s
 
     with failing(ValueError, before="nothing was computed: "), refusing():
         if Path(name).is_dir() and not descriptors_in(Path(name)):
-            told = silent if quiet else say_line
-            recipe = recipe_of_folder(Path(name), the_store(), changes, told, every_pixel=True)
+            report = silent if quiet else say_line
+            recipe = recipe_of_folder(Path(name), the_store(), changes, report, every_pixel=True)
             return recipe, ["neusee", "sheet", name, *changes]
         return descriptor_recipe(descriptor_of(Path(name)), changes), [
             "neusee",
@@ -291,7 +297,7 @@ def _loaded_camera(words: list[str] | None, quiet: bool) -> tuple[Recipe, list[s
 def _line(quantity: dict[str, object]) -> str:
     from neusee.nodes.calibrate import Quantity
 
-    found = Quantity(**{name: value for name, value in quantity.items() if name != "section"})  # type: ignore[arg-type]
-    return f"{found.symbol:18s} {found.text:22s} {found.name}" + f" ({found.reason})" * bool(
-        found.reason
+    stated = Quantity(**{name: value for name, value in quantity.items() if name != "section"})  # type: ignore[arg-type]
+    return f"{stated.symbol:18s} {stated.text:22s} {stated.name}" + f" ({stated.reason})" * bool(
+        stated.reason
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterator
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from types import MappingProxyType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
@@ -162,28 +162,37 @@ def node_lines(name: str, own: Own = MappingProxyType({})) -> list[str]:
     if name == "glossary":
         return glossary_lines()
     if name == "reading":
-        settled = [
-            line
-            for row in SETTLED
-            for line in (f"{row.number}: {row.matter}", f"  no key: {row.why}", "")
-        ]
-        return [line for row in READINGS for line in (*_reading(row.path), "")] + settled
+        return _reading_lines()
     nodes = dict(all_nodes(own))
     if name not in nodes:
         raise LookupError(f"there is no node {name}: {nearest(name, nodes)}")
-    node, uses = nodes[name], list(_uses(name))
-    lines = [name, "", *inspect.cleandoc(node.__doc__ or "").splitlines(), "", "inputs"]
-    lines += [f"  {i}{' (optional)' if i in node.optional else ''}" for i in node.inputs] or [
-        "  none"
-    ]
-    rows = [[f"  {name}", words] for name, words in parameter_rows(node)]
-    lines += ["", "parameters", *(columns(rows) or ["  none"])]
-    for path in dict.fromkeys(path for _, step in uses for path in _readings_of(step)):
+    uses = list(_uses(name))
+    paths = dict.fromkeys(chain.from_iterable(_readings_of(step) for _, step in uses))
+    lines = [name, "", *_signature_lines(nodes[name])]
+    for path in paths:
         lines += ["", *_reading(path)]
+    recipes = dict.fromkeys(file for file, _ in uses)
+    return [*lines, "", f"written in  {', '.join(recipes) or 'no recipe'}"]
+
+
+def _reading_lines() -> list[str]:
+    """Return each interpretation of the paper, and then what the paper settles."""
+    lines: list[str] = []
+    for reading in READINGS:
+        lines += [*_reading(reading.path), ""]
+    for row in SETTLED:
+        lines += [f"{row.number}: {row.matter}", f"  no key: {row.why}", ""]
+    return lines
+
+
+def _signature_lines(node: Node) -> list[str]:
+    """Return the docstring of a node, its inputs and its parameters."""
+    inputs = [f"  {i}{' (optional)' if i in node.optional else ''}" for i in node.inputs]
+    rows = [[f"  {name}", words] for name, words in parameter_rows(node)]
     return [
-        *lines,
-        "",
-        f"written in  {', '.join(dict.fromkeys(file for file, _ in uses)) or 'no recipe'}",
+        *inspect.cleandoc(node.__doc__ or "").splitlines(),
+        *("", "inputs", *(inputs or ["  none"])),
+        *("", "parameters", *(columns(rows) or ["  none"])),
     ]
 
 
@@ -246,20 +255,28 @@ def _quantity(hint: Any) -> str:
     from neusee.nodes import units
     from neusee.nodes.units import in_words, number_ranges
 
-    found = next(number_ranges(hint), None)
-    if found is None or not found.si or found.least is None or found.greatest is None:
+    number_range = next(number_ranges(hint), None)
+    if (
+        number_range is None
+        or not number_range.si
+        or number_range.least is None
+        or number_range.greatest is None
+    ):
         return ""
-    name, usual = _QUANTITIES[found.si]
+    name, usual = _QUANTITIES[number_range.si]
     example = next(
         (text for kind, text in _EXAMPLES.items() if hint == getattr(units, kind)), usual
     )
-    greatest = in_words(found.greatest, found.si)
-    if found.least == 0:
+    greatest = in_words(number_range.greatest, number_range.si)
+    if number_range.least == 0:
         return (
             f"{name} {'above' if 'gt=0' in repr(hint) else 'from'} 0 to {greatest}, such as"
             f" {example}"
         )
-    return f"{name} from {in_words(found.least, found.si)} to {greatest}, such as {example}"
+    return (
+        f"{name} from {in_words(number_range.least, number_range.si)} to {greatest}, such as"
+        f" {example}"
+    )
 
 
 def _limits(hint: Any) -> str:
@@ -303,10 +320,10 @@ def _readings_of(step: Any) -> Iterator[str]:
     """Yield each recipe key that chooses an interpretation of the paper and to which a parameter
     of ``step`` refers.
     """
-    known = {row.path for row in READINGS}
+    paths = {row.path for row in READINGS}
     for value in (step.get("with") or {}).values():
         match = re.fullmatch(r"\$\{(\w+\.\w+)\??\}", str(value))
-        if match and (match[1].startswith("reading.") or match[1] in known):
+        if match and (match[1].startswith("reading.") or match[1] in paths):
             yield match[1]
 
 

@@ -78,9 +78,9 @@ def _fix(words: list[str], number: int) -> str:
     """
     if number == 0:
         return "write key=value, +key=value or ~key"
-    rest = itertools.takewhile(lambda word: not _is_change(word), words[number:])
-    whole = " ".join([words[number - 1], *rest])
-    return f"quote a value that has a space: {shlex.quote(whole)}"
+    following = itertools.takewhile(lambda word: not _is_change(word), words[number:])
+    value = " ".join([words[number - 1], *following])
+    return f"quote a value that has a space: {shlex.quote(value)}"
 
 
 def _is_change(word: str) -> bool:
@@ -136,8 +136,8 @@ def refusing() -> Iterator[None]:
 def _first_lines(text: str) -> list[str]:
     """Return the lines of an error, at most `_MOST` of them, and how many more there are."""
     lines = text.splitlines()
-    more = len(lines) - _MOST
-    return [*lines[:_MOST], f"and {more} more like these"] if more > 0 else lines
+    hidden = len(lines) - _MOST
+    return [*lines[:_MOST], f"and {hidden} more like these"] if hidden > 0 else lines
 
 
 @contextmanager
@@ -215,30 +215,30 @@ def typed_command() -> str:
 
 
 @contextmanager
-def resumable(kept: Callable[[], str]) -> Iterator[None]:
-    """If the ``with`` block is stopped by Ctrl-C or by an error of a file, say what is ``kept`` and
-    how to go on.
+def resumable(state: Callable[[], str]) -> Iterator[None]:
+    """If the ``with`` block is stopped by Ctrl-C or by an error of a file, say what is kept, by
+    ``state``, and how to go on.
 
     The exit code is 130 after Ctrl-C, and 1 after an error of a file.
     """
     try:
         yield
     except KeyboardInterrupt:
-        say_stopped(f"stopped: {kept()}; to go on: {typed_command()}")
+        say_stopped(f"stopped: {state()}; to go on: {typed_command()}")
         raise typer.Exit(INTERRUPTED) from None
     except OSError as error:
         if isinstance(error, BrokenPipeError) or "--debug" in TYPED:
             raise
-        fail(f"{error}\nfailed: {kept()}; to go on: {typed_command()}", FAILED)
+        fail(f"{error}\nfailed: {state()}; to go on: {typed_command()}", FAILED)
 
 
-def kept_in(store: Store, what: str) -> str:
-    """Return a clause that says that ``what`` is kept in the cache, or why the cache keeps
+def kept_in(store: Store, subject: str) -> str:
+    """Return a clause that says that ``subject`` is kept in the cache, or why the cache keeps
     nothing.
     """
     if store.failure:
         return f"nothing is kept, because the cache {store.root} cannot be written"
-    return f"{what} kept in the cache {store.root}"
+    return f"{subject} kept in the cache {store.root}"
 
 
 def kept_training(out: Path, recipe: str) -> str:
@@ -266,21 +266,21 @@ def say_json(document: dict[str, Any]) -> None:
     say([json_line(document)])
 
 
-def say_folder(folder: Path, as_json: bool, *more: str) -> None:
+def say_folder(folder: Path, as_json: bool, *further: str) -> None:
     """Print the path of the page in a folder of results, or the page's document and the files
-    ``more`` as JSON.
+    ``further`` as JSON.
     """
     page = str(folder / "report.html")
     if not as_json:
         return say([page])
-    files = ("provenance.json", *more)
-    found = [json.loads(text_of(folder / name)) for name in files]
-    say_json(
-        {"report": page, **{name: value for document in found for name, value in document.items()}}
-    )
+    files = ("provenance.json", *further)
+    document: dict[str, Any] = {"report": page}
+    for name in files:
+        document |= json.loads(text_of(folder / name))
+    say_json(document)
 
 
-def print_warning(message: Warning | str, *where: object, **more: object) -> None:
+def print_warning(message: Warning | str, *where: object, **details: object) -> None:
     """Print a warning as one line on stderr, in place of Python's form, which shows a line of
     source code.
     """

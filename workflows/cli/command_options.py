@@ -102,15 +102,15 @@ class ProgressLines:
         self._before = now
         if not (count := _COUNT_AT_END.search(line) or _COUNT.match(line)):
             return ""
-        what, done, whole = count["what"], int(count["done"]), int(count["all"])
+        task, done, total = count["what"], int(count["done"]), int(count["all"])
         # a stopped study may begin with any count
-        if what not in self._began or done <= self._last[what]:
-            self._began[what] = (before, 0) if done == 1 else (now, done)
-        self._last[what] = done
-        began, first = self._began[what]
+        if task not in self._began or done <= self._last[task]:
+            self._began[task] = (before, 0) if done == 1 else (now, done)
+        self._last[task] = done
+        began, first = self._began[task]
         if done == first:
             return ""
-        seconds = (now - began) / (done - first) * (whole - done)
+        seconds = (now - began) / (done - first) * (total - done)
         return f"; about {lasts(seconds)} left" if seconds >= 1 else ""
 
 
@@ -152,12 +152,13 @@ def option_words(options: Mapping[str, Any]) -> list[str]:
 
     The value True has no word.
     """
-    given = {name: value for name, value in options.items() if value}
-    return [
-        word
-        for name, value in given.items()
-        for word in (f"--{name}", str(value))[: 1 if value is True else 2]
-    ]
+    words: list[str] = []
+    for name, value in options.items():
+        if value is True:
+            words.append(f"--{name}")
+        elif value:
+            words += [f"--{name}", str(value)]
+    return words
 
 
 def check_device(device: str) -> None:
@@ -222,14 +223,8 @@ def check_executor(place: str, job: Sequence[str]) -> None:
     """End the command before any work for a place that is none, or for options of jobs that
     cannot be.
     """
-    kind, _, count = place.partition(":")
-    counted = not count or (count.isdecimal() and int(count) > 0)
-    known = (
-        place == "local"
-        or (kind == "dask" and (counted or count == "here"))
-        or (kind == "slurm" and counted)
-    )
-    if not known and "://" not in place:
+    kind = place.partition(":")[0]
+    if not _is_place(place) and "://" not in place:
         forms = "local, dask, dask:4, slurm:4, or a scheduler's address such as tcp://host:8786"
         fail(f"--executor {place}: write {forms}")
     if job and kind != "slurm":
@@ -247,3 +242,13 @@ def check_executor(place: str, job: Sequence[str]) -> None:
             f"--executor {place}: this machine has no command {name}: run it where jobs of SLURM"
             " are submitted"
         )
+
+
+def _is_place(place: str) -> bool:
+    """Return True for ``local``, ``dask:here``, and ``dask`` or ``slurm`` with or without a number
+    of workers.
+    """
+    kind, _, count = place.partition(":")
+    if place == "local" or place == "dask:here":
+        return True
+    return kind in ("dask", "slurm") and (not count or (count.isdecimal() and int(count) > 0))

@@ -68,7 +68,7 @@ def nodes_page() -> str:
             " on the terminal."
         ),
     ]
-    for family, names in groupby(dict(all_nodes()).items(), lambda each: each[0].partition(".")[0]):
+    for family, names in groupby(dict(all_nodes()).items(), lambda item: item[0].partition(".")[0]):
         rows = [
             [
                 f"[`{name}`](nodes/{family}.md#{_anchor(name)})",
@@ -90,9 +90,10 @@ def family_pages(uses: Mapping[str, list[str]]) -> dict[str, str]:
     of each node.
     """
     pages = {}
-    for family, names in groupby(dict(all_nodes()).items(), lambda each: each[0].partition(".")[0]):
+    for family, names in groupby(dict(all_nodes()).items(), lambda item: item[0].partition(".")[0]):
         lines = [f"# {family}", "", f"{escaped(first_sentence(family_title(family)))}.", ""]
-        lines += [line for name, node in names for line in _node(name, node, uses.get(name, []))]
+        for name, node in names:
+            lines += _node(name, node, uses.get(name, []))
         pages[f"reference/nodes/{family}.md"] = "\n".join(lines) + "\n"
     return pages
 
@@ -108,7 +109,10 @@ def _node(name: str, node: Node, files: list[str]) -> Iterator[str]:
         *prose(inspect.cleandoc(node.__doc__ or "")),
         "",
     )
-    inputs = [f"`{each}`{' (optional)' if each in node.optional else ''}" for each in node.inputs]
+    inputs = [
+        f"`{name_of_input}`{' (optional)' if name_of_input in node.optional else ''}"
+        for name_of_input in node.inputs
+    ]
     yield from (f"**Inputs:** {', '.join(inputs) or 'none'}.", "")
     rows = [
         [f"`{parameter}`", *map(escaped, words.rsplit("; ", 1))]
@@ -129,8 +133,8 @@ def _node(name: str, node: Node, files: list[str]) -> Iterator[str]:
 
 def commands_page() -> str:
     """Return the page on every command: what it does, its arguments and its options."""
-    whole = get_command(program())
-    context = typer.Context(whole, info_name="neusee")
+    command = get_command(program())
+    context = typer.Context(command, info_name="neusee")
     lines = [
         "# Options of all commands",
         "",
@@ -139,7 +143,7 @@ def commands_page() -> str:
             f" {EXIT_CODES}"
         ),
         "",
-        *_command(whole, context, 1),
+        *_command(command, context, 1),
     ]
     return "\n".join(lines) + "\n"
 
@@ -151,8 +155,8 @@ def _command(command: Any, context: typer.Context, level: int) -> Iterator[str]:
         text = inspect.cleandoc(command.help or "")
         yield from (f"{'#' * level} {context.command_path}", "", f"`{usage}`", "", *prose(text))
     rows = [
-        [_spelled(each), escaped(getattr(each, "help", None) or ""), _default(each)]
-        for each in command.params
+        [_spelled(parameter), escaped(getattr(parameter, "help", None) or ""), _default(parameter)]
+        for parameter in command.params
     ]
     yield from (*(table(["", "meaning", "default"], rows) if rows else ()), "")
     for name in command.list_commands(context) if hasattr(command, "list_commands") else ():

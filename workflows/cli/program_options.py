@@ -16,8 +16,8 @@ from neusee.workflows.cli.commands_and_exit_codes import COMMANDS, DONE, EXIT_CO
 NO_CODE = "--no-code"
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(asked: bool) -> None:
+    if asked:
         say([f"neusee {__version__}"])
         raise typer.Exit(DONE)
 

@@ -7,8 +7,9 @@ import keyword
 from dataclasses import asdict
 from importlib.resources import files
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -17,11 +18,15 @@ from neusee.workflows.cli.command_options import AsJson, Debug
 from neusee.workflows.cli.commands_and_exit_codes import DONE, MISSED
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
     from types import ModuleType
 
     from torch import nn
 
     from neusee.nodes import Node
+    from neusee.workflows.contract.node_rules import Finding
+
+T = TypeVar("T")
 
 
 # --- init command ---------------------------------------------------------------------------------
@@ -61,35 +66,46 @@ def init(
     The folder holds a recipe, a sensor, a node, tests, a README and a .gitignore. The recipe runs
     as it is. No file is replaced.
     """
+    _refuse_inside_file(folder)
+    existing = [name for name in FILES if _is_taken(folder / name)]
+    if existing:
+        where = "here" if folder == Path() else f"in {folder}"
+        fail(
+            f"{', '.join(existing)}: there is such a file {where} already, and none is replaced:"
+            " name an empty folder"
+        )
+    with failing(OSError):
+        for name, (start, called) in FILES.items():
+            _write_start(folder / name, start, called)
+    _say_written([folder / name for name in FILES], folder, NEXT)
+
+
+def _refuse_inside_file(folder: Path) -> None:
+    """End the command for a folder that is a file, or that would be inside a file."""
     above = [path for path in (folder, *folder.parents) if path.exists()]
     if above and not above[0].is_dir():
         fail(
             f"{above[0]} is a file, so that no project can be made in {folder}: name another folder"
         )
-    if there := [
-        name for name in FILES if (folder / name).exists() or (folder / name).is_symlink()
-    ]:
-        where = "here" if folder == Path() else f"in {folder}"
-        fail(
-            f"{', '.join(there)}: there is such a file {where} already, and none is replaced: name"
-            " an empty folder"
-        )
-    with failing(OSError):
-        for name, (start, called) in FILES.items():
-            text = (files("neusee.workflows.cli") / "starts" / start).read_text(encoding="utf-8")
-            path = folder / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text.replace("NAME", called) if called else text, encoding="utf-8")
+
+
+def _is_taken(path: Path) -> bool:
+    """Return True if there is a file, also if it is a link to nothing."""
+    return path.exists() or path.is_symlink()
+
+
+def _write_start(path: Path, start: str, name: str) -> None:
+    """Write a start with a name in place of NAME; without a name, as it is."""
+    text = (files("neusee.workflows.cli") / "starts" / start).read_text(encoding="utf-8")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text.replace("NAME", name) if name else text, encoding="utf-8")
+
+
+def _say_written(paths: Iterable[Path], folder: Path, commands: Iterable[str]) -> None:
+    """Print the files that were written, and the commands to try next."""
     place = [] if folder == Path() else [f"  cd {folder}"]
-    say(
-        [
-            *(f"written  {folder / name}" for name in FILES),
-            "",
-            "next",
-            *place,
-            *(f"  {command}" for command in NEXT),
-        ]
-    )
+    written = [f"written  {path}" for path in paths]
+    say([*written, "", "next", *place, *(f"  {command}" for command in commands)])
 
 
 # --- new command ----------------------------------------------------------------------------------
@@ -152,30 +168,22 @@ def new(
     """
     if kind not in KINDS:
         fail(f"there is no start of a {kind}: write one of {', '.join(KINDS)}")
-    if not name.isidentifier() or keyword.iskeyword(name) or name != name.lower():
-        fail(f"{name} is no name: use small letters, digits and _, as for a file of Python")
+    _refuse_no_name(name)
     names, commands = KINDS[kind]
     paths = {folder / path.replace("NAME", name): start for path, start in names.items()}
-    if there := [str(path) for path in paths if path.exists()]:
-        fail(f"{', '.join(there)}: there is such a file already, and none is replaced")
+    if existing := [str(path) for path in paths if path.exists()]:
+        fail(f"{', '.join(existing)}: there is such a file already, and none is replaced")
     if "NAME.py" in names and (taken := _taken(name)):
         fail(f"{name} is the name of {taken}: take another name, because both cannot be imported")
     with failing(OSError):
         for path, start in paths.items():
-            text = (files("neusee.workflows.cli") / "starts" / start).read_text(encoding="utf-8")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text.replace("NAME", name), encoding="utf-8")
-    place = [] if folder == Path() else [f"  cd {folder}"]
-    written = [f"written  {path}" for path in paths]
-    say(
-        [
-            *written,
-            "",
-            "next",
-            *place,
-            *(f"  {command.replace('NAME', name)}" for command in commands),
-        ]
-    )
+            _write_start(path, start, name)
+    _say_written(paths, folder, [command.replace("NAME", name) for command in commands])
+
+
+def _refuse_no_name(name: str) -> None:
+    if not name.isidentifier() or keyword.iskeyword(name) or name != name.lower():
+        fail(f"{name} is no name: use small letters, digits and _, as for a file of Python")
 
 
 def _taken(name: str) -> str:
@@ -221,25 +229,26 @@ def check(
         nodes, networks = _found(place)
         from neusee.workflows.contract.node_contract import check_all
 
-        found = check_all(nodes, networks, process)
+        by_name = check_all(nodes, networks, process)
+    failed = sum(f.ok is False for f in chain.from_iterable(by_name.values()))
     if as_json:
-        say(
-            [
-                json.dumps(
-                    {name: [asdict(f) for f in findings] for name, findings in found.items()},
-                    indent=1,
-                )
-            ]
-        )
-    for name, findings in found.items() if not as_json else ():
-        say([name, *(f"  {_MARKS[f.ok]:<4}  {f.rule:<11}  {f.text}" for f in findings), ""])
-    failed = sum(f.ok is False for findings in found.values() for f in findings)
-    if not as_json:
-        end = (
-            f"{failed} rule{'s fail' if failed > 1 else ' fails'}" if failed else "every rule holds"
-        )
-        say([f"{_count(len(nodes), len(networks))}: {end}"])
+        document = {name: [asdict(f) for f in findings] for name, findings in by_name.items()}
+        say([json.dumps(document, indent=1)])
+    else:
+        _say_findings(by_name)
+        say([f"{_count(len(nodes), len(networks))}: {_verdict(failed)}"])
     raise typer.Exit(MISSED if failed else DONE)
+
+
+def _say_findings(by_name: Mapping[str, Sequence[Finding]]) -> None:
+    for name, findings in by_name.items():
+        say([name, *(f"  {_MARKS[f.ok]:<4}  {f.rule:<11}  {f.text}" for f in findings), ""])
+
+
+def _verdict(failed: int) -> str:
+    if not failed:
+        return "every rule holds"
+    return f"{failed} rule{'s fail' if failed > 1 else ' fails'}"
 
 
 def _is_of_neusee(place: str) -> bool:
@@ -274,7 +283,7 @@ def _count(nodes: int, networks: int) -> str:
     counts = [(nodes, "node")] * (nodes > 0 or not networks) + [(networks, "network")] * (
         networks > 0
     )
-    return " and ".join(f"{count} {what}{'s' * (count != 1)}" for count, what in counts)
+    return " and ".join(f"{count} {noun}{'s' * (count != 1)}" for count, noun in counts)
 
 
 def _found(place: str) -> tuple[dict[str, Node], dict[str, type[nn.Module]]]:
@@ -296,11 +305,14 @@ def _found(place: str) -> tuple[dict[str, Node], dict[str, type[nn.Module]]]:
         if place == family:
             module = _installed(family)
             networks = whole_networks(module) if module else {}
-            nodes = {f"{family}.{name}": node for name, node in nodes_of(family).items()}
-            return nodes, {f"{family}.{key}": value for key, value in networks.items()}
+            return _within(family, nodes_of(family)), _within(family, networks)
         if not _is_module(place):
             return {place: find_node(place)}, {}
     module = import_own(place, Path.cwd())
     name = installed_as(module.__name__) or module.__name__.rpartition(".")[2]
-    nodes = {f"{name}.{key}": node for key, node in own_nodes(name, module).items()}
-    return nodes, {f"{name}.{key}": value for key, value in whole_networks(module).items()}
+    return _within(name, own_nodes(name, module)), _within(name, whole_networks(module))
+
+
+def _within(family: str, members: Mapping[str, T]) -> dict[str, T]:
+    """Return the members of a family by their names in a recipe."""
+    return {f"{family}.{name}": member for name, member in members.items()}

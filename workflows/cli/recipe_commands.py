@@ -46,6 +46,7 @@ from neusee.workflows.cli.repetition import keep_answer, keep_run, say_and_keep
 from neusee.workflows.report.terminal_text import commands_to_try, json_line
 
 if TYPE_CHECKING:
+    from neusee.workflows.explain.run_forecast import Plan
     from neusee.workflows.graph.recipe_graph import Recipe
     from neusee.workflows.simulation.simulate_recipe import Simulation
     from neusee.workflows.store.result_store import Store
@@ -100,10 +101,11 @@ def run(
     first_light. The folder of results holds report.html, the numbers, the pictures and the recipe
     with every final value.
     """
-    check_executor(executor, job or [])
+    jobs, again = job or [], rerun or []
+    check_executor(executor, jobs)
     with within_memory(memory) as limit:
         recipe, command = load(words, "run", exact=exact)
-    _check_rerun(recipe, rerun or [])
+    _check_rerun(recipe, again)
     from neusee.workflows.report import console, contents
     from neusee.workflows.simulation.simulate_recipe import simulate
     from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -123,22 +125,28 @@ def run(
                 store, f"{table.finished} steps are finished, and results that take time are"
             )
         ),
-        executor_of(
-            executor, store, job or [], lambda line: None if silent else say_line(line)
-        ) as cluster,
+        executor_of(executor, store, jobs, _speaker(silent)) as cluster,
         table,
     ):
-        done = simulate(
-            cheaper, store, out, command, device, table.watch, cluster, limit, rerun or []
-        )
+        done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit, again)
     hints = [] if silent else commands_to_try(recipe, command[2 : -1 if exact else None], _loads)
     _say_briefly(done, as_json) if silent else say(
         console.closing(done.document, str(done.page), hints)
     )
     if done.document["missed"]:
         raise typer.Exit(MISSED)
-    if executor == "local" and not rerun:
+    if executor == "local" and not again:
         keep_run(_text([*before, *table.printed()], done, hints), as_json, out, done, recipe, store)
+
+
+def _speaker(silent: bool) -> Callable[[str], None]:
+    """Return a function that prints a line, or that prints nothing if ``silent``."""
+
+    def speak(line: str) -> None:
+        if not silent:
+            say_line(line)
+
+    return speak
 
 
 def _opening(recipe: Recipe, command: Sequence[str], silent: bool) -> list[str]:
@@ -200,21 +208,32 @@ def _predicted(
     is too small.
     """
     from neusee.workflows.explain.run_forecast import lanes_for, planned
-    from neusee.workflows.report.console import forecast_line
 
     if silent and not local:
         return {}
     plan = planned(recipe, store, lanes_for(recipe, device, memory))
-    if local and plan.refused:
-        fail(f"{'memory' if memory is None else '--memory'}: {plan.refused}; nothing was run")
-    slots = plan.schedule.slots if plan.schedule else ()
-    unknown = sum(not estimate.known for estimate in plan.expected.values())
-    line = forecast_line(
-        plan.schedule.makespan if plan.schedule else 0.0, len(plan.expected), unknown
-    )
+    if local:
+        _refuse_beyond_memory(plan, memory)
+    line = _forecast_of(plan)
     if line and not silent:
         say([line])
+    slots = plan.schedule.slots if plan.schedule else ()
     return {slot.task: slot.end - slot.start for slot in slots if plan.expected[slot.task].known}
+
+
+def _refuse_beyond_memory(plan: Plan, memory: int | None) -> None:
+    """End the command for a run that needs more than ``--memory``, or than the free memory."""
+    if plan.refused:
+        fail(f"{'memory' if memory is None else '--memory'}: {plan.refused}; nothing was run")
+
+
+def _forecast_of(plan: Plan) -> str:
+    """Return the line that says how long a run will take, or an empty text."""
+    from neusee.workflows.report.console import forecast_line
+
+    unknown = sum(not estimate.known for estimate in plan.expected.values())
+    seconds = plan.schedule.makespan if plan.schedule else 0.0
+    return forecast_line(seconds, len(plan.expected), unknown)
 
 
 def _loads(words: Sequence[str]) -> bool:
@@ -273,21 +292,21 @@ def plan(
     store = the_store()
     if devices:
         with refusing():
-            found = run_forecast.Forecast(
+            forecast = run_forecast.Forecast(
                 run_forecast.simulated_lines(recipe, store, devices), [], {}, False
             )
     else:
-        found = run_forecast.forecast(recipe, store, device, limit)
+        forecast = run_forecast.forecast(recipe, store, device, limit)
     text = (
-        json_line({"command": shlex.join(command), **asdict(found)})
+        json_line({"command": shlex.join(command), **asdict(forecast)})
         if as_json
-        else "\n".join(found.lines)
+        else "\n".join(forecast.lines)
     )
-    if found.totals.get("steps") == 0 and not found.refused:
-        say_and_keep(text, recipe, store, found.totals["memory_of_report"] or 0.0)
+    if forecast.totals.get("steps") == 0 and not forecast.refused:
+        say_and_keep(text, recipe, store, forecast.totals["memory_of_report"] or 0.0)
     else:
         say([text])
-    if found.refused:
+    if forecast.refused:
         raise typer.Exit(FAILED)
 
 
@@ -365,15 +384,15 @@ def safety(
     from neusee.workflows.safety.safety_text import lines
 
     with refusing(), failing(RunError, code=FAILED):
-        folder, found = assess(recipe, store, out, command)
+        folder, assessment = assess(recipe, store, out, command)
 
     def text(page: str) -> str:
         if as_json:
-            return json_line({"report": page, **found.document})
-        return page if quiet else "\n".join([*lines(found.paragraphs), "", f"page   {page}"])
+            return json_line({"report": page, **assessment.document})
+        return page if quiet else "\n".join([*lines(assessment.paragraphs), "", f"page   {page}"])
 
     say([text(str(folder / "report.html"))])
-    keep_answer(text, as_json, out, folder, found.report, recipe)
+    keep_answer(text, as_json, out, folder, assessment.report, recipe)
 
 
 # --- sweep command --------------------------------------------------------------------------------
@@ -516,9 +535,7 @@ def _restored(
     from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
     device, limit = place
-    plan = planned(recipe, store, lanes_for(recipe, device, limit))
-    if plan.refused:
-        fail(f"{'memory' if limit is None else '--memory'}: {plan.refused}; nothing was run")
+    _refuse_beyond_memory(planned(recipe, store, lanes_for(recipe, device, limit)), limit)
     if not silent:
         say(console.opening(recipe, shlex.join(command[1:])))
     cheaper = with_substitutions(recipe, contents.wanted(recipe))
@@ -585,15 +602,16 @@ def compare(
         records = [read_record(where, out) for where in (left, right)]
         from neusee.workflows.comparison import comparison_report
 
-        found = comparison_report.compare(*records)
-    page = comparison_report.write_comparison(found, out, ["neusee", *TYPED]) / "report.html"
+        comparison = comparison_report.compare(*records)
+    page = comparison_report.write_comparison(comparison, out, ["neusee", *TYPED]) / "report.html"
     if as_json:
-        say_json({"report": str(page), **comparison_report.document(found)})
+        say_json({"report": str(page), **comparison_report.document(comparison)})
     else:
-        say([str(page)] if quiet else [*comparison_report.lines(found), "", f"page   {page}"])
-    if found.largest > fail_above:
-        worst = max(found.numbers, key=lambda each: each.relative)
+        say([str(page)] if quiet else [*comparison_report.lines(comparison), "", f"page   {page}"])
+    if comparison.largest > fail_above:
+        worst = max(comparison.numbers, key=lambda number: number.relative)
         fail(
-            f"{worst.name} differs by {found.largest:.3g} relatively, more than {fail_above:g}",
+            f"{worst.name} differs by {comparison.largest:.3g} relatively, more than"
+            f" {fail_above:g}",
             MISSED,
         )

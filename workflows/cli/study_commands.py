@@ -168,7 +168,7 @@ def uncertainty(
             help="Relative error of each standard deviation at which to stop.",
         ),
     ] = 0.05,
-    most: Annotated[
+    draws: Annotated[
         int, typer.Option("--most", min=64, max=10_000_000, help="Largest number of draws.")
     ] = 1000,
     points: Annotated[
@@ -205,15 +205,15 @@ def uncertainty(
     --error; the page says which input causes the scatter. Run the same command again to continue.
     """
     check_device(device)
-    how: dict[str, Any] = {
+    options: dict[str, Any] = {
         "error": error,
-        "most": most,
+        "most": draws,
         "points": points.value,
         "workers": workers,
         "device": device,
     }
-    how["until"] = tuple(until or ())
-    _run("uncertainty", words, quiet, as_json, out, _refuse_unknown_until, **how)
+    options["until"] = tuple(until or ())
+    _run("uncertainty", words, quiet, as_json, out, _refuse_unknown_until, **options)
 
 
 @study.command()
@@ -267,9 +267,9 @@ def protection(
     detection of details, over scene light and protection, with the bounds of every mask. The page
     begins with a paragraph to quote.
     """
-    how: dict[str, Any] = {"draws": draws, "bands": bands, "light": light.value, "size": size}
-    how |= {"prnu": prnu, "residual": residual}
-    _run("protection", words, quiet, as_json, out, **how)
+    options: dict[str, Any] = {"draws": draws, "bands": bands, "light": light.value, "size": size}
+    options |= {"prnu": prnu, "residual": residual}
+    _run("protection", words, quiet, as_json, out, **options)
 
 
 def _refuse_unknown_until(recipe: Recipe, options: dict[str, Any]) -> None:
@@ -305,9 +305,9 @@ def _run(
 
     command += option_words(options)
     progress = progress_lines(quiet or as_json)
-    kept = resumable(lambda: kept_in(store, "the parts that are finished are"))
+    stopping = resumable(lambda: kept_in(store, "the parts that are finished are"))
     with (
-        kept,
+        stopping,
         failing(RunError, ImportError, code=FAILED),
         failing(ValueError, code=BAD),
         refusing(),
@@ -419,8 +419,8 @@ def _evaluate(name: str, **options: Any) -> Path:
     from neusee.workflows.evaluation.pipelines import EvaluationRefused
     from neusee.workflows.graph.run_error import RunError
 
-    kept = resumable(lambda: kept_in(store, "the points that are finished are"))
-    with kept, failing(EvaluationRefused), failing(RunError, code=FAILED), refusing():
+    stopping = resumable(lambda: kept_in(store, "the points that are finished are"))
+    with stopping, failing(EvaluationRefused), failing(RunError, code=FAILED), refusing():
         return verbs.evaluate(name, store=store, **options)
 
 

@@ -75,18 +75,31 @@ def run_sweep(
     result = work.sweep(done, state)
     path = write_sweep(work, result, again, out, netcdf, time.perf_counter() - began)
     if silent:
-        print(*_failures(result), sep="\n", end="\n" if result.failed else "", file=sys.stderr)
-        if as_json:
-            say_json(_document(result, path, again))
-        else:
-            say_line(str(path / "sweep.csv"))
+        _say_briefly(result, path, again, as_json)
     else:
         print(
             *_closing(result, path, again, time.perf_counter() - began, work.store.failure),
             sep="\n",
             flush=True,
         )
-    return INTERRUPTED if state == "interrupted" else FAILED if result.failed else DONE
+    return _exit_code(result)
+
+
+def _exit_code(result: Sweep) -> int:
+    if result.state == "interrupted":
+        return INTERRUPTED
+    return FAILED if result.failed else DONE
+
+
+def _say_briefly(result: Sweep, path: Path, again: Sequence[str], as_json: bool) -> None:
+    """Print the path of the table of a sweep, or its document as JSON, and the failures on
+    stderr.
+    """
+    print(*_failures(result), sep="\n", end="\n" if result.failed else "", file=sys.stderr)
+    if as_json:
+        say_json(_document(result, path, again))
+    else:
+        say_line(str(path / "sweep.csv"))
 
 
 def _document(result: Sweep, path: Path, again: Sequence[str]) -> dict[str, Any]:
@@ -172,8 +185,8 @@ def _closing(
     if failure:
         yield f"warning  {failure}"
     if result.state != "complete":
-        kept = "nothing is kept in the cache" if failure else "what is done is kept"
-        yield f"partial: {kept}; to go on: {shlex.join(again)}"
+        state = "nothing is kept in the cache" if failure else "what is done is kept"
+        yield f"partial: {state}; to go on: {shlex.join(again)}"
 
 
 def _failures(result: Sweep) -> Iterator[str]:

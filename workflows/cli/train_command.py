@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
@@ -84,11 +84,7 @@ def train(
     """
     recipe, command = load(words or ["train_small"], "train")
     if recipe.lifting is not None:
-        if stage is not Stages.BOTH or mesh:
-            fail(
-                f"{recipe.name} learns a lift, which has neither stages nor a mesh: leave --stage"
-                " and --mesh out"
-            )
+        _refuse_stage_and_mesh(recipe, stage, mesh)
         check_device(device)
         return _lift(recipe, command, out, device, quiet, as_json)
     from neusee.workflows.api import verbs
@@ -100,9 +96,7 @@ def train(
     silent, who = quiet or as_json or rank > 0, f"process {rank}: " if world > 1 else ""
     stages = _NUMBERS.get(stage, recipe.training.learnt if recipe.training else ())
     command += ["--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
-    lengths = (
-        {s: recipe.training.stages[s].iterations for s in stages if s} if recipe.training else {}
-    )
+    lengths = _lengths(recipe, stages)
     with (
         resumable(lambda: kept_training(out, recipe.name)),
         failing(RunError, ValueError, ArithmeticError, code=FAILED, before=who),
@@ -126,13 +120,29 @@ def train(
         _say_results(folder, as_json, [] if silent else _next(folder, stage))
 
 
+def _refuse_stage_and_mesh(recipe: Recipe, stage: Stages, mesh: str) -> None:
+    """End the command for options that the training of a lift does not have."""
+    if stage is not Stages.BOTH or mesh:
+        fail(
+            f"{recipe.name} learns a lift, which has neither stages nor a mesh: leave --stage"
+            " and --mesh out"
+        )
+
+
+def _lengths(recipe: Recipe, stages: Iterable[int]) -> dict[int, int]:
+    """Return the iterations of each stage, but for the design of a mask."""
+    if not recipe.training:
+        return {}
+    return {stage: recipe.training.stages[stage].iterations for stage in stages if stage}
+
+
 def _say_results(folder: Path, as_json: bool, lines: list[str]) -> None:
     """Print ``lines`` and the folder of a training, or the document of the training as JSON."""
     if not as_json:
         return say([*lines, str(folder)])
     files = (folder / name for name in ("mask.json", "training.json"))
-    found = {path.stem: json.loads(text_of(path)) for path in files if path.is_file()}
-    say_json({"folder": str(folder), **found})
+    documents = {path.stem: json.loads(text_of(path)) for path in files if path.is_file()}
+    say_json({"folder": str(folder), **documents})
 
 
 def _lift(

@@ -34,49 +34,52 @@ _COLUMNS = ("name", "index", "left", "right", "right - left", "relative")
 _NONE = "–"
 
 
-def report(found: RunComparison) -> StudyReport:
+def report(comparison: RunComparison) -> StudyReport:
     """Return the page of a comparison with its pictures and its table of numbers."""
-    rows = [[n.name, n.index, n.left, n.right, n.difference, n.relative] for n in found.numbers]
-    drawings = [each for each in (*found.figures, *found.data) if each.drawing]
+    rows = [
+        [n.name, n.index, n.left, n.right, n.difference, n.relative] for n in comparison.numbers
+    ]
+    drawings = [file for file in (*comparison.figures, *comparison.data) if file.drawing]
     sections = [
-        _results(found),
-        _numbers(found),
+        _results(comparison),
+        _numbers(comparison),
         *map(_drawing, drawings),
-        _files(found),
-        *_causes(found),
+        _files(comparison),
+        *_causes(comparison),
     ]
     return StudyReport(
-        f"{found.left.name} and {found.right.name}",
-        "\n\n".join([" ".join(summary(found)), _runs(found)]),
+        f"{comparison.left.name} and {comparison.right.name}",
+        "\n\n".join([" ".join(summary(comparison)), _runs(comparison)]),
         sections,
-        {_stem(each): each.drawing for each in drawings},
+        {_stem(file): file.drawing for file in drawings},
         {"numbers.csv": (_COLUMNS, rows)},
         shown=("command", "date", "versions"),
     )
 
 
-def summary(found: RunComparison) -> list[str]:
+def summary(comparison: RunComparison) -> list[str]:
     """Return sentences that count what differs between two runs."""
     drawn, data = (
-        [each for each in files if each.state != "same"] for files in (found.figures, found.data)
+        [file for file in files if file.state != "same"]
+        for files in (comparison.figures, comparison.data)
     )
     code = (
         "The left or the right folder records no digests of code."
-        if found.code is None
+        if comparison.code is None
         else (
-            f"{_counted(len(found.code), 'difference')} in the code."
-            if found.code
+            f"{_counted(len(comparison.code), 'difference')} in the code."
+            if comparison.code
             else "The code is the same."
         )
     )
     return [
-        *_compared(found.numbers),
-        f"{len(drawn)} of {_counted(len(found.figures), 'picture')} differ.",
-        f"{len(data)} of {_counted(len(found.data), 'data file')} and tensors differ.",
+        *_compared(comparison.numbers),
+        f"{len(drawn)} of {_counted(len(comparison.figures), 'picture')} differ.",
+        f"{len(data)} of {_counted(len(comparison.data), 'data file')} and tensors differ.",
         (
-            f"{_counted(len(found.recipe), 'value')} of the recipe"
-            f" differ{'s' * (len(found.recipe) == 1)}."
-            if found.recipe
+            f"{_counted(len(comparison.recipe), 'value')} of the recipe"
+            f" differ{'s' * (len(comparison.recipe) == 1)}."
+            if comparison.recipe
             else "The recipe is the same."
         ),
         code,
@@ -85,52 +88,55 @@ def summary(found: RunComparison) -> list[str]:
 
 def _compared(numbers: Sequence[NumberDifference]) -> list[str]:
     """Return how many numbers of both runs differ, and how many numbers only one run has."""
-    both = [each for each in numbers if each.left is not None and each.right is not None]
-    differ = [each for each in both if each.relative > 0]
-    counted = _counted(len(both), "number")
-    said = (
-        f"{len(differ)} of {counted} differ{_by(differ)}."
-        if differ
-        else f"All {counted} are the same."
-    )
+    both = [number for number in numbers if number.left is not None and number.right is not None]
+    sentences = ["The runs have no number in common."]
+    if both or not numbers:
+        sentences = [_differ(both)]
     alone = {
-        "left": sum(each.right is None for each in numbers),
-        "right": sum(each.left is None for each in numbers),
+        "left": sum(number.right is None for number in numbers),
+        "right": sum(number.left is None for number in numbers),
     }
-    return [
-        *([said] if both or not numbers else ["The runs have no number in common."]),
-        *(
-            f"Only the {side} run has {_counted(count, 'further number')}."
-            for side, count in alone.items()
-            if count
-        ),
-    ]
+    for side, count in alone.items():
+        if count:
+            sentences.append(f"Only the {side} run has {_counted(count, 'further number')}.")
+    return sentences
 
 
-def difference_text(each: NumberDifference) -> list[str]:
+def _differ(both: Sequence[NumberDifference]) -> str:
+    """Return how many of the numbers that both runs have differ, and by how much."""
+    differ = [number for number in both if number.relative > 0]
+    counted = _counted(len(both), "number")
+    if not differ:
+        return f"All {counted} are the same."
+    return f"{len(differ)} of {counted} differ{_by(differ)}."
+
+
+def difference_text(number: NumberDifference) -> list[str]:
     """Return name, index, both sides, difference and relative difference of a number as cells of
     a table.
     """
-    sides = [_NONE if side is None else f"{side:.6g}" for side in (each.left, each.right)]
-    change = _NONE if each.difference is None else f"{each.difference:+.3g}"
-    return [each.name, str(each.index), *sides, change, _relative(each.relative)]
+    sides = [_NONE if side is None else f"{side:.6g}" for side in (number.left, number.right)]
+    change = _NONE if number.difference is None else f"{number.difference:+.3g}"
+    return [number.name, str(number.index), *sides, change, _relative(number.relative)]
 
 
 def _relative(value: float) -> str:
     return f"{value:.2g}" if value < float("inf") else _NONE
 
 
-def _by(differ: list[NumberDifference]) -> str:
-    most = max(each.relative for each in differ)
-    return f", by at most {most:.2g} relative to the larger of both" if most < float("inf") else ""
+def _by(differ: Sequence[NumberDifference]) -> str:
+    worst = max(number.relative for number in differ)
+    return (
+        f", by at most {worst:.2g} relative to the larger of both" if worst < float("inf") else ""
+    )
 
 
 def _counted(count: int, word: str) -> str:
     return f"{count} {word}{'s' * (count != 1)}"
 
 
-def _runs(found: RunComparison) -> str:
-    sides = (("Left", found.left), ("right", found.right))
+def _runs(comparison: RunComparison) -> str:
+    sides = (("Left", comparison.left), ("right", comparison.right))
     return (
         "; ".join(
             f"{word}: `{run.document.command}`, {run.document.started}" for word, run in sides
@@ -139,81 +145,82 @@ def _runs(found: RunComparison) -> str:
     )
 
 
-def _results(found: RunComparison) -> Section:
-    header, rows = found.table
+def _results(comparison: RunComparison) -> Section:
+    header, rows = comparison.table
     text = "The result table of both runs." if rows else "Neither run has a result table."
     return Section("Results", text, header, rows)
 
 
-def _numbers(found: RunComparison) -> Section:
-    differ = largest(found.numbers)
+def _numbers(comparison: RunComparison) -> Section:
+    differ = largest(comparison.numbers)
     text = """Each result with a number that differs; of several numbers, such as one for each band,
         the one with the largest relative difference. Relative means: divided by the larger of both.
         `numbers.csv` has all numbers."""
     if not differ:
         text = "Every number of both runs is the same. `numbers.csv` has all numbers."
     return Section(
-        "Numbers", text, _COLUMNS if differ else (), [difference_text(each) for each in differ]
+        "Numbers", text, _COLUMNS if differ else (), [difference_text(number) for number in differ]
     )
 
 
-def _drawing(each: FileDifference) -> Section:
+def _drawing(file: FileDifference) -> Section:
     said = (
-        f"Root mean square difference {each.rms:.3g}."
-        if each.rms is not None
-        else f"{each.state}.".capitalize()
+        f"Root mean square difference {file.rms:.3g}."
+        if file.rms is not None
+        else f"{file.state}.".capitalize()
     )
-    scale = f" Largest value of both {each.scale:.4g}." if each.scale not in (None, 255.0) else ""
-    return Section(each.name, said + scale, picture=each.drawing)
+    scale = f" Largest value of both {file.scale:.4g}." if file.scale not in (None, 255.0) else ""
+    return Section(file.name, said + scale, picture=file.drawing)
 
 
-def _files(found: RunComparison) -> Section:
-    files = [*found.figures, *found.data]
-    rows = [[each.name, each.state, each.largest, each.rms, each.scale] for each in files]
+def _files(comparison: RunComparison) -> Section:
+    files = [*comparison.figures, *comparison.data]
+    rows = [[file.name, file.state, file.largest, file.rms, file.scale] for file in files]
     text = """Differences of figures are in levels of 0 to 255, those of data files in the unit of
         the file. Figures of times and of the graph are not compared."""
-    lines = _sentences(found.missing)
+    lines = _sentences(comparison.missing)
     columns = ("file", "state", "largest difference", "root mean square", "largest value")
     return Section("Files", f"{text}\n\n{lines}" if lines else text, columns if rows else (), rows)
 
 
-def _causes(found: RunComparison) -> list[Section]:
+def _causes(comparison: RunComparison) -> list[Section]:
     return [
-        _table("Recipe", "The final values of both recipes", found.recipe, sources=True),
+        _table("Recipe", "The final values of both recipes", comparison.recipe, sources=True),
         Section(
             "Code",
             (
                 "The folder of a run of an earlier version records no digests of code, so that the"
                 " code is not compared."
-                if found.code is None
+                if comparison.code is None
                 else (
                     "What differs in the code of the nodes, by module and definition."
-                    if found.code
+                    if comparison.code
                     else "The code of every common node is the same."
                 )
             ),
-            ("difference",) if found.code else (),
-            [[line] for line in found.code or ()],
+            ("difference",) if comparison.code else (),
+            [[line] for line in comparison.code or ()],
         ),
         Section(
             "Steps",
-            _sentences(found.steps) or "Both runs have the same steps with the same cache keys.",
+            _sentences(comparison.steps)
+            or "Both runs have the same steps with the same cache keys.",
         ),
-        _table("Environment", "Command, device, machine and versions", found.environment),
+        _table("Environment", "Command, device, machine and versions", comparison.environment),
     ]
 
 
 def _table(
-    heading: str, what: str, rows: Iterable[ValueDifference], sources: bool = False
+    heading: str, subject: str, rows: Iterable[ValueDifference], sources: bool = False
 ) -> Section:
     cells: list[list[Any]] = [
         [
-            each.name,
-            each.left or _NONE,
-            each.right or _NONE,
-            *([each.left_source or _NONE, each.right_source or _NONE] if sources else []),
+            row.name,
+            row.left or _NONE,
+            row.right or _NONE,
+            *([row.left_source or _NONE, row.right_source or _NONE] if sources else []),
         ]
-        for each in rows
+        for row in rows
     ]
     columns = (
         "name",
@@ -223,7 +230,7 @@ def _table(
     )
     return Section(
         heading,
-        f"{what} {'that differ' if cells else 'are the same'}.",
+        f"{subject} {'that differ' if cells else 'are the same'}.",
         columns if cells else (),
         cells,
     )
@@ -233,8 +240,8 @@ def _sentences(lines: list[str]) -> str:
     return "\n\n".join(f"{line[0].upper()}{line[1:]}." for line in lines)
 
 
-def _stem(each: FileDifference) -> str:
-    return each.name.rpartition(".")[0].replace(" ", "_")
+def _stem(file: FileDifference) -> str:
+    return file.name.rpartition(".")[0].replace(" ", "_")
 
 
 # --- compare runs ---------------------------------------------------------------------------------
@@ -264,7 +271,7 @@ class RunComparison:
         """Return the largest relative difference of a number of both runs; infinite if one run
         lacks a number.
         """
-        return max((each.relative for each in self.numbers), default=0.0)
+        return max((number.relative for number in self.numbers), default=0.0)
 
 
 def compare(left: RunRecord, right: RunRecord) -> RunComparison:
@@ -288,12 +295,12 @@ def compare(left: RunRecord, right: RunRecord) -> RunComparison:
     )
 
 
-def document(found: RunComparison) -> dict[str, Any]:
+def document(comparison: RunComparison) -> dict[str, Any]:
     """Return a comparison as a document of JSON values."""
     return {
-        "left": str(found.left.folder),
-        "right": str(found.right.folder),
-        "largest": found.largest,
+        "left": str(comparison.left.folder),
+        "right": str(comparison.right.folder),
+        "largest": comparison.largest,
         "numbers": [
             {
                 "name": n.name,
@@ -303,42 +310,44 @@ def document(found: RunComparison) -> dict[str, Any]:
                 "difference": n.difference,
                 "relative": n.relative,
             }
-            for n in found.numbers
+            for n in comparison.numbers
         ],
-        "recipe": [asdict(each) for each in found.recipe],
-        "code": found.code,
-        "environment": [asdict(each) for each in found.environment],
-        "steps": found.steps,
-        "figures": [_of_file(each) for each in found.figures],
-        "data": [_of_file(each) for each in found.data],
-        "missing": found.missing,
+        "recipe": [asdict(value) for value in comparison.recipe],
+        "code": comparison.code,
+        "environment": [asdict(value) for value in comparison.environment],
+        "steps": comparison.steps,
+        "figures": [_of_file(file) for file in comparison.figures],
+        "data": [_of_file(file) for file in comparison.data],
+        "missing": comparison.missing,
     }
 
 
-def write_comparison(found: RunComparison, out: Path, command: Sequence[str]) -> Path:
+def write_comparison(comparison: RunComparison, out: Path, command: Sequence[str]) -> Path:
     """Write the folder ``out/comparisons/<date>_<recipe>_<key>/`` of a comparison, and return
     its path.
     """
-    content = document(found)
-    names = list(dict.fromkeys(side.document.recipe for side in (found.left, found.right)))
+    content = document(comparison)
+    names = list(
+        dict.fromkeys(side.document.recipe for side in (comparison.left, comparison.right))
+    )
     with new_run(
         out / "comparisons", "_and_".join(names), digest(content["left"], content["right"])
     ) as folder:
         about = {
             "study": "compare",
             "recipe": names[0],
-            "title": f"Comparison of {found.left.name} and {found.right.name}.",
+            "title": f"Comparison of {comparison.left.name} and {comparison.right.name}.",
             "command": shlex.join(command),
             "date": timestamp(),
             "versions": versions(),
         }
-        folder.said = about | {"began": found.began}
-        report(found).write(folder, about | content)
+        folder.said = about | {"began": comparison.began}
+        report(comparison).write(folder, about | content)
     return folder.path
 
 
-def _of_file(each: FileDifference) -> dict[str, Any]:
-    return {name: value for name, value in asdict(each).items() if name != "drawing"}
+def _of_file(file: FileDifference) -> dict[str, Any]:
+    return {name: value for name, value in asdict(file).items() if name != "drawing"}
 
 
 # --- comparison text ------------------------------------------------------------------------------
@@ -349,23 +358,34 @@ def _of_file(each: FileDifference) -> dict[str, Any]:
 _MOST = 12  #: rows of each table
 
 
-def lines(found: RunComparison) -> list[str]:
+def lines(comparison: RunComparison) -> list[str]:
     """Return lines with the tables of a comparison; the page has what is cut here."""
-    head = [f"left   {found.left.folder}", f"right  {found.right.folder}", *summary(found)]
-    differ = largest(found.numbers)
-    header = ["number", "index", "left", "right", "right - left", "relative"]
-    numbers = _text_table([header, *map(difference_text, differ)]) if differ else []
-    files = [each for each in (*found.figures, *found.data) if each.state != "same"]
+    head = [f"left   {comparison.left.folder}", f"right  {comparison.right.folder}"]
+    head += summary(comparison)
+    files = [file for file in (*comparison.figures, *comparison.data) if file.state != "same"]
     blocks = {
-        "numbers": numbers,
-        "pictures and data": [f"  {_file(each)}" for each in files],
-        "recipe": [f"  {_value(each)}" for each in found.recipe],
-        "code": [f"  {line}" for line in found.code or ()],
-        "environment": [f"  {_value(each)}" for each in found.environment],
-        "steps": [f"  {line}" for line in (*found.steps, *found.missing)],
+        "numbers": _number_table(comparison),
+        "pictures and data": _indented(map(_file, files)),
+        "recipe": _indented(map(_value, comparison.recipe)),
+        "code": _indented(comparison.code or ()),
+        "environment": _indented(map(_value, comparison.environment)),
+        "steps": _indented((*comparison.steps, *comparison.missing)),
     }
-    tables = [["", title, *_cut(rows)] for title, rows in blocks.items() if rows]
-    return [*head, *(line for block in tables for line in block)]
+    for title, rows in blocks.items():
+        if rows:
+            head += ["", title, *_cut(rows)]
+    return head
+
+
+def _number_table(comparison: RunComparison) -> list[str]:
+    """Return the lines of the numbers that differ; none without any."""
+    differ = largest(comparison.numbers)
+    header = ["number", "index", "left", "right", "right - left", "relative"]
+    return _text_table([header, *map(difference_text, differ)]) if differ else []
+
+
+def _indented(texts: Iterable[str]) -> list[str]:
+    return [f"  {text}" for text in texts]
 
 
 def _text_table(rows: list[list[str]]) -> list[str]:
@@ -373,22 +393,22 @@ def _text_table(rows: list[list[str]]) -> list[str]:
 
 
 def _cut(rows: list[str]) -> list[str]:
-    more = len(rows) - _MOST
-    return [*rows[:_MOST], f"  and {more} more on the page"] if more > 0 else rows
+    hidden = len(rows) - _MOST
+    return [*rows[:_MOST], f"  and {hidden} more on the page"] if hidden > 0 else rows
 
 
-def _value(each: ValueDifference) -> str:
+def _value(value: ValueDifference) -> str:
     sides = [
         (text or "none") + (f" ({source})" if source else "")
-        for text, source in ((each.left, each.left_source), (each.right, each.right_source))
+        for text, source in ((value.left, value.left_source), (value.right, value.right_source))
     ]
-    return f"{each.name}: {sides[0]} -> {sides[1]}"
+    return f"{value.name}: {sides[0]} -> {sides[1]}"
 
 
-def _file(each: FileDifference) -> str:
-    if each.largest is None:
-        return f"{each.name}: {each.state}"
+def _file(file: FileDifference) -> str:
+    if file.largest is None:
+        return f"{file.name}: {file.state}"
     return (
-        f"{each.name}: differs by at most {each.largest:.4g}, where the largest value is"
-        f" {each.scale:.4g}"
+        f"{file.name}: differs by at most {file.largest:.4g}, where the largest value is"
+        f" {file.scale:.4g}"
     )

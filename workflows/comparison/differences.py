@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import filecmp
+import itertools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.comparison.run_record import NotComparable, RunRecord
+from neusee.nodes.file_headers import exr_needs, picture_needs, safetensors_need
+from neusee.workflows.comparison.run_record import FinalValue, NotComparable, RunRecord
 from neusee.workflows.keys.sealed_files import refuse_other_than_file
 from neusee.workflows.report.figures.style import canvas, drawn, picture
 
@@ -21,6 +23,7 @@ from neusee.workflows.report.figures.style import canvas, drawn, picture
 _MEASURED = frozenset({"engine", "peak memory"})  #: facts of a run that differ each time
 _STATE, _PACKAGE, _SETTINGS, _PYTHON = "state of ", "package ", "settings", "Python"
 _SEVERAL = 6  #: names that a line lists
+_NO_VALUE = FinalValue("", "")
 
 
 @dataclass(frozen=True)
@@ -87,17 +90,16 @@ def numbers(left: RunRecord, right: RunRecord) -> list[NumberDifference]:
     return [NumberDifference(*name, sides[0].get(name), sides[1].get(name)) for name in names]
 
 
-def largest(found: list[NumberDifference]) -> list[NumberDifference]:
+def largest(numbers: list[NumberDifference]) -> list[NumberDifference]:
     """Return, for each result that differs, its number with the largest relative difference; the
     largest first.
     """
     worst: dict[str, NumberDifference] = {}
-    for each in found:
-        if each.relative > 0 and (
-            each.name not in worst or each.relative > worst[each.name].relative
-        ):
-            worst[each.name] = each
-    return sorted(worst.values(), key=lambda each: -each.relative)
+    for number in numbers:
+        before = worst[number.name].relative if number.name in worst else 0.0
+        if number.relative > before:
+            worst[number.name] = number
+    return sorted(worst.values(), key=lambda number: -number.relative)
 
 
 def table(left: RunRecord, right: RunRecord) -> tuple[list[str], list[list[str]]]:
@@ -106,7 +108,8 @@ def table(left: RunRecord, right: RunRecord) -> tuple[list[str], list[list[str]]
     """
     sides = [record.document.table for record in (left, right)]
     columns = list(dict.fromkeys([*sides[0].columns, *sides[1].columns]))
-    names = dict.fromkeys(str(row.get("name", "")) for side in sides for row in side.rows)
+    rows_of_both = itertools.chain(*(side.rows for side in sides))
+    names = dict.fromkeys(str(row.get("name", "")) for row in rows_of_both)
     rows = []
     for name in names:
         for side, word in zip(sides, ("left", "right"), strict=True):
@@ -127,15 +130,12 @@ def recipe(left: RunRecord, right: RunRecord) -> list[ValueDifference]:
     """Return the final values that differ between two recipes, each with the places where it was
     written.
     """
-    found = []
+    differing = []
     for name in dict.fromkeys([*left.values, *right.values]):
-        sides = [record.values.get(name) for record in (left, right)]
-        texts = [side.text if side else "" for side in sides]
-        if texts[0] != texts[1]:
-            found.append(
-                ValueDifference(name, *texts, *(side.source if side else "" for side in sides))
-            )
-    return found
+        old, new = (record.values.get(name, _NO_VALUE) for record in (left, right))
+        if old.text != new.text:
+            differing.append(ValueDifference(name, old.text, new.text, old.source, new.source))
+    return differing
 
 
 def code(left: RunRecord, right: RunRecord) -> list[str] | None:
@@ -144,41 +144,50 @@ def code(left: RunRecord, right: RunRecord) -> list[str] | None:
     """
     if left.code is None or right.code is None:
         return None
-    one, other = left.code.nodes, right.code.nodes
-    changed = sorted(node for node in one.keys() & other.keys() if one[node] != other[node])
-    only = [f"only the {side} run uses the node {node}" for side, node in _only(one, other)]
+    left_nodes, right_nodes = left.code.nodes, right.code.nodes
+    changed = sorted(
+        node
+        for node in left_nodes.keys() & right_nodes.keys()
+        if left_nodes[node] != right_nodes[node]
+    )
+    only = [
+        f"only the {side} run uses the node {node}" for side, node in _only(left_nodes, right_nodes)
+    ]
     nodes = [f"the code of {_listed(changed)} differs"] if changed else []
-    return [*nodes, *only, *_definitions(left.code.parts, right.code.parts, whole=not only)]
+    return [*nodes, *only, *_definitions(left.code.parts, right.code.parts, complete=not only)]
 
 
 def environment(left: RunRecord, right: RunRecord) -> list[ValueDifference]:
     """Return what differs in command, device, machine, versions and settings of two runs."""
-    documents = [record.document for record in (left, right)]
-    facts = [{name: value for name, value in d.facts if name not in _MEASURED} for d in documents]
-    for each, document in zip(facts, documents, strict=True):
-        each |= {"neusee": document.version, "device": document.device, "recipe": document.recipe}
-        each |= {"command": document.command}
-    for each, record in zip(facts, (left, right), strict=True):
-        parts = record.code.parts if record.code else {}
-        packages = {
-            name.removeprefix(_PACKAGE): _release(p)
-            for name, p in parts.items()
-            if name.startswith(_PACKAGE)
-        }
-        settings = parts.get(_SETTINGS, {})
-        each |= {name: version for name, version in packages.items() if name not in each} | settings
-    names = dict.fromkeys([*facts[0], *facts[1]])
-    sides = [(name, facts[0].get(name, ""), facts[1].get(name, "")) for name in names]
-    return [ValueDifference(*row) for row in sides if row[1] != row[2]]
+    sides = [_surroundings(record) for record in (left, right)]
+    differing = []
+    for name in dict.fromkeys([*sides[0], *sides[1]]):
+        values = [side.get(name, "") for side in sides]
+        if values[0] != values[1]:
+            differing.append(ValueDifference(name, left=values[0], right=values[1]))
+    return differing
+
+
+def _surroundings(record: RunRecord) -> dict[str, str]:
+    """Return command, device, machine, versions and settings of a run, by name."""
+    document = record.document
+    facts = {name: value for name, value in document.facts if name not in _MEASURED}
+    facts |= {"neusee": document.version, "device": document.device, "recipe": document.recipe}
+    facts |= {"command": document.command}
+    parts = record.code.parts if record.code else {}
+    for name, definitions in parts.items():
+        if name.startswith(_PACKAGE):
+            facts.setdefault(name.removeprefix(_PACKAGE), _release(definitions))
+    return facts | parts.get(_SETTINGS, {})
 
 
 def steps(left: RunRecord, right: RunRecord) -> list[str]:
     """Return lines that count the steps with other cache keys, and name the steps that only one
     run has.
     """
-    one, other = ({row.step: row.key for row in r.document.steps} for r in (left, right))
-    both = one.keys() & other.keys()
-    differ = [name for name in one if name in both and one[name] != other[name]]
+    left_keys, right_keys = ({row.step: row.key for row in r.document.steps} for r in (left, right))
+    both = left_keys.keys() & right_keys.keys()
+    differ = [name for name in left_keys if name in both and left_keys[name] != right_keys[name]]
     lines = (
         [f"{len(differ)} of {len(both)} common steps have another cache key: {_listed(differ)}"]
         if differ
@@ -186,7 +195,10 @@ def steps(left: RunRecord, right: RunRecord) -> list[str]:
     )
     return [
         *lines,
-        *(f"only the {side} run has the step {name}" for side, name in _only(one, other)),
+        *(
+            f"only the {side} run has the step {name}"
+            for side, name in _only(left_keys, right_keys)
+        ),
     ]
 
 
@@ -197,29 +209,35 @@ def _release(package: Mapping[str, str]) -> str:
 
 
 def _definitions(
-    left: Mapping[str, Mapping[str, str]], right: Mapping[str, Mapping[str, str]], whole: bool
+    left: Mapping[str, Mapping[str, str]], right: Mapping[str, Mapping[str, str]], complete: bool
 ) -> Iterator[str]:
     """Yield one line for each definition of a module, or declared file, that differs.
 
-    With ``whole``, also for each module that only one run uses, which means little if their nodes
-    are not the same.
+    With ``complete``, also for each module that only one run uses, which means little if their
+    nodes are not the same.
     """
     for module in sorted(left.keys() | right.keys()):
         if module in (_SETTINGS, _PYTHON) or module.startswith(_PACKAGE):
             continue
-        old, new = left.get(module), right.get(module)
-        if old is None or new is None:
-            if whole and not module.startswith(_STATE):
-                yield f"only the {'left' if new is None else 'right'} run uses {module}"
-        elif module.startswith(_STATE):
-            name = module.removeprefix(_STATE)
-            if old != new and left.get(name) == right.get(name):
-                yield f"a value that {name} holds differs: a constant, a table or a default"
-        else:
-            labels = sorted(
-                label for label in old.keys() | new.keys() if old.get(label) != new.get(label)
-            )
-            yield from (f"{module}: {label} {_how(old, new, label)}" for label in labels)
+        if module in left and module in right:
+            yield from _changes(left, right, module)
+        elif complete and not module.startswith(_STATE):
+            yield f"only the {'left' if module in left else 'right'} run uses {module}"
+
+
+def _changes(
+    left: Mapping[str, Mapping[str, str]], right: Mapping[str, Mapping[str, str]], module: str
+) -> Iterator[str]:
+    """Yield what differs in a module, or in the values that it holds, that both runs use."""
+    old, new = left[module], right[module]
+    if module.startswith(_STATE):
+        name = module.removeprefix(_STATE)
+        if old != new and left.get(name) == right.get(name):
+            yield f"a value that {name} holds differs: a constant, a table or a default"
+        return
+    for label in sorted(old.keys() | new.keys()):
+        if old.get(label) != new.get(label):
+            yield f"{module}: {label} {_how(old, new, label)}"
 
 
 def _how(old: Mapping[str, str], new: Mapping[str, str], label: str) -> str:
@@ -234,8 +252,8 @@ def _only(left: Mapping[str, object], right: Mapping[str, object]) -> Iterator[t
 
 
 def _listed(names: list[str]) -> str:
-    rest = len(names) - _SEVERAL
-    return ", ".join(names) if rest <= 0 else f"{', '.join(names[:_SEVERAL])} and {rest} more"
+    hidden = len(names) - _SEVERAL
+    return ", ".join(names) if hidden <= 0 else f"{', '.join(names[:_SEVERAL])} and {hidden} more"
 
 
 # --- picture differences --------------------------------------------------------------------------
@@ -282,33 +300,33 @@ def data_files(left: Path, right: Path) -> list[FileDifference]:
 
     Only the bytes of other files are compared.
     """
-    found: list[FileDifference] = []
+    differences: list[FileDifference] = []
     for name in _common(left / "data", right / "data"):
-        one, other = left / "data" / name, right / "data" / name
-        if filecmp.cmp(one, other, shallow=False):
-            found.append(FileDifference(name, "same"))
+        left_file, right_file = left / "data" / name, right / "data" / name
+        if filecmp.cmp(left_file, right_file, shallow=False):
+            differences.append(FileDifference(name, "same"))
         elif name.endswith(".exr"):
-            found.append(_exr(name, one, other))
+            differences.append(_exr(name, left_file, right_file))
         elif name.endswith(".safetensors"):
-            found += _tensors(name, one, other)
+            differences += _tensors(name, left_file, right_file)
         else:
-            found.append(FileDifference(name, "differs"))
-    return found
+            differences.append(FileDifference(name, "differs"))
+    return differences
 
 
 def only_one_has(left: Path, right: Path) -> list[str]:
     """Return a line for each figure and each data file that only one of two runs has."""
     lines = []
     for folder in ("figures", "data"):
-        here, there = _names(left / folder), _names(right / folder)
+        left_names, right_names = _names(left / folder), _names(right / folder)
         lines += [
             f"only the left run has {folder}/{name}"
-            for name in sorted(here - there)
+            for name in sorted(left_names - right_names)
             if _counts(name)
         ]
         lines += [
             f"only the right run has {folder}/{name}"
-            for name in sorted(there - here)
+            for name in sorted(right_names - left_names)
             if _counts(name)
         ]
     return lines
@@ -332,26 +350,28 @@ def _figure(name: str, left: Path, right: Path) -> FileDifference:
 
     if filecmp.cmp(left, right, shallow=False):
         return FileDifference(name, "same")
-    one, other = _levels(left), _levels(right)
-    if one.shape != other.shape:
-        sizes = " and ".join(f"{x.shape[1]} x {x.shape[0]}" for x in (one, other))
+    left_levels, right_levels = _levels(left), _levels(right)
+    if left_levels.shape != right_levels.shape:
+        sizes = " and ".join(f"{x.shape[1]} x {x.shape[0]}" for x in (left_levels, right_levels))
         return FileDifference(
-            name, f"drawn in two sizes, {sizes} pixels", drawing=drawing(one, other, None, "")
+            name,
+            f"drawn in two sizes, {sizes} pixels",
+            drawing=drawing(left_levels, right_levels, None, ""),
         )
-    change = np.abs(one.astype(np.int16) - other).max(-1)
+    change = np.abs(left_levels.astype(np.int16) - right_levels).max(-1)
     largest = int(change.max())
     if not largest:
         return FileDifference(name, "same")
     rms = float(np.sqrt(np.mean(change.astype(float) ** 2)))
-    shown = drawing(one, other, change, f"difference, at most {largest} of 255 levels")
+    shown = drawing(
+        left_levels, right_levels, change, f"difference, at most {largest} of 255 levels"
+    )
     return FileDifference(name, "differs", largest, rms, 255.0, shown)
 
 
 def _levels(path: Path) -> Any:
     import numpy as np
     from PIL import Image, UnidentifiedImageError
-
-    from neusee.nodes.file_headers import picture_needs
 
     try:
         refuse_other_than_file(path)
@@ -367,23 +387,28 @@ def _levels(path: Path) -> Any:
 def _exr(name: str, left: Path, right: Path) -> FileDifference:
     import numpy as np
 
-    one, other = _channels(left), _channels(right)
-    if one.keys() != other.keys() or any(one[c].shape != other[c].shape for c in one):
-        return FileDifference(name, f"differs in channels or size: {_form(one)} and {_form(other)}")
-    a, b = (np.stack([channels[c] for c in one]).astype(np.float64) for channels in (one, other))
-    found = _numbers(name, a, b)
-    if found.largest and len(one) <= _COLOURS:
+    left_channels, right_channels = _channels(left), _channels(right)
+    if left_channels.keys() != right_channels.keys() or any(
+        left_channels[c].shape != right_channels[c].shape for c in left_channels
+    ):
+        return FileDifference(
+            name, f"differs in channels or size: {_form(left_channels)} and {_form(right_channels)}"
+        )
+    a, b = (
+        np.stack([channels[c] for c in left_channels]).astype(np.float64)
+        for channels in (left_channels, right_channels)
+    )
+    compared = _numbers(name, a, b)
+    if compared.largest and len(left_channels) <= _COLOURS:
         top = float(np.nanpercentile(np.maximum(np.abs(a), np.abs(b)), 99.9)) or 1.0
-        one_view, other_view = (_viewed(x / top, list(one)) for x in (a, b))
-        text = f"difference, at most {found.largest:.4g}"
-        return replace(found, drawing=drawing(one_view, other_view, np.abs(a - b).max(0), text))
-    return found
+        one_view, other_view = (_viewed(x / top, list(left_channels)) for x in (a, b))
+        text = f"difference, at most {compared.largest:.4g}"
+        return replace(compared, drawing=drawing(one_view, other_view, np.abs(a - b).max(0), text))
+    return compared
 
 
 def _channels(path: Path) -> dict[str, Any]:
     import OpenEXR
-
-    from neusee.nodes.file_headers import exr_needs
 
     try:
         exr_needs(path, 8.0)
@@ -412,26 +437,29 @@ def _tensors(name: str, left: Path, right: Path) -> Iterator[FileDifference]:
     """Yield the difference of each tensor with several elements; the numbers of a run have the
     others.
     """
-    one, other = _loaded(left), _loaded(right)
-    for key in dict.fromkeys([*one, *other]):
+    left_tensors, right_tensors = _loaded(left), _loaded(right)
+    for key in dict.fromkeys([*left_tensors, *right_tensors]):
         title = f"{name}: {key}"
-        if key in one and key in other and one[key].size == other[key].size == 1:
+        if (
+            key in left_tensors
+            and key in right_tensors
+            and left_tensors[key].size == right_tensors[key].size == 1
+        ):
             continue  # a single number is one of the numbers of the run
-        if key not in one or key not in other:
-            yield FileDifference(title, f"only the {'left' if key in one else 'right'} run has it")
-        elif one[key].shape != other[key].shape:
+        if key not in left_tensors or key not in right_tensors:
             yield FileDifference(
-                title, f"differs in shape: {tuple(one[key].shape)} and {tuple(other[key].shape)}"
+                title, f"only the {'left' if key in left_tensors else 'right'} run has it"
             )
+        elif left_tensors[key].shape != right_tensors[key].shape:
+            shapes = (tuple(tensors[key].shape) for tensors in (left_tensors, right_tensors))
+            yield FileDifference(title, f"differs in shape: {' and '.join(map(str, shapes))}")
         else:
-            yield _numbers(title, one[key], other[key])
+            yield _numbers(title, left_tensors[key], right_tensors[key])
 
 
 def _loaded(path: Path) -> dict[str, Any]:
     from safetensors import SafetensorError
     from safetensors.torch import load_file
-
-    from neusee.nodes.file_headers import safetensors_need
 
     try:
         safetensors_need(path, 3.0)
@@ -440,7 +468,7 @@ def _loaded(path: Path) -> dict[str, Any]:
         raise NotComparable(f"{path}: {error}: {_BROKEN}") from None
 
 
-def _numbers(name: str, one: Any, other: Any) -> FileDifference:
+def _numbers(name: str, left: Any, right: Any) -> FileDifference:
     """Return the largest and the root mean square difference of two arrays; equal and paired NaN
     values differ by 0.
     """
@@ -448,7 +476,7 @@ def _numbers(name: str, one: Any, other: Any) -> FileDifference:
 
     with np.errstate(invalid="ignore"):
         change = np.where(
-            (one == other) | (np.isnan(one) & np.isnan(other)), 0.0, np.abs(one - other)
+            (left == right) | (np.isnan(left) & np.isnan(right)), 0.0, np.abs(left - right)
         )
     if not change.size or not change.any():
         return FileDifference(name, "same")
@@ -457,7 +485,7 @@ def _numbers(name: str, one: Any, other: Any) -> FileDifference:
         return FileDifference(
             name, f"differs, with NaN or infinity in one run alone at {places} places"
         )
-    scale = float(max(np.nanmax(np.abs(x)) for x in (one, other)))
+    scale = float(max(np.nanmax(np.abs(x)) for x in (left, right)))
     return FileDifference(
         name, "differs", float(change.max()), float(np.sqrt(np.mean(change**2))), scale
     )

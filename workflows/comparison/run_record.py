@@ -114,14 +114,16 @@ def read_record(where: str, root: Path) -> RunRecord:
         folder = find_run(where, root).resolve()
     except FileNotFoundError as error:
         raise NotComparable(str(error)) from None
-    found = _json(folder / "provenance.json")
-    kind = found.get("study") or found.get("stage") if isinstance(found, dict) else None
+    provenance = _json(folder / "provenance.json")
+    kind = (
+        provenance.get("study") or provenance.get("stage") if isinstance(provenance, dict) else None
+    )
     if kind:
         text = f"{folder} is the folder of `{kind}`: compare reads folders of `neusee run`"
         raise NotComparable(
             f"{text}; the numbers of this folder are in its tables and its page report.html"
         )
-    document = _checked(folder / "provenance.json", RunDocument, found)
+    document = _checked(folder / "provenance.json", RunDocument, provenance)
     code = folder / CODE
     digests = _checked(code, CodeDigests, _json(code)) if code.is_file() else None
     return RunRecord(folder, document, _values(folder / "recipe.yaml"), digests)
@@ -159,9 +161,9 @@ def _values(path: Path) -> dict[str, FinalValue]:
         raise NotComparable(str(error)) from None
     lines = text_of(path, "utf-8-sig").splitlines()
     sources = [line.rpartition(" # ")[::2] for line in lines]
-    found = {}
+    values = {}
     for leaf in document.root.leaves():
         before, source = sources[leaf.key.line - 1]
         if before:  # a block of which every value is a default has no source
-            found[leaf.name] = FinalValue(flow(leaf.plain), source.strip())
-    return found
+            values[leaf.name] = FinalValue(flow(leaf.plain), source.strip())
+    return values

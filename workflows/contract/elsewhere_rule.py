@@ -107,8 +107,8 @@ def _called(asked: Asked, module: str, pickled: bytes) -> Outcome:
         import_missing(asked.files, module)
         function = pickle.loads(pickled)
     except (Exception, SystemExit) as error:
-        found = failed(error, module)
-        return Outcome(failure=f"cannot be imported: it {found.failure}", place=found.place)
+        outcome = failed(error, module)
+        return Outcome(failure=f"cannot be imported: it {outcome.failure}", place=outcome.place)
     _disturb(asked.settings)  # again, as the import may have changed it back
     return outcome_of(function, module)
 
@@ -144,7 +144,10 @@ def _disturb(settings: Settings) -> None:
     # so that a second time does not change it back
     if settings.has_other_errors and np.geterr() != _errors[0]:
         np.seterr(
-            **{name: "ignore" if what == "raise" else "raise" for name, what in np.geterr().items()}
+            **{
+                name: "ignore" if reaction == "raise" else "raise"
+                for name, reaction in np.geterr().items()
+            }
         )
         _errors[0] = np.geterr()
 
@@ -198,16 +201,16 @@ class Trial:
         self.others = others
         self.findings = dict[str, Finding]()  #: by the name of the call
         self._pickled = dict[str, bytes]()
-        for each in tried:
+        for attempt in tried:
             try:
-                self._pickled[each.name] = pickle.dumps(each.function)
+                self._pickled[attempt.name] = pickle.dumps(attempt.function)
             except Exception as error:
                 text = (
                     "not tried: its example cannot be sent to another process:"
                     f" {type(error).__name__}: {error}"
                 )
-                self.findings[each.name] = Finding(RULE, None, text)
-        self._tried = {each.name: each for each in tried if each.name in self._pickled}
+                self.findings[attempt.name] = Finding(RULE, None, text)
+        self._tried = {attempt.name: attempt for attempt in tried if attempt.name in self._pickled}
         self._here: Found = {}
         self._processes = dict[Changes, Elsewhere]()  # by what only a new process can have
 
@@ -222,7 +225,8 @@ class Trial:
         away = self._outcomes(first, frozenset(self.others.changed()))
         self._leave_out_ends([name for name, outcome in away.items() if outcome.is_end])
         self._here = {
-            name: outcome_of(each.function, each.module) for name, each in self._tried.items()
+            name: outcome_of(attempt.function, attempt.module)
+            for name, attempt in self._tried.items()
         }
         open_names = list[str]()
         for name, here in self._here.items():
@@ -252,24 +256,27 @@ class Trial:
         names = [*self._tried]
         if WORK in changes:
             names.reverse()
-        declared = {
-            name: value for each in self._tried.values() for name, value in each.declared.items()
-        }
+        declared: dict[str, str] = {}
+        for attempt in self._tried.values():
+            declared |= attempt.declared
         settings = (others or self.others).settings(changes, Path(process.folder.name), declared)
         calls = tuple((self._tried[name].module, self._pickled[name]) for name in names)
         return dict(zip(names, process.outcomes(Asked(settings, own_files(), calls)), strict=True))
 
-    def _each(self, *sets: Iterable[Surrounding]) -> list[Found]:
+    def _each(self, sets: Sequence[Iterable[Surrounding]]) -> list[Found]:
         """Return the outcomes for each set of changes; the processes that they need start at the
         same time.
         """
-        changes = [frozenset(each) for each in sets]
-        for each in changes:
-            if each & FRESH not in self._processes:
-                self._processes[each & FRESH] = self._stack.enter_context(
-                    closing(Elsewhere(self.others, each))
+        changes = [frozenset(change_set) for change_set in sets]
+        for change_set in changes:
+            if change_set & FRESH not in self._processes:
+                self._processes[change_set & FRESH] = self._stack.enter_context(
+                    closing(Elsewhere(self.others, change_set))
                 )
-        return [self._outcomes(self._processes[each & FRESH], each) for each in changes]
+        return [
+            self._outcomes(self._processes[change_set & FRESH], change_set)
+            for change_set in changes
+        ]
 
     # --- what decides -----------------------------------------------------------------------------
 
@@ -279,7 +286,7 @@ class Trial:
         """
         if not names:
             return
-        [same] = self._each(())
+        [same] = self._each([()])
         for name in names:
             if same[name].is_end:
                 self._fail(
@@ -291,12 +298,12 @@ class Trial:
         """Say which results differ by rounding alone, and with the number of threads alone."""
         sizes = dict[str, float]()
         for name in names:
-            found = self._difference(name, away[name], self._here[name])
-            if found and found.is_rounding:
-                sizes[name] = found.size
+            deviation = self._difference(name, away[name], self._here[name])
+            if deviation and deviation.is_rounding:
+                sizes[name] = deviation.size
         if not sizes:
             return
-        [others] = self._each(set(self.others.changed()) - {THREADS})
+        [others] = self._each([set(self.others.changed()) - {THREADS}])
         for name, size in sizes.items():
             if not self._difference(name, others[name], self._here[name]):
                 self._say_same(name, size)
@@ -306,27 +313,36 @@ class Trial:
         if not names:
             return
         changed = self.others.changed()
-        same, *singles = self._each((), *([each] for each in changed))
-        unsteady = {
-            name: one
-            for name in names
-            if (one := self._difference(name, same[name], self._here[name]))
-        }
-        again = self._each(())[0] if unsteady else same
+        same, *singles = self._each([(), *([surrounding] for surrounding in changed)])
+        unsteady = self._differences(names, same, self._here)
+        again = self._each([()])[0] if unsteady else same
         for name in names:
-            if found := self._difference(name, again[name], same[name]):
+            if deviation := self._difference(name, again[name], same[name]):
                 self._fail(
                     name,
-                    f"{_UNSTEADY} {found.text}; other surroundings were not compared",
-                    found.place,
+                    f"{_UNSTEADY} {deviation.text}; other surroundings were not compared",
+                    deviation.place,
                 )
-                continue
-            for surrounding, outcomes in zip(changed, singles, strict=True):
-                found = self._difference(name, outcomes[name], same[name])
-                if found and not (surrounding is THREADS and found.is_rounding):
-                    variables = self._deciding(name, same) if surrounding is VARIABLES else []
-                    self._fail_in(name, surrounding, found, variables)
+            else:
+                for surrounding, outcomes in zip(changed, singles, strict=True):
+                    self._settle_one(name, surrounding, outcomes, same)
         self._settle_hidden([name for name in names if name not in self.findings], same, unsteady)
+
+    def _settle_one(
+        self, name: str, surrounding: Surrounding, outcomes: Found, same: Found
+    ) -> None:
+        """Say if a result depends on one surrounding, by more than rounding if on the threads."""
+        deviation = self._difference(name, outcomes[name], same[name])
+        if deviation and not (surrounding is THREADS and deviation.is_rounding):
+            variables = self._deciding(name, same) if surrounding is VARIABLES else []
+            self._fail_in(name, surrounding, deviation, variables)
+
+    def _differences(
+        self, names: Iterable[str], actual: Found, expected: Found
+    ) -> dict[str, Difference]:
+        """Return how the outcomes differ, by name, of those that do."""
+        pairs = ((name, self._difference(name, actual[name], expected[name])) for name in names)
+        return {name: deviation for name, deviation in pairs if deviation}
 
     def _deciding(self, name: str, same: Found) -> list[str]:
         """Return the variables of the environment without any of which a result differs, by
@@ -336,10 +352,10 @@ class Trial:
         todo, deciding = [self.others.variables], list[str]()
         while todo:
             few = todo.pop()
-            found = self._outcomes(
+            outcomes = self._outcomes(
                 process, frozenset({VARIABLES}), replace(self.others, variables=few)
             )
-            if not few or not self._difference(name, found[name], same[name]):
+            if not few or not self._difference(name, outcomes[name], same[name]):
                 continue
             if len(few) == 1:
                 deciding += few
@@ -356,11 +372,11 @@ class Trial:
         for seed in range(_MORE_SEEDS):
             others = replace(self.others, hash_seed=self.others.hash_seed + 1 + seed)
             with closing(Elsewhere(others, frozenset({HASH}))) as process:
-                found = self._outcomes(process, frozenset({HASH}))
+                outcomes = self._outcomes(process, frozenset({HASH}))
             for name in names:
-                one = self._difference(name, found[name], same[name])
-                if one and name not in self.findings:
-                    self._fail_in(name, HASH, one)
+                deviation = self._difference(name, outcomes[name], same[name])
+                if deviation and name not in self.findings:
+                    self._fail_in(name, HASH, deviation)
         for name in names:
             if name in self.findings:
                 continue
@@ -377,8 +393,8 @@ class Trial:
 
     # --- words ------------------------------------------------------------------------------------
 
-    def _difference(self, name: str, found: Outcome, wanted: Outcome) -> Difference | None:
-        return difference(found, wanted, self._tried[name].rtol)
+    def _difference(self, name: str, outcome: Outcome, expected: Outcome) -> Difference | None:
+        return difference(outcome, expected, self._tried[name].rtol)
 
     def _say_same(self, name: str, rounding: float = 0.0) -> None:
         count = len(self.others.changed()) - (rounding > 0)
@@ -394,11 +410,15 @@ class Trial:
         self.findings[name] = Finding(RULE, True, f"{text}; the clock was not changed")
 
     def _fail_in(
-        self, name: str, surrounding: Surrounding, found: Difference, variables: Sequence[str] = ()
+        self,
+        name: str,
+        surrounding: Surrounding,
+        deviation: Difference,
+        variables: Sequence[str] = (),
     ) -> None:
         differs = self.others.differs(surrounding, variables)
         fix = surrounding.fix.replace("NAME", variables[0]) if variables else surrounding.fix
-        self._fail(name, f"{differs} {found.text}: {fix}", found.place)
+        self._fail(name, f"{differs} {deviation.text}: {fix}", deviation.place)
 
     def _fail(self, name: str, text: str, place: str = "") -> None:
         """Add a sentence on a call; several surroundings make several sentences."""
@@ -423,8 +443,10 @@ def check_elsewhere(
         trial = Trial(tried, first.others)
         trial.compare(first)
     except NotStartedError as error:
-        return {each.name: Finding(RULE, None, f"not tried: {error}") for each in tried}, set()
-    return trial.findings, {each.name for each in tried if trial.ends(each.name)}
+        return {
+            attempt.name: Finding(RULE, None, f"not tried: {error}") for attempt in tried
+        }, set()
+    return trial.findings, {attempt.name for attempt in tried if trial.ends(attempt.name)}
 
 
 # --- tried calls ----------------------------------------------------------------------------------
@@ -459,7 +481,9 @@ def _tried(
     module = code.__module__
     variables = [*depends, *_declarations(module)]
     names = {entry.removeprefix(_VARIABLE) for entry in variables if entry.startswith(_VARIABLE)}
-    declared = {each: os.environ[each] for each in sorted(names) if each in os.environ}
+    declared = {
+        variable: os.environ[variable] for variable in sorted(names) if variable in os.environ
+    }
     return Tried(name, module, _place(code), rtol, function, declared)
 
 

@@ -94,7 +94,10 @@ def check_words(node: Node) -> list[Finding]:
 
 def check_values(call: Call) -> list[Finding]:
     """Return what each rule found on what a node computes in one call."""
-    return [finding for rule in _OF_VALUES for finding in _guarded(rule, call)]
+    findings: list[Finding] = []
+    for rule in _OF_VALUES:
+        findings += _guarded(rule, call)
+    return findings
 
 
 def _check_key(node: Node) -> Iterator[Finding]:
@@ -111,12 +114,7 @@ def _check_key(node: Node) -> Iterator[Finding]:
 def example_call(node: Node, example: Mapping[str, Any] | None = None) -> Call | Finding:
     """Return the call of the example, or the finding that there is none or that it is wrong."""
     if example is None and node.hooks.example is None:
-        name = node.fn.__name__
-        return Finding(
-            "example",
-            False,
-            f"none: attach a function with @{name}.example that returns its arguments",
-        )
+        return _no_example(node)
     try:
         validated = node.params
     except Exception:
@@ -126,24 +124,47 @@ def example_call(node: Node, example: Mapping[str, Any] | None = None) -> Call |
             "not tried: the parameters cannot be validated, see the rule signature",
         )
     try:
-        given = dict(
-            node.hooks.example() if example is None and node.hooks.example else example or {}
-        )
+        arguments = _arguments(node, example)
     except Exception as error:
         return Finding("example", False, f"the example raises {type(error).__name__}: {error}")
-    inputs = [given.pop(name, None) for name in node.inputs]
-    missing = [
-        n for n, v in zip(node.inputs, inputs, strict=True) if v is None and n not in node.optional
-    ]
+    inputs = {name: arguments.pop(name, None) for name in node.inputs}
+    missing = _missing(node, inputs)
     if missing:
         return Finding("example", False, f"lacks the inputs {', '.join(missing)}")
     try:
-        params = {name: value for name, value in validated(**given)}
+        params = dict(validated(**arguments))
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        text = first["msg"].removeprefix("Value error, ")
-        return Finding("example", False, f"{'.'.join(map(str, first['loc']))}: {text}")
-    return Call(node, inputs, params)
+        return Finding("example", False, _first_mistake(error))
+    return Call(node, list(inputs.values()), params)
+
+
+def _missing(node: Node, inputs: Mapping[str, Any]) -> list[str]:
+    """Return the names of inputs that a node needs and an example does not give."""
+    required = [name for name in node.inputs if name not in node.optional]
+    return [name for name in required if inputs[name] is None]
+
+
+def _first_mistake(error: ValidationError) -> str:
+    """Return the first mistake in the parameters of an example."""
+    first = error.errors(include_url=False)[0]
+    text = first["msg"].removeprefix("Value error, ")
+    return f"{'.'.join(map(str, first['loc']))}: {text}"
+
+
+def _no_example(node: Node) -> Finding:
+    name = node.fn.__name__
+    return Finding(
+        "example",
+        False,
+        f"none: attach a function with @{name}.example that returns its arguments",
+    )
+
+
+def _arguments(node: Node, example: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the arguments of an example, or of that of the node."""
+    if example is None and node.hooks.example:
+        return dict(node.hooks.example())
+    return dict(example or {})
 
 
 def _guarded(rule: Callable[[Call], Iterator[Finding]], call: Call) -> Iterator[Finding]:
@@ -169,31 +190,31 @@ def whole_networks(module: ModuleType) -> dict[str, type[nn.Module]]:
     their file use.
     """
     classes = network_classes(module)
-    used: set[str] = set()
+    named: set[str] = set()
     for name in {value.__module__ for value in classes.values()}:
         for item in ast.parse(inspect.getsource(sys.modules[name])).body:
             own = getattr(item, "name", "")
-            used |= {
-                part.id for part in ast.walk(item) if isinstance(part, ast.Name) and part.id != own
+            named |= {
+                leaf.id for leaf in ast.walk(item) if isinstance(leaf, ast.Name) and leaf.id != own
             }
-    return {name: value for name, value in classes.items() if name not in used}
+    return {name: value for name, value in classes.items() if name not in named}
 
 
 def check_network(name: str, network: type[nn.Module]) -> list[Finding]:
     """Return what each rule found on a network class, built with the defaults of its arguments."""
-    found = [*_check_docstring(network), *_check_network_key(network)]
+    findings = [*_check_docstring(network), *_check_network_key(network)]
     make: Make = partial(own_network, Architecture(name, network), None, None)
     try:
         make(0)
     except ParameterError as error:
         return [
-            *found,
+            *findings,
             Finding("arguments", False, f"{error}: give each argument a default, for this check"),
         ]
-    found.append(Finding("arguments", True, "the class builds with its defaults"))
+    findings.append(Finding("arguments", True, "the class builds with its defaults"))
     for rule in (_check_picture, _check_double, _check_weights, _check_gradient):
-        found += _guarded_network(rule, make)
-    return found
+        findings += _guarded_network(rule, make)
+    return findings
 
 
 def _guarded_network(rule: Callable[[Make], Iterator[Finding]], make: Make) -> Iterator[Finding]:
@@ -251,11 +272,11 @@ def _check_weights(make: Make) -> Iterator[Finding]:
     """Find whether the weights of one network make another one, built with other random numbers,
     equal to it.
     """
-    one, other = make(1).eval(), make(2).eval()
-    other.inner.load_state_dict(one.inner.state_dict())
+    first, second = make(1).eval(), make(2).eval()
+    second.inner.load_state_dict(first.inner.state_dict())
     picture = _picture()
     with torch.no_grad():
-        same = torch.equal(one(picture), other(picture))
+        same = torch.equal(first(picture), second(picture))
     text = "a file of weights holds all that the network has drawn"
     wrong = (
         "two networks with the same weights differ: register each drawn tensor as a parameter or a"
@@ -270,14 +291,12 @@ def _check_gradient(make: Make) -> Iterator[Finding]:
     with torch.random.fork_rng([]):
         torch.manual_seed(0)
         (net(_picture()) - _picture().flip(-1)).square().mean().backward()
-    trained = {name: one.grad for name, one in net.inner.named_parameters() if one.requires_grad}
-    if not trained:
+    trainable = {name: p for name, p in net.inner.named_parameters() if p.requires_grad}
+    if not trainable:
         yield Finding("gradient", False, "the class has no parameters: there is nothing to train")
         return
-    unused = [name for name, grad in trained.items() if grad is None]
-    wrong = [
-        name for name, grad in trained.items() if grad is not None and not grad.isfinite().all()
-    ]
+    unused = [name for name, parameter in trainable.items() if parameter.grad is None]
+    wrong = [name for name, parameter in trainable.items() if not _has_finite_gradient(parameter)]
     if wrong:
         yield Finding("gradient", False, f"the gradient of {wrong[0]} is not finite")
     elif unused:
@@ -285,7 +304,12 @@ def _check_gradient(make: Make) -> Iterator[Finding]:
             "gradient", False, f"{unused[0]} has no gradient: the result does not depend on it"
         )
     else:
-        yield Finding("gradient", True, f"finite for each of {len(trained)} parameters")
+        yield Finding("gradient", True, f"finite for each of {len(trainable)} parameters")
+
+
+def _has_finite_gradient(parameter: nn.Parameter) -> bool:
+    """Return True if a gradient is finite, or there is none."""
+    return parameter.grad is None or bool(parameter.grad.isfinite().all())
 
 
 def _picture() -> torch.Tensor:
@@ -308,17 +332,24 @@ def check_all(
     ``process`` returns a process in which all surroundings are changed. A call that ends this
     process would end the check, so each is made there first.
     """
-    found = {name: check_words(node) for name, node in nodes.items()}
+    findings = {name: check_words(node) for name, node in nodes.items()}
     calls = {name: example_call(node) for name, node in nodes.items()}
     tried = [node_call(name, call) for name, call in calls.items() if isinstance(call, Call)]
     tried += [network_call(name, network) for name, network in networks.items()]
     away, ending = check_elsewhere(tried, process)
     for name, call in calls.items():
-        found[name] += (
-            [call] if isinstance(call, Finding) else [] if name in ending else check_values(call)
-        )
+        findings[name] += _on_values(call, name in ending)
     for name, network in networks.items():
-        found[name] = [] if name in ending else check_network(name, network)
+        findings[name] = [] if name in ending else check_network(name, network)
     for name, finding in away.items():
-        found[name].append(finding)
-    return found
+        findings[name].append(finding)
+    return findings
+
+
+def _on_values(call: Call | Finding, ends: bool) -> list[Finding]:
+    """Return what each rule found on the values of a call, unless there is none or it ends its
+    process.
+    """
+    if isinstance(call, Finding):
+        return [call]
+    return [] if ends else check_values(call)

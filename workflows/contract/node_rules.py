@@ -11,7 +11,7 @@ import re
 import textwrap
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -59,10 +59,7 @@ def check_docstring(node: Node) -> Iterator[Finding]:
     faults = []
     if not first.endswith(".") or not first[:1].isupper() or len(first) > _LONGEST:
         faults.append("the first paragraph must be one sentence")
-    for word in _LINES:
-        found = [line for line in lines if line.startswith(word)]
-        if len(found) != 1 or len(found[0].removeprefix(word).strip()) < 2:
-            faults.append(f"one line must begin with {word}")
+    faults += [f"one line must begin with {word}" for word in _LINES if not _has_line(lines, word)]
     if "Raises:" not in text and _raises(node):
         faults.append("the function raises an error, so one line must begin with Raises:")
     yield Finding(
@@ -70,6 +67,12 @@ def check_docstring(node: Node) -> Iterator[Finding]:
         not faults,
         "; ".join(faults) or "one sentence, shapes, units, error and source",
     )
+
+
+def _has_line(lines: Sequence[str], word: str) -> bool:
+    """Return True if one line alone begins with a word, and says something."""
+    begun = [line for line in lines if line.startswith(word)]
+    return len(begun) == 1 and len(begun[0].removeprefix(word).strip()) >= 2
 
 
 def check_signature(node: Node) -> Iterator[Finding]:
@@ -100,8 +103,8 @@ def check_hooks(node: Node) -> Iterator[Finding]:
         for p in inspect.signature(hook).parameters.values() if hook else ():
             if p.kind is p.KEYWORD_ONLY and p.name not in own:
                 faults.append(f"{name} asks for {p.name}, which {node.fn.__name__} does not have")
-    there = [name for name in _HOOKS if getattr(node.hooks, name)]
-    yield Finding("hooks", not faults, "; ".join(faults) or (", ".join(there) or "none"))
+    attached = [name for name in _HOOKS if getattr(node.hooks, name)]
+    yield Finding("hooks", not faults, "; ".join(faults) or (", ".join(attached) or "none"))
 
 
 def _raises(node: Node) -> bool:
@@ -153,10 +156,7 @@ def check_result(call: Call) -> Iterator[Finding]:
         same,
         "left as they were" if same else "changed in place: let the node clone the input",
     )
-    tensors = tensors_in(first)
-    finite = all(
-        bool(x.isfinite().all()) for x in tensors if x.is_floating_point() or x.is_complex()
-    )
+    finite = all(bool(x.isfinite().all()) for x in _floating(first))
     yield Finding(
         "finite",
         finite,
@@ -164,7 +164,7 @@ def check_result(call: Call) -> Iterator[Finding]:
     )
     again = all(
         torch.allclose(x, y, 0.0, 0.0, True)
-        for x, y in zip(tensors, tensors_in(second), strict=True)
+        for x, y in zip(tensors_in(first), tensors_in(second), strict=True)
     )
     yield Finding(
         "same twice",
@@ -197,15 +197,15 @@ def check_reference(call: Call) -> Iterator[Finding]:
     if node.hooks.approximation_error is not None:
         return  # factors of a cheaper form, of which many have the same product
     rng = {"rng": torch.Generator().manual_seed(_SEED)} if node.random else {}
-    found, slow = (
+    results, slow = (
         tensors_in(call.result()),
         tensors_in(node.hooks.reference(*call.inputs, **call.params, **rng)),
     )
-    if [x.shape for x in found] != [x.shape for x in slow]:
-        shapes = [_shapes(tensors) or "no tensor" for tensors in (found, slow)]
+    if [x.shape for x in results] != [x.shape for x in slow]:
+        shapes = [_shapes(tensors) or "no tensor" for tensors in (results, slow)]
         yield Finding("reference", False, f"the result is {shapes[0]}, the reference {shapes[1]}")
         return
-    error = max(map(off_by, found, slow), default=0.0)
+    error = max(map(off_by, results, slow), default=0.0)
     ok = error <= node.rtol
     yield Finding(
         "reference", ok, f"off by {error:.2g} of the largest value; rtol = {node.rtol:.2g}"
@@ -214,17 +214,33 @@ def check_reference(call: Call) -> Iterator[Finding]:
 
 def check_gradient(call: Call) -> Iterator[Finding]:
     """Find whether each gradient is that of finite differences in float64."""
-    stated = [
-        line
-        for line in (inspect.getdoc(call.node.fn) or "").splitlines()
-        if line.startswith("Gradient:")
-    ]
+    lines = (inspect.getdoc(call.node.fn) or "").splitlines()
+    stated = [line for line in lines if line.startswith("Gradient:")]
     if stated:
         yield Finding("gradient", None, f"not compared: {stated[0]}")
         return
+    followed = []
+    for name, function, zero in _followed(call):
+        if fault := _slope_fault(function, zero):
+            yield Finding("gradient", False, f"with respect to {name}: {fault}")
+            return
+        followed.append(name)
+    if followed:
+        yield Finding(
+            "gradient",
+            True,
+            f"as finite differences, with respect to {', '.join(dict.fromkeys(followed))}",
+        )
+
+
+def _followed(
+    call: Call,
+) -> Iterator[tuple[str, Callable[[Tensor], tuple[Tensor, ...]], Tensor]]:
+    """Yield the name of the input of each tensor on which the result depends with a slope, the
+    result as a function of a change of the tensor, and no change.
+    """
     inputs = [_double(value) for value in call.inputs]
     scales = [_largest(y) for y in _floating(call.result(inputs))]
-    followed = []
     for i, name in enumerate(call.node.inputs):
         for j, x in enumerate(tensors_in([inputs[i]])):
             if not x.is_floating_point() or x.numel() == 0:
@@ -234,18 +250,9 @@ def check_gradient(call: Call) -> Iterator[Finding]:
             with warnings.catch_warnings():
                 # a node may read a number of a tensor without a slope
                 warnings.simplefilter("ignore")
-                if not any(y.requires_grad for y in function(zero)):
-                    continue
-            if fault := _slope_fault(function, zero):
-                yield Finding("gradient", False, f"with respect to {name}: {fault}")
-                return
-            followed.append(name)
-    if followed:
-        yield Finding(
-            "gradient",
-            True,
-            f"as finite differences, with respect to {', '.join(dict.fromkeys(followed))}",
-        )
+                follows = any(y.requires_grad for y in function(zero))
+            if follows:
+                yield name, function, zero
 
 
 def _slope_fault(function: Callable[[Tensor], tuple[Tensor, ...]], zero: Tensor) -> str:
@@ -284,45 +291,47 @@ def check_bands(call: Call) -> Iterator[Finding]:
     axes = call.node.bands
     if not axes:
         return
-    one = [
+    first_bands = [
         _first_band(value, axes[name]) if name in axes else value
         for name, value in zip(call.node.inputs, call.inputs, strict=True)
     ]
-    whole, alone = (
+    of_stack, alone = (
         tensors_in(_first_band(call.result(), axes["return"])),
-        tensors_in(call.result(one)),
+        tensors_in(call.result(first_bands)),
     )
-    same = all(torch.equal(x, y) for x, y in zip(whole, alone, strict=True))
+    same = all(torch.equal(x, y) for x, y in zip(of_stack, alone, strict=True))
     yield Finding("bands", same, f"the first band alone has {'the same' if same else 'other'} bits")
 
 
 def check_skip_bound(call: Call) -> Iterator[Finding]:
     """Find whether leaving the node out changes the result by no more than its bound."""
     hook = call.node.hooks.skip_bound
-    if (
-        hook is None
-        or not isinstance(whole := call.result(), Tensor)
-        or not isinstance(call.inputs[0], Tensor)
-    ):
+    if hook is None:
         return
+    result = call.result()
+    if not isinstance(result, Tensor) or not isinstance(call.inputs[0], Tensor):
+        return
+    without = call.inputs[0]
     stats = [TensorStats.of(value) for value in call.inputs]
     bound = float(hook(*stats, **call.params))
-    without = call.inputs[0]
-    if without.shape != whole.shape or math.isnan(bound):
+    if without.shape != result.shape or math.isnan(bound):
         return
     scale = float(without.abs().max())
     if (of := call.node.hooks.skip_scale) is not None:
         scale = min(scale, float(of(stats[0], **call.params)))
-    difference = (whole - without).double()
-    change = float(
-        difference.square().mean().sqrt() if call.node.random else difference.abs().max()
-    ) / (scale or 1.0)
+    change = _size(result - without, call.node.random) / (scale or 1.0)
     # of a root mean square over few numbers
-    spread = 5 / math.sqrt(whole.numel()) if call.node.random else 1e-9
+    spread = 5 / math.sqrt(result.numel()) if call.node.random else 1e-9
     ok = change <= bound * (1 + spread) + 1e-12
     yield Finding(
         "skip bound", ok, f"left out, the result changes by {change:.3g}; the bound is {bound:.3g}"
     )
+
+
+def _size(change: Tensor, is_random: bool) -> float:
+    """Return the largest element of a change, or the root mean square of a random one."""
+    double = change.double()
+    return float(double.square().mean().sqrt() if is_random else double.abs().max())
 
 
 def check_shape(call: Call) -> Iterator[Finding]:
@@ -330,13 +339,15 @@ def check_shape(call: Call) -> Iterator[Finding]:
     hook = call.node.hooks.shape
     if hook is None:
         return
-    known = [
+    inputs = [
         each_tensor(lambda x: x.to("meta") if x.numel() > _FEW else x, value)
         for value in call.inputs
     ]
-    told, there = (_every_tensor(value) for value in (hook(*known, **call.params), call.result()))
-    same = [tuple(x.shape) for x in told] == [tuple(x.shape) for x in there]
-    yield Finding("shape", same, f"told {_shapes(told)}, is {_shapes(there)}")
+    stated, actual = (
+        _every_tensor(value) for value in (hook(*inputs, **call.params), call.result())
+    )
+    same = [tuple(x.shape) for x in stated] == [tuple(x.shape) for x in actual]
+    yield Finding("shape", same, f"told {_shapes(stated)}, is {_shapes(actual)}")
 
 
 def _every_tensor(value: Any) -> list[Tensor]:
@@ -345,14 +356,15 @@ def _every_tensor(value: Any) -> list[Tensor]:
     """
     if isinstance(value, Tensor):
         return [value]
-    inner = (
-        value.values()
-        if isinstance(value, dict)
-        else value
-        if isinstance(value, (tuple, list))
-        else ()
-    )
-    return [x for each in inner for x in _every_tensor(each)]
+    elements: Iterable[Any] = ()
+    if isinstance(value, dict):
+        elements = value.values()
+    elif isinstance(value, tuple | list):
+        elements = value
+    tensors = []
+    for element in elements:
+        tensors += _every_tensor(element)
+    return tensors
 
 
 def _scaled(
@@ -396,13 +408,13 @@ def _first_band(value: Any, axis: int) -> Any:
     return value._replace(**cut) if cut else value
 
 
-def off_by(found: Tensor, wanted: Tensor) -> float:
+def off_by(actual: Tensor, expected: Tensor) -> float:
     """Return the largest difference of two tensors relative to the largest wanted value."""
-    if found.numel() == 0:
+    if actual.numel() == 0:
         return 0.0
-    wide = torch.complex128 if wanted.is_complex() else torch.float64
-    scale = float(wanted.to(wide).abs().max())
-    return float((found.to(wide) - wanted.to(wide)).abs().max()) / (scale or 1.0)
+    wide = torch.complex128 if expected.is_complex() else torch.float64
+    scale = float(expected.to(wide).abs().max())
+    return float((actual.to(wide) - expected.to(wide)).abs().max()) / (scale or 1.0)
 
 
 def _shapes(tensors: Sequence[Tensor]) -> str:
@@ -455,46 +467,60 @@ def failed(error: BaseException, module: str) -> Outcome:
     )
 
 
-def difference(found: Outcome, wanted: Outcome, rtol: float) -> Difference | None:
+def difference(actual: Outcome, expected: Outcome, rtol: float) -> Difference | None:
     """Return how an outcome differs; None if all bits are the same. NaN is the same as NaN."""
-    if found.failure or wanted.failure:
-        same = found.failure == wanted.failure
-        text = f"it {found.failure}" if found.failure else "it gives a result"
-        return None if same else Difference(text, found.place)
-    names = [[name for name, _ in outcome.parts] for outcome in (found, wanted)]
+    if actual.failure or expected.failure:
+        return _of_failures(actual, expected)
+    names = [[name for name, _ in outcome.parts] for outcome in (actual, expected)]
     if names[0] != names[1]:
         return Difference("the result has other parts, or in another order")
-    each = [
-        _of_part(*part, there[1], rtol)
-        for part, there in zip(found.parts, wanted.parts, strict=True)
-    ]
-    return max((one for one in each if one), key=lambda one: one.size, default=None)
+    pairs = zip(actual.parts, expected.parts, strict=True)
+    deviations = [_of_part(name, own, other, rtol) for (name, own), (_, other) in pairs]
+    differing = [deviation for deviation in deviations if deviation]
+    return max(differing, key=lambda deviation: deviation.size, default=None)
 
 
-def _of_part(name: str, found: Any, wanted: Any, rtol: float) -> Difference | None:
-    """Return how one part of a result differs; None if it does not."""
-    what = f"the result{name}"
-    if not isinstance(found, Tensor) or not isinstance(wanted, Tensor):
-        same = type(found) is type(wanted) and (
-            found == wanted or (found != found and wanted != wanted)
-        )
-        return None if same else Difference(f"{what} is {_short(found)} and not {_short(wanted)}")
-    if found.shape != wanted.shape or found.dtype != wanted.dtype:
-        return Difference(f"{what} is {_kind(found)} and not {_kind(wanted)}")
-    if torch.allclose(found, wanted, 0.0, 0.0, True):
+def _of_failures(actual: Outcome, expected: Outcome) -> Difference | None:
+    """Return how an outcome differs, where one of both is a failure."""
+    if actual.failure == expected.failure:
         return None
-    size = off_by(found, wanted)
-    if not size < float("inf"):
-        return Difference(f"{what} has NaN or infinite values at other places")
-    eps = (
-        torch.finfo(wanted.dtype).eps if wanted.is_floating_point() or wanted.is_complex() else 0.0
-    )
     return Difference(
-        f"{what} differs by {size:.2g} of its largest value",
+        f"it {actual.failure}" if actual.failure else "it gives a result", actual.place
+    )
+
+
+def _of_part(name: str, actual: Any, expected: Any, rtol: float) -> Difference | None:
+    """Return how one part of a result differs; None if it does not."""
+    subject = f"the result{name}"
+    if not isinstance(actual, Tensor) or not isinstance(expected, Tensor):
+        if _same_value(actual, expected):
+            return None
+        return Difference(f"{subject} is {_short(actual)} and not {_short(expected)}")
+    if actual.shape != expected.shape or actual.dtype != expected.dtype:
+        return Difference(f"{subject} is {_kind(actual)} and not {_kind(expected)}")
+    if torch.allclose(actual, expected, 0.0, 0.0, True):
+        return None
+    size = off_by(actual, expected)
+    if not size < float("inf"):
+        return Difference(f"{subject} has NaN or infinite values at other places")
+    return Difference(
+        f"{subject} differs by {size:.2g} of its largest value",
         "",
         size,
-        size <= max(rtol, _EPS * eps),
+        size <= max(rtol, _EPS * _last_digit(expected)),
     )
+
+
+def _same_value(actual: Any, expected: Any) -> bool:
+    """Return True for equal values of one type, and for two NaN."""
+    if type(actual) is not type(expected):
+        return False
+    return bool(actual == expected or (actual != actual and expected != expected))
+
+
+def _last_digit(x: Tensor) -> float:
+    """Return the step of the numbers of a tensor beside 1; 0 for whole numbers."""
+    return torch.finfo(x.dtype).eps if x.is_floating_point() or x.is_complex() else 0.0
 
 
 def _parts(name: str, value: Any) -> Iterator[tuple[str, Any]]:

@@ -146,7 +146,7 @@ class Others:
 
     def changed(self) -> tuple[Surrounding, ...]:
         """Return the surroundings that can be changed here."""
-        return tuple(each for each in ALL if self._can_change(each))
+        return tuple(surrounding for surrounding in ALL if self._can_change(surrounding))
 
     def differs(self, surrounding: Surrounding, variables: Sequence[str] = ()) -> str:
         """Return in which surrounding a result differs; ``variables`` of the environment decide
@@ -177,8 +177,12 @@ class Others:
                 " left out"
             ),
         }
-        changed = [each for each in self.changed() if not (without_threads and each is THREADS)]
-        text = ", ".join(words.get(each, each.name) for each in changed)
+        changed = [
+            surrounding
+            for surrounding in self.changed()
+            if not (without_threads and surrounding is THREADS)
+        ]
+        text = ", ".join(words.get(surrounding, surrounding.name) for surrounding in changed)
         return text if self.locale else f"{text}; locale not changed: no other is installed"
 
     def environment(
@@ -187,20 +191,22 @@ class Others:
         """Return the environment of a new process of Python with those of ``changes`` that only
         a new one can have.
         """
-        given = {
+        variables = {
             **environ,
             "PYTHONHASHSEED": str(self.hash_seed + 1 if HASH in changes else self.hash_seed),
         }
         # of compiled programs
-        given.setdefault("XDG_CACHE_HOME", os.path.join(os.path.expanduser("~"), ".cache"))
+        variables.setdefault("XDG_CACHE_HOME", os.path.join(os.path.expanduser("~"), ".cache"))
         if LOCALE in changes:
-            given = {name: value for name, value in given.items() if name not in OF_LANGUAGES}
-            given |= {"LC_ALL": self.locale, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+            variables = {
+                name: value for name, value in variables.items() if name not in OF_LANGUAGES
+            }
+            variables |= {"LC_ALL": self.locale, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
         if THREADS in changes:
-            given |= dict.fromkeys(OF_THREADS, str(self.threads))
+            variables |= dict.fromkeys(OF_THREADS, str(self.threads))
         if MEMORY in changes:
-            given["MALLOC_PERTURB_"] = "165"  # the library of C fills what it gives and takes
-        return given
+            variables["MALLOC_PERTURB_"] = "165"  # the library of C fills what it gives and takes
+        return variables
 
     def settings(
         self, changes: frozenset[Surrounding], folder: Path, declared: Mapping[str, str]
@@ -228,12 +234,12 @@ class Others:
             has_other_errors=ERRORS in changes,
         )
 
-    def _can_change(self, each: Surrounding) -> bool:
+    def _can_change(self, surrounding: Surrounding) -> bool:
         return (
             bool(self.locale)
-            if each is LOCALE
+            if surrounding is LOCALE
             else bool(self.variables)
-            if each is VARIABLES
+            if surrounding is VARIABLES
             else True
         )
 
@@ -263,9 +269,10 @@ def installed_locales(environ: Mapping[str, str]) -> list[str]:
     except OSError:
         names = []
     own = [Path(folder) for folder in environ.get("LOCPATH", "").split(":") if folder]
-    return names + [
-        path.name for folder in own if folder.is_dir() for path in sorted(folder.iterdir())
-    ]
+    for folder in own:
+        if folder.is_dir():
+            names += sorted(path.name for path in folder.iterdir())
+    return names
 
 
 def other_locale(now: str, names: Iterable[str], environ: Mapping[str, str]) -> str:
@@ -277,17 +284,17 @@ def other_locale(now: str, names: Iterable[str], environ: Mapping[str, str]) -> 
 
     def rank(name: str) -> tuple[int, bool, str]:
         language = next(
-            (number for number, each in enumerate(_LANGUAGES) if name.startswith(each)),
+            (number for number, prefix in enumerate(_LANGUAGES) if name.startswith(prefix)),
             len(_LANGUAGES),
         )
         return language, _is_utf8(name), name
 
     plain = ("C", "POSIX")
-    found = sorted(
+    candidates = sorted(
         (n for n in names if n.split(".")[0] not in plain and _same(n) != _same(now)), key=rank
     )
-    if found:
-        return found[0]
+    if candidates:
+        return candidates[0]
     is_ascii = (
         now in plain
         and environ.get("PYTHONUTF8") == "0"
@@ -347,10 +354,10 @@ class Elsewhere:
         After a call that ends its fork, or that does not end, the other calls are made in another
         one.
         """
-        found: list[Outcome] = []
-        while len(found) < len(asked.calls):
-            found += self._up_to_an_end(replace(asked, calls=asked.calls[len(found) :]))
-        return found
+        outcomes: list[Outcome] = []
+        while len(outcomes) < len(asked.calls):
+            outcomes += self._up_to_an_end(replace(asked, calls=asked.calls[len(outcomes) :]))
+        return outcomes
 
     def close(self) -> None:
         """End the process and remove its folder."""
@@ -402,17 +409,21 @@ class Elsewhere:
             raise NotStartedError(f"a process of Python ended, {_words(code)}") from None
 
     def _received(self, asked: Asked) -> list[Outcome]:
-        found: list[Outcome] = []
+        outcomes: list[Outcome] = []
         while True:
             if not self._pipe.poll(LONGEST):
                 self._end()
                 self._start()
-                return [*found, _ended(f"does not end within {LONGEST:.0f} s")]
+                return [*outcomes, _ended(f"does not end within {LONGEST:.0f} s")]
             answer = pickle.loads(self._pipe.recv_bytes())
             if isinstance(answer, int):
-                has_all = len(found) == len(asked.calls)
-                return found if has_all else [*found, _ended(f"ends the process, {_words(answer)}")]
-            found.append(answer)
+                has_all = len(outcomes) == len(asked.calls)
+                return (
+                    outcomes
+                    if has_all
+                    else [*outcomes, _ended(f"ends the process, {_words(answer)}")]
+                )
+            outcomes.append(answer)
 
 
 @contextmanager
@@ -427,8 +438,8 @@ def elsewhere(early: bool = True) -> Iterator[Callable[[], Elsewhere]]:
 
     def process() -> Elsewhere:
         if not begun:
-            given = others(os.environ)
-            begun.append(Elsewhere(given, frozenset(given.changed())))
+            settings = others(os.environ)
+            begun.append(Elsewhere(settings, frozenset(settings.changed())))
         return begun[0]
 
     try:
@@ -437,8 +448,8 @@ def elsewhere(early: bool = True) -> Iterator[Callable[[], Elsewhere]]:
                 process()
         yield process
     finally:
-        for each in begun:
-            each.close()
+        for started in begun:
+            started.close()
 
 
 def _ended(failure: str) -> Outcome:

@@ -108,8 +108,8 @@ class Law:
 @cache
 def _file() -> Mapping[str, Any]:
     text = resources.files(__package__).joinpath("node_costs.json").read_text(encoding="utf-8")
-    found: dict[str, Any] = json.loads(text)
-    return found
+    costs: dict[str, Any] = json.loads(text)
+    return costs
 
 
 @cache
@@ -160,14 +160,16 @@ class Sized(NamedTuple):
     size: Size
     reads_file: bool  #: which may change
 
-    def holds(self, step: Step, inputs: Sequence[Any], below: Sequence[Size], least: float) -> bool:
+    def holds(
+        self, step: Step, inputs: Sequence[Any], below: Sequence[Size], smallest: float
+    ) -> bool:
         """Return True if a step has the same node, parameters and known inputs, and therefore
         the same size.
         """
         if (
             self.reads_file
             or step.node is not self.step.node
-            or least != self.least
+            or smallest != self.least
             or below != self.below
         ):
             return False
@@ -199,50 +201,50 @@ def sizes_of(recipe: Recipe, order: Sequence[str]) -> dict[str, Size]:
     A result of unknown shape counts as large as its inputs, or as the largest known result of the
     recipe if that is larger.
     """
-    found = _sizes(recipe, order, 0.0)
-    if all(size.known for size in found.values()):
-        return found
-    told = [size.result for size in found.values() if size.known and size.result < math.inf]
-    return _sizes(recipe, order, max(told, default=_LEAST))
+    sizes = _sizes(recipe, order, 0.0)
+    if all(size.known for size in sizes.values()):
+        return sizes
+    known_bytes = [size.result for size in sizes.values() if size.known and size.result < math.inf]
+    return _sizes(recipe, order, max(known_bytes, default=_LEAST))
 
 
-def _sizes(recipe: Recipe, order: Sequence[str], least: float) -> dict[str, Size]:
+def _sizes(recipe: Recipe, order: Sequence[str], smallest: float) -> dict[str, Size]:
     forms: dict[str, Form] = {}
-    found: dict[str, Size] = {}
+    sizes: dict[str, Size] = {}
     for name in order:
         step = recipe.steps[name]
         inputs, below = (
             inputs_of(step, forms),
-            [found[source] for source in dict.fromkeys(step.sources)],
+            [sizes[source] for source in dict.fromkeys(step.sources)],
         )
-        known = _sized.get(name)
-        if known is not None and known.holds(step, inputs, below, least):
-            forms[name], found[name] = known.form, known.size
+        remembered = _sized.get(name)
+        if remembered is not None and remembered.holds(step, inputs, below, smallest):
+            forms[name], sizes[name] = remembered.form, remembered.size
             continue
         try:
             forms[name] = form_of(step.node, inputs, step.params)
         except OverflowError:
-            found[name] = Size(0.0, math.inf, math.inf, math.inf)
+            sizes[name] = Size(0.0, math.inf, math.inf, math.inf)
             continue
-        found[name] = _size(step, inputs, forms[name], below, least)
+        sizes[name] = _size(step, inputs, forms[name], below, smallest)
         # a guess, so that the sizes of later steps can be computed
-        if forms[name] is None and not found[name].known:
+        if forms[name] is None and not sizes[name].known:
             forms[name] = next((x for x in inputs if x is not None), None)
-        if known is not None and alike(forms[name], known.form):
+        if remembered is not None and alike(forms[name], remembered.form):
             # the same object, so that later steps have the size that they had
-            forms[name] = known.form
+            forms[name] = remembered.form
         _remember(
-            Sized(step, inputs, below, least, forms[name], found[name], has_path(step.params))
+            Sized(step, inputs, below, smallest, forms[name], sizes[name], has_path(step.params))
         )
-    return found
+    return sizes
 
 
 def _size(
-    step: Step, inputs: Sequence[Form], form: Form, below: Sequence[Size], least: float
+    step: Step, inputs: Sequence[Form], form: Form, below: Sequence[Size], smallest: float
 ) -> Size:
-    known = all(size.known for size in below)
+    is_known = all(size.known for size in below)
     if form is not None and complete(step.node, inputs):
-        return size_of(step.node, inputs, step.params, form)._replace(known=known)
+        return size_of(step.node, inputs, step.params, form)._replace(known=is_known)
     read = sum(size.result for size in below)
     law = shipped().get(step.node.path)
     if form is not None:
@@ -250,8 +252,8 @@ def _size(
     elif law and law.most:
         result = law.most
     else:
-        result, known = max(read, least), False
-    return Size(read, result, 0.0, (read + result) / 4, 0, known)
+        result, is_known = max(read, smallest), False
+    return Size(read, result, 0.0, (read + result) / 4, 0, is_known)
 
 
 def size_of(node: Node, inputs: Sequence[Any], params: Mapping[str, Any], result: Any) -> Size:
@@ -369,9 +371,9 @@ class Costs:
         Args: steps: a key, the step, and the measured costs of the same result or None. Returns:
                 the costs by key.
         """
-        found, loaded = dict[str, Estimate](), set[str]()
+        estimates, loaded = dict[str, Estimate](), set[str]()
         for key, step, exact in steps:
-            found[key] = self.of(step, kinds, exact)
+            estimates[key] = self.of(step, kinds, exact)
             law = shipped().get(step.node.path)
             if (
                 law
@@ -380,8 +382,8 @@ class Costs:
             ):
                 loaded.update(law.loads.libraries)
                 if not self._measured(step, exact):
-                    found[key] = _loading(found[key], law.loads)
-        return found
+                    estimates[key] = _loading(estimates[key], law.loads)
+        return estimates
 
     def _measured(self, step: Step, exact: Row | None) -> bool:
         """Return True if the costs of a step are those of earlier runs, which loaded the
@@ -397,9 +399,9 @@ class Costs:
 
     def with_sizes(self, sizes: Mapping[str, Size]) -> Costs:
         """Return the same measurements for the steps with other ``sizes``."""
-        found = copy(self)
-        found._sizes = sizes
-        return found
+        costs = copy(self)
+        costs._sizes = sizes
+        return costs
 
     def size_of(self, step: str) -> float:
         """Return the bytes of the result of the step with this name, or 0 if its shape is not
@@ -435,8 +437,8 @@ class Costs:
         """Predict a step by the median of earlier runs of the same size."""
         result = size.result if size else float(median(row["bytes"] for row in rows))
         peaks = [float(row["peak"]) for row in rows if row.get("peak") is not None]
-        least = law.peak(size) * law.spread[0].least if law and size else 0.0
-        peak = max(median(peaks) if peaks else 0.0, result, least)
+        lower_bound = law.peak(size) * law.spread[0].least if law and size else 0.0
+        peak = max(median(peaks) if peaks else 0.0, result, lower_bound)
         seconds = {kind: self._seconds(rows, kind) for kind in kinds}
         usual = law.spread if law else EXACT
         spread = (
@@ -455,10 +457,10 @@ class Costs:
         says takes more here.
         """
         size, law = size or Size(0.0, 0.0, 0.0, 0.0, known=False), shipped().get(path) or guess()
-        more = [max(1.0, factor) for factor in _scales(law, rows, self._faster)]
+        factors = [max(1.0, factor) for factor in _scales(law, rows, self._faster)]
         on_cpu, peak = (
-            more[1] * law.spread[1].most * law.time(size),
-            more[0] * law.spread[0].most * law.peak(size),
+            factors[1] * law.spread[1].most * law.time(size),
+            factors[0] * law.spread[0].most * law.peak(size),
         )
         seconds = {kind: on_cpu / self._faster(kind) for kind in kinds}
         spread = (Range(size.result / peak if peak else 0.0, 1.0), Range(0.0, 1.0))
@@ -480,7 +482,7 @@ class Costs:
         """Return the speed of each kind of device relative to the CPU, from the steps that were
         measured on both.
         """
-        found: dict[str, list[float]] = {}
+        ratios_by_kind: dict[str, list[float]] = {}
         for rows in self._steps.values():
             by_kind: dict[str, list[float]] = {}
             for row in rows:
@@ -488,8 +490,8 @@ class Costs:
             cpu = median(by_kind.pop("cpu", [0.0]))
             for kind, seconds in by_kind.items():
                 if cpu > 0 and median(seconds) > 0:
-                    found.setdefault(kind, []).append(cpu / median(seconds))
-        return {kind: median(ratios) for kind, ratios in found.items()}
+                    ratios_by_kind.setdefault(kind, []).append(cpu / median(seconds))
+        return {kind: median(ratios) for kind, ratios in ratios_by_kind.items()}
 
 
 def _append(rows: list[Row], row: Row) -> None:
@@ -541,22 +543,22 @@ def _scales(law: Law, rows: Sequence[Row], faster: Any) -> tuple[float, float]:
 
 def _size_of_work(row: Row) -> Any:
     """Return the size of the step of a journal line, or None for a line without a valid size."""
-    found = row.get("size")
+    numbers = row.get("size")
     valid = (
-        isinstance(found, list | tuple)
-        and len(found) == 4
-        and all(isinstance(x, int | float) for x in found)
+        isinstance(numbers, list | tuple)
+        and len(numbers) == 4
+        and all(isinstance(x, int | float) for x in numbers)
     )
-    return Size(*found) if valid else None  # type: ignore[misc]
+    return Size(*numbers) if valid else None  # type: ignore[misc]
 
 
 def _extent(size: Size) -> float:
     return size.inputs + size.result
 
 
-def _alike(one: Size, other: Size) -> bool:
-    return one[:4] == other[:4] or all(
-        abs(a - b) <= 1e-9 * max(abs(a), abs(b)) for a, b in zip(one[:4], other[:4], strict=True)
+def _alike(size: Size, other: Size) -> bool:
+    return size[:4] == other[:4] or all(
+        abs(a - b) <= 1e-9 * max(abs(a), abs(b)) for a, b in zip(size[:4], other[:4], strict=True)
     )
 
 

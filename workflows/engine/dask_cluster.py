@@ -57,15 +57,15 @@ class SlurmOptions:
         """Return the options in words such as ``queue=gpu``; raise ValueError for a word that is
         none.
         """
-        found = cls()
+        options = cls()
         for word in words:
             name, sign, value = word.partition("=")
-            known = {field.name: getattr(found, field.name) for field in fields(cls)}
-            if not sign or name not in known:
-                hint = nearest(name, known) or f"write one of {', '.join(known)}"
+            current = {field.name: getattr(options, field.name) for field in fields(cls)}
+            if not sign or name not in current:
+                hint = nearest(name, current) or f"write one of {', '.join(current)}"
                 raise ValueError(f"{word}: write NAME=VALUE, such as queue=gpu; {hint}")
-            found = replace(found, **{name: _value(name, value, known[name])})
-        return found
+            options = replace(options, **{name: _value(name, value, current[name])})
+        return options
 
 
 def missing_command() -> str:
@@ -132,15 +132,15 @@ class SlurmJobs:
             *shlex.split(command), script, stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )
         out, error = (text.decode(errors="replace") for text in await process.communicate())
-        found = next((word for word in out.replace(";", " ").split() if word.isdecimal()), "")
-        if process.returncode or not found:
+        number = next((word for word in out.replace(";", " ").split() if word.isdecimal()), "")
+        if process.returncode or not number:
             said = " ".join(
                 (error.strip() or out.strip() or f"exit code {process.returncode}").split()
             )
             said = said.removeprefix("sbatch: error: ")
             self.refused.append(said)
             raise ClusterLost(said)
-        self.ids.append(found)
+        self.ids.append(number)
         return out
 
     def queue(self) -> str:
@@ -187,13 +187,13 @@ def wait_for_job(
     none comes in time.
     """
     began = looked = time.monotonic()
-    told = False
+    announced = False
     while not client.nthreads():
         now = time.monotonic()
         if jobs.refused:
             raise ClusterLost(f"sbatch refused a job: {jobs.refused[0]}")
-        if jobs.ids and not told:
-            told = True
+        if jobs.ids and not announced:
+            announced = True
             say(
                 f"jobs     {', '.join(jobs.ids)}: waiting up to {options.wait:g} min for the first"
                 " worker"

@@ -13,6 +13,7 @@ from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from typing import Any, get_args, get_origin
 
 import torch
@@ -85,27 +86,27 @@ class SchedulerLink:
 
         Raises `ClusterLost` if there was none for too long.
         """
-        found: Mapping[str, int] | None = None
+        threads: Mapping[str, int] | None = None
         with suppress(OSError, AttributeError):  # the latter while the client closes
-            found = self.client.sync(
+            threads = self.client.sync(
                 self.client.scheduler.ncores, workers=None, callback_timeout=_ANSWER
             )
         self._asked = now = time.monotonic()
-        self.newest = found or {}
-        if found or found is None:
+        self.newest = threads or {}
+        if threads or threads is None:
             self._workers_seen = now
         elif now - self._workers_seen > PATIENCE:
             raise ClusterLost(
                 f"the scheduler {self.address} has had no worker for {PATIENCE:.0f} s"
             )
-        return found
+        return threads
 
     def wait_for_workers(self) -> Mapping[str, int]:
         """Return the connected workers as soon as there is one."""
-        while not (found := self.workers()):
+        while not (workers := self.workers()):
             self.renewed()
             time.sleep(10 * FRESH)
-        return found
+        return workers
 
     def close(self) -> None:
         """Close the connection, and those before it."""
@@ -150,8 +151,8 @@ def silence_logs() -> None:
     """
     import distributed  # noqa: F401  makes its loggers, each with a handler of its own
 
-    known = [name for name in logging.root.manager.loggerDict if name.startswith(f"{_LOGGERS[0]}.")]
-    for name in (*_LOGGERS, *known):
+    made = [name for name in logging.root.manager.loggerDict if name.startswith(f"{_LOGGERS[0]}.")]
+    for name in (*_LOGGERS, *made):
         logger = logging.getLogger(name)
         logger.handlers[:] = [logging.NullHandler()]
         logger.propagate = False
@@ -301,8 +302,8 @@ def _one_here(work: StepJob, here: _Here) -> Outcome:
         return Outcome(work, error=RunError(work.step, [], OSError(text)))
     work = replace(work, own=own_code(work.step, code))
     # of an earlier job, whose memo may still hold it
-    if work.own and (known := taints_of(work.own.modules)):
-        return Outcome(work, taints=known)
+    if work.own and (earlier_taints := taints_of(work.own.modules)):
+        return Outcome(work, taints=earlier_taints)
     outcome = carry_out(work, partial(here.fetch, kinds=kinds_of(work)), here.store)
     if work.own and outcome.taints:
         taint_code(tainted_modules(work.own, outcome.taints), outcome.taints)
@@ -322,7 +323,9 @@ def kinds_of(work: StepJob) -> dict[Key, Any]:
     for name, read in zip(node.inputs, work.reads, strict=True):
         kind = node.hints.get(name, Any)
         if isinstance(read, tuple):
-            lists = [each for each in (kind, *get_args(kind)) if get_origin(each) is list]
+            lists = [
+                candidate for candidate in (kind, *get_args(kind)) if get_origin(candidate) is list
+            ]
             kind = get_args(lists[0])[0] if lists else Any
         if kind is Any:
             list(all_nodes())
@@ -405,7 +408,9 @@ class Dask:
         worker is gone.
         """
         lane = work[0].lane
-        there = {"workers": [lane], "allow_other_workers": True} if lane in self.link.newest else {}
+        assignment = (
+            {"workers": [lane], "allow_other_workers": True} if lane in self.link.newest else {}
+        )
         self._tries[work[0].key] = self._tries.get(work[0].key, 0) + 1
         future = self.client.submit(
             work_here,
@@ -417,10 +422,10 @@ class Dask:
             key=f"neusee-{work[0].key}-{work[-1].key}-{self._tries[work[0].key]}",
             pure=False,
             retries=_TRIES,
-            **there,
+            **assignment,
         )
         self._running[future] = tuple(work)
-        if there:
+        if assignment:
             self._bound.add(future)
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
@@ -437,9 +442,9 @@ class Dask:
                 self._submit_again(self._running)
             self._free_of_lost_workers()
             ended = [future for future in self._running if future.status != "pending"]
-            found = [outcome for future in ended for outcome in self._taken(future)]
-            if found or left <= 0:
-                return found
+            outcomes = [*chain.from_iterable(map(self._taken, ended))]
+            if outcomes or left <= 0:
+                return outcomes
         return []
 
     def cancel(self) -> None:
@@ -463,8 +468,8 @@ class Dask:
         """Send again what was meant for a worker that is gone: dask would keep it for that
         worker if none was left.
         """
-        if there := self.link.newest:
-            self._submit_again([f for f in self._bound if self._running[f][0].lane not in there])
+        if present := self.link.newest:
+            self._submit_again([f for f in self._bound if self._running[f][0].lane not in present])
 
     def _rest(self, seconds: float) -> None:
         """Wait until a task ends, or for a time."""
@@ -496,16 +501,16 @@ class Dask:
         """Update the list of connected workers and their devices; wait until a worker is
         connected.
         """
-        there = self.link.workers()
-        if there is None and self._lanes:  # a cut, which may end
+        present = self.link.workers()
+        if present is None and self._lanes:  # a cut, which may end
             return
-        there = there or self.link.wait_for_workers()
-        new = [address for address in there if address not in self._lanes]
-        found: dict[str, Any] = {}
+        present = present or self.link.wait_for_workers()
+        new = [address for address in present if address not in self._lanes]
+        answers: dict[str, Any] = {}
         with suppress(OSError):
-            found = self.client.run(lane_here, workers=new, on_error="ignore") if new else {}
-        known = {**self._lanes, **{address: Lane(*about) for address, about in found.items()}}
-        self._lanes = {address: known[address] for address in sorted(there) if address in known}
+            answers = self.client.run(lane_here, workers=new, on_error="ignore") if new else {}
+        lanes = {**self._lanes, **{address: Lane(*about) for address, about in answers.items()}}
+        self._lanes = {address: lanes[address] for address in sorted(present) if address in lanes}
         self._looked = time.monotonic()
 
 

@@ -68,24 +68,26 @@ def as_function(
     steps in ``redraw`` are computed at every call, which may have another seed. ``caller`` replaces
     `call` for all steps computed at a call.
     """
-    wanted = recipe.outputs if outputs is None else tuple(outputs)
-    given, tuned = _read(recipe, free)
-    recipe = with_substitutions(recipe, wanted, given | tuned.keys())
-    sources = {name: () if name in given else step.sources for name, step in recipe.steps.items()}
-    order = in_order(sources, wanted)
-    if idle := sorted((given | tuned.keys()) - set(order)):
+    names = recipe.outputs if outputs is None else tuple(outputs)
+    replaced, tuned = _read(recipe, free)
+    recipe = with_substitutions(recipe, names, replaced | tuned.keys())
+    sources = {
+        name: () if name in replaced else step.sources for name, step in recipe.steps.items()
+    }
+    order = in_order(sources, names)
+    if idle := sorted((replaced | tuned.keys()) - set(order)):
         raise ValueError(f"no output depends on {', '.join(idle)}")
-    live, roots = dict[str, None](), {*given, *tuned, *redraw}
+    live, roots = dict[str, None](), {*replaced, *tuned, *redraw}
     for name in order:
         if name in roots or not live.keys().isdisjoint(sources[name]):
             live[name] = None
-    border = {name for step in live for name in sources[step]} | set(wanted)
+    border = set(names).union(*(sources[step] for step in live))
     fixed = run(recipe, store, sorted(border - live.keys()), device=device)
     left_out = {
         name: done.bound or 0.0 for name, done in fixed.done.items() if done.state == "left out"
     }
     return _Function(
-        recipe, free, wanted, given, tuned, list(live), fixed.values, left_out, device, caller
+        recipe, free, names, replaced, tuned, list(live), fixed.values, left_out, device, caller
     )
 
 
@@ -93,12 +95,12 @@ def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, di
     """Split the names ``free`` into names of steps, and full names of parameters grouped by
     step.
     """
-    given: set[str] = set()
+    replaced: set[str] = set()
     tuned: dict[str, dict[str, str]] = {}
     for name in free:
         step, _, param = name.rpartition(".")
         if name in recipe.steps:
-            given.add(name)
+            replaced.add(name)
         elif step not in recipe.steps:
             raise ValueError(unknown_step(step or name, recipe.steps))
         elif param not in recipe.steps[step].params:
@@ -107,7 +109,7 @@ def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, di
             )
         else:
             tuned.setdefault(step, {})[param] = name
-    return given, tuned
+    return replaced, tuned
 
 
 @dataclass(eq=False, repr=False)
@@ -131,7 +133,9 @@ class _Function:
         self._facts: dict[str, TensorStats | None] = {}
         self._spent = _spent(self.recipe, self.fixed, self.left_out)
         live = [name for name in self.live if name not in self.given]
-        self._last = {source: name for name in live for source in self.recipe.steps[name].sources}
+        self._last: dict[str, str] = {}
+        for name in live:
+            self._last.update(dict.fromkeys(self.recipe.steps[name].sources, name))
 
     def __call__(self, theta: Theta, seed: int | None = None) -> dict[str, Any]:
         """Return the outputs for the free values ``theta``; the seed of the noise is ``seed`` or
@@ -145,11 +149,13 @@ class _Function:
             )
         values, ledger = dict(self.fixed), self._spent.copy()
         for name in self.live:
-            step, given = self.recipe.steps[name], name in self.given
+            step, is_given = self.recipe.steps[name], name in self.given
             values[name] = (
-                settle(theta[name]) if given else self._evaluate(step, values, theta, ledger, seed)
+                settle(theta[name])
+                if is_given
+                else self._evaluate(step, values, theta, ledger, seed)
             )
-            for source in () if given else set(step.sources):
+            for source in () if is_given else set(step.sources):
                 if self._last[source] == name and source not in self.wanted:
                     del values[source]
         return {name: values[name] for name in self.wanted}

@@ -33,7 +33,9 @@ class Loop:
     ) -> None:
         self.executor, self.begin, self.room = executor, begin, room
         self.busy: dict[str, Chain] = {}
-        self._chain_of = {work.key: i for i, chain in enumerate(chains) for work in chain}
+        self._chain_of: dict[Key, int] = {}
+        for i, chain in enumerate(chains):
+            self._chain_of.update({work.key: i for work in chain})
         self._chains = list(chains)
         self._missing = [self._outside(chain) for chain in chains]
         self._after: dict[Key, list[int]] = {}
@@ -69,12 +71,8 @@ class Loop:
         run.
         """
         own = {work.key for work in chain}
-        return {
-            key
-            for work in chain
-            for key in work.sources
-            if key in self._chain_of and key not in own
-        }
+        read = set[Key]().union(*(work.sources for work in chain))
+        return {key for key in read if key in self._chain_of and key not in own}
 
     def _hand_out(self) -> None:
         """Submit to every idle device or worker the first ready chain of jobs that may run
@@ -99,11 +97,11 @@ class Loop:
         A chain of another lane may move to ``lane`` if the other lane is busy or lost.
         """
         running = [work for chain in self.busy.values() for work in chain]
-        there = self.executor.lanes
+        lanes = self.executor.lanes
         for place in range(len(self._ready) - 1, -1, -1):
             chain = self._chains[self._ready[place]]
             own = chain[0].lane
-            moved = (own in self.busy or own not in there) and device_kind(
+            moved = (own in self.busy or own not in lanes) and device_kind(
                 chain[0].device
             ) == device_kind(device)
             if (own == lane or moved) and (not running or self.room(chain[0], running)):
@@ -133,12 +131,9 @@ class Loop:
         result as ready.
         """
         i = self._chain_of[outcome.work.key]
-        chain = self._chains[i]
-        last = outcome.work.key == chain[-1].key
+        last = outcome.work.key == self._chains[i][-1].key
         if outcome.held:
-            pause = min(_LONGEST, 2 * self._held.get(i, (0.0, _FIRST_LOOK / 2))[1])
-            self._held[i] = (time.monotonic() + pause, pause)
-            self._chains[i] = chain[[w.key for w in chain].index(outcome.work.key) :]
+            self._hold(i, outcome.work.key)
         elif last:
             self._open -= 1
             self._held.pop(i, None)
@@ -154,6 +149,15 @@ class Loop:
         if len(self.executor.lanes) > 1 or freed:
             self._ready.sort(reverse=True)
 
+    def _hold(self, i: int, key: Key) -> None:
+        """Let a chain wait, twice as long as before, from the job whose result another process
+        computes.
+        """
+        chain = self._chains[i]
+        pause = min(_LONGEST, 2 * self._held.get(i, (0.0, _FIRST_LOOK / 2))[1])
+        self._held[i] = (time.monotonic() + pause, pause)
+        self._chains[i] = chain[[work.key for work in chain].index(key) :]
+
 
 def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
     """Group jobs into chains: single jobs, or if ``fused``, jobs on one device that each feed
@@ -161,18 +165,15 @@ def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
     """
     if not fused:
         return [(work,) for work in works]
-    readers = Counter(key for work in works for key in set(work.sources))
+    readers = Counter[Key]()
+    for work in works:
+        readers.update(set(work.sources))
     planned = {work.key for work in works}
     chains: dict[Key, list[StepJob]] = {}  # by the key of the last job
     for work in works:
         above = [key for key in dict.fromkeys(work.sources) if key in planned]
-        chain = chains.get(above[0]) if len(above) == 1 else None
-        if (
-            chain
-            and readers[above[0]] == 1
-            and not chain[-1].wanted
-            and chain[-1].lane == work.lane
-        ):
+        chain = chains.get(above[0]) if len(above) == 1 and readers[above[0]] == 1 else None
+        if chain and not chain[-1].wanted and chain[-1].lane == work.lane:
             del chains[above[0]]
             chains[work.key] = [*chain, work]
         else:

@@ -92,7 +92,7 @@ class RunSeries:
         The next run computes private results again, which may differ then.
         """
         public = [key for key in keys if not is_private(key)]
-        self.facts = {key: found for key in public if (found := facts.get(key)) is not None}
+        self.facts = {key: stats for key in public if (stats := facts.get(key)) is not None}
 
 
 # --- values in memory -----------------------------------------------------------------------------
@@ -200,7 +200,7 @@ class Execution:
         store: Store,
         devices: list[str],
         watch: Callable[[Event], None],
-        wanted: Iterable[str],
+        outputs: Iterable[str],
         executor: Executor | None,
         memory: int | None,
         show: Show = lambda *_: None,
@@ -215,7 +215,7 @@ class Execution:
             watch,
             show,
         )
-        self.wanted = frozenset(wanted)
+        self.wanted = frozenset(outputs)
         self.own = Local(devices, store, self._fetch, memory, nodes_of(recipe, self.wanted))
         self.executor = executor or self.own
         self.series = series or RunSeries.begun(store)
@@ -276,7 +276,10 @@ class Execution:
         before = self._carried.get(name)
         if before is None or before.value is None:  # a worker sends no value
             return
-        if any(before.work.origin[part] != origin[part] for part in ("params", "inputs")):
+        if any(
+            before.work.origin[origin_part] != origin[origin_part]
+            for origin_part in ("params", "inputs")
+        ):
             return
         outcome = replace(before, work=replace(before.work, key=key, origin=origin))
         self.values.add(outcome)
@@ -298,8 +301,8 @@ class Execution:
                 order = in_order(below, targets)
             try:
                 plan = [key for key in order if key in below.missing]
-                known = self.known if again else below.knows
-                uses = uses_of(plan, [*targets, *later], known, self.sources)
+                is_known = self.known if again else below.knows
+                uses = uses_of(plan, [*targets, *later], is_known, self.sources)
                 return self._execute(plan, again, targets, keep, uses, asked=not (keep or later))
             except InputMissing:
                 continue
@@ -413,9 +416,10 @@ class Execution:
         asked: bool,
     ) -> None:
         self.values.free(list(self.values), uses, keep)
-        for part, executor in self._by_executor(plan):
-            read = {key for each in plan if each not in part for key in self.sources(each)}
-            for outcome in self._outcomes(part, again, {*targets, *read}, asked, executor):
+        for keys, executor in self._by_executor(plan):
+            elsewhere = [key for key in plan if key not in keys]
+            read = set[Key]().union(*map(self.sources, elsewhere))
+            for outcome in self._outcomes(keys, again, {*targets, *read}, asked, executor):
                 key, sources = outcome.work.key, outcome.work.sources
                 if outcome.value is not None or not outcome.kept:
                     self.values.add(outcome)
@@ -431,7 +435,7 @@ class Execution:
         """
         private = [key for key in plan if self.executor is not self.own and is_private(key)]
         public = [key for key in plan if key not in private]
-        return [part for part in ((public, self.executor), (private, self.own)) if part[0]]
+        return [group for group in ((public, self.executor), (private, self.own)) if group[0]]
 
     def _outcomes(
         self,
@@ -448,9 +452,11 @@ class Execution:
             self.store, sizes_of(self.recipe, needed(self.recipe, self.wanted))
         )
         # a small one stays in memory until it is read
-        most = 0.0 if asked else small_result(executor)
-        kept = {key for key in targets if self.costs.size_of(self.makers[key].name) >= most}
-        works = [self._work(key, key in again, key in kept, executor) for key in plan]
+        threshold = 0.0 if asked else small_result(executor)
+        large_targets = {
+            key for key in targets if self.costs.size_of(self.makers[key].name) >= threshold
+        }
+        works = [self._work(key, key in again, key in large_targets, executor) for key in plan]
         try:
             prepared = prepare(
                 works, self.costs, self.receipts, executor.lanes, targets, self.values
@@ -476,7 +482,11 @@ class Execution:
         reads = tuple(self._read(step.wires.get(name)) for name in step.node.inputs)
         device, lanes = places(step, self.devices)[0], executor.lanes
         lane = next(iter(lanes)) if len(lanes) == 1 else ""
-        wanted, name, seed = target or step.name in self.wanted, self.recipe.name, self.recipe.seed
+        is_requested, name, seed = (
+            target or step.name in self.wanted,
+            self.recipe.name,
+            self.recipe.seed,
+        )
         recompute = recompute or key in self._anew
         work = StepJob(
             step,
@@ -487,7 +497,7 @@ class Execution:
             name,
             device,
             lane,
-            wanted,
+            is_requested,
             recompute=recompute,
         )
         return replace(work, own=own_code(step, self.code))
@@ -576,10 +586,10 @@ class Execution:
         """Return the statistics of the result of a step; compute the result if no statistics are
         known.
         """
-        key, known = self.keys[name], self.known_facts(name)
-        if known is None and key not in self.facts:
+        key, stats = self.keys[name], self.known_facts(name)
+        if stats is None and key not in self.facts:
             self.make([key], keep=True)
-        return known or self.known_facts(name)
+        return stats or self.known_facts(name)
 
     def known_facts(self, name: str) -> TensorStats | None:
         """Return the statistics of the result of a step, from this run or from an earlier run."""

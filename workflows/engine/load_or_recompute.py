@@ -28,8 +28,10 @@ class Upstream(dict[Key, list[Key]]):
     value is known.
     """
 
-    def __init__(self, known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]) -> None:
-        self._known, self._sources = known, sources
+    def __init__(
+        self, is_known: Callable[[Key], bool], sources: Callable[[Key], list[Key]]
+    ) -> None:
+        self._known, self._sources = is_known, sources
         self.missing = set[Key]()
 
     def __missing__(self, key: Key) -> list[Key]:
@@ -50,13 +52,13 @@ class Upstream(dict[Key, list[Key]]):
 def uses_of(
     plan: Iterable[Key],
     targets: Sequence[Key],
-    known: Callable[[Key], bool],
+    is_known: Callable[[Key], bool],
     sources: Callable[[Key], list[Key]],
 ) -> Counter[Key]:
     """Return how often each value is read while the values with the keys ``plan`` and
     ``targets`` are computed.
     """
-    below, uses = Upstream(known, sources), Counter(targets)
+    below, uses = Upstream(is_known, sources), Counter(targets)
     in_order(below, targets)
     for key in below.missing.union(plan):
         uses.update(sources(key))
@@ -108,13 +110,13 @@ def _smallest_cut(
         edges.append((make, sink, max(1, _whole(compute(key), unit))))
         edges += [(make, 2 * number[below], never) for below in dict.fromkeys(sources(key))]
     rows, columns, capacities = (
-        np.array(part, dtype=np.int32) for part in zip(*edges, strict=True)
+        np.array(column, dtype=np.int32) for column in zip(*edges, strict=True)
     )
     graph = csr_array((capacities, (rows, columns)), shape=(sink + 1, sink + 1))
-    rest = graph - maximum_flow(graph, source, sink).flow
-    rest.data = np.where(rest.data > 0, rest.data, 0)
-    rest.eliminate_zeros()
-    reached = set(breadth_first_order(rest, source, return_predecessors=False).tolist())
+    residual = graph - maximum_flow(graph, source, sink).flow
+    residual.data = np.where(residual.data > 0, residual.data, 0)
+    residual.eliminate_zeros()
+    reached = set(breadth_first_order(residual, source, return_predecessors=False).tolist())
     return {key for key in keys if 2 * number[key] + 1 in reached}
 
 

@@ -27,7 +27,7 @@ def check_devices(text: str) -> None:
 
     ``cpu:0,cpu:1`` are two lanes of one CPU, and so two devices.
     """
-    found = dict[tuple[str, int], str]()
+    names = dict[tuple[str, int], str]()
     for name in text.split(","):
         try:
             place = torch.empty(0, device=name).device
@@ -36,13 +36,13 @@ def check_devices(text: str) -> None:
         if place.type == "meta":
             raise ValueError(f"{name}: a tensor there has a shape and no values: write cpu or cuda")
         lane = place.type, torch.device(name).index or place.index or 0
-        if lane in found:
-            again = name if name == found[lane] else f"{found[lane]} and {name} are one device"
+        if lane in names:
+            again = name if name == names[lane] else f"{names[lane]} and {name} are one device"
             raise ValueError(
                 f"{text}: names a device twice ({again}): name each device once; cpu:0,cpu:1 are"
                 " two lanes"
             )
-        found[lane] = name
+        names[lane] = name
 
 
 def _reason(text: str) -> str:
@@ -80,7 +80,7 @@ def lanes_of(
     paths of the nodes that will run, whose libraries the program holds as well.
     """
     pools = [pool_of(device) for device in devices]
-    found = {}
+    lanes = {}
     for device in devices:
         held = program_memory(nodes) if pool_of(device) == "cpu" else 0
         limit = (
@@ -88,8 +88,8 @@ def lanes_of(
             if pool_of(device) == "cpu"
             else memory or _SHARE * there_is(device)
         )
-        found[device] = Lane(device, (limit - held) / pools.count(pool_of(device)), held)
-    return found
+        lanes[device] = Lane(device, (limit - held) / pools.count(pool_of(device)), held)
+    return lanes
 
 
 def memory_limit(memory: int | None, workers: int = 1) -> float:

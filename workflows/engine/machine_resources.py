@@ -171,17 +171,17 @@ def free_memory() -> int:
 
 
 def _free_memory() -> int:
-    found = there_is("cpu") - process_memory()
+    free = there_is("cpu") - process_memory()
     with suppress(OSError, ValueError, StopIteration), open("/proc/meminfo") as file:
-        found = min(
-            found,
+        free = min(
+            free,
             next(int(line.split()[1]) * 1024 for line in file if line.startswith("MemAvailable:")),
         )
-    for limit, used in zip(_CGROUPS, _USED, strict=True):
+    for limit, usage_file in zip(_CGROUPS, _USED, strict=True):
         with suppress(OSError, ValueError):
-            taken = int(Path(used).read_text()) - _reclaimable(Path(used).parent)
-            found = min(found, int(Path(limit).read_text()) - taken)
-    return max(found, 0)
+            taken = int(Path(usage_file).read_text()) - _reclaimable(Path(usage_file).parent)
+            free = min(free, int(Path(limit).read_text()) - taken)
+    return max(free, 0)
 
 
 def _reclaimable(group: Path) -> int:
@@ -200,8 +200,8 @@ def there_is(device: str) -> int:
         import torch
 
         return int(torch.cuda.get_device_properties(device).total_memory)
-    found = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     for path in _CGROUPS:
         with suppress(OSError, ValueError):
-            found = min(found, int(Path(path).read_text()))
-    return found
+            memory = min(memory, int(Path(path).read_text()))
+    return memory

@@ -81,11 +81,11 @@ def _room() -> Room:
     """Return the memory that the readers of input files may still use: what the limits leave, or
     what is free.
     """
-    found = free_anywhere()
+    room = free_anywhere()
     if not _limits:
-        return found
+        return room
     limit = min(_limits)
-    return Room(min(limit - process_memory(), found.free), limit)
+    return Room(min(limit - process_memory(), room.free), limit)
 
 
 measured_by(_room)
@@ -110,10 +110,10 @@ def guarded() -> Iterator[None]:
         yield
     finally:
         try:
-            told = _leave(here)
+            stopped = _leave(here)
         except MemoryLimit:  # told at the last moment, and delivered only now
-            told = _leave(here)
-    if told:
+            stopped = _leave(here)
+    if stopped:
         raise MemoryLimit
 
 
@@ -122,10 +122,10 @@ def _leave(here: int) -> bool:
     delivered.
     """
     with _guard:
-        told = _inside.pop(here, True)
-        if told:
+        stopped = _inside.pop(here, True)
+        if stopped:
             _deliver(here)
-    return told
+    return stopped
 
 
 def _deliver(here: int) -> None:
@@ -158,8 +158,8 @@ def _look() -> None:
 
 
 def _stop(now: float, limit: float) -> None:
-    for thread, told in _inside.items():
-        if not told:
+    for thread, stopped in _inside.items():
+        if not stopped:
             _last[:] = [now, limit]
             _inside[thread] = True
             _raise_in(ctypes.c_ulong(thread), ctypes.py_object(MemoryLimit))

@@ -178,8 +178,8 @@ def band_count(step: Step, inputs: Sequence[Any]) -> int:
     ]
     if any(not isinstance(value, Tensor) and type(value) not in BAND_FIELDS for _, value in banded):
         return 0  # a low-rank cube has no slice of one band
-    found = {x.shape[axis] for axis, value in banded for x in band_tensors(value) if _has(x, axis)}
-    return found.pop() if len(found) == 1 else 0
+    counts = {x.shape[axis] for axis, value in banded for x in band_tensors(value) if _has(x, axis)}
+    return counts.pop() if len(counts) == 1 else 0
 
 
 def bands_in(node: Node, inputs: Sequence[Any]) -> int:
@@ -205,13 +205,13 @@ def band_keys(step: Step, inputs: Sequence[Any], code: str) -> list[str]:
         params,
         *([said] if (said := written(step)) else []),
     ]
-    each: list[list[str]] = []
+    hashes: list[list[str]] = []
     for name, value in zip(step.node.inputs, inputs, strict=False):
         axis = _axis(step, name, value)
         same.append([name, axis, content(value if axis is None else _without_bands(value))])
         if axis is not None:
-            each += [[_hashed(part) for part in x.unbind(axis)] for x in band_tensors(value)]
-    return [digest(same, list(band)) for band in zip(*each, strict=True)]
+            hashes += [[_hashed(band) for band in x.unbind(axis)] for x in band_tensors(value)]
+    return [digest(same, list(band)) for band in zip(*hashes, strict=True)]
 
 
 def content(value: Any) -> list[Any]:
@@ -265,14 +265,14 @@ def taken(
 
     If ``of`` names inputs, only these inputs are reduced.
     """
-    found = list(inputs)
+    reduced = list(inputs)
     for i, (name, value) in enumerate(zip(step.node.inputs, inputs, strict=False)):
         axis = _axis(step, name, value)
         if axis is not None and (of is None or name in of):
-            found[i] = with_band_tensors(
+            reduced[i] = with_band_tensors(
                 value, [_slices(x, axis, which) for x in band_tensors(value)]
             )
-    return found
+    return reduced
 
 
 def _slices(x: Tensor, axis: int, which: list[int]) -> Tensor:
@@ -280,9 +280,9 @@ def _slices(x: Tensor, axis: int, which: list[int]) -> Tensor:
     allows.
     """
     if which == list(range(which[0], which[0] + len(which))):
-        part = x.narrow(axis, which[0], len(which))
-        if part.is_contiguous() and part.data_ptr() % _ALIGN == 0:
-            return part
+        view = x.narrow(axis, which[0], len(which))
+        if view.is_contiguous() and view.data_ptr() % _ALIGN == 0:
+            return view
     return x.index_select(axis, torch.tensor(which, device=x.device))
 
 
@@ -362,8 +362,8 @@ class _Stack:
                 return
         if self.held is None:
             self.held = x.new_empty(*x.shape[:axis], len(self.names), *x.shape[axis + 1 :])
-        for i, part in zip(which, slices, strict=True):
-            self.held.select(axis, i).copy_(part)
+        for i, band in zip(which, slices, strict=True):
+            self.held.select(axis, i).copy_(band)
         self.inside.update(which)
 
     def whole(self) -> Tensor | Stacked:
@@ -376,6 +376,6 @@ class _Stack:
             return Stacked(self.blobs.read(self.names, shape, blob.dtype), tuple(self.names))
         assert self.held is not None
         for i in set(range(len(self.names))) - self.inside:
-            part = self.held.select(self.axis, i)
-            part.copy_(self.blobs.read([self.names[i]], (1, *part.shape), part.dtype)[0])
+            band = self.held.select(self.axis, i)
+            band.copy_(self.blobs.read([self.names[i]], (1, *band.shape), band.dtype)[0])
         return self.held

@@ -51,22 +51,21 @@ def prepare(
     abouts: Mapping[Key, Mapping[str, Any]],
     lanes: Mapping[str, Lane],
     keep: Collection[Key],
-    there: Container[Key] = (),
+    in_memory: Container[Key] = (),
 ) -> Prepared:
     """Assign a device to each job of a run and schedule the jobs; raise `TooLarge` if the memory is
     too small.
 
-    The keys ``there`` are of values that are in memory already. Other values that no job computes
-    are read.
+    The keys ``in_memory`` are of values that are in memory already. Other values that no job
+    computes are read.
     """
     kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
     expected = costs.in_turn(((w.key, w.step, abouts.get(w.key)) for w in works), kinds)
-    read = {
-        key: 0.0 if key in there else costs.size_of(name)
-        for work in works
-        for name, key in zip(work.step.sources, work.sources, strict=True)
-        if key not in expected
-    }
+    read: dict[Key, float] = {}
+    for work in works:
+        for name, key in zip(work.step.sources, work.sources, strict=True):
+            if key not in expected:
+                read[key] = 0.0 if key in in_memory else costs.size_of(name)
     try:
         return _scheduled(works, expected, lanes, keep, read)
     except TooLarge as error:
@@ -216,15 +215,17 @@ def _one_after_another(
     last use.
     """
     sizes = {**read, **{key: cost.bytes for key, cost in expected.items()}}
-    there = set[Key]()
-    last = {key: work.key for work in works for key in work.sources}
-    now, held, most, slots = 0.0, 0.0, 0.0, []
+    in_memory = set[Key]()
+    last: dict[Key, Key] = {}
+    for work in works:
+        last.update(dict.fromkeys(work.sources, work.key))
+    now, held, peak, slots = 0.0, 0.0, 0.0, []
     for work in works:
         cost = expected[work.key]
-        new = {*work.sources, work.key} - there
-        there |= new
+        new = {*work.sources, work.key} - in_memory
+        in_memory |= new
         held += sum(sizes[key] for key in new)
-        most = max(most, held + cost.work)
+        peak = max(peak, held + cost.work)
         ended = {
             key
             for key in (*work.sources, work.key)
@@ -235,7 +236,7 @@ def _one_after_another(
             Slot(work.step.name, lane, now, now + cost.seconds[device_kind(work.device)], 1)
         )
         now = slots[-1].end
-    return Schedule(tuple(slots), now, {lane: most}, 0.0)
+    return Schedule(tuple(slots), now, {lane: peak}, 0.0)
 
 
 def past_costs(store: Store, sizes: Mapping[str, Size]) -> Costs:

@@ -71,8 +71,8 @@ def error_in(about: Mapping[str, Any] | None) -> tuple[float, float] | None:
     """Return the approximation error in the metadata of a stored result, or None if the metadata
     contain none.
     """
-    found = (about or {}).get("error")
-    return (float(found[0]), float(found[1])) if found else None
+    error = (about or {}).get("error")
+    return (float(error[0]), float(error[1])) if error else None
 
 
 def checks_in(about: Mapping[str, Any] | None) -> tuple[Check, ...]:
@@ -84,9 +84,9 @@ def facts_in(about: Mapping[str, Any] | None) -> TensorStats | None:
     """Return the statistics in the metadata of a stored result, or None if the metadata contain
     none.
     """
-    found = (about or {}).get("facts")
+    facts = (about or {}).get("facts")
     try:
-        return TensorStats(**{**found, "shape": tuple(found["shape"])}) if found else None
+        return TensorStats(**{**facts, "shape": tuple(facts["shape"])}) if facts else None
     except (TypeError, LookupError):  # no statistics that this program writes
         return None
 

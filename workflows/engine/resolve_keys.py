@@ -28,29 +28,29 @@ def resolve(
 
     ``code`` has the digests of nodes that were read a moment ago, if there are any.
     """
-    found, code, ledger = Resolved(), code or Code(store.code_memo), ErrorBudget(recipe)
+    resolved, code, ledger = Resolved(), code or Code(store.code_memo), ErrorBudget(recipe)
 
     def facts_of(name: str) -> TensorStats | None:
-        known = facts_in(store.about(found.keys[name]))
-        if known is None:
+        facts = facts_in(store.about(resolved.keys[name]))
+        if facts is None:
             raise LookupError(name)
-        return known
+        return facts
 
     for name in order:
         step = recipe.steps[name]
         if step.node.hooks.skip_bound is not None:
             try:
-                found.verdicts[name] = ledger.verdict(step, step.params, facts_of)
+                resolved.verdicts[name] = ledger.verdict(step, step.params, facts_of)
             except RunError:
-                found.verdicts[name] = None
+                resolved.verdicts[name] = None
         else:
             ledger.pass_on(step)
-        verdict = found.verdicts.get(name)
+        verdict = resolved.verdicts.get(name)
         if verdict is not None and verdict.left_out:
-            found.keys[name] = found.keys[verdict.instead]
+            resolved.keys[name] = resolved.keys[verdict.instead]
             continue
-        key, origin = key_of(step, found.keys, recipe.seed, code, place(step, device))
-        found.keys[name], found.origins[key] = key, origin
-        found.makers.setdefault(key, name)
+        key, origin = key_of(step, resolved.keys, recipe.seed, code, place(step, device))
+        resolved.keys[name], resolved.origins[key] = key, origin
+        resolved.makers.setdefault(key, name)
     code.save()
-    return found
+    return resolved

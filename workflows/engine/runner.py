@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -67,9 +68,9 @@ def shortest_first(
     for name in order:
         below = (longest[source] for source in recipe.steps[name].sources)
         longest[name] = max(seconds.get(name, 0.0), max(below, default=0.0))
-    most = max((longest[name] for name in first), default=0.0)
-    found = dict.fromkeys([*first, *(name for name in others if longest[name] < most)])
-    return sorted(found, key=longest.__getitem__)
+    limit = max((longest[name] for name in first), default=0.0)
+    names = dict.fromkeys([*first, *(name for name in others if longest[name] < limit)])
+    return sorted(names, key=longest.__getitem__)
 
 
 # --- runner ---------------------------------------------------------------------------------------
@@ -166,42 +167,58 @@ def run(
     """
     began = time.perf_counter()
     check_devices(device)
-    wanted = recipe.outputs if outputs is None else tuple(outputs)
-    for name in wanted:
+    names = recipe.outputs if outputs is None else tuple(outputs)
+    for name in names:
         if name not in recipe.steps:
             raise ValueError(unknown_step(name, recipe.steps))
     again = copies_of(recipe, anew)
-    recipe, store, watch = (
-        with_substitutions(recipe, wanted),
-        store or open_store(),
-        watch or (lambda event: None),
-    )
+    recipe = with_substitutions(recipe, names)
+    store = store or open_store()
     series = series or RunSeries.begun(store)
-    how = (executor, memory, show or (lambda *_: None), series)
     attempt, carried = 1, dict[str, Outcome]()
     while True:
-        work = Execution(recipe, store, device.split(","), watch, wanted, *how, carried, again)
+        work = Execution(
+            recipe,
+            store,
+            device.split(","),
+            watch or (lambda event: None),
+            names,
+            executor,
+            memory,
+            show=show or (lambda *_: None),
+            series=series,
+            carried=carried,
+            anew=again,
+        )
         try:
             with limited(memory_limit(memory)):
-                return replace(_attempt(work, wanted, began, show is not None), attempts=attempt)
+                return replace(_attempt(work, names, began, show is not None), attempts=attempt)
         except TaintedRun as seen:
             carried[seen.outcome.work.step.name] = seen.outcome
             series.read_code_again(store)
         except ToleranceNotProven as failed:
             # a third attempt is exact
             scale = stricter_scale(recipe, failed.over) if attempt == 1 else 0.0
-            attempt, whole = attempt + 1, recipe.unsubstituted or recipe
-            recipe = with_substitutions(
-                replace(whole, tolerance_scale=scale, exact=scale == 0.0), wanted
-            )
-            if not recipe.exact and _futile(recipe, work, wanted):
-                recipe = replace(whole, tolerance_scale=0.0, exact=True)
+            attempt, recipe = attempt + 1, _stricter(recipe, scale, work, names)
         finally:
             work.close()
             give_back()
 
 
-def _futile(stricter: Recipe, work: Execution, wanted: tuple[str, ...]) -> bool:
+def _stricter(recipe: Recipe, scale: float, work: Execution, outputs: tuple[str, ...]) -> Recipe:
+    """Return the recipe of the next attempt, with the tolerance ``scale``: an exact one if that is
+    0 or if a stricter one would fail as well.
+    """
+    unchanged = recipe.unsubstituted or recipe
+    stricter = with_substitutions(
+        replace(unchanged, tolerance_scale=scale, exact=scale == 0.0), outputs
+    )
+    if not stricter.exact and _futile(stricter, work, outputs):
+        return replace(unchanged, tolerance_scale=0.0, exact=True)
+    return stricter
+
+
+def _futile(stricter: Recipe, work: Execution, outputs: tuple[str, ...]) -> bool:
     """Return True if the error of the run ``work`` is above the tolerance even where only rounding
     is left of it.
 
@@ -219,65 +236,67 @@ def _futile(stricter: Recipe, work: Execution, wanted: tuple[str, ...]) -> bool:
         return replace(done, error=(_ROUNDING, done.error[1] * _ROUNDING / done.error[0]))
 
     order = needed(
-        work.recipe, tolerance_frontier(work.recipe, needed(work.recipe, wanted), wanted)
+        work.recipe, tolerance_frontier(work.recipe, needed(work.recipe, outputs), outputs)
     )
-    return proof(work.recipe, order, wanted, at_best, work.known_facts).over(stricter) > 1.0
+    return proof(work.recipe, order, outputs, at_best, work.known_facts).over(stricter) > 1.0
 
 
-def _attempt(work: Execution, wanted: tuple[str, ...], began: float, shows: bool) -> Result:
+def _attempt(work: Execution, outputs: tuple[str, ...], began: float, shows: bool) -> Result:
     """Run the recipe; raise `ToleranceNotProven` if its errors cannot be proved to be within the
     tolerance.
     """
     recipe, store = work.recipe, work.store
-    order = needed(recipe, wanted)
+    order = needed(recipe, outputs)
     with torch.no_grad():
         work.resolve(order)
-        first = tolerance_frontier(recipe, order, wanted)
-        missing, targets = (
-            work.missing(wanted) if first else set(),
-            [work.keys[name] for name in wanted],
-        )
+        first = tolerance_frontier(recipe, order, outputs)
+        missing = work.missing(outputs) if first else set()
+        targets = [work.keys[name] for name in outputs]
         if early := [name for name in first if work.keys[name] in missing]:
             # a sweep shows nothing
-            early = _targets_first(work, order, early, wanted, missing) if shows else early
+            early = _targets_first(work, order, early, outputs, missing) if shows else early
             work.make([work.keys[name] for name in early], keep=False, later=targets)
-
-        def known(name: str) -> StepRecord:
-            return work.done.get(name) or work.asleep(name)
-
         lead = order if first and not missing else needed(recipe, first)
-        proved = proof(recipe, lead, wanted, known, work.known_facts)
+        proved = proof(recipe, lead, outputs, partial(_record_so_far, work), work.known_facts)
         over = proved.over(recipe)
         if over > 1.0 and not recipe.exact:
             raise ToleranceNotProven(over)
         work.make(targets, keep=False)
-    values = {name: to_device(work.values[work.keys[name]], work.devices[0]) for name in wanted}
+    values = {name: to_device(work.values[work.keys[name]], work.devices[0]) for name in outputs}
     done = work.account(order)
     peak = process_peak()
     seconds = time.perf_counter() - began
     if missing:  # otherwise all results were known before
-        proved = proof(recipe, order, wanted, done.__getitem__, work.known_facts)
-    device = ",".join(work.devices)
-    expected = running_peak(work.schedule, work.own.lanes) if work.executor is work.own else None
-    code = work.origins, work.code.parts
+        proved = proof(recipe, order, outputs, done.__getitem__, work.known_facts)
     return Result(
-        values,
-        done,
-        work.keys,
-        seconds,
-        peak,
-        recipe,
-        store,
-        device,
-        work.schedule,
-        proved,
-        expected,
-        *code,
+        values=values,
+        done=done,
+        keys=work.keys,
+        seconds=seconds,
+        peak_memory=peak,
+        recipe=recipe,
+        store=store,
+        device=",".join(work.devices),
+        schedule=work.schedule,
+        proof=proved,
+        predicted_peak=_predicted_peak(work),
+        origins=work.origins,
+        code=work.code.parts,
     )
 
 
+def _record_so_far(work: Execution, name: str) -> StepRecord:
+    """Return the record of a step that has run or was left out, or of one that did not run yet."""
+    return work.done.get(name) or work.asleep(name)
+
+
+def _predicted_peak(work: Execution) -> float | None:
+    """Return the predicted peak bytes of this process; None if another process computed."""
+    return running_peak(work.schedule, work.own.lanes) if work.executor is work.own else None
+
+
 def _targets_first(
-    work: Execution, order: list[str], early: list[str], wanted: tuple[str, ...], missing: set[Key]
+    work: Execution, order: list[str], early: list[str], outputs: tuple[str, ...], missing: set[Key]
 ) -> list[str]:
     """Return the steps ``early`` and the outputs that need only shorter steps, the shortest
     first.
@@ -287,5 +306,5 @@ def _targets_first(
     seconds = {
         name: cost.seconds["cpu"] for name, cost in work.costs.in_turn(steps, ["cpu"]).items()
     }
-    others = [name for name in wanted if work.keys[name] in missing]
+    others = [name for name in outputs if work.keys[name] in missing]
     return shortest_first(work.recipe, order, early, others, seconds)

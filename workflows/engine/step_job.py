@@ -120,7 +120,7 @@ Fetch = Callable[[Key], Any]
 #: step and its value
 Show = Callable[[Recipe, Mapping[str, Key], str, Any], None]
 T = TypeVar("T")
-_STATS = tuple(each.name for each in fields(TensorStats))
+_STATS = tuple(field.name for field in fields(TensorStats))
 _WATCHED = 1 << 20  #: bytes of inputs from which the memory of a step is measured
 
 
@@ -154,9 +154,10 @@ class StepJob:
     @property
     def sources(self) -> tuple[Key, ...]:
         """Return the cache keys of all values that the job reads."""
-        return tuple(
-            k for read in self.reads for k in ((read,) if isinstance(read, str) else read or ())
-        )
+        keys: list[Key] = []
+        for read in self.reads:
+            keys += [read] if isinstance(read, str) else read or ()
+        return tuple(keys)
 
 
 @dataclass(slots=True)
@@ -272,11 +273,8 @@ def gathered(read: Read, fetch: Fetch) -> Any:
 
 def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
     """Compute a step and return its value with statistics, checks and costs."""
-    step = work.step
-    seen = _Seen()
-    evaluate = _observing(
-        partial(call, step, params=step.params, seed=work.seed, device=work.device), work, seen
-    )
+    step, hooks = work.step, work.step.node.hooks
+    observations = _Seen()
     stamps = file_stamps(step.params)
     began, clock = time.time(), time.perf_counter()
     size = sum(t.nbytes for t in tensors_in(inputs))
@@ -288,33 +286,45 @@ def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
         guarded(),
         refusing_allocations(own_here),
     ):
-        if step.node.bands and (work.parts > 1 or work.device.startswith("cpu")):
-            value = call_by_band(
-                step, inputs, evaluate, work.origin["code"], store.blobs, work.parts
-            )
-        else:
-            value = evaluate(inputs)
+        value = _value(work, inputs, store, observations)
         bare = plain_of(value)
-        checks = (
-            _observing(examine, work, seen)(step, bare, inputs) if step.node.hooks.check else ()
-        )
+        checks = _observing(examine, work, observations)(step, bare, inputs) if hooks.check else ()
     seconds = time.perf_counter() - clock
-    same = stamps == file_stamps(step.params)
-    if not same or work.origin["params"] != {
-        name: plain(param) for name, param in step.params.items()
-    }:
-        raise RunError(step, [], OSError("an input file changed while it was read: run again"))
-    found = sum(t.nbytes for t in tensors_in(bare))
-    sized = measured_size(step.node, inputs, step.params, bare)
-    deviation = (
-        step.node.hooks.approximation_error(bare) if step.node.hooks.approximation_error else None
-    )
-    facts = TensorStats.of(bare)
-    taints = tuple(dict.fromkeys(seen.taints))
-    most = None if peak.bytes is None else peak.bytes + seen.peak
+    _refuse_changed_files(work, stamps)
     return Outcome(
-        work, value, facts, checks, began, seconds, found, deviation, most, sized, taints=taints
+        work,
+        value,
+        bytes=sum(t.nbytes for t in tensors_in(bare)),
+        size=measured_size(step.node, inputs, step.params, bare),
+        deviation=hooks.approximation_error(bare) if hooks.approximation_error else None,
+        facts=TensorStats.of(bare),
+        checks=checks,
+        began=began,
+        seconds=seconds,
+        peak=None if peak.bytes is None else peak.bytes + observations.peak,
+        taints=tuple(dict.fromkeys(observations.taints)),
     )
+
+
+def _value(work: StepJob, inputs: list[Any], store: Store, observations: _Seen) -> Any:
+    """Return the value of a step, computed band by band where its node and memory ask for it."""
+    step = work.step
+    evaluate = _observing(
+        partial(call, step, params=step.params, seed=work.seed, device=work.device),
+        work,
+        observations,
+    )
+    if step.node.bands and (work.parts > 1 or work.device.startswith("cpu")):
+        return call_by_band(step, inputs, evaluate, work.origin["code"], store.blobs, work.parts)
+    return evaluate(inputs)
+
+
+def _refuse_changed_files(work: StepJob, stamps: Any) -> None:
+    """Raise `RunError` if an input file is not what it was when the step began."""
+    params = work.step.params
+    same = stamps == file_stamps(params)
+    if not same or work.origin["params"] != {name: plain(param) for name, param in params.items()}:
+        raise RunError(work.step, [], OSError("an input file changed while it was read: run again"))
 
 
 @dataclass(slots=True)
@@ -325,24 +335,24 @@ class _Seen:
     peak: int = 0  #: peak bytes of a process of its own
 
 
-def _observing(function: Callable[..., T], work: StepJob, seen: _Seen) -> Callable[..., T]:
+def _observing(function: Callable[..., T], work: StepJob, observations: _Seen) -> Callable[..., T]:
     """Return a function that is observed where the code is not of neusee, and that adds what it
-    finds to ``seen``.
+    finds to ``observations``.
     """
     own = work.own
     if own is None:
         return function
 
-    def watched(*args: Any, **more: Any) -> T:
+    def watched(*args: Any, **named: Any) -> T:
         try:
-            value, found = _called_observed(
-                partial(function, *args, **more), own, _is_apart(work), seen
+            value, taints = _called_observed(
+                partial(function, *args, **named), own, _is_apart(work), observations
             )
         except ProcessEnded as error:
             raise RunError(work.step, [], error) from error
-        seen.taints.extend(found)
-        if found:
-            hold_back(tainted_modules(own, found))
+        observations.taints.extend(taints)
+        if taints:
+            hold_back(tainted_modules(own, taints))
         return value
 
     return watched
@@ -361,7 +371,7 @@ def _is_apart(work: StepJob) -> bool:
 
 
 def _called_observed(
-    function: Callable[[], T], own: OwnCode, apart: bool, seen: _Seen
+    function: Callable[[], T], own: OwnCode, apart: bool, observations: _Seen
 ) -> tuple[T, list[Taint]]:
     """Call a function of own code, in a process of its own if ``apart`` and its value can be
     sent.
@@ -369,13 +379,13 @@ def _called_observed(
     returned = call_in_fork(partial(call_observed, function, own), own.variables) if apart else None
     if returned is None:
         return call_observed(function, own)
-    seen.peak = max(seen.peak, returned.peak or 0)
-    value, found = returned.value
-    home, lost = min(own.modules), [taint for taint in found if taint.kind == "memory"]
+    observations.peak = max(observations.peak, returned.peak or 0)
+    value, taints = returned.value
+    home, lost = min(own.modules), [taint for taint in taints if taint.kind == "memory"]
     say_lost(home, lost)
     say_hidden(home, returned.asked, own.free)
     return value, [
-        *(taint for taint in found if taint not in lost),
+        *(taint for taint in taints if taint not in lost),
         *undeclared(own, returned.asked),
     ]
 
@@ -388,26 +398,31 @@ def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Leas
     if is_private(outcome.work.key) or outcome.taints or (own and not may_be_stored(own.modules)):
         outcome.value = plain_of(outcome.value)
         return outcome
+    try:
+        _store(outcome, store, later, lease)
+    except TypeError as error:
+        raise RunError(outcome.work.step, [], error) from error
+    outcome.value = plain_of(outcome.value)
+    return outcome
+
+
+def _store(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Lease) -> None:
+    """Store a result as it pays: its metadata alone, with a small value, or with a file that may
+    be written later.
+    """
     work, value, about = outcome.work, outcome.value, _about(outcome)
     small = outcome.bytes <= INLINE
     not_worth = not (work.wanted or small or _pays(outcome, store, outcome.bytes))
-    try:
-        if work.unlocked and (not_worth or (small and not _pays(outcome, store, 0))):
-            outcome.kept = store.put_small(work.key, value, about)
-        elif not_worth:
-            store.put_receipt(work.key, about)
-        elif later is not None and outcome.bytes >= LARGE:
-            pack(value)  # a value that cannot be stored raises here, where the step is known
-            later.add(
-                work.key, outcome.bytes, lambda: _written(store, work.key, value, about, lease)
-            )
-            outcome.kept = outcome.waits = True
-        else:
-            outcome.kept = store.put(work.key, value, about)
-    except TypeError as error:
-        raise RunError(work.step, [], error) from error
-    outcome.value = plain_of(outcome.value)
-    return outcome
+    if work.unlocked and (not_worth or (small and not _pays(outcome, store, 0))):
+        outcome.kept = store.put_small(work.key, value, about)
+    elif not_worth:
+        store.put_receipt(work.key, about)
+    elif later is not None and outcome.bytes >= LARGE:
+        pack(value)  # a value that cannot be stored raises here, where the step is known
+        later.add(work.key, outcome.bytes, lambda: _written(store, work.key, value, about, lease))
+        outcome.kept = outcome.waits = True
+    else:
+        outcome.kept = store.put(work.key, value, about)
 
 
 def _written(store: Store, key: Key, value: Any, about: dict[str, Any], lease: Lease) -> None:

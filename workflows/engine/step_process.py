@@ -96,8 +96,8 @@ def _called(function: Callable[[], T], variables: frozenset[str]) -> Returned[T]
         sent: _Sent = torch.load(f"/proc/self/fd/{file.fileno()}", mmap=True, weights_only=False)
     for name, text in sent.printed.items():
         getattr(sys, name).write(text)
-    for each in sent.said:
-        warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+    for warning in sent.said:
+        warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
     if sent.error is not None:
         raise sent.error
     return sent.returned
@@ -245,7 +245,7 @@ def _returned(
 
 def _write(sent: _Sent, file: int) -> int:
     """Write what the parent reads; return the exit code of the fork."""
-    plain = [_plain_warning(each) for each in sent.said]
+    plain = [_plain_warning(warning) for warning in sent.said]
     try:
         with open(file, "wb", closefd=False) as binary:
             torch.save(sent._replace(said=plain), binary)
@@ -256,5 +256,7 @@ def _write(sent: _Sent, file: int) -> int:
     return 0
 
 
-def _plain_warning(each: warnings.WarningMessage) -> warnings.WarningMessage:
-    return warnings.WarningMessage(str(each.message), each.category, each.filename, each.lineno)
+def _plain_warning(warning: warnings.WarningMessage) -> warnings.WarningMessage:
+    return warnings.WarningMessage(
+        str(warning.message), warning.category, warning.filename, warning.lineno
+    )

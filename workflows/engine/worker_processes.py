@@ -21,6 +21,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
+from itertools import chain
 from multiprocessing.connection import Connection, wait
 from typing import Generic, TypeVar
 
@@ -102,12 +103,12 @@ def shared_in_order(work: Callable[[int], T], count: int, workers: int) -> Itera
     """Yield ``work(number)`` for each number below ``count``, in order; this process does what
     no worker finished.
     """
-    found, due = dict[int, tuple[T] | None](), 0
+    done, due = dict[int, tuple[T] | None](), 0
     with closing(shared(work, range(count), workers)) as ended:
-        for number, given in ended:
-            found[number] = given
-            while due in found:
-                ready = found.pop(due)
+        for number, value in ended:
+            done[number] = value
+            while due in done:
+                ready = done.pop(due)
                 yield ready[0] if ready else work(due)
                 due += 1
 
@@ -136,12 +137,12 @@ class _Team(Generic[T]):
             for pipe in wait(list(self._now)) if self._now else ():
                 assert isinstance(pipe, Connection)
                 index, number = self._now.pop(pipe)
-                found = self._answer(pipe)
-                if found is not None:
+                answer = self._answer(pipe)
+                if answer is not None:
                     self._hand(index, pipe)
-                yield number, found[0] if found else None
+                yield number, answer[0] if answer else None
             if not self._now:  # no worker is left
-                self._lost += [number for run in self._left for number in run]
+                self._lost += chain.from_iterable(self._left)
                 self._left = []
 
     def close(self) -> None:
@@ -156,8 +157,8 @@ class _Team(Generic[T]):
 
     def _begin(self, index: int) -> None:
         context = multiprocessing.get_context("fork")
-        mine, there = context.Pipe()
-        arguments = (there, [*self._pipes, mine], self._work, os.getpid())
+        mine, theirs = context.Pipe()
+        arguments = (theirs, [*self._pipes, mine], self._work, os.getpid())
         process = context.Process(
             target=_serve, args=arguments, name=f"neusee worker {index}", daemon=True
         )
@@ -170,7 +171,7 @@ class _Team(Generic[T]):
             mine.close()
             return
         finally:
-            there.close()
+            theirs.close()
         self._processes.append(process)
         self._pipes.append(mine)
         self._hand(index, mine)
@@ -195,12 +196,12 @@ class _Team(Generic[T]):
         worker has ended.
         """
         try:
-            found, said = pickle.loads(pipe.recv_bytes())
+            value, said = pickle.loads(pipe.recv_bytes())
         except (EOFError, OSError, pickle.UnpicklingError):
             return None
         for text, category in said:
             warnings.warn(text, category, stacklevel=2)
-        return (found,)
+        return (value,)
 
 
 def _serve(
@@ -226,11 +227,11 @@ def _done(work: Callable[[int], T], number: int) -> bytes:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("default")
         try:
-            found: tuple[T] | None = (work(number),)
+            value: tuple[T] | None = (work(number),)
         except BaseException:  # the parent does this piece, and meets the error again
-            found = None
-    told = [(str(each.message), each.category) for each in said]
+            value = None
+    messages = [(str(warning.message), warning.category) for warning in said]
     try:
-        return pickle.dumps((found, told if found else []), protocol=5)
+        return pickle.dumps((value, messages if value else []), protocol=5)
     except Exception:  # a result that cannot be sent
         return pickle.dumps((None, []), protocol=5)

@@ -76,8 +76,8 @@ class MetricTable:
         and its interval.
         """
         column = self.values[metric][:, strength]
-        kept = ~np.isnan(column)
-        return mean(column[kept], self.photographs[kept])
+        valid = ~np.isnan(column)
+        return mean(column[valid], self.photographs[valid])
 
 
 def sums_by_photograph(values: Numbers, photographs: Numbers) -> Numbers:
@@ -103,8 +103,8 @@ def mean(
         return Interval(centre, math.nan, math.nan)
     from scipy.stats import t
 
-    rest = sums_by_photograph(x - centre, owner)
-    spread = math.sqrt(float((rest**2).sum()) * count / (count - 1)) / len(x)
+    residuals = sums_by_photograph(x - centre, owner)
+    spread = math.sqrt(float((residuals**2).sum()) * count / (count - 1)) / len(x)
     half = float(t.ppf((1 + CONFIDENCE) / 2, count - 1)) * spread
     return Interval(centre, centre - half, centre + half)
 
@@ -119,14 +119,14 @@ def metric_table(
     ``photographs`` has the number of the photograph of each scene; without it every scene has its
     own.
     """
-    each = {
+    values = {
         metric: np.array(
             [[point.get(k, {}).get(metric, math.nan) for k in strengths] for point in points]
         )
         for metric in METRICS
     }
     owner = range(len(points)) if photographs is None else photographs
-    return MetricTable(tuple(strengths), each, np.array(owner, dtype=np.float64))
+    return MetricTable(tuple(strengths), values, np.array(owner, dtype=np.float64))
 
 
 # --- paired intervals -----------------------------------------------------------------------------
@@ -164,12 +164,12 @@ def ratio(top: Numbers, bottom: Numbers, photographs: Numbers, seed: int) -> Int
     value, count = float(a.sum() / b.sum()), len(a)
     if count < FEW:
         return Interval(value, math.nan, math.nan)
-    rest = a - value * b
-    error = _standard_error((rest**2).sum(), b.sum(), count)
-    low, high = np.quantile(_drawn_errors(rest, b, seed), _LIMITS, method="inverted_cdf")
+    residuals = a - value * b
+    error = _standard_error((residuals**2).sum(), b.sum(), count)
+    low, high = np.quantile(_drawn_errors(residuals, b, seed), _LIMITS, method="inverted_cdf")
     if count < _SMALL:
-        least, wider = _student(count - 1), math.sqrt(count / (count - 1))
-        low, high = wider * min(low, -least), wider * max(high, least)
+        quantile, wider = _student(count - 1), math.sqrt(count / (count - 1))
+        low, high = wider * min(low, -quantile), wider * max(high, quantile)
     return Interval(value, *(float(value - q * error) if error else value for q in (high, low)))
 
 
@@ -190,21 +190,21 @@ def _standard_error(squares: Numbers, total: Numbers, count: int) -> Numbers:
     return error
 
 
-def _drawn_errors(rest: Numbers, b: Numbers, seed: int) -> Numbers:
+def _drawn_errors(residuals: Numbers, b: Numbers, seed: int) -> Numbers:
     """Return the error of the ratio in each drawn set of photographs, in units of the standard
     error in that set.
     """
-    rng, count = np.random.default_rng(seed), len(rest)
-    products = np.stack([rest, b, rest * rest, rest * b, b * b], 1)
-    found: list[Numbers] = []
+    rng, count = np.random.default_rng(seed), len(residuals)
+    products = np.stack([residuals, b, residuals * residuals, residuals * b, b * b], 1)
+    errors: list[Numbers] = []
     for _ in range(0, _DRAWS, _AT_ONCE):
         times = rng.multinomial(count, np.full(count, 1 / count), _AT_ONCE).astype(np.float64)
         r, total, rr, rb, bb = (times @ products).T
         moved = r / total
         squares = np.maximum(rr - 2 * moved * rb + moved**2 * bb, 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            found.append(np.where(moved == 0, 0.0, moved / _standard_error(squares, total, count)))
-    return np.concatenate(found)
+            errors.append(np.where(moved == 0, 0.0, moved / _standard_error(squares, total, count)))
+    return np.concatenate(errors)
 
 
 def less(values: Numbers, reference: Numbers, photographs: Numbers, seed: int) -> Interval:
@@ -239,9 +239,9 @@ def gains_by_strength(values: MetricTable, reference: MetricTable, seed: int) ->
     """Return by which fraction the L1 error of the small pictures is lower, at each laser
     strength.
     """
-    found = []
+    gains = []
     for i in range(len(values.strengths)):
         own, other = values.values["l1 small"][:, i], reference.values["l1 small"][:, i]
-        kept = ~np.isnan(own + other)
-        found.append(gain(own[kept], other[kept], values.photographs[kept], seed))
-    return found
+        both = ~np.isnan(own + other)
+        gains.append(gain(own[both], other[both], values.photographs[both], seed))
+    return gains

@@ -54,7 +54,7 @@ def read_protection(level: float | None, way: str) -> EqualProtection | None:
 def protect(
     recipe: str,
     changes: Sequence[str | Override],
-    each: Sequence[PipelineRecipes],
+    pipelines: Sequence[PipelineRecipes],
     asked: EqualProtection,
     store: Store,
     folder: Path,
@@ -68,12 +68,12 @@ def protect(
     """
     shades: dict[str, EqualShade] = {}
     wrong: dict[str, None] = {}
-    for one in each:
-        front = one.pipeline.front
+    for pipeline in pipelines:
+        front = pipeline.pipeline.front
         if front in shades:
             continue
         try:
-            shades[front] = _shade(recipe, changes, one, asked, store, folder)
+            shades[front] = _shade(recipe, changes, pipeline, asked, store, folder)
             progress(
                 f"{front}: peak"
                 f" {shades[front].alone:.3g}{shades[front].said or ', without a filter'}"
@@ -83,19 +83,22 @@ def protect(
     if wrong:
         raise EvaluationRefused("\n".join(wrong))
     return compose_pipelines(
-        recipe, changes, [replace(p.pipeline, shade=shades[p.pipeline.front]) for p in each], folder
+        recipe,
+        changes,
+        [replace(p.pipeline, shade=shades[p.pipeline.front]) for p in pipelines],
+        folder,
     )
 
 
 def _shade(
     recipe: str,
     changes: Sequence[str | Override],
-    one: PipelineRecipes,
+    pipeline: PipelineRecipes,
     asked: EqualProtection,
     store: Store,
     folder: Path,
 ) -> EqualShade:
-    dark = one.recipe(NONE)
+    dark = pipeline.recipe(NONE)
     if dark.steps["pupil[mask]"].wires.get("shade"):
         raise EvaluationRefused(
             "has a filter or a stop of its own: leave it out, because every pipeline gets one"
@@ -103,7 +106,7 @@ def _shade(
     camera = ProtectionCamera.of(dark, store, _BANDS)
 
     def peak_of(shade: EqualShade) -> float:
-        shaded = replace(one.pipeline, shade=shade)
+        shaded = replace(pipeline.pipeline, shade=shade)
         (other,) = compose_pipelines(recipe, changes, [shaded], folder)
         return float(run(other.recipe(NONE), store, ["lsr[mask]"]).values["lsr[mask]"].max())
 
@@ -126,12 +129,12 @@ def as_document(result: EvaluationResult) -> dict[str, Any]:
     if result.protection is None:
         return {}
     shades = {p.name: p.shade for p in result.pipelines if p.shade is not None}
-    each = {name: {**asdict(shade), "words": shade.words} for name, shade in shades.items()}
+    protections = {name: {**asdict(shade), "words": shade.words} for name, shade in shades.items()}
     return {
         "equal protection": {
             "peak": result.protection.level,
             "by": result.protection.way,
-            "pipelines": each,
+            "pipelines": protections,
         }
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -38,7 +39,12 @@ from neusee.workflows.report.figures.style import (
 from neusee.workflows.report.study_page import Mark, Section
 
 if TYPE_CHECKING:
-    from neusee.workflows.evaluation.evaluation_result import EvaluationResult, MaskOptics, Panel
+    from neusee.workflows.evaluation.evaluation_result import (
+        EvaluationResult,
+        MaskOptics,
+        MistoldPoint,
+        Panel,
+    )
 
 
 # --- evaluation figures ---------------------------------------------------------------------------
@@ -123,23 +129,33 @@ def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
 
 def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], name: str) -> None:
     intervals = [table.at(metric, i) for i in range(len(table.strengths))]
-    at = _places(table.strengths)
+    places = _places(table.strengths)
     ax.plot(
-        at, [x.mean for x in intervals], marker="o", markersize=4, linewidth=1.4, label=name, **look
+        places,
+        [x.mean for x in intervals],
+        marker="o",
+        markersize=4,
+        linewidth=1.4,
+        label=name,
+        **look,
     )
     low, up = [x.low for x in intervals], [x.high for x in intervals]
-    ax.fill_between(at, low, up, color=look["color"], alpha=0.15, linewidth=0)
+    ax.fill_between(places, low, up, color=look["color"], alpha=0.15, linewidth=0)
 
 
 def _top(tables: Iterable[MetricTable], metric: str) -> float:
     """Return the end of an axis that shows every mean, and intervals up to three times the
     largest mean.
     """
-    found = [table.at(metric, i) for table in tables for i in range(len(table.strengths))]
-    largest = max((x.mean for x in found if x.mean > 0), default=0.0)
+    intervals: list[Interval] = []
+    for table in tables:
+        intervals += [table.at(metric, i) for i in range(len(table.strengths))]
+    largest = max((x.mean for x in intervals if x.mean > 0), default=0.0)
     return (
         1.05
-        * max(largest, min(3 * largest, max([x.high for x in found if x.high > 0], default=0.0)))
+        * max(
+            largest, min(3 * largest, max([x.high for x in intervals if x.high > 0], default=0.0))
+        )
         or 1.0
     )
 
@@ -174,14 +190,14 @@ def wavelengths(result: EvaluationResult) -> Any:
 
 def _means(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
     """Return the mean of x and y in each sixth of the range of x that has a value."""
-    kept = ~np.isnan(x + y)
-    x, y = x[kept], y[kept]
+    valid = ~np.isnan(x + y)
+    x, y = x[valid], y[valid]
     if not len(x):
         return x, y
-    part = np.minimum((6 * (x - x.min()) / max(float(np.ptp(x)), 1e-9)).astype(int), 5)
-    each = [i for i in range(6) if (part == i).any()]
-    return np.array([x[part == i].mean() for i in each]), np.array(
-        [y[part == i].mean() for i in each]
+    bin_numbers = np.minimum((6 * (x - x.min()) / max(float(np.ptp(x)), 1e-9)).astype(int), 5)
+    filled = [i for i in range(6) if (bin_numbers == i).any()]
+    return np.array([x[bin_numbers == i].mean() for i in filled]), np.array(
+        [y[bin_numbers == i].mean() for i in filled]
     )
 
 
@@ -196,10 +212,10 @@ def curves(masks: Mapping[str, MaskOptics]) -> Any:
     for name, mask in masks.items():
         left.plot(mask.wavelengths, mask.lsr, linewidth=1.6, label=name, **looks[name])
         right.plot(mask.wavelengths, mask.bsr, linewidth=1.6, **looks[name])
-    one = next(iter(masks.values()))
+    first = next(iter(masks.values()))
     left.plot(
-        one.wavelengths,
-        one.floor,
+        first.wavelengths,
+        first.floor,
         color=_GREY,
         linewidth=1.2,
         linestyle=(0, (1, 2)),
@@ -225,8 +241,8 @@ def plane(masks: Mapping[str, MaskOptics]) -> Any:
     figure, axes = canvas(8.4, 5.2)
     ax = axes[0, 0]
     floor = float(np.mean([mask.floor.mean() for mask in masks.values()]))
-    least = min(floor, *(float(mask.lsr.mean()) for mask in masks.values()))
-    x = np.geomspace(least / 3, 1.6, 200)
+    smallest = min(floor, *(float(mask.lsr.mean()) for mask in masks.values()))
+    x = np.geomspace(smallest / 3, 1.6, 200)
     unsuppressed = float(next(iter(masks.values())).unsuppressed.mean())
     bound = most_contrast(unsuppressed, torch.from_numpy(x)).numpy()
     ax.fill_between(x, bound, 1.5, color=_GREY, alpha=0.15, linewidth=0)
@@ -247,14 +263,21 @@ def plane(masks: Mapping[str, MaskOptics]) -> Any:
     )
     looks = _looks(list(masks))
     for name, mask in masks.items():
-        at, colour, mark = (
+        laser_ratio, colour, mark = (
             float(mask.lsr.mean()),
             looks[name]["color"],
             _MARKERS[looks[name]["linestyle"]],
         )
-        ax.plot([at, at], [mask.median.mean(), mask.rms.mean()], color=colour, linewidth=0.8)
-        ax.plot(at, mask.rms.mean(), mark, markersize=6, markerfacecolor="none", color=colour)
-        ax.plot(at, mask.median.mean(), mark, markersize=7, color=colour, label=name)
+        ax.plot(
+            [laser_ratio, laser_ratio],
+            [mask.median.mean(), mask.rms.mean()],
+            color=colour,
+            linewidth=0.8,
+        )
+        ax.plot(
+            laser_ratio, mask.rms.mean(), mark, markersize=6, markerfacecolor="none", color=colour
+        )
+        ax.plot(laser_ratio, mask.median.mean(), mark, markersize=7, color=colour, label=name)
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.set_xlim(x[0], x[-1])
@@ -277,8 +300,8 @@ COLUMNS = (
     "mask",
     "restorer",
     "scenes",
-    *(f"{m} {e}" for m in METRICS for e in _EACH),
-    *(f"{name} {e}" for name in ("l1 less", "l1 gain", "l1 small gain") for e in _EACH),
+    *map(" ".join, itertools.product(METRICS, _EACH)),
+    *map(" ".join, itertools.product(("l1 less", "l1 gain", "l1 small gain"), _EACH)),
 )
 #: tolerance of a bound, because a circular aperture is sampled on a square grid of frequencies
 _COARSE = 1.05
@@ -317,10 +340,10 @@ def rows(result: EvaluationResult) -> list[Sequence[Any]]:
     """
     listed: list[Sequence[Any]] = []
     for p in result.pipelines:
-        each = [result.tables[p.name].mean(metric) for metric in METRICS] + list(
+        intervals = [result.tables[p.name].mean(metric) for metric in METRICS] + list(
             result.against[p.name].values()
         )
-        numbers = [x for interval in each for x in astuple(interval)]
+        numbers = itertools.chain(*map(astuple, intervals))
         listed.append(
             (
                 p.name,
@@ -336,36 +359,38 @@ def rows(result: EvaluationResult) -> list[Sequence[Any]]:
 def lead(result: EvaluationResult) -> str:
     """Return a few sentences with the main result of the evaluation."""
     best = min(result.pipelines, key=lambda p: float(result.tables[p.name].scenes("l1").mean()))
-    least = _with_interval(result.tables[best.name].mean("l1"), "l1")
-    strengths = ", ".join(
-        "none" if k == 0 else f"{k:g}".replace("e+0", "e") for k in result.strengths
-    )
-    enough = len(result.scenes) >= len(CASES) or _drawn(result)
-    few = (
-        "" if enough else f" These are too few scenes for all {len(CASES)} lasers of the protocol."
-    )
-    uncertain = result.recipe.uncertain
-    names = [
-        name for name in (uncertain.names if uncertain else ()) if not name.startswith("lasers.")
-    ]
-    laser = (
-        " The wavelength of the laser of each scene is drawn by the law of the recipe."
-        if _drawn(result)
-        else ""
-    )
-    drawn = (
-        f"{laser} These values are drawn for each scene: {', '.join(names)}." if names else laser
-    )
-    level = result.protection.level if result.protection else 0.0
-    which = "every pipeline" if all(p.shade for p in result.pipelines) else "each of them once more"
-    equal = (
-        f" Filters and stops bring {which} to a peak of {level:g} of the plain lens's."
-        if level
-        else ""
-    )
+    lowest = _with_interval(result.tables[best.name].mean("l1"), "l1")
+    strengths = ", ".join(_strength_names(result))
     return f"""{len(result.scenes)} scenes, laser strengths {strengths} (1 saturates a pixel of the
         plain lens), {len(result.pipelines)} pipelines of a mask and a restorer. Lowest L1:
-        {best.name}, {least}. {few}{drawn}{equal}"""
+        {best.name}, {lowest}. {_few_text(result)}{_drawn_text(result)}{_equal_text(result)}"""
+
+
+def _few_text(result: EvaluationResult) -> str:
+    """Return that the scenes are too few for all lasers, if they are."""
+    if len(result.scenes) >= len(CASES) or _drawn(result):
+        return ""
+    return f" These are too few scenes for all {len(CASES)} lasers of the protocol."
+
+
+def _drawn_text(result: EvaluationResult) -> str:
+    """Return which values are drawn for each scene."""
+    laser = ""
+    if _drawn(result):
+        laser = " The wavelength of the laser of each scene is drawn by the law of the recipe."
+    uncertain = result.recipe.uncertain
+    drawn = uncertain.names if uncertain else ()
+    names = [name for name in drawn if not name.startswith("lasers.")]
+    return f"{laser} These values are drawn for each scene: {', '.join(names)}." if names else laser
+
+
+def _equal_text(result: EvaluationResult) -> str:
+    """Return to which peak filters and stops bring the pipelines, if they do."""
+    level = result.protection.level if result.protection else 0.0
+    if not level:
+        return ""
+    which = "every pipeline" if all(p.shade for p in result.pipelines) else "each of them once more"
+    return f" Filters and stops bring {which} to a peak of {level:g} of the plain lens's."
 
 
 def sections(result: EvaluationResult, shown: Mapping[str, bytes]) -> list[Section]:
@@ -448,11 +473,11 @@ def _gained(result: EvaluationResult, reference: str) -> Section:
     listed: list[Sequence[Any]] = []
     marks: dict[tuple[int, int], Mark] = {}
     for name in (name for name, other in result.references.items() if other == reference != name):
-        found = gains_by_strength(result.tables[name], result.tables[reference], result.recipe.seed)
-        for i, x in enumerate(found, 1):
+        gains = gains_by_strength(result.tables[name], result.tables[reference], result.recipe.seed)
+        for i, x in enumerate(gains, 1):
             if x.excludes_zero:
                 marks[len(listed), i] = "pass" if x.mean > 0 else "fail"
-        listed.append((name, *(_between(x, ".1%") for x in found)))
+        listed.append((name, *(_between(x, ".1%") for x in gains)))
     columns = ("pipeline", *_strength_names(result))
     return Section(f"Gain by strength over {reference}", text, columns, listed, marks=marks)
 
@@ -489,13 +514,9 @@ def _mistold(result: EvaluationResult) -> list[Section]:
     if not result.mistold:
         return []
     errors = list(dict.fromkeys(point.error for point in result.mistold))
-    strength, listed = result.mistold[0].strength, []
-    for name in dict.fromkeys(point.pipeline for point in result.mistold):
-        own = [point for point in result.mistold if point.pipeline == name]
-        told = {point.scene.number: point.true["psnr"] for point in own}
-        each = [[p.wrong["psnr"] for p in own if p.error == error] for error in errors]
-        cells = (_with_interval(mean(values), "psnr") if values else "" for values in each)
-        listed.append((name, _with_interval(mean(list(told.values())), "psnr"), *cells))
+    names = dict.fromkeys(point.pipeline for point in result.mistold)
+    strength = result.mistold[0].strength
+    listed = [_mistold_row(result.mistold, name, errors) for name in names]
     text = f"""PSNR in dB of the restored picture at the strength {strength:g}, in the first scenes
         with a laser: mean and 95 % interval. In every other table the restorer is told the exact
         PSF and the exact pattern of the laser, which no camera knows. Here it is told one of them
@@ -506,6 +527,19 @@ def _mistold(result: EvaluationResult) -> list[Section]:
             "What the restorer is not told", text, ("pipeline", "told exactly", *errors), listed
         )
     ]
+
+
+def _mistold_row(
+    points: Sequence[MistoldPoint], name: str, errors: Sequence[str]
+) -> tuple[str, ...]:
+    """Return the PSNR of one pipeline that is told the truth, and that with each error."""
+    own = [point for point in points if point.pipeline == name]
+    exact = {point.scene.number: point.true["psnr"] for point in own}
+    cells = [_with_interval(mean(list(exact.values())), "psnr")]
+    for error in errors:
+        values = [point.wrong["psnr"] for point in own if point.error == error]
+        cells.append(_with_interval(mean(values), "psnr") if values else "")
+    return (name, *cells)
 
 
 def _column(metric: str) -> str:

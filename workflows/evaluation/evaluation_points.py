@@ -63,31 +63,50 @@ def errors_of(recipe: Recipe, mismatch: Mismatch) -> dict[str, Mapping[str, Any]
     A parameter with None is removed: the input ``dirt`` of a pupil. The result is empty if the
     restorer knows nothing.
     """
-    told = known(recipe, _readers(recipe))
-    if not told:
+    told_steps = known(recipe, _readers(recipe))
+    if not told_steps:
         return {}
-    pupils = [
-        name for name in needed(recipe, told) if recipe.steps[name].node.path == "optics.pupil"
-    ]
-    found: dict[str, Mapping[str, Any]] = {}
+    steps = needed(recipe, told_steps)
+    return _laser_errors(recipe, mismatch, steps) | _pupil_errors(recipe, mismatch, steps)
+
+
+def _laser_errors(
+    recipe: Recipe, mismatch: Mismatch, steps: Sequence[str]
+) -> dict[str, Mapping[str, Any]]:
+    """Return the errors in direction and wavelength of a laser whose direction ``steps`` read."""
     direction, line = f"direction[{BEAM}]", f"line[{BEAM}]"
-    glare = [name for name in needed(recipe, told) if direction in recipe.steps[name].sources]
-    if mismatch.pixels and glare:
+    glare = [name for name in steps if direction in recipe.steps[name].sources]
+    if not glare:
+        return {}
+    errors: dict[str, Mapping[str, Any]] = {}
+    if mismatch.pixels:
         lens = recipe.steps[glare[0]].params
         angle = mismatch.pixels * lens["pixel_pitch"] / lens["focal_length"]
-        found[f"direction {mismatch.pixels:g} px off"] = {f"{direction}.angle": (angle, angle)}
-    if mismatch.wavelength and glare and "wavelength" in recipe.steps[line].params:
-        found[f"wavelength {mismatch.wavelength * 1e9:g} nm off"] = {
-            f"{line}.wavelength": mismatch.wavelength
-        }
-    if mismatch.defocus and pupils:
-        found[f"defocus {mismatch.defocus:g} waves off"] = dict.fromkeys(
-            (f"{name}.defocus" for name in pupils), mismatch.defocus
-        )
+        errors[f"direction {mismatch.pixels:g} px off"] = {f"{direction}.angle": (angle, angle)}
+    if mismatch.wavelength and "wavelength" in recipe.steps[line].params:
+        text = f"wavelength {mismatch.wavelength * 1e9:g} nm off"
+        errors[text] = {f"{line}.wavelength": mismatch.wavelength}
+    return errors
+
+
+def _pupil_errors(
+    recipe: Recipe, mismatch: Mismatch, steps: Sequence[str]
+) -> dict[str, Mapping[str, Any]]:
+    """Return the errors in defocus and dirt of the pupils among ``steps``."""
+    pupils = [name for name in steps if recipe.steps[name].node.path == "optics.pupil"]
     dirty = [name for name in pupils if recipe.steps[name].wires.get("dirt") is not None]
+    errors: dict[str, Mapping[str, Any]] = {}
+    if mismatch.defocus and pupils:
+        text = f"defocus {mismatch.defocus:g} waves off"
+        errors[text] = _of_each(pupils, "defocus", mismatch.defocus)
     if mismatch.dirt and dirty:
-        found["dirt not told"] = dict.fromkeys(f"{name}.dirt" for name in dirty)
-    return found
+        errors["dirt not told"] = _of_each(dirty, "dirt", None)
+    return errors
+
+
+def _of_each(steps: Sequence[str], parameter: str, value: Any) -> dict[str, Any]:
+    """Return the same value of a parameter of each step."""
+    return {f"{step}.{parameter}": value for step in steps}
 
 
 def mistold(recipe: Recipe, error: Mapping[str, Any]) -> Recipe:
@@ -193,25 +212,27 @@ class EvaluationPoints:
         return numbers
 
     def values(
-        self, pipeline: PipelineRecipes, point: PointRequest, more: Sequence[str] = ()
+        self, pipeline: PipelineRecipes, point: PointRequest, further: Sequence[str] = ()
     ) -> dict[str, Any]:
         """Run a pipeline on one scene and laser, and return the outputs and the results of the
-        steps ``more``.
+        ``further`` steps.
         """
-        outputs = (*pipeline.pipeline.outputs, *more)
+        outputs = (*pipeline.pipeline.outputs, *further)
         function = self._function(pipeline, point.lit, outputs)
         self._kept.turn(point)
         with torch.no_grad():
             changed = self._changed(pipeline, point, outputs)
-            known = {name: value for name, value in changed.items() if name in function.free}
-            values: dict[str, Any] = function({"scene": point.scene.picture, **known})
+            free_values = {name: value for name, value in changed.items() if name in function.free}
+            values: dict[str, Any] = function({"scene": point.scene.picture, **free_values})
         return values
 
     def forget(self) -> None:
         """Remove all results that depend on the laser from memory."""
         self._functions = {name: f for name, f in self._functions.items() if name[1] == NONE}
-        used = {id(value) for f in self._functions.values() for value in f.fixed.values()}
-        self._fixed = {key: value for key, value in self._fixed.items() if id(value) in used}
+        in_use = set[int]()
+        for function in self._functions.values():
+            in_use |= set(map(id, function.fixed.values()))
+        self._fixed = {key: value for key, value in self._fixed.items() if id(value) in in_use}
         self._kept.clear()
 
     def release(self) -> None:
@@ -234,7 +255,7 @@ class EvaluationPoints:
             device_kind(self.device),
             self.small,
         ]
-        own = [self._code.digest(used.__module__) for used in (quality, resize)]
+        own = [self._code.digest(function.__module__) for function in (quality, resize)]
         return digest(
             "evaluate",
             engine("evaluation.evaluation_points"),
@@ -277,8 +298,10 @@ class EvaluationPoints:
         name = (f"{pipeline.name} {outputs}", case, id(pipeline.recipe))
         if name not in self._functions:
             recipe = replace(pipeline.recipe(case), estimates=False)  # one PSF for all scenes
-            whole = with_substitutions(recipe, outputs)  # as in `run`, but the scene is an argument
-            steps = set(needed(whole, outputs))
+            full_recipe = with_substitutions(
+                recipe, outputs
+            )  # as in `run`, but the scene is an argument
+            steps = set(needed(full_recipe, outputs))
             inputs = self.inputs(pipeline, case, outputs)
             free = [
                 "scene",
@@ -290,10 +313,12 @@ class EvaluationPoints:
                     *(f"{spot}.strength" for spot in spots(recipe, outputs)),
                 ]
             free += [TOLD + name for name in free if TOLD + name.rpartition(".")[0] in steps]
-            caller = self._kept.caller(dependents(whole, list(filter(_is_moved, whole.steps))))
+            caller = self._kept.caller(
+                dependents(full_recipe, list(filter(_is_moved, full_recipe.steps)))
+            )
             ways: dict[str, Any] = {"store": self.store, "device": self.device, "caller": caller}
-            self._functions[name] = as_function(whole, *free, outputs=outputs, **ways)
-            self._share(self._functions[name], whole)
+            self._functions[name] = as_function(full_recipe, *free, outputs=outputs, **ways)
+            self._share(self._functions[name], full_recipe)
         return self._functions[name]
 
     def _changed(
@@ -317,11 +342,11 @@ class EvaluationPoints:
             if TOLD + name.rpartition(".")[0] in recipe.steps
         }
         wrong = {name: value for name, value in pipeline.error.items() if value is not None}
-        told = {
+        told_values = {
             TOLD + name: shifted(x, wrong[name]) if name in wrong else x
             for name, x in copies.items()
         }
-        return changed | told
+        return changed | told_values
 
     def inputs(self, pipeline: PipelineRecipes, case: str, outputs: Sequence[str]) -> Inputs | None:
         """Return the uncertain inputs of a pipeline, or None if no output depends on an uncertain
@@ -350,7 +375,7 @@ class EvaluationPoints:
 
     def _numbers(self, pipeline: PipelineRecipes, values: Mapping[str, Any]) -> PointNumbers:
         line, truth = pipeline.pipeline, values["truth"]
-        small = whole = values[line.quality]
+        small = full = values[line.quality]
         if min(truth.shape[-2:]) > self.small:
             domain = pipeline.recipe(NONE).steps[line.quality].params["domain"]
             small = quality(
@@ -358,7 +383,7 @@ class EvaluationPoints:
             )
         peak, saturated = values["peak[mask]"], values["saturated[mask]"]
         return {
-            **{name: float(value) for name, value in whole._asdict().items()},
+            **{name: float(value) for name, value in full._asdict().items()},
             **{f"{name} small": float(value) for name, value in small._asdict().items()},
             "saturated": float(saturated.pixels),
             "peak": float(peak.irradiance),
@@ -405,14 +430,14 @@ class _SharedResults:
         def compute(
             step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str
         ) -> Any:
-            kept = self._of_strength if step.name in moved else self._of_scene
+            results = self._of_strength if step.name in moved else self._of_scene
             own = (step.name, self._seed) if step.node.random else ()
             identities = [tuple(map(id, x)) if type(x) is list else id(x) for x in inputs]
             key = (own, step.node.path, repr(sorted(params.items())), device, *identities)
             # the inputs are kept too, so that no other object gets their identity
-            if key not in kept:
-                kept[key] = (inputs, call(step, inputs, params, self._seed, device))
-            return kept[key][1]
+            if key not in results:
+                results[key] = (inputs, call(step, inputs, params, self._seed, device))
+            return results[key][1]
 
         return compute
 
@@ -458,7 +483,10 @@ class PointCommands:
     bench: EvaluationPoints
 
     def commands(
-        self, each: Sequence[PipelineRecipes], scenes: Sequence[Scene], strengths: Sequence[float]
+        self,
+        pipelines: Sequence[PipelineRecipes],
+        scenes: Sequence[Scene],
+        strengths: Sequence[float],
     ) -> dict[str, list[dict[float, str]]]:
         """Return the command of each point by pipeline, scene and strength; empty where no command
         gives the point.
@@ -468,7 +496,7 @@ class PointCommands:
         """
         proved: dict[tuple[str, bool], bool] = {}
         listed: dict[str, list[dict[float, str]]] = {}
-        for pipeline in each:
+        for pipeline in pipelines:
             listed[pipeline.name] = []
             for scene in scenes:
                 points = [

@@ -37,7 +37,7 @@ from neusee.workflows.evaluation.pipelines import (
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.protection.equal_rivals import EqualProtection
-from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
+from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings, Mismatch
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.study_folder import Progress
 from neusee.workflows.store.result_store import Store, compute_once
@@ -63,14 +63,14 @@ class MaskOptics:
 
 
 def masks(
-    each: Sequence[PipelineRecipes],
+    pipelines: Sequence[PipelineRecipes],
     store: Store,
     device: str,
     points: Mapping[str, Sequence[Mapping[float, Any]]],
 ) -> dict[str, MaskOptics]:
     """Return the laser suppression and the image contrast of each mask, by name of the mask."""
     optics: dict[str, MaskOptics] = {}
-    for pipeline in each:
+    for pipeline in pipelines:
         if pipeline.pipeline.front not in optics:
             bsr = [next(iter(point.values()))["bsr"] for point in points[pipeline.name]]
             optics[pipeline.pipeline.front] = _mask(pipeline, store, device, np.mean(bsr, axis=0))
@@ -78,19 +78,24 @@ def masks(
 
 
 def _mask(pipeline: PipelineRecipes, store: Store, device: str, bsr: Numbers) -> MaskOptics:
-    wanted = ("bands", "lsr[mask]", "mtf[mask]", "psf[mask]")
-    values = run(pipeline.recipe(NONE), store, wanted, device=device).values
-    bands, lsr, mtf, psf = (values[name] for name in wanted)
-    each = (
-        lsr,
-        mtf.median,
-        mtf.rms,
-        least_lsr(psf),
-        metrics.limits(psf).passed,
-        most_unsuppressed(psf),
+    names = ("bands", "lsr[mask]", "mtf[mask]", "psf[mask]")
+    values = run(pipeline.recipe(NONE), store, names, device=device).values
+    bands, lsr, mtf, psf = (values[name] for name in names)
+    return MaskOptics(
+        wavelengths=_numbers(bands.centres) * 1e9,
+        lsr=_numbers(lsr),
+        bsr=bsr,
+        median=_numbers(mtf.median),
+        rms=_numbers(mtf.rms),
+        floor=_numbers(least_lsr(psf)),
+        most=_numbers(metrics.limits(psf).passed),
+        unsuppressed=_numbers(most_unsuppressed(psf)),
     )
-    suppression, *rest = (x.double().cpu().numpy() for x in each)
-    return MaskOptics(bands.centres.double().cpu().numpy() * 1e9, suppression, bsr, *rest)
+
+
+def _numbers(tensor: Tensor) -> Numbers:
+    array: Numbers = tensor.double().cpu().numpy()
+    return array
 
 
 # --- comparison pictures --------------------------------------------------------------------------
@@ -117,7 +122,7 @@ class Panel:
 
 def panels(
     bench: EvaluationPoints,
-    each: Sequence[PipelineRecipes],
+    pipelines: Sequence[PipelineRecipes],
     scene: Scene,
     strengths: Sequence[float],
     figure: Collection[str] | None = None,
@@ -137,9 +142,12 @@ def panels(
         bench.forget()
         point = PointRequest(replace(scene, case=case), strength)
         key = digest(
-            "evaluate pictures", _SIDE, bool(figure), [[p.name, bench.key(p, point)] for p in each]
+            "evaluate pictures",
+            _SIDE,
+            bool(figure),
+            [[p.name, bench.key(p, point)] for p in pipelines],
         )
-        compute = partial(_develop, bench, each, point, bool(figure))
+        compute = partial(_develop, bench, pipelines, point, bool(figure))
         columns.append(
             Panel(
                 case, strength, compute_once(bench.store, key, dict, compute, {"step": "evaluate"})
@@ -149,18 +157,21 @@ def panels(
 
 
 def _develop(
-    bench: EvaluationPoints, each: Sequence[PipelineRecipes], point: PointRequest, sensors: bool
+    bench: EvaluationPoints,
+    pipelines: Sequence[PipelineRecipes],
+    point: PointRequest,
+    sensors: bool,
 ) -> dict[str, Tensor]:
     """Return the pictures of one laser by name, with those of the sensor behind each mask first
     if ``sensors``.
     """
     pictures: dict[str, Tensor] = {}
     restored: dict[str, Tensor] = {}
-    for pipeline in each:
+    for pipeline in pipelines:
         line = pipeline.pipeline
         sensor = sensors and line.mask != FLAT and f"{line.front}, sensor" not in pictures
-        more = (_MASKED,) if sensor else ()
-        values = bench.values(pipeline, point, (_PLAIN, *more) if not pictures else more)
+        further = (_MASKED,) if sensor else ()
+        values = bench.values(pipeline, point, (_PLAIN, *further) if not pictures else further)
         if not pictures:
             pictures = {"truth": _shrink(values["truth"]), "plain lens": _shrink(values[_PLAIN])}
         if sensor:
@@ -233,7 +244,7 @@ class EvaluationResult:
 
 def told_with_errors(
     bench: EvaluationPoints,
-    each: Sequence[PipelineRecipes],
+    pipelines: Sequence[PipelineRecipes],
     shown: Sequence[Scene],
     strengths: Sequence[float],
     progress: Progress,
@@ -244,27 +255,50 @@ def told_with_errors(
     The recipe declares the errors; a pipeline whose restorer knows nothing of optics and lasers has
     none.
     """
-    settings = each[0].recipe(NONE).evaluation or EvaluateSettings()
-    mismatch, lit = settings.mismatch, [scene for scene in shown if scene.case != NONE]
-    strength = (
-        max(strengths) if mismatch is None or mismatch.strength is None else mismatch.strength
-    )
-    if mismatch is None or not strength:
+    mismatch = (pipelines[0].recipe(NONE).evaluation or EvaluateSettings()).mismatch
+    if mismatch is None:
         return []
-    found: list[MistoldPoint] = []
-    for pipeline in (p for p in each if p.pipeline.restorer != NONE):
-        errors = errors_of(pipeline.recipe(next(iter(CASES))), mismatch)
-        variants = {text: _variant(pipeline, text, error) for text, error in errors.items()}
-        for scene in lit[: mismatch.scenes] if variants else ():
-            bench.forget()
-            request = PointRequest(scene, strength)
-            true = bench.point(pipeline, request)
-            for text, variant in variants.items():
-                wrong = bench.point(variant, request)
-                found.append(MistoldPoint(pipeline.name, text, scene, strength, true, wrong))
+    strength = _mismatch_strength(mismatch, strengths)
+    if not strength:
+        return []
+    lit = [PointRequest(scene, strength) for scene in shown if scene.case != NONE]
+    points: list[MistoldPoint] = []
+    for pipeline in (p for p in pipelines if p.pipeline.restorer != NONE):
+        variants = _variants(pipeline, mismatch)
         if variants:
+            points += _mistold_points(bench, pipeline, variants, lit[: mismatch.scenes])
             progress(f"{pipeline.name}, told with errors: {bench.computed} points computed")
-    return found
+    return points
+
+
+def _mismatch_strength(mismatch: Mismatch, strengths: Sequence[float]) -> float:
+    """Return the strength of the laser at which restorers are told errors."""
+    return max(strengths) if mismatch.strength is None else mismatch.strength
+
+
+def _variants(pipeline: PipelineRecipes, mismatch: Mismatch) -> dict[str, PipelineRecipes]:
+    """Return the pipeline with each error in what its restorer is told, by text."""
+    errors = errors_of(pipeline.recipe(next(iter(CASES))), mismatch)
+    return {text: _variant(pipeline, text, error) for text, error in errors.items()}
+
+
+def _mistold_points(
+    bench: EvaluationPoints,
+    pipeline: PipelineRecipes,
+    variants: Mapping[str, PipelineRecipes],
+    requests: Sequence[PointRequest],
+) -> list[MistoldPoint]:
+    """Return the points of a pipeline with each of its errors, beside those without."""
+    points = []
+    for request in requests:
+        bench.forget()
+        true = bench.point(pipeline, request)
+        for text, variant in variants.items():
+            wrong = bench.point(variant, request)
+            points.append(
+                MistoldPoint(pipeline.name, text, request.scene, request.strength, true, wrong)
+            )
+    return points
 
 
 def _variant(pipeline: PipelineRecipes, text: str, error: Mapping[str, Any]) -> PipelineRecipes:
@@ -279,10 +313,10 @@ def mistold_rows(points: Sequence[MistoldPoint]) -> list[Sequence[Any]]:
     """Return the rows of ``mistold.csv``, with the truth and with each error."""
     rows: dict[Any, Sequence[Any]] = {}
     for p in points:
-        for told, numbers in (("exactly", p.true), (p.error, p.wrong)):
+        for error, numbers in (("exactly", p.true), (p.error, p.wrong)):
             place = (
                 p.pipeline,
-                told,
+                error,
                 p.scene.number,
                 p.scene.name,
                 p.scene.case,
@@ -323,29 +357,36 @@ class Measured(NamedTuple):
 def measure(
     asked: AskedCamera,
     bench: EvaluationPoints,
-    each: list[PipelineRecipes],
+    pipelines: list[PipelineRecipes],
     shown: Sequence[Scene],
     strengths: tuple[float, ...],
 ) -> Measured:
     """Return the numbers of all points, those of restorers told with errors, the masks, and the
     pictures to show.
     """
-    points, kept, broken = _points(bench, each, shown, strengths, asked.progress)
-    mistold = told_with_errors(bench, each, kept, strengths, asked.progress)
-    optics = masks(each, asked.store, bench.device, points)
-    if more := asked.settings.figure:
+    points, readable, broken = _points(bench, pipelines, shown, strengths, asked.progress)
+    mistold = told_with_errors(bench, pipelines, readable, strengths, asked.progress)
+    optics = masks(pipelines, asked.store, bench.device, points)
+    if figure_changes := asked.settings.figure:
         bench.release()
-        lines = [p.pipeline for p in each]
-        each = compose_pipelines(asked.recipe, [*asked.changes, *more], lines, asked.folder)
+        lines = [p.pipeline for p in pipelines]
+        pipelines = compose_pipelines(
+            asked.recipe, [*asked.changes, *figure_changes], lines, asked.folder
+        )
     figure = SIX if asked.settings.lasers == "drawn" else None
     return Measured(
-        points, kept, broken, mistold, optics, panels(bench, each, kept[0], strengths, figure)
+        points,
+        readable,
+        broken,
+        mistold,
+        optics,
+        panels(bench, pipelines, readable[0], strengths, figure),
     )
 
 
 def _points(
     bench: EvaluationPoints,
-    each: Sequence[PipelineRecipes],
+    pipelines: Sequence[PipelineRecipes],
     shown: Sequence[Scene],
     strengths: Sequence[float],
     progress: Progress,
@@ -357,13 +398,13 @@ def _points(
     """
     points: dict[int, dict[str, dict[float, PointNumbers]]] = {}
     broken: list[tuple[Path, str]] = []
-    before, order = "", [scene.case for scene in shown]
-    for done, scene in enumerate(sorted(shown, key=lambda scene: order.index(scene.case)), 1):
+    before = ""
+    for done, scene in enumerate(_laser_by_laser(shown), 1):
         if before not in ("", scene.case):
             bench.forget()
-        before, own = scene.case, {p.name: dict[float, PointNumbers]() for p in each}
+        before, own = scene.case, {p.name: dict[float, PointNumbers]() for p in pipelines}
         try:
-            _scene_points(bench, each, scene, strengths, own)
+            _scene_points(bench, pipelines, scene, strengths, own)
         except UnreadablePhotograph as error:
             broken.append((scene.path or Path(scene.name), str(error)))
             progress(f"not read, and left out: {scene.name}")
@@ -373,15 +414,28 @@ def _points(
             f"scene {done} of {len(shown)} ({scene.case}, {scene.name}): {bench.computed} points"
             " computed"
         )
-    kept = [scene for scene in shown if scene.number in points]
-    if not kept:
+    readable = [scene for scene in shown if scene.number in points]
+    if not readable:
         raise EvaluationRefused(broken[0][1])
-    return {p.name: [points[scene.number][p.name] for scene in kept] for p in each}, kept, broken
+    return _by_pipeline([points[scene.number] for scene in readable]), readable, broken
+
+
+def _by_pipeline(
+    scenes: Sequence[Mapping[str, dict[float, PointNumbers]]],
+) -> dict[str, list[dict[float, PointNumbers]]]:
+    """Return the points of each scene, by pipeline."""
+    return {name: [points[name] for points in scenes] for name in scenes[0]}
+
+
+def _laser_by_laser(shown: Sequence[Scene]) -> list[Scene]:
+    """Return the scenes sorted by their lasers, in the order of the first scene of each laser."""
+    order = [scene.case for scene in shown]
+    return sorted(shown, key=lambda scene: order.index(scene.case))
 
 
 def _scene_points(
     bench: EvaluationPoints,
-    each: Sequence[PipelineRecipes],
+    pipelines: Sequence[PipelineRecipes],
     scene: Scene,
     strengths: Sequence[float],
     points: dict[str, dict[float, PointNumbers]],
@@ -389,5 +443,5 @@ def _scene_points(
     """Compute the points of one scene into ``points``, by pipeline."""
     alone = replace(scene)  # a copy, which releases the picture when it is deleted
     for strength in strengths if scene.case != NONE else (0.0,):
-        for pipeline in each:
+        for pipeline in pipelines:
             points[pipeline.name][strength] = bench.point(pipeline, PointRequest(alone, strength))

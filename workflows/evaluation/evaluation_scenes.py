@@ -24,7 +24,7 @@ from neusee.workflows.evaluation.pipelines import (
     one_line,
 )
 from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys.cache_key import digest, file_digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs, NothingDrawn
@@ -122,31 +122,36 @@ def scenes(
 
     Without ``count`` every photograph is in one scene.
     """
-    broken: list[tuple[Path, str]] = []
-    own = recipe.steps["scene"]
-    shape = _shape(recipe)
-    paths: Sequence[Path] = [own.params["file"]] if own.node.path == PHOTOGRAPH else []
-    if root is not None:
-        if not root.is_dir():
-            raise EvaluationRefused(f"--data {root}: this folder does not exist")
-        paths, broken = list_photographs(root)
-        if not paths:
-            reason = f"; {broken[0][0].name}: {broken[0][1]}" if broken else ""
-            raise EvaluationRefused(
-                f"--data {root}: the folder contains no readable PNG or JPEG file{reason}"
-            )
+    own, shape = recipe.steps["scene"], _shape(recipe)
+    paths, broken = _photographs(own, root)
     shown = []
     for i in range(max(1, len(paths)) if count is None else count):
         path = choose_photograph(paths, recipe.seed, i) if paths else None
-        name = (
-            own.node.path
-            if path is None
-            else path.relative_to(root).as_posix()
-            if root
-            else path.name
-        )
+        name = _scene_name(own, path, root)
         shown.append(Scene(i, cases[i % len(cases)], name, path, shape, recipe, store))
     return shown, broken
+
+
+def _photographs(own: Step, root: Path | None) -> tuple[Sequence[Path], list[tuple[Path, str]]]:
+    """Return the photographs of a folder, or that of the recipe, and those that are unreadable."""
+    if root is None:
+        return ([own.params["file"]] if own.node.path == PHOTOGRAPH else []), []
+    if not root.is_dir():
+        raise EvaluationRefused(f"--data {root}: this folder does not exist")
+    paths, broken = list_photographs(root)
+    if not paths:
+        reason = f"; {broken[0][0].name}: {broken[0][1]}" if broken else ""
+        raise EvaluationRefused(
+            f"--data {root}: the folder contains no readable PNG or JPEG file{reason}"
+        )
+    return paths, broken
+
+
+def _scene_name(own: Step, path: Path | None, root: Path | None) -> str:
+    """Return the name of a scene: the photograph within its folder, or the node of the recipe."""
+    if path is None:
+        return own.node.path
+    return path.relative_to(root).as_posix() if root else path.name
 
 
 def photographs(shown: Sequence[Scene]) -> list[int]:
@@ -187,25 +192,36 @@ def refuse_directions(pipeline: PipelineRecipes, shown: Sequence[Scene]) -> None
 
     Of each laser only the scenes with the largest angles over wavelength along y and x are tried.
     """
-    each = dict(zip((scene.number for scene in shown), wavelengths(pipeline, shown), strict=True))
+    numbers = (scene.number for scene in shown)
+    wavelength_of = dict(zip(numbers, wavelengths(pipeline, shown), strict=True))
     wrong: dict[str, None] = {}
     for case in dict.fromkeys(scene.case for scene in shown if scene.case != NONE):
         lit = [(scene, scene.angle(pipeline.recipe(case))) for scene in shown if scene.case == case]
         for axis in (0, 1):
             scene, direction = max(
-                lit, key=lambda pair: abs(pair[1][axis]) / (each[pair[0].number] or 1.0)
+                lit, key=lambda pair: abs(pair[1][axis]) / (wavelength_of[pair[0].number] or 1.0)
             )
-            try:
-                pipeline.recipe(case, direction, each[scene.number])
-            except RecipeError as error:
-                wrong |= dict.fromkeys(
-                    f"scene {scene.number + 1} ({case}): {one_line(p)}" for p in error.diagnostics
-                )
+            wrong |= _direction_faults(pipeline, scene, direction, wavelength_of[scene.number])
     if wrong:
         text = "\n".join(wrong)
         raise EvaluationRefused(
             f"{text}\nThe directions are drawn over the sensor: choose a smaller sensor.shape"
         )
+
+
+def _direction_faults(
+    pipeline: PipelineRecipes,
+    scene: Scene,
+    direction: tuple[float, float],
+    wavelength: float | None,
+) -> dict[str, None]:
+    """Return a line for each mistake of the recipe with the laser of a scene."""
+    try:
+        pipeline.recipe(scene.case, direction, wavelength)
+    except RecipeError as error:
+        start = f"scene {scene.number + 1} ({scene.case})"
+        return dict.fromkeys(f"{start}: {one_line(p)}" for p in error.diagnostics)
+    return {}
 
 
 def _shape(recipe: Recipe) -> tuple[int, int]:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
@@ -147,29 +148,49 @@ def read_pipelines(text: str, folder: Path, mark: Location | None = None) -> lis
 
     ``mark`` is the place of the text, if it stands in a recipe.
     """
-    found: list[Pipeline] = []
+    words = [word for word in map(str.strip, text.split(",")) if word]
+    pipelines: list[Pipeline] = []
     wrong: list[str] = []
-    for word in filter(None, (part.strip() for part in text.split(","))):
-        match = _PIPELINE.fullmatch(word)
-        if match is None:
-            wrong.append(f"{word}: {_HOW}")
-            continue
-        height, weights = (
-            folder / Path(x).expanduser() if (x := match[k]) else None
-            for k in ("height", "weights")
-        )
-        found.append(Pipeline(match["mask"], match["restorer"], height, weights))
-        wrong += [
-            f"{word}: {why}" for path in (height, weights) if path and (why := _fault(path, mark))
-        ]
-    found = named_apart(found)
-    twice = {p.name for p in found if [q.name for q in found].count(p.name) > 1}
-    wrong += [f"{name} is listed twice: remove one" for name in sorted(twice)]
-    if not found and not wrong:
+    for word in words:
+        try:
+            pipelines.append(_pipeline(word, folder))
+        except ValueError as error:
+            wrong.append(f"{word}: {error}")
+        else:
+            wrong += [f"{word}: {fault}" for fault in _faults(pipelines[-1], mark)]
+    pipelines = named_apart(pipelines)
+    wrong += [f"{name} is listed twice: remove one" for name in _twice(pipelines)]
+    if not words:
         wrong = [f"there is no pipeline: {_HOW}"]
     if wrong:
         raise EvaluationRefused("\n".join(wrong))
-    return found
+    return pipelines
+
+
+def _pipeline(word: str, folder: Path) -> Pipeline:
+    """Return the pipeline that a word names; raise `ValueError` for another form of word."""
+    match = _PIPELINE.fullmatch(word)
+    if match is None:
+        raise ValueError(_HOW)
+    height, weights = (_named_file(match[group], folder) for group in ("height", "weights"))
+    return Pipeline(match["mask"], match["restorer"], height, weights)
+
+
+def _faults(pipeline: Pipeline, mark: Location | None) -> list[str]:
+    """Return why files of a pipeline cannot be used."""
+    faults = [_fault(path, mark) for path in (pipeline.height_file, pipeline.weights) if path]
+    return [fault for fault in faults if fault]
+
+
+def _named_file(text: str | None, folder: Path) -> Path | None:
+    """Return the file that a pipeline names, if it names one."""
+    return folder / Path(text).expanduser() if text else None
+
+
+def _twice(pipelines: Sequence[Pipeline]) -> list[str]:
+    """Return the names that several pipelines have, in alphabetical order."""
+    counts = Counter(pipeline.name for pipeline in pipelines)
+    return sorted(name for name, count in counts.items() if count > 1)
 
 
 def _fault(path: Path, mark: Location | None) -> str:
@@ -186,8 +207,10 @@ def named_apart(pipelines: Sequence[Pipeline]) -> list[Pipeline]:
     """Return pipelines in which different files have different names: with as many folders as
     that needs.
     """
-    files = [file for p in pipelines for file in (p.height_file, p.weights) if file is not None]
-    names = _shortest_names(files)
+    files: list[Path | None] = []
+    for p in pipelines:
+        files += [p.height_file, p.weights]
+    names = _shortest_names([file for file in files if file is not None])
     return [
         replace(p, height_name=names.get(p.height_file, ""), weights_name=names.get(p.weights, ""))
         for p in pipelines
@@ -217,7 +240,7 @@ def compose_pipelines(
     all mistakes.
     """
     own = _own_laser(recipe, changes, folder)
-    found: list[PipelineRecipes] = []
+    composed: list[PipelineRecipes] = []
     wrong: dict[str, None] = {}
     for pipeline in pipelines:
         try:
@@ -225,7 +248,7 @@ def compose_pipelines(
             recipe_of = cache(partial(_with_laser, recipe, [*changes, *words], own, folder))
             for case in (NONE, next(iter(CASES))):
                 _check(recipe_of(case), pipeline)
-            found.append(PipelineRecipes(pipeline, recipe_of, words=tuple(words), fwhm=own.fwhm))
+            composed.append(PipelineRecipes(pipeline, recipe_of, words=tuple(words), fwhm=own.fwhm))
         except RecipeError as error:
             wrong |= dict.fromkeys(
                 f"{pipeline.name}: {one_line(problem)}" for problem in error.diagnostics
@@ -234,7 +257,7 @@ def compose_pipelines(
             wrong[f"{pipeline.name}: {error}"] = None
     if wrong:
         raise EvaluationRefused("\n".join(wrong))
-    return found
+    return composed
 
 
 def one_line(problem: Diagnostic) -> str:

@@ -21,6 +21,14 @@ import numpy as np
 from neusee.workflows.evaluation import equal_protection
 from neusee.workflows.evaluation.confidence_intervals import METRICS, compare_with, metric_table
 from neusee.workflows.evaluation.equal_protection import protect, read_protection
+from neusee.workflows.evaluation.evaluation_page import (
+    COLUMNS,
+    draw_pictures,
+    lead,
+    rows,
+    sections,
+    summary,
+)
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointCommands
 from neusee.workflows.evaluation.evaluation_result import (
     AskedCamera,
@@ -116,15 +124,25 @@ def evaluate(
         base, asked.store, data, count, [DRAWN] if settings.lasers == "drawn" else list(CASES)
     )
     refuse_directions(bare[0], shown)
-    each, references = _equalled(asked, bare, reference, equal)
-    _report_scenes(shown, broken, strengths, each, progress)
+    composed, references = _equalled(asked, bare, reference, equal)
+    _report_scenes(shown, broken, strengths, composed, progress)
     bench = EvaluationPoints(asked.store, small, device)
-    found = measure(asked, bench, each, shown, strengths)
-    waves = tuple(wavelengths(bare[0], found.scenes))
+    measured = measure(asked, bench, composed, shown, strengths)
+    waves = tuple(wavelengths(bare[0], measured.scenes))
     result = _result(
-        base, strengths, small, references, found, [p.pipeline for p in each], equal, broken, waves
+        base,
+        strengths,
+        small,
+        references,
+        measured,
+        [p.pipeline for p in composed],
+        equal,
+        broken,
+        waves,
     )
-    commands = PointCommands(recipe, changes, place, bench).commands(each, found.scenes, strengths)
+    commands = PointCommands(recipe, changes, place, bench).commands(
+        composed, measured.scenes, strengths
+    )
     result = replace(result, commands=commands)
     document = study_run.document(_document(result, bench))
     return study_run.write(runs, digest(document["summary"]), document, _report(result))
@@ -183,22 +201,36 @@ def _result(
     strengths: tuple[float, ...],
     small: int,
     references: dict[str, str],
-    found: Measured,
+    measured: Measured,
     pipelines: Sequence[Pipeline],
     equal: EqualProtection | None,
     broken: Sequence[tuple[Path, str]],
     waves: Sequence[float | None],
 ) -> EvaluationResult:
     """Return the result of an evaluation with its statistics over scenes."""
-    owners, lost = photographs(found.scenes), [*broken, *found.broken]
-    tables = {name: metric_table(own, strengths, owners) for name, own in found.points.items()}
-    least = min(small, *(base.steps["truth"].params["shape"])) if "truth" in base.steps else small
-    more = {
+    owners = photographs(measured.scenes)
+    tables = {name: metric_table(own, strengths, owners) for name, own in measured.points.items()}
+    if "truth" in base.steps:
+        small = min(small, min(base.steps["truth"].params["shape"]))
+    against = {
         name: compare_with(own, tables[references[name]], base.seed) for name, own in tables.items()
     }
-    rest = (found.masks, found.panels, pipelines, found.mistold, equal, waves)
     return EvaluationResult(
-        base, found.scenes, lost, strengths, least, references, found.points, tables, more, *rest
+        recipe=base,
+        scenes=measured.scenes,
+        broken=[*broken, *measured.broken],
+        strengths=strengths,
+        small=small,
+        references=references,
+        points=measured.points,
+        tables=tables,
+        against=against,
+        masks=measured.masks,
+        panels=measured.panels,
+        pipelines=pipelines,
+        mistold=measured.mistold,
+        protection=equal,
+        wavelengths=waves,
     )
 
 
@@ -224,11 +256,13 @@ def _report_scenes(
     shown: Sequence[Scene],
     broken: Sequence[tuple[Path, str]],
     strengths: Sequence[float],
-    each: Sequence[PipelineRecipes],
+    pipelines: Sequence[PipelineRecipes],
     progress: Progress,
 ) -> None:
-    names = ", ".join(pipeline.name for pipeline in each)
-    progress(f"{len(shown)} scenes, {len(strengths)} strengths, {len(each)} pipelines: {names}")
+    names = ", ".join(pipeline.name for pipeline in pipelines)
+    progress(
+        f"{len(shown)} scenes, {len(strengths)} strengths, {len(pipelines)} pipelines: {names}"
+    )
     for path, reason in broken[:5]:
         progress(f"not read: {path.name}: {reason}")
     if len(broken) > 5:
@@ -239,8 +273,6 @@ def _report_scenes(
 
 
 def _document(result: EvaluationResult, bench: EvaluationPoints) -> dict[str, Any]:
-    from neusee.workflows.evaluation.evaluation_page import summary
-
     return {
         "scenes": [[s.number, s.name, s.case, s.seed] for s in result.scenes],
         "not read": [[str(path), reason] for path, reason in result.broken],
@@ -256,14 +288,6 @@ def _document(result: EvaluationResult, bench: EvaluationPoints) -> dict[str, An
 
 
 def _report(result: EvaluationResult) -> StudyReport:
-    from neusee.workflows.evaluation.evaluation_page import (
-        COLUMNS,
-        draw_pictures,
-        lead,
-        rows,
-        sections,
-    )
-
     pictures = draw_pictures(result)
     tables: dict[str, CsvTable] = {
         "points.csv": ((*_POINT, *METRICS, "command"), _point_rows(result)),
@@ -303,30 +327,21 @@ _POINT = (
 
 def _point_rows(result: EvaluationResult) -> list[Sequence[Any]]:
     waves = ["" if metres is None else f"{metres * 1e9:.6g}" for metres in result.wavelengths]
-    return [
-        (
-            p.name,
-            p.front,
-            p.back,
-            s.number,
-            s.name,
-            s.case,
-            nm,
-            f"{k:g}",
-            *(point[m] for m in METRICS),
-            commands[k],
-        )
-        for p in result.pipelines
-        for s, at, nm, commands in zip(
+    rows: list[Sequence[Any]] = []
+    for p in result.pipelines:
+        scenes = zip(
             result.scenes, result.points[p.name], waves, result.commands[p.name], strict=True
         )
-        for k, point in at.items()
-    ]
+        for s, points, nm, commands in scenes:
+            start = (p.name, p.front, p.back, s.number, s.name, s.case, nm)
+            for k, point in points.items():
+                rows.append((*start, f"{k:g}", *(point[m] for m in METRICS), commands[k]))
+    return rows
 
 
 def _curve_rows(result: EvaluationResult) -> list[Sequence[Any]]:
-    return [
-        (name, f"{x:.6g}", *row)
-        for name, mask in result.masks.items()
-        for x, *row in zip(mask.wavelengths, mask.lsr, mask.bsr, mask.floor, strict=True)
-    ]
+    rows: list[Sequence[Any]] = []
+    for name, mask in result.masks.items():
+        columns = zip(mask.wavelengths, mask.lsr, mask.bsr, mask.floor, strict=True)
+        rows += [(name, f"{x:.6g}", *row) for x, *row in columns]
+    return rows

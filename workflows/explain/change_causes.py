@@ -40,25 +40,11 @@ def edits(root: Path, old: str, new: str) -> list[str]:
     before, after = read_parts(root, old), read_parts(root, new)
     if not before or not after:
         return []
-    names = [name for name in after if name in before and _is_module(name)]
-    inside = [text for name in names for text in _inside(name, before[name], after[name])]
-    came = [
-        f"{_file(name)} is imported now"
-        for name in after
-        if name not in before and _is_module(name)
-    ]
-    gone = [
-        f"{_file(name)} is no longer imported"
-        for name in before
-        if name not in after and _is_module(name)
-    ]
-    source = sorted(inside, key=lambda text: text.startswith("the ")) + came + gone
-    beside = [
-        text
-        for name in dict.fromkeys([*after, *before])
-        if not _is_module(name) and not name.startswith(_STATE)
-        for text in _beside(name, before.get(name, {}), after.get(name, {}))
-    ]
+    source = _edited_modules(before, after)
+    beside: list[str] = []
+    for name in dict.fromkeys([*after, *before]):
+        if not _is_module(name) and not name.startswith(_STATE):
+            beside += _beside(name, before.get(name, {}), after.get(name, {}))
     return source + beside or [
         f"a value that {_file(name.removeprefix(_STATE))} holds was changed while the program ran:"
         " a constant, a table, a default or a function"
@@ -67,8 +53,24 @@ def edits(root: Path, old: str, new: str) -> list[str]:
     ]
 
 
+def _edited_modules(
+    before: Mapping[str, dict[str, str]], after: Mapping[str, dict[str, str]]
+) -> list[str]:
+    """Return one text clause for each definition that differs, and for each module that is imported
+    now, or no longer.
+    """
+    now, then = list(filter(_is_module, after)), list(filter(_is_module, before))
+    inside: list[str] = []
+    for name in now:
+        if name in before:
+            inside += _inside(name, before[name], after[name])
+    came = [f"{_file(name)} is imported now" for name in now if name not in before]
+    removed = [f"{_file(name)} is no longer imported" for name in then if name not in after]
+    return sorted(inside, key=lambda text: text.startswith("the ")) + came + removed
+
+
 def _is_module(name: str) -> bool:
-    return all(part.isidentifier() for part in name.split(".")) and name not in _OTHER
+    return all(word.isidentifier() for word in name.split(".")) and name not in _OTHER
 
 
 def _beside(name: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
@@ -79,29 +81,29 @@ def _beside(name: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
     if not labels:
         return []
     if name == _SETTINGS:
-        values = [
-            (label, old.get(label, USUAL.get(label)), new.get(label, USUAL.get(label)))
+        return [
+            f"{label} {old.get(label, USUAL.get(label))} -> {new.get(label, USUAL.get(label))},"
+            " a setting of this process"
             for label in labels
         ]
-        return [
-            f"{label} {before} -> {after}, a setting of this process"
-            for label, before, after in values
-        ]
     if name == "Python" or name.startswith("package "):
-        before, after = old.get("version"), new.get("version")
-        if not before or not after:
-            return [f"{name} is {'used now' if after else 'no longer used'}"]
-        if before == after:
-            return [f"{name} has other files, under the same version: {after}"]
-        return [f"{before} -> {after}{', an installed package' if name != 'Python' else ''}"]
+        return [_other_version(name, old.get("version"), new.get("version"))]
     if name == "closure":
         return ["a value that the function of the node holds from the function around it changed"]
     if name == _PROGRAM:
         return ["the program itself changed, which the node imports (neusee/workflows)"]
-    what = f"declared {name}" if name.startswith("file ") else name
-    return [
-        f"{what} changed" if old and new else f"{name} is declared {'now' if new else 'no more'}"
-    ]
+    if not old or not new:
+        return [f"{name} is declared {'now' if new else 'no more'}"]
+    return [f"declared {name} changed" if name.startswith("file ") else f"{name} changed"]
+
+
+def _other_version(name: str, before: str | None, after: str | None) -> str:
+    """Return the text clause for Python or a package of another version, or with other files."""
+    if not before or not after:
+        return f"{name} is {'used now' if after else 'no longer used'}"
+    if before == after:
+        return f"{name} has other files, under the same version: {after}"
+    return f"{before} -> {after}{', an installed package' if name != 'Python' else ''}"
 
 
 def _inside(module: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
@@ -109,10 +111,10 @@ def _inside(module: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
     file = _file(module)
     differ = [label for label in new if label in old and old[label] != new[label]]
     lines = _lines(module) if differ else {}
-    at = {label: f" (line {lines[label]})" if label in lines else "" for label in differ}
+    places = {label: f" (line {lines[label]})" if label in lines else "" for label in differ}
     changed = [
         f"{'code of ' + label if label.endswith('()') else _named(label)} in {file}"
-        f" changed{at[label]}"
+        f" changed{places[label]}"
         for label in differ
     ]
     added = [f"{_named(label)} was added to {file}" for label in new if label not in old]
@@ -129,20 +131,21 @@ def _lines(module: str) -> dict[str, int]:
         body = ast.parse(path.read_bytes()).body if path else []
     except (OSError, SyntaxError):
         return {}
-    found = dict[str, int]()
+    lines = dict[str, int]()
     for item in body:
-        if isinstance(item, ast.ClassDef):
-            found[f"class {item.name}"] = item.lineno
-        elif isinstance(item, ast.FunctionDef):
-            hooks = [ast.unparse(each) for each in item.decorator_list] if item.name == "_" else []
-            found |= {f"{name}()": item.lineno for name in hooks or [item.name]}
-        elif isinstance(item, ast.Assign):
-            found |= {
-                f"constant {each.id}": item.lineno
-                for each in item.targets
-                if isinstance(each, ast.Name)
-            }
-    return found
+        lines |= dict.fromkeys(_labels_of(item), item.lineno)
+    return lines
+
+
+def _labels_of(item: ast.stmt) -> list[str]:
+    """Return the names of what a statement defines, as the parts of a digest name it."""
+    if isinstance(item, ast.ClassDef):
+        return [f"class {item.name}"]
+    if isinstance(item, ast.FunctionDef):
+        hooks = [ast.unparse(decorator) for decorator in item.decorator_list]
+        return [f"{name}()" for name in (hooks if item.name == "_" and hooks else [item.name])]
+    targets = item.targets if isinstance(item, ast.Assign) else []
+    return [f"constant {target.id}" for target in targets if isinstance(target, ast.Name)]
 
 
 def _named(label: str) -> str:
@@ -220,10 +223,12 @@ class Wording:
         if name not in step.param_marks:
             return None, f"default of {step.node.path}"
         mark = str(step.param_marks[name])
-        found = self._marked.get(mark, [])
+        marked = self._marked.get(mark, [])
         here = ("steps", step.name.partition("[")[0], "with", name)
-        named = [s for s in found if s.path == here] or [s for s in found if s.path[-1:] == (name,)]
-        setting = (named or found)[0] if named or len(found) == 1 else None
+        named = [s for s in marked if s.path == here] or [
+            s for s in marked if s.path[-1:] == (name,)
+        ]
+        setting = (named or marked)[0] if named or len(marked) == 1 else None
         return setting, setting.source if setting else mark
 
     @cached_property
@@ -389,24 +394,24 @@ class Comparison:
         self.about = functools.cache(store.about)
         self._edited = functools.cache(functools.partial(edits, store.root))
 
-    def roots(self, start: Pair, most: float = float("inf")) -> Roots | None:
+    def roots(self, start: Pair, limit: float = float("inf")) -> Roots | None:
         """Return the root causes of the change of a result, or None if there are more than
-        ``most`` causes.
+        ``limit`` causes.
         """
         above: dict[Pair, Pair | None] = {start: None}
-        found: dict[str, Pair] = {}
+        pairs: dict[str, Pair] = {}
         todo = [start]
         for pair in todo:  # the list grows during the loop, so that the nearest pairs come first
             texts, below = self.compare(pair)
             for text in texts:
-                found.setdefault(text, pair)
-            if len(found) > most:
+                pairs.setdefault(text, pair)
+            if len(pairs) > limit:
                 return None
             for other in below:
                 if other not in above:
                     above[other] = pair
                     todo.append(other)
-        return Roots(found, above)
+        return Roots(pairs, above)
 
     def compare(self, pair: Pair) -> Found:
         """Return the differences between two results of a step, and the pairs of their inputs
@@ -423,20 +428,20 @@ class Comparison:
         if old["node"] != new["node"]:
             where = self.wording.source("steps", label.partition("[")[0], "node")
             return [f"{old['node']} -> {new['node']}{where}"]
-        found = self.wording.params(label, old["params"], new["params"])
-        if not found and old.get("written") != new.get("written"):
-            found = ["a file of a parameter has another name, or a mapping another order"]
+        texts = self.wording.params(label, old["params"], new["params"])
+        if not texts and old.get("written") != new.get("written"):
+            texts = ["a file of a parameter has another name, or a mapping another order"]
         if old["code"] != new["code"]:
             private = [
                 f"the loaded code of {new['node']} is not that of its file any more: restart Python"
             ]
-            found += (
+            texts += (
                 private
                 if is_private(new["code"])
                 else self._edited(old["code"], new["code"])
                 or [f"the code of {new['node']} changed"]
             )
-        return found + self._stream(old.get("stream"), new.get("stream"))
+        return texts + self._stream(old.get("stream"), new.get("stream"))
 
     def origin(self, key: Key) -> Origin | None:
         """Return the parts of a cache key, from the recipe or from the store, or None if the key
@@ -465,8 +470,8 @@ class Comparison:
             self._labels(pair, new), new["inputs"], old["inputs"], strict=True
         ):
             if after != before:
-                more, behind = self._input(path, labels, _listed(after), _listed(before))
-                texts, pairs = texts + more, pairs + behind
+                input_texts, behind = self._input(path, labels, _listed(after), _listed(before))
+                texts, pairs = texts + input_texts, pairs + behind
         return texts, pairs
 
     def _labels(self, pair: Pair, origin: Origin) -> list[tuple[tuple[str, ...], list[str]]]:
@@ -495,10 +500,7 @@ class Comparison:
         then = dict(zip([self.step(key) or key for key in old], old, strict=True))
         now = dict(zip(labels, new, strict=True))
         if len(old) == len(new) and (len(then) < len(old) or not then.keys() & now.keys()):
-            found = [self._source(path, *row) for row in zip(labels, new, old, strict=True)]
-            return [t for texts, _ in found for t in texts], [
-                p for _, pairs in found for p in pairs
-            ]
+            return self._one_by_one(path, labels, new, old)
         texts = self._joined(
             path, [n for n in now if n not in then], [n for n in then if n not in now]
         )
@@ -506,6 +508,17 @@ class Comparison:
             Pair(name, key, then[name]) for name, key in now.items() if then.get(name, key) != key
         ]
         return texts or ([] if pairs else ["the order of its sources changed"]), pairs
+
+    def _one_by_one(
+        self, path: tuple[str, ...], labels: list[str], new: list[Key], old: list[Key]
+    ) -> Found:
+        """Return the differences of steps whose order tells which was which."""
+        texts, pairs = list[str](), list[Pair]()
+        for label, key, earlier in zip(labels, new, old, strict=True):
+            of_source = self._source(path, label, key, earlier)
+            texts += of_source[0]
+            pairs += of_source[1]
+        return texts, pairs
 
     def _source(self, path: tuple[str, ...], label: str, new: Key, old: Key) -> Found:
         """Return how one source of an input differs: a step has changed, or was exchanged, added
@@ -543,8 +556,8 @@ class Comparison:
             else texts
         )
 
-    def _between(self, key: Key, wanted: tuple[str | None, ...]) -> tuple[list[str], Key | None]:
-        """Go upstream along first inputs to a step in ``wanted``; return the passed steps and
+    def _between(self, key: Key, steps: tuple[str | None, ...]) -> tuple[list[str], Key | None]:
+        """Go upstream along first inputs to a step in ``steps``; return the passed steps and
         the key found.
         """
         passed: list[str] = []
@@ -554,7 +567,7 @@ class Comparison:
                 break
             passed.append(self.step(key) or "a step")
             key = first
-            if self.step(key) in wanted:
+            if self.step(key) in steps:
                 return passed, key
         return [], None
 
@@ -594,8 +607,8 @@ class Comparison:
 
 def _few(names: list[str]) -> str:
     """Return the first names of a list as text, such as ``a, b and 4 more``."""
-    rest = len(names) - _FEW
-    return ", ".join(names) if rest <= 0 else f"{', '.join(names[:_FEW])} and {rest} more"
+    hidden = len(names) - _FEW
+    return ", ".join(names) if hidden <= 0 else f"{', '.join(names[:_FEW])} and {hidden} more"
 
 
 def _listed(value: Any) -> list[Any]:

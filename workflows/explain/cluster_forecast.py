@@ -121,13 +121,13 @@ def _guesses(estimates: Mapping[str, Estimate]) -> list[str]:
     names = [name for name, cost in estimates.items() if not cost.known]
     if not names:
         return []
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ["", f"guesses, never measured: {', '.join(names[:_SHOWN])}{more}"]
+    remainder = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ["", f"guesses, never measured: {', '.join(names[:_SHOWN])}{remainder}"]
 
 
 def _time(seconds: float) -> str:
     return f"{seconds:.3g} s" if seconds >= 1 or seconds == 0 else f"{seconds * 1e3:.3g} ms"
 
 
-def _count(number: int, one: str, many: str = "") -> str:
-    return f"{number} {one if number == 1 else many or one + 's'}"
+def _count(number: int, singular: str, many: str = "") -> str:
+    return f"{number} {singular if number == 1 else many or singular + 's'}"

@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
@@ -72,10 +73,10 @@ def _row(name: str, plan: Plan, store: Store) -> Row:
     state = (
         "stored" if store.has(plan.keys[name]) else "run" if name in plan.awake else "not needed"
     )
-    known = (
+    measured = (
         {"seconds": _ranged(about["seconds"], Range()), "bytes": about["bytes"]} if about else {}
     )
-    return row | {"state": state, **known}
+    return row | {"state": state, **measured}
 
 
 def _costs(cost: Estimate, where: str) -> Row:
@@ -83,8 +84,8 @@ def _costs(cost: Estimate, where: str) -> Row:
     memory, time = cost.spread
     peak = _ranged(cost.peak, memory)
     peak["least"] = max(peak["least"], cost.bytes)
-    found = {"seconds": _ranged(seconds, time), "bytes": cost.bytes, "memory": peak}
-    return found | {"guess": not cost.known, "bytes_guessed": not cost.sized}
+    fields = {"seconds": _ranged(seconds, time), "bytes": cost.bytes, "memory": peak}
+    return fields | {"guess": not cost.known, "bytes_guessed": not cost.sized}
 
 
 def _ranged(expected: float, around: Range) -> dict[str, float]:
@@ -140,8 +141,8 @@ def memory_text(cost: Mapping[str, float]) -> str:
 
 def _between(cost: Mapping[str, float], unit: float) -> str:
     """Return the range of a cost as text, or an empty text for a cost that is known exactly."""
-    least, most = (_figures(cost[end] / unit) for end in ("least", "most"))
-    return f" ({least}-{most})" if least != most else ""
+    low, high = (_figures(cost[end] / unit) for end in ("least", "most"))
+    return f" ({low}-{high})" if low != high else ""
 
 
 def _figures(value: float) -> str:
@@ -173,8 +174,9 @@ def shown_steps(recipe: Recipe) -> list[str]:
     """Return the steps whose results the pictures and data files of a run show, as far as the
     recipe has them.
     """
-    groups = [recipe.outputs, *(group for job in _jobs(recipe) for group in job)]
-    return list(dict.fromkeys(name for group in groups for name in group if name in recipe.steps))
+    groups = [recipe.outputs, *chain.from_iterable(_jobs(recipe))]
+    names = dict.fromkeys(chain.from_iterable(groups))
+    return [name for name in names if name in recipe.steps]
 
 
 def held_beside(recipe: Recipe, costs: Costs, limit: float) -> float:
@@ -185,10 +187,12 @@ def held_beside(recipe: Recipe, costs: Costs, limit: float) -> float:
     files. ``limit`` is the memory (bytes) that the process may use; with 0 no file is made beside
     the run.
     """
-    large, room, most = min(LARGE, limit / 32), min(ROOM, limit / 16), limit / 16
+    large, room, largest_shown = min(LARGE, limit / 32), min(ROOM, limit / 16), limit / 16
     sizes = [costs.size_of(name) for name in shown_steps(recipe) if name not in wanted(recipe)]
     small = sum(size for size in sizes if size <= large)
-    return min(small, room) + max((size for size in sizes if large < size <= most), default=0.0)
+    return min(small, room) + max(
+        (size for size in sizes if large < size <= largest_shown), default=0.0
+    )
 
 
 def report_peak(
@@ -219,15 +223,17 @@ def shown_at_once(recipe: Recipe, costs: Costs) -> float:
     The outputs of the recipe stay in memory. Another result is there from the first picture or file
     that shows it to the last, as `workflows.report.shown_values` holds it.
     """
-    most = 0.0
+    largest = 0.0
     for groups in _jobs(recipe):
-        uses, there = Counter(name for group in groups for name in group), set(recipe.outputs)
+        uses, in_memory = Counter(chain.from_iterable(groups)), set(recipe.outputs)
         for group in groups:
-            there.update(group)
-            most = max(most, sum(costs.size_of(name) for name in there if name in recipe.steps))
+            in_memory.update(group)
+            largest = max(
+                largest, sum(costs.size_of(name) for name in in_memory if name in recipe.steps)
+            )
             uses.subtract(group)
-            there = {name for name in there if uses[name] > 0 or name in recipe.outputs}
-    return most
+            in_memory = {name for name in in_memory if uses[name] > 0 or name in recipe.outputs}
+    return largest
 
 
 def _jobs(recipe: Recipe) -> tuple[Sequence[Sequence[str]], ...]:
@@ -299,14 +305,14 @@ def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane], beside: flo
     expected = costs.in_turn(((w.step.name, w.step, abouts.get(w.key)) for w in works), kinds)
     empty = Plan(recipe, order, keys, left_out, awake, loaded, expected, {}, None)
     try:
-        found = prepare(works, costs, abouts, lanes, [keys[name] for name in wanted(recipe)])
+        prepared = prepare(works, costs, abouts, lanes, [keys[name] for name in wanted(recipe)])
     except TooLarge as error:
         return replace(empty, refused=str(error))
-    where = {w.step.name: w.lane for w in found.works}
-    running = running_peak(found.schedule, lanes) + (
+    where = {w.step.name: w.lane for w in prepared.works}
+    running = running_peak(prepared.schedule, lanes) + (
         held_beside(recipe, costs, beside) if works else 0.0
     )
-    plan = replace(empty, lanes=where, schedule=found.schedule, running=running)
+    plan = replace(empty, lanes=where, schedule=prepared.schedule, running=running)
     return _with_report(plan, store, costs, lanes, code)
 
 
@@ -322,9 +328,9 @@ def _with_report(
     keys = resolve(
         plan.recipe, order, store, ",".join(lane.device for lane in lanes.values()), code
     ).keys
-    there = {plan.keys[name] for name in plan.order}
+    of_run = {plan.keys[name] for name in plan.order}
     makers: dict[Key, str] = {}
-    for name in _awake(plan.recipe, keys, store, shown, there)[0]:
+    for name in _awake(plan.recipe, keys, store, shown, of_run)[0]:
         makers.setdefault(keys[name], name)
     devices = [lane.device for lane in lanes.values()]
     works = [
@@ -421,7 +427,7 @@ def _sums(plan: Plan, lanes: Mapping[str, Lane], totals: Mapping[str, Any]) -> l
     may be left out.
     """
     lines = []
-    if unsure := [name for name, known in plan.left_out.items() if known is None]:
+    if unsure := [name for name, decision in plan.left_out.items() if decision is None]:
         lines += _wrapped(
             f"left out or not, depending on the values of the inputs: {', '.join(unsure)}"
         )
@@ -475,22 +481,22 @@ def _awake(
     keys: Mapping[str, Key],
     store: Store,
     targets: Iterable[str],
-    there: Container[Key] = (),
+    in_memory: Container[Key] = (),
 ) -> tuple[set[str], dict[str, int]]:
     """Return the steps that a run must compute, and the size (bytes) of each stored result that the
     run must read.
 
-    Results with the keys ``there`` are known and need no step.
+    Results with the keys ``in_memory`` are known and need no step.
     """
-    found, loaded, todo = set[str](), dict[str, int](), [*targets]
+    awake, loaded, todo = set[str](), dict[str, int](), [*targets]
     while todo:
         name = todo.pop()
-        if name in found or name in loaded or keys[name] in there:
+        if name in awake or name in loaded or keys[name] in in_memory:
             continue
         if store.has(keys[name]):
             about: dict[str, Any] = store.about(keys[name]) or {}
             loaded[name] = about.get("bytes", 0)
         else:
-            found.add(name)
+            awake.add(name)
             todo += recipe.steps[name].sources
-    return found, loaded
+    return awake, loaded

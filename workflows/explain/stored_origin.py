@@ -24,17 +24,17 @@ def why_key_lines(store: Store, prefix: str) -> list[str]:
 
     Raises `LookupError` if no key or more than one key begins with ``prefix``.
     """
-    found = sorted(
+    keys = sorted(
         dict.fromkeys(row["key"] for row in rows_of(store) if row["key"].startswith(prefix))
     )
-    if len(found) != 1:
-        some = f"; there are {', '.join(key[:12] for key in found[:5])}" if found else ""
+    if len(keys) != 1:
+        some = f"; there are {', '.join(key[:12] for key in keys[:5])}" if keys else ""
         raise LookupError(
-            f"{len(found) or 'no'} results have a key that begins with {prefix!r}{some}"
+            f"{len(keys) or 'no'} results have a key that begins with {prefix!r}{some}"
         )
-    key, about = found[0], store.about(found[0])
+    key, about = keys[0], store.about(keys[0])
     if about is None:
-        raise LookupError(f"the result {found[0]} is no longer in the store")
+        raise LookupError(f"the result {keys[0]} is no longer in the store")
     comparison = Comparison(store)
     head = f"{about['step']} of {about.get('recipe') or 'a recipe'}: {state_of(about)}, key {key}"
     return [head, *_made_of(comparison, key), *because(comparison, about["step"], key, about)]
@@ -58,14 +58,14 @@ def because(
     rows = rows_of(comparison.store, label) or rows_of(comparison.store, maker or label)
     keys = keys_in(rows)
     earlier = keys[: keys.index(key)] if key in keys else keys
-    found = _nearest(comparison, label, key, earlier)
-    if found is None:
+    nearest = _nearest(comparison, label, key, earlier)
+    if nearest is None:
         yield (
             f"  no earlier result to compare with: {'the first' if key in keys else 'no'} result of"
             " this step"
         )
         return
-    old, roots = found
+    old, roots = nearest
     for text in list(roots.found)[:_SHOWN]:
         yield f"  {_chain(roots.chain(text))}: {text}"
     if len(roots.found) > _SHOWN:
@@ -88,8 +88,8 @@ def _nearest(
     for old in earlier[: -_CANDIDATES - 1 : -1]:
         if comparison.origin(old) is None:
             continue
-        most = len(best[1].found) - 1 if best else float("inf")
-        roots = comparison.roots(Pair(label, key, old), most)
+        limit = len(best[1].found) - 1 if best else float("inf")
+        roots = comparison.roots(Pair(label, key, old), limit)
         best = (old, roots) if roots is not None else best
         if best and (len(best[1].found) <= 1 or len(comparison.seen) > _PAIRS):
             break
@@ -106,8 +106,8 @@ def _made_of(comparison: Comparison, key: Key) -> Iterator[str]:
     yield f"  node    {origin['node']}, code {origin['code'][:8]}"
     for name, value in origin["params"].items():
         yield f"  with    {name} = {spoken(value)}"
-    for given in origin["inputs"]:
-        for source in [given] if isinstance(given, str) else given or ():
+    for inputs in origin["inputs"]:
+        for source in [inputs] if isinstance(inputs, str) else inputs or ():
             yield f"  from    {comparison.step(source) or 'an unknown step'}, {source[:8]}"
     if stream := origin.get("stream"):
         yield f"  noise   seed {stream[0]}, of {stream[1]}, on {stream[2]}"

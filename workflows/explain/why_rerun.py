@@ -28,16 +28,15 @@ def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> l
     """
     names = [name for name in recipe.steps if step in (name, name.partition("[")[0])]
     if not names:
-        known = {*recipe.steps, *(name.partition("[")[0] for name in recipe.steps)}
-        raise ValueError(f"there is no step {step!r}; {nearest(step, known)}")
+        names_of_steps = {*recipe.steps, *(name.partition("[")[0] for name in recipe.steps)}
+        raise ValueError(f"there is no step {step!r}; {nearest(step, names_of_steps)}")
     recipe = with_substitutions(recipe, [*recipe.outputs, *names])
     resolved = resolve(recipe, needed(recipe, [*recipe.outputs, *names]), store, device)
     comparison = Comparison(store, recipe, resolved)
-    return [
-        line
-        for name in names
-        for line in _step_lines(comparison, recipe, recipe.steps[name], resolved)
-    ]
+    lines: list[str] = []
+    for name in names:
+        lines += _step_lines(comparison, recipe, recipe.steps[name], resolved)
+    return lines
 
 
 def explained(
@@ -91,8 +90,8 @@ def _at_once(comparison: Comparison, step: Step, key: Key, earlier: list[Key]) -
     best: list[str] = []
     for old in earlier[: -_AT_ONCE - 1 : -1]:
         before, now = comparison.origin(old), comparison.origin(key)
-        found = _direct(comparison, step, before, now) if before and now else []
-        best = min(filter(None, (best, found)), key=len, default=[])
+        differences = _direct(comparison, step, before, now) if before and now else []
+        best = min(filter(None, (best, differences)), key=len, default=[])
         if len(best) == 1:
             break
     return best[0] if best else ""

@@ -60,12 +60,12 @@ def descriptor_of(path: Path) -> Path:
     """
     if not path.is_dir():
         return path
-    found = descriptors_in(path)
-    if len(found) == 1:
-        return found[0]
+    descriptors = descriptors_in(path)
+    if len(descriptors) == 1:
+        return descriptors[0]
     has = (
-        f"has {len(found)} descriptors"
-        if found
+        f"has {len(descriptors)} descriptors"
+        if descriptors
         else "has no descriptor, a .txt with levels in lines b and d"
     )
     raise ValueError(f"{path} {has}: name one file")
@@ -174,19 +174,19 @@ def recipe_of_folder(
     name = "".join(c if c.isalnum() else "_" for c in folder.absolute().name) or "frames"
     if descriptors_in(folder):
         return _described(descriptor_of(folder), name, store, changes)
-    found, scale = find_levels(folder, progress), 1.0
-    needs = _corrections(found, progress, every_pixel)
-    fit = _fit(_loaded(name, _read(folder, found, scale, needs) + "outputs: [measured]\n"), store)
-    if found.light != "photons":
+    levels, scale = find_levels(folder, progress), 1.0
+    needs = _corrections(levels, progress, every_pixel)
+    fit = _fit(_loaded(name, _read(folder, levels, scale, needs) + "outputs: [measured]\n"), store)
+    if levels.light != "photons":
         scale = float(fit.efficiency) / _EFFICIENCY
-    times = len({level.exposure for level in found.levels if level.dark})
-    rest = _rest(fit, float(fit.efficiency) / scale, times, found.light != "photons")
-    return _loaded(name, _read(folder, found, scale, needs) + rest, changes)
+    times = len({level.exposure for level in levels.levels if level.dark})
+    model_text = _rest(fit, float(fit.efficiency) / scale, times, levels.light != "photons")
+    return _loaded(name, _read(folder, levels, scale, needs) + model_text, changes)
 
 
-def _corrections(found: FolderLevels, progress: Progress, every_pixel: bool) -> _Corrections:
+def _corrections(levels: FolderLevels, progress: Progress, every_pixel: bool) -> _Corrections:
     """Return which numbers are divided and which pixels are left out, and tell both."""
-    divisor = _shift(found)
+    divisor = _shift(levels)
     if divisor > 1:
         progress(
             f"all numbers are multiples of {divisor}: shifted to the left in the files, and divided"
@@ -194,7 +194,9 @@ def _corrections(found: FolderLevels, progress: Progress, every_pixel: bool) -> 
         )
     if every_pixel:
         return _Corrections(divisor, ())
-    darkest = max((level for level in found.levels if level.dark), key=lambda level: level.exposure)
+    darkest = max(
+        (level for level in levels.levels if level.dark), key=lambda level: level.exposure
+    )
     mask = hot_pixels(files=darkest.files, divisor=divisor)
     count = int(mask.sum())
     if not count:
@@ -207,12 +209,12 @@ def _corrections(found: FolderLevels, progress: Progress, every_pixel: bool) -> 
     return _Corrections(divisor, darkest.files)
 
 
-def _shift(found: FolderLevels) -> int:
+def _shift(levels: FolderLevels) -> int:
     """Return the divisor of numbers of a converter of 8 to 14 bits that are shifted to the left
     in 16 bits, else 1.
     """
     divisor = 0
-    for level in found.levels:
+    for level in levels.levels:
         divisor = int(np.gcd(divisor, frame_divisor(level.files[0])))
         if divisor == 1:
             return 1
@@ -244,17 +246,20 @@ def _loaded(name: str, text: str, changes: Sequence[str] = ()) -> Recipe:
         path.write_text(text, encoding="utf-8")
         recipe = load(path, changes)
     settings = recipe.config.settings.items()
-    gone = f"{path.parent.name}/"  # the sources of values name no folder that is gone
-    named = {key: replace(each, source=each.source.rpartition(gone)[-1]) for key, each in settings}
+    temporary = f"{path.parent.name}/"  # the sources of values name no folder that is gone
+    named = {
+        key: replace(setting, source=setting.source.rpartition(temporary)[-1])
+        for key, setting in settings
+    }
     return replace(recipe, config=Config(named))
 
 
-def _read(folder: Path, found: FolderLevels, scale: float, needs: _Corrections) -> str:
-    levels = "\n".join(_level(level, scale) for level in found.levels)
+def _read(folder: Path, folder_levels: FolderLevels, scale: float, needs: _Corrections) -> str:
+    levels = "\n".join(_level(level, scale) for level in folder_levels.levels)
     divisor = f", divisor: {needs.divisor}" if needs.divisor > 1 else ""
     return _READ.format(
         folder=" ".join(folder.name.split()) or ".",
-        source=found.source,
+        source=folder_levels.source,
         levels=levels,
         divisor=divisor,
         hot=_HOT.format(files=_listed(needs.hot), divisor=divisor) if needs.hot else "",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -133,22 +133,22 @@ def find_table(folder: Path) -> Path | None:
     """Return the only CSV file of a folder with a column ``file``, or None; raise ValueError for
     several.
     """
-    found = [path for path in sorted(folder.glob("*.csv")) if "file" in _header(path)]
-    if len(found) > 1:
+    tables = [path for path in sorted(folder.glob("*.csv")) if "file" in _header(path)]
+    if len(tables) > 1:
         raise ValueError(
-            f"{folder} has {len(found)} tables of frames, {', '.join(p.name for p in found)}:"
+            f"{folder} has {len(tables)} tables of frames, {', '.join(p.name for p in tables)}:"
             " keep one"
         )
-    return found[0] if found else None
+    return tables[0] if tables else None
 
 
 def read_table(table: Path) -> list[TableRow]:
     """Return the lines of a table of frames; raise ValueError with all mistakes, each with its
     line.
     """
-    found = list(_read(table))
-    rows = [item for item in found if isinstance(item, TableRow)]
-    if problems := [item for item in found if isinstance(item, str)]:
+    items = list(_read(table))
+    rows = [item for item in items if isinstance(item, TableRow)]
+    if problems := [item for item in items if isinstance(item, str)]:
         raise ValueError("\n".join(problems))
     if not rows:
         raise ValueError(f"{table.name} has no line below its header: write one line for each file")
@@ -165,20 +165,26 @@ def _header(table: Path) -> list[str]:
 def _read(table: Path) -> Iterator[TableRow | str]:
     lines = csv_rows(table)
     names = [cell.strip().lower() for cell in next(lines)[1]]
-    time = next((name for name in names if name in _TIMES), None)
+    time = next((name for name in names if name in _TIMES), "")
     if strange := [name for name in names if name not in (*_TIMES, "file", "photons", "light")]:
         yield f"{table.name}:1: column {strange[0]} is unknown: write {_COLUMNS}"
     for line, cells in lines:
         row = dict(zip(names, (cell.strip() for cell in cells), strict=False))
-        file = table.parent / row.get("file", "")
-        if not file.is_file():
-            yield f"{table.name}:{line}: no such file: {row.get('file') or '(empty)'}"
-            continue
         try:
-            exposure = _exposure_of_row(row.get(time or "", ""), time or "")
-            yield TableRow(line, file, exposure, _light(row, "photons"), _light(row, "light"))
+            yield _table_row(table, line, row, time)
         except ValueError as error:
             yield f"{table.name}:{line}: {error}"
+
+
+def _table_row(table: Path, line: int, row: Mapping[str, str], time: str) -> TableRow:
+    """Return a line of a table; raise ValueError for a file that is not there, and for a value
+    that is no number.
+    """
+    file = table.parent / row.get("file", "")
+    if not file.is_file():
+        raise ValueError(f"no such file: {row.get('file') or '(empty)'}")
+    exposure = _exposure_of_row(row.get(time, ""), time)
+    return TableRow(line, file, exposure, _light(row, "photons"), _light(row, "light"))
 
 
 def _exposure_of_row(text: str, column: str) -> float | None:
@@ -198,7 +204,7 @@ def _exposure_of_row(text: str, column: str) -> float | None:
     return number * (scale or 1.0)
 
 
-def _light(row: dict[str, str], column: str) -> float | None:
+def _light(row: Mapping[str, str], column: str) -> float | None:
     text = row.get(column, "")
     if not text:
         return None
@@ -224,47 +230,60 @@ _CHANCE = 6.0  #: standard errors of a mean, added to the difference
 Files = tuple[str, bool, Sequence[Path]]  #: name of a level, True for a dark one, its files
 
 
+def _means(files: Sequence[Path]) -> list[tuple[Path, float, float]]:
+    """Return file, mean and standard error of each frame of a level."""
+    means = []
+    for file in files:
+        means += [(file, mean, error) for mean, error in frame_means(file)]
+    return means
+
+
 def misplaced_frames(levels: Sequence[Files], folder: Path) -> Iterator[str]:
     """Yield a sentence for each level whose frames differ too much in their means, or one if
     darks are not dark.
     """
-    means = [
-        [(file, *found) for file in files for found in frame_means(file)] for _, _, files in levels
-    ]
-    middles = [float(np.median([mean for _, mean, _ in each])) for each in means]
-    darks = [middle for middle, (_, dark, _) in zip(middles, levels, strict=True) if dark]
-    lit = float(
-        np.median(
-            [middle for middle, (_, dark, _) in zip(middles, levels, strict=True) if not dark]
-        )
-    )
-    if lit <= max(darks):
+    means = [_means(files) for _, _, files in levels]
+    middles = [float(np.median([mean for _, mean, _ in of_level])) for of_level in means]
+    darks, lit = _of_kind(middles, levels, dark=True), _of_kind(middles, levels, dark=False)
+    half_of_lit = float(np.median(lit))
+    if half_of_lit <= max(darks):
         yield (
             f"{folder}: dark frames have means up to {max(darks):.0f} DN, and half of the lit "
             "levels no more than "
-            f"{lit:.0f} DN: cover the lens, or check which files are dark"
+            f"{half_of_lit:.0f} DN: cover the lens, or check which files are dark"
         )
         return
     black, bright = min(darks), max(middles)
-    for (_, dark, _), each, middle in zip(levels, means, middles, strict=True):
+    for (_, dark, _), of_level, middle in zip(levels, means, middles, strict=True):
         room = _OFF * (0.0 if dark else middle - black) + _FLOOR * (bright - black)
-        room += _CHANCE * max(error for _, _, error in each)
-        values = [mean for _, mean, _ in each]
-        if max(values) - min(values) > room:
-            yield _odd([(file, mean) for file, mean, _ in each], middle, room, folder)
+        room += _CHANCE * max(error for _, _, error in of_level)
+        frames = [(file, mean) for file, mean, _ in of_level]
+        if _spread(frames) > room:
+            yield _odd(frames, middle, room, folder)
 
 
-def _odd(each: Sequence[tuple[Path, float]], middle: float, room: float, folder: Path) -> str:
+def _of_kind(middles: Sequence[float], levels: Sequence[Files], dark: bool) -> list[float]:
+    """Return the middle values of the dark or of the lit levels."""
+    return [middle for middle, level in zip(middles, levels, strict=True) if level[1] == dark]
+
+
+def _spread(frames: Sequence[tuple[Path, float]]) -> float:
+    """Return the difference of the largest and the smallest mean of frames."""
+    values = [mean for _, mean in frames]
+    return max(values) - min(values)
+
+
+def _odd(frames: Sequence[tuple[Path, float]], middle: float, room: float, folder: Path) -> str:
     """Return which frame of a level does not fit the others, or both of a pair."""
-    values = [mean for _, mean in each]
+    values = [mean for _, mean in frames]
     if len(values) == 2:
-        (a, one), (b, other) = each
+        (a, first_mean), (b, second_mean) = frames
         both = (
             f"{_name(a, folder)} and {_name(b, folder)} count as one level, but have means of"
-            f" {one:.1f} and"
+            f" {first_mean:.1f} and"
         )
-        return f"{both} {other:.1f} DN: check names and table"
-    file, mean = max(each, key=lambda pair: abs(pair[1] - middle))
+        return f"{both} {second_mean:.1f} DN: check names and table"
+    file, mean = max(frames, key=lambda pair: abs(pair[1] - middle))
     return (
         f"{_name(file, folder)} has a mean of {mean:.1f} DN, but its level {middle:.1f} DN, "
         "which may differ by "
@@ -405,10 +424,10 @@ def _exposures(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
     """Yield a line for each exposure with what said it, so that a wrong one is seen before the
     work.
     """
-    told: dict[tuple[bool, float, str], list[Path]] = defaultdict(list)
+    by_source: dict[tuple[bool, float, str], list[Path]] = defaultdict(list)
     for frame in frames:
-        told[not frame.dark, frame.exposure or 0.0, frame.told].append(frame.file)
-    for (lit, seconds, text), files in sorted(told.items()):
+        by_source[not frame.dark, frame.exposure or 0.0, frame.told].append(frame.file)
+    for (lit, seconds, text), files in sorted(by_source.items()):
         kind, count = "lit" if lit else "dark", f"{len(files)} file{'s' * (len(files) != 1)}"
         yield (
             f"{kind}: exposure {_readable(seconds)}, from {text}: {count} such as"
@@ -430,16 +449,14 @@ def _left(unread: Sequence[Path], folder: Path) -> Iterator[str]:
 
 def _found(folder: Path) -> tuple[list[Frame], str, list[str]]:
     """Return the frames of a folder, what told of them, and the problems of single files."""
-    frames, problems = list[Frame](), list[str]()
     try:
         table = find_table(folder)
         rows = read_table(table) if table else []
     except ValueError as error:
         return [], "", [str(error)]
     listed = {row.file.resolve(): row for row in rows}
-    files = [row.file for row in rows] or sorted(
-        p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES
-    )
+    files = [row.file for row in rows] if rows else _frame_files(folder)
+    frames, problems = list[Frame](), list[str]()
     for file in files:
         name, row = read_name(file, folder), listed.get(file.resolve())
         try:
@@ -451,11 +468,17 @@ def _found(folder: Path) -> tuple[list[Frame], str, list[str]]:
         problems += _contradiction(frames[-1], name, row, table, folder)
         if row is None or row.exposure is None:
             problems += _doubt(frames[-1], name, files, folder)
-    return (
-        frames,
-        f"the table {table.name}" if table else "names and headers of the files",
-        problems,
-    )
+    return frames, _sources(table), problems
+
+
+def _sources(table: Path | None) -> str:
+    """Return what says light and exposure of the frames of a folder."""
+    return f"the table {table.name}" if table else "names and headers of the files"
+
+
+def _frame_files(folder: Path) -> list[Path]:
+    """Return the files of frames in a folder and the folders within, sorted."""
+    return sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
 
 
 def _frame(
@@ -465,9 +488,6 @@ def _frame(
     photons, exposure = (row.photons, row.exposure) if row else (name.photons, name.exposure)
     light = row.light if row else None
     dark = 0.0 in (photons, light, header.photons) or (name.dark and not photons and not light)
-    told = "the header"
-    if exposure is not None:
-        told = table.name if row and table else f"{name.written} of the name"
     return Frame(
         file=file,
         header=header,
@@ -476,8 +496,15 @@ def _frame(
         exposure=header.exposure if exposure is None else exposure,
         photons=header.photons if photons is None else photons,
         light=light,
-        told=told,
+        told=_source(exposure, name, table if row else None),
     )
+
+
+def _source(exposure: float | None, name: NamedFrame, table: Path | None) -> str:
+    """Return what says the exposure of a frame."""
+    if exposure is None:
+        return "the header"
+    return table.name if table else f"{name.written} of the name"
 
 
 def _contradiction(
@@ -525,16 +552,18 @@ def _some(files: Sequence[Path], folder: Path) -> str:
 def _sizes(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
     """Yield a problem where frames differ in size or in the bits of a number from most others."""
     sizes = [f"{frame.header.shape[1]} x {frame.header.shape[0]}" for frame in frames]
-    for what, has in (("pixels", sizes), ("bits", [str(frame.header.bits) for frame in frames])):
+    for quantity, has in (
+        ("pixels", sizes),
+        ("bits", [str(frame.header.bits) for frame in frames]),
+    ):
         counts = Counter(has)
         if len(counts) > 1:
             usual = counts.most_common(1)[0][0]
             odd = [frame.file for frame, text in zip(frames, has, strict=True) if text != usual]
             others = ", ".join(sorted(counts.keys() - {usual}))
             yield (
-                f"{_some(odd, folder)}: {others} {what}, but {counts[usual]} files have {usual} "
-                f"{what}: give frames "
-                "of one sensor and one setting"
+                f"{_some(odd, folder)}: {others} {quantity}, but {counts[usual]} files have {usual}"
+                f" {quantity}: give frames of one sensor and one setting"
             )
 
 
@@ -548,13 +577,18 @@ def _unknown(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
             f"{folder}: no dark frames: cover the lens, take two or more, and name them such as"
             " dark_10ms_1.png"
         )
-    for name in ("photons", "light"):
-        missing = [frame.file for frame in lit if getattr(frame, name) is None]
-        if 0 < len(missing) < len(lit):
-            yield (
-                f"{_some(missing, folder)}: no {name}, which {len(lit) - len(missing)} other lit"
-                f" files have: {_HOW}"
-            )
+    yield from _partly_known("photons", lit, folder)
+    yield from _partly_known("light", lit, folder)
+
+
+def _partly_known(name: str, lit: Sequence[Frame], folder: Path) -> Iterator[str]:
+    """Yield that some lit frames lack a light that others have, if so."""
+    missing = [frame.file for frame in lit if getattr(frame, name) is None]
+    if 0 < len(missing) < len(lit):
+        yield (
+            f"{_some(missing, folder)}: no {name}, which {len(lit) - len(missing)} other lit"
+            f" files have: {_HOW}"
+        )
 
 
 def _kind_of_light(frames: Sequence[Frame]) -> Light:
@@ -583,8 +617,8 @@ def _groups(frames: Sequence[Frame], light: Light) -> dict[_Key, list[Frame]]:
         elif light == "exposure":
             groups[False, time, time, frame.level].append(frame)
         else:
-            told = frame.photons if light == "photons" else frame.light
-            groups[False, float(told or 0.0), time, ""].append(frame)
+            amount = frame.photons if light == "photons" else frame.light
+            groups[False, float(amount or 0.0), time, ""].append(frame)
     return dict(sorted(groups.items(), key=lambda item: (not item[0][0], *item[0][1:])))
 
 

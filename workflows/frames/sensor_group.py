@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -72,7 +72,9 @@ def frames_of_sensor(recipe: Recipe, store: Store) -> SensorFrames:
 
     A level is full where its variance has fallen.
     """
-    files = [file for step in recipe.steps.values() for file in _files(step)]
+    files: list[Path] = []
+    for step in recipe.steps.values():
+        files += _files(step)
     header = frame_header(files[0])
     levels: Levels = run(recipe, store, ("measured",)).values["measured"]
     brightest = max(
@@ -122,29 +124,29 @@ def _values(
 ) -> dict[str, _Value]:
     """Return each value of a sensor that the budget has, by its name in the group."""
     moved = {name: _moved(draws[name], row) for name, row in budget.items() if name in draws}
-    found = {
+    values = {
         new: _Value(budget[name]["value"], unit, moved[name])
         for name, (new, unit) in _VALUES.items()
         if name in moved
     }
     if "dark_signal" in moved:
         electrons = moved["dark_signal"] / moved["gain"]
-        found["offset"] = _Value(
+        values["offset"] = _Value(
             budget["dark_signal"]["value"] / budget["gain"]["value"], "e-", electrons
         )
     if "dark_current" in moved:
         of = float(str(budget["dark_current"]["unit"]).removeprefix("e- in ").removesuffix(" s"))
-        one = frames.exposure / of
-        found["dark_current"] = _Value(
-            one * budget["dark_current"]["value"], "e-", one * moved["dark_current"]
+        ratio = frames.exposure / of
+        values["dark_current"] = _Value(
+            ratio * budget["dark_current"]["value"], "e-", ratio * moved["dark_current"]
         )
     if frames.full is not None:
         normal = np.random.default_rng(_STREAM).standard_normal(len(moved["gain"]))
         signal = frames.full.signal + frames.full.uncertainty * normal
-        found["full_well"] = _Value(
+        values["full_well"] = _Value(
             frames.full.signal / budget["gain"]["value"], "e-", signal / moved["gain"]
         )
-    return found
+    return values
 
 
 def _moved(draws: NDArray[np.float64], row: Mapping[str, Any]) -> NDArray[np.float64]:
@@ -157,7 +159,12 @@ def _moved(draws: NDArray[np.float64], row: Mapping[str, Any]) -> NDArray[np.flo
 
 
 def _written(values: Mapping[str, _Value], frames: SensorFrames, source: str) -> str:
-    lines = [
+    return "\n".join([*_head(frames, source), *_sensor(values, frames), *_posterior(values), ""])
+
+
+def _head(frames: SensorFrames, source: str) -> list[str]:
+    """Return the lines of what does not follow from the calibration."""
+    return [
         f"{FIRST}: {source}.",
         "# What the frames do not tell is that of the packaged sensor: check pixel_pitch.",
         "defaults: [small]",
@@ -166,16 +173,22 @@ def _written(values: Mapping[str, _Value], frames: SensorFrames, source: str) ->
         f"  exposure: {frames.exposure:.9g} s",
         f"  bits: {frames.bits}",
     ]
+
+
+def _sensor(values: Mapping[str, _Value], frames: SensorFrames) -> list[str]:
+    """Return the lines of the values, and of those that the frames do not give."""
+    lines = []
     if frames.full is None:
         lines.append("  # full_well: no frame reached saturation")
     for name, value in values.items():
         note = f"   # {_NOTES[name]}" if name in _NOTES else ""
         lines.append(f"  {name}: {_text(value.mean, value.unit)}{note}")
-    lines += [
-        f"  # {name}: no value from these frames"
-        for name in ("quantum_efficiency", "dark_current")
-        if name not in values
-    ]
+    missing = [name for name in ("quantum_efficiency", "dark_current") if name not in values]
+    return [*lines, *(f"  # {name}: no value from these frames" for name in missing)]
+
+
+def _posterior(values: Mapping[str, _Value]) -> list[str]:
+    """Return the lines of means, standard uncertainties and correlations."""
     correlation = np.atleast_2d(np.corrcoef([value.draws for value in values.values()]))
     means = ", ".join(
         f"sensor.{name}: {_text(value.mean, value.unit)}" for name, value in values.items()
@@ -183,20 +196,17 @@ def _written(values: Mapping[str, _Value], frames: SensorFrames, source: str) ->
     widths = ", ".join(
         f"sensor.{name}: {_text(float(v.draws.std(ddof=1)), v.unit)}" for name, v in values.items()
     )
-    rows = ", ".join(
-        "[" + ", ".join(f"{x:.6f}" for x in row) + "]" for row in _symmetric(correlation)
-    )
-    return "\n".join(
-        [
-            *lines,
-            "posterior:   # standard uncertainties, which `neusee study uncertainty` draws "
-            "together",
-            f"  mean: {{{means}}}",
-            f"  sd: {{{widths}}}",
-            f"  correlation: [{rows}]",
-            "",
-        ]
-    )
+    rows = ", ".join(map(_numbers, _symmetric(correlation)))
+    return [
+        "posterior:   # standard uncertainties, which `neusee study uncertainty` draws together",
+        f"  mean: {{{means}}}",
+        f"  sd: {{{widths}}}",
+        f"  correlation: [{rows}]",
+    ]
+
+
+def _numbers(row: Iterable[float]) -> str:
+    return "[" + ", ".join(f"{x:.6f}" for x in row) + "]"
 
 
 def _symmetric(correlation: NDArray[np.float64]) -> NDArray[np.float64]:

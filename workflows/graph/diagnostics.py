@@ -18,7 +18,7 @@ CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 
 def visible(text: str) -> str:
     """Return a text with escapes such as ``\\x1b`` in place of characters that a terminal obeys."""
-    return CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
+    return CONTROL.sub(lambda match: ascii(match[0])[1:-1], text)
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -65,9 +65,11 @@ def _of_values_once(diagnostics: set[Diagnostic]) -> Iterator[Diagnostic]:
     beside `a = -1 m`.
     """
     of_steps = {
-        (each.mark, each.path.partition(" = ")[0]) for each in diagnostics if " = " in each.path
+        (mistake.mark, mistake.path.partition(" = ")[0])
+        for mistake in diagnostics
+        if " = " in mistake.path
     }
-    yield from (each for each in diagnostics if (each.mark, each.path) not in of_steps)
+    yield from (mistake for mistake in diagnostics if (mistake.mark, mistake.path) not in of_steps)
 
 
 def _table(diagnostics: tuple[Diagnostic, ...]) -> str:
@@ -81,13 +83,15 @@ def _lists_once(messages: Iterable[str]) -> Iterator[str]:
     """Yield messages, with a list of known names in the first message alone if many messages end
     with this list.
     """
-    known = set[str]()
+    told_names = set[str]()
     for message in messages:
-        before, found, names = message.partition(_KNOWN)
+        before, separator, names = message.partition(_KNOWN)
         yield (
-            f"{before}see the names above" if found and "," in names and names in known else message
+            f"{before}see the names above"
+            if separator and "," in names and names in told_names
+            else message
         )
-        known.add(names)
+        told_names.add(names)
 
 
 def nearest(name: str, among: Iterable[str]) -> str:

@@ -73,9 +73,9 @@ def changes(base: Config, other: Config, apart: str) -> list[str]:
         }
         for config in (other, base)
     )
-    gone = [f"~{path}" for path in was if path not in own]
+    removed = [f"~{path}" for path in was if path not in own]
     put = [f"{path}={flow(x)}" if path in was else f"+{path}={flow(x)}" for path, x in own.items()]
-    return gone + [
+    return removed + [
         text
         for text, (path, x) in zip(put, own.items(), strict=True)
         if path not in was or was[path] != x

@@ -230,13 +230,13 @@ def copies_of(recipe: Recipe, names: Iterable[str]) -> set[str]:
 
     Raises `ValueError` for a name of no step.
     """
-    found = set[str]()
+    copies = set[str]()
     for name in names:
         own = {step for step in recipe.steps if name in (step, step.partition("[")[0])}
         if not own:
             raise ValueError(unknown_step(name, recipe.steps))
-        found |= own
-    return found
+        copies |= own
+    return copies
 
 
 def needed(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
@@ -276,11 +276,11 @@ def dependents(
     ``order`` lists the steps to consider, in topological order; by default, all steps of the
     recipe.
     """
-    found = set(roots)
+    names = set(roots)
     for name in needed(recipe, recipe.steps) if order is None else order:
-        if not found.isdisjoint(recipe.steps[name].sources):
-            found.add(name)
-    return found
+        if not names.isdisjoint(recipe.steps[name].sources):
+            names.add(name)
+    return names
 
 
 def in_order(sources: Mapping[str, Iterable[str]], names: Iterable[str]) -> list[str]:
@@ -290,8 +290,8 @@ def in_order(sources: Mapping[str, Iterable[str]], names: Iterable[str]) -> list
     order: dict[str, None] = {}
     stack = [(name, iter(sources[name])) for name in reversed(list(names))]
     while stack:
-        name, rest = stack[-1]
-        below = next((s for s in rest if s not in order), None)
+        name, sources_left = stack[-1]
+        below = next((s for s in sources_left if s not in order), None)
         if below is not None:
             stack.append((below, iter(sources[below])))
             continue
@@ -307,8 +307,8 @@ def unknown_step(name: str, steps: Collection[str]) -> str:
     copies = sorted(step for step in steps if step.startswith(f"{name}["))
     if not copies:
         return f"no step {name!r}; {nearest(name, steps)}"
-    more = f" and {len(copies) - _COPIES} more" if len(copies) > _COPIES else ""
-    return f"no output {name}: this recipe has {', '.join(copies[:_COPIES])}{more}"
+    remainder = f" and {len(copies) - _COPIES} more" if len(copies) > _COPIES else ""
+    return f"no output {name}: this recipe has {', '.join(copies[:_COPIES])}{remainder}"
 
 
 # --- told copies ----------------------------------------------------------------------------------

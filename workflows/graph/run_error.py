@@ -27,7 +27,7 @@ class RunError(RuntimeError):
 
     def __reduce__(self) -> tuple[Any, ...]:
         plain = type(self.cause).__module__ == "builtins" and all(
-            isinstance(each, str) for each in self.cause.args
+            isinstance(argument, str) for argument in self.cause.args
         )
         return _unpickled, (self.step, str(self), self.cause if plain else repr(self.cause))
 

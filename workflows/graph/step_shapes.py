@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,11 +27,11 @@ def forms_of(recipe: Recipe, order: Iterable[str]) -> dict[str, Form]:
     """Return the form of the result of each step in ``order``, which lists each step after its
     inputs.
     """
-    found: dict[str, Form] = {}
+    forms: dict[str, Form] = {}
     for name in order:
         step = recipe.steps[name]
-        found[name] = form_of(step.node, inputs_of(step, found), step.params)
-    return found
+        forms[name] = form_of(step.node, inputs_of(step, forms), step.params)
+    return forms
 
 
 def inputs_of(step: Step, forms: Mapping[str, Form]) -> list[Form]:
@@ -63,11 +64,11 @@ def form_of(node: Node, inputs: Sequence[Form], params: Mapping[str, Any]) -> Fo
     return None
 
 
-def is_same(one: Form, other: Form) -> bool:
+def is_same(form: Form, other: Form) -> bool:
     """Return True if two forms of an input are the same object, or lists of the same objects."""
-    if type(one) is list and type(other) is list:
-        return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
-    return one is other
+    if type(form) is list and type(other) is list:
+        return len(form) == len(other) and all(a is b for a, b in zip(form, other, strict=True))
+    return form is other
 
 
 def has_path(value: Any) -> bool:
@@ -84,10 +85,10 @@ def complete(node: Node, inputs: Sequence[Form]) -> bool:
     list.
     """
     named = zip(inputs, node.inputs, strict=False)
+    if any(x is None and name not in node.optional for x, name in named):
+        return False
     lists = (x for x in inputs if type(x) is list)
-    return all(x is not None or name in node.optional for x, name in named) and not any(
-        item is None for x in lists for item in x
-    )
+    return not any(item is None for item in chain.from_iterable(lists))
 
 
 def without_values(value: Any) -> Form:
@@ -124,17 +125,19 @@ def tensors_of(form: Form) -> list[Tensor]:
     )
 
 
-def alike(one: Form, other: Form) -> bool:
+def alike(form: Form, other: Form) -> bool:
     """Return True if two forms tell the same: equal shapes and types, and equal values as far as
     these are known.
     """
     from torch import Tensor, equal
 
-    if type(one) is not type(other):
+    if type(form) is not type(other):
         return False
-    if isinstance(one, Tensor):
-        same = one.shape == other.shape and one.dtype == other.dtype and one.device == other.device
-        return same and (one.device.type == "meta" or equal(one, other))
-    if isinstance(one, list | tuple):
-        return len(one) == len(other) and all(map(alike, one, other))
-    return one is None or (isinstance(one, str | int | float) and one == other)
+    if isinstance(form, Tensor):
+        same = (
+            form.shape == other.shape and form.dtype == other.dtype and form.device == other.device
+        )
+        return same and (form.device.type == "meta" or equal(form, other))
+    if isinstance(form, list | tuple):
+        return len(form) == len(other) and all(map(alike, form, other))
+    return form is None or (isinstance(form, str | int | float) and form == other)

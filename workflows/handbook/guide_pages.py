@@ -53,8 +53,8 @@ def read_pages() -> dict[str, str]:
 
 def title_of(text: str) -> str:
     """Return the first heading of a page."""
-    found = re.search(r"^# (.+)$", text, re.MULTILINE)
-    return found[1] if found else "Page without a title"
+    heading = re.search(r"^# (.+)$", text, re.MULTILINE)
+    return heading[1] if heading else "Page without a title"
 
 
 def write_files(pages: Mapping[str, str], folder: Path) -> None:
@@ -84,10 +84,10 @@ def with_pictures(text: str, paths: Mapping[Picture, str]) -> str:
     """Return the text of a page in which pictures take the place of their marks; other marks
     stay invisible.
     """
-    wanted = pictures_of(text)
+    pictures = pictures_of(text)
 
     def figure(mark: re.Match[str]) -> str:
-        picture = next(wanted)
+        picture = next(pictures)
         if picture not in paths:
             return mark[0]
         shown = (
@@ -138,11 +138,11 @@ def draw_pictures(
         f"commands that draw pictures: {len(by_words)}; what the cache holds is not computed again"
     )
     names: dict[Picture, str] = {}
-    for number, (words, wanted) in enumerate(by_words.items(), 1):
+    for number, (words, pictures_of_words) in enumerate(by_words.items(), 1):
         try:
             results = _run(words, work, work / f"results_{number}")
             _name_latest(results, work)
-            names |= {picture: _take(picture, results, target) for picture in wanted}
+            names |= {picture: _take(picture, results, target) for picture in pictures_of_words}
         except NoPicture as error:
             if strict:
                 raise
@@ -183,16 +183,16 @@ def _name_latest(results: Path, work: Path) -> None:
 
 def _take(picture: Picture, results: Path, target: Path) -> str:
     """Copy a picture out of a folder of results and return its new name."""
-    found = sorted(results.glob(picture.file))
-    if not found:
-        there = (
+    matching = sorted(results.glob(picture.file))
+    if not matching:
+        written = (
             ", ".join(sorted(str(path.relative_to(results)) for path in results.rglob("*.png")))
             or "no picture"
         )
         raise NoPicture(
-            f"neusee {' '.join(picture.words)} wrote no {picture.file}; it wrote {there}"
+            f"neusee {' '.join(picture.words)} wrote no {picture.file}; it wrote {written}"
         )
     digest = hashlib.sha256(" ".join([*picture.words, picture.file]).encode()).hexdigest()[:12]
-    name = f"{digest}{found[0].suffix}"
-    shutil.copyfile(found[0], target / name)
+    name = f"{digest}{matching[0].suffix}"
+    shutil.copyfile(matching[0], target / name)
     return name

@@ -7,6 +7,7 @@ once, and not once for each node. The schema requires no key, because groups may
 from __future__ import annotations
 
 import inspect
+import itertools
 import math
 import re
 from collections.abc import Mapping
@@ -134,21 +135,30 @@ def _defaults() -> Schema:
     options = {
         group: {"anyOf": [names, {"type": ["string", "null"]}]} for group, names in offered.items()
     }
-    one: Schema = {"type": "object", "properties": options, "minProperties": 1, "maxProperties": 1}
-    return {"anyOf": [one, {"type": "string"}]}
+    group_choice: Schema = {
+        "type": "object",
+        "properties": options,
+        "minProperties": 1,
+        "maxProperties": 1,
+    }
+    return {"anyOf": [group_choice, {"type": "string"}]}
 
 
 def _step(nodes: Mapping[str, Node]) -> Schema:
     """Return the JSON schema of a recipe step: the keys of all steps, and the inputs and
     parameters of each node.
     """
-    each: Schema = {"type": ["string", "array", "null"], "items": {"type": "string"}, "maxItems": 2}
+    collection: Schema = {
+        "type": ["string", "array", "null"],
+        "items": {"type": "string"},
+        "maxItems": 2,
+    }
     names: Schema = {"anyOf": [{"enum": list(nodes)}, REFERENCE]}
     return {
         "type": ["object", "null"],
         "properties": {
             "node": names,
-            "each": each,
+            "each": collection,
             "from": _ANY,
             "with": _ANY,
             "device": _DEVICE,
@@ -186,8 +196,11 @@ def _inputs(node: Node) -> Schema:
 
 def _expectation() -> Schema:
     number: Schema = {"anyOf": [{"type": "number"}, REFERENCE]}
-    at: Schema = {"type": ["array", "integer", "string"], "items": {"type": ["integer", "string"]}}
-    properties = {"step": {"type": "string"}, "at": at, "value": number, "rtol": number}
+    place: Schema = {
+        "type": ["array", "integer", "string"],
+        "items": {"type": ["integer", "string"]},
+    }
+    properties = {"step": {"type": "string"}, "at": place, "value": number, "rtol": number}
     required = ["step", "value", "rtol"]
     return {
         "type": "object",
@@ -241,12 +254,13 @@ class _Generator(GenerateJsonSchema):
         parameter allows.
         """
         read = schema["function"]["function"]
-        known = [unit for scale in units._SCALE.values() for unit in scale if _takes(read, unit)]
-        if not known:
+        every_unit = itertools.chain.from_iterable(units._SCALE.values())
+        allowed_units = [unit for unit in every_unit if _takes(read, unit)]
+        if not allowed_units:
             return super().function_before_schema(schema)
-        least = max(schema["schema"].get(bound, -math.inf) for bound in ("gt", "ge"))
-        sign = "[+]?" if least >= 0 else "[-+]?"
-        pattern = rf"^\s*{sign}{_NUMBER}\s*({'|'.join(map(re.escape, known))})\s*$"
+        lower_bound = max(schema["schema"].get(bound, -math.inf) for bound in ("gt", "ge"))
+        sign = "[+]?" if lower_bound >= 0 else "[-+]?"
+        pattern = rf"^\s*{sign}{_NUMBER}\s*({'|'.join(map(re.escape, allowed_units))})\s*$"
         return {"type": "string", "pattern": pattern}
 
 

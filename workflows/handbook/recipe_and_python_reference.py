@@ -26,7 +26,8 @@ def escaped(text: str) -> str:
     """
     parts = _CODE.split(text)
     return "".join(
-        part if n % 2 else re.sub(r"([\\*_<>\[\]|])", r"\\\1", part) for n, part in enumerate(parts)
+        piece if n % 2 else re.sub(r"([\\*_<>\[\]|])", r"\\\1", piece)
+        for n, piece in enumerate(parts)
     )
 
 
@@ -69,25 +70,18 @@ def _sentences(paragraph: str) -> Iterator[str]:
 
 def python_page() -> str:
     """Return the page on every public name of the package ``neusee``."""
-    found = {name: getattr(neusee, name) for name in neusee.__all__ if not name.startswith("_")}
-    functions = [
-        line
-        for name, value in found.items()
-        if not inspect.isclass(value)
-        for line in _section(name, value)
-    ]
-    errors = {
-        name
-        for name, value in found.items()
-        if inspect.isclass(value) and issubclass(value, Exception)
-    }
-    classes = [
-        line
-        for name, value in found.items()
-        if inspect.isclass(value) and name not in errors
-        for line in _class(name, value)
-    ]
-    raised = [line for name in sorted(errors) for line in _section(name, found[name])]
+    public = {name: getattr(neusee, name) for name in neusee.__all__ if not name.startswith("_")}
+    functions: list[str] = []
+    classes: list[str] = []
+    raised: list[str] = []
+    for name, value in public.items():
+        if not inspect.isclass(value):
+            functions += _section(name, value)
+        elif not issubclass(value, Exception):
+            classes += _class(name, value)
+    for name in sorted(public):
+        if _is_error(public[name]):
+            raised += _section(name, public[name])
     opening = [
         "# Public names",
         "",
@@ -102,15 +96,28 @@ def python_page() -> str:
         "",
         *prose(inspect.getdoc(neusee) or ""),
     ]
-    parts = [opening, ["## Functions"], functions, ["## Classes"], classes, ["## Errors"], raised]
-    return "\n".join(line for part in parts for line in (*part, "")) + "\n"
+    lines: list[str] = []
+    for section in (
+        opening,
+        ["## Functions"],
+        functions,
+        ["## Classes"],
+        classes,
+        ["## Errors"],
+        raised,
+    ):
+        lines += [*section, ""]
+    return "\n".join(lines) + "\n"
+
+
+def _is_error(value: Any) -> bool:
+    return inspect.isclass(value) and issubclass(value, Exception)
 
 
 def _section(name: str, value: Any, level: str = "###") -> Iterator[str]:
     """Yield the heading, the signature and the docstring of a function or a class."""
     yield from (f"{level} {name}", "")
-    is_error = inspect.isclass(value) and issubclass(value, Exception)
-    if callable(value) and not is_error:
+    if callable(value) and not _is_error(value):
         yield from ("```python", f"{name}{_signature(value)}", "```", "")
     yield from (*prose(inspect.getdoc(value) or ""), "")
 
@@ -129,12 +136,14 @@ def _class(name: str, value: type) -> Iterator[str]:
 def _signature(value: Any) -> str:
     """Return the arguments and the result of a function, without the argument ``self``."""
     try:
-        found = inspect.signature(value)
+        signature = inspect.signature(value)
     except (TypeError, ValueError):
         return "()"
     shown = str(
-        found.replace(
-            parameters=[each for name, each in found.parameters.items() if name != "self"]
+        signature.replace(
+            parameters=[
+                parameter for name, parameter in signature.parameters.items() if name != "self"
+            ]
         )
     )
     # no address
@@ -171,12 +180,12 @@ def recipe_page() -> str:
     """Return the page on the keys of a recipe, the keys of a step, the groups and the packaged
     recipes.
     """
-    whole = schema()
+    recipe_schema = schema()
     keys = [
-        [f"`{name}`", _kind(part), part["description"]]
-        for name, part in whole["properties"].items()
+        [f"`{name}`", _kind(entry), entry["description"]]
+        for name, entry in recipe_schema["properties"].items()
     ]
-    step = whole["$defs"]["step"]["properties"]
+    step = recipe_schema["$defs"]["step"]["properties"]
     lines = [
         "# Recipe language",
         "",
@@ -202,13 +211,13 @@ def recipe_page() -> str:
             f" {', '.join(map(_code, KINDS))}."
         ),
         *("", "## Block `train`", ""),
-        *_training(whole["$defs"]["train"], whole["$defs"]),
+        *_training(recipe_schema["$defs"]["train"], recipe_schema["$defs"]),
         *("", "## Groups", ""),
         *_groups(),
         *("", "## Recipes", ""),
         *table(
             ["recipe", "what it shows"],
-            [[f"`{each.name}`", escaped(each.title)] for each in recipes()],
+            [[f"`{recipe.name}`", escaped(recipe.title)] for recipe in recipes()],
         ),
     ]
     return "\n".join(lines) + "\n"
@@ -218,15 +227,15 @@ def _code(text: str) -> str:
     return f"`{text}`"
 
 
-def _kind(part: Mapping[str, Any]) -> str:
+def _kind(entry: Mapping[str, Any]) -> str:
     """Return the types that a part of the schema allows, in words."""
-    if "anyOf" in part:
+    if "anyOf" in entry:
         return " or ".join(
-            dict.fromkeys(_kind(each) for each in part["anyOf"] if "pattern" not in each)
+            dict.fromkeys(_kind(choice) for choice in entry["anyOf"] if "pattern" not in choice)
         )
-    if "$ref" in part:
+    if "$ref" in entry:
         return "mapping"
-    kinds = part.get("type", [])
+    kinds = entry.get("type", [])
     return " or ".join(
         _TYPES.get(kind, kind) for kind in ([kinds] if isinstance(kinds, str) else kinds)
     )
@@ -237,10 +246,10 @@ def _training(block: Mapping[str, Any], blocks: Mapping[str, Any]) -> list[str]:
     rows = [
         [
             f"`{name}`",
-            _kind(part),
-            _code(str(part["default"])) if part.get("default") is not None else "",
+            _kind(entry),
+            _code(str(entry["default"])) if entry.get("default") is not None else "",
         ]
-        for name, part in _keys(block, blocks, "train")
+        for name, entry in _keys(block, blocks, "train")
     ]
     return table(["key", "value", "default"], rows)
 
@@ -248,11 +257,11 @@ def _training(block: Mapping[str, Any], blocks: Mapping[str, Any]) -> list[str]:
 def _keys(
     block: Mapping[str, Any], blocks: Mapping[str, Any], path: str
 ) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    for name, part in block["properties"].items():
-        if inner := part.get("$ref"):
+    for name, entry in block["properties"].items():
+        if inner := entry.get("$ref"):
             yield from _keys(blocks[inner.rpartition("/")[2]], blocks, f"{path}.{name}")
         else:
-            yield f"{path}.{name}", part
+            yield f"{path}.{name}", entry
 
 
 def _groups() -> Iterator[str]:

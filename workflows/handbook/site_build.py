@@ -5,6 +5,7 @@ files.
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import os
 import shutil
 import subprocess
@@ -113,15 +114,23 @@ def complete_nav(nav: Tree, pages: Mapping[str, str]) -> Tree:
     An entry that ends in ``/`` stands for all pages in a folder.
     """
     named = set(_named(nav, pages))
-    rest = [{title_of(text): path} for path, text in pages.items() if path not in named]
-    kept = [{title: _filled(entry, pages)} for each in nav for title, entry in each.items()]
-    return [*(each for each in kept if all(each.values())), *([{_REST: rest}] if rest else [])]
+    unnamed = [{title_of(text): path} for path, text in pages.items() if path not in named]
+    return _sections(nav, pages) + ([{_REST: unnamed}] if unnamed else [])
+
+
+def _sections(nav: Tree, pages: Mapping[str, str]) -> Tree:
+    """Return each entry with its title, without entries of no page."""
+    sections = []
+    for entries in nav:
+        for title, entry in entries.items():
+            if pages_of_entry := _filled(entry, pages):
+                sections.append({title: pages_of_entry})
+    return sections
 
 
 def _filled(entry: Any, pages: Mapping[str, str]) -> Any:
     if isinstance(entry, list):
-        found = [{title: _filled(inner, pages)} for each in entry for title, inner in each.items()]
-        return [each for each in found if all(each.values())]
+        return _sections(entry, pages)
     if entry.endswith("/"):
         return [{title_of(text): path} for path, text in pages.items() if path.startswith(entry)]
     return entry if entry in pages else None
@@ -134,7 +143,11 @@ def _named(entry: Any, pages: Mapping[str, str]) -> set[str]:
             for path in pages
             if path == entry or (entry.endswith("/") and path.startswith(entry))
         }
-    return {path for each in entry for inner in each.values() for path in _named(inner, pages)}
+    named = set()
+    for entries in entry:
+        for inner in entries.values():
+            named |= _named(inner, pages)
+    return named
 
 
 def _draw(
@@ -145,8 +158,8 @@ def _draw(
     strict: bool,
 ) -> dict[Picture, str]:
     write_files(pages, work)
-    wanted = [picture for text in pages.values() for picture in pictures_of(text)]
-    return draw_pictures(wanted, work, target, progress, strict)
+    pictures = list(itertools.chain.from_iterable(map(pictures_of, pages.values())))
+    return draw_pictures(pictures, work, target, progress, strict)
 
 
 def _write_docs(pages: Mapping[str, str], drawn: Mapping[Picture, str], docs: Path) -> None:

@@ -8,6 +8,7 @@ import os
 import sys
 import time
 from collections.abc import Iterable, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,7 +82,7 @@ def written(step: Step) -> dict[str, Any]:
 
     Of a node of neusee only the order of a mapping counts, where the node says so.
     """
-    found: dict[str, Any] = {}
+    notes: dict[str, Any] = {}
     own = is_own(step.node.fn.__module__)
     for name, value in step.params.items():
         if not own and (step.node.path, name) not in _ORDERED:
@@ -89,8 +90,8 @@ def written(step: Step) -> dict[str, Any]:
         marks = [mark for mark in (step.param_marks.get(name), step.mark) if mark is not None]
         said = _said(value, [os.path.abspath(mark.folder) for mark in marks])
         if said is not None:
-            found[name] = said
-    return found
+            notes[name] = said
+    return notes
 
 
 def _said(value: Any, folders: list[str]) -> Any:
@@ -98,12 +99,19 @@ def _said(value: Any, folders: list[str]) -> Any:
     if isinstance(value, Path):
         return _name(value, folders)
     if isinstance(value, Mapping):
-        parts = [[str(key), _said(part, folders)] for key, part in value.items()]
-        return parts if len(parts) > 1 or any(part is not None for _, part in parts) else None
+        return _said_in_order(value, folders)
     if isinstance(value, tuple | list):
-        said = [_said(part, folders) for part in value]
-        return said if any(part is not None for part in said) else None
+        said = [_said(item, folders) for item in value]
+        return said if any(item is not None for item in said) else None
     return None
+
+
+def _said_in_order(mapping: Mapping[Any, Any], folders: list[str]) -> Any:
+    """Return the keys of a mapping in their order with what their values say, or None for a single
+    key whose value says nothing.
+    """
+    parts = [[str(key), _said(item, folders)] for key, item in mapping.items()]
+    return parts if len(parts) > 1 or any(item is not None for _, item in parts) else None
 
 
 def _name(path: Path, folders: list[str]) -> list[str]:
@@ -111,7 +119,7 @@ def _name(path: Path, folders: list[str]) -> list[str]:
     links lead to.
     """
     full = os.path.abspath(path)
-    folder = next((each for each in folders if _is_in(full, each)), None)
+    folder = next((candidate for candidate in folders if _is_in(full, candidate)), None)
     real, top = os.path.realpath(full), folder and os.path.realpath(folder)
     name = Path(os.path.relpath(full, folder) if folder else full).as_posix()
     target = Path(
@@ -178,11 +186,9 @@ def files_in(value: Any) -> Iterable[Path]:
     if isinstance(value, Path):
         return [value]
     if isinstance(value, Mapping):
-        return [path for part in value.values() for path in files_in(part)]
+        return list(chain.from_iterable(map(files_in, value.values())))
     return (
-        [path for part in value for path in files_in(part)]
-        if isinstance(value, tuple | list)
-        else []
+        list(chain.from_iterable(map(files_in, value))) if isinstance(value, tuple | list) else []
     )
 
 
@@ -245,13 +251,18 @@ def code_of(step: Step, code: Code) -> str:
     """
     return code.of(
         step.node,
-        tuple(dict.fromkeys((each.__module__, each.__qualname__) for each in networks_of(step))),
+        tuple(
+            dict.fromkeys(
+                (network.__module__, network.__qualname__) for network in networks_of(step)
+            )
+        ),
     )
 
 
 def networks_of(step: Step) -> list[type[Any]]:
     """Return the network classes that the parameters of a step name."""
-    return [network for value in step.params.values() if (network := _network_of(value))]
+    networks = map(_network_of, step.params.values())
+    return [network for network in networks if network]
 
 
 def _network_of(value: Any) -> type[Any] | None:

@@ -115,23 +115,23 @@ class Imports:
 
         Raises `LookupError` if the package of all nodes is used as a whole.
         """
-        found: dict[str, set[str]] = {}
+        names_by_module: dict[str, set[str]] = {}
         for item in summary.imports:
             for module, name in self._imported(item):
-                found.setdefault(module, set()).add(name)
+                names_by_module.setdefault(module, set()).add(name)
         for use in summary.uses:
-            used = self._used(use)
-            if used is None and self._module.startswith(ROOT):
-                what = (
+            modules = self._used(use)
+            if modules is None and self._module.startswith(ROOT):
+                problem = (
                     "the package of all nodes is used, so the modules that a result depends on are"
                     " unknown"
                 )
                 raise UnfollowedCode(
-                    f"{self._path}:{use[-1]}: {what}: import each name from its own module"
+                    f"{self._path}:{use[-1]}: {problem}: import each name from its own module"
                 )
-            for module in used or ():
-                found.setdefault(module, set()).add("")
-        return found
+            for module in modules or ():
+                names_by_module.setdefault(module, set()).add("")
+        return names_by_module
 
     def _imported(self, item: Import) -> Iterator[tuple[str, str]]:
         """Yield the modules that an import needs: a submodule, or the module that defines the
@@ -152,11 +152,13 @@ class Imports:
         """
         level, base, name, chain, _ = use
         first = ".".join(filter(None, (absolute(level, base, self._package), name)))
-        modules, rest = [first], chain.split(".") if chain else []
-        while rest and self._is_module(modules[-1], rest[0]):
-            modules.append(f"{modules[-1]}.{rest.pop(0)}")
-        whole = modules[-1] in ("neusee", ROOT) and (not rest or rest[0].startswith("__"))
-        return None if whole else modules[1:]
+        modules, attributes = [first], chain.split(".") if chain else []
+        while attributes and self._is_module(modules[-1], attributes[0]):
+            modules.append(f"{modules[-1]}.{attributes.pop(0)}")
+        uses_all = modules[-1] in ("neusee", ROOT) and (
+            not attributes or attributes[0].startswith("__")
+        )
+        return None if uses_all else modules[1:]
 
     def _is_module(self, package: str, name: str) -> bool:
         """Return True if a package, whose source is followed or which is a folder, has a module
@@ -202,20 +204,20 @@ def engine(*modules: str) -> str:
     The default module is ``engine.runner``. Only imports of neusee.workflows at the top level of a
     module count. Raises `LookupError` for a module without a source file.
     """
-    seen: dict[str, str] = {}
+    digests: dict[str, str] = {}
     todo = list(modules or ("engine.runner",))
     while todo:
         name = todo.pop()
-        if name in seen:
+        if name in digests:
             continue
         path = _source(name)
         if path is None:
             raise LookupError(
                 f"{_ROOT}.{name} has no source file below {_HERE}, so its results have no cache key"
             )
-        seen[name], imports = outline(path.read_bytes())
+        digests[name], imports = outline(path.read_bytes())
         todo += imported_by_engine(imports)
-    return digest(seen)
+    return digest(digests)
 
 
 def outline(source: bytes) -> Outline:
@@ -308,11 +310,11 @@ class Code:
             self._codes[id(node)] = node, self._of(node)
         code = self._codes[id(node)][1]
         for module, name in classes:
-            whole = self._whole(module)
-            self._refuse(whole, module, node, {name.partition(".")[0]})
-            parts = {**self._whole(node.fn.__module__).parts, **whole.parts}
+            closure = self._whole(module)
+            self._refuse(closure, module, node, {name.partition(".")[0]})
+            parts = {**self._whole(node.fn.__module__).parts, **closure.parts}
             code = self._named(
-                digest(code, whole.code), parts, is_private(code) or is_private(whole.code)
+                digest(code, closure.code), parts, is_private(code) or is_private(closure.code)
             )
         return self._beside(code, node, [node.fn.__module__, *(module for module, _ in classes)])
 
@@ -323,12 +325,12 @@ class Code:
         wholes = {name: self._whole(name) for name in self._siblings.of(roots)}
         if not wholes:
             return code
-        for name, whole in wholes.items():
-            self._refuse(whole, name, node, {"_"})
+        for name, closure in wholes.items():
+            self._refuse(closure, name, node, {"_"})
         parts = dict(self.parts.get(code, {}))
-        for whole in wholes.values():
-            parts |= whole.parts
-        codes = [whole.code for whole in wholes.values()]
+        for closure in wholes.values():
+            parts |= closure.parts
+        codes = [closure.code for closure in wholes.values()]
         return self._named(digest(code, codes), parts, any(map(is_private, [code, *codes])))
 
     def digest(self, module: str) -> str:
@@ -355,59 +357,47 @@ class Code:
 
     def _of(self, node: Node) -> str:
         module = node.fn.__module__
-        code, whole = self.digest(module), self._whole(module)
-        self._refuse(whole, module, node, {node.fn.__name__, "_"})
+        code, closure = self.digest(module), self._whole(module)
+        self._refuse(closure, module, node, {node.fn.__name__, "_"})
         plain = getattr(sys.modules.get(module), node.fn.__name__, None) is node
         if plain and not node.depends:
             return code
-        source = whole.looks[module].path or Path(module)
-        declared = resolve(
-            node.depends,
-            module,
-            source,
-            node.environment,
-            lambda name: module_path(name) is not None,
-        )
+        source = closure.looks[module].path or Path(module)
+        declared = resolve(node.depends, module, source, node.environment, _is_a_module)
         parts, private = dict(declared.parts), is_private(code)
         for name in declared.modules:
             below = self._whole(name)
             parts, private = {**parts, **parts_of(below.looks)}, private or is_private(below.code)
         if declared.changed:
             private = True
-            say_once(
-                module,
-                f"{source.parent / declared.changed[0]} was changed after the import of {source}:"
-                " restart",
-            )
+            _say_changed(module, source, declared.changed[0])
         if not plain:
-            state = LoadedState(sys.modules[module], (), self._follows(_packages(module)))
-            parts["closure"] = {node.path: state.digest({"function": node.fn})}
-            if state.changing and f"{FREE}function" not in node.depends:
-                raise UnfollowedCode(
-                    changing_refusal("function", state.changing["function"], source)
-                )
-            inner = [
-                self._whole(name).code for name in sorted(state.modules.keys() - whole.looks.keys())
-            ]
-            parts["closure"].update({f"module {n}": each for n, each in enumerate(inner)})
+            parts["closure"], inner = self._held_around(node, closure, source)
             private = private or any(map(is_private, inner))
-        return self._named(digest(code, parts), {**whole.parts, **parts}, private)
+        return self._named(digest(code, parts), {**closure.parts, **parts}, private)
+
+    def _held_around(
+        self, node: Node, closure: Whole, source: Path
+    ) -> tuple[dict[str, str], list[str]]:
+        """Return what the function of a node holds from the function around it, and the digests of
+        the modules that it leads to.
+        """
+        module = node.fn.__module__
+        state = LoadedState(sys.modules[module], (), self._follows(_packages(module)))
+        parts = {node.path: state.digest({"function": node.fn})}
+        if state.changing and f"{FREE}function" not in node.depends:
+            raise UnfollowedCode(changing_refusal("function", state.changing["function"], source))
+        inner = [
+            self._whole(name).code for name in sorted(state.modules.keys() - closure.looks.keys())
+        ]
+        parts.update({f"module {n}": inner_code for n, inner_code in enumerate(inner)})
+        return parts, inner
 
     def _whole(self, module: str) -> Whole:
         """Return the digest of a module with the modules that it leads to."""
         if module in self._wholes:
             return self._wholes[module]
-        looks: dict[str, Look] = {}
-        names: Names = {module: set()}
-        todo, packages = [module], _packages(module)
-        while todo:
-            name = todo.pop()
-            look = self._look(name, packages, name == module) if name not in looks else None
-            if look is not None:
-                looks[name] = look
-                for other, used in look.imports.items():
-                    names.setdefault(other, set()).update(used)
-                    todo.append(other)
+        looks, names = self._led_to(module)
         if module not in looks or looks[module].summary is None:
             raise UnfollowedCode(
                 f"{module} has no source file, so its nodes have no cache key: save the module as a"
@@ -422,6 +412,24 @@ class Code:
         self._wholes[module] = Whole(code, looks, names, parts)
         return self._wholes[module]
 
+    def _led_to(self, module: str) -> tuple[dict[str, Look], Names]:
+        """Return what each module adds that a module leads to, itself included, and the names that
+        others use of it.
+        """
+        looks: dict[str, Look] = {}
+        names: Names = {module: set()}
+        todo, packages = [module], _packages(module)
+        while todo:
+            name = todo.pop()
+            look = self._look(name, packages, name == module) if name not in looks else None
+            if look is None:
+                continue
+            looks[name] = look
+            for other, used_names in look.imports.items():
+                names.setdefault(other, set()).update(used_names)
+                todo.append(other)
+        return looks, names
+
     def _named(self, code: str, parts: Parts, private: bool) -> str:
         """Return a digest, private to this process where the loaded code is not that of the
         files.
@@ -431,32 +439,20 @@ class Code:
         self._parts[code] = self.parts[code] = parts
         return code
 
-    def _refuse(self, whole: Whole, module: str, node: Node, own: set[str]) -> None:
+    def _refuse(self, closure: Whole, module: str, node: Node, own: set[str]) -> None:
         """Raise `LookupError` for the first construct that is not followed, not declared, and
         that ``own`` reaches.
         """
-        for name, look in whole.looks.items():
-            if (
-                look.summary is None
-                or look.path is None
-                or not (look.summary.constructs or look.changing)
-            ):
+        for name, look in closure.looks.items():
+            if look.summary is None or look.path is None:
                 continue
-            used = own if name == module else whole.names.get(name) or {""}
+            if not look.summary.constructs and not look.changing:
+                continue
+            used_names = own if name == module else closure.names.get(name) or {""}
             free = [*look.summary.depends, *node.depends]
-            read = (
-                read_names(look.summary.statements, set() if used & {"", "*"} else used)
-                if look.changing
-                else set()
-            )
-            for held, what in look.changing.items():
-                if held in read and f"{FREE}{held}" not in free:
-                    raise UnfollowedCode(changing_refusal(held, what, look.path))
-            lines = [r for r in reached(look.summary.statements, None if "" in used else used)]
-            found = [item for item in look.summary.constructs if any(item.line in r for r in lines)]
-            left = uncovered(found, free)
-            if left is not None:
-                raise UnfollowedCode(refusal(left, look.path))
+            if look.changing:
+                _refuse_changing(look.changing, look.summary, look.path, used_names, free)
+            _refuse_constructs(look.summary, look.path, used_names, free)
 
     def _look(self, module: str, packages: frozenset[str], root: bool) -> Look | None:
         key = (module, packages, root)
@@ -487,61 +483,70 @@ class Code:
 
     def _source(self, module: str, path: Path, packages: frozenset[str], root: bool) -> Look:
         """Return what a module adds whose source is followed."""
-        known = imported(module)
+        is_imported = imported(module)
         summary = self._summary(module, path)
         follows = self._follows(packages)
+        free = {entry.removeprefix(FREE) for entry in summary.depends if entry.startswith(FREE)}
+        imports = self._imports(module, path, summary, packages, free)
+        state, private, parts = "", holds_here_alone(module), {module: summary.definitions}
+        changing: Mapping[str, str] = {}
+        if is_imported:
+            loaded, state = self._loaded_state(module, summary, follows, free, root)
+            parts[f"state of {module}"], changing = {"values": state}, loaded.changing
+            for name in sorted(loaded.modules):
+                imports.setdefault(name, set()).update(loaded.modules[name])
+            if loaded.replaced and not private:
+                private = True
+                _say_replaced(module, path, loaded.replaced[0])
+        if summary.depends:
+            declared = resolve(summary.depends, module, path, {}, _is_a_module)
+            parts.update(declared.parts)
+            imports.update({name: {""} for name in declared.modules})
+            if declared.changed:
+                private = True
+                _say_changed(module, path, declared.changed[0])
+        return Look(parts, imports, summary, path, state, changing, private)
+
+    def _imports(
+        self,
+        module: str,
+        path: Path,
+        summary: Summary,
+        packages: frozenset[str],
+        free: set[str],
+    ) -> dict[str, set[str]]:
+        """Return the modules that a module imports and does not declare ``free``, with the names
+        that are used.
+        """
         inner = Imports(
             module,
             path,
             lambda name: self._summary_of(name, packages),
             lambda name: self._origin(name, packages).kind,
         )
-        free = {entry.removeprefix(FREE) for entry in summary.depends if entry.startswith(FREE)}
-        imports = {
-            name: used
-            for name, used in inner.names(summary).items()
-            if name.partition(".")[0] not in free
-        }
-        state, private, parts = "", holds_here_alone(module), {module: summary.definitions}
-        changing: Mapping[str, str] = {}
-        if known:
-            loaded = LoadedState(
-                sys.modules[module],
-                summary.functions if compiled_as_written(module) else (),
-                follows,
+        names = inner.names(summary)
+        return {name: used for name, used in names.items() if name.partition(".")[0] not in free}
+
+    def _loaded_state(
+        self,
+        module: str,
+        summary: Summary,
+        follows: Callable[[str], bool],
+        free: set[str],
+        root: bool,
+    ) -> tuple[LoadedState, str]:
+        """Return the state of a loaded module, and its digest."""
+        loaded = LoadedState(
+            sys.modules[module],
+            summary.functions if compiled_as_written(module) else (),
+            follows,
+        )
+        values = counted_values(sys.modules[module], summary, free, root)
+        if (only := self._loaded) is not None:
+            values = without_modules(
+                module, values, lambda name: follows(name) and name not in only
             )
-            values = counted_values(sys.modules[module], summary, free, root)
-            if (only := self._loaded) is not None:
-                values = without_modules(
-                    module, values, lambda name: follows(name) and name not in only
-                )
-            state = loaded.digest(values)
-            parts[f"state of {module}"], changing = {"values": state}, loaded.changing
-            for name in sorted(loaded.modules):
-                imports.setdefault(name, set()).update(loaded.modules[name])
-            if loaded.replaced and not private:
-                private = True
-                text = (
-                    f"the loaded code of {loaded.replaced[0]}() is not that of {path}, so results"
-                    " are not stored"
-                )
-                say_once(
-                    module, f"{text}: restart Python, and delete __pycache__ if this is said again"
-                )
-        if summary.depends:
-            declared = resolve(
-                summary.depends, module, path, {}, lambda name: module_path(name) is not None
-            )
-            parts.update(declared.parts)
-            imports.update({name: {""} for name in declared.modules})
-            if declared.changed:
-                private = True
-                say_once(
-                    module,
-                    f"{path.parent / declared.changed[0]} was changed after the import of {path}:"
-                    " restart",
-                )
-        return Look(parts, imports, summary, path, state, changing, private)
+        return loaded, loaded.digest(values)
 
     def _follows(self, packages: frozenset[str]) -> Callable[[str], bool]:
         """Return the function that tells whether the source of a module is followed."""
@@ -571,8 +576,8 @@ class Code:
         return origin.path, self._summary(module, origin.path)
 
     def _summary(self, module: str, path: Path) -> Summary:
-        (source, found), own = source_of(module, path), is_own(module)
-        name = f"{PYTHON}:{EDITION}:{found}{':own' * own}"
+        (source, content_digest), own = source_of(module, path), is_own(module)
+        name = f"{PYTHON}:{EDITION}:{content_digest}{':own' * own}"
         if name not in self._summaries:
             try:
                 self._summaries[name] = _summarised(source, own)
@@ -584,6 +589,48 @@ class Code:
 
 #: several stores in one process parse a source once
 _summarised = functools.lru_cache(1000)(summarise)
+
+
+def _is_a_module(name: str) -> bool:
+    return module_path(name) is not None
+
+
+def _say_changed(module: str, source: Path, entry: str) -> None:
+    """Say that a declared file was changed after the import of a module."""
+    say_once(module, f"{source.parent / entry} was changed after the import of {source}: restart")
+
+
+def _say_replaced(module: str, path: Path, function: str) -> None:
+    """Say that the loaded code of a function is another one than that in its file."""
+    text = f"the loaded code of {function}() is not that of {path}, so results are not stored"
+    say_once(module, f"{text}: restart Python, and delete __pycache__ if this is said again")
+
+
+def _refuse_changing(
+    changing: Mapping[str, str],
+    summary: Summary,
+    path: Path,
+    used_names: set[str],
+    free: Sequence[str],
+) -> None:
+    """Raise `LookupError` for an object that changes while a process runs, is read and is not
+    declared.
+    """
+    read = read_names(summary.statements, set() if used_names & {"", "*"} else used_names)
+    for held, kind_of_object in changing.items():
+        if held in read and f"{FREE}{held}" not in free:
+            raise UnfollowedCode(changing_refusal(held, kind_of_object, path))
+
+
+def _refuse_constructs(
+    summary: Summary, path: Path, used_names: set[str], free: Sequence[str]
+) -> None:
+    """Raise `LookupError` for the first construct that the used names reach and no entry covers."""
+    lines = [*reached(summary.statements, None if "" in used_names else used_names)]
+    met = [item for item in summary.constructs if any(item.line in span for span in lines)]
+    left = uncovered(met, free)
+    if left is not None:
+        raise UnfollowedCode(refusal(left, path))
 
 
 def _decides_nothing(module: str) -> bool:
@@ -635,12 +682,14 @@ class KnownKeys:
         `key_of` does.
         """
         beside = (seed, device_kind(device), *(keys[name] for name in step.sources))
-        known = self._newest.get(step.name)
-        if known is not None and known.beside == beside and _is_same(step, known.step):
-            return known.key, known.origin
+        newest = self._newest.get(step.name)
+        if newest is not None and newest.beside == beside and _is_same(step, newest.step):
+            return newest.key, newest.origin
         key, origin = key_of(step, keys, seed, self.code, device)
-        if known is not None and known.key == key:
-            key = known.key  # the same object, which saves memory where many points keep their keys
+        if newest is not None and newest.key == key:
+            key = (
+                newest.key
+            )  # the same object, which saves memory where many points keep their keys
         if not has_path(step.params):
             self._newest[step.name] = _Known(step, beside, key, origin)
         return key, origin
@@ -657,12 +706,14 @@ def _is_same(step: Step, other: Step) -> bool:
     return same and all(_is_equal(value, other.params[name]) for name, value in step.params.items())
 
 
-def _is_equal(one: Any, other: Any) -> bool:
+def _is_equal(value: Any, other: Any) -> bool:
     """Return True for the same object, and for numbers and words that are equal and written
     alike.
     """
-    if one is other:
+    if value is other:
         return True
     return (
-        type(one) is type(other) and isinstance(one, float | int | str) and repr(one) == repr(other)
+        type(value) is type(other)
+        and isinstance(value, float | int | str)
+        and repr(value) == repr(other)
     )

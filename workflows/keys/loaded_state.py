@@ -15,7 +15,7 @@ import re
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from enum import Enum
 from fractions import Fraction
 from pathlib import Path, PurePath
@@ -112,7 +112,9 @@ class _Hows(dict[type, str]):
 
     def __missing__(self, kind: type) -> str:
         other = "changing" if hasattr(kind, "__next__") else "object"
-        self[kind] = next((how for how, kinds in _KINDS if issubclass(kind, kinds)), other)
+        self[kind] = next(
+            (description for description, kinds in _KINDS if issubclass(kind, kinds)), other
+        )
         return self[kind]
 
 
@@ -177,24 +179,24 @@ class LoadedState:
         """
         if value is None:
             return _NOTHING
-        how = _HOW[type(value)]
-        seen, name, before = self._seen, id(value), len(self._changes)
+        kind = _HOW[type(value)]
+        numbers, name, before = self._seen, id(value), len(self._changes)
         try:
-            if how in _ATOMS:
-                return _DESCRIBED[how](self, value)
-            if name in seen:
+            if kind in _ATOMS:
+                return _DESCRIBED[kind](self, value)
+            if name in numbers:
                 self._changes += self._holds.get(name, ())
-                return "again", seen[name]
-            seen[name] = len(seen)
+                return "again", numbers[name]
+            numbers[name] = len(numbers)
             self._kept.append(value)
-            told = _DESCRIBED[how](self, value)
+            text = _DESCRIBED[kind](self, value)
         except RecursionError:
             raise  # where it ends depends on the calls around it
         except Exception as error:  # the methods of a class may do anything
-            told = self._unread(value, f"could not be read ({type(error).__name__}: {error})")
+            text = self._unread(value, f"could not be read ({type(error).__name__}: {error})")
         if len(self._changes) > before:
             self._holds[name] = self._changes[before:]
-        return told
+        return text
 
     def _unread(self, value: Any, why: str) -> str:
         """Return the type of a value whose parts cannot be told; note it if the parts of such a
@@ -238,15 +240,19 @@ class LoadedState:
         return self._typed(value)
 
     def _table(self, value: Any) -> Any:
-        return self._typed(value), [
-            (self._of(key), self._of(part)) for key, part in list(value.items())
-        ]
+        return self._typed(value), self._pairs(list(value.items()))
+
+    def _pairs(self, pairs: Iterable[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+        texts = []
+        for key, item in pairs:
+            texts.append((self._of(key), self._of(item)))
+        return texts
 
     def _list(self, value: Any) -> Any:
-        return self._typed(value), [self._of(part) for part in value]
+        return self._typed(value), [self._of(item) for item in value]
 
     def _set(self, value: Any) -> Any:
-        return self._typed(value), sorted((self._of(part) for part in value), key=repr)
+        return self._typed(value), sorted((self._of(item) for item in value), key=repr)
 
     def _node(self, value: Any) -> Any:
         return "node", self._of(value.fn), [self._of(hook) for hook in _hooks(value)]
@@ -276,47 +282,48 @@ class LoadedState:
         """
         kind = type(value)
         if kind is SimpleNamespace or issubclass(kind, nn.Module) or self._followed(_home(kind)):
-            parts = [
-                (name, part)
-                for name, part in _attributes(value)
+            attributes = [
+                (name, attribute)
+                for name, attribute in _attributes(value)
                 if self._lazy or not _is_lazy(kind, name)
             ]
-            return self._typed(value), [(name, self._of(part)) for name, part in parts]
-        # a class that answers to each name answers to this one too
-        wraps = (
-            kind.__module__ != "typing"
-            and inspect.getattr_static(value, "__wrapped__", None) is not None
-        )
-        inner = value.__wrapped__ if wraps else None
+            return self._typed(value), [
+                (name, self._of(attribute)) for name, attribute in attributes
+            ]
+        inner = _wrapped(value, kind)
         return self._typed(value), self._of(inner) if callable(inner) else ""
 
     def _function(self, function: FunctionType) -> Any:
         """Return a function by module and name, with its defaults and closure if it is local."""
         home, code = str(function.__globals__.get("__name__")), function.__code__
         if code is _DISPATCH:
-            kinds: Mapping[type, Any] = function.registry  # type: ignore[attr-defined]
-            parts = sorted(
-                kinds.items(), key=lambda item: f"{item[0].__module__}.{item[0].__qualname__}"
-            )
-            return "singledispatch", [(self._of(kind), self._of(part)) for kind, part in parts]
-        own = home == self._name and code.co_filename == self._file
-        if home != self._name:
-            self._noted(home, function.__qualname__)
-        if own and self._functions and function_code(code) not in self._functions:
-            self.replaced.append(function.__qualname__)
+            return "singledispatch", self._pairs(_implementations(function))
+        own = self._noted_function(function, home)
         local = own or not _found(home, function)
         held = (
             (function.__defaults__, function.__kwdefaults__, function.__closure__) if local else ()
         )
         exact = function_code(code) if local and not own and self._followed(home) else ""
-        told = [part and self._of(part) for part in held]
+        described = [item and self._of(item) for item in held]
         if own and is_own(home):  # an attribute of a function may hold what a call left in it
-            told += [
-                (name, self._of(part))
-                for name, part in vars(function).items()
+            described += [
+                (name, self._of(attribute))
+                for name, attribute in vars(function).items()
                 if name != "__wrapped__"
             ]
-        return "function", home, code.co_qualname, exact, told
+        return "function", home, code.co_qualname, exact, described
+
+    def _noted_function(self, function: FunctionType, home: str) -> bool:
+        """Note a function of another module, or one whose loaded code is not that of the file;
+        return True for a function of the file of this module.
+        """
+        code = function.__code__
+        own = home == self._name and code.co_filename == self._file
+        if home != self._name:
+            self._noted(home, function.__qualname__)
+        if own and self._functions and function_code(code) not in self._functions:
+            self.replaced.append(function.__qualname__)
+        return own
 
     def _class(self, kind: type) -> Any:
         name = ("class", self._noted(_home(kind), kind.__qualname__), kind.__qualname__)
@@ -326,11 +333,11 @@ class LoadedState:
         for base in kind.__mro__[1:]:
             self._noted(base.__module__, base.__qualname__)
         parts = [
-            (name, part)
-            for name, part in vars(kind).items()
-            if not _SKIPPED.fullmatch(name) or _is_method(part)
+            (name, attribute)
+            for name, attribute in vars(kind).items()
+            if not _SKIPPED.fullmatch(name) or _is_method(attribute)
         ]
-        return name, bases, [(name, self._of(part)) for name, part in parts]
+        return name, bases, [(name, self._of(attribute)) for name, attribute in parts]
 
     def _typed(self, value: Any) -> str:
         kind = type(value)
@@ -355,7 +362,7 @@ _NOTHING = ("NoneType", "None")
 _ATOMS = frozenset({"plain", "text", "builtin", "module"})
 #: the method that describes a value, by the kind of its type
 _DESCRIBED: dict[str, Callable[[LoadedState, Any], Any]] = {
-    how: getattr(LoadedState, f"_{how}") for how in ("object", *(how for how, _ in _KINDS))
+    kind: getattr(LoadedState, f"_{kind}") for kind in ("object", *(kind for kind, _ in _KINDS))
 }
 
 
@@ -369,10 +376,10 @@ def counted_values(
     nodes = [name for name, value in values.items() if root and issubclass(type(value), Node)]
     if nodes:
         classes = [name for name, value in values.items() if _is_network(value)]
-        names = read_names(summary.statements, [*nodes, *classes, "_"])
-        return {name: value for name, value in values.items() if name in names}
-    noted = written_only(summary.statements)
-    return {name: value for name, value in values.items() if name not in noted}
+        counted = values.keys() & read_names(summary.statements, [*nodes, *classes, "_"])
+    else:
+        counted = values.keys() - written_only(summary.statements)
+    return {name: value for name, value in values.items() if name in counted}
 
 
 def without_modules(
@@ -421,12 +428,12 @@ def _attributes(value: Any) -> list[tuple[str, Any]]:
     slots = {
         slot for base in type(value).__mro__ for slot in _named(vars(base).get("__slots__", ()))
     }
-    found = {
+    in_slots = {
         slot: getattr(value, slot)
         for slot in sorted(slots)
         if not slot.startswith("__") and hasattr(value, slot)
     }
-    return list({**found, **getattr(value, "__dict__", {})}.items())
+    return list({**in_slots, **getattr(value, "__dict__", {})}.items())
 
 
 def _home(kind: type) -> str:
@@ -458,14 +465,28 @@ def _found(module: str, function: FunctionType) -> bool:
     """Return True if a function is what its module has under its name, so that the source of the
     module decides it.
     """
-    found: Any = sys.modules.get(module)
+    holder: Any = sys.modules.get(module)
     for name in function.__qualname__.split("."):
-        found = getattr(found, name, None)
-    return found is function
+        holder = getattr(holder, name, None)
+    return holder is function
 
 
-def _is_method(part: Any) -> bool:
-    return isinstance(part, FunctionType | staticmethod | classmethod | property)
+def _is_method(attribute: Any) -> bool:
+    return isinstance(attribute, FunctionType | staticmethod | classmethod | property)
+
+
+def _implementations(function: FunctionType) -> list[tuple[type, Any]]:
+    """Return the function for each type of a ``singledispatch``, by the name of the type."""
+    kinds: Mapping[type, Any] = function.registry  # type: ignore[attr-defined]
+    return sorted(kinds.items(), key=lambda item: f"{item[0].__module__}.{item[0].__qualname__}")
+
+
+def _wrapped(value: Any, kind: type) -> Any:
+    """Return what an object wraps, or None."""
+    # a class that answers to each name answers to this one too
+    if kind.__module__ == "typing" or inspect.getattr_static(value, "__wrapped__", None) is None:
+        return None
+    return value.__wrapped__
 
 
 # --- process settings -----------------------------------------------------------------------------

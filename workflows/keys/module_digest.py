@@ -95,16 +95,16 @@ def read_memo(memo: Path) -> dict[str, Summary]:
     """
     _saved[memo] = 0
     try:
-        known, summaries = _read(memo.name, bytes_of(memo), secrets())
+        memory, summaries = _read(memo.name, bytes_of(memo), secrets())
     except (OSError, ValueError):
         return {}
-    for module, distributions in known.distributions.items():
+    for module, distributions in memory.distributions.items():
         distributions_of.setdefault(module, distributions)
-    for name, outline in known.outlines.items():
+    for name, outline in memory.outlines.items():
         outlines.setdefault(name, outline)
-    for stamps, content in known.contents.items():
+    for stamps, content in memory.contents.items():
         known_contents.setdefault(stamps, content)
-    _saved[memo] = len(known.outlines) + len(known.contents)
+    _saved[memo] = len(memory.outlines) + len(memory.contents)
     return dict(summaries)
 
 
@@ -114,8 +114,8 @@ def _read(name: str, raw: bytes, signed_by: tuple[bytes, ...]) -> tuple[_Known, 
     secrets.
     """
     seal, _, content = raw.partition(b"\n")
-    known, text = unseal_file("sources", name, seal, content).split(b"\n", 1)
-    return _KNOWN.validate_json(known), _SUMMARIES.validate_json(text)
+    memory, text = unseal_file("sources", name, seal, content).split(b"\n", 1)
+    return _KNOWN.validate_json(memory), _SUMMARIES.validate_json(text)
 
 
 def is_complete(memo: Path) -> bool:
@@ -130,9 +130,9 @@ def write_memo(memo: Path, summaries: Mapping[str, Summary]) -> None:
     newest = dict(list(outlines.items())[-_KEPT:])
     packages = dict(list(known_contents.items())[-_KEPT:])
     _saved[memo] = len(outlines) + len(known_contents)
-    known = _KNOWN.dump_json(_Known(distributions_of, newest, packages))
+    memory = _KNOWN.dump_json(_Known(distributions_of, newest, packages))
     text = json.dumps(dict(list(summaries.items())[-_KEPT:])).encode()
-    content = b"\n".join([known, text])
+    content = b"\n".join([memory, text])
     _write(
         memo, b"\n".join([seal_file("sources", memo.name, content), content]), memo.parent / "tmp"
     )
@@ -173,13 +173,13 @@ def _write(path: Path, content: bytes, folder: Path) -> None:
     ``folder`` is that of temporary files, in the root of the store.
     """
     root = str(folder.parent)
-    part = folder / f"{path.name}.{os.getpid()}.{threading.get_ident()}"
+    partial = folder / f"{path.name}.{os.getpid()}.{threading.get_ident()}"
     with suppress(OSError):
         make_folders(str(folder), root)
         make_folders(str(path.parent), root)
-        part.write_bytes(content)
-        inherit(str(part), root, 0o444)
-        os.replace(part, path)
+        partial.write_bytes(content)
+        inherit(str(partial), root, 0o444)
+        os.replace(partial, path)
 
 
 # --- installed content ----------------------------------------------------------------------------
@@ -273,9 +273,11 @@ def _counted(top: str, version: str) -> Counted:
     when first asked.
     """
     own = [module_origin.plain(name) for name in module_origin.distributions_with(top)]
-    found = {name: _content(name, top) for name in own}
-    parts = {f"package {top}": {"version": version, "content": _joined(found.values())}}
-    edited = top in sys.modules and max(each.changed for each in found.values()) > import_time(top)
+    contents = {name: _content(name, top) for name in own}
+    parts = {f"package {top}": {"version": version, "content": _joined(contents.values())}}
+    edited = top in sys.modules and max(
+        content.changed for content in contents.values()
+    ) > import_time(top)
     for name in sorted(_required(own)):
         about = {"version": module_origin.released(name)}
         if name not in BY_VERSION:
@@ -285,7 +287,7 @@ def _counted(top: str, version: str) -> Counted:
 
 
 def _joined(contents: Iterable[Content]) -> str:
-    return " ".join(each.digest for each in contents)
+    return " ".join(content.digest for content in contents)
 
 
 def _required(names: Iterable[str]) -> set[str]:
@@ -296,25 +298,25 @@ def _required(names: Iterable[str]) -> set[str]:
     that package.
     """
     first = set(names)
-    found, todo = set(first), [*first]
+    distributions, todo = set(first), [*first]
     while todo:
         text = (
             module_origin.metadata_text(todo.pop(), "METADATA")
             .decode(errors="replace")
             .partition("\n\n")[0]
         )
-        for name, rest in _REQUIRED.findall(text):
-            each = module_origin.plain(name)
+        for name, marker in _REQUIRED.findall(text):
+            requirement = module_origin.plain(name)
             if (
-                each in found
-                or _OF_AN_EXTRA.search(rest)
-                or each == _PROGRAM
-                or not module_origin.released(each)
+                requirement in distributions
+                or _OF_AN_EXTRA.search(marker)
+                or requirement == _PROGRAM
+                or not module_origin.released(requirement)
             ):
                 continue
-            found.add(each)
-            todo += [] if each in BY_VERSION else [each]
-    return found - first
+            distributions.add(requirement)
+            todo += [] if requirement in BY_VERSION else [requirement]
+    return distributions - first
 
 
 def _content(name: str, top: str) -> Content:
@@ -345,17 +347,21 @@ def _files(name: str, top: str) -> dict[str, str]:
     without a record.
     """
     site = os.path.dirname(module_origin.metadata_folder(name))
-    found = [*_recorded(module_origin.metadata_text(name, "RECORD").decode(errors="replace"))]
-    if found:
-        folders = {path.rpartition("/")[0] for path in found if path.endswith("/__init__.py")}
-        for package in sorted(each for each in folders if each.rpartition("/")[0] not in folders):
-            found += filter(_is_module, _below(site, package))
+    recorded = [*_recorded(module_origin.metadata_text(name, "RECORD").decode(errors="replace"))]
+    if recorded:
+        folders = {path.rpartition("/")[0] for path in recorded if path.endswith("/__init__.py")}
+        for package in sorted(
+            folder for folder in folders if folder.rpartition("/")[0] not in folders
+        ):
+            recorded += filter(_is_module, _below(site, package))
     else:
-        found += [
-            each for each in os.listdir(site) if each.partition(".")[0] == top and _is_module(each)
+        recorded += [
+            entry
+            for entry in os.listdir(site)
+            if entry.partition(".")[0] == top and _is_module(entry)
         ]
-        found += _below(site, top)
-    return {path: os.path.join(site, path) for path in found}
+        recorded += _below(site, top)
+    return {path: os.path.join(site, path) for path in recorded}
 
 
 def _recorded(record: str) -> Iterator[str]:
@@ -374,7 +380,7 @@ def _recorded(record: str) -> Iterator[str]:
 def _below(site: str, package: str) -> Iterator[str]:
     """Yield the files in the folder of a package, as a record names them."""
     for folder, inside, files in os.walk(os.path.join(site, package)):
-        inside[:] = [each for each in inside if each != "__pycache__"]
+        inside[:] = [subfolder for subfolder in inside if subfolder != "__pycache__"]
         where = os.path.relpath(folder, site)
         yield from (f"{where}/{file}" for file in files if not file.endswith(_LEFT_OUT))
 
@@ -426,16 +432,16 @@ def source_of(module: str, path: Path) -> tuple[bytes, str]:
     if module in _frozen and _frozen[module][0] is spec and spec is not None:
         return _frozen[module][1:]
     source = path.read_bytes()
-    found = source, xxhash.xxh3_128_hexdigest(source)
+    source_and_digest = source, xxhash.xxh3_128_hexdigest(source)
     _edited_since.discard(module)
     if spec is not None:
-        _frozen[module] = (spec, *found)
+        _frozen[module] = (spec, *source_and_digest)
         if _edited(module, spec, path):
             _edited_since.add(module)
             say_once(
                 module, f"{path} was edited after its import: restart Python to reuse new results"
             )
-    return found
+    return source_and_digest
 
 
 def edited_since(module: str) -> bool:
@@ -519,7 +525,7 @@ class Whole(NamedTuple):
 
 
 def parts_of(looks: dict[str, Look]) -> Parts:
-    return {name: part for look in looks.values() for name, part in look.parts.items()}
+    return {name: content for look in looks.values() for name, content in look.parts.items()}
 
 
 def digest_of(look: Look, documents: bool) -> list[Any]:
@@ -528,8 +534,8 @@ def digest_of(look: Look, documents: bool) -> list[Any]:
         return [look.parts]
     source = look.summary.whole if documents else look.summary.tree
     other = {
-        name: part
-        for name, part in look.parts.items()
+        name: content
+        for name, content in look.parts.items()
         if name.startswith(("file ", "environment "))
     }
     return [source, look.state, other]
@@ -543,11 +549,11 @@ def installed_look(module: str, version: str, packages: frozenset[str]) -> Look:
         return Look(
             {f"package {module.partition('.')[0]}": {"version": version or "not installed"}}, {}
         )
-    found = counted(module, version)
-    if found.edited:
+    package = counted(module, version)
+    if package.edited:
         say_once(
             module,
-            f"the package {found.edited} was changed after its import: restart Python to store"
+            f"the package {package.edited} was changed after its import: restart Python to store"
             " results",
         )
-    return Look(found.parts, {}, private=bool(found.edited))
+    return Look(package.parts, {}, private=bool(package.edited))

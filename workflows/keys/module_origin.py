@@ -164,11 +164,11 @@ def _releases() -> dict[str, tuple[str, str]]:
     """Return version and folder of metadata of each installed distribution, from the names of
     these folders.
     """
-    found: dict[str, tuple[str, str]] = {}
+    releases: dict[str, tuple[str, str]] = {}
     for folder in _metadata():
         name, _, version = os.path.basename(folder).removesuffix(".dist-info").partition("-")
-        found.setdefault(plain(name), (version, folder))
-    return found
+        releases.setdefault(plain(name), (version, folder))
+    return releases
 
 
 def _metadata() -> Iterator[str]:
@@ -187,12 +187,12 @@ def _distributions(top: str) -> list[str]:
     inside = re.compile(
         rb'^"?%s(/|\.py,|\.[^/,]*(so|pyd),)' % re.escape(top.encode()), re.MULTILINE
     )
-    found = [folder for folder in _metadata() if _contains(folder, top, inside)]
+    folders = [folder for folder in _metadata() if _contains(folder, top, inside)]
     names = (
         re.search(
             r"^Name: *(.*?)\s*$", _text(folder, "METADATA").decode(errors="replace"), re.MULTILINE
         )
-        for folder in found
+        for folder in folders
     )
     return sorted({name[1] for name in names if name})
 
@@ -233,8 +233,8 @@ def _without_file(module: str, top: str, packages: frozenset[str]) -> Origin:
     if "." not in module:
         spec = _spec(module)
         return Origin("absent" if spec is None else "nowhere" if spec.has_location else "folder")
-    found = any(not os.path.isdir(folder) for folder in _folders_above(module))
-    return Origin("nowhere" if found else "absent")
+    not_a_folder = any(not os.path.isdir(folder) for folder in _folders_above(module))
+    return Origin("nowhere" if not_a_folder else "absent")
 
 
 def _folders_above(module: str) -> list[str]:
@@ -268,9 +268,9 @@ def _file_in(folder: str, name: str) -> str | None:
     if folder not in _listed:
         _listed[folder] = frozenset(os.listdir(folder) if os.path.isdir(folder) else ())
     if name in _listed[folder]:
-        found = module_file(folder, [name])
-        if found is not None:
-            return str(found)
+        file = module_file(folder, [name])
+        if file is not None:
+            return str(file)
     return next(
         (os.path.join(folder, name + end) for end in _ENDS if name + end in _listed[folder]), None
     )

@@ -65,15 +65,15 @@ def opened(path: Path | str) -> BufferedReader:
     return os.fdopen(number, "rb")
 
 
-def bytes_of(path: Path | str, most: int = MOST) -> bytes:
+def bytes_of(path: Path | str, max_bytes: int = MOST) -> bytes:
     """Return the bytes of a regular file; raise `NotRegular` for anything else, and for more
-    than ``most`` bytes.
+    than ``max_bytes`` bytes.
     """
     with opened(path) as file:
         size = os.fstat(file.fileno()).st_size
-        if size > most:
+        if size > max_bytes:
             raise NotRegular(
-                f"{path} has {size} bytes, more than the limit of {most}: give a shorter file"
+                f"{path} has {size} bytes, more than the limit of {max_bytes}: give a shorter file"
             )
         return file.read(size)
 
@@ -85,12 +85,14 @@ def head_of(path: Path | str, count: int) -> bytes:
 
 
 def text_of(
-    path: Path | str, encoding: str = "utf-8", errors: str = "strict", most: int = MOST
+    path: Path | str, encoding: str = "utf-8", errors: str = "strict", max_bytes: int = MOST
 ) -> str:
     """Return the text of a regular file, with ``\\n`` at the end of each line; raise what
     `bytes_of` raises.
     """
-    return bytes_of(path, most).decode(encoding, errors).replace("\r\n", "\n").replace("\r", "\n")
+    return (
+        bytes_of(path, max_bytes).decode(encoding, errors).replace("\r\n", "\n").replace("\r", "\n")
+    )
 
 
 # --- inherited modes ------------------------------------------------------------------------------
@@ -194,24 +196,25 @@ def secrets() -> tuple[bytes, ...]:
 
 @functools.lru_cache(8)
 def _split(text: str) -> tuple[bytes, ...]:
-    return tuple(part.strip().encode() for part in text.split(",") if part.strip())
+    return tuple(secret.strip().encode() for secret in text.split(",") if secret.strip())
 
 
 def signature(kind: Kind, key: str, sha256: bytes) -> str:
     """Return the signature of a content under a key as 64 hexadecimal digits, or an empty text
     without a secret.
     """
-    known = secrets()
-    return _signed_by(known[0], kind, key, sha256) if known else ""
+    secret_values = secrets()
+    return _signed_by(secret_values[0], kind, key, sha256) if secret_values else ""
 
 
 def check_signature(sign: str, kind: Kind, key: str, sha256: bytes) -> None:
     """Raise `Unsigned` if a secret is set and ``sign`` is the signature of this content, kind
     and key by none.
     """
-    known = secrets()
-    if known and not any(
-        hmac.compare_digest(sign.encode(), _signed_by(s, kind, key, sha256).encode()) for s in known
+    secret_values = secrets()
+    if secret_values and not any(
+        hmac.compare_digest(sign.encode(), _signed_by(s, kind, key, sha256).encode())
+        for s in secret_values
     ):
         raise Unsigned("there is no signature by a secret in NEUSEE_CACHE_SECRET")
 
@@ -289,12 +292,12 @@ def checked_body(raw: bytes) -> tuple[bytes, str]:
 
     Raises `ValueError` for a checksum that does not match.
     """
-    rest, sign = raw[: -len(_END)], b""
-    if rest[-_SIGNED:].startswith(_SIGN):
-        rest, sign = rest[:-_SIGNED], rest[-_SIGNED + len(_SIGN) :]
-    body = rest[:-_SEALED]
-    whole = raw.endswith(_END) and len(rest) > _SEALED
-    if not whole or rest[-_SEALED:] != _SEAL + xxhash.xxh3_128_hexdigest(body).encode():
+    unsigned, sign = raw[: -len(_END)], b""
+    if unsigned[-_SIGNED:].startswith(_SIGN):
+        unsigned, sign = unsigned[:-_SIGNED], unsigned[-_SIGNED + len(_SIGN) :]
+    body = unsigned[:-_SEALED]
+    is_complete = raw.endswith(_END) and len(unsigned) > _SEALED
+    if not is_complete or unsigned[-_SEALED:] != _SEAL + xxhash.xxh3_128_hexdigest(body).encode():
         raise ValueError("checksum mismatch: the metadata have changed since they were written")
     return body, sign.decode(errors="replace")
 

@@ -10,6 +10,7 @@ import sys
 import threading
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from types import CodeType
 from typing import NamedTuple
 
@@ -64,12 +65,12 @@ def function_code(code: CodeType) -> str:
     """Return the digest of a code object, which never changes, with its name, its constants and
     its inner functions.
     """
-    known = _known.get(id(code))
-    if known is None or known[0] is not code:
+    digested = _known.get(id(code))
+    if digested is None or digested[0] is not code:
         if len(_known) > _MOST:
             _known.clear()
-        known = _known[id(code)] = code, _digest_of(code)
-    return known[1]
+        digested = _known[id(code)] = code, _digest_of(code)
+    return digested[1]
 
 
 def _digest_of(code: CodeType) -> str:
@@ -122,20 +123,21 @@ def reached(parts: Sequence[Statement], names: Collection[str] | None) -> Iterat
     run.
     """
     if names is None or "*" in names:
-        yield from (range(part.first, part.last + 1) for part in parts)
+        yield from (range(statement.first, statement.last + 1) for statement in parts)
         return
-    wanted, seen = set(names), set[int]()
+    wanted_names, reached_already = set(names), set[int]()
     while True:
         new = [
             n
-            for n, part in enumerate(parts)
-            if n not in seen and (not part.binds or wanted & {*part.binds})
+            for n, statement in enumerate(parts)
+            if n not in reached_already
+            and (not statement.binds or wanted_names & {*statement.binds})
         ]
         if not new:
             return
         for n in new:
-            seen.add(n)
-            wanted |= {*parts[n].refers}
+            reached_already.add(n)
+            wanted_names |= {*parts[n].refers}
             yield range(parts[n].first, parts[n].last + 1)
 
 
@@ -143,31 +145,30 @@ def read_names(parts: Sequence[Statement], names: Collection[str]) -> set[str]:
     """Return the names that the statements read which the use of some names, or of all if none
     is given, may run.
     """
-    wanted = set(names) or {name for part in parts for name in part.binds}
+    read = set(names) or set(chain.from_iterable(statement.binds for statement in parts))
     while True:
-        run = [part for part in parts if not part.binds or wanted & {*part.binds}]
-        more = wanted | {name for part in run for name in part.refers}
-        if more == wanted:
-            return wanted
-        wanted = more
+        run = [statement for statement in parts if not statement.binds or read & {*statement.binds}]
+        longer = read.union(*(statement.refers for statement in run))
+        if longer == read:
+            return read
+        read = longer
 
 
 def written_only(parts: Sequence[Statement]) -> set[str]:
     """Return the names whose objects a module changes and that none of its code reads, such as a
     log.
     """
-    return {name for part in parts for name in part.writes} - {
-        name for part in parts for name in part.refers
-    }
+    writes = chain.from_iterable(statement.writes for statement in parts)
+    return set(writes).difference(*(statement.refers for statement in parts))
 
 
 def _statement(item: ast.stmt, kinds: Kinds) -> Statement:
     marks = item.decorator_list if isinstance(item, _DEFINITION) else []
     first = min([item.lineno, *(mark.lineno for mark in marks)])
-    written = {id(part) for part in _noted(kinds)}
-    loads = [part for part in each(kinds, ast.Name) if isinstance(part.ctx, ast.Load)]
-    refers = {part.id for part in loads if id(part) not in written}
-    writes = {part.id for part in loads if id(part) in written}
+    written = {id(name) for name in _noted(kinds)}
+    loads = [name for name in each(kinds, ast.Name) if isinstance(name.ctx, ast.Load)]
+    refers = {name.id for name in loads if id(name) not in written}
+    writes = {name.id for name in loads if id(name) in written}
     return Statement(
         first, item.end_lineno or item.lineno, sorted(_binds(item)), sorted(refers), sorted(writes)
     )
@@ -348,16 +349,16 @@ def reach_of(tree: ast.Module, bound: Mapping[str, str]) -> Reach:
     """Return what a module reaches; ``bound`` has the full name of each imported name, relative
     ones with a dot.
     """
-    found = _Pass(bound)
-    found.visit_all(tree.body, NameScope(tree, None))
-    unused = {full for name, full in bound.items() if name not in found.named and not is_calm(full)}
+    walk = _Pass(bound)
+    walk.visit_all(tree.body, NameScope(tree, None))
+    unused = {full for name, full in bound.items() if name not in walk.named and not is_calm(full)}
     return Reach(
-        sorted(found.outward),
-        sorted(found.passed),
+        sorted(walk.outward),
+        sorted(walk.passed),
         sorted(unused),
-        found.inward,
-        found.changes_arguments,
-        found.seeks,
+        walk.inward,
+        walk.changes_arguments,
+        walk.seeks,
     )
 
 
@@ -365,9 +366,10 @@ def outward_names(reaches: Collection[Reach]) -> set[str]:
     """Return the full names of what code may change in other modules, also by functions that it
     calls.
     """
-    names = {name for reach in reaches for name in reach.outward}
-    passed = any(reach.changes_arguments for reach in reaches)
-    return names | {name for reach in reaches for name in reach.passed if passed}
+    names = set(chain.from_iterable(reach.outward for reach in reaches))
+    if any(reach.changes_arguments for reach in reaches):
+        names.update(*(reach.passed for reach in reaches))
+    return names
 
 
 class _Pass:
@@ -435,33 +437,29 @@ class _Pass:
     def _imported_call(self, call: ast.Call, full: str, scope: NameScope, bare: bool) -> None:
         """Note the call of a function of another module, if it may change something."""
         last = last_name(call.func)
-        name, given = (
-            full if last in full.split(".") else f"{full}.{last}",
-            self._given(call, scope),
-        )
+        name = full if last in full.split(".") else f"{full}.{last}"
+        passed_names = self._given(call, scope)
         if _is_quiet(name, call):
             return
         if not is_calm(full):
-            self.passed |= given
+            self.passed |= passed_names
             if bare or _changes(last):
                 self.outward.add(name)
             return
-        named = bool(_SETTER.match(last) or _CHANGER.match(last))
-        if (bare and named) or name.startswith("torch.library."):
+        if name.startswith("torch.library.") or (bare and _is_setter(last)):
             self.outward.add(name)
         if bare or last.endswith("_"):
-            self.outward |= {each for each in given if not is_calm(each)}
+            self.outward |= {held_name for held_name in passed_names if not is_calm(held_name)}
 
     def _given(self, call: ast.Call, scope: NameScope) -> set[str]:
         """Return the names of what other modules hold and a call is given, not of what their
         functions return.
         """
-        given = [
-            each
-            for each in [*call.args, *(word.value for word in call.keywords)]
-            if not isinstance(each, ast.Call)
-        ]
-        return {name for each in given for name in self._imports(each, scope) if "()" not in name}
+        names = set[str]()
+        for argument in [*call.args, *(word.value for word in call.keywords)]:
+            if not isinstance(argument, ast.Call):
+                names |= self._imports(argument, scope)
+        return {name for name in names if "()" not in name}
 
     def _imports(self, item: ast.expr, scope: NameScope) -> set[str]:
         return {root.name for root in roots(item, scope, self._bound) if root.kind == "import"}
@@ -473,13 +471,15 @@ class _Pass:
         is defined.
         """
         for mark in getattr(item, "decorator_list", ()):
-            found = self._imports(mark.func if isinstance(mark, ast.Call) else mark, scope)
-            self.outward |= {name for name in found if not _is_quiet_decorator(name)}
+            imports = self._imports(mark.func if isinstance(mark, ast.Call) else mark, scope)
+            self.outward |= {name for name in imports if not _is_quiet_decorator(name)}
         if isinstance(item, ast.ClassDef):
             for base in [*item.bases, *(word.value for word in item.keywords)]:
-                found = self._imports(base, scope)
+                imports = self._imports(base, scope)
                 self.outward |= {
-                    name for name in found if not is_calm(name) and not _starts(name, _QUIET_CALLS)
+                    name
+                    for name in imports
+                    if not is_calm(name) and not _starts(name, _QUIET_CALLS)
                 }
 
 
@@ -488,6 +488,10 @@ def is_calm(name: str) -> bool:
     given.
     """
     return name.partition(".")[0] in CALM
+
+
+def _is_setter(method: str) -> bool:
+    return bool(_SETTER.match(method) or _CHANGER.match(method))
 
 
 def _changes(method: str) -> bool:
@@ -567,34 +571,33 @@ def summarise(source: bytes, own: bool = False) -> Summary:
         functions = functions_of(source)
     tree = Syntax(parsed)
     text = _digest_of_syntax(tree)
-    depends = [entry for item, _ in tree.texts for entry in _declared(item)]
     imports, bound = _imports(tree.all)
-    binds = sorted(name for name, ways in bound.items() if any(way[2] for way in ways))
-    names = {
-        name: ".".join(filter(None, way[1:]))
-        for name, ways in bound.items()
-        for way in sorted(ways)
-        if not way[0]
-    }
-    imports += [
-        way for call in each(tree.all, ast.Call) if (way := _by_literal(call, names)) is not None
-    ]
+    names = _full_names(bound)
+    by_literal = [_by_literal(call, names) for call in each(tree.all, ast.Call)]
     return Summary(
         text,
         digest(text, tree.documents),
         any(_reads_docstrings(kinds, own) for kinds in (tree.all, tree.not_run)),
-        imports,
-        binds,
-        _uses(
-            tree.all, {name: {way for way in ways if _chained(way)} for name, ways in bound.items()}
-        ),
+        [*imports, *(way for way in by_literal if way is not None)],
+        sorted(name for name, ways in bound.items() if any(way[2] for way in ways)),
+        _uses(tree.all, {name: set(filter(_chained, ways)) for name, ways in bound.items()}),
         _definitions(tree.texts),
         functions,
         _all_constructs(parsed, tree, names) if own else constructs(tree, names),
         statements(tree.blocks),
-        depends,
+        [*chain.from_iterable(_declared(item) for item, _ in tree.texts)],
         reach_of(parsed, {name: _full(ways) for name, ways in bound.items()}) if own else NOWHERE,
     )
+
+
+def _full_names(bound: Mapping[str, set[Import]]) -> dict[str, str]:
+    """Return the full name of each name that an import binds that is not relative."""
+    names: dict[str, str] = {}
+    for name, ways in bound.items():
+        for way in sorted(ways):
+            if not way[0]:
+                names[name] = ".".join(filter(None, way[1:]))
+    return names
 
 
 def syntax_outline(source: bytes) -> tuple[str, list[tuple[str, list[str]]]]:
@@ -606,9 +609,12 @@ def syntax_outline(source: bytes) -> tuple[str, list[tuple[str, list[str]]]]:
     """
     with _parsing:
         tree = ast.parse(source)
-    found = [item for item in tree.body if isinstance(item, ast.Import | ast.ImportFrom)]
+    import_statements = [
+        item for item in tree.body if isinstance(item, ast.Import | ast.ImportFrom)
+    ]
     imports = [
-        (getattr(item, "module", "") or "", [alias.name for alias in item.names]) for item in found
+        (getattr(item, "module", "") or "", [alias.name for alias in item.names])
+        for item in import_statements
     ]
     return _digest_of_syntax(Syntax(tree)), imports
 
@@ -644,9 +650,11 @@ def _by_literal(call: ast.Call, names: Mapping[str, str]) -> Import | None:
 def _all_constructs(parsed: ast.Module, tree: Syntax, names: Mapping[str, str]) -> list[Construct]:
     """Return what is not followed, with what only matters in code of a user."""
     usual = constructs(tree, names)
-    known = {(item.line, item.text.rpartition(".")[2]) for item in usual}
-    more = [*facts(tree.all, names), *moments(tree.all, names)]
-    beside = [item for item in more if (item.line, item.text.rpartition(".")[2]) not in known]
+    usual_places = {(item.line, item.text.rpartition(".")[2]) for item in usual}
+    by_user = [*facts(tree.all, names), *moments(tree.all, names)]
+    beside = [
+        item for item in by_user if (item.line, item.text.rpartition(".")[2]) not in usual_places
+    ]
     return sorted({*usual, *orders(parsed), *beside}, key=lambda item: (item.line, item))
 
 
@@ -744,11 +752,11 @@ def _definitions(texts: Iterable[tuple[ast.stmt, str]]) -> dict[str, str]:
 
     Definitions with the same label share one digest.
     """
-    found: dict[str, list[str]] = defaultdict(list)
+    texts_by_label: dict[str, list[str]] = defaultdict(list)
     for item, text in texts:
         for label in _labels(item):
-            found[label].append(text)
-    return {label: digest(parts)[:_SHORT_DIGEST] for label, parts in found.items()}
+            texts_by_label[label].append(text)
+    return {label: digest(parts)[:_SHORT_DIGEST] for label, parts in texts_by_label.items()}
 
 
 def _labels(item: ast.stmt) -> Iterable[str]:
@@ -764,13 +772,8 @@ def _labels(item: ast.stmt) -> Iterable[str]:
     targets = (
         item.targets if isinstance(item, ast.Assign) else [getattr(item, "target", None) or item]
     )
-    names = [
-        n.id
-        for t in targets
-        if not isinstance(t, ast.stmt)
-        for n in ast.walk(t)
-        if isinstance(n, ast.Name)
-    ]
+    inside = chain.from_iterable(ast.walk(t) for t in targets if not isinstance(t, ast.stmt))
+    names = [part.id for part in inside if isinstance(part, ast.Name)]
     return [f"constant {name}" for name in names] or ["other statements"]
 
 

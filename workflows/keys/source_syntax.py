@@ -58,8 +58,8 @@ class Syntax:
         for item in self._without_docstring(tree):
             self._top(item)
         for block in self.blocks:
-            for kind, found in block.kinds.items():
-                self.all[kind] += found
+            for kind, nodes in block.kinds.items():
+                self.all[kind] += nodes
 
     def _top(self, item: ast.stmt) -> None:
         """Add a statement at the top level: its text, and its blocks that a process runs."""
@@ -69,8 +69,8 @@ class Syntax:
             self._visit_quietly(item.test)
             self._visit_quietly(*item.body)
             self._words.append(f"[{len(item.orelse)}")
-            for part in item.orelse:
-                self._block(part)
+            for statement in item.orelse:
+                self._block(statement)
             if not item.orelse:
                 self.blocks.append(Block(ast.copy_location(ast.Pass(), item), {}))
         else:
@@ -108,11 +108,11 @@ class Syntax:
                 if field == "body" and kind in _DOCUMENTED:
                     value = self._without_docstring(item)
                 words.append(f"[{len(value)}")
-                for part in value:
-                    if isinstance(part, ast.AST):
-                        self._visit(part, scope)
+                for child in value:
+                    if isinstance(child, ast.AST):
+                        self._visit(child, scope)
                     else:
-                        words.append(repr(part))
+                        words.append(repr(child))
             else:
                 words.append(repr(value))
 
@@ -124,8 +124,8 @@ class Syntax:
         self._visit_quietly(item.test)
         self._visit_quietly(*item.body)
         self._words.append(f"[{len(item.orelse)}")
-        for part in item.orelse:
-            self._visit(part, scope)
+        for statement in item.orelse:
+            self._visit(statement, scope)
 
     def _visit_quietly(self, *items: ast.AST) -> None:
         """Add the text of items that no process runs."""
@@ -153,9 +153,9 @@ class Syntax:
         return body
 
 
-def each(kinds: Kinds, *wanted: type) -> Iterator[Any]:
+def each(kinds: Kinds, *types: type) -> Iterator[Any]:
     """Yield the parts of the given types, those of the first type first."""
-    for kind in wanted:
+    for kind in types:
         yield from kinds.get(kind, ())
 
 
@@ -231,14 +231,14 @@ class NameScope:
         self.is_module = above is None
         inner = getattr(item, "args", None) if isinstance(item, _FUNCTIONS) else None
         self.arguments = (
-            {part.arg for part in ast.walk(inner) if isinstance(part, ast.arg)}
+            {argument.arg for argument in ast.walk(inner) if isinstance(argument, ast.arg)}
             if inner
             else set[str]()
         )
         self.values: dict[str, list[ast.expr | None]] = defaultdict(list)
         body = getattr(item, "body", [])
-        for part in _inside(body if isinstance(body, list) else [body]):
-            for target, value in _bindings(part):
+        for statement in _inside(body if isinstance(body, list) else [body]):
+            for target, value in _bindings(statement):
                 self.values[target].append(value)
 
     def holder(self, name: str) -> NameScope | None:
@@ -253,7 +253,7 @@ def roots(
     item: ast.expr,
     scope: NameScope,
     bound: Mapping[str, str],
-    seen: frozenset[str] = frozenset(),
+    visited: frozenset[str] = frozenset(),
 ) -> list[Root]:
     """Return what an expression is part of; nothing for a new object."""
     attributes: list[str] = []
@@ -262,11 +262,10 @@ def roots(
             attributes.append(item.attr)
         item = item.value
     if isinstance(item, ast.Call):
-        return _of_call(item, scope, bound, seen)
+        return _of_call(item, scope, bound, visited)
     if not isinstance(item, ast.Name):
-        inner = _parts(item)
-        return [root for part in inner for root in roots(part, scope, bound, seen)]
-    if item.id in seen:
+        return _of_all(_parts(item), scope, bound, visited)
+    if item.id in visited:
         return []
     if "__class__" in attributes:
         return [Root("class", item.id)]
@@ -274,8 +273,18 @@ def roots(
         Root(root.kind, ".".join([root.name, *reversed(attributes)]))
         if root.kind == "import"
         else root
-        for root in _of_name(item.id, scope, bound, seen | {item.id})
+        for root in _of_name(item.id, scope, bound, visited | {item.id})
     ]
+
+
+def _of_all(
+    items: Iterable[ast.expr], scope: NameScope, bound: Mapping[str, str], visited: frozenset[str]
+) -> list[Root]:
+    """Return what some expressions are part of, one after another."""
+    origins: list[Root] = []
+    for item in items:
+        origins += roots(item, scope, bound, visited)
+    return origins
 
 
 def last_name(item: ast.expr) -> str:
@@ -290,46 +299,46 @@ def last_name(item: ast.expr) -> str:
 
 
 def _of_name(
-    name: str, scope: NameScope, bound: Mapping[str, str], seen: frozenset[str]
+    name: str, scope: NameScope, bound: Mapping[str, str], visited: frozenset[str]
 ) -> list[Root]:
+    imported = [Root("import", bound[name])] if name in bound else []
     holder = scope.holder(name)
     if holder is None or (holder.is_module and name in bound):
-        return [Root("import", bound[name])] if name in bound else []
+        return imported
     if name in holder.arguments:
         kind: Literal["class", "argument"] = "class" if name in _CLASS else "argument"
         return [] if name in _SELF else [Root(kind, name)]
     values = [value for value in holder.values[name] if value is not None]
-    found = [root for value in values for root in roots(value, holder, bound, seen)]
-    if name in bound and None in holder.values[name]:  # an import inside of a function
-        found.append(Root("import", bound[name]))
-    return [*found, Root("own", name)] if holder.is_module else found
+    origins = _of_all(values, holder, bound, visited)
+    if None in holder.values[name]:  # an import inside of a function
+        origins += imported
+    return [*origins, Root("own", name)] if holder.is_module else origins
 
 
 def _of_call(
-    call: ast.Call, scope: NameScope, bound: Mapping[str, str], seen: frozenset[str]
+    call: ast.Call, scope: NameScope, bound: Mapping[str, str], visited: frozenset[str]
 ) -> list[Root]:
     """Return what the result of a call may be part of: of the object whose method it is, unless
     it is a new object.
     """
     name = last_name(call.func)
     if isinstance(call.func, ast.Name) and name in _THROUGH:
-        return [root for argument in call.args for root in roots(argument, scope, bound, seen)]
+        return _of_all(call.args, scope, bound, visited)
     if isinstance(call.func, ast.Name) and name in ("globals", "type"):
         return [Root("own" if name == "globals" else "class", name)]
-    found = roots(call.func, scope, bound, seen)
-    new = name[:1].isupper() or name in ("copy", "clone", "deepcopy", "detach", "tolist", "item")
-    old = (
-        []
-        if new
-        else [
-            root
-            for root in found
-            if root.kind == "import" and root.name.partition(".")[0] not in _NEW
-        ]
-    )
-    return [
-        Root("import", root.name if root.name.endswith("()") else f"{root.name}()") for root in old
-    ]
+    origins = roots(call.func, scope, bound, visited)
+    if name[:1].isupper() or name in _COPYING:
+        return []
+    old = [root.name for root in origins if _is_of_library(root)]
+    return [Root("import", name if name.endswith("()") else f"{name}()") for name in old]
+
+
+#: functions and methods whose result is a new object
+_COPYING = ("copy", "clone", "deepcopy", "detach", "tolist", "item")
+
+
+def _is_of_library(root: Root) -> bool:
+    return root.kind == "import" and root.name.partition(".")[0] not in _NEW
 
 
 def _parts(item: ast.expr) -> list[ast.expr]:
@@ -366,18 +375,24 @@ def _bindings(item: ast.AST) -> Iterator[tuple[str, ast.expr | None]]:
     elif isinstance(item, ast.Import | ast.ImportFrom):
         yield from ((alias.asname or alias.name.partition(".")[0], None) for alias in item.names)
     for target, value in _assigned(item):
-        for part in ast.walk(target):
-            if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store):
-                yield part.id, value
+        if isinstance(item, _LOOPS) and value is not None:
+            value = ast.Starred(value)  # one of its parts
+        for child in ast.walk(target):
+            if isinstance(child, ast.Name) and isinstance(child.ctx, ast.Store):
+                yield child.id, value
+
+
+_LOOPS = (ast.For, ast.AsyncFor, ast.comprehension)
 
 
 def _assigned(item: ast.AST) -> Iterator[tuple[ast.expr, ast.expr | None]]:
+    """Yield each target of a statement with the expression that gives it its value."""
     if isinstance(item, ast.Assign):
         yield from ((target, item.value) for target in item.targets)
     elif isinstance(item, ast.AnnAssign | ast.AugAssign | ast.NamedExpr):
         yield item.target, item.value
-    elif isinstance(item, ast.For | ast.AsyncFor | ast.comprehension):
-        yield item.target, ast.Starred(item.iter)  # one of its parts
+    elif isinstance(item, _LOOPS):
+        yield item.target, item.iter
     elif isinstance(item, ast.withitem) and item.optional_vars is not None:
         yield item.optional_vars, item.context_expr
 
@@ -403,7 +418,7 @@ def dotted(item: ast.expr, bound: Mapping[str, str]) -> str:
 def arguments(function: ast.AST) -> set[str]:
     inner = getattr(function, "args", None)
     return (
-        {part.arg for part in ast.walk(inner) if isinstance(part, ast.arg)}
+        {argument.arg for argument in ast.walk(inner) if isinstance(argument, ast.arg)}
         if inner is not None
         else set()
     )
@@ -412,23 +427,10 @@ def arguments(function: ast.AST) -> set[str]:
 def assigned(function: ast.AST) -> Iterator[tuple[str, ast.expr]]:
     """Yield each local name of a function with an expression that gives it its value."""
     for item in ast.walk(function):
-        if isinstance(item, ast.Assign):
-            pairs: Iterable[tuple[ast.AST, ast.expr | None]] = [
-                (target, item.value) for target in item.targets
-            ]
-        elif isinstance(item, ast.AnnAssign | ast.AugAssign | ast.NamedExpr):
-            pairs = [(item.target, item.value)]
-        elif isinstance(item, ast.For | ast.AsyncFor | ast.comprehension):
-            pairs = [(item.target, item.iter)]
-        elif isinstance(item, ast.withitem):
-            pairs = [(item.optional_vars, item.context_expr)] if item.optional_vars else []
-        else:
-            continue
-        for target, value in pairs:
+        for target, value in _assigned(item):
+            names = [child.id for child in ast.walk(target) if isinstance(child, ast.Name)]
             if value is not None:
-                yield from (
-                    (part.id, value) for part in ast.walk(target) if isinstance(part, ast.Name)
-                )
+                yield from ((name, value) for name in names)
 
 
 def read_by(call: ast.Call) -> ast.expr | None:
@@ -464,18 +466,22 @@ def text_of(item: ast.expr) -> str | None:
     if isinstance(item, ast.BinOp) and isinstance(item.op, ast.Add):
         return _joined([item.left, item.right])
     if isinstance(item, ast.JoinedStr):
-        return _joined(
-            [each.value if isinstance(each, ast.FormattedValue) else each for each in item.values]
-        )
-    if (
-        isinstance(item, ast.Call)
-        and isinstance(item.func, ast.Attribute)
-        and item.func.attr == "join"
-        and item.args
-    ):
-        between, parts = text_of(item.func.value), item.args[0]
-        return _joined(parts.elts, between) if isinstance(parts, ast.List | ast.Tuple) else None
+        return _joined(map(_without_format, item.values))
+    if isinstance(item, ast.Call) and isinstance(item.func, ast.Attribute):
+        return _text_of_join(item, item.func)
     return None
+
+
+def _without_format(piece: ast.expr) -> ast.expr:
+    return piece.value if isinstance(piece, ast.FormattedValue) else piece
+
+
+def _text_of_join(call: ast.Call, method: ast.Attribute) -> str | None:
+    """Return the text of ``", ".join(["a", "b"])``, or None for another call."""
+    if method.attr != "join" or not call.args:
+        return None
+    between, parts = text_of(method.value), call.args[0]
+    return _joined(parts.elts, between) if isinstance(parts, ast.List | ast.Tuple) else None
 
 
 def reads_attributes_unnamed(kinds: Kinds) -> bool:
@@ -488,16 +494,16 @@ def reads_attributes_unnamed(kinds: Kinds) -> bool:
         name = last_name(call.func)
         names = call.args[1:2] if name != "attrgetter" else call.args
         if (name in _ALL and call.args) or (
-            name in _NAMING and any(text_of(each) is None for each in names)
+            name in _NAMING and any(text_of(argument) is None for argument in names)
         ):
             return True
     return False
 
 
 def _joined(parts: Iterable[ast.expr], between: str | None = "") -> str | None:
-    found = [text_of(part) for part in parts]
-    known = [text for text in found if text is not None]
-    return between.join(known) if between is not None and len(known) == len(found) else None
+    values = [text_of(piece) for piece in parts]
+    literals = [text for text in values if text is not None]
+    return between.join(literals) if between is not None and len(literals) == len(values) else None
 
 
 # --- scratch files --------------------------------------------------------------------------------
@@ -565,7 +571,10 @@ class Scratch:
         """
         joins = [item.right for scope, item in tree.joins if self.holds(item.left, scope)]
         calls = [(scope, call) for scope, call in tree.calls if self._is_below_made(call, scope)]
-        return {id(part) for part in [*joins, *(part for _, call in calls for part in call.args)]}
+        return {
+            id(argument)
+            for argument in [*joins, *(argument for _, call in calls for argument in call.args)]
+        }
 
     def _is_below_made(self, call: ast.Call, scope: Scope) -> bool:
         """Return True for a call that joins words to a temporary path, and for a method of an
@@ -576,31 +585,33 @@ class Scratch:
         joins = dotted(call.func, self._bound) in _THROUGH_FILES
         return joins and bool(call.args) and self.holds(call.args[0], scope)
 
-    def _is_made(self, item: ast.expr, scope: Scope, seen: frozenset[str]) -> bool:
+    def _is_made(self, item: ast.expr, scope: Scope, visited: frozenset[str]) -> bool:
         if isinstance(item, ast.Attribute | ast.Subscript | ast.Starred | ast.NamedExpr):
-            return self._is_made(item.value, scope, seen)
+            return self._is_made(item.value, scope, visited)
         if isinstance(item, ast.BinOp):
-            return self._is_made(item.left, scope, seen)
+            return self._is_made(item.left, scope, visited)
         if isinstance(item, ast.JoinedStr):
             first = item.values[0] if item.values else item
-            return isinstance(first, ast.FormattedValue) and self._is_made(first.value, scope, seen)
+            return isinstance(first, ast.FormattedValue) and self._is_made(
+                first.value, scope, visited
+            )
         if isinstance(item, ast.Call):
-            return self._is_made_by(item, scope, seen)
-        return isinstance(item, ast.Name) and self._is_name_made(item.id, scope, seen)
+            return self._is_made_by(item, scope, visited)
+        return isinstance(item, ast.Name) and self._is_name_made(item.id, scope, visited)
 
-    def _is_made_by(self, call: ast.Call, scope: Scope, seen: frozenset[str]) -> bool:
+    def _is_made_by(self, call: ast.Call, scope: Scope, visited: frozenset[str]) -> bool:
         full = dotted(call.func, self._bound)
         last = call.func.attr if isinstance(call.func, ast.Attribute) else ""
         if full in _MADE:
             return True
         if full in _THROUGH_FILES or last in _THROUGH_FILES or self._reads(full):
             first = read_by(call)
-            return first is not None and self._is_made(first, scope, seen)
-        return bool(last) and self._is_made(call.func, scope, seen)
+            return first is not None and self._is_made(first, scope, visited)
+        return bool(last) and self._is_made(call.func, scope, visited)
 
-    def _is_name_made(self, name: str, scope: Scope, seen: frozenset[str]) -> bool:
+    def _is_name_made(self, name: str, scope: Scope, visited: frozenset[str]) -> bool:
         """Return True if all that gives a local name its value is made."""
-        if name in seen:
+        if name in visited:
             return True  # a path that is lengthened
         for depth in range(len(scope), 0, -1):
             function = scope[depth - 1]
@@ -608,5 +619,7 @@ class Scratch:
                 return False
             values = [value for target, value in assigned(function) if target == name]
             if values:
-                return all(self._is_made(value, scope[:depth], seen | {name}) for value in values)
+                return all(
+                    self._is_made(value, scope[:depth], visited | {name}) for value in values
+                )
         return False

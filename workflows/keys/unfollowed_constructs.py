@@ -186,9 +186,9 @@ def constructs(tree: Syntax, bound: Mapping[str, str]) -> list[Construct]:
     """
     own = _bound_here(tree.all)
     scratch = Scratch(bound, lambda full: _READERS.fullmatch(full) is not None)
-    found = [*_named(tree.all, bound, own), *_read(tree.calls, bound, own, scratch)]
-    found += _file_names(tree.all, scratch.texts(tree) if scratch else set())
-    return sorted(set(found), key=lambda item: (item.line, item))
+    unfollowed = [*_named(tree.all, bound, own), *_read(tree.calls, bound, own, scratch)]
+    unfollowed += _file_names(tree.all, scratch.texts(tree) if scratch else set())
+    return sorted(set(unfollowed), key=lambda item: (item.line, item))
 
 
 def literal_import(call: ast.expr, bound: Mapping[str, str]) -> str | None:
@@ -217,27 +217,30 @@ def _bound_here(kinds: Kinds) -> set[str]:
     """Return the names that statements and arguments bind, so that they hide a builtin of the
     same name.
     """
-    found = {item.name for item in each(kinds, ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)}
-    found |= {item.arg for item in each(kinds, ast.arg)}
-    return found | {item.id for item in each(kinds, ast.Name) if not isinstance(item.ctx, ast.Load)}
+    names = {item.name for item in each(kinds, ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)}
+    names |= {item.arg for item in each(kinds, ast.arg)}
+    return names | {item.id for item in each(kinds, ast.Name) if not isinstance(item.ctx, ast.Load)}
 
 
 def _named(kinds: Kinds, bound: Mapping[str, str], own: set[str]) -> Iterator[Construct]:
     """Yield each use of a name that reads what no import shows, such as ``os.environ``."""
-    known = {id(call.func) for call in each(kinds, ast.Call) if literal_import(call, bound)}
-    known |= {id(use.value) for use in each(kinds, ast.Attribute)}
+    accounted = {id(call.func) for call in each(kinds, ast.Call) if literal_import(call, bound)}
+    accounted |= {id(use.value) for use in each(kinds, ast.Attribute)}
     names = {id(use): name for use, name in _variables(kinds, bound)}
     for item in each(kinds, ast.Attribute, ast.Name):
-        if id(item) in known or not isinstance(item.ctx, ast.Load):
+        if id(item) in accounted or not isinstance(item.ctx, ast.Load):
             continue
-        base = _first_name(item)
-        if base not in bound and (base in own or base not in _BUILTINS):
+        if not _is_imported_or_builtin(_first_name(item), bound, own):
             continue
         full = dotted(item, bound)
         if entry := entry_of(full):
             yield Construct(
                 entry[0], names.get(id(_environ(item)), ""), full, entry[1], item.lineno
             )
+
+
+def _is_imported_or_builtin(base: str, bound: Mapping[str, str], own: set[str]) -> bool:
+    return base in bound or (base not in own and base in _BUILTINS)
 
 
 def entry_of(full: str) -> tuple[str, str] | None:
@@ -284,21 +287,21 @@ def _read(
     function around it.
     """
     for scope, item in calls:
-        full = dotted(item.func, bound)
-        method = isinstance(item.func, ast.Attribute) and item.func.attr in _METHODS
-        known = _first_name(item.func) in bound or (full == "open" and full not in own)
-        if known and _READERS.fullmatch(full):
-            path = read_by(item)
-        elif (
-            method and isinstance(item.func, ast.Attribute) and _first_name(item.func) not in bound
-        ):
-            path = item.func.value
-        else:
-            continue
+        path = _path_read(item, bound, own)
         if path is None or _writes(item) or _given(path, scope, frozenset()):
             continue
         if not scratch.holds(path, scope):
             yield Construct("file", _literal(path), ast.unparse(item)[:60], _FILE, item.lineno)
+
+
+def _path_read(call: ast.Call, bound: Mapping[str, str], own: set[str]) -> ast.expr | None:
+    """Return the path of the file that a call reads, or None for a call that reads no file."""
+    full, is_imported = dotted(call.func, bound), _first_name(call.func) in bound
+    if (is_imported or (full == "open" and full not in own)) and _READERS.fullmatch(full):
+        return read_by(call)
+    if is_imported or not isinstance(call.func, ast.Attribute) or call.func.attr not in _METHODS:
+        return None
+    return call.func.value
 
 
 def _writes(call: ast.Call) -> bool:
@@ -313,27 +316,27 @@ def _literal(path: ast.AST) -> str:
     return path.value if isinstance(path, ast.Constant) and isinstance(path.value, str) else ""
 
 
-def _given(path: ast.expr, scope: Scope, seen: frozenset[str]) -> bool:
+def _given(path: ast.expr, scope: Scope, visited: frozenset[str]) -> bool:
     """Return True if a path comes from an argument of a function around it, through any local
     names.
     """
     names = [
-        part
-        for part in ast.walk(path)
-        if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Load)
+        variable
+        for variable in ast.walk(path)
+        if isinstance(variable, ast.Name) and isinstance(variable.ctx, ast.Load)
     ]
-    return any(_name_given(name.id, scope, seen) for name in names)
+    return any(_name_given(name.id, scope, visited) for name in names)
 
 
-def _name_given(name: str, scope: Scope, seen: frozenset[str]) -> bool:
-    if name in seen:
+def _name_given(name: str, scope: Scope, visited: frozenset[str]) -> bool:
+    if name in visited:
         return False
     for function in reversed(scope):
         if name in arguments(function):
             return True
         values = [value for target, value in assigned(function) if target == name]
         if values:
-            return any(_given(value, scope, seen | {name}) for value in values)
+            return any(_given(value, scope, visited | {name}) for value in values)
     return False
 
 
@@ -343,9 +346,12 @@ def _file_names(kinds: Kinds, scratch: set[int]) -> Iterator[Construct]:
 
     ``scratch`` are the texts, by id, that name a file in a temporary folder.
     """
-    spoken = {id(part) for item in each(kinds, ast.Raise, ast.JoinedStr) for part in ast.walk(item)}
+    spoken = set[int]()
+    for item in each(kinds, ast.Raise, ast.JoinedStr):
+        spoken |= {id(piece) for piece in ast.walk(item)}
     for item in each(kinds, ast.Constant):
-        if _FILE_NAME.fullmatch(text := _literal(item)) and id(item) not in spoken | scratch:
+        text = _literal(item)
+        if _FILE_NAME.fullmatch(text) and id(item) not in spoken | scratch:
             yield Construct("file", text, repr(text), _FILE, item.lineno)
 
 
@@ -391,48 +397,60 @@ def orders(tree: ast.Module) -> list[Construct]:
     """Return each place where a module takes the order of a set, or a hash, that differs between
     processes.
     """
-    found = _found(tree, NameScope(tree, None))
-    return [Construct("hash", "", ast.unparse(item)[:60], _WHY, item.lineno) for item in found]
+    expressions = _found(tree, NameScope(tree, None))
+    return [
+        Construct("hash", "", ast.unparse(item)[:60], _WHY, item.lineno) for item in expressions
+    ]
 
 
 def _found(item: ast.AST, scope: NameScope) -> Iterator[ast.expr]:
     if isinstance(item, _SCOPES):
         scope = NameScope(item, scope)
-    yield from (each for each in _taken(item, scope) if _is_set(each, scope))
+    yield from (taken for taken in _taken(item, scope) if _is_set(taken, scope))
     if isinstance(item, ast.Call):
-        if _is_hash(item, scope) or (
-            last_name(item.func) == "pop"
-            and not item.args
-            and _of_set(item.func, scope, frozenset())
-        ):
+        if _is_hash(item, scope) or _pops_of_set(item, scope):
             yield item
         if last_name(item.func) in _UNORDERED:
-            yield from (each for argument in item.args for each in _below(argument, scope))
+            for argument in item.args:
+                yield from _below(argument, scope)
             return
-    if not (isinstance(item, ast.FunctionDef) and item.name == "__hash__"):
+    if not _defines_hash(item):
         for child in ast.iter_child_nodes(item):
             yield from _found(child, scope)
+
+
+def _defines_hash(item: ast.AST) -> bool:
+    return isinstance(item, ast.FunctionDef) and item.name == "__hash__"
+
+
+def _pops_of_set(call: ast.Call, scope: NameScope) -> bool:
+    """Return True for ``pop()`` of a set, which gives any of its elements."""
+    if last_name(call.func) != "pop" or call.args:
+        return False
+    return _of_set(call.func, scope, frozenset())
 
 
 def _below(argument: ast.expr, scope: NameScope) -> Iterator[ast.expr]:
     """Yield what is found inside of an argument whose own order is nothing."""
     if isinstance(argument, ast.Call) and last_name(argument.func) in _ORDERED:
-        for part in argument.args:
-            yield from _below(part, scope)
+        for value in argument.args:
+            yield from _below(value, scope)
     elif isinstance(argument, _LISTED):
-        first = argument.generators[0].iter
-        inner = [
-            each for part in argument.generators for each in (part.target, part.iter, *part.ifs)
-        ]
-        values = (
-            [argument.key, argument.value] if isinstance(argument, ast.DictComp) else [argument.elt]
-        )
-        yield from (
-            each for part in (*inner, *values) if part is not first for each in _found(part, scope)
-        )
+        for operand in _behind_first(argument):
+            yield from _found(operand, scope)
     else:
         for child in ast.iter_child_nodes(argument):
             yield from _found(child, scope)
+
+
+def _behind_first(listed: ast.ListComp | ast.DictComp | ast.GeneratorExp) -> list[ast.expr]:
+    """Return the expressions of a comprehension but for what it goes through first."""
+    operands: list[ast.expr] = []
+    for clause in listed.generators:
+        operands += [clause.target, clause.iter, *clause.ifs]
+    operands.remove(listed.generators[0].iter)
+    values = [listed.key, listed.value] if isinstance(listed, ast.DictComp) else [listed.elt]
+    return [*operands, *values]
 
 
 def _taken(item: ast.AST, scope: NameScope) -> list[ast.expr]:
@@ -440,7 +458,7 @@ def _taken(item: ast.AST, scope: NameScope) -> list[ast.expr]:
     if isinstance(item, ast.For | ast.AsyncFor):
         return [item.iter]
     if isinstance(item, _LISTED):
-        return [part.iter for part in item.generators]
+        return [clause.iter for clause in item.generators]
     if isinstance(item, ast.Starred):
         return [item.value]
     return [*item.args] if isinstance(item, ast.Call) and last_name(item.func) in _ORDERED else []
@@ -455,38 +473,46 @@ def _is_hash(call: ast.Call, scope: NameScope) -> bool:
     )
 
 
-def _is_set(item: ast.expr, scope: NameScope, seen: frozenset[str] = frozenset()) -> bool:
+def _is_set(item: ast.expr, scope: NameScope, visited: frozenset[str] = frozenset()) -> bool:
     """Return True for an expression that is a set, and not one of numbers."""
     if isinstance(item, ast.Set):
-        return not all(
-            isinstance(each, ast.Constant) and isinstance(each.value, int | float)
-            for each in item.elts
-        )
+        return not all(map(_is_number, item.elts))
     if isinstance(item, ast.BinOp) and isinstance(
         item.op, ast.BitOr | ast.BitAnd | ast.Sub | ast.BitXor
     ):
-        return _is_set(item.left, scope, seen) or _is_set(item.right, scope, seen)
+        return _is_set(item.left, scope, visited) or _is_set(item.right, scope, visited)
     if isinstance(item, ast.Call):
-        made = isinstance(item.func, ast.Name) and item.func.id in ("set", "frozenset")
-        ranged = (
-            bool(item.args)
-            and isinstance(item.args[0], ast.Call)
-            and last_name(item.args[0].func) == "range"
+        return _makes_set(item) or (
+            last_name(item.func) in _OF_SETS and _of_set(item.func, scope, visited)
         )
-        return (made and not ranged) or (
-            last_name(item.func) in _OF_SETS and _of_set(item.func, scope, seen)
-        )
-    if isinstance(item, ast.Name) and item.id not in seen:
-        holder = scope.holder(item.id)
-        values = holder.values.get(item.id, []) if holder is not None else []
-        return holder is not None and any(
-            value is not None and _is_set(value, holder, seen | {item.id}) for value in values
-        )
+    if isinstance(item, ast.Name) and item.id not in visited:
+        return _names_set(item.id, scope, visited)
     return isinstance(item, ast.SetComp)
 
 
-def _of_set(function: ast.expr, scope: NameScope, seen: frozenset[str]) -> bool:
-    return isinstance(function, ast.Attribute) and _is_set(function.value, scope, seen)
+def _is_number(item: ast.expr) -> bool:
+    return isinstance(item, ast.Constant) and isinstance(item.value, int | float)
+
+
+def _makes_set(call: ast.Call) -> bool:
+    """Return True for ``set(…)``, but not of a range of numbers."""
+    if not isinstance(call.func, ast.Name) or call.func.id not in ("set", "frozenset"):
+        return False
+    first = call.args[0] if call.args else None
+    return not (isinstance(first, ast.Call) and last_name(first.func) == "range")
+
+
+def _names_set(name: str, scope: NameScope, visited: frozenset[str]) -> bool:
+    """Return True for a name to which a set is bound."""
+    holder = scope.holder(name)
+    if holder is None:
+        return False
+    values = [value for value in holder.values.get(name, []) if value is not None]
+    return any(_is_set(value, holder, visited | {name}) for value in values)
+
+
+def _of_set(function: ast.expr, scope: NameScope, visited: frozenset[str]) -> bool:
+    return isinstance(function, ast.Attribute) and _is_set(function.value, scope, visited)
 
 
 # --- facts beside content -------------------------------------------------------------------------
@@ -576,8 +602,8 @@ def facts(kinds: Kinds, bound: Mapping[str, str]) -> list[Construct]:
     """Return each use of a fact beside the content of a file; ``bound`` has the full name of
     each imported name.
     """
-    found = [*_by_name(kinds, bound), *_by_text(kinds), *_by_place(kinds), *_of_paths(kinds)]
-    return [Construct(why[0], "", text, why[1], line) for text, why, line in found]
+    uses = [*_by_name(kinds, bound), *_by_text(kinds), *_by_place(kinds), *_of_paths(kinds)]
+    return [Construct(why[0], "", text, why[1], line) for text, why, line in uses]
 
 
 _Found = Iterator[tuple[str, tuple[str, str], int]]
@@ -615,28 +641,33 @@ def _by_text(kinds: Kinds) -> _Found:
 
 def _by_place(kinds: Kinds) -> _Found:
     """Yield each use of the result of ``os.stat`` as a row of numbers."""
-    assigned = [item for item in each(kinds, ast.Assign) if _is_stat(item.value, frozenset())]
-    named = frozenset(
-        target.id for item in assigned for target in item.targets if isinstance(target, ast.Name)
-    )
-    rows = [
-        target
-        for item in assigned
-        for target in item.targets
-        if isinstance(target, ast.Tuple | ast.List)
-    ]
-    rows += [
-        item
-        for item in each(kinds, ast.Subscript)
-        if _is_stat(item.value, named)
-        and not (isinstance(item.slice, ast.Constant) and item.slice.value == _SIZE)
-    ]
-    rows += [
-        item for item in each(kinds, ast.Starred, ast.FormattedValue) if _is_stat(item.value, named)
-    ]
-    calls = [call for call in each(kinds, ast.Call) if last_name(call.func) in _TAKING]
-    rows += [call for call in calls if any(_is_stat(argument, named) for argument in call.args)]
+    targets: list[ast.expr] = []
+    for item in each(kinds, ast.Assign):
+        if _is_stat(item.value, frozenset()):
+            targets += item.targets
+    named = frozenset(target.id for target in targets if isinstance(target, ast.Name))
+    unpacked = [target for target in targets if isinstance(target, ast.Tuple | ast.List)]
+    rows = [*unpacked, *_rows_of_stat(kinds, named)]
     yield from (("stat", ("stamp", _STAMP), row.lineno) for row in rows)
+
+
+def _rows_of_stat(kinds: Kinds, named: frozenset[str]) -> Iterator[ast.expr]:
+    """Yield each place that takes such a result as a row: by index, by ``*`` or in a text, and by
+    a call.
+    """
+    yield from (item for item in each(kinds, ast.Subscript) if _is_field_of_stat(item, named))
+    for item in each(kinds, ast.Starred, ast.FormattedValue):
+        if _is_stat(item.value, named):
+            yield item
+    for call in each(kinds, ast.Call):
+        if last_name(call.func) in _TAKING and any(_is_stat(item, named) for item in call.args):
+            yield call
+
+
+def _is_field_of_stat(item: ast.Subscript, named: frozenset[str]) -> bool:
+    """Return True for an entry of such a result by its place, but for the size."""
+    is_size = isinstance(item.slice, ast.Constant) and item.slice.value == _SIZE
+    return _is_stat(item.value, named) and not is_size
 
 
 def _is_stat(item: ast.expr, named: frozenset[str]) -> bool:
@@ -733,12 +764,12 @@ def moments(kinds: Kinds, bound: Mapping[str, str]) -> list[Construct]:
     """Return each use of a fact of the moment; ``bound`` has the full name of each imported
     name.
     """
-    found = [
+    uses = [
         *_moment_by_name(kinds, bound),
         *_by_date(kinds),
         *_looked_up(kinds, bound),
     ]
-    return [Construct("state", "", text, why, line) for text, why, line in found]
+    return [Construct("state", "", text, why, line) for text, why, line in uses]
 
 
 _MomentFact = Iterator[tuple[str, str, int]]
@@ -771,10 +802,10 @@ def _looked_up(kinds: Kinds, bound: Mapping[str, str]) -> _MomentFact:
         base, name = dotted(call.args[0], bound), text_of(call.args[1])
         if base.partition(".")[0] not in _HOLDING:
             continue
-        known = entry_of(f"{base}.{name}") if name else ("state", _LOOKED_UP)
-        if known or name in _LAST:
+        entry = entry_of(f"{base}.{name}") if name else ("state", _LOOKED_UP)
+        if entry or name in _LAST:
             yield (
                 ast.unparse(call)[:60],
-                known[1] if known else _WHY_OF_MOMENT,
+                entry[1] if entry else _WHY_OF_MOMENT,
                 call.lineno,
             )

@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -14,7 +15,13 @@ from neusee.nodes.own_modules import own_modules
 from neusee.workflows.keys.cache_key import digest, file_digest, files_in, is_own, networks_of
 from neusee.workflows.keys.module_digest import Look, Whole, edited_since
 from neusee.workflows.keys.module_origin import origin_of
-from neusee.workflows.keys.source_summary import Reach, is_calm, outward_names, written_only
+from neusee.workflows.keys.source_summary import (
+    Reach,
+    Summary,
+    is_calm,
+    outward_names,
+    written_only,
+)
 from neusee.workflows.keys.unfollowed_constructs import Construct, UnfollowedCode
 
 if TYPE_CHECKING:
@@ -72,33 +79,31 @@ def resolve(
 
     Raises `LookupError` for an entry that is neither a file nor a module.
     """
-    found = Declared({}, [], [])
+    declared = Declared({}, [], [])
     for entry in entries:
         if entry.startswith(VARIABLE):
             name = entry.removeprefix(VARIABLE)
             values = dict.fromkeys([then.get(name, os.environ.get(name)), os.environ.get(name)])
-            found.parts[f"environment variable {name}"] = {"value": digest(*values)[:16]}
+            declared.parts[f"environment variable {name}"] = {"value": digest(*values)[:16]}
         elif not entry.startswith(FREE):
             path = source.parent / entry
             if path.exists():
-                found.parts[f"file {entry}"] = {"content": _content(path)}
-                found.changed.extend([entry] if _changed(path, import_time(module)) else [])
-            elif all(part.isidentifier() for part in entry.split(".")) and exists(entry):
-                found.modules.append(entry)
+                declared.parts[f"file {entry}"] = {"content": _content(path)}
+                declared.changed.extend([entry] if _changed(path, import_time(module)) else [])
+            elif all(word.isidentifier() for word in entry.split(".")) and exists(entry):
+                declared.modules.append(entry)
             else:
                 text = (
                     f"{source}: depends={entry!r} is no file in {source.parent} and no module:"
                     " correct the name"
                 )
                 raise UnfollowedCode(text)
-    return found
+    return declared
 
 
-def uncovered(found: Iterable[Construct], entries: Sequence[str]) -> Construct | None:
+def uncovered(met: Iterable[Construct], entries: Sequence[str]) -> Construct | None:
     """Return the first construct that no entry covers, or None."""
-    return next(
-        (item for item in found if not any(_covers(entry, item) for entry in entries)), None
-    )
+    return next((item for item in met if not any(_covers(entry, item) for entry in entries)), None)
 
 
 def refusal(item: Construct, source: Path) -> str:
@@ -114,12 +119,12 @@ def refusal(item: Construct, source: Path) -> str:
     )
 
 
-def changing_refusal(name: str, what: str, source: Path) -> str:
+def changing_refusal(name: str, kind_of_object: str, source: Path) -> str:
     """Return the message that refuses a name of a module whose object changes while a process
     runs, or is not read.
     """
     return (
-        f"{source}: {name} is or holds a {what}, and a cache key cannot see it: "
+        f"{source}: {name} is or holds a {kind_of_object}, and a cache key cannot see it: "
         "make it inside of the function that uses it; or, if no result depends on it,"
         f' depends=["{FREE}{name}"]'
     )
@@ -199,7 +204,8 @@ def taint_code(modules: Iterable[str], taints: tuple[Any, ...]) -> bool:
 
 def taints_of(modules: Iterable[str]) -> tuple[Any, ...]:
     """Return what modules have reached in this process although their keys do not cover it."""
-    return tuple(dict.fromkeys(taint for module in modules for taint in _taints.get(module, ())))
+    taints = chain.from_iterable(_taints.get(module, ()) for module in modules)
+    return tuple(dict.fromkeys(taints))
 
 
 def holds_here_alone(module: str) -> bool:
@@ -240,9 +246,9 @@ class Siblings:
         others = own_modules()
         if not others:
             return []
-        followed = {
-            name: look for root in roots for name, look in self._whole_of(root).looks.items()
-        }
+        followed: dict[str, Look] = {}
+        for root in roots:
+            followed.update(self._whole_of(root).looks)
         mine = _own(followed)
         beside = [name for name in others if name not in followed]
         return [name for name in beside if self._joins(name, mine, any(map(is_own, roots)))]
@@ -265,13 +271,19 @@ def _scope(looks: Mapping[str, Look]) -> Scope:
     """Return whose results the code of a module and of its helpers may change."""
     reaches = _own(looks).values()
     names = outward_names(reaches)
-    names |= {name for reach in reaches for name in reach.unused if _kind(name) == "distribution"}
-    summaries = [look.summary for name, look in looks.items() if is_own(name) and look.summary]
-    unseen = any(each.kind in _UNSEEN for summary in summaries for each in summary.constructs)
+    for reach in reaches:
+        names |= {name for name in reach.unused if _kind(name) == "distribution"}
     own = {name for name in names if _is_of_user(name)}
-    if unseen or any(_is_shared(name) for name in names - own):
+    if _holds_unseen(looks) or any(_is_shared(name) for name in names - own):
         return "all"
     return "own" if own else "nothing"
+
+
+def _holds_unseen(looks: Mapping[str, Look]) -> bool:
+    """Return True if own code among some modules has a construct whose reach nobody can see."""
+    summaries = [look.summary for name, look in looks.items() if is_own(name) and look.summary]
+    constructs = chain.from_iterable(summary.constructs for summary in summaries)
+    return any(construct.kind in _UNSEEN for construct in constructs)
 
 
 def _own(looks: Mapping[str, Look]) -> dict[str, Reach]:
@@ -292,8 +304,8 @@ def _is_shared(name: str) -> bool:
     """Return True for something of a library that others see: not for the result of a call, such
     as an open file.
     """
-    called, found, _ = name.rpartition("()")
-    return not found or _GETTER.search(called.rpartition(".")[2]) is not None
+    called, separator, _ = name.rpartition("()")
+    return not separator or _GETTER.search(called.rpartition(".")[2]) is not None
 
 
 def _kind(name: str) -> str:
@@ -330,7 +342,7 @@ class OwnCode:
 def own_code(step: Step, code: Code) -> OwnCode | None:
     """Return the code of a step that is not of neusee, or None for a step of the package alone."""
     return own_code_of(
-        step.node, step.params, [each.__module__ for each in networks_of(step)], code
+        step.node, step.params, [network.__module__ for network in networks_of(step)], code
     )
 
 
@@ -343,46 +355,55 @@ def own_code_of(
     roots = [node.fn.__module__, *networks]
     if not any(map(is_own, roots)):
         return None
-    looks = {name: look for root in roots for name, look in code.looks(root).items()}
-    followed = {name: look for name, look in looks.items() if look.summary is not None}
-    modules = frozenset(filter(is_own, followed))
-    files = {os.path.realpath(file) for file in files_in(params)}
-    free, variables = set[str](), set[str]()
-    declared = [(look.path, look.summary.depends) for look in followed.values() if look.summary]
+    looks: dict[str, Look] = {}
+    for root in roots:
+        looks.update(code.looks(root))
+    summaries = {name: look.summary for name, look in looks.items() if look.summary is not None}
+    own = {name: summary for name, summary in summaries.items() if is_own(name)}
+    declared = [(looks[name].path, summary.depends) for name, summary in summaries.items()]
     declared.append((looks[roots[0]].path, [*node.depends]))
-    for source, entries in declared:
-        free.update(entry.removeprefix(FREE) for entry in entries if entry.startswith(FREE))
-        variables.update(
-            entry.removeprefix(VARIABLE) for entry in entries if entry.startswith(VARIABLE)
-        )
-        beside = [source.parent / entry for entry in entries] if source else []
-        files.update(os.path.realpath(path) for path in beside if path.exists())
-    summaries = {name: followed[name].summary for name in modules}
-    changed = outward_names([each.reach for each in summaries.values() if each])
-    unread = {
-        f"{name}.{log}"
-        for name, each in summaries.items()
-        if each
-        for log in written_only(each.statements)
-    }
-    imports = {
-        module
-        for each in summaries.values()
-        if each
-        for level, module, _ in each.imports
-        if not level
-    }
-    may_change = bool(changed) or any(not is_calm(name) for name in imports - modules)
+    entries = [*chain.from_iterable(depends for _, depends in declared)]
+    files = {os.path.realpath(file) for file in files_in(params)}
+    for source, depends in declared:
+        files |= _declared_files(source, depends)
+    changed = outward_names([summary.reach for summary in own.values()])
     return OwnCode(
-        modules=modules,
+        modules=frozenset(own),
         followed=frozenset(looks),
         files=frozenset(files),
-        free=frozenset(free),
+        free=_after(FREE, entries),
         changed=frozenset(changed),
-        unread=frozenset(unread),
-        may_change=may_change,
-        variables=frozenset(variables),
+        unread=_unread_logs(own),
+        may_change=bool(changed) or _may_change_others(own),
+        variables=_after(VARIABLE, entries),
     )
+
+
+def _declared_files(source: Path | None, entries: Sequence[str]) -> set[str]:
+    """Return the real paths of the files beside a source file that its entries name."""
+    beside = [source.parent / entry for entry in entries] if source else []
+    return {os.path.realpath(path) for path in beside if path.exists()}
+
+
+def _after(prefix: str, entries: Iterable[str]) -> frozenset[str]:
+    """Return the names that follow a prefix in the declared entries."""
+    return frozenset(entry.removeprefix(prefix) for entry in entries if entry.startswith(prefix))
+
+
+def _unread_logs(summaries: Mapping[str, Summary]) -> frozenset[str]:
+    """Return the full names of objects of modules that the modules write to and never read."""
+    logs = set[str]()
+    for name, summary in summaries.items():
+        logs |= {f"{name}.{log}" for log in written_only(summary.statements)}
+    return frozenset(logs)
+
+
+def _may_change_others(summaries: Mapping[str, Summary]) -> bool:
+    """Return True if own modules import, by full name, another one that is not calm."""
+    imports = set[str]()
+    for summary in summaries.values():
+        imports |= {module for level, module, _ in summary.imports if not level}
+    return any(not is_calm(name) for name in imports - summaries.keys())
 
 
 def reads_time(looks: Mapping[str, Look]) -> bool:
@@ -390,7 +411,8 @@ def reads_time(looks: Mapping[str, Look]) -> bool:
     package of its own.
     """
     own = [look for name, look in looks.items() if is_own(name)]
-    names = {imported.partition(".")[0] for look in own for imported in look.imports}
-    return not _TIMED.isdisjoint(names) or any(
-        "content" in part for look in own for part in look.parts.values()
-    )
+    imports = chain.from_iterable(look.imports for look in own)
+    if not _TIMED.isdisjoint(name.partition(".")[0] for name in imports):
+        return True
+    contents = chain.from_iterable(look.parts.values() for look in own)
+    return any("content" in content for content in contents)

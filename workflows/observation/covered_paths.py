@@ -86,7 +86,7 @@ def program() -> tuple[str, ...]:
     whole folder.
     """
     prefixes = {sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix}
-    python = [os.path.join(prefix, part) for prefix in prefixes for part in _OF_PYTHON]
+    python = [os.path.join(prefix, folder) for prefix in prefixes for folder in _OF_PYTHON]
     paths = sysconfig.get_paths()
     installed = [paths[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")]
     zipped = os.path.join(

@@ -38,12 +38,16 @@ class _Shown(dict[bytes, bytes]):
     """The variables that libraries have; who asks for another one decides whether it is found."""
 
     def __init__(
-        self, whole: Mapping[bytes, bytes], declared: frozenset[str], asked: Asked
+        self, environment: Mapping[bytes, bytes], declared: frozenset[str], asked: Asked
     ) -> None:
         super().__init__(
-            {name: value for name, value in whole.items() if is_shown(os.fsdecode(name), declared)}
+            {
+                name: value
+                for name, value in environment.items()
+                if is_shown(os.fsdecode(name), declared)
+            }
         )
-        self.hidden = {name: value for name, value in whole.items() if name not in self}
+        self.hidden = {name: value for name, value in environment.items() if name not in self}
         self._declared, self._asked = declared, asked
 
     def __missing__(self, name: bytes) -> bytes:

@@ -149,13 +149,13 @@ class NotificationClient:
         return json.loads(self._exactly(int.from_bytes(self._exactly(8), "little")))
 
     def _exactly(self, length: int) -> bytes:
-        found = b""
-        while len(found) < length:
-            part = self._socket.recv(length - len(found))
-            if not part:
+        received = b""
+        while len(received) < length:
+            chunk = self._socket.recv(length - len(received))
+            if not chunk:
                 raise ValueError("it ended")
-            found += part
-        return found
+            received += chunk
+        return received
 
 
 # --- kernel layer ---------------------------------------------------------------------------------

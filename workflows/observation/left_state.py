@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import sys
 from collections.abc import Callable, Iterator
+from itertools import chain
 from pathlib import Path
 from types import FunctionType, MappingProxyType, ModuleType
 from typing import Any, NamedTuple
@@ -54,9 +55,11 @@ def _is_free(store: _Place, places: list[_Place]) -> bool:
     ends = [
         place for place in places if isinstance(place.item, _ENDS) and place.local == store.local
     ]
-    before = [each for end in ends if _line(end.item) < _line(store.item) for each in end.decides]
+    earlier = [end for end in ends if _line(end.item) < _line(store.item)]
+    before = [*chain.from_iterable(end.decides for end in earlier)]
     return not any(
-        _names(each) & store.local for each in [store.item.value, *store.decides, *before]
+        _names(expression) & store.local
+        for expression in [store.item.value, *store.decides, *before]
     )
 
 
@@ -65,27 +68,23 @@ def _places(
 ) -> Iterator[_Place]:
     """Yield the statements below a part of a syntax tree that stand in functions."""
     for child in ast.iter_child_nodes(item):
-        inner, names, given = decides, local, shared
+        inner, names, declared = decides, local, shared
         if isinstance(child, _FUNCTIONS):
-            given = shared | {
-                name
-                for each in ast.walk(child)
-                if isinstance(each, ast.Global)
-                for name in each.names
-            }
-            names = local | _locals(child) - given
+            statements = [part for part in ast.walk(child) if isinstance(part, ast.Global)]
+            declared = shared.union(*(statement.names for statement in statements))
+            names = local | _locals(child) - declared
         elif isinstance(child, ast.If | ast.While | ast.IfExp):
             inner = [*decides, child.test]
         elif isinstance(child, ast.For | ast.AsyncFor):
             inner = [*decides, child.iter]
         if isinstance(child, ast.stmt) and not isinstance(child, _FUNCTIONS):
-            yield _Place(child, inner, names, given)
-        yield from _places(child, inner, names, given)
+            yield _Place(child, inner, names, declared)
+        yield from _places(child, inner, names, declared)
 
 
 def _locals(function: ast.AST) -> set[str]:
     """Return the arguments of a function and the names that it sets."""
-    arguments = {each.arg for each in ast.walk(function) if isinstance(each, ast.arg)}
+    arguments = {argument.arg for argument in ast.walk(function) if isinstance(argument, ast.arg)}
     return arguments | _stored(function)
 
 
@@ -94,12 +93,8 @@ def _targets(item: ast.AST) -> set[str]:
     if isinstance(item, ast.For | ast.AsyncFor):
         return _stored(item.target)
     if isinstance(item, ast.With | ast.AsyncWith):
-        return {
-            name
-            for part in item.items
-            if part.optional_vars
-            for name in _stored(part.optional_vars)
-        }
+        names = [context.optional_vars for context in item.items if context.optional_vars]
+        return set[str]().union(*map(_stored, names))
     return (
         set()
         if isinstance(item, ast.ClassDef) or hasattr(item, "body") or hasattr(item, "cases")
@@ -109,14 +104,14 @@ def _targets(item: ast.AST) -> set[str]:
 
 def _stored(item: ast.AST) -> set[str]:
     return {
-        each.id
-        for each in ast.walk(item)
-        if isinstance(each, ast.Name) and not isinstance(each.ctx, ast.Load)
+        name.id
+        for name in ast.walk(item)
+        if isinstance(name, ast.Name) and not isinstance(name.ctx, ast.Load)
     }
 
 
 def _names(item: ast.AST) -> set[str]:
-    return {each.id for each in ast.walk(item) if isinstance(each, ast.Name)}
+    return {name.id for name in ast.walk(item) if isinstance(name, ast.Name)}
 
 
 def _line(item: ast.AST) -> int:
@@ -157,23 +152,23 @@ def watch_state(own: OwnCode) -> _Told:
     return told
 
 
-def is_of_library(found: Taint, own: OwnCode) -> bool:
+def is_of_library(left: Taint, own: OwnCode) -> bool:
     """Return True for something that a step left outside of its own modules, where code of any
     module may read it.
     """
-    return found.kind == "memory" and not any(
-        found.what.startswith(f"{module}.") for module in own.modules
+    return left.kind == "memory" and not any(
+        left.what.startswith(f"{module}.") for module in own.modules
     )
 
 
 def _of_modules(own: OwnCode) -> dict[str, dict[str, str]]:
     """Return a digest of each value of the user's modules, by module and name; empty for None."""
-    found = {
+    modules = {
         name: module
         for name in own.modules
         if isinstance(module := sys.modules.get(name), ModuleType)
     }
-    return {name: _digests(module, own) for name, module in found.items()}
+    return {name: _digests(module, own) for name, module in modules.items()}
 
 
 def _digests(module: ModuleType, own: OwnCode) -> dict[str, str]:
@@ -202,7 +197,7 @@ def _is_usual(function: FunctionType) -> bool:
     """
     if function.__kwdefaults__ or function.__closure__ or vars(function):
         return False
-    return all(type(part) in _UNLIKE for part in function.__defaults__ or ())
+    return all(type(default) in _UNLIKE for default in function.__defaults__ or ())
 
 
 def _changed_modules(own: OwnCode, before: dict[str, dict[str, str]]) -> Iterator[str]:
@@ -229,11 +224,12 @@ def _is_unread(own: OwnCode, module: str, name: str) -> bool:
     home = sys.modules[module]
     value = getattr(home, name, None)
     others = [
-        sys.modules[each]
-        for each in {*own_modules(), *own.modules} - {module}
-        if each in sys.modules
+        sys.modules[other]
+        for other in {*own_modules(), *own.modules} - {module}
+        if other in sys.modules
     ]
-    return not any(part is value or part is home for each in others for part in vars(each).values())
+    attributes = chain.from_iterable(vars(other).values() for other in others)
+    return not any(attribute is value or attribute is home for attribute in attributes)
 
 
 def _is_lazy(module: str, name: str) -> bool:
@@ -248,24 +244,24 @@ def _of_others(own: OwnCode) -> dict[str, dict[str, Any]]:
     change.
     """
     names = [name for name in own.changed if "()" not in name and not name.startswith(".")]
-    found = {name: _attributes(value) for name in names if (value := _found(name)) is not None}
+    attributes = {name: _attributes(value) for name in names if (value := _found(name)) is not None}
     for name in names:
         place, _, last = name.rpartition(".")
         parts = getattr(_found(place), "__dict__", {}) if place else {}
-        found.setdefault(place, {last: parts[last]} if last in parts else {})
-    return found
+        attributes.setdefault(place, {last: parts[last]} if last in parts else {})
+    return attributes
 
 
 def _found(name: str) -> Any:
     """Return what has a full name, or None for a name that nothing has."""
     parts = name.split(".")
-    most = next((n for n in range(len(parts), 0, -1) if ".".join(parts[:n]) in sys.modules), 0)
-    if not most or parts[0] == _SYSTEM:
+    depth = next((n for n in range(len(parts), 0, -1) if ".".join(parts[:n]) in sys.modules), 0)
+    if not depth or parts[0] == _SYSTEM:
         return None
-    found: Any = sys.modules[".".join(parts[:most])]
-    for part in parts[most:]:
-        found = getattr(found, "__dict__", {}).get(part)
-    return found
+    value: Any = sys.modules[".".join(parts[:depth])]
+    for attribute in parts[depth:]:
+        value = getattr(value, "__dict__", {}).get(attribute)
+    return value
 
 
 def _attributes(value: Any) -> dict[str, Any]:
@@ -276,19 +272,21 @@ def _attributes(value: Any) -> dict[str, Any]:
     """
     names = getattr(value, "__dict__", None)
     if isinstance(names, dict | MappingProxyType):
-        found = {name: part for name, part in names.copy().items() if not name.startswith("__")}
+        attributes = {
+            name: attribute for name, attribute in names.copy().items() if not name.startswith("__")
+        }
         tables = (
             []
             if isinstance(value, ModuleType | type)
-            else [n for n, part in found.items() if type(part) is dict]
+            else [n for n, attribute in attributes.items() if type(attribute) is dict]
         )
         for table in tables:
-            found |= {
+            attributes |= {
                 f"{table}[{key!r}]": entry
-                for key, entry in found[table].items()
+                for key, entry in attributes[table].items()
                 if isinstance(key, str)
             }
-        return found
+        return attributes
     return {"": LoadedState(sys, (), lambda _: False).digest({"value": value})}
 
 
@@ -309,8 +307,10 @@ def _is_of_package(value: Any, place: str) -> bool:
     return str(getattr(value, "__module__", "")).partition(".")[0] == place.partition(".")[0]
 
 
-def _is_alike(one: Any, other: Any) -> bool:
-    return one is other or (type(one) is type(other) and type(one) in _UNLIKE and one == other)
+def _is_alike(value: Any, other: Any) -> bool:
+    return value is other or (
+        type(value) is type(other) and type(value) in _UNLIKE and value == other
+    )
 
 
 def _settings() -> dict[str, str]:

@@ -95,11 +95,11 @@ class Observation:
             self._tasks.mark(task.thread, arguments[call.number])
             return
         try:
-            kept = self._kept(task, call, arguments)
+            record = self._kept(task, call, arguments)
         except (OSError, StopIteration, ValueError) as error:
-            kept = Record("unseen", f"{call.name}: {error}")
-        if kept is not None:
-            self.records[kept] = None
+            record = Record("unseen", f"{call.name}: {error}")
+        if record is not None:
+            self.records[record] = None
 
     def _kept(self, task: Task, call: Call, arguments: tuple[int, ...]) -> Record | None:
         if not self._tasks.holds(task):

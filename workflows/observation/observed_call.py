@@ -68,9 +68,9 @@ def observed(
     if python_watch.watch_here() is not None:
         return function(), ()
     with one_at_a_time():
-        told = state() if state is not None else list[Taint]
+        left_taints = state() if state is not None else list[Taint]
         step, taints = _observed(function, covered)
-        taints += tuple(told())
+        taints += tuple(left_taints())
     return step.value(), taints
 
 
@@ -223,8 +223,8 @@ def call_observed(function: Callable[[], T], own: OwnCode) -> tuple[T, list[Tain
     cover.
     """
     covered = Covered(frozenset(map(Path, own.files)), own.followed.__contains__)
-    value, found = observed(function, covered, lambda: watch_state(own))
-    return value, [taint for taint in found if not own.free & _words_of(taint)]
+    value, taints = observed(function, covered, lambda: watch_state(own))
+    return value, [taint for taint in taints if not own.free & _words_of(taint)]
 
 
 def tainted_modules(own: OwnCode, taints: Iterable[Taint]) -> frozenset[str]:
@@ -233,7 +233,7 @@ def tainted_modules(own: OwnCode, taints: Iterable[Taint]) -> frozenset[str]:
     """
     return (
         own.modules.union(own_modules())
-        if any(is_of_library(each, own) for each in taints)
+        if any(is_of_library(reached, own) for reached in taints)
         else own.modules
     )
 
@@ -243,17 +243,17 @@ def undeclared(own: OwnCode, asked: Asked) -> list[Taint]:
     not have.
     """
     taints = [taint("variable", name) for name in asked.of_own_code]
-    return [each for each in taints if not own.free & _words_of(each)]
+    return [variable for variable in taints if not own.free & _words_of(variable)]
 
 
 def say_lost(module: str, left: Iterable[Taint]) -> None:
     """Say what own code changed in a process of its own, where no other step finds it."""
-    for each in left:
+    for change in left:
         text = (
-            f"{module} changes {each.what}, and no other step finds the change, since its steps"
+            f"{module} changes {change.what}, and no other step finds the change, since its steps"
             " compute in processes"
         )
-        say_once(module, f"{text} of their own: {each.fix.partition(', or')[0]}")
+        say_once(module, f"{text} of their own: {change.fix.partition(', or')[0]}")
 
 
 def say_hidden(module: str, asked: Asked, free: Collection[str] = ()) -> None:
@@ -269,9 +269,9 @@ def say_hidden(module: str, asked: Asked, free: Collection[str] = ()) -> None:
         say_once(module, f'{text}; if it decides a result, declare it, depends=["env:{names[0]}"]')
 
 
-def _words_of(found: Taint) -> set[str]:
+def _words_of(reached: Taint) -> set[str]:
     """Return the words by which an author states that something decides no result."""
-    return {found.kind, found.what, Path(found.what).name, found.what.rpartition(".")[2]}
+    return {reached.kind, reached.what, Path(reached.what).name, reached.what.rpartition(".")[2]}
 
 
 # --- own import -----------------------------------------------------------------------------------
@@ -295,31 +295,31 @@ def import_observed(name: str) -> ModuleType:
     before = set(sys.modules)
     load = functools.partial(importlib.import_module, name)
     with _hidden(name) as asked:
-        module, found = observed_import(load, Covered(frozenset(), lambda _: True))
+        module, reaches = observed_import(load, Covered(frozenset(), lambda _: True))
     say_hidden(name, asked)
-    found += tuple(taint("variable", each) for each in asked.of_own_code)
+    reaches += tuple(taint("variable", variable) for variable in asked.of_own_code)
     new = [
-        each
-        for each in sys.modules
-        if each not in before and origin_of(each, frozenset()).kind == "source"
+        module_name
+        for module_name in sys.modules
+        if module_name not in before and origin_of(module_name, frozenset()).kind == "source"
     ]
-    taints = tuple(each for each in found if not _is_declared(each, new))
+    taints = tuple(reach for reach in reaches if not _is_declared(reach, new))
     if taints:
         taint_code(new, taints)
-        for each in taints:
+        for reach in taints:
             reached = (
-                f"{WORDS[each.kind]} {each.what} when it is imported, which no cache key covers"
+                f"{WORDS[reach.kind]} {reach.what} when it is imported, which no cache key covers"
             )
             say_once(
                 name,
                 f"{name} {reached}: the results of its nodes are not stored; to have them stored,"
-                f" {each.fix}",
+                f" {reach.fix}",
             )
     return module
 
 
-def _is_declared(found: Taint, modules: Iterable[str]) -> bool:
-    return any(declares(module, found) for module in modules)
+def _is_declared(reached: Taint, modules: Iterable[str]) -> bool:
+    return any(declares(module, reached) for module in modules)
 
 
 @contextmanager
@@ -346,7 +346,7 @@ def _declared_variables(name: str) -> frozenset[str]:
     names = set[str]()
     for source in sources:
         if source.is_file():
-            names.update(each.decode() for each in _VARIABLE.findall(bytes_of(source)))
+            names.update(variable.decode() for variable in _VARIABLE.findall(bytes_of(source)))
     return frozenset(names)
 
 
@@ -382,21 +382,25 @@ def call_hook(node: Node, hook: Callable[[], T], params: Mapping[str, Any]) -> T
     """
     home = node.fn.__module__
     files = frozenset(Path(os.path.realpath(file)) for file in files_in(params))
-    value, found = observed(hook, Covered(files, lambda _: True))
+    value, taints = observed(hook, Covered(files, lambda _: True))
     free = {entry.removeprefix(FREE) for entry in node.depends}
     left = [
-        each
-        for each in found
-        if not (free & {each.kind, each.what, Path(each.what).name} or declares(home, each))
+        reached
+        for reached in taints
+        if not (
+            free & {reached.kind, reached.what, Path(reached.what).name} or declares(home, reached)
+        )
     ]
     if left:
         taint_code({home, *own_modules()}, tuple(left))
-        for each in left:
+        for reached in left:
             text = (
-                f"a hook of {node.path} {WORDS[each.kind]} {each.what}, which no cache key covers"
+                f"a hook of {node.path} {WORDS[reached.kind]} {reached.what},"
+                " which no cache key covers"
             )
             say_once(
                 home,
-                f"{text}: the results of own nodes are not stored; to have them stored, {each.fix}",
+                f"{text}: the results of own nodes are not stored; to have them stored,"
+                f" {reached.fix}",
             )
     return value

@@ -135,7 +135,7 @@ class Watch:
 
     def chance(self) -> set[str]:
         """Return the sources of chance that the call has asked, up to now."""
-        unseeded = any(not each.is_seeded() for each in self.generators)
+        unseeded = any(not generator.is_seeded() for generator in self.generators)
         return self.draws | ({"numpy.random.RandomState without a seed"} if unseeded else set())
 
     def trusted(self) -> bool:
@@ -554,9 +554,9 @@ def _of_address(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
     return note
 
 
-def _named(does: Does, what: str) -> Callable[[Watch, tuple[Any, ...]], None]:
+def _named(does: Does, path: str) -> Callable[[Watch, tuple[Any, ...]], None]:
     """Return what takes note of an event without its arguments."""
-    return lambda watch, arguments: watch.records.append(Record(does, what))
+    return lambda watch, arguments: watch.records.append(Record(does, path))
 
 
 def _command(watch: Watch, arguments: tuple[Any, ...]) -> None:

@@ -108,10 +108,10 @@ def _asking(function: Callable[[int], bytes]) -> Callable[[int], bytes]:
 
 
 def _seeding(function: Callable[..., None]) -> Callable[..., None]:
-    def seed(self: random.Random, a: Any = None, *rest: Any, **named: Any) -> None:
+    def seed(self: random.Random, a: Any = None, *arguments: Any, **named: Any) -> None:
         if a is None:
             _note("random.Random without a seed")
-        function(self, a, *rest, **named)
+        function(self, a, *arguments, **named)
 
     return seed
 
@@ -176,11 +176,14 @@ class LegacyGenerator(np.random.MT19937, metaclass=_Replacement):
     def __reduce__(self) -> Any:
         """Return what a file keeps: the generator of NumPy that this is."""
         made: tuple[Any, ...] = super().__reduce__()
-        make, arguments, *rest = made
+        make, arguments, *state = made
         return (
             make,
-            tuple(np.random.MT19937 if each is LegacyGenerator else each for each in arguments),
-            *rest,
+            tuple(
+                np.random.MT19937 if argument is LegacyGenerator else argument
+                for argument in arguments
+            ),
+            *state,
         )
 
 
@@ -255,7 +258,7 @@ class SharedGenerators:
             "numpy.random": Shared(_of_numpy),
             "random": Shared(random.getstate),
         }
-        replaced = [each for each in self._replaced() if hasattr(each[0], each[1])]
+        replaced = [function for function in self._replaced() if hasattr(function[0], function[1])]
         self._after = replaced
         self._before = [(place, name, getattr(place, name)) for place, name, _ in replaced]
 
@@ -290,11 +293,9 @@ class SharedGenerators:
             (torch.cuda, of_cuda),
             (torch.cuda.random, of_cuda),
         )
-        wrapped = [
-            (place, name, function)
-            for place, functions in places
-            for name, function in functions.items()
-        ]
+        wrapped: list[tuple[Any, str, Any]] = []
+        for place, functions in places:
+            wrapped += [(place, name, function) for name, function in functions.items()]
         return [(_TORCH, _GENERATOR, generator), *wrapped]
 
 
@@ -322,9 +323,9 @@ def _setting(function: Callable[..., Any], shared: Shared, by: _By) -> Callable[
     system gives it.
     """
 
-    def set_generator(*given: Any, **named: Any) -> Any:
-        without = next(iter((*given, *named.values())), None) is None
-        return shared.set(lambda: function(*given, **named), "system" if without else by)
+    def set_generator(*arguments: Any, **named: Any) -> Any:
+        without = next(iter((*arguments, *named.values())), None) is None
+        return shared.set(lambda: function(*arguments, **named), "system" if without else by)
 
     return set_generator
 
@@ -334,7 +335,7 @@ def _differs(state: Any, first: Any) -> bool:
     drawn nothing yet.
     """
     if isinstance(state, dict):
-        return any(found != first.get(number, (found[0], 0)) for number, found in state.items())
+        return any(now != first.get(number, (now[0], 0)) for number, now in state.items())
     return bool(state != first)
 
 
@@ -347,5 +348,6 @@ def _of_cuda() -> dict[int, tuple[int, int]]:
     """Return seed and count of the draws of each graphics processor in use."""
     generators = torch.cuda.default_generators if torch.cuda.is_initialized() else ()  # type: ignore[no-untyped-call]
     return {
-        number: (each.initial_seed(), each.get_offset()) for number, each in enumerate(generators)
+        number: (generator.initial_seed(), generator.get_offset())
+        for number, generator in enumerate(generators)
     }

@@ -189,8 +189,8 @@ def audit_arch(name: str) -> int:
 
 def numbers(name: str) -> dict[int, Call]:
     """Return the calls of a processor by their numbers."""
-    found = {call.x86_64 if name == "x86_64" else call.aarch64: call for call in CALLS}
-    return {number: call for number, call in found.items() if number >= 0}
+    calls = {call.x86_64 if name == "x86_64" else call.aarch64: call for call in CALLS}
+    return {number: call for number, call in calls.items() if number >= 0}
 
 
 # --- seccomp filter -------------------------------------------------------------------------------

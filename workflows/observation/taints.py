@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Set
+from itertools import chain
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -102,21 +103,21 @@ _OF_CHANCE = {
 }
 
 
-def taint(kind: Kind, what: str) -> Taint:
+def taint(kind: Kind, name: str) -> Taint:
     """Return a taint with what to write against it."""
-    fix = _FIX[kind].format(name=_short(kind, what))
+    fix = _FIX[kind].format(name=_short(kind, name))
     return Taint(
         kind,
-        what,
-        f"{_OF_CHANCE[what]}; or {fix}" if kind == "random" and what in _OF_CHANCE else fix,
+        name,
+        f"{_OF_CHANCE[name]}; or {fix}" if kind == "random" and name in _OF_CHANCE else fix,
     )
 
 
-def _short(kind: Kind, what: str) -> str:
+def _short(kind: Kind, name: str) -> str:
     """Return the last name of a file or of something in a module, by which it is declared."""
     if kind == "memory":
-        return what.rpartition(".")[2]
-    return Path(what).name if kind in _OF_PATHS else what
+        return name.rpartition(".")[2]
+    return Path(name).name if kind in _OF_PATHS else name
 
 
 # --- judgement ------------------------------------------------------------------------------------
@@ -155,9 +156,9 @@ class Judgement:
         for record in records:
             getattr(self, f"_{record.does}")(record)
 
-    def add(self, kind: Kind, what: str) -> None:
+    def add(self, kind: Kind, name: str) -> None:
         """Add a taint."""
-        self._taints[taint(kind, what)] = None
+        self._taints[taint(kind, name)] = None
 
     def judge_modules(self) -> None:
         """Add a taint for each module of the user that was executed and that the key does not
@@ -169,10 +170,14 @@ class Judgement:
 
     def taints(self) -> tuple[Taint, ...]:
         """Return the taints, each once; a look at a folder on the way to another one is none."""
-        reached = [each.what for each in self._taints if each.kind in ("file", "folder", "write")]
-        on_the_way = {
-            above for path in (*reached, *self._looks) for above in _with_parents(path)[1:]
-        }
+        reached = [
+            reached_item.what
+            for reached_item in self._taints
+            if reached_item.kind in ("file", "folder", "write")
+        ]
+        on_the_way = set[str]()
+        for path in (*reached, *self._looks):
+            on_the_way.update(_with_parents(path)[1:])
         for path in self._looks:
             if path not in on_the_way:
                 self._read(path)
@@ -356,15 +361,15 @@ class Judgement:
 
 
 def _with_parents(path: str) -> list[str]:
-    found = [path]
+    paths = [path]
     while path not in ("/", "") and (above := os.path.dirname(path)) != path:
         path = above
-        found.append(path)
-    return found
+        paths.append(path)
+    return paths
 
 
 def _with_all_parents(paths: Iterable[str]) -> set[str]:
     """Return paths with the folders that they are in: to look at one says only that the way to
     the end exists.
     """
-    return {above for path in paths for above in _with_parents(path)}
+    return set(chain.from_iterable(map(_with_parents, paths)))

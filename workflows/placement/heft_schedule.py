@@ -97,15 +97,15 @@ class MemoryProfile:
         """Return the index of the time interval that begins at ``time``; split an interval at
         ``time`` if necessary.
         """
-        at, count = bisect_left(self.times, time), len(self.times)
-        if at < count and self.times[at] == time:
-            return at
+        index, count = bisect_left(self.times, time), len(self.times)
+        if index < count and self.times[index] == time:
+            return index
         if count == len(self.level):
             self.level = np.concatenate([self.level, np.zeros(count)])
-        self.times.insert(at, time)
-        self.level[at + 1 : count + 1] = self.level[at:count].copy()
-        self.level[at] = self.level[at - 1]
-        return at
+        self.times.insert(index, time)
+        self.level[index + 1 : count + 1] = self.level[index:count].copy()
+        self.level[index] = self.level[index - 1]
+        return index
 
 
 def stacked(holds: Iterable[Hold]) -> Iterator[Hold]:
@@ -162,7 +162,7 @@ class PartialSchedule:
         self.free_at: list[float] = [0.0] * count
         self.left = [len(readers) for readers in graph.readers]
         self.gaps: list[tuple[list[float], list[float]]] = [([0.0], [math.inf]) for _ in devices]
-        most = sum(graph.own) + max((graph.work(i, 1) for i in range(count)), default=0.0)
+        upper_bound = sum(graph.own) + max((graph.work(i, 1) for i in range(count)), default=0.0)
         sent = sum(
             max(0.0, math.ceil(s))
             for t, sizes in enumerate(graph.sizes)
@@ -170,7 +170,8 @@ class PartialSchedule:
             if graph.tasks[t].takes
         )
         self.rooms = [
-            MemoryProfile(d.memory) if bounded and d.memory < most + sent else None for d in devices
+            MemoryProfile(d.memory) if bounded and d.memory < upper_bound + sent else None
+            for d in devices
         ]
         # no delay to itself
         self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]
@@ -375,16 +376,16 @@ class PartialSchedule:
         memory allows.
         """
         for (j, size, d), copies in self.copies.items():
-            room, kept = self.rooms[d], copies[:1]
+            room, joined = self.rooms[d], copies[:1]
             for copy in copies[1:]:
-                until = kept[-1][2]
+                until = joined[-1][2]
                 if room is None or room.highest(until, copy[0]) + math.ceil(size) <= room.limit:
                     if room is not None:
                         room.add(until, copy[0], math.ceil(size))
-                    kept[-1] = (*kept[-1][:2], max(until, copy[2]))
+                    joined[-1] = (*joined[-1][:2], max(until, copy[2]))
                 else:
-                    kept.append(copy)
-            self.copies[j, size, d] = kept
+                    joined.append(copy)
+            self.copies[j, size, d] = joined
 
     def _moves(self) -> Iterator[Move]:
         devices = self.graph.cluster.devices
@@ -582,16 +583,16 @@ def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
     device lacks memory.
     """
     board, device = PartialSchedule(graph, bounded=False), graph.cluster.devices[d]
-    left, held, peak, at = [len(readers) for readers in graph.readers], 0.0, 0.0, 0.0
+    left, held, peak, now = [len(readers) for readers in graph.readers], 0.0, 0.0, 0.0
     needed, largest = 0.0, 0
     for i in order:
         held += graph.own[i]
         board.parts[i] = _fewest(graph, i, device.memory - held)
         peak = max(peak, held + graph.work(i, board.parts[i]))
-        least = held + graph.work(i, graph.tasks[i].parts)
-        needed, largest = (least, i) if least > needed else (needed, largest)
-        began, at = at, at + graph.seconds[i][d]
-        board.put(i, d, began, at)
+        smallest = held + graph.work(i, graph.tasks[i].parts)
+        needed, largest = (smallest, i) if smallest > needed else (needed, largest)
+        began, now = now, now + graph.seconds[i][d]
+        board.put(i, d, began, now)
         for j in graph.sources[i]:
             left[j] -= 1
         held -= sum(
@@ -610,5 +611,5 @@ def _fewest(graph: Graph, i: int, room: float) -> int:
 
     If no allowed number suffices, return the largest allowed number.
     """
-    most = graph.tasks[i].parts
-    return 1 + bisect_left(range(1, most), True, key=lambda parts: graph.work(i, parts) <= room)
+    limit = graph.tasks[i].parts
+    return 1 + bisect_left(range(1, limit), True, key=lambda parts: graph.work(i, parts) <= room)

@@ -115,15 +115,15 @@ def _devices(groups: list[dict[str, Any]]) -> dict[Device, dict[str, Any]]:
         for machine in group["node"]
         for _ in range(group["count"])
     ]
-    total, seen = (
+    total, numbers = (
         Counter((machine, group["kind"]) for machine, group in rows),
         Counter[tuple[str, str]](),
     )
     devices = {}
     for machine, group in rows:
         of = (machine, group["kind"])
-        name = "cpu" if of[1] == "cpu" and total[of] == 1 else f"{of[1]}:{seen[of]}"
-        seen[of] += 1
+        name = "cpu" if of[1] == "cpu" and total[of] == 1 else f"{of[1]}:{numbers[of]}"
+        numbers[of] += 1
         devices[Device(f"{machine}/{name}" if machine else name, of[1], group["memory"])] = group
     return devices
 
@@ -164,14 +164,14 @@ def _links(value: Value, diagnostics: list[Diagnostic]) -> dict[tuple[str, str],
         return {}
     links = {}
     for name, link in value.data.items():
-        one, dash, other = str(name).partition("-")
+        first, dash, other = str(name).partition("-")
         if not dash:
             diagnostics.append(
                 _problem(link, "must name two kinds, such as cuda-cuda or cpu-cuda", link.key)
             )
-        if (other, one) in links:
-            diagnostics.append(_problem(link, f"is the same as {other}-{one}", link.key))
-        links[one, other or one] = _link(link, diagnostics)
+        if (other, first) in links:
+            diagnostics.append(_problem(link, f"is the same as {other}-{first}", link.key))
+        links[first, other or first] = _link(link, diagnostics)
     return links
 
 

@@ -70,10 +70,10 @@ class Cluster:
         """Return the link between two devices; from a device to itself, the link has no delay."""
         if a == b:
             return Link()
-        one, other = self._by_name[a], self._by_name[b]
-        if one.machine != other.machine:
+        device, other = self._by_name[a], self._by_name[b]
+        if device.machine != other.machine:
             return self.network
-        pair = (one.kind, other.kind)
+        pair = (device.kind, other.kind)
         return self.links.get(pair) or self.links.get((pair[1], pair[0])) or self.bus
 
     @cached_property
@@ -150,11 +150,11 @@ class Schedule:
         task that ends last.
         """
         by_name = {slot.task: slot for slot in self.slots}
-        at = max(self.slots, key=lambda slot: slot.end, default=None)
+        last = max(self.slots, key=lambda slot: slot.end, default=None)
         path = []
-        while at is not None:
-            path.append(at)
-            at = by_name.get(at.after)
+        while last is not None:
+            path.append(last)
+            last = by_name.get(last.after)
         return tuple(path[::-1])
 
 
@@ -183,16 +183,16 @@ class TooLarge(ValueError):
         """Return the error with the memory that the program itself holds on the device, as part
         of need and limit.
         """
-        more = TooLarge(self.task, self.device, self.needed, self.memory, self.parts)
+        error = TooLarge(self.task, self.device, self.needed, self.memory, self.parts)
         cut = f" in {self.parts} parts" if self.parts > 1 else ""
-        more.args = (
+        error.args = (
             (
                 f"{self.task} needs {_size(self.needed + held)}{cut}, of which the program itself"
                 f" holds {_size(held)}, and the limit is {_size(self.memory + held)}: give more"
                 " memory, or choose a smaller picture, pupil or number of bands"
             ),
         )
-        return more
+        return error
 
     @property
     def short(self) -> float:
@@ -275,12 +275,12 @@ class Graph:
         return order
 
     def _check(self) -> None:
-        there = ", ".join(device.name for device in self.cluster.devices)
+        names = ", ".join(device.name for device in self.cluster.devices)
         for task, able in zip(self.tasks, self.able, strict=True):
             if not able:
                 raise ValueError(
                     f"{task.name} needs {', '.join(task.seconds) or 'a device'}; the cluster has"
-                    f" {there}"
+                    f" {names}"
                 )
             if not all(0 <= seconds < math.inf for seconds in task.seconds.values()):
                 raise ValueError(

@@ -83,8 +83,8 @@ class CameraPhysics(LinearPhysics):  # type: ignore[misc]
     def A(self, x: Tensor, mask: Tensor | None = None, **_: Any) -> Tensor:
         """Return the expected frames of scenes; pixels that clipped are 0."""
         self.update_parameters(mask=mask)
-        seen: Tensor = self.mask.to(x) * self.blur.seen(x)
-        return seen
+        frame: Tensor = self.mask.to(x) * self.blur.seen(x)
+        return frame
 
     def A_adjoint(self, y: Tensor, mask: Tensor | None = None, **_: Any) -> Tensor:
         """Return the adjoint of `A`, applied to frames."""
@@ -104,8 +104,10 @@ class CameraPhysics(LinearPhysics):  # type: ignore[misc]
         """Return frames in electrons, with the known pattern and the dark electrons, without the
         offset.
         """
-        whole: Tensor = y * self.frame_unit + self.noise_model.pattern.to(y) + self.sensor_of.dark
-        return whole
+        electrons: Tensor = (
+            y * self.frame_unit + self.noise_model.pattern.to(y) + self.sensor_of.dark
+        )
+        return electrons
 
     def even(self) -> Tensor:
         """Return the scene without contrast that has the mean of each channel of the frame; a

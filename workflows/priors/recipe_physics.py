@@ -60,13 +60,15 @@ def as_physics(
                 f"as_physics needs the step {name}: {unknown_step(name, recipe.steps)}"
             )
     sensor = measuring_sensor(*(recipe.steps[f"{name}[{arm}]"].params for name in _SENSOR))
-    wanted = [*_OPTICS, f"psf[{arm}]", f"signal[{arm}]", f"clipped[{arm}]"]
-    found = {
+    outputs = [*_OPTICS, f"psf[{arm}]", f"signal[{arm}]", f"clipped[{arm}]"]
+    values = {
         name.partition("[")[0]: value
-        for name, value in run(recipe, store, wanted, device=device).values.items()
+        for name, value in run(recipe, store, outputs, device=device).values.items()
     }
     return made(
-        *_parts(found, sensor, glare, dtype), sensor.well if unit is None else unit, found["matrix"]
+        *_parts(values, sensor, glare, dtype),
+        sensor.well if unit is None else unit,
+        values["matrix"],
     )
 
 
@@ -87,15 +89,15 @@ def _deepinv_camera() -> type[CameraPhysics]:
 
 
 def _parts(
-    found: Mapping[str, Any], sensor: MeasuringSensor, glare: Tensor | None, dtype: torch.dtype
+    values: Mapping[str, Any], sensor: MeasuringSensor, glare: Tensor | None, dtype: torch.dtype
 ) -> tuple[Any, MeasuringSensor, Tensor, Tensor, Tensor]:
     """Return the blur, the sensor, the frame in electrons, the mask of its unclipped pixels, and
     the known pattern.
     """
-    frame, known = found["signal"].to(dtype), (~found["clipped"]).to(dtype)
+    frame, unclipped = values["signal"].to(dtype), (~values["clipped"]).to(dtype)
     size = (frame.shape[-2], frame.shape[-1])
     blur = frame_blur(
-        found["psf"], found["illuminant"], found["responses"], found["bands"], size, dtype
+        values["psf"], values["illuminant"], values["responses"], values["bands"], size, dtype
     )
     if glare is not None and (glare.ndim != 3 or len(glare) != len(frame)):
         raise ValueError(
@@ -103,4 +105,4 @@ def _parts(
             " the frame"
         )
     pattern = torch.zeros_like(frame) if glare is None else crop(glare.to(frame), shape=size)
-    return blur, sensor, frame, known, pattern
+    return blur, sensor, frame, unclipped, pattern

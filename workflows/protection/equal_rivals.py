@@ -60,11 +60,11 @@ class Candidate:
     found: FrontMeasures
     protection: float  #: share of the harm of the clear lens: peak, or heat
 
-    def transmittance(self, wanted: float) -> float:
-        """Return the transmittance of the grey filter with which this front protects as
-        ``wanted``; at most 1.
+    def transmittance(self, protection: float) -> float:
+        """Return the transmittance of the grey filter with which this front has a
+        ``protection``; at most 1.
         """
-        return min(1.0, wanted / self.protection)
+        return min(1.0, protection / self.protection)
 
 
 @dataclass(frozen=True)
@@ -87,22 +87,22 @@ class Rival:
 
 
 def quiet_picture(
-    found: FrontMeasures, transmittance: float, electrons: float, pixel: PixelNoise
+    measures: FrontMeasures, transmittance: float, electrons: float, pixel: PixelNoise
 ) -> dict[str, float]:
     """Return each of `MEASURES` in dB, more is better, for a frame without a laser at a scene
     light in e- a pixel.
     """
     amplitude = electrons * transmittance
     noise: Tensor = noise_variance(
-        amplitude * found.spectrum.light, 0.0, pixel.read_noise, pixel.prnu
+        amplitude * measures.spectrum.light, 0.0, pixel.read_noise, pixel.prnu
     )[None]
-    bits = float(information_bits(found.spectrum, amplitude, noise).mean())
+    bits = float(information_bits(measures.spectrum, amplitude, noise).mean())
     values = {
-        "error": -decibels(float(remaining_error(found.spectrum, amplitude, noise).mean())),
+        "error": -decibels(float(remaining_error(measures.spectrum, amplitude, noise).mean())),
         "information": decibels(max(bits, 1e-30)),
-        "NEQ": float(mean_log_neq(found.spectrum, amplitude, noise).mean()) * decibels(math.e),
+        "NEQ": float(mean_log_neq(measures.spectrum, amplitude, noise).mean()) * decibels(math.e),
     }
-    for name, energy in found.energy.items():
+    for name, energy in measures.energy.items():
         values[name] = 2 * decibels(
             max(float(detection_snr(energy, amplitude, CONTRAST, noise)), 1e-30)
         )
@@ -111,7 +111,7 @@ def quiet_picture(
 
 def best(
     candidates: Sequence[Candidate],
-    wanted: float,
+    protection: float,
     electrons: float,
     pixel: PixelNoise,
     name: str = "",
@@ -119,46 +119,48 @@ def best(
     """Return the best value of each of `MEASURES` over candidates of equal protection, and the
     rival with the value.
     """
-    found: dict[str, tuple[float, Rival]] = {}
+    leaders: dict[str, tuple[float, Rival]] = {}
     for candidate in candidates:
-        grey = candidate.transmittance(wanted)
+        grey = candidate.transmittance(protection)
         for measure, value in quiet_picture(candidate.found, grey, electrons, pixel).items():
-            if measure not in found or value > found[measure][0]:
-                found[measure] = value, Rival(name, candidate.front, grey)
-    return found
+            if measure not in leaders or value > leaders[measure][0]:
+                leaders[measure] = value, Rival(name, candidate.front, grey)
+    return leaders
 
 
 def gains(
     masked: Sequence[Candidate],
     plain: Sequence[Candidate],
-    wanted: float,
+    protection: float,
     electrons: float,
     pixel: PixelNoise,
 ) -> dict[str, float]:
     """Return by how many dB the best with the mask exceeds the best stop-and-filter of equal
     protection, by measure.
     """
-    mask, rival = (best(each, wanted, electrons, pixel) for each in (masked, plain))
+    mask, rival = (best(candidates, protection, electrons, pixel) for candidates in (masked, plain))
     return {measure: mask[measure][0] - rival[measure][0] for measure in MEASURES}
 
 
 def neq_curve(
-    found: FrontMeasures, transmittance: float, electrons: float, pixel: PixelNoise
+    measures: FrontMeasures, transmittance: float, electrons: float, pixel: PixelNoise
 ) -> list[float]:
     """Return the NEQ in the rings of frequency, averaged over directions, in electrons."""
     amplitude = electrons * transmittance
     noise = float(
-        noise_variance(amplitude * found.spectrum.light.mean(), 0.0, pixel.read_noise, pixel.prnu)
+        noise_variance(
+            amplitude * measures.spectrum.light.mean(), 0.0, pixel.read_noise, pixel.prnu
+        )
     )
-    curve: Tensor = amplitude**2 * found.square / noise
+    curve: Tensor = amplitude**2 * measures.square / noise
     return [float(x) for x in torch.clamp(curve, min=1e-12)]
 
 
-def colour_shift(found: FrontMeasures) -> float:
+def colour_shift(measures: FrontMeasures) -> float:
     """Return the ratio of the largest to the smallest share of light that the channels receive;
     1: no tint.
     """
-    light = found.spectrum.light
+    light = measures.spectrum.light
     return float(light.max() / light.min().clamp_min(1e-12))
 
 
@@ -231,9 +233,9 @@ class EqualShade:
         ]
 
 
-def stop_diameter(camera: ProtectionCamera, wanted: float) -> float:
+def stop_diameter(camera: ProtectionCamera, level: float) -> float:
     """Return the diameter of the smallest stop whose peak, with the mask if there is one, is not
-    below ``wanted``.
+    below ``level``.
 
     Raises: ValueError if the samples of the pupil carry no stop that is small enough.
     """
@@ -242,18 +244,18 @@ def stop_diameter(camera: ProtectionCamera, wanted: float) -> float:
         return float(metrics.lsr(camera.psf(True, diameter, camera.bands)).max())
 
     low, high = _LEAST_SAMPLES / int(camera.stop.samples), 1.0
-    if (least := peak(low)) > wanted:
+    if (smallest := peak(low)) > level:
         raise ValueError(
-            f"needs a smaller stop than the samples of the pupil carry: ask for {least:.2g} or"
+            f"needs a smaller stop than the samples of the pupil carry: ask for {smallest:.2g} or"
             " more, or take filters with --by filter"
         )
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        low, high = (low, middle) if peak(middle) >= wanted else (middle, high)
+        low, high = (low, middle) if peak(middle) >= level else (middle, high)
     return high
 
 
-def best_diameter(camera: ProtectionCamera, store: Store, wanted: float, electrons: float) -> float:
+def best_diameter(camera: ProtectionCamera, store: Store, level: float, electrons: float) -> float:
     """Return the diameter of the stop whose filtered picture has the least error, with the filter
     that it then needs.
 
@@ -261,37 +263,40 @@ def best_diameter(camera: ProtectionCamera, store: Store, wanted: float, electro
     """
     side = min(int(n) for n in camera.lens["shape"])
     bench = FrontBench(camera, store, FrontSettings(0.1, 0.12, min(14.0, side / 4), (side,), None))
-    usual, least = usual_condition(), stop_diameter(camera, wanted)
-    diameters = [_RATIO**k for k in range(40) if _RATIO**k > least]
-    fronts = [Front(True, diameter) for diameter in (*diameters, least)]
-    found = [bench.measure(front, usual) for front in fronts]
-    each = [Candidate(front, one, one.peak) for front, one in zip(fronts, found, strict=True)]
-    return best(each, wanted, electrons, camera.pixel(0.0, 0.0))["error"][1].front.diameter
+    usual, smallest = usual_condition(), stop_diameter(camera, level)
+    diameters = [_RATIO**k for k in range(40) if _RATIO**k > smallest]
+    fronts = [Front(True, diameter) for diameter in (*diameters, smallest)]
+    measured = [bench.measure(front, usual) for front in fronts]
+    candidates = [
+        Candidate(front, measures, measures.peak)
+        for front, measures in zip(fronts, measured, strict=True)
+    ]
+    return best(candidates, level, electrons, camera.pixel(0.0, 0.0))["error"][1].front.diameter
 
 
 def shade_equally(
     camera: ProtectionCamera,
     store: Store,
-    wanted: float,
+    level: float,
     way: str,
     electrons: Callable[[], float],
     peak_of: Callable[[EqualShade], float],
 ) -> EqualShade:
-    """Return the stop and the filter of one of the `WAYS` with which the peak is ``wanted``.
+    """Return the stop and the filter of one of the `WAYS` with which the peak is ``level``.
 
     ``electrons`` returns the mean light of the scene, in e- a pixel behind the plain lens.
     ``peak_of`` returns the peak behind a shade at the worst of all wavelengths, relative to the
     clear lens.
     """
     alone = peak_of(EqualShade(1.0))
-    if wanted > alone * (1 + 1e-6):
+    if level > alone * (1 + 1e-6):
         raise ValueError(
             f"lowers the peak to {alone:.4g} already: ask for at most that, or leave this mask out"
         )
     diameter = 1.0
     if way == "stop":
-        diameter = stop_diameter(camera, wanted)
+        diameter = stop_diameter(camera, level)
     elif way == "best":
-        diameter = best_diameter(camera, store, wanted, electrons())
+        diameter = best_diameter(camera, store, level, electrons())
     reached = alone if diameter == 1 else peak_of(EqualShade(alone, diameter))
-    return EqualShade(alone, diameter, min(1.0, wanted / reached))
+    return EqualShade(alone, diameter, min(1.0, level / reached))

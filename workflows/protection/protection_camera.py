@@ -80,7 +80,7 @@ class ProtectionCamera:
         which = (
             torch.linspace(0, len(bands.centres) - 1, min(count, len(bands.centres))).round().long()
         )
-        few = Bands(*(one[which] for one in bands))
+        few = Bands(*(values[which] for values in bands))
         keys = tuple(result.keys[name] for name in names)
         return cls(
             recipe, height, flat, stop, few, bands, illuminant[which], responses[:, which], keys
@@ -110,34 +110,38 @@ class ProtectionCamera:
         diameter: float,
         bands: Bands,
         condition: Condition | None = None,
-        **more: Any,
+        **options: Any,
     ) -> Psf:
         """Return the PSF with or without the mask, in a stop of a relative ``diameter``, under a
         condition.
         """
-        notches = {name: more.pop(name) for name in ("notches", "depth") if name in more}
-        found: Psf = optics.psf(
-            self._front(masked, diameter, bands, condition, **notches), **{**self.lens, **more}
+        notches = {name: options.pop(name) for name in ("notches", "depth") if name in options}
+        psf: Psf = optics.psf(
+            self._front(masked, diameter, bands, condition, **notches), **{**self.lens, **options}
         )
-        return found
+        return psf
 
     def laser_psf(
-        self, masked: bool, diameter: float, line: Bands, condition: Condition, **more: Any
+        self, masked: bool, diameter: float, line: Bands, condition: Condition, **options: Any
     ) -> Psf:
         """Return the PSF of a laser from the ``angle`` of its direction, with the light that the
         lens scatters.
         """
-        notches = {name: more.pop(name) for name in ("notches", "depth") if name in more}
+        notches = {name: options.pop(name) for name in ("notches", "depth") if name in options}
         front, lens = (
             self._front(masked, diameter, line, condition, **notches),
-            {**self.lens, **more},
+            {**self.lens, **options},
         )
         sizes = {name: lens[name] for name in ("focal_length", "pixel_pitch", "angle")}
-        whole = float(self.stop.diameter)
-        found: Psf = stray_light(
-            optics.psf(front, **lens), front, surfaces=condition.surfaces, diameter=whole, **sizes
+        aperture = float(self.stop.diameter)
+        psf: Psf = stray_light(
+            optics.psf(front, **lens),
+            front,
+            surfaces=condition.surfaces,
+            diameter=aperture,
+            **sizes,
         )
-        return found
+        return psf
 
     def _front(
         self,
@@ -150,16 +154,22 @@ class ProtectionCamera:
         pupil = self.recipe.steps["pupil[mask]"]
         index = self.recipe.steps[str(pupil.wires["index"])]
         height = self.height if masked else self.flat
-        given = dict(pupil.params)
+        params = dict(pupil.params)
         film = None
         if condition is not None:
-            given["defocus"] = float(given.get("defocus", 0.0)) + condition.defocus
+            params["defocus"] = float(params.get("defocus", 0.0)) + condition.defocus
             film = self._film(condition)
         shaded = shade(self.stop, diameter=diameter, **notches)
-        found: Pupil = optics.pupil(
-            height, index.node(bands, **index.params), bands, self.stop, film, shade=shaded, **given
+        front: Pupil = optics.pupil(
+            height,
+            index.node(bands, **index.params),
+            bands,
+            self.stop,
+            film,
+            shade=shaded,
+            **params,
         )
-        return found
+        return front
 
     def _film(self, condition: Condition) -> Any:
         if not condition.grease:
@@ -170,16 +180,16 @@ class ProtectionCamera:
 
     def laser_line(self, wavelength: float) -> Bands:
         """Return one narrow band at the wavelength of a laser."""
-        one = torch.ones(1, dtype=torch.float64)
-        return Bands(one * wavelength, one * 1e-9, one)
+        unit = torch.ones(1, dtype=torch.float64)
+        return Bands(unit * wavelength, unit * 1e-9, unit)
 
     def laser_colour(self, line: Bands) -> Tensor:
         """Return the response of each channel to a laser relative to the channel that responds
         most: (channel,).
         """
         step = self.recipe.steps["responses"]
-        found: Tensor = step.node(line, **step.params)[:, 0].double()
-        return found / found.max() if float(found.max()) > 0 else torch.ones_like(found)
+        response: Tensor = step.node(line, **step.params)[:, 0].double()
+        return response / response.max() if float(response.max()) > 0 else torch.ones_like(response)
 
     @property
     def nodes(self) -> tuple[Node, ...]:
@@ -284,7 +294,7 @@ class FrontBench:
         self._psfs: dict[Front, Psf] = {}
         self._harms: dict[Front, dict[str, Tensor]] = {}
         code = Code(store.code_memo)
-        files = [file_digest(Path(inspect.getfile(one))) for one in _SOURCES]
+        files = [file_digest(Path(inspect.getfile(source))) for source in _SOURCES]
         files += [file_digest(Path(__file__)), file_digest(Path(inspect.getfile(ProtectionCamera)))]
         steps = [
             camera.recipe.steps[name]
@@ -305,19 +315,23 @@ class FrontBench:
     def measure(self, front: Front, condition: Condition) -> FrontMeasures:
         """Return what is measured of a front under a condition, from the store if it is there."""
         key = digest("protection front", self._key, repr(front), condition.plain)
-        found = compute_once(self.store, key, dict, lambda: self._measure(front, condition), _ABOUT)
-        return _measures(found)
+        measures = compute_once(
+            self.store, key, dict, lambda: self._measure(front, condition), _ABOUT
+        )
+        return _measures(measures)
 
     def _measure(self, front: Front, condition: Condition) -> dict[str, Tensor]:
         camera, s = self.camera, self.settings
         light = camera.illuminant, camera.responses, camera.bands
-        known, true = self._known(front), self._psf(front, camera.bands, condition)
-        spectrum = picture_spectrum(true, known, *light, s.variance, s.up_to)
+        assumed, true = self._known(front), self._psf(front, camera.bands, condition)
+        spectrum = picture_spectrum(true, assumed, *light, s.variance, s.up_to)
         radius, square = radial_contrast(true, *light)
-        found: dict[str, Tensor] = {f"spectrum.{name}": x for name, x in spectrum._asdict().items()}
-        found |= {f"energy.{name}": x for name, x in detail_energy(true, *light, s.size).items()}
-        found |= {"radius": radius, "square": square, **self._harm(front)}
-        return found | self._glare(front, condition)
+        measures: dict[str, Tensor] = {
+            f"spectrum.{name}": x for name, x in spectrum._asdict().items()
+        }
+        measures |= {f"energy.{name}": x for name, x in detail_energy(true, *light, s.size).items()}
+        measures |= {"radius": radius, "square": square, **self._harm(front)}
+        return measures | self._glare(front, condition)
 
     def _harm(self, front: Front) -> dict[str, Tensor]:
         """Return peak and heat at the worst of all bands of the recipe; they are computed once.
@@ -356,14 +370,14 @@ class FrontBench:
             self._psfs[front] = self._psf(front, self.camera.bands, None)
         return self._psfs[front]
 
-    def _psf(self, front: Front, bands: Bands, condition: Condition | None, **more: Any) -> Psf:
+    def _psf(self, front: Front, bands: Bands, condition: Condition | None, **options: Any) -> Psf:
         return self.camera.psf(
-            front.masked, front.diameter, bands, condition, **front.notches, **more
+            front.masked, front.diameter, bands, condition, **front.notches, **options
         )
 
-    def _laser_psf(self, front: Front, line: Bands, condition: Condition, **more: Any) -> Psf:
+    def _laser_psf(self, front: Front, line: Bands, condition: Condition, **options: Any) -> Psf:
         return self.camera.laser_psf(
-            front.masked, front.diameter, line, condition, **front.notches, **more
+            front.masked, front.diameter, line, condition, **front.notches, **options
         )
 
     def _glare(self, front: Front, condition: Condition) -> dict[str, Tensor]:
@@ -375,7 +389,7 @@ class FrontBench:
         """
         camera = self.camera
         line = camera.laser_line(condition.wavelength)
-        found = {"colour": camera.laser_colour(line)}
+        glare = {"colour": camera.laser_colour(line)}
         reach = min(self.settings.fields)
         spot = (condition.direction[0] * reach, condition.direction[1] * reach)
         scale = camera.lens["pixel_pitch"] / camera.lens["focal_length"]
@@ -388,19 +402,19 @@ class FrontBench:
                     raise
                 continue
             levels = glare_levels(light.intensity[0], float(light.clear_peak))
-            found |= {f"level.{side}": levels.level, f"share.{side}": levels.share}
-        return found
+            glare |= {f"level.{side}": levels.level, f"share.{side}": levels.share}
+        return glare
 
 
-def _measures(found: Mapping[str, Any]) -> FrontMeasures:
-    sides = [int(name.removeprefix("level.")) for name in found if name.startswith("level.")]
+def _measures(stored: Mapping[str, Any]) -> FrontMeasures:
+    sides = [int(name.removeprefix("level.")) for name in stored if name.startswith("level.")]
     return FrontMeasures(
-        PictureSpectrum(*(found[f"spectrum.{name}"] for name in PictureSpectrum._fields)),
-        {name: found[f"energy.{name}"] for name in TARGETS},
-        float(found["peak"]),
-        float(found["heat"]),
-        found["radius"],
-        found["square"],
-        {side: GlareLevels(found[f"level.{side}"], found[f"share.{side}"]) for side in sides},
-        found["colour"],
+        PictureSpectrum(*(stored[f"spectrum.{name}"] for name in PictureSpectrum._fields)),
+        {name: stored[f"energy.{name}"] for name in TARGETS},
+        float(stored["peak"]),
+        float(stored["heat"]),
+        stored["radius"],
+        stored["square"],
+        {side: GlareLevels(stored[f"level.{side}"], stored[f"share.{side}"]) for side in sides},
+        stored["colour"],
     )

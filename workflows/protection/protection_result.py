@@ -23,8 +23,16 @@ from neusee.workflows.protection.equal_rivals import (
     neq_curve,
     quiet_picture,
 )
-from neusee.workflows.protection.protection_camera import Front, FrontBench, refuse_no_mask
+from neusee.workflows.protection.protection_camera import (
+    Front,
+    FrontBench,
+    FrontMeasures,
+    refuse_no_mask,
+)
 from neusee.workflows.protection.unknown_conditions import Condition, usual_condition
+
+#: by measure, the best value over candidates and the rival that has it
+Best = Mapping[str, tuple[float, Rival]]
 
 LIGHTS = (10.0, 30.0, 100.0, 300.0, 1e3, 3e3, 1e4)  #: e- a pixel
 LEVELS = (1e-1, 3e-2, 1e-2, 3e-3, 1e-3, 3e-4, 1e-4)  #: share of the clear lens's peak, or heat
@@ -78,9 +86,9 @@ def measure_protection(
     """
     usual = usual_condition()
 
-    def candidate(front: Front, at: Condition = usual) -> Candidate:
-        found, harm = bench.measure(front, at), bench.measure(front, usual)
-        return Candidate(front, found, harm.peak if bench.settings.dwell is None else harm.heat)
+    def candidate(front: Front, condition: Condition = usual) -> Candidate:
+        measures, harm = bench.measure(front, condition), bench.measure(front, usual)
+        return Candidate(front, measures, harm.peak if bench.settings.dwell is None else harm.heat)
 
     mask = candidate(Front(True))
     own = mask.protection
@@ -89,47 +97,71 @@ def measure_protection(
     clear = [candidate(Front(False, d)) for d in _diameters(bench, own)]
     masked = [candidate(Front(True, d)) for d in _MASK_STOPS]
     progress(f"{len(clear)} stops and {len(masked)} stops with the mask are measured")
-    gain = {
-        level: {n: gains(masked, clear, level, n, pixel) for n in LIGHTS}
-        for level in (own, *LEVELS)
-    }
+    gain = {level: _gains(masked, clear, level, pixel) for level in (own, *LEVELS)}
     stops = {n: best(clear, own, n, pixel, "stop and filter")["error"][1] for n in LIGHTS}
     rivals = _rivals(clear, masked, own, pixel, stops)
     rivals["notch"] = Rival("notch", Front(False, 1.0, usual.wavelength, 1 - own), 1.0)
-    known = {name: candidate(rival.front) for name, rival in rivals.items()}
+    measured = {name: candidate(rival.front) for name, rival in rivals.items()}
     quiet = {
-        name: {n: quiet_picture(known[name].found, rival.transmittance, n, pixel) for n in LIGHTS}
+        name: _quiet(measured[name].found, rival.transmittance, pixel)
         for name, rival in rivals.items()
     }
-    quiet["best stop and filter"] = {
-        n: {m: v for m, (v, _) in best(clear, own, n, pixel).items()} for n in LIGHTS
-    }
-    drawn = _drawn_gains(conditions, candidate, masked, clear, own, pixel, progress)
+    quiet["best stop and filter"] = _best_quiet(clear, own, pixel)
+    pairs = {n: (best(masked, own, n, pixel), best(clear, own, n, pixel)) for n in LIGHTS}
+    drawn = _drawn_gains(conditions, candidate, pairs, pixel, progress)
     attack, lost = _attacks(conditions, candidate, rivals, pixel, progress)
-    curves = {
-        name: neq_curve(known[name].found, r.transmittance, SHOWN_AT, pixel)
-        for name, r in rivals.items()
-    }
-    tint = {name: colour_shift(one.found) for name, one in known.items()}
-    radius = [float(x) for x in mask.found.radius]
-    fields = _fields(rivals, known, pixel)
     bound, forbidden = _bounds(bench, pixel, own)
     return ProtectionResult(
-        own,
-        rivals,
-        quiet,
-        stops,
-        gain,
-        drawn,
-        curves,
-        radius,
-        bound,
-        forbidden,
-        attack,
-        fields,
-        lost,
-        tint,
+        own=own,
+        rivals=rivals,
+        quiet=quiet,
+        stops=stops,
+        gain=gain,
+        drawn=drawn,
+        curves=_curves(rivals, measured, pixel),
+        radius=[float(x) for x in mask.found.radius],
+        bound=bound,
+        forbidden=forbidden,
+        attack=attack,
+        fields=_fields(rivals, measured, pixel),
+        lost=lost,
+        tint={name: colour_shift(judged.found) for name, judged in measured.items()},
     )
+
+
+def _curves(
+    rivals: Mapping[str, Rival], measured: Mapping[str, Candidate], pixel: PixelNoise
+) -> dict[str, list[float]]:
+    """Return the NEQ of each rival in the rings of frequency."""
+    return {
+        name: neq_curve(measured[name].found, rival.transmittance, SHOWN_AT, pixel)
+        for name, rival in rivals.items()
+    }
+
+
+def _gains(
+    masked: Sequence[Candidate], clear: Sequence[Candidate], level: float, pixel: PixelNoise
+) -> dict[float, dict[str, float]]:
+    """Return the gain of the mask at each light, at one level of protection."""
+    return {n: gains(masked, clear, level, n, pixel) for n in LIGHTS}
+
+
+def _quiet(
+    measures: FrontMeasures, transmittance: float, pixel: PixelNoise
+) -> dict[float, dict[str, float]]:
+    """Return the measures of a frame without a laser at each light."""
+    return {n: quiet_picture(measures, transmittance, n, pixel) for n in LIGHTS}
+
+
+def _best_quiet(
+    clear: Sequence[Candidate], own: float, pixel: PixelNoise
+) -> dict[float, dict[str, float]]:
+    """Return the best of each measure over all stops and filters, at each light."""
+    values = {}
+    for n in LIGHTS:
+        leaders = best(clear, own, n, pixel)
+        values[n] = {measure: value for measure, (value, _) in leaders.items()}
+    return values
 
 
 def _diameters(bench: FrontBench, own: float) -> list[float]:
@@ -163,42 +195,39 @@ def _rivals(
     """
     alone = min((c for c in clear if c.protection >= own), key=lambda c: c.protection)
     both = best(masked, own, ATTACKED_AT, pixel)["error"][1]
-    found = {
+    rivals = {
         "open lens": Rival("open lens", Front(False), 1.0),
         "grey filter": Rival("grey filter", Front(False), min(1.0, own / clear[0].protection)),
         "smaller stop": Rival("smaller stop", alone.front, alone.transmittance(own)),
         "stop and filter": stops[ATTACKED_AT],
         "mask": Rival("mask", Front(True), 1.0),
     }
-    return found if both.front == Front(True) else {**found, "mask and stop": both}
+    return rivals if both.front == Front(True) else {**rivals, "mask and stop": both}
 
 
 def _drawn_gains(
     conditions: Sequence[Condition],
     candidate: Callable[[Front, Condition], Candidate],
-    masked: Sequence[Candidate],
-    clear: Sequence[Candidate],
-    own: float,
+    pairs: Mapping[float, tuple[Best, Best]],
     pixel: PixelNoise,
     progress: Callable[[str], None],
 ) -> dict[float, dict[str, list[float]]]:
     """Return the gain of the mask in each draw; mask, stop and filter are chosen before, at the
-    usual condition.
+    usual condition: the best of both at each light, ``pairs``.
     """
-    chosen = {n: (best(masked, own, n, pixel), best(clear, own, n, pixel)) for n in LIGHTS}
-    found: dict[float, dict[str, list[float]]] = {n: {m: [] for m in DRAWN} for n in LIGHTS}
+
+    def value(rival: Rival, condition: Condition, n: float, measure: str) -> float:
+        measures = candidate(rival.front, condition).found
+        return quiet_picture(measures, rival.transmittance, n, pixel)[measure]
+
+    drawn: dict[float, dict[str, list[float]]] = {n: {m: [] for m in DRAWN} for n in LIGHTS}
     for number, condition in enumerate(conditions, 1):
-        for n, pair in chosen.items():
+        for n, (masked, plain) in pairs.items():
             for measure in DRAWN:
-                one, other = (
-                    quiet_picture(
-                        candidate(rival.front, condition).found, rival.transmittance, n, pixel
-                    )[measure]
-                    for rival in (pair[0][measure][1], pair[1][measure][1])
-                )
-                found[n][measure].append(one - other)
+                own = value(masked[measure][1], condition, n, measure)
+                drawn[n][measure].append(own - value(plain[measure][1], condition, n, measure))
         progress(f"draw {number} of {len(conditions)}: quiet frames")
-    return found
+    return drawn
 
 
 def _attacks(
@@ -212,32 +241,34 @@ def _attacks(
     picture is lost.
     """
     names = [name for name in rivals if name != "notch"]
-    found: dict[str, dict[str, list[list[float]]]] = {
+    attack: dict[str, dict[str, list[list[float]]]] = {
         n: {"error": [], "information": [], "seen": []} for n in names
     }
     lost: dict[str, list[float]] = {name: [] for name in names}
     for number, condition in enumerate(conditions, 1):
         for name in names:
-            one = candidate(rivals[name].front, condition).found
-            field = min(one.glare)
+            measures = candidate(rivals[name].front, condition).found
+            field = min(measures.glare)
             under = attacked_picture(
-                one.spectrum,
-                one.glare[field],
+                measures.spectrum,
+                measures.glare[field],
                 pixel,
                 electrons=ATTACKED_AT,
                 transmittance=rivals[name].transmittance,
-                colour=one.colour,
+                colour=measures.colour,
                 strengths=torch.tensor(STRENGTHS, dtype=torch.float64),
             )
             for quantity, values in under._asdict().items():
-                found[name][quantity].append(values.tolist())
-            whole = 10 ** (
-                quiet_picture(one, rivals[name].transmittance, ATTACKED_AT, pixel)["information"]
+                attack[name][quantity].append(values.tolist())
+            quiet = 10 ** (
+                quiet_picture(measures, rivals[name].transmittance, ATTACKED_AT, pixel)[
+                    "information"
+                ]
                 / 10
             )
-            lost[name].append(_crossing([x / whole for x in under.information.tolist()]))
+            lost[name].append(_crossing([x / quiet for x in under.information.tolist()]))
         progress(f"draw {number} of {len(conditions)}: under attack")
-    return found, lost
+    return attack, lost
 
 
 def _crossing(share: Sequence[float]) -> float:
@@ -248,32 +279,32 @@ def _crossing(share: Sequence[float]) -> float:
         return float(STRENGTHS[0])
     for i in range(1, len(share)):
         if share[i] < _HALF:
-            part = (share[i - 1] - _HALF) / (share[i - 1] - share[i])
-            return float(STRENGTHS[i - 1] * (STRENGTHS[i] / STRENGTHS[i - 1]) ** part)
+            position = (share[i - 1] - _HALF) / (share[i - 1] - share[i])
+            return float(STRENGTHS[i - 1] * (STRENGTHS[i] / STRENGTHS[i - 1]) ** position)
     return float(STRENGTHS[-1])
 
 
 def _fields(
-    rivals: Mapping[str, Rival], known: Mapping[str, Candidate], pixel: PixelNoise
+    rivals: Mapping[str, Rival], measured: Mapping[str, Candidate], pixel: PixelNoise
 ) -> dict[str, dict[int, list[float]]]:
     """Return the share of pixels that are not full, by rival and by side of the field, for each
     strength.
     """
-    found: dict[str, dict[int, list[float]]] = {}
+    shares: dict[str, dict[int, list[float]]] = {}
     for name, rival in rivals.items():
-        one = known[name].found
-        for side, glare in one.glare.items():
+        measures = measured[name].found
+        for side, glare in measures.glare.items():
             under: Any = attacked_picture(
-                one.spectrum,
+                measures.spectrum,
                 glare,
                 pixel,
                 electrons=ATTACKED_AT,
-                colour=one.colour,
+                colour=measures.colour,
                 transmittance=rival.transmittance,
                 strengths=torch.tensor(STRENGTHS, dtype=torch.float64),
             )
-            found.setdefault(name, {})[side] = under.seen.tolist()
-    return found
+            shares.setdefault(name, {})[side] = under.seen.tolist()
+    return shares
 
 
 def _bounds(
@@ -284,10 +315,10 @@ def _bounds(
     """
     bands = bench.camera.bands
     middle = len(bands.centres) // 2
-    one = bench.camera.psf(True, 1.0, type(bands)(*(x[middle : middle + 1] for x in bands)))
+    psf = bench.camera.psf(True, 1.0, type(bands)(*(x[middle : middle + 1] for x in bands)))
     bound = {}
     for n in LIGHTS:
-        found = metrics.protection_bounds(one, electrons=n, read_noise=pixel.read_noise)
-        bound[n] = float(found.over_both), float(found.over_both_bound)
-    peak = float(metrics.lsr(one))
+        limits = metrics.protection_bounds(psf, electrons=n, read_noise=pixel.read_noise)
+        bound[n] = float(limits.over_both), float(limits.over_both_bound)
+    peak = float(metrics.lsr(psf))
     return bound, {n: largest_glare(peak, n, pixel.read_noise) for n in LIGHTS}

@@ -67,9 +67,9 @@ def draw_conditions(
     The draw of a number depends only on the seed and the laws, so that a larger ``count`` begins
     with the same draws.
     """
-    given: Mapping[str, str] = asdict(laws or UnknownLaws())
+    texts: Mapping[str, str] = asdict(laws or UnknownLaws())
     columns = draw_laws(
-        {name: read_law(text) for name, text in given.items()}, count, [seed, 4], first
+        {name: read_law(text) for name, text in texts.items()}, count, [seed, 4], first
     )
     return [
         Condition(
@@ -86,6 +86,6 @@ def draw_conditions(
 
 def usual_condition(laws: UnknownLaws | None = None) -> Condition:
     """Return the condition with every value at its median, and a clean window."""
-    given: Mapping[str, str] = asdict(laws or UnknownLaws())
-    middle = {name: read_law(text).median for name, text in given.items()}
+    texts: Mapping[str, str] = asdict(laws or UnknownLaws())
+    middle = {name: read_law(text).median for name, text in texts.items()}
     return Condition(middle["wavelength"], (0.0, 0.0), 0.0, 0.0, middle["scatter"], 0)

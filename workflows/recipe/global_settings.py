@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any
@@ -26,14 +26,7 @@ def unaffected_expectations(recipe: Recipe, written: Recipe | None) -> Recipe:
     None for ``written`` means that the recipe is not valid without the changes, so that the changes
     affect everything.
     """
-    same: set[str] = set()
-    for name in needed(recipe, recipe.steps) if written else ():
-        if (
-            written
-            and same.issuperset(recipe.steps[name].sources)
-            and _alike(recipe, written, name)
-        ):
-            same.add(name)
+    same = _unchanged_steps(recipe, written) if written else set[str]()
     lost = [
         e for e in recipe.expect if (written is None or e in written.expect) and e.step not in same
     ]
@@ -43,15 +36,24 @@ def unaffected_expectations(recipe: Recipe, written: Recipe | None) -> Recipe:
         "not compared, because your changes affect these numbers:"
         f" {', '.join(e.name for e in lost)}"
     )
-    kept = tuple(e for e in recipe.expect if e not in lost)
-    return replace(recipe, expect=kept, notes=(*recipe.notes, note))
+    comparable = tuple(e for e in recipe.expect if e not in lost)
+    return replace(recipe, expect=comparable, notes=(*recipe.notes, note))
+
+
+def _unchanged_steps(recipe: Recipe, written: Recipe) -> set[str]:
+    """Return the steps that are the same in two recipes, with all that they depend on."""
+    same: set[str] = set()
+    for name in needed(recipe, recipe.steps):
+        if same.issuperset(recipe.steps[name].sources) and _alike(recipe, written, name):
+            same.add(name)
+    return same
 
 
 def _alike(recipe: Recipe, written: Recipe, name: str) -> bool:
-    one, other = recipe.steps[name], written.steps.get(name)
-    if other is None or (one.node.random and recipe.seed != written.seed):
+    step, other = recipe.steps[name], written.steps.get(name)
+    if other is None or (step.node.random and recipe.seed != written.seed):
         return False
-    return (one.node, one.params, one.wires) == (other.node, other.params, other.wires)
+    return (step.node, step.params, step.wires) == (other.node, other.params, other.wires)
 
 
 # --- exported files -------------------------------------------------------------------------------
@@ -81,12 +83,12 @@ def exports_of(root: Value, wiring: Wiring) -> dict[str, bool] | None:
     """Return the names of the data files that a run writes, with True for half floats; None for
     all files.
     """
-    given = root.items.get(KEY)
-    if given is None:
+    block = root.items.get(KEY)
+    if block is None:
         return None
-    values = given.data if isinstance(given.data, list) else [given]
+    values = block.data if isinstance(block.data, list) else [block]
     words = [wiring.references.resolve(value, Scope({}, KEY)) for value in values]
-    if not isinstance(given.data, list) and words[0].data in (None, ALL, NONE):
+    if not isinstance(block.data, list) and words[0].data in (None, ALL, NONE):
         return {} if words[0].data == NONE else None
     return dict(_named(words, wiring))
 
@@ -134,7 +136,7 @@ def seed_and_tolerance(
         value = references.resolve(root.items[key], Scope({}, key))
         if value.data is not BROKEN:
             numbers[key] = value.data
-            if not _is_number(value.data, whole=key == "seed") or value.data < 0:
+            if not _is_number(value.data, is_integer=key == "seed") or value.data < 0:
                 diagnostics.append(Diagnostic(value.mark, f"{key} = {value.data}", _NUMBERS[key]))
     return numbers["seed"], numbers["tolerance"]
 
@@ -158,44 +160,57 @@ def outputs_of(root: Value, wiring: Wiring) -> tuple[str, ...]:
     """Return the names of all copies, such as ``psf[mask]``, of the steps in the recipe key
     ``outputs``.
     """
-    given = root.items.get("outputs")
-    if given is None or given.data in (None, "", [], {}):
+    block = root.items.get("outputs")
+    if block is None or block.data in (None, "", [], {}):
         # else reported as unknown
-        if given is not None or not get_close_matches("outputs", map(str, root.items)):
+        if block is not None or not get_close_matches("outputs", map(str, root.items)):
             wiring.refuse(
-                given or root, "outputs", "no output is requested: write outputs: [STEP, …]"
+                block or root, "outputs", "no output is requested: write outputs: [STEP, …]"
             )
         return ()
-    if isinstance(given.data, dict):
-        wiring.refuse(given, "outputs", "must be a list of steps, not a mapping")
+    if isinstance(block.data, dict):
+        wiring.refuse(block, "outputs", "must be a list of steps, not a mapping")
         return ()
-    values = given.data if isinstance(given.data, list) else [given]
+    values = block.data if isinstance(block.data, list) else [block]
     resolved = [wiring.references.resolve(value, Scope({}, "outputs")) for value in values]
-    names = (
-        name
-        for value in resolved
-        if value.data is not BROKEN
-        for name in wiring.outputs(value, value.name)
-    )
+    names: list[str] = []
+    for value in resolved:
+        if value.data is not BROKEN:
+            names += wiring.outputs(value, value.name)
     return tuple(dict.fromkeys(names))
 
 
 def expectations(root: Value, wiring: Wiring) -> tuple[Expectation, ...]:
     """Return the expected numbers in the key ``expect`` of a recipe."""
-    given = root.items.get("expect")
-    if given is None or given.data is None:
+    block = root.items.get("expect")
+    if block is None or block.data is None:
         return ()
-    given = wiring.references.resolve(given, Scope({}, "expect"))
-    if not isinstance(given.data, dict):
-        wiring.refuse(given, "expect", f"must be a mapping of names, not {kind(given)}")
+    block = wiring.references.resolve(block, Scope({}, "expect"))
+    if not isinstance(block.data, dict):
+        wiring.refuse(block, "expect", f"must be a mapping of names, not {kind(block)}")
         return ()
-    expected = (_expectation(str(name), value, wiring) for name, value in given.data.items())
+    expected = (_expectation(str(name), value, wiring) for name, value in block.data.items())
     return tuple(e for e in expected if e is not None)
 
 
-def _expectation(name: str, given: Value, wiring: Wiring) -> Expectation | None:
+def _expectation(name: str, block: Value, wiring: Wiring) -> Expectation | None:
     before = len(wiring.diagnostics)
-    values: dict[str, Value] = given.items if isinstance(given.data, dict) else {}
+    values: dict[str, Value] = block.items if isinstance(block.data, dict) else {}
+    _refuse_keys(block, values, wiring)
+    _refuse_numbers(values, wiring)
+    steps = wiring.outputs(values["step"], values["step"].name) if "step" in values else ()
+    if len(steps) > 1:
+        wiring.refuse(values["step"], values["step"].name, f"must be one step, such as {steps[0]}")
+    indices = _indices(values["at"], wiring) if "at" in values else ()
+    if len(wiring.diagnostics) > before or not steps:
+        return None
+    return Expectation(
+        name, steps[0], indices, float(values["value"].data), float(values["rtol"].data), block.key
+    )
+
+
+def _refuse_keys(block: Value, values: Mapping[str, Value], wiring: Wiring) -> None:
+    """Report the unknown and the missing keys of an expected number."""
     unknown = {
         value: nearest(str(key), _EXPECTED) for key, value in values.items() if key not in _EXPECTED
     }
@@ -205,30 +220,25 @@ def _expectation(name: str, given: Value, wiring: Wiring) -> Expectation | None:
     for key in ("step", "value", "rtol"):
         if key not in values and f"did you mean {key}?" not in unknown.values():
             message = f"needs {key}: {{step, value, rtol}} and perhaps at"
-            wiring.diagnostics.append(Diagnostic(given.key, given.name, message))
+            wiring.diagnostics.append(Diagnostic(block.key, block.name, message))
+
+
+def _refuse_numbers(values: Mapping[str, Value], wiring: Wiring) -> None:
+    """Report a value or a relative tolerance that is no number."""
     for key in ("value", "rtol"):
         number = values.get(key)
         if number and not (_is_number(number.data) and (key == "value" or number.data >= 0)):
             wiring.refuse(number, f"{number.name} = {number.plain}", "must be a number")
-    steps = wiring.outputs(values["step"], values["step"].name) if "step" in values else ()
-    if len(steps) > 1:
-        wiring.refuse(values["step"], values["step"].name, f"must be one step, such as {steps[0]}")
-    at = _indices(values["at"], wiring) if "at" in values else ()
-    if len(wiring.diagnostics) > before or not steps:
-        return None
-    return Expectation(
-        name, steps[0], at, float(values["value"].data), float(values["rtol"].data), given.key
-    )
 
 
-def _indices(given: Value, wiring: Wiring) -> tuple[int | str, ...]:
-    at = given.plain if isinstance(given.data, list) else [given.plain]
-    if not all(isinstance(part, int | str) and not isinstance(part, bool) for part in at):
-        wiring.refuse(given, given.name, "must be a list of indices or names of fields")
-    return tuple(at)
+def _indices(value: Value, wiring: Wiring) -> tuple[int | str, ...]:
+    indices = value.plain if isinstance(value.data, list) else [value.plain]
+    if not all(isinstance(index, int | str) and not isinstance(index, bool) for index in indices):
+        wiring.refuse(value, value.name, "must be a list of indices or names of fields")
+    return tuple(indices)
 
 
-def _is_number(data: Any, whole: bool = False) -> bool:
-    if isinstance(data, bool) or not isinstance(data, int if whole else int | float):
+def _is_number(data: Any, is_integer: bool = False) -> bool:
+    if isinstance(data, bool) or not isinstance(data, int if is_integer else int | float):
         return False
-    return whole or math.isfinite(data)
+    return is_integer or math.isfinite(data)

@@ -6,13 +6,14 @@ import functools
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, visible
 from neusee.workflows.graph.final_values import Config, Setting, changes
-from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
 from neusee.workflows.keys.sealed_files import head_of
 from neusee.workflows.recipe.distributions.law_text import read_mismatch
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
@@ -81,10 +82,10 @@ def with_cameras(
     of options. Raises `RecipeError` with the location of an override, also for one that changes the
     training.
     """
-    given = composed.root.items[_TRAIN].items["cameras"]
+    block = composed.root.items[_TRAIN].items["cameras"]
     cameras = tuple(
-        made([_override("train.cameras=[]", given), *_overrides(each)])
-        for each in given.items.values()
+        made([_override("train.cameras=[]", block), *_overrides(camera)])
+        for camera in block.items.values()
     )
     settings = dict(recipe.config.settings)
     stated = [changes(recipe.config, camera.config, _TRAIN) for camera in cameras]
@@ -93,12 +94,12 @@ def with_cameras(
 
 
 def _overrides(camera: Value) -> list[Override]:
-    found = [_override(str(value.plain), value) for value in camera.items.values()]
-    if wrong := [o for o in found if o.path[0] == _TRAIN]:
+    overrides = [_override(str(value.plain), value) for value in camera.items.values()]
+    if wrong := [o for o in overrides if o.path[0] == _TRAIN]:
         raise RecipeError(
             Diagnostic(o.mark, camera.name, f"{o.text} is no setting of a camera") for o in wrong
         )
-    return found
+    return overrides
 
 
 def _override(text: str, value: Value) -> Override:
@@ -125,8 +126,8 @@ def final_values(
     spare = wiring.references.spare
     for key, block in wiring.root.items.items():
         if key != "steps":
-            found = _block_settings(block, checker, memory)
-            settings |= {name: value for name, value in found.items() if value.path not in spare}
+            of_block = _block_settings(block, checker, memory)
+            settings |= {name: value for name, value in of_block.items() if value.path not in spare}
             continue
         for name, step in block.items.items():
             settings |= _block_settings(step, checker, memory)
@@ -144,20 +145,20 @@ def _block_settings(
     """Return the final values of a block by path, those of an earlier check if the block is the
     same object.
     """
-    known = memory.settings.get(block.path) if memory else None
-    same = known is not None and known[0] is block
-    found = known[1] if known and same else dict(settings_of([block], checker))
+    remembered = memory.settings.get(block.path) if memory else None
+    same = remembered is not None and remembered[0] is block
+    settings = remembered[1] if remembered and same else dict(settings_of([block], checker))
     # paths of files may differ
-    if any(setting.path in checker.files for setting in found.values()):
+    if any(setting.path in checker.files for setting in settings.values()):
         return dict(settings_of([block], checker))
     if memory and not same:
-        memory.settings[block.path] = block, found
-    return found
+        memory.settings[block.path] = block, settings
+    return settings
 
 
 def settings_of(blocks: Iterable[Value], checker: Checker) -> Iterator[tuple[str, Setting]]:
     """Yield the values that blocks of a recipe write, each with its path."""
-    for leaf in (leaf for block in blocks for leaf in block.leaves()):
+    for leaf in chain.from_iterable(block.leaves() for block in blocks):
         value: Any = checker.files.get(leaf.path, leaf.plain)
         sources = dict.fromkeys(map(str, (leaf.mark, *arguments_in(leaf))))
         yield leaf.name, Setting(value, ", ".join(sources), leaf.path)
@@ -294,13 +295,12 @@ def check(composed: Composed) -> Recipe:
     composed, uncertain = settle(composed)
     diagnostics = list(composed.diagnostics)
     uncertain = _with_mismatch(composed, uncertain, blocks[0] if training else None, diagnostics)
-    root, references = (
-        composed.root,
-        References(composed.root, diagnostics, dict(composed.replaced)),
-    )
+    root = composed.root
+    references = References(root, diagnostics, dict(composed.replaced))
     checker = Checker([], own=own.modules)
     checker.files[(KEY,)] = own.places
     graph = cached_graph(root, own.modules)
+    memory = graph.memory if graph else None
     steps, absent = (
         (graph.steps, graph.absent) if graph else declare(root, references, diagnostics, own)
     )
@@ -309,50 +309,55 @@ def check(composed: Composed) -> Recipe:
     loops = _cycles(bound, steps, graph)
     diagnostics += loops
     seed, tolerance = seed_and_tolerance(root, references, checker.diagnostics)
-    estimates, outputs = (
-        estimates_of(root, references, checker.diagnostics),
-        outputs_of(root, wiring),
-    )
-    check_steps(checked, checker, None if loops else outputs, graph.memory.forms if graph else None)
+    estimates = estimates_of(root, references, checker.diagnostics)
+    outputs = outputs_of(root, wiring)
+    check_steps(checked, checker, None if loops else outputs, memory.forms if memory else None)
     expect, exports = expectations(root, wiring), exports_of(root, wiring)
     safety = _safety(root, references, diagnostics, checker.files)
     references.finish()
+    _refuse_mistakes(composed, diagnostics, checker, own)
+    if graph is None:
+        cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
+    settings = final_values(wiring, bound, checker, uncertain, memory)
+    said_before_run = (composed.notes, own.notes, checker.notes, references.notes)
+    return Recipe(
+        name=composed.name,
+        title=composed.title,
+        seed=seed,
+        tolerance=tolerance,
+        outputs=outputs,
+        steps=bound,
+        expect=expect,
+        config=Config(settings | dict(settings_of(blocks, checker))),
+        notes=(*chain.from_iterable(said_before_run), *_notes_of(uncertain)),
+        absent=_places_of_null(absent),
+        estimates=estimates,
+        uncertain=uncertain,
+        training=training,
+        lifting=lifting,
+        safety=safety,
+        evaluation=evaluation,
+        traceability=traceability,
+        exports=exports,
+    )
+
+
+def _refuse_mistakes(
+    composed: Composed, diagnostics: list[Diagnostic], checker: Checker, own: OwnFamilies
+) -> None:
+    """Raise `RecipeError` with the mistakes of a recipe, if it has any."""
     if not composed.whole:  # a missing group causes further errors
         diagnostics = list(composed.diagnostics)
     if problems := _causes([*diagnostics, *checker.diagnostics], own):
         raise RecipeError(problems)
-    if graph is None:
-        cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
-    memory = graph.memory if graph else None
-    config = Config(
-        final_values(wiring, bound, checker, uncertain, memory) | dict(settings_of(blocks, checker))
-    )
-    gone = {name: f"null ({value.mark})" for name, value in absent.items()}
-    notes = (
-        *composed.notes,
-        *own.notes,
-        *checker.notes,
-        *references.notes,
-        *(uncertain.notes if uncertain else ()),
-    )
-    args = (
-        composed.name,
-        composed.title,
-        seed,
-        tolerance,
-        outputs,
-        bound,
-        expect,
-        config,
-        notes,
-        gone,
-        False,
-        estimates,
-    )
-    recipe = Recipe(
-        *args, uncertain=uncertain, safety=safety, traceability=traceability, exports=exports
-    )
-    return replace(recipe, training=training, lifting=lifting, evaluation=evaluation)
+
+
+def _notes_of(uncertain: Uncertain | None) -> tuple[str, ...]:
+    return uncertain.notes if uncertain else ()
+
+
+def _places_of_null(absent: Mapping[str, Value]) -> dict[str, str]:
+    return {name: f"null ({value.mark})" for name, value in absent.items()}
 
 
 def _cycles(
@@ -379,8 +384,8 @@ def _with_mismatch(
     """Return the uncertain values of a recipe with the differences that ``train.mismatch``
     states, if any.
     """
-    given = block.child("mismatch") if block else None
-    if given is None or not (mismatch := read_mismatch(given, composed.root, diagnostics)):
+    stated = block.child("mismatch") if block else None
+    if stated is None or not (mismatch := read_mismatch(stated, composed.root, diagnostics)):
         return uncertain
     return replace(
         uncertain or Uncertain(replace(composed, diagnostics=()), {}, None), mismatch=mismatch
@@ -402,7 +407,9 @@ def _safety(
 
 def _causes(problems: list[Diagnostic], own: OwnFamilies) -> list[Diagnostic]:
     """Return the mistakes without those that follow from a family that could not be read."""
-    return [each for each in problems if own.is_whole or not each.message.startswith(NO_FAMILY)]
+    return [
+        problem for problem in problems if own.is_whole or not problem.message.startswith(NO_FAMILY)
+    ]
 
 
 def _bind(
@@ -414,33 +421,54 @@ def _bind(
     ``graph`` has the inputs of each copy, and the copies that were checked with the same values
     before.
     """
-    known, memory = (graph.wires, graph.memory) if graph else ({}, None)
+    known_wires, memory = (graph.wires, graph.memory) if graph else ({}, None)
     for step in wiring.steps.values():
         if not step.items:
-            for part in ("from", "with", "device", "cache"):
-                wiring.references.touch(step.part(part), step.dims)
+            for key in ("from", "with", "device", "cache"):
+                wiring.references.touch(step.part(key), step.dims)
         for items in step.items:
             name = step.instance(items)
             if memory and (same := memory.find(name, wiring.references)):
                 checked.append(same)
                 yield same.step
                 continue
-            attempt, scope = Attempt(wiring.references, checker), step.scope(wiring.root, items)
-            given = wiring.references.resolve(step.part("with"), scope)
-            wires = known[name] if name in known else wiring.wires(step, items)
-            device = device_of(step, wiring.references, scope, checker.diagnostics)
-            cached = cached_of(step, wiring.references, scope, checker.diagnostics)
-            if step.node is None:
+            attempt = Attempt(wiring.references, checker)
+            bound = _bound_copy(wiring, checker, step, items, known_wires)
+            if bound is None:
                 continue
-            params = checker.read(step.node, given, step.value.key)
-            marks = {str(name): value.mark for name, value in given.items.items()}
-            found = Step(
-                name, step.node, params or {}, wires, step.value.key, marks, device, cached
-            )
-            if params is not None:
-                checked.append(CheckedStep(found, given, step.value))
+            if bound.is_valid:
+                checked.append(CheckedStep(bound.step, bound.parameters, step.value))
                 attempt.remember(name, checked[-1], memory)
-            yield found
+            yield bound.step
+
+
+class _BoundCopy(NamedTuple):
+    """One copy of a step, with the parameters that the recipe writes."""
+
+    step: Step
+    parameters: Value
+    is_valid: bool  #: whether the parameters are right
+
+
+def _bound_copy(
+    wiring: Wiring,
+    checker: Checker,
+    step: Declared,
+    items: tuple[str, ...],
+    known_wires: Mapping[str, Mapping[str, Wire]],
+) -> _BoundCopy | None:
+    """Return one copy of a step with its parameters and inputs, or None without its node."""
+    name, scope = step.instance(items), step.scope(wiring.root, items)
+    parameters = wiring.references.resolve(step.part("with"), scope)
+    wires = known_wires[name] if name in known_wires else wiring.wires(step, items)
+    device = device_of(step, wiring.references, scope, checker.diagnostics)
+    cached = cached_of(step, wiring.references, scope, checker.diagnostics)
+    if step.node is None:
+        return None
+    params = checker.read(step.node, parameters, step.value.key)
+    marks = {str(name): value.mark for name, value in parameters.items.items()}
+    step_copy = Step(name, step.node, params or {}, wires, step.value.key, marks, device, cached)
+    return _BoundCopy(step_copy, parameters, params is not None)
 
 
 def families_of(name: str, folder: Path | None = None) -> Own:
@@ -463,11 +491,11 @@ def recipes() -> list[Titled]:
     """Return names and titles of all recipes that a name finds: those of the user, and the
     packaged recipes.
     """
-    found: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     for folder in shared_folders():
         for path in sorted(folder.glob("*.yaml")):
-            found.setdefault(path.stem, path)
-    return [_titled(path) for _, path in sorted(found.items())]
+            paths.setdefault(path.stem, path)
+    return [_titled(path) for _, path in sorted(paths.items())]
 
 
 def groups(beside: Path | None = None) -> dict[str, list[Titled]]:

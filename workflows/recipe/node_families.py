@@ -162,12 +162,12 @@ def own_nodes(family: str, module: ModuleType) -> dict[str, Node]:
     of another name.
     """
     name = module.__name__
-    found = {
+    nodes = {
         key: value
         for key, value in vars(module).items()
         if isinstance(value, Node) and f"{value.fn.__module__}.".startswith(f"{name}.")
     }
-    if not found and not network_classes(module):
+    if not nodes and not network_classes(module):
         raise LookupError(
             f"{name} defines no node: decorate a function with @node() of neusee.nodes, or write a"
             " network class"
@@ -177,9 +177,9 @@ def own_nodes(family: str, module: ModuleType) -> dict[str, Node]:
             f"{name} is the family {_family_of[name]} in this process: use that name, or a new"
             " process"
         )
-    for key, node in found.items():
+    for key, node in nodes.items():
         node.path = f"{family}.{key}"
-    return found
+    return nodes
 
 
 def import_own(where: str, folder: Path) -> ModuleType:
@@ -232,10 +232,10 @@ def _with_parameters(node: Node) -> Node:
 
 def unannotated(node: Node) -> list[str]:
     """Return the names of the parameters of a node that have no annotation."""
-    given = inspect.signature(node.fn).parameters.values()
+    parameters = inspect.signature(node.fn).parameters.values()
     return [
         p.name
-        for p in given
+        for p in parameters
         if p.kind is p.KEYWORD_ONLY and p.name != "rng" and p.name not in node.hints
     ]
 
@@ -282,11 +282,11 @@ def _installed() -> dict[str, tuple[EntryPoint, ...]]:
     """Return the entry points of each family of an installed package; a name of a family of
     neusee does not count.
     """
-    found = dict[str, tuple[EntryPoint, ...]]()
+    points = dict[str, tuple[EntryPoint, ...]]()
     for point in entry_points(group=GROUP):
         if not _is_ours(point.name):
-            found[point.name] = (*found.get(point.name, ()), point)
-    return found
+            points[point.name] = (*points.get(point.name, ()), point)
+    return points
 
 
 def _load(family: str) -> ModuleType:
@@ -342,18 +342,20 @@ def read_own_families(root: Value, diagnostics: list[Diagnostic]) -> OwnFamilies
 
     Importing runs the code. The variable ``NEUSEE_NO_CODE`` refuses that.
     """
-    found = OwnFamilies()
-    given = root.items.get(KEY)
-    if given is None or given.data is None:
-        return found
-    if not isinstance(given.data, list):
+    own = OwnFamilies()
+    entries = root.items.get(KEY)
+    if entries is None or entries.data is None:
+        return own
+    if not isinstance(entries.data, list):
         diagnostics.append(
-            Diagnostic(given.mark, KEY, f"must be a list of files and modules, not {kind(given)}")
+            Diagnostic(
+                entries.mark, KEY, f"must be a list of files and modules, not {kind(entries)}"
+            )
         )
-        found.is_whole = False
-        return found
+        own.is_whole = False
+        return own
     before = len(diagnostics)
-    for entry in given.data:
+    for entry in entries.data:
         pair = _pair(entry)
         if pair is None:
             diagnostics.append(Diagnostic(entry.mark, entry.name, _FORM))
@@ -363,18 +365,18 @@ def read_own_families(root: Value, diagnostics: list[Diagnostic]) -> OwnFamilies
             diagnostics.append(Diagnostic(entry.mark, f"{entry.name} = {pair[1].data}", message))
             continue
         try:
-            _add(found, *pair)
+            _add(own, *pair)
         except LookupError as error:
             diagnostics.append(
                 Diagnostic(entry.mark, f"{entry.name} = {pair[1].data}", str(error.args[0]))
             )
-    found.is_whole = len(diagnostics) == before
-    if found.modules:
+    own.is_whole = len(diagnostics) == before
+    if own.modules:
         names = ", ".join(
-            str(getattr(module, "__file__", module)) for module in found.modules.values()
+            str(getattr(module, "__file__", module)) for module in own.modules.values()
         )
-        found.notes.append(f"reading this recipe ran code: {names}")
-    return found
+        own.notes.append(f"reading this recipe ran code: {names}")
+    return own
 
 
 def _pair(entry: Value) -> tuple[str, Value] | None:
@@ -387,21 +389,21 @@ def _pair(entry: Value) -> tuple[str, Value] | None:
     return None
 
 
-def _add(found: OwnFamilies, family: str, where: Value) -> None:
+def _add(own: OwnFamilies, family: str, where: Value) -> None:
     """Import one entry; raise `LookupError` if that fails or if its family has the name of
     another one.
     """
     folder = Path(where.mark.folder)
     module = import_own(str(where.data), folder)
     name = family or module.__name__.rpartition(".")[2]
-    if found.modules.get(name) is module:
+    if own.modules.get(name) is module:
         return
-    if name in found.modules or is_known(name):
-        other = getattr(found.modules.get(name), "__file__", "neusee or an installed package")
+    if name in own.modules or is_known(name):
+        other = getattr(own.modules.get(name), "__file__", "neusee or an installed package")
         text = f"a family of nodes {name} is there already, of {other}"
         raise LookupError(f"{text}: name yours, as in `nodes: [my_{name}: {where.data}]`")
     own_nodes(name, module)
-    found.modules[name] = module
+    own.modules[name] = module
     full = folder / str(where.data)
     place = os.path.abspath(full) if full.exists() else str(where.data)
-    found.places.append({family: place} if family else place)
+    own.places.append({family: place} if family else place)

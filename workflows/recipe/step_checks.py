@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -36,6 +36,7 @@ from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, Where, kind
 
 if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
     from torch import Tensor
 
 
@@ -60,28 +61,26 @@ class Checker:
     #: the user's families of nodes, whose network classes a parameter may name
     own: Own = field(default_factory=dict)
 
-    def read(self, node: Node, given: Value, step: Location) -> dict[str, Any] | None:
+    def read(self, node: Node, block: Value, step: Location) -> dict[str, Any] | None:
         """Return the validated parameters of a step with the defaults of its node, or None if a
         parameter is wrong.
         """
-        if broken(given):
+        if broken(block):
             return None
-        if given.data is not None and not isinstance(given.data, dict):
-            message = f"must be a mapping of parameters, not {kind(given)}"
-            self.diagnostics.append(Diagnostic(given.mark, given.name, message))
+        if block.data is not None and not isinstance(block.data, dict):
+            message = f"must be a mapping of parameters, not {kind(block)}"
+            self.diagnostics.append(Diagnostic(block.mark, block.name, message))
             return None
-        values = {str(name): value for name, value in given.items.items()}
+        values = {str(name): value for name, value in block.items.items()}
         plain = {name: self._plain(node, name, value) for name, value in values.items()}
         try:
             model = node.params.model_validate(plain, context=class_context(self.own))
         except ValidationError as error:
-            self.diagnostics += _problems(error, node, values, given, step)
+            self.diagnostics += _problems(error, node, values, block, step)
             return None
         params = {name: getattr(model, name) for name in node.params.model_fields}
-        strange = [
-            (value, why) for name, value in values.items() if (why := _strange(params[name], value))
-        ]
-        self.diagnostics += [Diagnostic(value.mark, _said(value), why) for value, why in strange]
+        strange = _strange_files(params, values)
+        self.diagnostics += strange
         return None if strange else params
 
     def preflight(
@@ -89,7 +88,7 @@ class Checker:
         bound: Step,
         inputs: Mapping[str, Any],
         source: Callable[[Wire], Mapping[Any, Value]],
-        given: Value,
+        parameters: Value,
         step: Value,
     ) -> Sequence[str] | None:
         """Check a step with its node's own check, and return its notes, or None for a mistake.
@@ -100,13 +99,13 @@ class Checker:
         if bound.node.hooks.preflight is None:
             return ()
         try:
-            known = {name: inputs.get(name) for name in bound.node.preflight_inputs}
+            forms = {name: inputs.get(name) for name in bound.node.preflight_inputs}
             return _checked(
-                bound, functools.partial(bound.node.hooks.preflight, **bound.params, **known)
+                bound, functools.partial(bound.node.hooks.preflight, **bound.params, **forms)
             )
         except ParameterError as error:
             fed, _, name = error.parameter.rpartition(".")
-            value = (source(bound.wires.get(fed)) if fed else given.items).get(name)
+            value = (source(bound.wires.get(fed)) if fed else parameters.items).get(name)
             if value is None:
                 self.diagnostics.append(
                     Diagnostic(step.key, f"{step.name}.with.{error.parameter}", str(error))
@@ -130,28 +129,31 @@ class Checker:
         hint = node.hints.get(name)
         if (
             not is_file(hint)
-            or not all(isinstance(part.data, str) for part in parts)
+            or not all(isinstance(item.data, str) for item in parts)
             or value.plain in texts_of(hint)
         ):
             return value.plain
         paths = [
-            os.path.normpath(Path(part.mark.folder) / Path(part.data).expanduser())
-            for part in parts
+            os.path.normpath(Path(item.mark.folder) / Path(item.data).expanduser())
+            for item in parts
         ]
         full = [os.path.abspath(path) for path in paths]
         self.files[value.path] = full if isinstance(value.data, list) else full[0]
         return paths if isinstance(value.data, list) else paths[0]
 
 
-def _strange(found: Any, value: Value) -> str:
+def _strange_files(params: Mapping[str, Any], values: Mapping[str, Value]) -> list[Diagnostic]:
+    """Return a diagnostic for each value that leads to a file which its recipe may not name."""
+    reasons = [(value, _strange(params[name], value)) for name, value in values.items()]
+    return [Diagnostic(value.mark, _said(value), why) for value, why in reasons if why]
+
+
+def _strange(parameter: Any, value: Value) -> str:
     """Return why a recipe of a stranger may not name the files that a value led to, or an empty
     text.
     """
-    files = [
-        part
-        for part in (found if isinstance(found, tuple | list) else [found])
-        if isinstance(part, Path)
-    ]
+    values = parameter if isinstance(parameter, tuple | list) else [parameter]
+    files = [path for path in values if isinstance(path, Path)]
     if not files or not is_strange():
         return ""
     if any(file.suffix == ".pt2" for file in files):
@@ -177,40 +179,54 @@ def _checked(bound: Step, hook: Callable[[], Sequence[str]]) -> Sequence[str]:
 
 
 def _problems(
-    error: ValidationError, node: Node, values: Mapping[str, Value], given: Value, step: Location
+    error: ValidationError, node: Node, values: Mapping[str, Value], block: Value, step: Location
 ) -> Iterator[Diagnostic]:
     """Yield a diagnostic for each parameter of a step that is wrong, unknown or missing."""
     details = error.errors(include_url=False)
-    strangers = [
-        str(e["loc"][0]) for e in details if e["type"] == "extra_forbidden" and len(e["loc"]) == 1
-    ]
-    meant = {nearest(name, node.params.model_fields) for name in strangers}
-    now = {new_name(f"{node.path}.{name}") for name in strangers}
+    strangers = [str(e["loc"][0]) for e in details if _is_of_parameter(e, "extra_forbidden")]
     wrong: dict[tuple[Location, str], list[str]] = {}
-    gone: dict[str, Diagnostic] = {}
+    removed: dict[str, Diagnostic] = {}
     for e in details:
         name = str(e["loc"][0])
-        if e["type"] == "extra_forbidden" and len(e["loc"]) == 1:
+        if _is_of_parameter(e, "extra_forbidden"):
             unknown = f"unknown to {node.path}; {nearest(name, node.params.model_fields)}"
             message = instead(f"{node.path}.{name}") or unknown
-            gone.setdefault(message, Diagnostic(values[name].key, f"{given.name}.{name}", message))
-        elif e["type"] == "missing" and len(e["loc"]) == 1:
-            if f"did you mean {name}?" not in meant and name not in now:
+            removed.setdefault(
+                message, Diagnostic(values[name].key, f"{block.name}.{name}", message)
+            )
+        elif _is_of_parameter(e, "missing"):
+            if not _is_meant(name, strangers, node):
                 yield Diagnostic(
-                    step, f"{given.name}.{name}", f"missing parameter: {node.path} needs {name}"
+                    step, f"{block.name}.{name}", f"missing parameter: {node.path} needs {name}"
                 )
         else:
             value = _deepest(values[name], e["loc"][1:])
             wrong.setdefault((value.mark, _said(value)), []).append(message_of(e, value))
-    yield from gone.values()  # parameters that moved to the same node share one message
+    yield from removed.values()  # parameters that moved to the same node share one message
     for (mark, path), messages in wrong.items():
-        absent = [
-            message for message in dict.fromkeys(messages) if message.startswith("no such file")
-        ]
-        others = [message for message in dict.fromkeys(messages) if message not in absent]
-        yield Diagnostic(
-            mark, path, "; ".join([*absent, *([", or ".join(others)] if others else [])])
-        )
+        yield Diagnostic(mark, path, _in_one(messages))
+
+
+def _is_of_parameter(error: ErrorDetails, kind_of_error: str) -> bool:
+    """Return True for an error of a parameter itself, not of a value inside of it."""
+    return error["type"] == kind_of_error and len(error["loc"]) == 1
+
+
+def _is_meant(name: str, strangers: Iterable[str], node: Node) -> bool:
+    """Return True if an unknown name is a misspelt or an old form of a parameter."""
+    meant = {nearest(stranger, node.params.model_fields) for stranger in strangers}
+    now = {new_name(f"{node.path}.{stranger}") for stranger in strangers}
+    return f"did you mean {name}?" in meant or name in now
+
+
+def _in_one(messages: Iterable[str]) -> str:
+    """Return the messages on one value as one: first that a file is missing, then the others as
+    alternatives.
+    """
+    once = dict.fromkeys(messages)
+    absent = [message for message in once if message.startswith("no such file")]
+    others = [message for message in once if message not in absent]
+    return "; ".join([*absent, *([", or ".join(others)] if others else [])])
 
 
 def _deepest(value: Value, path: tuple[int | str, ...]) -> Value:
@@ -280,55 +296,91 @@ def check_steps(
     no shape is known. ``before`` has what earlier checks of the same graph found, and is brought up
     to date.
     """
-    by_name = {each.step.name: each for each in checked}
+    by_name = {candidate.step.name: candidate for candidate in checked}
     sources = {
-        name: tuple(s for s in each.step.sources if s in by_name) for name, each in by_name.items()
+        name: tuple(s for s in candidate.step.sources if s in by_name)
+        for name, candidate in by_name.items()
     }
-    known: dict[str, Any] = {}
-    notes: dict[str, Iterable[str]] = {}
-    memory = machine_memory()
     computed = set(ordered(sources, [name for name in outputs or () if name in by_name]))
+    checks = _FormChecks(
+        by_name=by_name,
+        checker=checker,
+        computed=computed,
+        is_cycle=outputs is None,
+        before={} if before is None else before,
+        memory=machine_memory(),
+    )
+    notes: dict[str, Iterable[str]] = {}
     for name in by_name if outputs is None else ordered(sources, by_name):
-        each, forms = by_name[name], inputs_of(by_name[name].step, known)
-        if (
-            before is not None
-            and name in before
-            and before[name].holds(each, forms, name in computed)
-        ):
-            notes[name], known[name] = before[name].notes, before[name].form
-            continue
-        inputs = dict(zip(each.step.node.inputs, forms, strict=True))
-        found = checker.preflight(
-            each.step, inputs, lambda wire: _params(by_name, wire), each.params, each.value
-        )
-        if found is None:
-            notes[name] = (
-                []
-                if outputs is None or name in computed
-                else _set_aside(each.step, inputs, checker)
-            )
-            continue
-        notes[name] = found
-        try:
-            known[name] = form = _form(each.step, known)
-            if before is not None and name in before and alike(form, before[name].form):
-                # the same object, so that later steps need no new check
-                known[name] = before[name].form
-        except (ValueError, OverflowError) as error:
-            checker.diagnostics.append(Diagnostic(each.value.key, each.value.name, str(error)))
-        if name in computed and (problem := _too_large(each.step, inputs, known.get(name), memory)):
-            del known[name]
-            shape = each.params.items.get("shape")
-            place = (
-                (each.value.key, each.value.name)
-                if shape is None
-                else (shape.mark, f"{shape.name} = {shape.plain}")
-            )
-            checker.diagnostics.append(Diagnostic(*place, problem))
-        elif before is not None and name in known:
-            before[name] = KnownForm(each, forms, name in computed, found, known[name])
+        notes[name] = checks.notes_of(name)
     for name in by_name:
         checker.notes.update(dict.fromkeys(notes.get(name, ())))
+
+
+@dataclass
+class _FormChecks:
+    """The checks of the steps of a recipe, one after another, with what is known of their
+    results.
+    """
+
+    by_name: Mapping[str, CheckedStep]
+    checker: Checker
+    computed: Collection[str]  #: steps that an output needs
+    is_cycle: bool  #: whether the steps depend on each other in a cycle
+    before: dict[str, KnownForm]  #: what earlier checks found, brought up to date
+    memory: float  #: of the machine, bytes
+    results: dict[str, Any] = field(default_factory=dict)
+
+    def notes_of(self, name: str) -> Sequence[str]:
+        """Check a step whose inputs were checked, and return its notes."""
+        current = self.by_name[name]
+        forms, is_computed = inputs_of(current.step, self.results), name in self.computed
+        known = self.before.get(name)
+        if known is not None and known.holds(current, forms, is_computed):
+            self.results[name] = known.form
+            return known.notes
+        inputs = dict(zip(current.step.node.inputs, forms, strict=True))
+        notes = self.checker.preflight(
+            current.step,
+            inputs,
+            lambda wire: _params(self.by_name, wire),
+            current.params,
+            current.value,
+        )
+        if notes is None:
+            is_needed = self.is_cycle or is_computed
+            return [] if is_needed else _set_aside(current.step, inputs, self.checker)
+        self._add_result(name)
+        problem = is_computed and _too_large(
+            current.step, inputs, self.results.get(name), self.memory
+        )
+        if problem:
+            del self.results[name]
+            self.checker.diagnostics.append(_at_shape(current, problem))
+        elif name in self.results:
+            self.before[name] = KnownForm(current, forms, is_computed, notes, self.results[name])
+        return notes
+
+    def _add_result(self, name: str) -> None:
+        """Add what is known of the result of a step, or a diagnostic if it cannot be."""
+        current, known = self.by_name[name], self.before.get(name)
+        try:
+            self.results[name] = form = _form(current.step, self.results)
+            if known is not None and alike(form, known.form):
+                # the same object, so that later steps need no new check
+                self.results[name] = known.form
+        except (ValueError, OverflowError) as error:
+            self.checker.diagnostics.append(
+                Diagnostic(current.value.key, current.value.name, str(error))
+            )
+
+
+def _at_shape(current: CheckedStep, problem: str) -> Diagnostic:
+    """Return a diagnostic at the shape that a step sets, or at the step."""
+    shape = current.params.items.get("shape")
+    if shape is None:
+        return Diagnostic(current.value.key, current.value.name, problem)
+    return Diagnostic(shape.mark, f"{shape.name} = {shape.plain}", problem)
 
 
 def _set_aside(step: Step, inputs: Mapping[str, Any], checker: Checker) -> list[str]:
@@ -343,13 +395,13 @@ def _set_aside(step: Step, inputs: Mapping[str, Any], checker: Checker) -> list[
 
 def refuse_indices(recipe: Recipe) -> Iterator[Diagnostic]:
     """Yield a diagnostic for each expected number whose index or field the result cannot have."""
-    known: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     for name in in_order(
         {name: step.sources for name, step in recipe.steps.items()}, [e.step for e in recipe.expect]
     ):
-        known[name] = _form(recipe.steps[name], known)
+        results[name] = _form(recipe.steps[name], results)
     for expected in recipe.expect:
-        if problem := _wrong_index(expected, known.get(expected.step)):
+        if problem := _wrong_index(expected, results.get(expected.step)):
             yield Diagnostic(
                 expected.mark, f"expect.{expected.name}.at = {list(expected.at)}", problem
             )
@@ -371,13 +423,13 @@ def _params(by_name: Mapping[str, CheckedStep], wire: Wire) -> Mapping[Any, Valu
     return {} if source is None else source.params.items
 
 
-def _form(step: Step, known: Mapping[str, Form]) -> Form:
+def _form(step: Step, results: Mapping[str, Form]) -> Form:
     """Return what is known of the result of a step; a step that is computed before the run tells
     its own mistakes.
     """
     if step.node.before_run:
         return step.node(**step.params)
-    return form_of(step.node, inputs_of(step, known), step.params)
+    return form_of(step.node, inputs_of(step, results), step.params)
 
 
 def _too_large(step: Step, inputs: Mapping[str, Any], result: Any, memory: float) -> str:
@@ -388,9 +440,9 @@ def _too_large(step: Step, inputs: Mapping[str, Any], result: Any, memory: float
     """
     if result is None or any(getattr(step.node, name) for name in _CHEAPER):
         return ""
-    single = [
-        one for value in inputs.values() for one in (value if type(value) is list else [value])
-    ]
+    single: list[Any] = []
+    for value in inputs.values():
+        single += value if type(value) is list else [value]
     needed = bytes_of(result) + max(map(bytes_of, single), default=0.0)
     if needed <= memory:
         return ""
@@ -406,42 +458,45 @@ def _numbers_of(tensor: Tensor) -> int:
     return tensor.numel()
 
 
-def _wrong_index(expected: Expectation, known: Any) -> str:
+def _wrong_index(expected: Expectation, result: Any) -> str:
     """Return a message if the indices ``at`` of an expected number do not select one number of a
     result.
     """
     from torch import Tensor
 
-    found, axis = known, 0
-    for part in expected.at:
-        if found is None:
+    selected, axis = result, 0
+    for index in expected.at:
+        if selected is None:
             return ""
-        if isinstance(part, str):
-            if part not in (fields := getattr(found, "_fields", ())):
-                return f"the result of {expected.step} has no field {part}; {nearest(part, fields)}"
-            found = getattr(found, part)
-        elif isinstance(found, Tensor):
-            if axis >= found.ndim:
+        if isinstance(index, str):
+            if index not in (fields := getattr(selected, "_fields", ())):
                 return (
-                    f"{_described(expected.step, found)}: give {found.ndim} indices, not {axis + 1}"
+                    f"the result of {expected.step} has no field {index}; {nearest(index, fields)}"
                 )
-            size = found.shape[axis]
-            if not -size <= part < size:
+            selected = getattr(selected, index)
+        elif isinstance(selected, Tensor):
+            if axis >= selected.ndim:
                 return (
-                    f"index {part} is out of range: {_described(expected.step, found)}; axis {axis}"
-                    f" has 0 to {size - 1}"
+                    f"{_described(expected.step, selected)}: give {selected.ndim} indices,"
+                    f" not {axis + 1}"
+                )
+            size = selected.shape[axis]
+            if not -size <= index < size:
+                return (
+                    f"index {index} is out of range: {_described(expected.step, selected)};"
+                    f" axis {axis} has 0 to {size - 1}"
                 )
             axis += 1
-    if isinstance(found, Tensor) and found.shape[axis:].numel() != 1:
+    if isinstance(selected, Tensor) and selected.shape[axis:].numel() != 1:
         return (
-            f"{_described(expected.step, found)}, of which `at` must select one: give {found.ndim}"
-            " indices"
+            f"{_described(expected.step, selected)}, of which `at` must select one: give"
+            f" {selected.ndim} indices"
         )
     return ""
 
 
-def _described(step: str, found: Tensor) -> str:
-    return f"{step} has {' x '.join(map(str, found.shape)) or '1'} values"
+def _described(step: str, tensor: Tensor) -> str:
+    return f"{step} has {' x '.join(map(str, tensor.shape)) or '1'} values"
 
 
 # --- bound steps ----------------------------------------------------------------------------------
@@ -476,12 +531,12 @@ class BoundStep:
         for path, value in reads.items():
             by_block.setdefault(path[0], {})[path] = value
         blocks = {name: root.child(name) for name in by_block}
-        used = frozenset(value.path for value in reads.values() if value is not None)
+        read_paths = frozenset(value.path for value in reads.values() if value is not None)
         return cls(
             checked,
             by_block,
             blocks,
-            used,
+            read_paths,
             frozenset(path for path, value in reads.items() if value is None),
         )
 
@@ -511,12 +566,12 @@ class GraphMemory:
         """Return the step ``name`` as it was checked before, or None if a value that it reads
         has changed.
         """
-        known = self.bound.get(name)
-        if known is None or not known.holds(references.root):
+        bound = self.bound.get(name)
+        if bound is None or not bound.holds(references.root):
             return None
-        references.offered |= known.offered
-        references.used |= known.used
-        return known.checked
+        references.offered |= bound.offered
+        references.used |= bound.used
+        return bound.checked
 
 
 class Attempt:
@@ -542,9 +597,9 @@ class Attempt:
 
     def _state(self) -> tuple[int, ...]:
         references, checker = self._references, self._checker
-        told: tuple[Sized, ...] = (references.diagnostics, references.lacking, references.notes)
-        lists = (*told, checker.diagnostics, checker.notes)
-        return tuple(len(each) for each in lists)
+        reports: tuple[Sized, ...] = (references.diagnostics, references.lacking, references.notes)
+        lists = (*reports, checker.diagnostics, checker.notes)
+        return tuple(len(messages) for messages in lists)
 
 
 # --- graph cache ----------------------------------------------------------------------------------
@@ -600,12 +655,10 @@ def cache_graph(
     """
     if any(_refers(step.value.items.get("node")) for step in steps.values()):
         return
-    fixed = [
-        name
-        for step in steps.values()
-        if not _refers(step.value.items.get("from"))
-        for name in step.instances
-    ]
+    fixed: list[str] = []
+    for step in steps.values():
+        if not _refers(step.value.items.get("from")):
+            fixed += step.instances
     graph = CachedGraph(steps, absent, {name: wires[name] for name in fixed})
     key = _key(root)
     while len(_graphs) >= _MOST:

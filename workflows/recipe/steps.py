@@ -55,11 +55,11 @@ class Declared:
         """Return the value of a key of a step, such as ``from`` or ``cache``, or an empty
         mapping for a missing key.
         """
-        given = self.value.items.get(key)
+        value = self.value.items.get(key)
         return (
             Value({}, self.value.key, self.value.key, (*self.value.path, key))
-            if given is None
-            else given
+            if value is None
+            else value
         )
 
     def scope(self, root: Value, items: tuple[str, ...]) -> Scope:
@@ -81,36 +81,46 @@ def declare(
     ``own`` has the families of nodes that the recipe names.
     Raises `RecipeError` for more steps than the limit, before the copies are made.
     """
-    given = root.items.get("steps")
-    if given is None or not isinstance(given.data, dict) or not given.data:
-        mark = root.mark if given is None else given.mark
+    written = _written_steps(root, diagnostics)
+    absent = {name: value for name, value in written if value.data is None}
+    steps, total = dict[str, Declared](), 0
+    find = functools.cache(functools.partial(find_node, own=own.modules))
+    for name, value in written:
+        if value.data is None:
+            continue
+        steps[name] = Declared(name, value, None, (), ())
+        if not _well_formed(name, value, diagnostics):
+            continue
+        node = _node(value, find, references, diagnostics, own)
+        dims = _dims(value, root, diagnostics)
+        copies = math.prod(len(root.items[dim].items) for dim in dims or ())
+        total += copies
+        if total > _MOST:
+            raise RecipeError([_too_many(value, dims or (), root, copies, total)])
+        steps[name] = Declared(name, value, node, dims or (), _items_of(dims, root))
+    return steps, absent
+
+
+def _written_steps(root: Value, diagnostics: list[Diagnostic]) -> list[tuple[str, Value]]:
+    """Return the steps that a recipe writes, by name; report a recipe without steps."""
+    block = root.items.get("steps")
+    if block is None or not isinstance(block.data, dict) or not block.data:
+        mark = root.mark if block is None else block.mark
         diagnostics.append(
             Diagnostic(
                 mark, "steps", "a recipe needs steps, or a group with steps (`camera: neusee`)"
             )
         )
-        return {}, {}
-    absent = {str(name): value for name, value in given.data.items() if value.data is None}
-    steps, total = dict[str, Declared](), 0
-    find = functools.cache(functools.partial(find_node, own=own.modules))
-    for name, value in (
-        (str(name), value) for name, value in given.data.items() if value.data is not None
-    ):
-        steps[name] = Declared(name, value, None, (), ())
-        if _well_formed(name, value, diagnostics):
-            node, dims = (
-                _node(value, find, references, diagnostics, own),
-                _dims(value, root, diagnostics),
-            )
-            copies = math.prod(len(root.items[dim].items) for dim in dims or ())
-            total += copies
-            if total > _MOST:
-                raise RecipeError([_too_many(value, dims or (), root, copies, total)])
-            items = tuple(
-                itertools.product(*(map(str, root.items[dim].items) for dim in dims or ()))
-            )
-            steps[name] = Declared(name, value, node, dims or (), () if dims is None else items)
-    return steps, absent
+        return []
+    return [(str(name), value) for name, value in block.data.items()]
+
+
+def _items_of(dims: tuple[str, ...] | None, root: Value) -> tuple[tuple[str, ...], ...]:
+    """Return the items of each copy of a step; no copy where the lists of items are wrong."""
+    if dims is None:
+        return ()
+    names = [map(str, root.items[dim].items) for dim in dims]
+    return tuple(itertools.product(*names))
 
 
 def _too_many(
@@ -124,12 +134,12 @@ def _too_many(
         )
         return Diagnostic(step.key, step.name, message)
     sizes = " x ".join(f"{len(root.items[dim].items)} {dim}" for dim in dims)
-    each = step.items["each"]
+    dims_value = step.items["each"]
     message = (
         f"makes {sizes} = {copies} steps, more than the limit of {_MOST}: use fewer items, or a"
         " sweep"
     )
-    return Diagnostic(each.mark, each.name, message)
+    return Diagnostic(dims_value.mark, dims_value.name, message)
 
 
 def _well_formed(name: str, value: Value, diagnostics: list[Diagnostic]) -> bool:
@@ -147,10 +157,12 @@ def _well_formed(name: str, value: Value, diagnostics: list[Diagnostic]) -> bool
             )
         )
         return False
-    for key, part in value.data.items():
+    for key, value_of_key in value.data.items():
         if key not in _KEYS:
             diagnostics.append(
-                Diagnostic(part.key, part.name, f"unknown; {nearest(str(key), _KEYS)}")
+                Diagnostic(
+                    value_of_key.key, value_of_key.name, f"unknown; {nearest(str(key), _KEYS)}"
+                )
             )
     return True
 
@@ -165,21 +177,21 @@ def _node(
     """Return the node that a step names, or None if the name is wrong; ``find`` returns a node
     by name.
     """
-    given = step.items.get("node")
-    if given is None:
+    name = step.items.get("node")
+    if name is None:
         diagnostics.append(
             Diagnostic(step.key, step.name, "the step has no node: write `node: family.name`")
         )
         return None
-    given = references.resolve(given, Scope({}, str(step.path[-1])))
-    if broken(given):
+    name = references.resolve(name, Scope({}, str(step.path[-1])))
+    if broken(name):
         return None
     try:
-        return find(str(given.plain))
+        return find(str(name.plain))
     except LookupError as error:
         # else a family may be one that failed
-        if own.is_whole or is_known(str(given.plain).partition(".")[0]):
-            diagnostics.append(Diagnostic(given.mark, f"{step.name}.node", str(error.args[0])))
+        if own.is_whole or is_known(str(name.plain).partition(".")[0]):
+            diagnostics.append(Diagnostic(name.mark, f"{step.name}.node", str(error.args[0])))
         return None
 
 
@@ -187,38 +199,48 @@ def _dims(step: Value, root: Value, diagnostics: list[Diagnostic]) -> tuple[str,
     """Return the names of the lists, such as ``lasers``, in a step's key ``each``, or None for a
     mistake.
     """
-    given = step.items.get("each")
-    if given is None or given.data is None:
+    setting = step.items.get("each")
+    if setting is None or setting.data is None:
         return ()
-    values = given.data if isinstance(given.data, list) else [given]
-    lists = [key for key, block in root.items.items() if key != "steps" and _is_item_list(block)]
+    lists = _item_lists(root)
     dims: list[str] = []
     before = len(diagnostics)
-    for value in values:
-        block = root.items.get(value.data) if isinstance(value.data, str) else None
-        if block is None or value.data not in lists:
+    for value in setting.data if isinstance(setting.data, list) else [setting]:
+        block = lists.get(value.data) if isinstance(value.data, str) else None
+        if block is None:
             hint = nearest(str(value.data), map(str, lists))
             diagnostics.append(
                 Diagnostic(
-                    value.mark, given.name, f"there is no list of items {value.data}; {hint}"
+                    value.mark, setting.name, f"there is no list of items {value.data}; {hint}"
                 )
             )
         elif value.data in dims or len(dims) == 2:
             diagnostics.append(
                 Diagnostic(
-                    value.mark, given.name, "`each` needs one or two different lists of items"
+                    value.mark, setting.name, "`each` needs one or two different lists of items"
                 )
             )
         else:
             dims.append(value.data)
-            diagnostics += [
-                Diagnostic(
-                    item.key, item.name, "an item's name must not have a space, comma or bracket"
-                )
-                for key, item in block.items.items()
-                if not _ITEM.fullmatch(str(key))
-            ]
+            diagnostics += _wrong_items(block)
     return tuple(dims) if len(diagnostics) == before else None
+
+
+def _item_lists(root: Value) -> dict[str | int, Value]:
+    """Return the blocks of a recipe that are lists of items, by name."""
+    return {
+        key: block for key, block in root.items.items() if key != "steps" and _is_item_list(block)
+    }
+
+
+def _wrong_items(block: Value) -> list[Diagnostic]:
+    """Return a diagnostic for each item whose name cannot stand in the brackets of a step."""
+    message = "an item's name must not have a space, comma or bracket"
+    return [
+        Diagnostic(item.key, item.name, message)
+        for key, item in block.items.items()
+        if not _ITEM.fullmatch(str(key))
+    ]
 
 
 def device_of(
@@ -227,20 +249,20 @@ def device_of(
     """Return the device, such as ``gpu``, that a copy of a step requests, or an empty string for
     any device.
     """
-    given = references.resolve(step.part("device"), scope)
-    if broken(given) or given.data in ({}, None, "any"):
+    setting = references.resolve(step.part("device"), scope)
+    if broken(setting) or setting.data in ({}, None, "any"):
         return ""
-    if not isinstance(given.data, str) or not _DEVICE.fullmatch(given.data):
+    if not isinstance(setting.data, str) or not _DEVICE.fullmatch(setting.data):
         hint = "write any, cpu, gpu, cuda, cuda:1 or mps"
         diagnostics.append(
-            Diagnostic(given.mark, f"{given.name} = {given.plain}", f"unknown device: {hint}")
+            Diagnostic(setting.mark, f"{setting.name} = {setting.plain}", f"unknown device: {hint}")
         )
         return ""
     only = step.node.device if step.node else "any"
-    if only != "any" and (only == "cpu") != (given.data == "cpu"):
+    if only != "any" and (only == "cpu") != (setting.data == "cpu"):
         message = f"{step.node and step.node.path} runs only on a {only.upper()}"
-        diagnostics.append(Diagnostic(given.mark, f"{given.name} = {given.data}", message))
-    return given.data
+        diagnostics.append(Diagnostic(setting.mark, f"{setting.name} = {setting.data}", message))
+    return setting.data
 
 
 def cached_of(
@@ -249,15 +271,15 @@ def cached_of(
     """Return False for a step with ``cache: false``, whose result is computed in each run and
     never stored.
     """
-    given = references.resolve(step.part("cache"), scope)
-    if broken(given) or given.data in ({}, None):
+    setting = references.resolve(step.part("cache"), scope)
+    if broken(setting) or setting.data in ({}, None):
         return True
-    if not isinstance(given.data, bool):
+    if not isinstance(setting.data, bool):
         diagnostics.append(
-            Diagnostic(given.mark, f"{given.name} = {given.plain}", "must be true or false")
+            Diagnostic(setting.mark, f"{setting.name} = {setting.plain}", "must be true or false")
         )
         return True
-    return given.data
+    return setting.data
 
 
 def _is_item_list(block: Value) -> bool:
@@ -296,15 +318,15 @@ class Wiring:
         """Return the steps that feed each input of one copy of a step, in the order of the
         node's inputs.
         """
-        given = self.references.resolve(step.part("from"), step.scope(self.root, items))
-        values = self._by_input(step.node, given) if step.node else None
+        sources = self.references.resolve(step.part("from"), step.scope(self.root, items))
+        values = self._by_input(step.node, sources) if step.node else None
         if step.node is None or values is None:
             return {}
         wires: dict[str, Wire] = {}
         for name in step.node.inputs:
             if name not in values:
                 wires[name] = None
-                self._require(step, step.node, name, given)
+                self._require(step, step.node, name, sources)
             elif values[name].data is not BROKEN:
                 wires[name] = self._wire(step, step.node, items, name, values[name])
         return wires
@@ -319,36 +341,36 @@ class Wiring:
         """Report a mistake at the location of a recipe value."""
         self.diagnostics.append(Diagnostic(value.mark, path, message))
 
-    def _by_input(self, node: Node, given: Value) -> dict[str, Value] | None:
+    def _by_input(self, node: Node, sources: Value) -> dict[str, Value] | None:
         """Return the values in a step's key ``from`` by input, or None for a mistake.
 
         A single name in ``from`` is for the first input.
         """
-        if given.data is BROKEN:
+        if sources.data is BROKEN:
             return None
-        if given.data is None:
+        if sources.data is None:
             return {}
-        if isinstance(given.data, list):
+        if isinstance(sources.data, list):
             self.refuse(
-                given,
-                given.name,
+                sources,
+                sources.name,
                 "must be a step's name, or a mapping of inputs to names, not a list",
             )
             return None
-        if not isinstance(given.data, dict):
+        if not isinstance(sources.data, dict):
             if node.inputs:
-                return {node.inputs[0]: given}
-            self.refuse(given, given.name, f"{node.path} takes no inputs: leave `from` out")
+                return {node.inputs[0]: sources}
+            self.refuse(sources, sources.name, f"{node.path} takes no inputs: leave `from` out")
             return None
-        for name, value in given.data.items():
+        for name, value in sources.data.items():
             if name not in node.inputs:
                 hint = nearest(str(name), node.inputs)
                 self.diagnostics.append(
                     Diagnostic(value.key, value.name, f"{node.path} has no input {name}; {hint}")
                 )
-        return {str(name): value for name, value in given.data.items()}
+        return {str(name): value for name, value in sources.data.items()}
 
-    def _require(self, step: Declared, node: Node, name: str, given: Value) -> None:
+    def _require(self, step: Declared, node: Node, name: str, sources: Value) -> None:
         """Report an input of a node that the step's key ``from`` does not name, unless the input
         is optional.
         """
@@ -356,11 +378,11 @@ class Wiring:
             name == "stop" and became_input(node.path, map(str, step.part("with").items))
         ):
             return  # the parameters of an old recipe are reported with the step that replaces them
-        if not (isinstance(given.data, dict) and _misspelt(name, node, given)):
-            mark = given.mark if given.items else step.value.key
+        if not (isinstance(sources.data, dict) and _misspelt(name, node, sources)):
+            mark = sources.mark if sources.items else step.value.key
             fix = f"write from: {{{name}: STEP}}{self._makers(needs(node, name))}"
             self.diagnostics.append(
-                Diagnostic(mark, given.name, f"{node.path} needs the input {name}: {fix}")
+                Diagnostic(mark, sources.name, f"{node.path} needs the input {name}: {fix}")
             )
 
     def _wire(
@@ -372,27 +394,26 @@ class Wiring:
         many, path, parsed = takes_many(node, name), f"{step.value.name}.from.{name}", _parse(value)
         null = self.absent.get(parsed[0]) if parsed else None
         if value.data is None or null:
-            if not many and name not in node.optional:
-                what = f"{parsed[0]}, which is null ({null.mark})" if parsed and null else "null"
-                self.refuse(value, path, f"{node.path} needs {name}, but the input is {what}")
-            return () if many else None
+            if many:
+                return ()
+            if name not in node.optional:
+                instead = f"{parsed[0]}, which is null ({null.mark})" if parsed and null else "null"
+                self.refuse(value, path, f"{node.path} needs {name}, but the input is {instead}")
+            return None
         here = dict(zip(step.dims, items, strict=True))
         names = self._producers(value, path, here, self._makers(needs(node, name)))
         if names is None or parsed is None:
             return None
-        producer = self.steps[parsed[0]]
+        producer, chosen_items = self.steps[parsed[0]], parsed[1]
         self._agree(node, name, producer, value, path)
         if many:
             return names
-        if set(producer.dims) <= set(here) or (
-            parsed[1] is not None and len(parsed[1]) == len(producer.dims)
-        ):
+        if set(producer.dims) <= set(here) or len(chosen_items or ()) == len(producer.dims):
             return names[0]
         left = ", ".join(dim for dim in producer.dims if dim not in here)
-        example = f"{parsed[0]}[{producer.items[0][0]}]" if producer.items else f"{parsed[0]}[…]"
         message = (
             f"{node.path} takes one step as {name}; {parsed[0]} is a step for each of {left}: write"
-            f" {example}"
+            f" {_example_of(producer)}"
         )
         self.refuse(value, path, message)
         return None
@@ -408,10 +429,10 @@ class Wiring:
             self.refuse(value, path, self._unknown(value, makers))
             return None
         producer, items = self.steps[parsed[0]], parsed[1]
-        chosen = {} if items is None else self._chosen(producer, items, value, path)
-        if chosen is None:
+        selected = {} if items is None else self._chosen(producer, items, value, path)
+        if selected is None:
             return None
-        fixed = {**here, **chosen}
+        fixed = {**here, **selected}
         choices = [[fixed[dim]] if dim in fixed else self._items(dim) for dim in producer.dims]
         return tuple(producer.instance(items) for items in itertools.product(*choices))
 
@@ -419,8 +440,8 @@ class Wiring:
         """Return the error message for a value that should name a step but does not."""
         parsed = _parse(value)
         if parsed is None:
-            what = value.data if isinstance(value.data, str) else kind(value)
-            return f"must be a step's name such as psf or psf[mask], not {what}"
+            content = value.data if isinstance(value.data, str) else kind(value)
+            return f"must be a step's name such as psf or psf[mask], not {content}"
         name = parsed[0]
         if name in self.absent:
             return f"step {name} is null ({self.absent[name].mark})"
@@ -444,19 +465,19 @@ class Wiring:
             self.refuse(value, path, f"{producer.name} has no items: leave out the brackets")
             return None
         left = list(producer.dims)
-        chosen: dict[str, str] = {}
+        selected: dict[str, str] = {}
         for item in items:
             among = left[:1] if len(items) == len(producer.dims) else left
             dim = next((dim for dim in among if item in self._items(dim)), None)
             if dim is None:
-                names = [name for dim in among for name in self._items(dim)]
+                names = [*itertools.chain.from_iterable(map(self._items, among))]
                 self.refuse(
                     value, path, f"{producer.name} has no item {item}; {nearest(item, names)}"
                 )
                 return None
-            chosen[dim] = item
+            selected[dim] = item
             left.remove(dim)
-        return chosen
+        return selected
 
     def _items(self, dim: str) -> list[str]:
         return [str(name) for name in self.root.items[dim].items]
@@ -477,9 +498,10 @@ class Wiring:
         """
         if not needed or all(n.__name__ == "Tensor" for n in needed):
             return ""
-        makers = [
-            name for s in self.steps.values() if _fits(_returned(s), needed) for name in s.instances
-        ]
+        makers: list[str] = []
+        for step in self.steps.values():
+            if _fits(_returned(step), needed):
+                makers += step.instances
         if not makers:
             return f"; no step returns {_a(needed)}"
         return f"; steps returning {_a(needed)}: {', '.join(makers[:6])}"
@@ -495,9 +517,15 @@ def _parse(value: Value) -> tuple[str, list[str] | None] | None:
     return match[1], None if match[2] is None else [item.strip() for item in match[2].split(",")]
 
 
-def _misspelt(name: str, node: Node, given: Value) -> bool:
+def _example_of(producer: Declared) -> str:
+    """Return the name of one copy of a step, as an input may name it."""
+    item = producer.items[0][0] if producer.items else "…"
+    return f"{producer.name}[{item}]"
+
+
+def _misspelt(name: str, node: Node, sources: Value) -> bool:
     """Return True if a step's key ``from`` contains a misspelt form of an input's name."""
-    strangers = [str(key) for key in given.items if key not in node.inputs]
+    strangers = [str(key) for key in sources.items if key not in node.inputs]
     return any(nearest(stranger, node.inputs) == f"did you mean {name}?" for stranger in strangers)
 
 
@@ -546,14 +574,14 @@ def _a(kinds: Sequence[type]) -> str:
 
 def cycles(steps: Mapping[str, Step], marks: Mapping[str, Location]) -> Iterator[Diagnostic]:
     """Yield one diagnostic for each cycle of steps in a recipe, with the lines of these steps."""
-    seen: set[frozenset[str]] = set()
+    reported: set[frozenset[str]] = set()
     for loop in _loops(
         {name: [s for s in step.sources if s in steps] for name, step in steps.items()}
     ):
         names = list(dict.fromkeys(name.partition("[")[0] for name in loop))
-        if frozenset(names) in seen:
+        if frozenset(names) in reported:
             continue
-        seen.add(frozenset(names))
+        reported.add(frozenset(names))
         start = min(range(len(names)), key=lambda n: marks[names[n]])
         names = names[start:] + names[:start]
         few = (

@@ -60,13 +60,21 @@ class Family:
             return name, "", "…" if self.begun else "", "", "", ""
         ran = sum(d.seconds for d in done if d.state == "run")
         last = max(done, key=lambda d: (d.facts is not None, self.members.index(d.step)))
-        shown = next((d for d in done if any(not c.ok for c in d.checks)), last)
+        shown = next((d for d in done if not all(c.ok for c in d.checks)), last)
+        seconds = f"{ran:.3f}" if ran else ""
+        return name, shown.device, self.state(), seconds, self._output(last), self._check(shown)
+
+    def _output(self, last: StepRecord) -> str:
+        """Return the shape of a result with its unit, or an empty text."""
         shape = shape_of(last)
-        check = "; ".join(("" if c.ok else "LOOK: ") + c.text for c in shown.checks)
-        why = next((d.why for d in done if d.state in ("run", "left out") and d.why), "")
-        check = f"{check}  ({why})" if check and why else check or why
-        output = f"{shape} {self.unit}".strip() if shape else ""
-        return name, shown.device, self.state(), f"{ran:.3f}" if ran else "", output, check
+        return f"{shape} {self.unit}".strip() if shape else ""
+
+    def _check(self, shown: StepRecord) -> str:
+        """Return the texts of the checks of a copy, and why the first copy ran or was left out."""
+        texts = "; ".join(("" if c.ok else "LOOK: ") + c.text for c in shown.checks)
+        reasons = (d.why for d in self.needed if d.state in ("run", "left out") and d.why)
+        why = next(reasons, "")
+        return f"{texts}  ({why})" if texts and why else texts or why
 
     def state(self) -> str:
         """Return the common state of all copies of a step, such as ``run``, or the number of
@@ -141,8 +149,10 @@ class ProgressTable(ABC):
             return self._lines
         from rich.console import Console
 
-        text, seen = StringIO(), self._live.console
-        Console(file=text, force_terminal=True, width=seen.width, height=seen.height).print(self)
+        text, screen = StringIO(), self._live.console
+        Console(file=text, force_terminal=True, width=screen.width, height=screen.height).print(
+            self
+        )
         return text.getvalue().removesuffix("\n").split("\n")
 
     def show_error(self, plain: Iterable[str], live: str) -> None:
@@ -218,9 +228,11 @@ class RunTable(ProgressTable):
     @property
     def finished(self) -> int:
         """Return the number of steps that the run has computed or loaded so far."""
-        return sum(
-            d.state in ("run", "cached") for family in self.families.values() for d in family.done
-        )
+        return sum(d.state in ("run", "cached") for d in self._done())
+
+    def _done(self) -> Iterator[StepRecord]:
+        for family in self.families.values():
+            yield from family.done
 
     def caption(self) -> str:
         """Return the time that is left, or how many steps were neither computed nor loaded in
@@ -228,7 +240,7 @@ class RunTable(ProgressTable):
         """
         if (left := sum(self._left.values())) >= 1:
             return f"about {lasts(left)} left, as earlier runs took"
-        count = sum(d.state == "not needed" for f in self.families.values() for d in f.done)
+        count = sum(d.state == "not needed" for d in self._done())
         steps = "1 step was" if count == 1 else f"{count} steps were"
         return f"{steps} not needed: the results that need them are in the cache" if count else ""
 
@@ -280,8 +292,8 @@ def opening(recipe: Recipe, command: str) -> list[str]:
     """Return the lines to print before a run: recipe title, numbers of checked steps and
     parameters, and notes.
     """
-    found = contents_of(recipe)
-    sizes = f"{found['steps']} steps of {found['nodes']} nodes, {found['parameters']} parameters"
+    counts = contents_of(recipe)
+    sizes = f"{counts['steps']} steps of {counts['nodes']} nodes, {counts['parameters']} parameters"
     notes = [f"note     {line}" for line in (*recipe.notes, *consequences(recipe.config.values))]
     return [
         f"neusee {command}: {recipe.title or recipe.name}",
@@ -296,8 +308,8 @@ def forecast_line(seconds: float, steps: int, unknown: int) -> str:
     """
     if seconds < 1 or unknown == steps:
         return ""
-    rest = f"; {unknown} of {steps} steps never ran before" if unknown else ""
-    return f"time     about {lasts(seconds)}, as earlier runs took{rest}"
+    new_steps = f"; {unknown} of {steps} steps never ran before" if unknown else ""
+    return f"time     about {lasts(seconds)}, as earlier runs took{new_steps}"
 
 
 def closing(doc: Mapping[str, Any], path: str, again: Sequence[str], took: str = "") -> list[str]:
@@ -307,14 +319,7 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str], took: str =
     ``took`` stands in place of the seconds of the document.
     """
     took = took or f"{doc['seconds']:.2f}"
-    lines = [said_of_economies(doc["spent"])] if doc["spent"]["economies"] else []
-    lines += [left_out_line(doc)] if doc["left_out"] else []
-    lines += [said_of_errors(doc["spent"])] if lines else []
-    lines += [doc["spectral"]["said"]] if doc.get("spectral") else []
-    rows = [[row["name"], *row["cells"]] for row in doc["table"]["rows"]]
-    lines += ["", *indented([["", *doc["table"]["columns"]], *rows])] if rows else []
-    lines += [line for text in doc["table"]["legend"] for line in wrapped(text)]
-    lines += story_lines(doc)
+    lines = [*_error_lines(doc), *_table_lines(doc["table"]), *story_lines(doc)]
     lines += ["", f"{doc['verdict']}  ({doc['counts']}, {took} s)"]
     lines += [
         f"  missed: {e['name']} = {e['found']:.5g}, expected {e['wanted']:.5g} ±"
@@ -329,13 +334,32 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str], took: str =
     return [*lines, f"report   {path}", "", "next", *[f"  {line}" for line in again]]
 
 
+def _error_lines(doc: Mapping[str, Any]) -> list[str]:
+    """Return the lines on cheaper steps, steps left out, and the errors of outputs and of bands."""
+    lines = [said_of_economies(doc["spent"])] if doc["spent"]["economies"] else []
+    lines += [left_out_line(doc)] if doc["left_out"] else []
+    lines += [said_of_errors(doc["spent"])] if lines else []
+    lines += [doc["spectral"]["said"]] if doc.get("spectral") else []
+    return lines
+
+
+def _table_lines(results: Mapping[str, Any]) -> list[str]:
+    """Return the result table with its legend, after an empty line."""
+    rows = [[row["name"], *row["cells"]] for row in results["rows"]]
+    lines = ["", *indented([["", *results["columns"]], *rows])] if rows else []
+    for text in results["legend"]:
+        lines += wrapped(text)
+    return lines
+
+
 def story_lines(doc: Mapping[str, Any]) -> list[str]:
     """Return the sentences on what the mask buys and costs, after an empty line and no wider
     than the terminal.
     """
-    lines = [
-        line for name in SENTENCES if name in doc["story"] for line in wrapped(doc["story"][name])
-    ]
+    lines: list[str] = []
+    for name in SENTENCES:
+        if name in doc["story"]:
+            lines += wrapped(doc["story"][name])
     return ["", *lines] if lines else []
 
 

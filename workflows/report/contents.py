@@ -134,8 +134,8 @@ def _rival(recipe: Recipe, asked: set[str]) -> Iterable[str]:
     filter of its own.
     """
     steps = TABLE[RIVAL].values()
-    told = asked.issuperset((TABLE["with mask"]["LSR"], *TABLE["restored"].values()))
-    return steps if told and not shade_of(recipe) and recipe.steps.keys() >= set(steps) else ()
+    has_mask = asked.issuperset((TABLE["with mask"]["LSR"], *TABLE["restored"].values()))
+    return steps if has_mask and not shade_of(recipe) and recipe.steps.keys() >= set(steps) else ()
 
 
 def shade_of(recipe: Recipe) -> str | None:
@@ -150,10 +150,10 @@ def compared(recipe: Recipe) -> tuple[list[Expectation], list[Expectation]]:
     the recipe needs.
     """
     asked = _asked(recipe)
-    found: tuple[list[Expectation], list[Expectation]] = ([], [])
+    numbers: tuple[list[Expectation], list[Expectation]] = ([], [])
     for number in recipe.expect:
-        found[number.step not in asked].append(number)
-    return found
+        numbers[number.step not in asked].append(number)
+    return numbers
 
 
 def _asked(recipe: Recipe) -> set[str]:
@@ -321,7 +321,7 @@ def is_table(value: Any) -> bool:
     parameter.
     """
     if isinstance(value, Mapping):
-        return any(isinstance(part, Path | tuple) for part in value.values())
+        return any(isinstance(item, Path | tuple) for item in value.values())
     return isinstance(value, Path)
 
 

@@ -17,10 +17,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neusee.nodes.scene import write_spectral
 from neusee.nodes.values import Bands, Psf
 from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.report import contents
+from neusee.workflows.report.figures.style import encoded
 from neusee.workflows.report.run_pictures import DerivedFile, files_of
 from neusee.workflows.store.band_files import bytes_of
 from neusee.workflows.store.derived_files import DerivedFiles
@@ -51,8 +53,6 @@ def spectral(path: Path, /, *, cube: Tensor | Psf, bands: Bands, half: bool = Fa
     """Write a spectral cube as OpenEXR in the layout of Fichet et al., JCGT 2021, with ``half``
     in 16 bits a value.
     """
-    from neusee.nodes.scene import write_spectral
-
     write_spectral(
         path, cube.intensity if isinstance(cube, Psf) else cube, bands.centres, half=half
     )
@@ -173,8 +173,6 @@ def srgb(path: Path, /, *, image: Tensor, source: Path, draws: int) -> None:
     """Write a restored picture in linear sRGB, white 1, as an sRGB PNG of 16 bits that names the
     frame.
     """
-    from neusee.workflows.report.figures.style import encoded
-
     codes = torch.from_numpy(encoded(image)).permute(2, 0, 1) * 65535.0
     path.write_bytes(_named(_png16(codes), source, draws, _chunk(b"sRGB", b"\0")))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import multiprocessing
 import os
 import pickle
@@ -36,6 +37,7 @@ from neusee.workflows.report.run_pictures import (
     graphs,
     key_of_file,
     states_of,
+    steps_of,
 )
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
@@ -74,15 +76,15 @@ class DrawingProcess:
         self._turn = threading.Lock()
         self._next = threading.Lock()  # and is the next then, before the first thread asks again
         context = multiprocessing.get_context("fork")
-        self._pipe, there = context.Pipe()
+        self._pipe, far_end = context.Pipe()
         # Python 3.12 warns of every fork beside a thread
         with warnings.catch_warnings(), deaf_fork():
             warnings.simplefilter("ignore", DeprecationWarning)
             self._process = context.Process(
-                target=_serve, args=(there, self._pipe), name="neusee draws", daemon=True
+                target=_serve, args=(far_end, self._pipe), name="neusee draws", daemon=True
             )
             self._process.start()
-        there.close()
+        far_end.close()
 
     def make(self, path: Path, make: Callable[..., None], arguments: Mapping[str, Any]) -> None:
         """Let the process call ``make(path, **arguments)``; raise `NotDrawn` if the call failed
@@ -245,20 +247,30 @@ class FilesBeside:
         # the first result, or a run that begins again with a smaller tolerance
         if recipe is not self._recipe:
             self._begin(recipe)
-        shown = {name for _, steps in self._open for name in steps}
-        names = [name for name in shown if keys.get(name) == keys[step]]
+        names = [name for name in self._shown() if keys.get(name) == keys[step]]
         size = _bytes_of(value)
-        if not names or (size > self._large and (self._busy or size > self._limit / 16)):
+        if not names or self._is_too_large(size):
             return  # the report makes the files of this result
-        if size > _SMALL and process_memory() > self._limit / 2:
-            return
         self._held.update(dict.fromkeys(names, value))
+        self._submit_complete(recipe, keys)
+        no_room = size > self._large or _bytes_of(list(self._held.values())) > self._room
+        self._let_go(names if no_room else ())
+
+    def _submit_complete(self, recipe: Recipe, keys: Mapping[str, Key]) -> None:
+        """Begin the files of which all results are held."""
         for file, steps in [job for job in self._open if job[1] <= self._held.keys()]:
             self._open.remove((file, steps))
             self._submit(file, recipe, {name: keys[name] for name in steps})
-        self._let_go(
-            names if size > self._large or _bytes_of(list(self._held.values())) > self._room else ()
-        )
+
+    def _shown(self) -> set[str]:
+        """Return the steps that files which are still to be made show."""
+        return set(itertools.chain.from_iterable(steps for _, steps in self._open))
+
+    def _is_too_large(self, size: int) -> bool:
+        """Return True for a result of so many bytes that none of it may be held now."""
+        if size > self._large and (self._busy or size > self._limit / 16):
+            return True
+        return size > _SMALL and process_memory() > self._limit / 2
 
     def add(
         self, name: str, key: str, make: Callable[..., None], arguments: Mapping[str, Any]
@@ -308,11 +320,11 @@ class FilesBeside:
 
     def _begin(self, recipe: Recipe) -> None:
         self._recipe, self._held, self._open = recipe, {}, []
-        known = dict.fromkeys(needed(recipe, wanted(recipe)), "")
+        no_keys = dict.fromkeys(needed(recipe, wanted(recipe)), "")
         for file in self._files(recipe):
             with suppress(Missing):
-                found = arguments_of(file.needs, recipe, known, self._code, self._shelf.store)
-                steps = frozenset(step for each in found.values() for step in each.steps)
+                sources = arguments_of(file.needs, recipe, no_keys, self._code, self._shelf.store)
+                steps = steps_of(sources)
                 if steps and not file.only_tables:
                     self._open.append((file, steps))
         if self._open and self._drawer is None and possible():
@@ -321,19 +333,19 @@ class FilesBeside:
 
     def _let_go(self, names: Iterable[str]) -> None:
         """Hold no result longer that no file needs, and none of the steps ``names``."""
-        still = {name for _, steps in self._open for name in steps} - set(names)
+        still = self._shown() - set(names)
         self._held = {name: value for name, value in self._held.items() if name in still}
 
     def _submit(self, file: DerivedFile, recipe: Recipe, keys: Mapping[str, Key]) -> None:
-        found = arguments_of(file.needs, recipe, keys, self._code, self._shelf.store)
-        arguments = {name: each.make(self._held) for name, each in found.items()}
+        sources = arguments_of(file.needs, recipe, keys, self._code, self._shelf.store)
+        arguments = {name: source.make(self._held) for name, source in sources.items()}
         large = _bytes_of(list(arguments.values())) > MOST
         drawing = isinstance(file.make, Drawing)
         if drawing and (large or self._drawer is None):
             return
         job = _Job(
             file.name,
-            key_of_file(file, found),
+            key_of_file(file, sources),
             file.suffix,
             file.make,
             arguments,
@@ -423,10 +435,10 @@ class GraphAhead:
         """Return the state of each step at the end: what is not stored runs, and equal results
         are computed once.
         """
-        known = states_of({name: self._done[name] for name in self._order if name in self._done})
-        seen, states = set[Key](), dict[str, str]()
+        ended = states_of({name: self._done[name] for name in self._order if name in self._done})
+        earlier_keys, states = set[Key](), dict[str, str]()
         for name in self._order:
-            there = keys[name] in seen or self._store.has(keys[name])
-            states[name] = known.get(name) or ("cached" if there else "run")
-            seen.add(keys[name])
+            stored = keys[name] in earlier_keys or self._store.has(keys[name])
+            states[name] = ended.get(name) or ("cached" if stored else "run")
+            earlier_keys.add(keys[name])
         return states

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import base64
 import io
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -37,15 +38,12 @@ def numbers_of(result: Result) -> dict[str, float | list[float]]:
     """
     recipe = result.recipe.unsubstituted or result.recipe
     names = metrics_of(recipe, {*result.keys, *wanted(recipe)})
-    absent = [name for name in names if name not in result.values]
-    again = recipe.run(result.store, absent, device=result.device).values if absent else {}
-    values = {**again, **result.values}
-    found: dict[str, list[float]] = {}
-    for step, field, _, number in (
-        row for name in names for row in result_numbers.numbers_of(name, values[name])
-    ):
-        found.setdefault(f"{step}.{field}".rstrip("."), []).append(number)
-    return {name: values[0] if len(values) == 1 else values for name, values in found.items()}
+    values = _values_of(result, recipe, names)
+    lists: dict[str, list[float]] = {}
+    for name in names:
+        for step, field, _, number in result_numbers.numbers_of(name, values[name]):
+            lists.setdefault(f"{step}.{field}".rstrip("."), []).append(number)
+    return {name: numbers[0] if len(numbers) == 1 else numbers for name, numbers in lists.items()}
 
 
 def arrays_of(value: Any) -> Any:
@@ -89,10 +87,17 @@ def result_html(result: Result) -> str:
         lines=[
             line for line in (result.recipe.title, f"{_counts(result)}, on {result.device}") if line
         ],
-        look=[f"{d.step}: {c.text}" for d in result.done.values() for c in d.checks if not c.ok],
+        look=_failed_checks(result),
         pictures=_pictures({**result.values, **values}),
         tables=[*_results(result, values), _outputs(result), _steps(result)],
     )
+
+
+def _failed_checks(result: Result) -> list[str]:
+    texts = []
+    for done in result.done.values():
+        texts += [f"{done.step}: {check.text}" for check in done.checks if not check.ok]
+    return texts
 
 
 def _counts(result: Result) -> str:
@@ -102,7 +107,7 @@ def _counts(result: Result) -> str:
 
 
 def _of_table(result: Result) -> list[str]:
-    cells = [step for row in TABLE.values() for step in row.values()]
+    cells = itertools.chain.from_iterable(row.values() for row in TABLE.values())
     return [BANDS, *[n for n in result.keys if n.startswith(LINES.removesuffix("*]"))], *cells]
 
 
@@ -116,25 +121,39 @@ def _at_hand(result: Result, steps: Iterable[str]) -> dict[str, Any]:
     """Return the results of those ``steps`` that are in the store or can be computed again
     within 2 s.
     """
-    held = {
-        name for name, key in result.keys.items() if name in result.values or result.store.has(key)
-    }
+    affordable = _affordable(result, dict.fromkeys(steps))
+    values = _values_of(result, result.recipe, affordable)
+    return {name: values[name] for name in affordable}
+
+
+def _affordable(result: Result, steps: Iterable[str]) -> list[str]:
+    """Return those ``steps`` of a run whose results need at most 2 s together."""
+    held = _held(result)
     sources = {
         name: () if name in held else result.recipe.steps[name].sources for name in result.keys
     }
-    kept: list[str] = []
-    for name in dict.fromkeys(steps):
-        missing = (
-            [n for n in in_order(sources, [*kept, name]) if n not in held]
-            if name in sources
-            else []
-        )
-        if name in sources and sum(_took(result, n) for n in missing) <= _LONGEST_WAIT:
-            kept.append(name)
-    absent = [name for name in kept if name not in result.values]
-    again = result.recipe.run(result.store, absent, device=result.device).values if absent else {}
-    values = {**again, **result.values}
-    return {name: values[name] for name in kept}
+    affordable: list[str] = []
+    for name in steps:
+        if name not in sources:
+            continue
+        missing = [n for n in in_order(sources, [*affordable, name]) if n not in held]
+        if sum(_took(result, n) for n in missing) <= _LONGEST_WAIT:
+            affordable.append(name)
+    return affordable
+
+
+def _held(result: Result) -> set[str]:
+    """Return the steps whose results the run or its store has."""
+    return {
+        name for name, key in result.keys.items() if name in result.values or result.store.has(key)
+    }
+
+
+def _values_of(result: Result, recipe: Recipe, steps: Iterable[str]) -> Mapping[str, Any]:
+    """Return the values of a run, and those of other ``steps``, which ``recipe`` computes."""
+    absent = [name for name in steps if name not in result.values]
+    again = recipe.run(result.store, absent, device=result.device).values if absent else {}
+    return {**again, **result.values}
 
 
 def _took(result: Result, step: str) -> float:
@@ -149,15 +168,25 @@ def _results(result: Result, values: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the result table of a run without empty rows and columns, or an empty list if all
     cells are empty.
     """
-    found = table(result.recipe, {name: result.keys[name] for name in values}, values.__getitem__)
-    rows = [[row["name"], *row["cells"]] for row in found["rows"] if any(row["cells"])]
-    columns = ["", *found["columns"]]
-    used = [i for i in range(len(columns)) if i == 0 or any(row[i] for row in rows)]
+    results = table(result.recipe, {name: result.keys[name] for name in values}, values.__getitem__)
+    rows = [[row["name"], *row["cells"]] for row in results["rows"] if any(row["cells"])]
+    columns = ["", *results["columns"]]
     if not rows:
         return []
-    cells = [[row[i] or "–" for i in used] for row in rows]
-    title = ". ".join(["Results", *found["legend"]])
-    return [_table(title, [columns[i] for i in used], cells, numbers=columns[1:])]
+    title = ". ".join(["Results", *results["legend"]])
+    shown, cells = _without_empty_columns(columns, rows)
+    return [_table(title, shown, cells, numbers=columns[1:])]
+
+
+def _without_empty_columns(
+    columns: Sequence[str], rows: Sequence[Sequence[str]]
+) -> tuple[list[str], list[list[str]]]:
+    """Return the columns with a text in any row, and the rows with – for each empty cell; the first
+    column stays.
+    """
+    shown = [0, *(i for i in range(1, len(columns)) if any(row[i] for row in rows))]
+    cells = [[row[i] or "–" for i in shown] for row in rows]
+    return [columns[i] for i in shown], cells
 
 
 def _outputs(result: Result) -> dict[str, Any]:
@@ -207,28 +236,32 @@ def _pictures(values: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Encode the truth, raw and restored pictures of a run as PNG, or up to four other images if
     one is missing.
     """
-    from neusee.workflows.report.figures.camera_pictures import centre, high
-
-    needs = _of_overview()
-    if all(need in values for need in FIGURES[0].needs.values() if not need.startswith("?")):
-        truth = values[needs["truth"]]
-        white = high(truth)
-        shown = {
-            name: centre(values[need], truth) / white
-            for name, need in needs.items()
-            if need in values
-        }
-    else:
-        found = {name: value for name, value in values.items() if _is_picture(value)}
-        shown = {
-            name: image.float() / high(image.float()) for name, image in list(found.items())[:4]
-        }
+    shown = _shown_pictures(values)
     edge = _EDGES.get(len(shown), 280)
     while True:
         pictures = [_picture(_NAMES.get(name, name), image, edge) for name, image in shown.items()]
         if sum(len(p["png"]) for p in pictures) <= _WEIGHT:
             return pictures
         edge = edge * 3 // 4
+
+
+def _shown_pictures(values: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Return linear pictures of which the brightest has the value 1: of the overview, or four
+    others.
+    """
+    from neusee.workflows.report.figures.camera_pictures import centre, high
+
+    if all(need in values for need in FIGURES[0].needs.values() if not need.startswith("?")):
+        needs = _of_overview()
+        truth = values[needs["truth"]]
+        white = high(truth)
+        return {
+            name: centre(values[need], truth) / white
+            for name, need in needs.items()
+            if need in values
+        }
+    pictures = [(name, value) for name, value in values.items() if _is_picture(value)]
+    return {name: picture.float() / high(picture.float()) for name, picture in pictures[:4]}
 
 
 def _is_picture(value: Any) -> bool:
@@ -290,22 +323,22 @@ def _graph(recipe: Recipe) -> dict[str, Any]:
     """Return a table of the steps of a recipe; ``psf[plain]`` and ``psf[mask]``, copies of one
     step, share a row.
     """
-    rows = []
-    for family, names in by_family(recipe.steps).items():
-        step = recipe.steps[names[0]]
-        reads = by_family(source for n in names for source in recipe.steps[n].sources)
-        title = f"{family} ×{len(names)}" if len(names) > 1 else names[0]
-        devices = dict.fromkeys(recipe.steps[n].device for n in names if recipe.steps[n].device)
-        rows.append([title, step.node.path, ", ".join(reads), ", ".join(devices)])
-    columns = (
-        ["step", "node", "reads", "where"]
-        if any(row[3] for row in rows)
-        else ["step", "node", "reads"]
-    )
-    title = (
-        f"{len(recipe.steps)} steps of {len({s.node.path for s in recipe.steps.values()})} nodes"
-    )
+    rows = [_copies(recipe, family, names) for family, names in by_family(recipe.steps).items()]
+    columns = ["step", "node", "reads", "where"]
+    if not any(row[3] for row in rows):
+        columns.remove("where")
+    nodes = {step.node.path for step in recipe.steps.values()}
+    title = f"{len(recipe.steps)} steps of {len(nodes)} nodes"
     return _table(title, columns, [row[: len(columns)] for row in rows], shown=len(rows) <= 12)
+
+
+def _copies(recipe: Recipe, family: str, names: Sequence[str]) -> list[str]:
+    """Return the row of all copies of a step: name, node, what they read, and where they run."""
+    steps = [recipe.steps[name] for name in names]
+    reads = by_family(itertools.chain.from_iterable(step.sources for step in steps))
+    title = f"{family} ×{len(names)}" if len(names) > 1 else names[0]
+    devices = dict.fromkeys(step.device for step in steps if step.device)
+    return [title, steps[0].node.path, ", ".join(reads), ", ".join(devices)]
 
 
 def _settings(title: str, settings: Mapping[str, Setting], shown: bool) -> dict[str, Any]:

@@ -65,20 +65,22 @@ def in_force(values: Mapping[str, object]) -> Iterable[tuple[Reading, str]]:
     for row in READINGS:
         if row.path in values:
             value = values[row.path]
-            known = {str(row.coherent): "coherent", str(row.as_printed): "as printed"}
-            yield row, known.get(str(value), str(value))
+            choices = {str(row.coherent): "coherent", str(row.as_printed): "as printed"}
+            yield row, choices.get(str(value), str(value))
 
 
 def consequences(values: Mapping[str, object]) -> list[str]:
     """Return a sentence on the visible effect of each printed value that is in force in a
     recipe.
     """
-    seen = (
+    visible = (
         (row, row.consequence)
         for row, state in in_force(values)
         if state == "as printed" and row.consequence
     )
-    return [f"{row.path} as printed ({row.number}): {_filled(text, values)}" for row, text in seen]
+    return [
+        f"{row.path} as printed ({row.number}): {_filled(text, values)}" for row, text in visible
+    ]
 
 
 def _filled(text: str, values: Mapping[str, object]) -> str:

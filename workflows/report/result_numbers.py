@@ -44,14 +44,14 @@ def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
     """
     rows = []
     for e in compared(recipe)[0]:
-        found: Any = value(e.step)
-        for part in e.at:
-            found = (
-                getattr(found, part)
-                if isinstance(part, str) and not isinstance(found, dict)
-                else found[part]
+        result: Any = value(e.step)
+        for key in e.at:
+            result = (
+                getattr(result, key)
+                if isinstance(key, str) and not isinstance(result, dict)
+                else result[key]
             )
-        number = float(found)
+        number = float(result)
         ok = abs(number - e.value) <= e.rtol * abs(e.value)
         rows.append(
             {
@@ -89,12 +89,12 @@ def arms(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, dic
     band, _ = _band(recipe, keys, value)
     numbers: dict[str, dict[str, float]] = {}
     for name, cells in TABLE.items():
-        known = {column: value(step) for column, step in cells.items() if step in keys}
-        numbers[name] = {
-            column: float(number(found, band))
-            for column, (x, field, number, _) in _COLUMNS.items()
-            if (found := _field(known.get(x), field)) is not None
-        }
+        results = {column: value(step) for column, step in cells.items() if step in keys}
+        numbers[name] = {}
+        for column, (source, field, number, _) in _COLUMNS.items():
+            result = _field(results.get(source), field)
+            if result is not None:
+                numbers[name][column] = float(number(result, band))
     return numbers
 
 
@@ -117,15 +117,17 @@ def suppressed(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[st
     if step not in keys or BANDS not in keys:
         return {}
     lsr, centres = value(step).flatten(), value(BANDS).centres
-    at = (nearest(centres, mean_wavelength(value(line))) for line in lines_of(recipe, keys))
-    return {name: float(lsr[min(band, lsr.numel() - 1)]) for band, name in at}
+    bands_of_lasers = (
+        nearest(centres, mean_wavelength(value(line))) for line in lines_of(recipe, keys)
+    )
+    return {name: float(lsr[min(band, lsr.numel() - 1)]) for band, name in bands_of_lasers}
 
 
-def _field(found: Any, field: str) -> Tensor | None:
+def _field(result: Any, field: str) -> Tensor | None:
     """Return the field ``field`` of a result, or its first field for an empty name, or None if
     the field is missing.
     """
-    fields = {} if found is None else dict(_fields(found))
+    fields = {} if result is None else dict(_fields(result))
     return fields.get(field) if field else next(iter(fields.values()), None)
 
 
@@ -161,7 +163,10 @@ def metrics(recipe: Recipe, keys: Mapping[str, str], value: Value) -> list[list[
     """Return the rows (step, field, index, value) of ``metrics.csv``, one for each number that a
     metric gave.
     """
-    return [row for name in metrics_of(recipe, keys) for row in numbers_of(name, value(name))]
+    rows: list[list[Any]] = []
+    for name in metrics_of(recipe, keys):
+        rows += numbers_of(name, value(name))
+    return rows
 
 
 def metrics_of(recipe: Recipe, among: Container[str]) -> list[str]:
@@ -173,21 +178,21 @@ def metrics_of(recipe: Recipe, among: Container[str]) -> list[str]:
     ]
 
 
-def numbers_of(step: str, found: Any) -> list[list[Any]]:
+def numbers_of(step: str, result: Any) -> list[list[Any]]:
     """Return a row (step, field, index, value) for each number in a result of at most 4096
     elements.
     """
     rows: list[list[Any]] = []
-    for field, tensor in _fields(found):
+    for field, tensor in _fields(result):
         if tensor.numel() <= _MOST and not tensor.is_complex():
             numbers = tensor.detach().double().flatten().tolist()
             rows += [[step, field, i if len(numbers) > 1 else "", n] for i, n in enumerate(numbers)]
     return rows
 
 
-def _fields(found: Any) -> list[tuple[str, Tensor]]:
-    if isinstance(found, Tensor):
-        return [("", found)]
-    if hasattr(found, "_asdict"):
-        return [(k, v) for k, v in found._asdict().items() if isinstance(v, Tensor)]
+def _fields(result: Any) -> list[tuple[str, Tensor]]:
+    if isinstance(result, Tensor):
+        return [("", result)]
+    if hasattr(result, "_asdict"):
+        return [(k, v) for k, v in result._asdict().items() if isinstance(v, Tensor)]
     return []

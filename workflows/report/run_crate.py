@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import cache
 from importlib.resources import files
@@ -14,6 +14,7 @@ from typing import Any
 from urllib.parse import quote
 
 from neusee import __version__
+from neusee.workflows.keys.cache_key import file_digest
 from neusee.workflows.keys.sealed_files import text_of
 
 # --- crate sources --------------------------------------------------------------------------------
@@ -47,17 +48,21 @@ _LINK = re.compile(r"\[(?P<name>[^]]+)]\((?P<address>[^)]+)\)")
 
 def tools(said: Mapping[str, Any]) -> list[Entity]:
     """Return neusee and the libraries that it computed with; neusee is the first."""
-    known = dict(said.get("versions") or _of_facts(said.get("facts") or ()))
-    rest = [_library(*each) for each in known.items() if each[0] != "neusee" and each[1] != "none"]
+    versions = dict(said.get("versions") or _of_facts(said.get("facts") or ()))
+    libraries = [
+        _library(*library)
+        for library in versions.items()
+        if library[0] != "neusee" and library[1] != "none"
+    ]
     ours = {
         "@id": f"#neusee-{__version__}",
         "@type": "SoftwareApplication",
         "name": "neusee",
         "softwareVersion": __version__,
         "description": "A simulator of what a laser does to a camera.",
-        **({"softwareRequirements": references(rest)} if rest else {}),
+        **({"softwareRequirements": references(libraries)} if libraries else {}),
     }
-    return [ours, *rest]
+    return [ours, *libraries]
 
 
 def _library(name: str, version: str) -> Entity:
@@ -88,38 +93,40 @@ def inputs(rows: Iterable[Any]) -> tuple[list[Entity], list[Entity]]:
     """Return an entity for each input file, which is not a part of the folder, and one for each
     known licence.
     """
-    found: dict[str, Entity] = {}
+    entities: dict[str, Entity] = {}
+    users: dict[str, list[str]] = {}
     licences: list[Entity] = []
     for row in rows:
         if not isinstance(row, Mapping) or not row.keys() >= {"file", "digest", "parameter"}:
             continue  # the inputs of a study of uncertainty are parameters
         name, entry = f"#input-{row['digest']}", _sample(row["file"], row["digest"])
-        users = [*found[name]["_users"], row["parameter"]] if name in found else [row["parameter"]]
-        found[name] = {
-            "@id": name,
-            "@type": "CreativeWork",
-            "name": row["file"],
-            "description": f"Input file, the value of {', '.join(users)}"
-            + (f": {entry['what']}; by {entry['author']}." if entry else "."),
-            "identifier": f"xxh3_128:{row['digest']}",
-            "encodingFormat": media_type(row["file"]),
-            **({"license": {"@id": entry["address"]}} if entry else {}),
-            "_users": users,
-        }
+        users.setdefault(name, []).append(row["parameter"])
+        entities[name] = _input_file(name, row, users[name], entry)
         if entry:
             licences.append(
                 {"@id": entry["address"], "@type": "CreativeWork", "name": entry["licence"]}
             )
-    return [
-        {key: value for key, value in entity.items() if key != "_users"}
-        for entity in found.values()
-    ], licences
+    return list(entities.values()), licences
+
+
+def _input_file(
+    name: str, row: Mapping[str, str], users: Sequence[str], entry: Mapping[str, str] | None
+) -> Entity:
+    """Return the entity of an input file, with what is known of it if neusee ships it."""
+    source = f": {entry['what']}; by {entry['author']}." if entry else "."
+    return {
+        "@id": name,
+        "@type": "CreativeWork",
+        "name": row["file"],
+        "description": f"Input file, the value of {', '.join(users)}{source}",
+        "identifier": f"xxh3_128:{row['digest']}",
+        "encodingFormat": media_type(row["file"]),
+        **({"license": {"@id": entry["address"]}} if entry else {}),
+    }
 
 
 def _sample(file: str, digest: str) -> dict[str, str] | None:
     """Return what is known of a file that neusee ships, or None for any other file."""
-    from neusee.workflows.keys.cache_key import file_digest
-
     row = _samples().get(file)
     try:
         return (
@@ -137,7 +144,7 @@ def _samples() -> dict[str, dict[str, str]]:
     ``samples/LICENSE.md``.
     """
     text = (files("neusee.recipes") / "samples" / "LICENSE.md").read_text(encoding="utf-8")
-    found = {}
+    samples = {}
     for line in text.splitlines():
         cells = [cell.strip() for cell in line.strip("|").split(" | ")]
         if len(cells) == 5 and (link := _LINK.fullmatch(cells[3])):
@@ -147,8 +154,8 @@ def _samples() -> dict[str, dict[str, str]]:
                 "licence": link["name"],
                 "address": link["address"],
             }
-            found.update({name: row for name in re.findall("`([^`]+)`", cells[0])})
-    return found
+            samples.update({name: row for name in re.findall("`([^`]+)`", cells[0])})
+    return samples
 
 
 def person() -> Entity | None:
@@ -156,8 +163,8 @@ def person() -> Entity | None:
     text = os.environ.get(CREATOR, "").strip()
     if not text:
         return None
-    found = _PERSON.fullmatch(text)
-    name, address = (found["name"], found["address"]) if found else (text, "#creator")
+    match = _PERSON.fullmatch(text)
+    name, address = (match["name"], match["address"]) if match else (text, "#creator")
     return {"@id": address, "@type": "Person", "name": name}
 
 
@@ -258,13 +265,13 @@ def remove_crate(folder: Path) -> dict[str, Any] | None:
     """
     path = folder / CRATE
     try:
-        found = json.loads(text_of(path))
+        crate = json.loads(text_of(path))
     except FileNotFoundError:
         return None
     except ValueError:
-        found = None
+        crate = None
     path.unlink()
-    return found if isinstance(found, dict) and isinstance(found.get("@graph"), list) else None
+    return crate if isinstance(crate, dict) and isinstance(crate.get("@graph"), list) else None
 
 
 def restore_crate(folder: Path, crate: Mapping[str, Any]) -> None:
@@ -277,21 +284,21 @@ def restore_crate(folder: Path, crate: Mapping[str, Any]) -> None:
 
 
 def _write(folder: Path, crate: Mapping[str, Any]) -> None:
-    part = folder / f".{CRATE}.part"
+    unfinished = folder / f".{CRATE}.part"
     graph = ",\n".join(json.dumps(entity, ensure_ascii=False) for entity in crate["@graph"])
     text = f'{{"@context": {json.dumps(crate["@context"])},\n"@graph": [\n{graph}\n]}}\n'
-    part.write_text(text, encoding="utf-8")
-    part.replace(folder / CRATE)
+    unfinished.write_text(text, encoding="utf-8")
+    unfinished.replace(folder / CRATE)
 
 
 def _graph(folder: Path, name: str, said: Mapping[str, Any], ended: datetime) -> list[Entity]:
-    figures = [row for row in said.get("figures") or () if isinstance(row, Mapping)]
-    texts = {row["file"]: row["title"] for row in figures if "file" in row} | _FILES
-    parts = [_file(path, size, texts.get(path, "")) for path, size in _sizes(folder)]
-    given, licences = inputs(said.get("inputs") or ())
+    titles = _titles(said)
+    parts = [_file(path, size, titles.get(path, "")) for path, size in _sizes(folder)]
+    input_files, licences = inputs(said.get("inputs") or ())
     software = tools(said)
     creator, terms = person(), licence()
-    action = _action(name, said, ended, parts, given, software, creator)
+    action = _command_entity(name, said, ended)
+    action |= _of_command(parts, input_files, software, creator)
     root = {
         "@id": "./",
         "@type": "Dataset",
@@ -305,8 +312,16 @@ def _graph(folder: Path, name: str, said: Mapping[str, Any], ended: datetime) ->
         **({"author": reference(creator)} if creator else {}),
     }
     about = [_descriptor(), root, _profile(), action, terms]
-    found = [*about, *software, *parts, *given, *licences, *([creator] if creator else [])]
-    return list({entity["@id"]: entity for entity in found}.values())
+    entities = [*about, *software, *parts, *input_files, *licences]
+    if creator:
+        entities.append(creator)
+    return list({entity["@id"]: entity for entity in entities}.values())
+
+
+def _titles(said: Mapping[str, Any]) -> dict[str, str]:
+    """Return the titles of files by path: those of figures, and of what each run writes."""
+    figures = [row for row in said.get("figures") or () if isinstance(row, Mapping)]
+    return {row["file"]: row["title"] for row in figures if "file" in row} | _FILES
 
 
 def _descriptor() -> Entity:
@@ -322,18 +337,10 @@ def _profile() -> Entity:
     return {"@id": _PROFILE, "@type": "CreativeWork", "name": "Process Run Crate", "version": "0.5"}
 
 
-def _action(
-    name: str,
-    said: Mapping[str, Any],
-    ended: datetime,
-    parts: list[Entity],
-    given: list[Entity],
-    software: list[Entity],
-    creator: Entity | None,
-) -> Entity:
-    """Return the entity of the command that wrote the folder."""
+def _command_entity(name: str, said: Mapping[str, Any], ended: datetime) -> Entity:
+    """Return the entity of the command that wrote the folder, with its times and its state."""
     command = _command(said)
-    recipe = [part for part in parts if part["@id"] == "recipe.yaml"]
+    stopped = said.get("state") in ("stopped", "interrupted")
     began = _began(said, ended)
     return {
         "@id": f"#{quoted(name)}",
@@ -342,11 +349,24 @@ def _action(
         **({"description": f"Computed on {said['device']}."} if said.get("device") else {}),
         **({"startTime": _time(began)} if began else {}),
         "endTime": _time(ended),
-        "actionStatus": _FAILED if said.get("state") in ("stopped", "interrupted") else _COMPLETED,
+        "actionStatus": _FAILED if stopped else _COMPLETED,
+    }
+
+
+def _of_command(
+    parts: list[Entity],
+    input_files: list[Entity],
+    software: list[Entity],
+    creator: Entity | None,
+) -> Entity:
+    """Return what a command ran, who gave it, what it read and what it wrote."""
+    recipe = [file for file in parts if file["@id"] == "recipe.yaml"]
+    objects = [*recipe, *input_files]
+    return {
         "instrument": reference(software[0]),
         **({"agent": reference(creator)} if creator else {}),
-        **({"object": references([*recipe, *given])} if recipe or given else {}),
-        "result": references(part for part in parts if part not in recipe),
+        **({"object": references(objects)} if objects else {}),
+        "result": references(file for file in parts if file not in recipe),
     }
 
 
@@ -354,8 +374,8 @@ def _command(said: Mapping[str, Any]) -> str:
     """Return the command line that a document names, which is a text, a list of words or
     missing.
     """
-    found = said.get("command") or said.get("again") or ""
-    return found if isinstance(found, str) else " ".join(map(str, found))
+    command = said.get("command") or said.get("again") or ""
+    return command if isinstance(command, str) else " ".join(map(str, command))
 
 
 def _began(said: Mapping[str, Any], ended: datetime) -> datetime | None:
@@ -380,7 +400,7 @@ def _sizes(folder: Path) -> list[tuple[str, int]]:
     """Return the path and the size of each file of a folder, without hidden files and without
     the crate itself.
     """
-    found, todo = [], [folder]
+    sizes, todo = [], [folder]
     while todo:
         with os.scandir(todo.pop()) as entries:
             for entry in entries:
@@ -389,10 +409,10 @@ def _sizes(folder: Path) -> list[tuple[str, int]]:
                 if entry.is_dir():
                     todo.append(Path(entry.path))
                 else:
-                    found.append(
+                    sizes.append(
                         (Path(entry.path).relative_to(folder).as_posix(), entry.stat().st_size)
                     )
-    return sorted((name, size) for name, size in found if name != CRATE)
+    return sorted((name, size) for name, size in sizes if name != CRATE)
 
 
 def _file(path: str, size: int, text: str) -> Entity:

@@ -150,21 +150,24 @@ def _folder(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
 
 def _sweep(root: Path) -> None:
     """Remove the unfinished folders of killed runs, in which no file has changed for an hour."""
-    for part in root.glob(".*.part"):
+    for unfinished in root.glob(".*.part"):
         try:
-            if _is_being_written(part):
+            if _is_being_written(unfinished):
                 continue
-            if time.time() - max(p.stat().st_mtime for p in (part, *part.rglob("*"))) > _ABANDONED:
-                shutil.rmtree(part, ignore_errors=True)
+            if (
+                time.time() - max(p.stat().st_mtime for p in (unfinished, *unfinished.rglob("*")))
+                > _ABANDONED
+            ):
+                shutil.rmtree(unfinished, ignore_errors=True)
         except OSError:  # another process has already removed the folder
             continue
 
 
-def _is_being_written(part: Path) -> bool:
+def _is_being_written(unfinished: Path) -> bool:
     """Return True if the process that made an unfinished folder runs on this machine, whatever
     the clock says.
     """
-    number = part.suffixes[-2].removeprefix(".") if len(part.suffixes) > 1 else ""
+    number = unfinished.suffixes[-2].removeprefix(".") if len(unfinished.suffixes) > 1 else ""
     try:
         os.kill(int(number), 0)
     except (ValueError, OverflowError, ProcessLookupError):
@@ -174,7 +177,7 @@ def _is_being_written(part: Path) -> bool:
     return True
 
 
-def _rename(part: Path, target: Path) -> Path:
+def _rename(unfinished: Path, target: Path) -> Path:
     """Rename the complete folder of a run to the first free name: ``name``, ``name_2``,
     ``name_3`` …
     """
@@ -183,7 +186,7 @@ def _rename(part: Path, target: Path) -> Path:
         path = target if number == 1 else target.with_name(f"{target.name}_{number}")
         if not path.exists():
             try:
-                return part.rename(path)
+                return unfinished.rename(path)
             except OSError:
                 # no other run took the name: the file system refused the rename
                 if not path.exists():
@@ -195,15 +198,15 @@ def _point(root: Path, name: str) -> None:
     """Make ``latest`` a symbolic link to the folder of a run, or a file with its name if links
     are not possible.
     """
-    part = root / f".latest.{os.getpid()}"
+    link = root / f".latest.{os.getpid()}"
     try:
-        part.symlink_to(name, target_is_directory=True)
+        link.symlink_to(name, target_is_directory=True)
     except OSError:
-        part.write_text(name + "\n", encoding="utf-8")
+        link.write_text(name + "\n", encoding="utf-8")
     try:
-        part.replace(root / "latest")
+        link.replace(root / "latest")
     except OSError:
-        part.unlink(missing_ok=True)
+        link.unlink(missing_ok=True)
         raise
 
 
@@ -245,11 +248,9 @@ def code_text(result: Result) -> str:
     """
     origins = [result.origins[key] for key in result.keys.values() if key in result.origins]
     nodes = {origin["node"]: origin["code"] for origin in origins}
-    parts = {
-        name: part
-        for code in dict.fromkeys(nodes.values())
-        for name, part in result.code.get(code, {}).items()
-    }
+    parts: dict[str, Any] = {}
+    for code in dict.fromkeys(nodes.values()):
+        parts |= result.code.get(code, {})
     return f'{{"nodes": {_lines(nodes)},\n"parts": {_lines(parts)}}}\n'
 
 
@@ -306,10 +307,10 @@ def rebuild(folder: Path) -> Path:
         p.stem: bytes_of(p, sys.maxsize) for p in sorted((folder / "figures").glob("*.png"))
     }
     target = folder / "report.html"
-    part = folder / ".report.html.part"
-    part.write_text(page(doc, pictures), encoding="utf-8")
+    unfinished = folder / ".report.html.part"
+    unfinished.write_text(page(doc, pictures), encoding="utf-8")
     crate = remove_crate(folder)
-    part.replace(target)
+    unfinished.replace(target)
     if crate is not None:
         restore_crate(folder, crate)
     return target

@@ -17,11 +17,13 @@ from neusee.nodes import Check
 from neusee.workflows.engine.provenance import facts_in, version_of
 from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.recipe_graph import Recipe, StepRecord
+from neusee.workflows.keys.cache_key import file_digest
 from neusee.workflows.recipe.distributions.nominal_values import told
 from neusee.workflows.report.contents import FIGURES, compared
 from neusee.workflows.report.paper_readings import consequences, in_force
 from neusee.workflows.report.result_numbers import expected, metrics, table
 from neusee.workflows.report.run_folder import present_time
+from neusee.workflows.report.run_pictures import GRAPH, TIMELINE
 from neusee.workflows.report.run_summary import said_of_frame, story
 from neusee.workflows.report.tolerance_spent import spectral_error, spent
 from neusee.workflows.store.cache_settings import format_size
@@ -63,76 +65,89 @@ def timing(steps: Sequence[StepRow], planned: float | None = None) -> dict[str, 
 
     Steps with the same result count once.
     """
-    ran = [s for s in steps if s["state"] == "run"]
-    own = {s["key"] for s in ran}
-    served = _once(
-        s for s in steps if s["state"] in ("cached", "not needed") and s["key"] not in own
-    )
-    known = [s for s in ran if s["predicted"] is not None]
-    took, saved = sum(s["seconds"] for s in ran), sum(s["made_in"] for s in served)
-    ends = [s["began"] + s["seconds"] for s in ran]
+    ran, loaded = _in_state(steps, "run"), _in_state(steps, "cached", "not needed")
+    own = {step["key"] for step in ran}
+    served = _once(step for step in loaded if step["key"] not in own)
+    predicted = [step for step in ran if step["predicted"] is not None]
+    took, saved = _total(ran, "seconds"), _total(served, "made_in")
     return {
         "ran": len(ran),
-        "served": len([s for s in steps if s["state"] in ("cached", "not needed")]),
+        "served": len(loaded),
         "steps": len(steps),
         "seconds": took,
-        "span": max(ends) - min(s["began"] for s in ran) if ran else 0.0,
+        "span": _span(ran),
         "planned": planned if ran else None,
-        "told": len(known),
-        "predicted": sum(s["predicted"] for s in known),
-        "actual": sum(s["seconds"] for s in known),
+        "told": len(predicted),
+        "predicted": _total(predicted, "predicted"),
+        "actual": _total(predicted, "seconds"),
         "saved": saved,
         "share": saved / (saved + took) if saved + took else 0.0,
-        "read": sum(s["bytes"] for s in served if s["state"] == "cached"),
-        "written": sum(s["bytes"] for s in ran if s["kept"]),
+        "read": _total(_in_state(served, "cached"), "bytes"),
+        "written": _total([step for step in ran if step["kept"]], "bytes"),
     }
+
+
+def _in_state(steps: Iterable[StepRow], *states: str) -> list[StepRow]:
+    return [step for step in steps if step["state"] in states]
+
+
+def _total(steps: Iterable[StepRow], column: str) -> Any:
+    return sum(step[column] for step in steps)
+
+
+def _span(ran: Sequence[StepRow]) -> Any:
+    """Return the time in s from the begin of the first step that ran to the end of the last."""
+    if not ran:
+        return 0.0
+    end = max(step["began"] + step["seconds"] for step in ran)
+    return end - min(step["began"] for step in ran)
 
 
 def _once(steps: Iterable[StepRow]) -> list[StepRow]:
     """Return one step for each distinct result, with preference for a step whose result was read
     from the cache.
     """
-    found: dict[str, StepRow] = {}
+    steps_by_key: dict[str, StepRow] = {}
     for step in steps:
-        if step["key"] not in found or step["state"] == "cached":
-            found[step["key"]] = step
-    return list(found.values())
+        if step["key"] not in steps_by_key or step["state"] == "cached":
+            steps_by_key[step["key"]] = step
+    return list(steps_by_key.values())
 
 
-def said_of(found: Mapping[str, Any]) -> list[str]:
+def said_of(times: Mapping[str, Any]) -> list[str]:
     """Return the times and the sizes in bytes of a run, which `timing` computed, as sentences."""
     lines = []
-    if found["ran"]:
+    if times["ran"]:
         lines.append(
-            f"{found['ran']} of {found['steps']} steps ran: {_seconds(found['seconds'])} of"
+            f"{times['ran']} of {times['steps']} steps ran: {_seconds(times['seconds'])} of"
             " computing time."
         )
-    if found["told"]:
-        known = (
+    if times["told"]:
+        steps = (
             "these steps"
-            if found["told"] == found["ran"]
-            else f"the {found['told']} whose time was no guess"
+            if times["told"] == times["ran"]
+            else f"the {times['told']} whose time was no guess"
         )
-        predicted, actual = _seconds(found["predicted"]), _seconds(found["actual"])
-        lines.append(f"Predicted for {known}: {predicted}; actual: {actual}.")
-    if found["planned"] is not None:
-        planned, span = _seconds(found["planned"]), _seconds(found["span"])
+        predicted, actual = _seconds(times["predicted"]), _seconds(times["actual"])
+        lines.append(f"Predicted for {steps}: {predicted}; actual: {actual}.")
+    if times["planned"] is not None:
+        planned, span = _seconds(times["planned"]), _seconds(times["span"])
         lines.append(f"Planned duration, with parallel branches: {planned}; actual: {span}.")
-    if found["ran"] and found.get("peak", [None])[0]:
-        predicted, actual = (format_size(size) for size in found["peak"])
+    if times["ran"] and times.get("peak", [None])[0]:
+        predicted, actual = (format_size(size) for size in times["peak"])
         lines.append(
             f"Predicted peak memory of the program while the steps ran: {predicted}; actual:"
             f" {actual}."
         )
-    if found["served"]:
-        share = f"{100 * found['share']:.3g} % of all computing time"
+    if times["served"]:
+        share = f"{100 * times['share']:.3g} % of all computing time"
         lines.append(
-            f"The cache served {found['served']} steps and saved {_seconds(found['saved'])},"
+            f"The cache served {times['served']} steps and saved {_seconds(times['saved'])},"
             f" {share}."
         )
     lines.append(
-        f"Read from the cache: {format_size(found['read'])}; written to it:"
-        f" {format_size(found['written'])}."
+        f"Read from the cache: {format_size(times['read'])}; written to it:"
+        f" {format_size(times['written'])}."
     )
     return lines
 
@@ -174,9 +189,9 @@ def document(result: Result, command: Sequence[str]) -> dict[str, Any]:
     afterwards.
     """
     recipe, done = result.recipe, list(result.done.values())
-    found, unchecked = expected(recipe, result.value), _unchecked(recipe)
+    expectations, unchecked = expected(recipe, result.value), _unchecked(recipe)
     steps = [_step(d, result) for d in done]
-    failed = [f"{s['step']}: {c['text']}" for s in steps for c in s["checks"] if not c["ok"]]
+    failed = _failed_checks(steps)
     time = timing(steps, _planned(result)) | {"peak": [result.predicted_peak, result.peak_memory]}
     return {
         "recipe": recipe.name,
@@ -189,7 +204,7 @@ def document(result: Result, command: Sequence[str]) -> dict[str, Any]:
         "tolerance": recipe.tolerance,
         "seed": recipe.seed,
         "counts": state_counts(done),
-        **_judgement(found, failed, unchecked),
+        **_judgement(expectations, failed, unchecked),
         "story": {
             **story(recipe, result.keys, result.value),
             **said_of_frame(recipe, result.keys, result.value),
@@ -246,19 +261,15 @@ def with_pictures(
     }
 
 
+def _failed_checks(steps: Iterable[StepRow]) -> list[str]:
+    failed = []
+    for step in steps:
+        failed += [f"{step['step']}: {c['text']}" for c in step["checks"] if not c["ok"]]
+    return failed
+
+
 def _judgement(
-    found: Sequence[Mapping[str, Any]],
-    failed: Sequence[str],
-    unchecked: Sequence[Mapping[str, str]],
-) -> dict[str, Any]:
-    """Return which expected numbers and checks a run met, and which it missed."""
-    return {
-        **_comparisons(found, failed, unchecked),
-    }
-
-
-def _comparisons(
-    found: Sequence[Mapping[str, Any]],
+    expectations: Sequence[Mapping[str, Any]],
     failed: Sequence[str],
     unchecked: Sequence[Mapping[str, str]],
 ) -> dict[str, Any]:
@@ -266,30 +277,32 @@ def _comparisons(
     and a verdict.
     """
     return {
-        "verdict": verdict(found, failed, len(unchecked)),
-        "missed": [e["name"] for e in found if not e["ok"]],
+        "verdict": verdict(expectations, failed, len(unchecked)),
+        "missed": [e["name"] for e in expectations if not e["ok"]],
         "failed": failed,
-        "expected": found,
+        "expected": expectations,
         "unchecked": unchecked,
     }
 
 
-def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str], unchecked: int = 0) -> str:
+def verdict(
+    expectations: Sequence[Mapping[str, Any]], failed: Sequence[str], unchecked: int = 0
+) -> str:
     """Return a sentence that counts the expected numbers that the run reproduced, and the checks
     that failed.
 
     ``unchecked`` is the number of expected numbers whose steps no output needs, so that the run has
     not compared them.
     """
-    met = sum(e["ok"] for e in found)
-    some = f"{met} of {len(found)} expected numbers within tolerance"
+    met = sum(e["ok"] for e in expectations)
+    some = f"{met} of {len(expectations)} expected numbers within tolerance"
     some += f", {unchecked} more not checked" if unchecked else ""
     none = (
         f"None of {unchecked} expected numbers checked"
         if unchecked
         else "No expected numbers in this recipe"
     )
-    numbers = some if found else none
+    numbers = some if expectations else none
     checks = (
         "every check held"
         if not failed
@@ -368,8 +381,8 @@ def unit_of(docstring: str) -> str:
         .removeprefix("Units:")
         .strip()
     )
-    before, found, after = units.partition("result ")
-    word = re.split(r"[\s,;:]|\.(?:\s|$)", after if found else before, maxsplit=1)[0]
+    before, mark, after = units.partition("result ")
+    word = re.split(r"[\s,;:]|\.(?:\s|$)", after if mark else before, maxsplit=1)[0]
     return word if word in _UNITS else ""
 
 
@@ -422,8 +435,6 @@ def _written(value: Any) -> str:
 
 
 def _figures(missing: Mapping[str, str], ran: bool) -> list[dict[str, str]]:
-    from neusee.workflows.report.run_pictures import GRAPH, TIMELINE
-
     shown = (
         [(f.name, f.title, f.caption) for f in FIGURES if f.name not in missing]
         + [GRAPH]
@@ -454,11 +465,11 @@ def _facts(result: Result) -> list[list[str]]:
 
 def _inputs(recipe: Recipe) -> list[dict[str, str]]:
     """Return parameter, name and digest of every input file of a recipe."""
-    from neusee.workflows.keys.cache_key import file_digest
-
-    return [
-        {"parameter": f"{step.name}.{name}", "file": value.name, "digest": file_digest(value)}
-        for step in recipe.steps.values()
-        for name, value in step.params.items()
-        if isinstance(value, Path)
-    ]
+    rows = []
+    for step in recipe.steps.values():
+        files = {name: value for name, value in step.params.items() if isinstance(value, Path)}
+        rows += [
+            {"parameter": f"{step.name}.{name}", "file": file.name, "digest": file_digest(file)}
+            for name, file in files.items()
+        ]
+    return rows

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -35,39 +36,43 @@ def in_turn(groups: Sequence[Sequence[str]], result: Result) -> Iterator[Mapping
     when their group comes, and the few that the store lacks are computed together before the first
     group. A value is deleted after the last group that needs it.
     """
-    uses = Counter(step for group in groups for step in group)
-    lacking = [
-        step
-        for step in uses
-        if step not in result.values and not result.store.has(result.keys[step])
-    ]
-    values = dict(_computed(lacking, result))
+    uses = Counter(itertools.chain.from_iterable(groups))
+    values = dict(_computed([step for step in uses if _is_lacking(step, result)], result))
     for group in groups:
         values |= _read([step for step in group if step not in values], result)
         yield {step: values[step] for step in group}
         uses.subtract(group)
-        done = [step for step in values if uses[step] <= 0]
-        for step in done:
-            del values[step]
-        if done:
-            give_back()
+        _drop([step for step in values if uses[step] <= 0], values)
+
+
+def _drop(steps: Sequence[str], values: dict[str, Any]) -> None:
+    """Delete the values of steps, and give their memory back."""
+    for step in steps:
+        del values[step]
+    if steps:
+        give_back()
+
+
+def _is_lacking(step: str, result: Result) -> bool:
+    """Return True for a step whose value neither the run nor its store has."""
+    return step not in result.values and not result.store.has(result.keys[step])
 
 
 def _read(steps: Iterable[str], result: Result) -> dict[str, Any]:
     """Return the values of steps from the run, from its store, or computed again if the store
     has lost them.
     """
-    device, found, lost = result.device.partition(",")[0], {}, list[str]()
+    device, values, lost = result.device.partition(",")[0], {}, list[str]()
     for step in steps:
         if step in result.values:
-            found[step] = result.values[step]
+            values[step] = result.values[step]
             continue
         hint = result.recipe.steps[step].node.hints.get("return", Any)
         with suppress(KeyError):
-            found[step] = to_device(result.store.get(result.keys[step], hint), device)
-        if step not in found:
+            values[step] = to_device(result.store.get(result.keys[step], hint), device)
+        if step not in values:
             lost.append(step)
-    return {**found, **_computed(lost, result)}
+    return {**values, **_computed(lost, result)}
 
 
 def _computed(steps: Sequence[str], result: Result) -> Mapping[str, Any]:
@@ -167,8 +172,11 @@ def graphs(recipe: Recipe, states: Mapping[str, str]) -> list[tuple[str, Mapping
     }
     sources = {name: list(recipe.steps[name].sources) for name in states}
     return [
-        (digest("graph", _drawing_code(), sources, each), {"sources": sources, "states": each})
-        for each in (states, again)
+        (
+            digest("graph", _drawing_code(), sources, step_states),
+            {"sources": sources, "states": step_states},
+        )
+        for step_states in (states, again)
     ]
 
 
@@ -177,8 +185,8 @@ def states_of(done: Mapping[str, StepRecord]) -> dict[str, str]:
     is from the cache.
     """
     return {
-        name: "cached" if each.state == "not needed" else str(each.state)
-        for name, each in done.items()
+        name: "cached" if record.state == "not needed" else str(record.state)
+        for name, record in done.items()
     }
 
 
@@ -198,14 +206,14 @@ def files_of(
     code, jobs, missing = Code(result.store.code_memo), list[Job](), dict[str, str]()
     for file in files:
         try:
-            found = arguments_of(file.needs, result.recipe, result.keys, code, result.store)
+            sources = arguments_of(file.needs, result.recipe, result.keys, code, result.store)
         except Missing as why:
             missing[file.name] = str(why)
             continue
-        if file.only_tables and not any(is_table(x.make({})) for x in found.values()):
+        if file.only_tables and not any(is_table(x.make({})) for x in sources.values()):
             missing[file.name] = ""
             continue
-        jobs.append((file, key_of_file(file, found), found))
+        jobs.append((file, key_of_file(file, sources), sources))
     code.save()
     return _made(jobs, result, shelf, missing), missing
 
@@ -221,23 +229,30 @@ def timeline(result: Result) -> dict[str, Any] | None:
         return None
     first = min(done.began for done in ran)
     rows = [(done.step, done.lane or done.device, done.began - first, done.seconds) for done in ran]
-    known = [done for done in ran if done.predicted is not None]
     plan = result.schedule or Schedule((), 0.0, {}, 0.0)
+    return {"schedule": replace(plan, slots=_planned(ran, plan)), "rows": rows}
+
+
+def _planned(ran: Sequence[StepRecord], plan: Schedule) -> tuple[Slot, ...]:
+    """Return the slots of the steps that ran, from the plan if it has all of them and none is a
+    guess.
+    """
+    predicted = [done for done in ran if done.predicted is not None]
     slots = {slot.task: slot for slot in plan.slots}
     # where the time of a step is only a guess, the gap that it leaves in the schedule is no plan to
     # compare with
-    whole = len(known) == len(ran) and all(done.step in slots for done in known)
-    planned = tuple(slots[done.step] for done in known) if whole else _in_turn(known)
-    return {"schedule": replace(plan, slots=planned), "rows": rows}
+    if len(predicted) == len(ran) and all(done.step in slots for done in predicted):
+        return tuple(slots[done.step] for done in predicted)
+    return _in_turn(predicted)
 
 
-def _in_turn(known: Iterable[StepRecord]) -> tuple[Slot, ...]:
+def _in_turn(predicted: Iterable[StepRecord]) -> tuple[Slot, ...]:
     """Return a schedule of predicted times in which the steps of each device follow each other
     as they ran.
     """
     end: dict[str, Slot] = {}
     slots = []
-    for done in sorted(known, key=lambda done: done.began):
+    for done in sorted(predicted, key=lambda done: done.began):
         lane = done.lane or done.device
         before = end.get(lane)
         start = before.end if before else 0.0
@@ -262,19 +277,24 @@ def arguments_of(
 
     Raises `Missing` for another argument whose step is missing.
     """
-    found = {}
+    sources = {}
     for argument, need in needs.items():
         try:
-            found[argument] = find(need.removeprefix("?"), recipe, keys, code, store)
+            sources[argument] = find(need.removeprefix("?"), recipe, keys, code, store)
         except Missing:
             if not need.startswith("?"):
                 raise
-    return found
+    return sources
 
 
-def key_of_file(file: DerivedFile, found: Mapping[str, Found]) -> str:
+def steps_of(sources: Mapping[str, Found]) -> frozenset[str]:
+    """Return the steps that the sources of all arguments need."""
+    return frozenset(itertools.chain.from_iterable(source.steps for source in sources.values()))
+
+
+def key_of_file(file: DerivedFile, sources: Mapping[str, Found]) -> str:
     """Return the key of a file: the digest of how it is made and of what it shows."""
-    return digest(*file.kind, [[name, x.identity] for name, x in found.items()])
+    return digest(*file.kind, [[name, x.identity] for name, x in sources.items()])
 
 
 def _made(
@@ -283,11 +303,11 @@ def _made(
     """Compute the figures or data files that the store lacks from the results of a run, and
     return all paths.
     """
-    paths = {file.name: path for file, key, _ in jobs if (path := shelf.find(key, file.suffix))}
+    paths = _stored(jobs, shelf)
     new = [job for job in jobs if job[0].name not in paths]
-    needed = [sorted({step for x in found.values() for step in x.steps}) for _, _, found in new]
-    for (file, key, found), values in zip(new, in_turn(needed, result), strict=True):
-        arguments = {name: x.make(values) for name, x in found.items()}
+    needed = [sorted(steps_of(sources)) for _, _, sources in new]
+    for (file, key, sources), values in zip(new, in_turn(needed, result), strict=True):
+        arguments = {name: x.make(values) for name, x in sources.items()}
         try:
             paths[file.name] = shelf.keep(
                 key, file.suffix, file.name, partial(file.make, **arguments)
@@ -295,6 +315,15 @@ def _made(
         except (ValueError, Missing, RuntimeError) as error:
             missing[file.name] = str(error).partition("\n")[0]
     return {file.name: paths[file.name] for file, _, _ in jobs if file.name in paths}
+
+
+def _stored(jobs: Sequence[Job], shelf: DerivedFiles) -> dict[str, Path]:
+    """Return the paths of the files that the store has."""
+    paths = {}
+    for file, key, _ in jobs:
+        if path := shelf.find(key, file.suffix):
+            paths[file.name] = path
+    return paths
 
 
 def _function(path: str) -> Callable[..., bytes]:

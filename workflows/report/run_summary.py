@@ -113,8 +113,8 @@ def _laser_peaks(keys: Mapping[str, str], value: Value) -> dict[str, float]:
     mask.
     """
     steps = {name: TABLE[name][_PEAK] for name in (PLAIN, MASK)}
-    found = {name: value(step) for name, step in steps.items() if step in keys}
-    return {name: float(peak.laser) for name, peak in found.items() if hasattr(peak, "laser")}
+    peaks = {name: value(step) for name, step in steps.items() if step in keys}
+    return {name: float(peak.laser) for name, peak in peaks.items() if hasattr(peak, "laser")}
 
 
 def _density(value: float) -> str:
@@ -135,17 +135,22 @@ def rival(lsr: Mapping[str, float], numbers: Mapping[str, Arm]) -> dict[str, str
         return {}
     text = f"A grey filter that passes {share:.3g} of the light weakens the laser as much: "
     command = f"doe=grey_filter doe.transmittance={share:.3g}"
-    found, restored = numbers.get(RIVAL, {}), numbers.get(RESTORED, {})
-    if _QUALITY not in found:
+    grey_filter, restored = numbers.get(RIVAL, {}), numbers.get(RESTORED, {})
+    if _QUALITY not in grey_filter:
         return {"rival": f"{text}for its picture, restored alike, run this recipe with {command}."}
     against = (
         f" against {restored[_QUALITY]:.1f} dB behind the mask" if _QUALITY in restored else ""
     )
     picture = (
-        f"its picture, restored by a Wiener filter, has a PSNR of {found[_QUALITY]:.1f} dB{against}"
+        "its picture, restored by a Wiener filter, has a PSNR of"
+        f" {grey_filter[_QUALITY]:.1f} dB{against}"
     )
-    count = "no pixel saturates" if not found.get(_LOST) else f"{found[_LOST]:,.0f} pixels saturate"
-    return {"rival": f"{text}{picture}{f'; {count}' if _LOST in found else ''} ({command})."}
+    count = (
+        "no pixel saturates"
+        if not grey_filter.get(_LOST)
+        else f"{grey_filter[_LOST]:,.0f} pixels saturate"
+    )
+    return {"rival": f"{text}{picture}{f'; {count}' if _LOST in grey_filter else ''} ({command})."}
 
 
 def _known(cells: Arm) -> dict[str, float]:
@@ -213,7 +218,7 @@ def _costs(plain: Arm, mask: Arm, restored: Arm, laser: bool, element: str) -> s
     mask.
     """
     texts = _picture(plain, mask, restored, element), _saturation(plain, mask, laser, element)
-    parts = [part for part in texts if part]
+    parts = [sentence for sentence in texts if sentence]
     return f"{'; '.join(parts)}." if parts else ""
 
 
@@ -304,7 +309,7 @@ def said_of_frame(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict
     if _SHADING in recipe.steps and _SHADING in keys:
         parts.append(_shading(value(_SHADING)))
     parts.append(_limits(recipe))
-    return {"frame": " ".join(part for part in parts if part)}
+    return {"frame": " ".join(sentence for sentence in parts if sentence)}
 
 
 def _invented(name: str, invented: Tensor) -> str:
@@ -326,10 +331,10 @@ def _interval(half: Tensor, invented: Tensor) -> str:
         return ""
     widths = half.mean(0)[~invented].flatten()
     widths = widths[:: max(1, len(widths) // 1_000_000)].double()
-    middle, most = (float(torch.quantile(widths, q)) for q in (0.5, 0.95))
+    middle, upper = (float(torch.quantile(widths, q)) for q in (0.5, 0.95))
     return (
         f"Elsewhere a restored pixel is known to ±{middle:.2g} of white in half of the pixels and"
-        f" to ±{most:.2g} in 95 % of them, with a probability of 90 % under the model of the"
+        f" to ±{upper:.2g} in 95 % of them, with a probability of 90 % under the model of the"
         " interval."
     )
 
@@ -351,26 +356,26 @@ def _doubtful(restored: Tensor, half: Tensor, invented: Tensor) -> str:
     )
 
 
-def _shading(found: Shading) -> str:
+def _shading(shading: Shading) -> str:
     """Return what the frames tell of dirt, as a smooth transmission."""
-    count = int(found.frames)
+    count = int(shading.frames)
     frames = "one frame tells" if count == 1 else f"{count} frames tell"
-    told = f"{frames} {float(found.told):.0%} of the variance of the shading"
-    width = f"±{NORMAL * float(found.deviation.median()):.2g}"
-    if not bool(found.identifiable):
+    evidence = f"{frames} {float(shading.told):.0%} of the variance of the shading"
+    width = f"±{NORMAL * float(shading.deviation.median()):.2g}"
+    if not bool(shading.identifiable):
         return (
-            f"Dirt is not identifiable: {told}, and the probability that there is none is"
-            f" {float(found.clean):.0%}. At least 8 different scenes, half of the variance and at"
+            f"Dirt is not identifiable: {evidence}, and the probability that there is none is"
+            f" {float(shading.clean):.0%}. At least 8 different scenes, half of the variance and at"
             " most 5% are needed. The frame is left as it is. The logarithm of a transmission"
             f" stays unknown to {width} in half of the field; the interval of the picture includes"
             " this."
         )
-    low, high = (float(end) for end in found.transmission.aminmax())
+    low, high = (float(end) for end in shading.transmission.aminmax())
     return (
         f"The frame was divided by a transmission of {low:.2f} to {high:.2f} relative to its"
-        f" geometric mean, whose logarithm is known to {width} in half of the field: {told}. What"
-        " all scenes have in common cannot be told from dirt, nor a constant factor. Light that"
-        " dirt scatters into the picture is not removed."
+        f" geometric mean, whose logarithm is known to {width} in half of the field: {evidence}."
+        " What all scenes have in common cannot be told from dirt, nor a constant factor. Light"
+        " that dirt scatters into the picture is not removed."
     )
 
 
@@ -390,9 +395,9 @@ def _limits(recipe: Recipe) -> str:
         )
     )
     measured = recipe.steps["restored_spread"].node.path == _MEASURED
-    known = "blur, the error of the measured PSF" if measured else "blur"
+    blur = "blur, the error of the measured PSF" if measured else "blur"
     return (
-        f"{whose}The interval includes noise, {known} and saturation. It does not include lasers"
+        f"{whose}The interval includes noise, {blur} and saturation. It does not include lasers"
         " that the filter is not told of, errors of the camera's description, and colours that no"
         " three channels tell apart."
     )

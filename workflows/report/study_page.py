@@ -50,13 +50,14 @@ def page(
     """Return the HTML page of a study; a red ``banner`` gives the reason why the result must not
     be used.
     """
+    texts = {name: _plain(value) for name, value in provenance.items()}
     return filled(
         "study_page.html.j2",
         title=title,
         banner=banner,
         lead=_paragraphs(lead),
         sections=[_section(f"s{i}", s) for i, s in enumerate(sections)],
-        provenance=[(name, text) for name, value in provenance.items() if (text := _plain(value))],
+        provenance=[(name, text) for name, text in texts.items() if text],
     )
 
 
@@ -188,7 +189,7 @@ def _holds_numbers(cells: Sequence[Any]) -> bool:
 
 
 def _paragraphs(text: str) -> list[str]:
-    return [" ".join(part.split()) for part in text.split("\n\n") if part.strip()]
+    return [" ".join(paragraph.split()) for paragraph in text.split("\n\n") if paragraph.strip()]
 
 
 def _plain(value: Any) -> str:

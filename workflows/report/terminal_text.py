@@ -63,10 +63,10 @@ def by_family(names: Iterable[str]) -> dict[str, list[str]]:
 
 def lasts(seconds: float) -> str:
     """Return a duration in words, such as ``3 h 05 min``, ``2 min 10 s`` or ``4 s``."""
-    whole = round(seconds)
-    if whole >= 3600:
-        return f"{whole // 3600} h {whole % 3600 // 60:02} min"
-    return f"{whole // 60} min {whole % 60:02} s" if whole >= 60 else f"{whole} s"
+    rounded = round(seconds)
+    if rounded >= 3600:
+        return f"{rounded // 3600} h {rounded % 3600 // 60:02} min"
+    return f"{rounded // 60} min {rounded % 60:02} s" if rounded >= 60 else f"{rounded} s"
 
 
 # --- json output ----------------------------------------------------------------------------------
@@ -113,8 +113,11 @@ def commands_to_try(
         if "height" in recipe.steps
         else [],
     }
-    tried = {what: again for what, again in changed.items() if again and works(again)}
-    shown = [[shlex.join(["neusee", "run", *again]), f"# {what}"] for what, again in tried.items()]
+    working = {purpose: again for purpose, again in changed.items() if again and works(again)}
+    shown = [
+        [shlex.join(["neusee", "run", *again]), f"# {purpose}"]
+        for purpose, again in working.items()
+    ]
     shown += [
         [shlex.join(["neusee", "plan", *words]), "# what would run, how long"],
         ["neusee nodes optics.psf", "# what a step computes, and its source"],

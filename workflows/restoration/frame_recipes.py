@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.composition import choices_of, compose, locate, shown
 from neusee.workflows.recipe.text.overrides import Override, read_override
-from neusee.workflows.recipe.text.yaml_values import read
+from neusee.workflows.recipe.text.yaml_values import Value, read
 
 # --- frame files ----------------------------------------------------------------------------------
 
@@ -26,17 +26,17 @@ def named_frames(words: Iterable[str], folder: Path) -> list[Path]:
 
     Raises `RecipeError` with every word that is no file, no folder, or a folder without frames.
     """
-    found, problems = list[Path](), list[Diagnostic]()
+    paths, problems = list[Path](), list[Diagnostic]()
     for number, word in enumerate(words, 1):
         files = list(_named(folder / Path(word).expanduser()))
         if not files:
             problems.append(
                 Diagnostic(Location(f"argument {number}"), word, _absent(folder / word))
             )
-        found += files
+        paths += files
     if problems:
         raise RecipeError(problems)
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(paths))
 
 
 def _named(path: Path) -> Iterator[Path]:
@@ -44,9 +44,9 @@ def _named(path: Path) -> Iterator[Path]:
         yield path
     elif path.is_dir():
         inside = (
-            each for each in path.iterdir() if each.is_file() and not each.name.startswith(".")
+            file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")
         )
-        yield from sorted(each for each in inside if each.suffix.lower() in FRAME_SUFFIXES)
+        yield from sorted(file for file in inside if file.suffix.lower() in FRAME_SUFFIXES)
 
 
 def _absent(path: Path) -> str:
@@ -89,7 +89,7 @@ def recipes_of(
     """
     name, base, words = _camera(camera, folder)
     words += _mask(mask, folder) + _psf(psf, changes, folder, first)
-    frames, found, problems = list(frames), list[Recipe](), dict[Diagnostic, None]()
+    frames, recipes, problems = list(frames), list[Recipe](), dict[Diagnostic, None]()
     if any(change.lstrip("+") == _SHADING for change in changes):
         quoted = ", ".join(map(_quoted, frames))
         words = [
@@ -99,12 +99,12 @@ def recipes_of(
     own = [(n, text) for n, text in enumerate(changes, first) if not psf or text not in _WITH_PSF]
     for frame in frames:
         try:
-            found.append(_one(frame, (name, base, words), own, folder))
+            recipes.append(_one(frame, (name, base, words), own, folder))
         except RecipeError as error:
             problems |= dict.fromkeys(error.diagnostics)
     if problems:
         raise RecipeError(problems)
-    return found
+    return recipes
 
 
 def _one(
@@ -193,7 +193,7 @@ def _psf(psf: str, changes: Sequence[str], folder: Path, first: int) -> list[Ove
         files = named_frames([psf], folder)
     except RecipeError as error:
         raise RecipeError(
-            [replace(each, mark=Location("--psf")) for each in error.diagnostics]
+            [replace(problem, mark=Location("--psf")) for problem in error.diagnostics]
         ) from None
     listed = "points.files=[" + ", ".join(map(_quoted, files)) + "]"
     words = [(f"restore={restorer}", ""), ("steps.level.from.psf=measured", ""), (listed, psf)]
@@ -208,19 +208,36 @@ def _prepared(name: str, base: Path, own: Sequence[Override]) -> list[Override]:
     document = read(path, shown(path, base)).root
     groups = {choice.group for choice in choices_of(document, [])}
     root = compose(name, (), base).root
-    steps = root.items["steps"].items if "steps" in root.items else {}
-    chosen = {override.path[0] for override in own}
-    words = ["camera=frame"] if "camera" in groups else []
-    words += [f"~{group}" for group in _DROPPED if group in groups]
-    if not chosen & {"laser", "lasers"}:
-        words += ["laser=none"] if "laser" in groups else []
-        words += ["lasers={}"] if "lasers" in document.items else []
-    if "restore" not in chosen:
-        words += ["restore=wiener_blind"] if "restore" in groups else ["+restore=wiener_blind"]
-    words += [f"+steps.{step}.each=simulated" for step in _SCENE if step in steps]
-    words += ["~expect"] if "expect" in root.items.keys() - chosen else []
-    words += ["outputs=" + json.dumps(OUTPUTS)] if "outputs" not in chosen else []
+    overridden = {override.path[0] for override in own}
+    words = _without_scene(groups)
+    if not overridden & {"laser", "lasers"}:
+        words += _no_laser(groups, document.items)
+    if "restore" not in overridden:
+        words.append("restore=wiener_blind" if "restore" in groups else "+restore=wiener_blind")
+    words += _simulated_steps(root)
+    if "expect" in root.items.keys() - overridden:
+        words.append("~expect")
+    if "outputs" not in overridden:
+        words.append("outputs=" + json.dumps(OUTPUTS))
     return [_said("neusee restore", word, base) for word in words]
+
+
+def _simulated_steps(root: Value) -> list[str]:
+    """Return the words that keep the steps of the scene to the simulated arm."""
+    steps = root.items["steps"].items if "steps" in root.items else {}
+    return [f"+steps.{step}.each=simulated" for step in _SCENE if step in steps]
+
+
+def _without_scene(groups: Container[str]) -> list[str]:
+    """Return the words that put frames in the place of the camera, and drop the other groups."""
+    words = ["camera=frame"] if "camera" in groups else []
+    return [*words, *(f"~{group}" for group in _DROPPED if group in groups)]
+
+
+def _no_laser(groups: Container[str], blocks: Container[str]) -> list[str]:
+    """Return the words that take the lasers out of a recipe."""
+    words = ["laser=none"] if "laser" in groups else []
+    return [*words, "lasers={}"] if "lasers" in blocks else words
 
 
 def _said(where: str, text: str, folder: Path, shown_as: str = "") -> Override:

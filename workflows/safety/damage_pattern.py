@@ -67,9 +67,9 @@ def spots_of(recipe: Recipe, safety: Safety, store: Store | None) -> tuple[Spot,
         name: step_of(recipe, safety, f"protection.spots.{name}", step, name)
         for name, step in named.items()
     }
-    found: Any = run(recipe, store, list(steps.values())) if steps else {}
+    results: Any = run(recipe, store, list(steps.values())) if steps else {}
     return tuple(
-        _spot(OPTIONS[name], found[step].intensity, recipe.steps[step].params)
+        _spot(OPTIONS[name], results[step].intensity, recipe.steps[step].params)
         for name, step in steps.items()
     )
 
@@ -80,13 +80,13 @@ def step_of(recipe: Recipe, safety: Safety, setting: str, step: str, arm: str) -
 
     Raises `RecipeError` at the setting for a step that does not exist.
     """
-    found = next(
+    full_name = next(
         (name for name in (step, f"{step}[{arm},{safety.name}]") if name in recipe.steps), None
     )
-    if found is None:
+    if full_name is None:
         value = safety.values[setting]
         raise RecipeError([Diagnostic(value.mark, value.name, unknown_step(step, recipe.steps))])
-    return found
+    return full_name
 
 
 def _spot(option: str, intensity: FloatArray, params: Mapping[str, float]) -> Spot:
@@ -113,14 +113,14 @@ def damage_patterns(spots: Sequence[Spot], findings: Sequence[Finding]) -> Itera
     is known.
     """
     for spot in spots:
-        known = [
-            each
-            for each in findings
-            if each.option == spot.option and each.limit.effect == "damage"
+        judged = [
+            finding
+            for finding in findings
+            if finding.option == spot.option and finding.limit.effect == "damage"
         ]
-        if not known:
+        if not judged:
             continue
-        worst = max(known, key=lambda each: each.ratio)
+        worst = max(judged, key=lambda finding: finding.ratio)
         ratio = spot.light * worst.ratio
         area = float((ratio >= 1).sum()) * (spot.pitch * 1e6) ** 2
         cut = _cut(spot.light, max(_FAINT, min(_DIM, 0.1 / worst.ratio)))
@@ -176,15 +176,15 @@ def damaged_frames(
     if safety.settings.damage is None or not reached:
         return
     here = exposures.at(safety.laser.distance)
-    at = here if here in reached else max(reached)
+    index = here if here in reached else max(reached)
     pitch = safety.settings.sensor.pixel_pitch
     for spot in spots:
         if spot.pitch > pitch:  # samples that miss pixels say nothing of them
             continue
-        hit = _hit(spot, pitch, damage, exposures, at)
+        hit = _hit(spot, pitch, damage, exposures, index)
         yield _frame(
             spot.option,
-            float(exposures.distances[at]),
+            float(exposures.distances[index]),
             hit,
             _half_width(hit),
             safety.settings.damage.device,
@@ -192,13 +192,13 @@ def damaged_frames(
 
 
 def _hit(
-    spot: Spot, pitch: float, damage: Sequence[Finding], exposures: Exposures, at: int
+    spot: Spot, pitch: float, damage: Sequence[Finding], exposures: Exposures, index: int
 ) -> list[tuple[str, FloatArray]]:
     """Return the kinds of damage that are reached behind one protection at a distance, with the
     places of each.
     """
     behind = [finding for finding in damage if finding.option == spot.option]
-    places = [_above(spot, pitch, float(_ratio(finding, exposures)[at])) for finding in behind]
+    places = [_above(spot, pitch, float(_ratio(finding, exposures)[index])) for finding in behind]
     kinds = [finding.limit.kind for finding in behind]
     return [(kind, pixels) for kind, pixels in zip(kinds, places, strict=True) if len(pixels)]
 
@@ -213,8 +213,8 @@ def _reached(damage: Sequence[Finding], exposures: Exposures) -> set[int]:
     """Return the indices of the distances at which a limit of damage is exceeded behind the
     plain lens.
     """
-    plain = [each for each in damage if each.option == "plain lens"]
-    indices = [np.flatnonzero(_ratio(each, exposures) >= 1) for each in plain]
+    plain = [finding for finding in damage if finding.option == "plain lens"]
+    indices = [np.flatnonzero(_ratio(finding, exposures) >= 1) for finding in plain]
     return set(np.concatenate(indices).tolist()) if indices else set()
 
 
@@ -330,13 +330,13 @@ def _upstream(recipe: Recipe, safety: Safety, node: str) -> list[str]:
     """Return the steps of a node on which the steps that the settings of the protection name
     depend.
     """
-    waiting, seen = list(_named_steps(recipe, safety)), set[str]()
+    waiting, visited = list(_named_steps(recipe, safety)), set[str]()
     while waiting:
         name = waiting.pop()
-        if name not in seen:
-            seen.add(name)
+        if name not in visited:
+            visited.add(name)
             waiting += recipe.steps[name].sources
-    return sorted(name for name in seen if recipe.steps[name].node.path == node)
+    return sorted(name for name in visited if recipe.steps[name].node.path == node)
 
 
 def _named_steps(recipe: Recipe, safety: Safety) -> Iterator[str]:

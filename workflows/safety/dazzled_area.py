@@ -75,7 +75,7 @@ class Area:
         return float(table.beyond[..., int(np.searchsorted(self.ranks, self.asked))].max())
 
     def saturated(
-        self, exposures: Exposures, draws: SettingDraws, at: int, light: FloatArray
+        self, exposures: Exposures, draws: SettingDraws, index: int, light: FloatArray
     ) -> FloatArray:
         """Return the number of pixels with at least each light at one distance.
 
@@ -83,12 +83,14 @@ class Area:
         """
         table, place, others = self._table(exposures, draws, veiled=False)
         columns = [place, *others]
-        columns = [each[:, at : at + 1] if each.shape[1] > 1 else each for each in columns]
-        known = table.at(columns[0], columns[1:], slice(None))[:, 0]
-        known = np.broadcast_to(known, (max(len(known), len(light)), known.shape[1]))
-        light = np.broadcast_to(light, (len(known), light.shape[1]))
+        columns = [
+            column[:, index : index + 1] if column.shape[1] > 1 else column for column in columns
+        ]
+        levels = table.at(columns[0], columns[1:], slice(None))[:, 0]
+        levels = np.broadcast_to(levels, (max(len(levels), len(light)), levels.shape[1]))
+        light = np.broadcast_to(light, (len(levels), light.shape[1]))
         ranks = self.ranks
-        rows = [_number(row, ranks, needed) for row, needed in zip(known, light, strict=True)]
+        rows = [_number(row, ranks, needed) for row, needed in zip(levels, light, strict=True)]
         return np.stack(rows)
 
     def _table(
@@ -114,8 +116,8 @@ class Area:
                 place = np.log(as_wide(exposures.beams[0], widths))
                 levels, others = _of_spots(self, veil, share, veiled), [share]
             exposures.tables[name] = levels, place, others
-        kept: tuple[Levels, FloatArray, list[FloatArray]] = exposures.tables[name]
-        return kept
+        table: tuple[Levels, FloatArray, list[FloatArray]] = exposures.tables[name]
+        return table
 
     @property
     def _diameter(self) -> float:
@@ -214,9 +216,9 @@ def _defocus(safety: Safety, beam: Beam, diameter: float) -> Callable[[FloatArra
     path = lens.defocus * _DEFOCUS * (diameter / lens.diameter) ** 2
 
     def waves(distance: FloatArray) -> FloatArray:
-        at: torch.Tensor = torch.from_numpy(distance)
+        distances: torch.Tensor = torch.from_numpy(distance)
         return np.asarray(
-            defocus_at(beam, at, torch.tensor(diameter), focus_of(lens), path), np.float64
+            defocus_at(beam, distances, torch.tensor(diameter), focus_of(lens), path), np.float64
         )
 
     return waves
@@ -241,21 +243,23 @@ def _of_clear(
     shares, shape = Grid.around(share, 2), area.safety.settings.sensor.shape
 
     def brightest(phases: Sequence[BrightPixels]) -> tuple[FloatArray, FloatArray]:
-        each = [
+        phase_levels = [
             levels_of(groups, shape, area.ranks, veil, np.exp(shares.points), veiled)
             for groups in phases
         ]
-        values, beyond = each[0]
+        values, beyond = phase_levels[0]
         return (
-            np.where(area.ranks <= _MIDDLE, np.max([value for value, _ in each], axis=0), values),
+            np.where(
+                area.ranks <= _MIDDLE, np.max([value for value, _ in phase_levels], axis=0), values
+            ),
             beyond,
         )
 
     levels = list(map(brightest, spots.groups))
     points = [len(grid.points) for grid in (*spots.grids, shares)]
     values, beyond = (
-        np.stack(part).reshape(len(spots.rungs), *points, len(area.ranks))
-        for part in zip(*levels, strict=True)
+        np.stack(arrays).reshape(len(spots.rungs), *points, len(area.ranks))
+        for arrays in zip(*levels, strict=True)
     )
     return Levels(np.log(spots.rungs), (*spots.grids, shares), values, beyond)
 
@@ -264,11 +268,11 @@ def _of_spots(area: Area, veil: Veil | None, share: FloatArray, veiled: bool) ->
     """Return the levels behind lens or mask, from the pixels of their PSFs at several distances."""
     assert area.ranked is not None
     shares, shape = Grid.around(share, 3), area.safety.settings.sensor.shape
-    found = [
-        levels_of(each, shape, area.ranks, veil, np.exp(shares.points), veiled)
-        for each in area.ranked.groups
+    spot_levels = [
+        levels_of(groups, shape, area.ranks, veil, np.exp(shares.points), veiled)
+        for groups in area.ranked.groups
     ]
-    values, beyond = (np.stack(part) for part in zip(*found, strict=True))
+    values, beyond = (np.stack(arrays) for arrays in zip(*spot_levels, strict=True))
     rungs = np.log(np.array(area.ranked.distances))
     misses = area.ranked.misses
     return Levels(
@@ -278,7 +282,7 @@ def _of_spots(area: Area, veil: Veil | None, share: FloatArray, veiled: bool) ->
 
 def area_of(safety: Safety, option: Option, ranked: Sequence[Ranked]) -> Area | str:
     """Return the dazzled area behind an option, or the reason why it is not known."""
-    arms = {each.arm: each for each in ranked}
+    arms = {spot.arm: spot for spot in ranked}
     if option.masked:
         if "mask" not in arms:
             return (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -78,7 +79,14 @@ def _step(recipe: Recipe, safety: Safety, named: str) -> Step:
     """Return the step of responses, completed by the laser if the step has a copy for each
     laser.
     """
-    name = next((each for each in (named, f"{named}[{safety.name}]") if each in recipe.steps), None)
+    name = next(
+        (
+            candidate
+            for candidate in (named, f"{named}[{safety.name}]")
+            if candidate in recipe.steps
+        ),
+        None,
+    )
     if name is None:
         raise _refused(safety, unknown_step(named, recipe.steps))
     step = recipe.steps[name]
@@ -160,9 +168,9 @@ def damage_limits(
     safety: Safety, option: Option, exposures: Exposures, draws: SettingDraws
 ) -> Iterator[Limit]:
     """Yield the limit of each part of the light that a law of damage judges, behind one option."""
-    for part in limit_parts(safety, option, exposures, draws):
-        if part.threshold is not None:
-            yield _damage_limit(part, safety, exposures, draws)
+    for damage_part in limit_parts(safety, option, exposures, draws):
+        if damage_part.threshold is not None:
+            yield _damage_limit(damage_part, safety, exposures, draws)
 
 
 def limit_parts(
@@ -180,8 +188,8 @@ def limit_parts(
     parts = damage_parts(light, safety.settings.damage.device, safety.laws)
     single = "incubation" if float(light.pulses.max()) <= 1 else ""
     if light.pulse_duration is None:
-        return tuple(part for part in parts if part.part == "mean")
-    return tuple(part for part in parts if part.part != single)
+        return tuple(damage_part for damage_part in parts if damage_part.part == "mean")
+    return tuple(damage_part for damage_part in parts if damage_part.part != single)
 
 
 def light_in_time(
@@ -235,53 +243,60 @@ def _of_beams(values: Sequence[float | None]) -> Tensor | None:
 
 
 def _damage_limit(
-    part: DamagePart, safety: Safety, exposures: Exposures, draws: SettingDraws
+    damage_part: DamagePart, safety: Safety, exposures: Exposures, draws: SettingDraws
 ) -> Limit:
     """Return the limit of one part of the light, with draws of its bracket, or of devices and
     medians.
 
     A third of the draws each is at the lower end of a bracket, in its middle and at its upper end.
     """
-    assert part.threshold is not None
+    assert damage_part.threshold is not None
     low, middle, high = (
-        end.numpy() for end in (part.threshold.low, part.threshold.middle, part.threshold.high)
+        end.numpy()
+        for end in (
+            damage_part.threshold.low,
+            damage_part.threshold.middle,
+            damage_part.threshold.high,
+        )
     )
     devices = np.ones((1 + draws.count, 1))
-    if part.law is not None:
-        stream = 2 * safety.laws.index(part.law)  # the same devices behind every option
-        values = middle * _scattered(part.law.median_factor, draws, stream)
-        devices = _scattered(part.law.factor, draws, stream + 1)
-    elif part.open_below:
+    if damage_part.law is not None:
+        stream = 2 * safety.laws.index(damage_part.law)  # the same devices behind every option
+        values = middle * _scattered(damage_part.law.median_factor, draws, stream)
+        devices = _scattered(damage_part.law.factor, draws, stream + 1)
+    elif damage_part.open_below:
         values = high + np.zeros_like(devices)
     else:
         place = np.concatenate([[0.0], draws.normal(_BRACKET)])[:, None]
         values = np.where(place > _THIRD, high, np.where(place < -_THIRD, low, middle))
-    quantity, factor = _stated_as(part, exposures, safety, draws)
+    quantity, factor = _stated_as(damage_part, exposures, safety, draws)
     return Limit(
-        name=_limit_name(part),
+        name=_limit_name(damage_part),
         effect="damage",
         quantity=quantity,
         values=values * factor,
         devices=devices,
-        factor=None if part.law is None else part.law.factor,
-        source=part.source,
-        note=part.note,
-        kind=part.kind,
-        part=part.part,
-        open_below=part.open_below,
-        reason=part.reason,
+        factor=None if damage_part.law is None else damage_part.law.factor,
+        source=damage_part.source,
+        note=damage_part.note,
+        kind=damage_part.kind,
+        part=damage_part.part,
+        open_below=damage_part.open_below,
+        reason=damage_part.reason,
     )
 
 
-def _limit_name(part: DamagePart) -> str:
+def _limit_name(damage_part: DamagePart) -> str:
     """Return the name of the limit of a part of the light; the first damage, a point, is not
     named.
     """
-    return f"damage: {part.part}" + ("" if part.kind == "point" else f", {part.kind}")
+    return f"damage: {damage_part.part}" + (
+        "" if damage_part.kind == "point" else f", {damage_part.kind}"
+    )
 
 
 def _stated_as(
-    part: DamagePart, exposures: Exposures, safety: Safety, draws: SettingDraws
+    damage_part: DamagePart, exposures: Exposures, safety: Safety, draws: SettingDraws
 ) -> tuple[Quantity, FloatArray]:
     """Return the quantity of a limit, and the factor that makes it a limit of the emitted power or
     pulse energy.
@@ -291,8 +306,8 @@ def _stated_as(
     """
     damage, beams = safety.settings.damage, exposures.beams
     assert damage is not None
-    if part.quantity == "fluence" or beams[0].pulse_duration is None:
-        return part.quantity, np.ones((1, 1))
+    if damage_part.quantity == "fluence" or beams[0].pulse_duration is None:
+        return damage_part.quantity, np.ones((1, 1))
     rates = np.array([[beam.repetition_rate or 0.0] for beam in beams])
     durations = np.array([[beam.pulse_duration or 0.0] for beam in beams])
     dwell = draws.column("damage.dwell", damage.dwell)[:, None]
@@ -325,13 +340,15 @@ def dazzle_limits(
     name = area.option.name
     full = saturating(safety, draws)[:, None]
     share = f"{100 * dazzle.share:g} % of the picture"
-    part = veil_level(dazzle, area.option.scene_share(safety.settings.lens.diameter)) / sensor.fills
-    found = [("saturated", 1.0)] + ([("veiled", part)] if 0 < part < 1 else [])
-    for word, part in found:
+    well_share = (
+        veil_level(dazzle, area.option.scene_share(safety.settings.lens.diameter)) / sensor.fills
+    )
+    levels = [("saturated", 1.0)] + ([("veiled", well_share)] if 0 < well_share < 1 else [])
+    for word, well_share in levels:
         light = area.level(exposures, draws, word == "veiled")
         values = (
             full
-            * part
+            * well_share
             * exposures.sensor[name]
             * sensor.pixel_pitch**2
             / (exposures.through[name] * light)
@@ -362,8 +379,12 @@ def veil_level(dazzle: Dazzle, scene: float = 1.0) -> float:
     as much less.
     """
     background = torch.tensor(dazzle.background * scene, dtype=torch.float64)
-    rest = {"feature": dazzle.feature, "threshold": dazzle.least, "read_noise": dazzle.read_noise}
-    return float(veil_limit(background, contrast=dazzle.contrast, rule=dazzle.rule, **rest))
+    options = {
+        "feature": dazzle.feature,
+        "threshold": dazzle.least,
+        "read_noise": dazzle.read_noise,
+    }
+    return float(veil_limit(background, contrast=dazzle.contrast, rule=dazzle.rule, **options))
 
 
 def saturating(safety: Safety, draws: SettingDraws) -> FloatArray:
@@ -380,8 +401,10 @@ def saturating(safety: Safety, draws: SettingDraws) -> FloatArray:
     prefixes = {name: "laser" if name == "wavelength" else "sensor" for name in nominal}
     columns = [draws.column(f"{prefixes[name]}.{name}", value) for name, value in nominal.items()]
     rows, places = np.unique(np.stack(columns, 1), axis=0, return_inverse=True)
-    known = [_saturation(safety, dict(zip(nominal, map(float, row), strict=True))) for row in rows]
-    return np.array(known)[places.ravel()]
+    irradiances = [
+        _saturation(safety, dict(zip(nominal, map(float, row), strict=True))) for row in rows
+    ]
+    return np.array(irradiances)[places.ravel()]
 
 
 def _saturation(safety: Safety, values: dict[str, float]) -> float:
@@ -394,8 +417,8 @@ def _saturation(safety: Safety, values: dict[str, float]) -> float:
     wavelength = values.pop("wavelength")
     if safety.channels is not None:
         return channel_saturation(safety.channels, wavelength, sensor.fills, values)
-    at = torch.tensor([wavelength], dtype=torch.float64)
-    return float(saturation(Bands(at, at, at), full_well=sensor.fills, **values))
+    centre = torch.tensor([wavelength], dtype=torch.float64)
+    return float(saturation(Bands(centre, centre, centre), full_well=sensor.fills, **values))
 
 
 # --- limit ratios ---------------------------------------------------------------------------------
@@ -497,20 +520,23 @@ def eye_finding(safety: Safety, exposures: Exposures) -> EyeFinding | str:
     """Return the exposure limit of the eye with its distance, or the sentence that says why
     there is none.
     """
-    beam, at = exposures.beams[0], exposures.at(safety.laser.distance)
+    beam, index = exposures.beams[0], exposures.at(safety.laser.distance)
     duration = safety.settings.eye.exposure or (0.25 if beam.wavelength <= 700e-9 else 10.0)
     rule = safety.settings.eye.rule
     try:
         limit, source = eye_limit(beam, duration, rule), eye_limit_source(beam, duration, rule)
         reach = np.array(
-            [nominal_ocular_hazard_distance(each, duration, rule=rule) for each in exposures.beams]
+            [
+                nominal_ocular_hazard_distance(drawn_beam, duration, rule=rule)
+                for drawn_beam in exposures.beams
+            ]
         )
     except ParameterError as error:
         return f"Nothing is said of the eye: {error}."
     quantity = "fluence" if beam.is_pulsed else "irradiance"
     here = (
         exposures.emitted("fluence" if beam.is_pulsed else "irradiance")[:, 0]
-        * exposures.lens[:, at]
+        * exposures.lens[:, index]
     )
     return EyeFinding(duration, limit, quantity, _spread(here), _spread(reach), source)
 
@@ -537,7 +563,7 @@ def _tasks(asked: EyeDazzle) -> Sequence[DazzleTask]:
         "margin": asked.margin,
     }
     size = math.degrees(asked.size) * 60
-    pairs = [(background, angle) for background in asked.backgrounds for angle in asked.angles]
+    pairs = itertools.product(asked.backgrounds, asked.angles)
     return [
         DazzleTask(math.degrees(angle), background, size=size, **viewer)
         for background, angle in pairs
@@ -567,11 +593,11 @@ def _row(task: DazzleTask, safety: Safety, exposures: Exposures) -> EyeDazzleRow
 
 def _efficiencies(beams: Sequence[Beam]) -> list[float]:
     """Return V(lambda) of the nominal beam and of each draw."""
-    known = {
+    efficiencies = {
         wavelength: luminous_efficiency(wavelength)
         for wavelength in {beam.wavelength for beam in beams}
     }
-    return [known[beam.wavelength] for beam in beams]
+    return [efficiencies[beam.wavelength] for beam in beams]
 
 
 def _spread(values: FloatArray) -> Spread:

@@ -58,8 +58,8 @@ class SettingDraws:
 
     def column(self, name: str, nominal: float) -> FloatArray:
         """Return the nominal value of a setting and its draws (1 + draw,)."""
-        rest = self.values.get(name, np.full(self.count, nominal))
-        return np.concatenate([[nominal], rest])
+        drawn = self.values.get(name, np.full(self.count, nominal))
+        return np.concatenate([[nominal], drawn])
 
     def normal(self, stream: int) -> FloatArray:
         """Return a standard normal number for each draw; another ``stream`` has independent
@@ -162,8 +162,8 @@ def ladder(
     last = min(furthest, far_distance(beam, diameter, FAR_WAVES if focused else UNFOCUSED_WAVES))
 
     def defocus(distance: float) -> float:
-        found = defocus_at(beam, distance, diameter, focus_of(lens), lens.defocus * _DEFOCUS)
-        return 0.0 if follows else float(found)
+        defocused = defocus_at(beam, distance, diameter, focus_of(lens), lens.defocus * _DEFOCUS)
+        return 0.0 if follows else float(defocused)
 
     rungs = [last]
     while rungs[-1] > nearest:
@@ -186,8 +186,8 @@ def miss_between(rungs: FloatArray, misses: Sequence[float], place: FloatArray) 
     if not len(misses):
         return np.zeros_like(place)
     gap = np.clip(np.searchsorted(rungs, place, side="right") - 1, 0, len(rungs) - 2)
-    part = np.clip((place - rungs[gap]) / (rungs[gap + 1] - rungs[gap]), 0, 1)
-    missed: FloatArray = np.asarray(misses, np.float64)[gap] * 4 * part * (1 - part)
+    position = np.clip((place - rungs[gap]) / (rungs[gap + 1] - rungs[gap]), 0, 1)
+    missed: FloatArray = np.asarray(misses, np.float64)[gap] * 4 * position * (1 - position)
     return missed
 
 
@@ -240,10 +240,10 @@ class Spread:
     @classmethod
     def of(cls, value: float, draws: FloatArray) -> Spread:
         """Return a number with the interval of its draws; NaN in a draw is left out."""
-        known = draws[~np.isnan(draws)]
-        if not known.size:
+        finite = draws[~np.isnan(draws)]
+        if not finite.size:
             return cls(value, value, value)
-        low, high = np.quantile(known, QUANTILES)
+        low, high = np.quantile(finite, QUANTILES)
         return cls(value, float(low), float(high))
 
 
@@ -284,25 +284,27 @@ def crossings(distances: FloatArray, ratio: FloatArray) -> tuple[FloatArray, Flo
     """
     with np.errstate(divide="ignore"):
         height = np.log(np.maximum(ratio, 1e-300))
-    at, inside = np.log(distances), height >= 0
+    place, inside = np.log(distances), height >= 0
     edge = np.zeros((len(inside), 1), bool)
     begins = inside & ~np.concatenate([edge, inside[:, :-1]], 1)
     ends = inside & ~np.concatenate([inside[:, 1:], edge], 1)
-    return _placed(at, height, begins, -1), _placed(at, height, ends, 1)
+    return _placed(place, height, begins, -1), _placed(place, height, ends, 1)
 
 
-def _placed(at: FloatArray, height: FloatArray, marks: NDArray[np.bool_], step: int) -> FloatArray:
+def _placed(
+    place: FloatArray, height: FloatArray, marks: NDArray[np.bool_], step: int
+) -> FloatArray:
     """Return the distance (draw, zone) where the height crosses 0 beside each marked sample, on
     the side ``step``.
     """
     row, column = np.nonzero(marks)
-    other = np.clip(column + step, 0, len(at) - 1)
+    other = np.clip(column + step, 0, len(place) - 1)
     inner, outer = height[row, column], height[row, other]
     share = np.where(other == column, 0.0, inner / np.where(other == column, 1.0, inner - outer))
-    found = np.exp(at[column] + share * (at[other] - at[column]))
+    distances = np.exp(place[column] + share * (place[other] - place[column]))
     count = marks.sum(1)
     placed = np.full((len(marks), int(count.max(initial=0))), np.nan)
-    placed[row, np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)] = found
+    placed[row, np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)] = distances
     return placed
 
 
@@ -310,17 +312,17 @@ def zones_of(
     distances: FloatArray,
     nominal: FloatArray,
     drawn: FloatArray,
-    at: float,
+    distance: float,
     asked: tuple[float, float] | None = None,
 ) -> Zones:
     """Return the zones of a limit from the ratio of exposure to limit: nominal (distance,), drawn
     (draw, distance).
 
-    Zones lie between the two distances ``asked``, whether or not the distance ``at`` of the recipe
+    Zones lie between the two distances ``asked``, whether or not the ``distance`` of the recipe
     does. The outer ends, such as the farthest distance, have the interval of all draws that have a
     zone; ends between two zones have that of the draws with as many zones as the nominal values.
     """
-    within = _at(distances, drawn, at) >= 1
+    within = _at(distances, drawn, distance) >= 1
     if asked is not None:
         shown = (distances >= asked[0] * (1 - _ROUNDED)) & (distances <= asked[1] * (1 + _ROUNDED))
         distances, nominal, drawn = distances[shown], nominal[shown], drawn[:, shown]
@@ -355,9 +357,9 @@ def _column(ends: FloatArray, zone: int) -> FloatArray:
     return ends[:, zone] if len(ends) else np.zeros(0)
 
 
-def _at(distances: FloatArray, ratio: FloatArray, at: float) -> FloatArray:
+def _at(distances: FloatArray, ratio: FloatArray, distance: float) -> FloatArray:
     """Return the ratio (draw,) at a distance, which is one of the distances."""
-    column: FloatArray = ratio[:, int(np.argmin(np.abs(distances - at)))]
+    column: FloatArray = ratio[:, int(np.argmin(np.abs(distances - distance)))]
     return column
 
 
@@ -459,10 +461,10 @@ def compute_exposures(
 
     Without ``distances`` they are those of the settings and of the recipe.
     """
-    at = asked_distances(safety) if distances is None else np.asarray(distances, np.float64)
+    places = asked_distances(safety) if distances is None else np.asarray(distances, np.float64)
     beams = tuple(_beams(safety, draws))
-    beam, where = _stacked(beams), torch.from_numpy(at)
-    air: Any = torch.from_numpy(_air(safety, draws, at) * _uneven(safety, draws, at))
+    beam, where = _stacked(beams), torch.from_numpy(places)
+    air: Any = torch.from_numpy(_air(safety, draws, places) * _uneven(safety, draws, places))
     lens = _exposure_column(draws, "lens.transmittance", safety.settings.lens.transmittance)
     focal_length = _exposure_column(draws, "lens.focal_length", safety.settings.lens.focal_length)
     diameter = _exposure_column(draws, "lens.diameter", safety.settings.lens.diameter)
@@ -496,7 +498,7 @@ def compute_exposures(
         columns["waves"][option.name] = waves.numpy()
     at_lens = axis_density(beam, where, air).numpy()
     return Exposures(
-        at,
+        places,
         at_lens,
         columns["sensor"],
         columns["spot"],
@@ -543,14 +545,16 @@ def _at_width(option: Option, nominal: Beam, radius: Any) -> Any:
     """
     if not option.peaks:
         return option.peak
-    at, ratio = np.log(np.array(option.peaks)).T
+    rungs, ratio = np.log(np.array(option.peaks)).T
     place = np.log(as_wide(nominal, np.asarray(radius, np.float64)))
-    inside = np.clip(place, at[0], at[-1])
-    between = np.exp(interpolated(at, ratio, inside) + miss_between(at, option.misses, inside))
-    return torch.from_numpy(np.where(place < at[0] - _ROUNDED, 1.0, np.minimum(between, 1.0)))
+    inside = np.clip(place, rungs[0], rungs[-1])
+    between = np.exp(
+        interpolated(rungs, ratio, inside) + miss_between(rungs, option.misses, inside)
+    )
+    return torch.from_numpy(np.where(place < rungs[0] - _ROUNDED, 1.0, np.minimum(between, 1.0)))
 
 
-def _uneven(safety: Safety, draws: SettingDraws, at: FloatArray) -> FloatArray:
+def _uneven(safety: Safety, draws: SettingDraws, distances: FloatArray) -> FloatArray:
     """Return the factor (1 + draw or 1, distance) of hot spots and of turbulent air on every
     irradiance.
     """
@@ -562,7 +566,7 @@ def _uneven(safety: Safety, draws: SettingDraws, at: FloatArray) -> FloatArray:
         return factor
     turbulence = torch.from_numpy(draws.column("beam.cn2", beam.cn2)[:, None])
     moments: Any = scintillation(
-        safety.laser.wavelength, torch.from_numpy(at), turbulence, beam.worst
+        safety.laser.wavelength, torch.from_numpy(distances), turbulence, beam.worst
     )
     return np.asarray(factor * moments.numpy(), np.float64)
 
@@ -572,20 +576,20 @@ def _beams(safety: Safety, draws: SettingDraws) -> list[Beam]:
     drawn = {
         name: draws.values[f"laser.{name}"] for name in BEAM if f"laser.{name}" in draws.values
     }
-    found = [safety.laser.beam()]
+    beams = [safety.laser.beam()]
     try:
         for i in range(draws.count):
-            found.append(
+            beams.append(
                 safety.laser.beam({name: float(x[i]) for name, x in drawn.items()})
                 if drawn
-                else found[0]
+                else beams[0]
             )
     except ParameterError as error:
         value = safety.values.get(f"laser.{error.parameter}", next(iter(safety.values.values())))
         raise RecipeError(
             [Diagnostic(value.mark, value.name, f"the value is drawn, but {error}")]
         ) from None
-    return found
+    return beams
 
 
 def _stacked(beams: tuple[Beam, ...]) -> Beam:
@@ -611,19 +615,21 @@ def _exposure_column(draws: SettingDraws, name: str, nominal: float) -> Any:
     return _short(draws.column(name, nominal))
 
 
-def _air(safety: Safety, draws: SettingDraws, at: FloatArray) -> FloatArray:
+def _air(safety: Safety, draws: SettingDraws, distances: FloatArray) -> FloatArray:
     """Return the transmittance of the air (1 + draw, distance), from that of one metre: even air
     has equal metres.
     """
     laser = safety.laser
     if laser.air_transmittance is not None:
-        whole = draws.column("laser.air_transmittance", laser.air_transmittance)[:, None]
-        return np.asarray(np.power(whole, at / laser.distance), np.float64)
+        transmittance = draws.column("laser.air_transmittance", laser.air_transmittance)[:, None]
+        return np.asarray(np.power(transmittance, distances / laser.distance), np.float64)
     if laser.visibility is None:
         return np.ones((1, 1))
     visible = draws.column("laser.visibility", laser.visibility).tolist()
-    known = {v: air_transmittance(1.0, v, laser.wavelength, laser.haze) for v in set(visible)}
-    return np.asarray(np.power(np.array([known[v] for v in visible])[:, None], at), np.float64)
+    per_metre = {v: air_transmittance(1.0, v, laser.wavelength, laser.haze) for v in set(visible)}
+    return np.asarray(
+        np.power(np.array([per_metre[v] for v in visible])[:, None], distances), np.float64
+    )
 
 
 def options_of(
@@ -639,13 +645,13 @@ def options_of(
     than interpolated.
     """
     protection = safety.settings.protection
-    found = [Option("plain lens")]
+    options = [Option("plain lens")]
     if mask is not None:
-        found.append(Option("mask", peak=mask, masked=True, peaks=peaks, misses=misses))
+        options.append(Option("mask", peak=mask, masked=True, peaks=peaks, misses=misses))
     if protection.filter is not None:
-        found.append(Option(f"grey filter {protection.filter:g}", passing=protection.filter))
+        options.append(Option(f"grey filter {protection.filter:g}", passing=protection.filter))
     if protection.stop is not None:
-        found.append(Option(f"stop {protection.stop * 1e3:g} mm", diameter=protection.stop))
+        options.append(Option(f"stop {protection.stop * 1e3:g} mm", diameter=protection.stop))
     if mask is not None and protection.filter is not None:
-        found.append(replace(found[1], name="mask and grey filter", passing=protection.filter))
-    return tuple(found)
+        options.append(replace(options[1], name="mask and grey filter", passing=protection.filter))
+    return tuple(options)

@@ -15,7 +15,15 @@ import torch
 from numpy.typing import NDArray
 
 from neusee.nodes.flare import surface_of, veil_at
-from neusee.nodes.laser import BrightPixels, hidden_light, summit_gain, unseen_light, with_frame
+from neusee.nodes.laser import (
+    BrightPixels,
+    beam_radius,
+    curvature_radius,
+    hidden_light,
+    summit_gain,
+    unseen_light,
+    with_frame,
+)
 from neusee.nodes.values import Psf
 from neusee.workflows.engine.execution import RunSeries
 from neusee.workflows.engine.runner import Result, run
@@ -77,13 +85,15 @@ def veil_of(safety: Safety, draws: SettingDraws) -> Veil | None:
     surfaces: Mapping[str, Mapping[str, Any]] = scatter.surfaces or assumed_surface
     camera = {"focal_length": lens.focal_length, "pixel_pitch": pitch, "diameter": lens.diameter}
 
-    known: dict[bytes, FloatArray] = {}
+    computed: dict[bytes, FloatArray] = {}
 
     def light(radius: FloatArray) -> FloatArray:
         key = hashlib.sha1(radius.tobytes()).digest()
-        if key not in known:
-            known[key] = veil_at(torch.from_numpy(radius), surfaces=surfaces, **camera)[0].numpy()
-        return known[key]
+        if key not in computed:
+            computed[key] = veil_at(torch.from_numpy(radius), surfaces=surfaces, **camera)[
+                0
+            ].numpy()
+        return computed[key]
 
     total = float(veil_at(torch.zeros(1, dtype=torch.float64), surfaces=surfaces, **camera)[1])
     share, assumed = _share(safety, draws, scatter, total)
@@ -122,11 +132,11 @@ class Grid:
     @classmethod
     def through_zero(cls, values: FloatArray, per_unit: float) -> Grid:
         """Return such a grid with a point at 0, so that values of 0 are not interpolated."""
-        known = cls.around(np.append(values, 0.0), per_unit).points
-        if len(known) == 1:
+        points = cls.around(np.append(values, 0.0), per_unit).points
+        if len(points) == 1:
             return cls(np.zeros(1))
-        step = known[1] - known[0]
-        ends = math.floor(known[0] / step + _ROUNDED), math.ceil(known[-1] / step - _ROUNDED)
+        step = points[1] - points[0]
+        ends = math.floor(points[0] / step + _ROUNDED), math.ceil(points[-1] / step - _ROUNDED)
         return cls(np.arange(ends[0], ends[1] + 1) * step)
 
     def weights(self, values: FloatArray) -> list[FloatArray]:
@@ -159,20 +169,21 @@ class Levels:
         """
         weights = [grid.weights(values) for grid, values in zip(self.grids, others, strict=True)]
         size = np.broadcast_shapes(
-            place.shape, *(part.shape for parts in weights for part in parts)
+            place.shape, *(weight.shape for weight in itertools.chain(*weights))
         )
         clipped = np.broadcast_to(np.clip(place, self.rungs[0], self.rungs[-1]), size)
         total = np.zeros((*size, len(range(*ranks.indices(self.values.shape[-1])))))
         for point in itertools.product(*(range(len(grid.points)) for grid in self.grids)):
             weight = functools.reduce(
-                np.multiply, (part[index] for part, index in zip(weights, point, strict=True))
+                np.multiply,
+                (grid_weights[index] for grid_weights, index in zip(weights, point, strict=True)),
             )
             weight = np.broadcast_to(weight, size)
             # a draw lies between two points of a grid, and needs no others
             rows = np.flatnonzero(weight.any(axis=1))
-            chosen: Any = (slice(None), *point, ranks)
+            cell: Any = (slice(None), *point, ranks)
             total[rows] += weight[rows, :, None] * interpolated(
-                self.rungs, self.values[chosen], clipped[rows]
+                self.rungs, self.values[cell], clipped[rows]
             )
         total += miss_between(self.rungs, self.misses, clipped)[..., None]
         if self.most is None:
@@ -204,9 +215,9 @@ def levels_of(
     whose light the radial law of `with_frame` decides. ``shares`` are those of the scattered light;
     without a veil there is one row.
     """
-    whole = with_frame(groups, shape)
-    radius, pixels = whole.radius.numpy(), whole.pixels.numpy()
-    core = (whole.smooth if smooth else whole.light).numpy()
+    framed = with_frame(groups, shape)
+    radius, pixels = framed.radius.numpy(), framed.pixels.numpy()
+    core = (framed.smooth if smooth else framed.light).numpy()
     scattered = veil.light(radius) / veil.share[0] if veil else np.zeros_like(core)
     added = np.arange(len(core)) >= len(groups.radius)
     hidden = hidden_light(groups) if added.any() else 0.0
@@ -267,10 +278,10 @@ def _at_ranks(ranks: FloatArray, counted: Counted) -> FloatArray:
     """
     first = np.minimum(counted.count - counted.alike + 1, counted.count)
     place = np.maximum.accumulate(np.stack([first, counted.count], 1).ravel())
-    found: FloatArray = np.interp(
+    logarithms: FloatArray = np.interp(
         np.log(ranks), np.log(place), np.repeat(np.log(counted.light + 1e-300), 2)
     )
-    return found
+    return logarithms
 
 
 def _lit_at_most(
@@ -442,7 +453,7 @@ def _peak(runs: _Runs, recipe: Recipe, step: str, distance: float) -> _Peak:
         return _Peak(float(runs.of(recipe, [step])[step].max()), 0.0, _focused(fill))
     peak = _peak_of(runs.of(recipe, [psf])[psf], fill)
     window = next(
-        (each.name for each in _upstream(recipe, psf) if each.node.path == "optics.psf"), None
+        (source.name for source in _upstream(recipe, psf) if source.node.path == "optics.psf"), None
     )
     for _ in range(_WIDENINGS):
         if window is None or peak.most <= peak.inside:
@@ -524,7 +535,11 @@ def _ranked(runs: _Runs, arm: str, step: str) -> Ranked:
     spots = _refined(_first(safety, recipe, step), level, _MOST)
     error = max(spots.misses, default=0.0)
     return Ranked(
-        arm, spots.distances, tuple(groups[at] for at in spots.distances), error, spots.misses
+        arm,
+        spots.distances,
+        tuple(groups[distance] for distance in spots.distances),
+        error,
+        spots.misses,
     )
 
 
@@ -573,8 +588,6 @@ def _carried(safety: Safety, recipe: Recipe, step: str) -> float:
     """Return the shortest distance in m at which the samples of the pupil carry the curvature of
     the beam.
     """
-    from neusee.nodes.laser import beam_radius, curvature_radius
-
     pupil = _pupils(recipe, step)[0]
     stop = recipe.steps[str(pupil.wires["stop"])].params
     pitch = safety.settings.lens.diameter / float(stop["samples"])
@@ -598,7 +611,7 @@ class _Refined:
 def _refined(
     distances: Sequence[float],
     value: Callable[[float], FloatArray],
-    most: int,
+    limit: int,
     close: float = _CLOSE,
 ) -> _Refined:
     """Return values (logarithms) at distances, and at the middles of the gaps in which
@@ -608,23 +621,25 @@ def _refined(
     middle is known: the peak behind a mask has kinks, where another lobe becomes the brightest.
     Gaps that miss no more than ``close`` stay.
     """
-    known = {distance: value(distance) for distance in distances}
+    values = {distance: value(distance) for distance in distances}
     misses = dict.fromkeys(itertools.pairwise(distances), math.inf)
-    while len(known) < most:
+    while len(values) < limit:
         wide = [gap for gap in misses if gap[1] / gap[0] > _FINEST and misses[gap] > close]
         if not wide:
             break
         near, far = max(wide, key=lambda gap: misses[gap] * math.log(gap[1] / gap[0]))
         middle = math.sqrt(near * far)
-        rising = sorted(known)
-        guess = interpolated(np.log(rising), np.stack([known[at] for at in rising]), np.log(middle))
-        known[middle] = value(middle)
-        miss = float(np.abs(known[middle] - guess).max())
+        rising = sorted(values)
+        guess = interpolated(
+            np.log(rising), np.stack([values[place] for place in rising]), np.log(middle)
+        )
+        values[middle] = value(middle)
+        miss = float(np.abs(values[middle] - guess).max())
         del misses[near, far]
         misses |= {(near, middle): miss, (middle, far): miss}
-    rising = sorted(known)
+    rising = sorted(values)
     gaps = tuple(misses[gap] for gap in itertools.pairwise(rising))
-    return _Refined(tuple(rising), tuple(known[distance] for distance in rising), gaps)
+    return _Refined(tuple(rising), tuple(values[distance] for distance in rising), gaps)
 
 
 def at_distance(recipe: Recipe, safety: Safety, step: str, distance: float) -> Recipe:
@@ -661,15 +676,15 @@ def _pupils(recipe: Recipe, step: str) -> list[Step]:
 
 def _bend(safety: Safety, distance: float) -> float:
     """Return the curvature in 1/m of the wavefront of the laser at a distance."""
-    from neusee.nodes.laser import curvature_radius
-
     return float(1 / curvature_radius(safety.laser.beam(), distance))
 
 
 def _wavefront_of(recipe: Recipe, step: str) -> str | None:
     """Return the name of the step of the wavefront on which a step depends; None without one."""
-    found = (each.name for each in _upstream(recipe, step) if each.node.path == "laser.wavefront")
-    return next(found, None)
+    names = (
+        source.name for source in _upstream(recipe, step) if source.node.path == "laser.wavefront"
+    )
+    return next(names, None)
 
 
 def _upstream(recipe: Recipe, step: str) -> Iterator[Step]:
@@ -683,10 +698,10 @@ def _step(recipe: Recipe, safety: Safety, arm: str, named: str) -> str:
     """
     setting, sensor = f"protection.pixels.{arm}", safety.settings.sensor
     step = step_of(recipe, safety, setting, named, arm)
-    given, params = recipe.steps[step], recipe.steps[step].params
+    ranking, params = recipe.steps[step], recipe.steps[step].params
     value, text = safety.values[setting], ""
-    if given.node.path != _RANKS:
-        text = f"the step {step} is of the node {given.node.path}: name a step of {_RANKS}"
+    if ranking.node.path != _RANKS:
+        text = f"the step {step} is of the node {ranking.node.path}: name a step of {_RANKS}"
     elif (
         not math.isclose(params["pixel_pitch"], sensor.pixel_pitch)
         or tuple(params["shape"]) != sensor.shape
@@ -695,7 +710,7 @@ def _step(recipe: Recipe, safety: Safety, arm: str, named: str) -> str:
             f"the step {step} has another sensor: give it safety.sensor.pixel_pitch and"
             " safety.sensor.shape"
         )
-    elif any(each.node.path == "flare.stray_light" for each in _upstream(recipe, step)):
+    elif any(source.node.path == "flare.stray_light" for source in _upstream(recipe, step)):
         text = (
             f"the step {step} has stray light, which the estimate adds itself: rank the PSF before"
             " flare.stray_light"

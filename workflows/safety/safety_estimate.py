@@ -105,33 +105,33 @@ def dazzled(
     """
     if not areas:
         return ()
-    full, at = saturating(safety, draws), exposures.at(safety.laser.distance)
-    whole = safety.settings.sensor.shape[0] * safety.settings.sensor.shape[1]
+    full, index = saturating(safety, draws), exposures.at(safety.laser.distance)
+    pixel_count = safety.settings.sensor.shape[0] * safety.settings.sensor.shape[1]
     pixel = safety.settings.sensor.pixel_pitch**2
-    here = float(mean[0, 0] * exposures.lens[0, at])
+    here = float(mean[0, 0] * exposures.lens[0, index])
     filled = [
-        full[:, None] * pixel / exposures.through[area.option.name][:, at : at + 1]
+        full[:, None] * pixel / exposures.through[area.option.name][:, index : index + 1]
         for area in areas
     ]
-    levels = [float(area.level(exposures, draws, veiled=False)[0, at]) for area in areas]
+    levels = [float(area.level(exposures, draws, veiled=False)[0, index]) for area in areas]
     limits = [
-        needed[0, 0] / level * exposures.lens[0, at]
+        needed[0, 0] / level * exposures.lens[0, index]
         for needed, level in zip(filled, levels, strict=True)
     ]
     lens = np.geomspace(_FAINT * limits[0], max(_STRONG * max(limits), 2 * here), _SAMPLES)
-    found: list[Dazzled] = []
+    rows: list[Dazzled] = []
     for area, needed in zip(areas, filled, strict=True):
-        count = np.minimum(area.saturated(exposures, draws, at, needed / mean)[:, 0], whole)
-        pixels = Spread.of(float(count[0]), count[1:])
-        plain = found[0].pixels if found else pixels
-        times = pixels.value / plain.value if pixels.value > 0 and plain.value > 0 else None
-        light = needed[:1] * exposures.lens[0, at] / lens[None]
-        curve = np.minimum(area.saturated(exposures, draws, at, light)[0] / whole, 1.0)
-        lost = pixels.value / whole
-        found.append(
-            Dazzled(area.option.name, area.option.masked, pixels, lost, times, lens, curve)
+        count = np.minimum(
+            area.saturated(exposures, draws, index, needed / mean)[:, 0], pixel_count
         )
-    return tuple(found)
+        pixels = Spread.of(float(count[0]), count[1:])
+        plain = rows[0].pixels if rows else pixels
+        times = pixels.value / plain.value if pixels.value > 0 and plain.value > 0 else None
+        light = needed[:1] * exposures.lens[0, index] / lens[None]
+        curve = np.minimum(area.saturated(exposures, draws, index, light)[0] / pixel_count, 1.0)
+        lost = pixels.value / pixel_count
+        rows.append(Dazzled(area.option.name, area.option.masked, pixels, lost, times, lens, curve))
+    return tuple(rows)
 
 
 # --- damage verdict -------------------------------------------------------------------------------
@@ -216,9 +216,9 @@ def damage_verdicts(
     for option in options:
         parts = limit_parts(safety, option, exposures, draws)
         judged = [
-            each
-            for each in findings
-            if each.option == option.name and each.limit.effect == "damage"
+            finding
+            for finding in findings
+            if finding.option == option.name and finding.limit.effect == "damage"
         ]
         rows = tuple(_rows(parts, judged, continuous=not exposures.beams[0].is_pulsed))
         if rows:
@@ -232,12 +232,12 @@ def _rows(
     order.
     """
     waiting = iter(findings)
-    for part in parts:
-        finding = next(waiting) if part.threshold is not None else None
+    for damage_part in parts:
+        finding = next(waiting) if damage_part.threshold is not None else None
         state: State = "not judged" if finding is None else state_of_finding(finding)
-        reason = part.reason if state == "not judged" else ""
-        for name in _CONTINUOUS if continuous else (part.part,):
-            yield DamageRow(name, part.kind, state, reason, finding)
+        reason = damage_part.reason if state == "not judged" else ""
+        for name in _CONTINUOUS if continuous else (damage_part.part,):
+            yield DamageRow(name, damage_part.kind, state, reason, finding)
 
 
 def state_of_finding(finding: Finding) -> State:
@@ -332,7 +332,7 @@ def ladder_text(ranked: tuple[Ranked, ...], peaks: Peaks | None) -> str:
         f" lens to (D / 2w)^2 = {FAR_FILL:g} with {FAR_WAVES:g} waves of curvature it is that of a"
         " distant laser."
     )
-    spots = [(each.arm, len(each.distances), each.error) for each in ranked]
+    spots = [(spot.arm, len(spot.distances), spot.error) for spot in ranked]
     if peaks and len(peaks.along) > 1:
         spots.append(("peak behind the mask", len(peaks.along), peaks.error))
     parts = [
@@ -369,10 +369,10 @@ def near_text(asked: float, ranked: tuple[Ranked, ...], peaks: Peaks | None) -> 
             f" {100 * lacking:.2g} %) that may be brighter outside: it counts as one spot, as sharp"
             " as that of the clear lens. Choose a larger window."
         )
-    for each in ranked:
-        if math.isfinite(each.error) and each.distances[0] > asked:
+    for spot in ranked:
+        if math.isfinite(spot.error) and spot.distances[0] > asked:
             yield (
-                f"Nearer than {each.distances[0]:.3g} m the pixels behind the {_ARMS[each.arm]} are"
+                f"Nearer than {spot.distances[0]:.3g} m the pixels behind the {_ARMS[spot.arm]} are"
                 f" not computed ({_MORE}): all light counts in the pixels that may be lost, the"
                 " most that there can be."
             )
@@ -404,8 +404,8 @@ def unsaid_of_damage(safety: Safety, verdicts: Sequence[DamageVerdict]) -> Itera
         )
 
 
-def unsaid_of_dazzle(safety: Safety, known: Mapping[str, Area | str]) -> Iterator[str]:
-    """Yield sentences on what is not said of dazzle; ``known`` has the area behind each
+def unsaid_of_dazzle(safety: Safety, areas: Mapping[str, Area | str]) -> Iterator[str]:
+    """Yield sentences on what is not said of dazzle; ``areas`` has the area behind each
     protection, or a reason.
     """
     dazzle, sensor = safety.settings.dazzle, safety.settings.sensor
@@ -423,7 +423,7 @@ def unsaid_of_dazzle(safety: Safety, known: Mapping[str, Area | str]) -> Iterato
             " without its filters may see it."
         )
         return
-    yield from _unsaid_areas(known)
+    yield from _unsaid_areas(areas)
     level = veil_level(dazzle)
     if level <= 0:
         yield "The feature of safety.dazzle is lost without any laser, so that no veil is stated."
@@ -434,12 +434,12 @@ def unsaid_of_dazzle(safety: Safety, known: Mapping[str, Area | str]) -> Iterato
         )
 
 
-def _unsaid_areas(known: Mapping[str, Area | str]) -> Iterator[str]:
+def _unsaid_areas(areas: Mapping[str, Area | str]) -> Iterator[str]:
     """Yield one sentence for each reason why the dazzled area behind some protections is not
     known.
     """
     reasons: dict[str, list[str]] = {}
-    for name, area in known.items():
+    for name, area in areas.items():
         if isinstance(area, str):
             reasons.setdefault(area, []).append(name)
     for reason, names in reasons.items():
@@ -578,9 +578,11 @@ def complete(recipe: Recipe, prepared: Prepared) -> Estimate:
     """Return the estimate from everything that decides it."""
     safety, draws, options = prepared.safety, prepared.draws, prepared.options
     exposures = compute_exposures(safety, draws, options)
-    known = {option.name: area_of(safety, option, prepared.ranked) for option in options}
+    area_behind = {option.name: area_of(safety, option, prepared.ranked) for option in options}
     areas = (
-        tuple(area for area in known.values() if isinstance(area, Area)) if _dazzles(safety) else ()
+        tuple(area for area in area_behind.values() if isinstance(area, Area))
+        if _dazzles(safety)
+        else ()
     )
     findings = tuple(_findings(safety, draws, options, exposures, areas))
     verdicts = tuple(damage_verdicts(safety, options, exposures, draws, findings))
@@ -589,7 +591,7 @@ def complete(recipe: Recipe, prepared: Prepared) -> Estimate:
     beyond = {area.option.name: area.beyond(exposures, draws) for area in areas}
     unsaid = (
         *unsaid_of_damage(safety, verdicts),
-        *unsaid_of_dazzle(safety, known),
+        *unsaid_of_dazzle(safety, area_behind),
         *beyond_window(beyond),
         *near_text(safety.settings.distances[0], prepared.ranked, prepared.peaks),
         *faults,
@@ -643,29 +645,29 @@ def _findings(
     areas: tuple[Area, ...],
 ) -> Iterator[Finding]:
     """Yield what each limit says behind each option."""
-    known = {area.option: area for area in areas}
+    area_behind = {area.option: area for area in areas}
     for option in options:
-        for limit in limits_behind(safety, draws, option, known.get(option), exposures):
+        for limit in limits_behind(safety, draws, option, area_behind.get(option), exposures):
             yield _finding(safety, option, limit, exposures)
 
 
 def _finding(safety: Safety, option: Option, limit: Limit, exposures: Exposures) -> Finding:
-    per_power, at = exposures.sensor[option.name], exposures.at(safety.laser.distance)
+    per_power, index = exposures.sensor[option.name], exposures.at(safety.laser.distance)
     light = emitted(safety, limit, exposures)
     limits = limit.values * limit.devices * np.ones((len(light), per_power.shape[1]))
     ratio, at_lens = (
         limit_ratio(safety, option.name, limit, exposures),
         limits * exposures.lens / per_power,
     )
-    here = light[:, 0] * per_power[:, at]
+    here = light[:, 0] * per_power[:, index]
     return Finding(
         option.name,
         limit,
-        _spread(limits[:, at]),
-        _spread(at_lens[:, at]),
+        _spread(limits[:, index]),
+        _spread(at_lens[:, index]),
         _spread(here),
-        float(ratio[0, at]),
-        _probability(limit, ratio[1:, at] * limit.devices[1:, 0]),
+        float(ratio[0, index]),
+        _probability(limit, ratio[1:, index] * limit.devices[1:, 0]),
         zones_of(
             exposures.distances,
             ratio[0],
@@ -674,7 +676,7 @@ def _finding(safety: Safety, option: Option, limit: Limit, exposures: Exposures)
             safety.settings.distances,
         ),
         np.stack([at_lens[0], *np.quantile(at_lens[1:], QUANTILES, axis=0)]),
-        _spread(ratio[:, at]),
+        _spread(ratio[:, index]),
     )
 
 

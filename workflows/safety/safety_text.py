@@ -73,8 +73,8 @@ def with_ends(spread: Spread, unit: str, factor: float = 1.0) -> str:
     if math.isclose(spread.low, spread.high, rel_tol=_SAME):
         return middle
     number, _, prefixed = middle.partition(" ")
-    one = factor * spread.value / float(number)
-    low, high = (f"{factor * x / one:.3g}" for x in (spread.low, spread.high))
+    prefix = factor * spread.value / float(number)
+    low, high = (f"{factor * x / prefix:.3g}" for x in (spread.low, spread.high))
     return f"{number} ({plain(low)} to {plain(high)}) {prefixed}"
 
 
@@ -169,19 +169,19 @@ def zone_cells(finding: Finding) -> list[str]:
 def eye_text(eye: EyeFinding) -> str:
     """Return what is said of the eye in two sentences."""
     unit = f"{UNITS[eye.quantity]}/m²"
-    each = " of each pulse" if eye.quantity == "fluence" else ""
+    per_pulse = " of each pulse" if eye.quantity == "fluence" else ""
     now = "exceeds" if eye.exposure.value > eye.limit else "does not exceed"
     return (
-        f"The eye may receive {scaled(eye.limit, unit)}{each} for {eye.duration:g} s (MPE); here it"
-        f" receives {with_ends(eye.exposure, unit)}, which {now} the limit. The nominal ocular"
-        f" hazard distance (NOHD) is {end(eye.distance)} in clear air. A distance that is safe for"
-        " a camera may blind people."
+        f"The eye may receive {scaled(eye.limit, unit)}{per_pulse} for {eye.duration:g} s (MPE);"
+        f" here it receives {with_ends(eye.exposure, unit)}, which {now} the limit. The nominal"
+        f" ocular hazard distance (NOHD) is {end(eye.distance)} in clear air. A distance that is"
+        " safe for a camera may blind people."
     )
 
 
-def laser_text(found: Estimate) -> str:
+def laser_text(estimate: Estimate) -> str:
     """Return the laser, its distance and its exposure at the lens in one sentence."""
-    beam, at = found.exposures.beams[0], found.at
+    beam, index = estimate.exposures.beams[0], estimate.at
     train = f" at {scaled(beam.repetition_rate, 'Hz')}" if beam.repetition_rate else ""
     light = (
         f"{scaled(beam.power, 'W')}"
@@ -193,24 +193,25 @@ def laser_text(found: Estimate) -> str:
     )
     quantity = "fluence" if beam.is_pulsed else "irradiance"
     here = (
-        found.exposures.emitted("fluence" if beam.is_pulsed else "irradiance")[:, 0]
-        * found.exposures.lens[:, at]
+        estimate.exposures.emitted("fluence" if beam.is_pulsed else "irradiance")[:, 0]
+        * estimate.exposures.lens[:, index]
     )
     spread = Spread.of(float(here[0]), here[1:])
-    each = " a pulse" if beam.is_pulsed else ""
+    per_pulse = " a pulse" if beam.is_pulsed else ""
     return (
-        f"{found.safety.name}: {found.emission}, {light}, {beam.wavelength * 1e9:.4g} nm,"
-        f" divergence {scaled(beam.divergence, 'rad')}, at {metres(found.safety.laser.distance)}:"
-        f" {with_ends(spread, UNITS[quantity] + '/m²')}{each} at the lens."
+        f"{estimate.safety.name}: {estimate.emission}, {light}, {beam.wavelength * 1e9:.4g} nm,"
+        f" divergence {scaled(beam.divergence, 'rad')}, at"
+        f" {metres(estimate.safety.laser.distance)}:"
+        f" {with_ends(spread, UNITS[quantity] + '/m²')}{per_pulse} at the lens."
     )
 
 
-def intervals_text(found: Estimate) -> str:
+def intervals_text(estimate: Estimate) -> str:
     """Return what the numbers in brackets mean."""
-    laws = found.draws.laws
+    laws = estimate.draws.laws
     named = f" {', '.join(f'{name} {text}' for name, text in laws.items())};" if laws else ""
-    text = f"In brackets: the middle 90 % of {found.draws.count} draws of all that is uncertain"
-    if not found.damage:
+    text = f"In brackets: the middle 90 % of {estimate.draws.count} draws of all that is uncertain"
+    if not estimate.damage:
         return f"{text}:{named.removesuffix(';')}." if named else f"{text}; nothing is."
     return (
         f"{text}:{named} the thresholds of damage. A published threshold has a bracket and no"
@@ -219,16 +220,16 @@ def intervals_text(found: Estimate) -> str:
     )
 
 
-def dazzled_cells(each: Dazzled) -> list[str]:
+def dazzled_cells(area: Dazzled) -> list[str]:
     """Return the row of a protection in the table of the dazzled area."""
-    low, high = (_pixels(x) for x in (each.pixels.low, each.pixels.high))
-    number = _pixels(each.pixels.value)
+    low, high = (_pixels(x) for x in (area.pixels.low, area.pixels.high))
+    number = _pixels(area.pixels.value)
     text = number if low == high else f"{number} ({low} to {high})"
     return [
-        each.option,
+        area.option,
         text,
-        share(each.share),
-        "–" if each.times is None else f"{each.times:.3g}",
+        share(area.share),
+        "–" if area.times is None else f"{area.times:.3g}",
     ]
 
 
@@ -239,26 +240,26 @@ def _pixels(number: float) -> str:
     return f"{float(f'{number:.3g}'):.0f}"
 
 
-def enlarged_text(found: Estimate) -> str:
+def enlarged_text(estimate: Estimate) -> str:
     """Return whether the mask makes the dazzled area larger than the plain lens, and by how
     much; empty: not known.
     """
-    parts = [text for text in (_counted_text(found), _sooner_text(found)) if text]
-    mask = _both(found)[1]
+    parts = [text for text in (_counted_text(estimate), _sooner_text(estimate)) if text]
+    mask = _both(estimate)[1]
     larger = mask.times > 1 if mask and mask.times else any("less light" in text for text in parts)
     return " ".join(["The mask enlarges the dazzled area.", *parts] if larger else parts)
 
 
-def _both(found: Estimate) -> tuple[Dazzled | None, Dazzled | None]:
+def _both(estimate: Estimate) -> tuple[Dazzled | None, Dazzled | None]:
     """Return the dazzled area behind the plain lens and behind the mask."""
-    return next(iter(found.dazzled), None), next(
-        (each for each in found.dazzled if each.masked), None
+    return next(iter(estimate.dazzled), None), next(
+        (area for area in estimate.dazzled if area.masked), None
     )
 
 
-def _counted_text(found: Estimate) -> str:
+def _counted_text(estimate: Estimate) -> str:
     """Return the filled pixels behind mask and plain lens at the distance of the recipe."""
-    plain, mask = _both(found)
+    plain, mask = _both(estimate)
     if plain is None or mask is None:
         return ""
     counts = (
@@ -266,24 +267,24 @@ def _counted_text(found: Estimate) -> str:
         " behind the plain lens"
     )
     times = "" if mask.times is None else f", {mask.times:.3g} times as many"
-    return f"At {metres(found.safety.laser.distance)} the laser fills {counts}{times}."
+    return f"At {metres(estimate.safety.laser.distance)} the laser fills {counts}{times}."
 
 
-def _sooner_text(found: Estimate) -> str:
+def _sooner_text(estimate: Estimate) -> str:
     """Return by how much less light at the lens the stated share of the picture is lost behind
     the mask.
     """
-    plain, mask = _both(found)
+    plain, mask = _both(estimate)
     limits = [
         next(
             (
                 f
-                for f in found.findings
-                if each and f.option == each.option and f.limit.effect == "dazzle"
+                for f in estimate.findings
+                if area and f.option == area.option and f.limit.effect == "dazzle"
             ),
             None,
         )
-        for each in (plain, mask)
+        for area in (plain, mask)
     ]
     if limits[0] is None or limits[1] is None:
         return ""
@@ -315,57 +316,63 @@ STATES = {
 }
 
 
-def verdict(found: Estimate) -> list[str]:
+def verdict(estimate: Estimate) -> list[str]:
     """Return the verdict of damage behind the plain lens, and a sentence for each limit of
     dazzle behind it.
     """
-    lens = found.options[0].name
-    damage = [damage_sentence(each, found) for each in found.damage if each.option == lens]
+    lens = estimate.options[0].name
+    damage = [
+        damage_sentence(judged, estimate) for judged in estimate.damage if judged.option == lens
+    ]
     dazzle = [
-        each for each in found.findings if each.option == lens and each.limit.effect != "damage"
+        finding
+        for finding in estimate.findings
+        if finding.option == lens and finding.limit.effect != "damage"
     ]
     return damage + [
-        f"{each.limit.name}: exceeded"
-        f" {'from ' if each.zones.zones else ''}{zones_text(each.zones)}."
-        for each in dazzle
+        f"{finding.limit.name}: exceeded"
+        f" {'from ' if finding.zones.zones else ''}{zones_text(finding.zones)}."
+        for finding in dazzle
     ]
 
 
-def damage_sentence(verdict: DamageVerdict, found: Estimate) -> str:
+def damage_sentence(verdict: DamageVerdict, estimate: Estimate) -> str:
     """Return the verdict of damage behind one protection in W/cm2 or J/cm2, with the distances
     of the worst part.
     """
-    at = f"at {metres(found.safety.laser.distance)} behind the {verdict.option}"
+    where = f"at {metres(estimate.safety.laser.distance)} behind the {verdict.option}"
     nearest = verdict.nearest
     if nearest is None or nearest.finding is None:
-        return f"Damage is not judged {at}: {verdict.rows[0].reason}."
-    near, zones = _compared(nearest, found), _zones(verdict, nearest.finding)
+        return f"Damage is not judged {where}: {verdict.rows[0].reason}."
+    near, zones = _compared(nearest, estimate), _zones(verdict, nearest.finding)
     if verdict.state == "above":
-        return f"Damage is expected {at}: {near} {zones}"
+        return f"Damage is expected {where}: {near} {zones}"
     if verdict.state == "not judged":
         parts = " and the ".join(dict.fromkeys(row.part for row in verdict.unjudged))
         text = (
-            f"Damage is not judged {at}, because no law judges the {parts}:"
+            f"Damage is not judged {where}, because no law judges the {parts}:"
             f" {verdict.unjudged[0].reason}."
         )
         if nearest.state == "not judged":
             return text
         return f"{text} Of what is judged, {near} {zones}".rstrip()
     opening = "Damage cannot be excluded" if verdict.state == "within" else "No damage is expected"
-    return f"{opening} {at}: {near} {zones}"
+    return f"{opening} {where}: {near} {zones}"
 
 
-def _compared(row: DamageRow, found: Estimate) -> str:
+def _compared(row: DamageRow, estimate: Estimate) -> str:
     """Return the exposure of one part of the light, and its ratio to the threshold."""
     finding = row.finding
     assert finding is not None
     unit = f"{UNITS[finding.limit.quantity]}/cm²"
-    part = _SUBJECTS[row.part] if found.exposures.beams[0].is_pulsed else "the continuous light"
+    subject = (
+        _SUBJECTS[row.part] if estimate.exposures.beams[0].is_pulsed else "the continuous light"
+    )
     exposure = scaled(finding.exposure.value * _PER_CM2, unit)
     threshold = with_ends(finding.at_sensor, unit, _PER_CM2)
     kind = "first damage" if finding.limit.kind == "point" else finding.limit.kind
     return (
-        f"{part} of {exposure} on the sensor is {times(finding)} the threshold of {kind},"
+        f"{subject} of {exposure} on the sensor is {times(finding)} the threshold of {kind},"
         f" {threshold}."
     )
 
@@ -406,19 +413,19 @@ def is_bracket(finding: Finding) -> bool:
     return finding.limit.effect == "damage" and finding.limit.factor is None
 
 
-def limit_rows(found: Estimate) -> list[list[str]]:
+def limit_rows(estimate: Estimate) -> list[list[str]]:
     """Return the table of limits, with the parts of the light that are not judged."""
-    rows = [_limit_cells(each) for each in found.findings]
-    for verdict in found.damage:
+    rows = [_limit_cells(finding) for finding in estimate.findings]
+    for verdict in estimate.damage:
         rows += [_unjudged_cells(verdict, row) for row in _without_limit(verdict)]
     return rows
 
 
-def zone_rows(found: Estimate) -> list[list[str]]:
+def zone_rows(estimate: Estimate) -> list[list[str]]:
     """Return the table of distances, with the parts of the light that are not judged."""
-    partial = {verdict.option for verdict in found.damage if verdict.unjudged}
-    rows = [_zone_cells(each, each.option in partial) for each in found.findings]
-    for verdict in found.damage:
+    partial = {verdict.option for verdict in estimate.damage if verdict.unjudged}
+    rows = [_zone_cells(finding, finding.option in partial) for finding in estimate.findings]
+    for verdict in estimate.damage:
         rows += [
             [verdict.option, f"damage: {row.part}", "not judged", "–", "–"]
             for row in _without_limit(verdict)
@@ -505,10 +512,10 @@ def distance_table(rows: Sequence[EyeDazzleRow]) -> list[list[str]]:
     return table
 
 
-def dazzle_text(found: EyeDazzleFinding, asked: EyeDazzle) -> str:
+def dazzle_text(finding: EyeDazzleFinding, asked: EyeDazzle) -> str:
     """Return what is asked of the eye, or why its dazzle is not judged."""
-    if found.reason:
-        return f"Dazzle of the eye is not judged: {found.reason}."
+    if finding.reason:
+        return f"Dazzle of the eye is not judged: {finding.reason}."
     size = math.degrees(asked.size) * 60
     return (
         f"A target of {size:.3g} arc minutes and the contrast {asked.contrast:g} is hidden from a"
@@ -545,12 +552,12 @@ def table(remedies: Sequence[Remedy]) -> list[list[str]]:
     without any.
     """
     rows = []
-    for limit in dict.fromkeys(each.limit for each in remedies):
-        known = [each for each in remedies if each.limit == limit]
-        if all(each.reason == MET for each in known):
+    for limit in dict.fromkeys(remedy.limit for remedy in remedies):
+        of_limit = [remedy for remedy in remedies if remedy.limit == limit]
+        if all(remedy.reason == MET for remedy in of_limit):
             rows.append([limit, "none", MET, "–", "–", "–", ""])
         else:
-            rows += [cells(each) for each in known]
+            rows += [cells(remedy) for remedy in of_limit]
     return rows
 
 
@@ -629,10 +636,12 @@ def sentences(remedies: Sequence[Remedy]) -> Iterator[str]:
     """Yield that an exposure never changes damage, and each limit against which no grey filter
     and no stop helps.
     """
-    if any(each.problem == "damage" for each in remedies):
+    if any(remedy.problem == "damage" for remedy in remedies):
         yield "An exposure never changes damage."
-    for limit in dict.fromkeys(each.limit for each in remedies):
-        helpless = {each.means for each in remedies if each.limit == limit and each.value is None}
+    for limit in dict.fromkeys(remedy.limit for remedy in remedies):
+        helpless = {
+            remedy.means for remedy in remedies if remedy.limit == limit and remedy.value is None
+        }
         if {"grey filter", "stop"} <= helpless:
             yield f"{limit}: no grey filter and no stop helps."
 
@@ -646,13 +655,13 @@ def sentences(remedies: Sequence[Remedy]) -> Iterator[str]:
 Paragraphs = Sequence[Sequence[str]]
 
 
-def paragraphs(found: Estimate) -> list[list[str]]:
+def paragraphs(estimate: Estimate) -> list[list[str]]:
     """Return the verdict, the tables of limits and distances, the eye, and the sources, before
     lines are wrapped.
     """
     parts = [
-        [f"{found.recipe.name}: {found.recipe.title}", CERTIFICATE, ""],
-        [laser_text(found)],
+        [f"{estimate.recipe.name}: {estimate.recipe.title}", CERTIFICATE, ""],
+        [laser_text(estimate)],
     ]
     steps = (
         _damage,
@@ -667,96 +676,99 @@ def paragraphs(found: Estimate) -> list[list[str]]:
         _eye_sources,
     )
     for step in steps:
-        parts += step(found)
+        parts += step(estimate)
     return parts
 
 
-def _damage(found: Estimate) -> Iterator[list[str]]:
+def _damage(estimate: Estimate) -> Iterator[list[str]]:
     """Yield the verdict of damage behind the plain lens."""
-    if found.damage:
-        yield from (["", "damage"], [damage_sentence(found.damage[0], found)])
+    if estimate.damage:
+        yield from (["", "damage"], [damage_sentence(estimate.damage[0], estimate)])
 
 
-def _limits(found: Estimate) -> Iterator[list[str]]:
+def _limits(estimate: Estimate) -> Iterator[list[str]]:
     """Yield the tables of limits and of distances."""
-    rows = limit_rows(found)
+    rows = limit_rows(estimate)
     if rows:
         yield _table("limits", LIMIT_COLUMNS, rows)
-        yield _table("distances", ZONE_COLUMNS, zone_rows(found))
+        yield _table("distances", ZONE_COLUMNS, zone_rows(estimate))
 
 
-def _dazzled_area(found: Estimate) -> Iterator[list[str]]:
+def _dazzled_area(estimate: Estimate) -> Iterator[list[str]]:
     """Yield the table of the dazzled area, and whether the mask enlarges it."""
-    if not found.dazzled:
+    if not estimate.dazzled:
         return
-    here = metres(found.safety.laser.distance)
+    here = metres(estimate.safety.laser.distance)
     yield _table(
         f"dazzled area at {here}",
         DAZZLE_COLUMNS,
-        [dazzled_cells(area) for area in found.dazzled],
+        [dazzled_cells(area) for area in estimate.dazzled],
     )
-    text = enlarged_text(found)
+    text = enlarged_text(estimate)
     if text:
         yield [text]
 
 
-def _unsaid(found: Estimate) -> Iterator[list[str]]:
+def _unsaid(estimate: Estimate) -> Iterator[list[str]]:
     """Yield what the estimate does not say."""
-    if found.unsaid:
+    if estimate.unsaid:
         yield ["", "not said"]
-        yield from ([text] for text in found.unsaid)
+        yield from ([text] for text in estimate.unsaid)
 
 
-def _counted(found: Estimate) -> Iterator[list[str]]:
+def _counted(estimate: Estimate) -> Iterator[list[str]]:
     """Yield what is counted along the axis."""
     yield from (
         ["", "counted along the axis"],
-        [safety_estimate.scatter_text(found.veil)],
-        [safety_estimate.focus_text(found.safety)],
+        [safety_estimate.scatter_text(estimate.veil)],
+        [safety_estimate.focus_text(estimate.safety)],
     )
-    yield from ([text] for text in safety_estimate.counted(found.safety))
+    yield from ([text] for text in safety_estimate.counted(estimate.safety))
 
 
-def _intervals(found: Estimate) -> Iterator[list[str]]:
+def _intervals(estimate: Estimate) -> Iterator[list[str]]:
     """Yield what the numbers in brackets mean."""
-    yield from (["", "intervals"], [intervals_text(found)])
+    yield from (["", "intervals"], [intervals_text(estimate)])
 
 
-def _sources(found: Estimate) -> Iterator[list[str]]:
+def _sources(estimate: Estimate) -> Iterator[list[str]]:
     """Yield the sources of the limits."""
     yield ["", "sources"]
-    yield from ([text] for text in dict.fromkeys(map(_source, found.findings)))
+    yield from ([text] for text in dict.fromkeys(map(_source, estimate.findings)))
 
 
-def _helps(found: Estimate) -> Iterator[list[str]]:
+def _helps(estimate: Estimate) -> Iterator[list[str]]:
     """Yield what helps, without the notes of the page."""
-    if found.helps:
-        cells = [row[:-1] for row in table(found.helps)]
+    if estimate.helps:
+        cells = [row[:-1] for row in table(estimate.helps)]
         yield _table("what helps, behind the plain lens", COLUMNS[:-1], cells)
-        yield from ([text] for text in sentences(found.helps))
+        yield from ([text] for text in sentences(estimate.helps))
 
 
-def _eye(found: Estimate) -> Iterator[list[str]]:
+def _eye(estimate: Estimate) -> Iterator[list[str]]:
     """Yield the limit of the eye and the distances of its dazzle."""
-    if found.eye:
-        yield from (["", "eye"], [eye_text(found.eye)])
-    if found.eye_dazzle.rows:
-        header, *cells = distance_table(found.eye_dazzle.rows)
+    if estimate.eye:
+        yield from (["", "eye"], [eye_text(estimate.eye)])
+    if estimate.eye_dazzle.rows:
+        header, *cells = distance_table(estimate.eye_dazzle.rows)
         yield _table("dazzle of the eye (NODD)", tuple(header), cells)
-    yield [dazzle_text(found.eye_dazzle, found.safety.settings.eye.dazzle)]
+    yield [dazzle_text(estimate.eye_dazzle, estimate.safety.settings.eye.dazzle)]
 
 
-def _eye_sources(found: Estimate) -> Iterator[list[str]]:
+def _eye_sources(estimate: Estimate) -> Iterator[list[str]]:
     """Yield the sources of what is said of the eye."""
-    if found.eye:
-        yield [f"eye: {found.eye.source}"]
-    if found.eye_dazzle.rows:
-        yield [f"dazzle of the eye: {found.eye_dazzle.source}"]
+    if estimate.eye:
+        yield [f"eye: {estimate.eye.source}"]
+    if estimate.eye_dazzle.rows:
+        yield [f"dazzle of the eye: {estimate.eye_dazzle.source}"]
 
 
 def lines(parts: Paragraphs) -> list[str]:
     """Return paragraphs as lines that are no wider than the terminal, but for tables."""
-    return [line for part in parts for line in (wrapped(part[0]) if len(part) == 1 else part)]
+    printed: list[str] = []
+    for paragraph in parts:
+        printed += wrapped(paragraph[0]) if len(paragraph) == 1 else paragraph
+    return printed
 
 
 def _source(finding: Finding) -> str:

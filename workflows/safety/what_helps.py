@@ -94,13 +94,16 @@ def remedies(safety: Safety, draws: SettingDraws, ranked: Sequence[Ranked]) -> t
     question = _Question(safety, draws, ranked)
     plain = question.ratios(_Trial(Option("plain lens")))
     ways = list(_ways(question)) if plain else []
-    return tuple(
-        replace(remedy, value=None, safe=None, cost=None, reason=OPEN)
-        if limit in question.open
-        else remedy
-        for limit in plain
-        for remedy in _remedies(limit, ways)
-    )
+    answers: list[Remedy] = []
+    for limit in plain:
+        for remedy in _remedies(limit, ways):  # which may find that the limit is open
+            answers.append(_open(remedy) if limit in question.open else remedy)
+    return tuple(answers)
+
+
+def _open(remedy: Remedy) -> Remedy:
+    """Return a means against a limit that is open below, with which nothing is safe."""
+    return replace(remedy, value=None, safe=None, cost=None, reason=OPEN)
 
 
 def problem_of(limit: str) -> Problem:
@@ -145,8 +148,8 @@ class _Question:
         # filter and exposure leave the spot as it is
         exposures = replace(exposures, tables=self.tables[drawn])
         area = area_of(safety, trial.option, self.ranked) if safety.settings.dazzle else None
-        known = area if isinstance(area, Area) else None
-        limits = list(limits_behind(safety, draws, trial.option, known, exposures))
+        dazzled_area = area if isinstance(area, Area) else None
+        limits = list(limits_behind(safety, draws, trial.option, dazzled_area, exposures))
         self.open.update(limit.name for limit in limits if getattr(limit, "open_below", False))
         return {
             limit.name: limit_ratio(safety, trial.option.name, limit, exposures)[:, 0]
@@ -279,9 +282,9 @@ def _stops(f_number: float) -> tuple[float, ...]:
     """Return diameters over that of a lens, from 1 down to f/64, or to half for a lens slower
     than f/32.
     """
-    least = min(0.5, f_number / _SLOWEST)
-    steps = max(4, math.ceil(math.log(least) / math.log(_HALF_STOP) / 2))
-    return tuple(least ** (x / steps) for x in range(steps + 1))
+    smallest = min(0.5, f_number / _SLOWEST)
+    steps = max(4, math.ceil(math.log(smallest) / math.log(_HALF_STOP) / 2))
+    return tuple(smallest ** (x / steps) for x in range(steps + 1))
 
 
 def _notch(question: _Question) -> tuple[float, float]:
@@ -310,7 +313,7 @@ def _remedies(limit: str, ways: Sequence[_Way]) -> Iterator[Remedy]:
     if problem_of(limit) != "contrast":
         looks = looks[:1]  # a longer exposure can only help contrast
     answers = [_remedy(limit, way) for way in looks]
-    yield from [each for each in answers if each.value is not None][:1] or answers[:1]
+    yield from [answer for answer in answers if answer.value is not None][:1] or answers[:1]
 
 
 def _remedy(limit: str, way: _Way) -> Remedy:
@@ -425,8 +428,8 @@ def _safe(limit: str, way: _Way, factors: FloatArray) -> tuple[float | None, flo
     limit with it.
     """
     towards = -1 if way.factors[-1] < 1 else 1
-    known = np.sort(towards * np.where(np.isnan(factors), towards * math.inf, factors))
-    safe = towards * float(known[min(len(known) - 1, math.ceil(_SAFE * len(known)))])
+    ordered = np.sort(towards * np.where(np.isnan(factors), towards * math.inf, factors))
+    safe = towards * float(ordered[min(len(ordered) - 1, math.ceil(_SAFE * len(ordered)))])
     for _ in range(_REFINED):
         if not math.isfinite(safe) or safe <= 0:
             return None, None

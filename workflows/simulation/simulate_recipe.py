@@ -89,13 +89,15 @@ def simulate(
     ):
         warnings.simplefilter("default")
         recipe = with_substitutions(recipe, wanted(recipe))
-        told, graph = explained(recipe, store, note), GraphAhead(beside, store, finished)
+        explained_run, graph = explained(recipe, store, note), GraphAhead(beside, store, finished)
 
         def show(*result: Any) -> None:
             beside(*result)
             graph(*result)
 
-        result = run(recipe, store, wanted(recipe), told, device, executor, memory, show, anew=anew)
+        result = run(
+            recipe, store, wanted(recipe), explained_run, device, executor, memory, show, anew=anew
+        )
         result = replace(
             result, done={name: finished.get(name, done) for name, done in result.done.items()}
         )

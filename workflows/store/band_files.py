@@ -129,13 +129,13 @@ class Blobs:
         data, kind = bytes_of(x), _kind(x.dtype, tuple(x.shape), name)
         kind = _signed(kind, signature("band", name, _sha256(data, kind)) if secrets() else "")
         xxh3 = _checksum(data, kind)
-        with self._disk.temporary(name) as (part, file):
+        with self._disk.temporary(name) as (temporary, file):
             for piece in (data, kind, xxh3.encode(), len(kind).to_bytes(4, "little")):
                 file.write(piece)
             file.flush()
             if len(data) > _SMALL:
                 os.fsync(file.fileno())
-            return self._named(name, part) or xxh3
+            return self._named(name, temporary) or xxh3
 
     def write_all(self, names: Sequence[str], slices: Sequence[Tensor]) -> list[str]:
         """Write several bands in parallel, because a disk syncs many files in little more time
@@ -144,16 +144,16 @@ class Blobs:
         with ThreadPoolExecutor(_WRITERS) as pool:
             return list(pool.map(self.write, names, slices))
 
-    def _named(self, name: str, part: str) -> str | None:
+    def _named(self, name: str, temporary: str) -> str | None:
         """Rename a complete temporary file to the name of its band, or return the checksum of
         the file of that name.
         """
         self._disk.make_folder(self._folder)
-        if name in self._lost or not self._disk.link(part, self.path(name)):
+        if name in self._lost or not self._disk.link(temporary, self.path(name)):
             if name not in self._lost:
                 with suppress(Damaged):
                     return self.about(name).xxh3
-            self._disk.rename(part, self.path(name))
+            self._disk.rename(temporary, self.path(name))
             self._lost.discard(name)
         return None
 
@@ -212,8 +212,8 @@ class Blobs:
         for i, (name, blob) in enumerate(zip(names, expected, strict=True)):
             try:
                 with open(self.path(name), "rb", opener=open_now) as file:
-                    at = address and address + i * size
-                    _load(file, blob, into[i * size : (i + 1) * size], at, verify)
+                    start = address and address + i * size
+                    _load(file, blob, into[i * size : (i + 1) * size], start, verify)
             except (OSError, *_UNREADABLE) as error:
                 if address is not None and not isinstance(error, _UNREADABLE):
                     raise
@@ -335,12 +335,12 @@ def _load(
     copied = address is None or may_change(file.fileno())
     # a map is looked into once the file was read: where a device fails, a read raises an error and
     # ends no process
-    found = "" if copied or not verify else _checksum_read(file, blob.nbytes, kind)
+    checksum = "" if copied or not verify else _checksum_read(file, blob.nbytes, kind)
     if address is not None:
         _map(None if copied else file.fileno(), address, blob.nbytes)
     if copied and file.readinto(into) != len(into):
         raise ValueError("the band file was truncated while it was read")
-    if verify and (found or _checksum(into, kind)) != blob.xxh3:
+    if verify and (checksum or _checksum(into, kind)) != blob.xxh3:
         raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
     if secrets():
         plain = _kind(blob.dtype, blob.shape, blob.name)

@@ -65,7 +65,7 @@ class DerivedFiles:
                 return path
         return None
 
-    def keep(self, key: str, suffix: str, what: str, write: Callable[[Path], None]) -> Path:
+    def keep(self, key: str, suffix: str, step: str, write: Callable[[Path], None]) -> Path:
         """Let ``write`` write a file beside its final path, rename the file, and store its
         checksum; return its path.
 
@@ -73,7 +73,7 @@ class DerivedFiles:
         written into a temporary folder.
         """
         try:
-            path, found = self._compared(key, suffix, write)
+            path, digest = self._compared(key, suffix, write)
         except OSError as error:
             self.store.report_failure(error)
             with self._failing:
@@ -81,15 +81,15 @@ class DerivedFiles:
                     self._spare = mkdtemp(prefix="neusee-")
                     weakref.finalize(self, _remove, self._spare, os.getpid())
                 self.folder = Path(self._spare)
-            path, found = self._compared(key, suffix, write)
+            path, digest = self._compared(key, suffix, write)
         about = {
-            "step": what,
+            "step": step,
             "seconds": 0.0,
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "file": path.name,
             "file_bytes": path.stat().st_size,
         }
-        self.store.put(key, found, about)
+        self.store.put(key, digest, about)
         self._fresh[path] = _state(path)
         return path
 
@@ -108,13 +108,13 @@ class DerivedFiles:
     def _written(self, key: str, suffix: str, write: Callable[[Path], None]) -> Path:
         path = self._path(key, suffix)
         make_folders(str(path.parent), str(self.store.root))
-        part = path.with_name(f".{key}.{os.getpid()}{suffix}")
+        temporary = path.with_name(f".{key}.{os.getpid()}{suffix}")
         try:
-            write(part)
-            part.chmod(0o444)
-            part.replace(path)
+            write(temporary)
+            temporary.chmod(0o444)
+            temporary.replace(path)
         finally:
-            part.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
         return path
 
 
@@ -129,21 +129,21 @@ def _state(path: Path) -> tuple[int, ...]:
     return about.st_ino, about.st_size, about.st_mtime_ns
 
 
-def _is_right(path: Path, kept: Tensor) -> bool:
+def _is_right(path: Path, stored_digest: Tensor) -> bool:
     """Return True if a file has the digest that was stored: SHA-256, or the faster xxh3 where
     nothing is signed.
     """
     import torch
 
-    signed = len(kept) == _SHA256
+    signed = len(stored_digest) == _SHA256
     return (signed or not secrets()) and torch.equal(
-        kept, _digest(path, "sha256" if signed else _FAST)
+        stored_digest, _digest(path, "sha256" if signed else _FAST)
     )
 
 
-def _digest(path: Path, how: Any) -> Tensor:
+def _digest(path: Path, algorithm: Any) -> Tensor:
     """Return a digest of a file as bytes."""
     import torch
 
     with open(path, "rb", opener=open_now) as file:
-        return torch.tensor(list(hashlib.file_digest(file, how).digest()), dtype=torch.uint8)
+        return torch.tensor(list(hashlib.file_digest(file, algorithm).digest()), dtype=torch.uint8)

@@ -77,16 +77,16 @@ def evict(
     """Delete stored values until ``excess`` bytes are freed; return the deleted and the
     undeletable values.
     """
-    left, gone, refused = {c.key: c for c in among}, list[Candidate](), list[Candidate]()
+    left, deleted, refused = {c.key: c for c in among}, list[Candidate](), list[Candidate]()
     while excess > 0 and (batch := chosen(left.values(), excess)):
         for candidate in batch:
             del left[candidate.key]
             if dry or drop(disk, candidate.key):
-                gone.append(candidate)
+                deleted.append(candidate)
                 excess -= candidate.size
             else:
                 refused.append(candidate)
-    return gone, refused
+    return deleted, refused
 
 
 class CacheBudget:
@@ -248,17 +248,17 @@ def sweep(disk: Disk, dry: bool = False) -> list[tuple[str, int]]:
     """
     if not os.path.isdir(disk.folder):
         return []
-    gone = disk.sweep(dry, _WEEK) if os.path.isdir(f"{disk.folder}/tmp") else []
+    swept = disk.sweep(dry, _WEEK) if os.path.isdir(f"{disk.folder}/tmp") else []
     for find in (_not_read, _payloads, bands, _files, _damaged):
-        gone += removed(disk, find, dry)
-    return gone
+        swept += removed(disk, find, dry)
+    return swept
 
 
 def removed(disk: Disk, find: Find, dry: bool) -> list[tuple[str, int]]:
     """Remove the files that ``find`` yields, or only list them if ``dry``; return the path and
     size of each file.
     """
-    gone = []
+    deleted = []
     with suppress(OSError):
         orphans = list(find(disk))  # without the lock; ``find`` decides again under the lock
         if dry or not orphans:
@@ -268,8 +268,8 @@ def removed(disk: Disk, find: Find, dry: bool) -> list[tuple[str, int]]:
                 with suppress(OSError):
                     size = entry.stat(follow_symlinks=False).st_size
                     disk.unlink(entry.path)
-                    gone.append((entry.path, size))
-    return gone
+                    deleted.append((entry.path, size))
+    return deleted
 
 
 def _not_read(disk: Disk) -> Iterator[os.DirEntry[str]]:
@@ -420,13 +420,13 @@ class Maintained(Protocol):
         uncounted = (f"{self.disk.folder}/tmp/", f"{self.disk.folder}/bad/")
         outside = sum(size for path, size in orphans.items() if path.startswith(uncounted))
         left = before - (sum(orphans.values()) - outside)
-        gone, refused = self.make_room(left - budget, dry) if budget is not None else ([], [])
-        after = left - sum(c.size for c in gone) if dry or not gone else total(self.disk)
+        deleted, refused = self.make_room(left - budget, dry) if budget is not None else ([], [])
+        after = left - sum(c.size for c in deleted) if dry or not deleted else total(self.disk)
         if not dry:
             self.journal.compact()
         freed = max(before - after, 0) + outside
         return Swept(
-            tuple(c.key for c in gone), tuple(c.key for c in refused), freed, len(orphans), after
+            tuple(c.key for c in deleted), tuple(c.key for c in refused), freed, len(orphans), after
         )
 
     def make_room(
@@ -437,14 +437,14 @@ class Maintained(Protocol):
         """
         if excess <= 0:
             return [], []
-        gone, refused = evict(
+        deleted, refused = evict(
             self.disk, candidates(self.disk, self.pinned(), self.read_seconds), excess, dry
         )
-        if gone and not dry:
+        if deleted and not dry:
             removed(self.disk, bands, dry)
-            for candidate in gone:
+            for candidate in deleted:
                 self._known.pop(candidate.key, None)
-        return gone, refused
+        return deleted, refused
 
     def check(self) -> Iterator[Checked]:
         """Yield the outcome of a check of every stored result; move damaged results to the folder

@@ -85,7 +85,7 @@ class Journal:
 
         The time that this takes does not grow with the number of results.
         """
-        self._read(whole=False)
+        self._read(all_lines=False)
         return self._rows
 
     def totals(self) -> tuple[int, int, int]:
@@ -96,9 +96,9 @@ class Journal:
         """
         newest = dict[bytes, tuple[int, bool]]()
         with suppress(OSError), open(self._path, "rb", opener=_opened) as file:
-            for key, size, kept in _TOTALS.findall(file.read()):
-                newest[key] = int(size or 0), kept == b"true"
-        sizes = [size for size, kept in newest.values() if kept]
+            for key, size, mark in _TOTALS.findall(file.read()):
+                newest[key] = int(size or 0), mark == b"true"
+        sizes = [size for size, has_value in newest.values() if has_value]
         return len(sizes), sum(sizes), len(newest) - len(sizes)
 
     def is_long(self) -> bool:
@@ -131,8 +131,8 @@ class Journal:
             lines = list[tuple[int, str, bytes]]()
             for key in metadata.names(self._disk):
                 with suppress(*metadata.UNREADABLE):
-                    kept = NO_VALUE not in read_file(self._disk.path(key, "json"))
-                    lines.append((place.get(key, -1), *self._line(key, newest.get(key), kept)))
+                    has_value = NO_VALUE not in read_file(self._disk.path(key, "json"))
+                    lines.append((place.get(key, -1), *self._line(key, newest.get(key), has_value)))
             for key, about in self._others():
                 raw = newest.get(key) or seal_record("journal", row_of(key, about))
                 lines.append((place.get(key, -1), str(about.get("date")), raw))
@@ -155,40 +155,40 @@ class Journal:
                     newest[key] = line
         return newest
 
-    def _line(self, key: str, line: bytes | None, kept: bool) -> tuple[str, bytes]:
+    def _line(self, key: str, line: bytes | None, has_value: bool) -> tuple[str, bytes]:
         """Return the date and the line of a result, which is ``line`` if that is right."""
-        if line is not None and kept == (NO_VALUE not in line):
+        if line is not None and has_value == (NO_VALUE not in line):
             return "", line
         row = (
             row_of(key, metadata.read(self._disk, key))
             if line is None
             else unseal_record("journal", line)
         )
-        return str(row["date"]), seal_record("journal", {**row, "kept": kept})
+        return str(row["date"]), seal_record("journal", {**row, "kept": has_value})
 
     def _forget(self) -> None:
         self._rows = []
         self._head, self._offset, self._fileless, self._whole = b"", 0, False, True
 
-    def _read(self, whole: bool = True) -> None:
+    def _read(self, all_lines: bool = True) -> None:
         with self._guard:
-            if whole and not self._whole:
+            if all_lines and not self._whole:
                 self._forget()
             if not self._fileless:
-                self._read_new_lines(whole)
+                self._read_new_lines(all_lines)
 
-    def _read_new_lines(self, whole: bool) -> None:
+    def _read_new_lines(self, all_lines: bool) -> None:
         """Read the lines added to the journal file since the last call; rebuild a missing or
         damaged file.
 
-        If ``whole`` is False, the first call reads the end of the file alone.
+        If ``all_lines`` is False, the first call reads the end of the file alone.
         """
         try:
             with open(self._path, "rb", opener=_opened) as file:
                 head = file.readline(100).strip()
                 if head != self._head or os.fstat(file.fileno()).st_size < self._offset:
                     self._forget()
-                start = self._offset or self._first_byte(file, len(head), whole)
+                start = self._offset or self._first_byte(file, len(head), all_lines)
                 file.seek(start)
                 raw = file.read()
         except FileNotFoundError:
@@ -206,12 +206,12 @@ class Journal:
         ):
             self._replace(list({row["key"]: row for row in self._rows}.values()))
 
-    def _first_byte(self, file: BinaryIO, head: int, whole: bool) -> int:
+    def _first_byte(self, file: BinaryIO, head: int, all_lines: bool) -> int:
         """Return where the first read begins: after the first line, or at the start of a line
         near the end.
         """
         size = os.fstat(file.fileno()).st_size
-        if whole or size - head <= _LATEST:
+        if all_lines or size - head <= _LATEST:
             return head
         self._whole = False
         file.seek(size - _LATEST)
@@ -258,13 +258,13 @@ def _is_row(row: Row) -> bool:
     if not row.keys() >= _NAMES:
         return False
     key, node = row["key"], row["node"]
-    known = (
+    is_valid = (
         isinstance(key, str)
         and key.isalnum()
         and (node is None or is_text(node))
         and row["kept"] is not None
     )
-    return known and all(row[name] is None or is_right(row[name]) for name, is_right in _CHECKED)
+    return is_valid and all(row[name] is None or is_right(row[name]) for name, is_right in _CHECKED)
 
 
 def _opened(path: str, flags: int) -> int:

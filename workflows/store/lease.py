@@ -85,11 +85,11 @@ class Leases:
         try:
             return self._taken(path)
         except FileExistsError:
-            seen = _look(path)
-        if seen is not None and not self._dead(path, seen):
+            look = _look(path)
+        if look is not None and not self._dead(path, look):
             return None
         try:
-            return self._taken_over(key, path, seen)
+            return self._taken_over(key, path, look)
         except FileExistsError:
             return None
 
@@ -106,25 +106,25 @@ class Leases:
                 os.link(_badge(self._disk), path)
         return self._kept(path)
 
-    def _taken_over(self, key: str, path: str, seen: tuple[object, ...] | None) -> Lease:
+    def _taken_over(self, key: str, path: str, look: tuple[object, ...] | None) -> Lease:
         """Take over the lease of a process that has ended, under the lock of the store.
 
         Raises `FileExistsError` if another process was first.
         """
-        part = f"{self._disk.folder}/tmp/{key}.{me()}.{threading.get_ident()}"
+        temporary = f"{self._disk.folder}/tmp/{key}.{me()}.{threading.get_ident()}"
         with self._disk.lock():
             now = _look(path)
-            if now is not None and (seen is None or now[:2] != seen[:2]):
+            if now is not None and (look is None or now[:2] != look[:2]):
                 raise FileExistsError(path)
             with _guard:
                 # fails for the later of two observers
-                os.link(_badge(self._disk), path if now is None else part)
+                os.link(_badge(self._disk), path if now is None else temporary)
             try:
                 if now is not None:
-                    os.replace(part, path)
+                    os.replace(temporary, path)
             finally:
                 with suppress(OSError):
-                    os.unlink(part)
+                    os.unlink(temporary)
         self._disk.sweep()
         return self._kept(path)
 
@@ -139,15 +139,15 @@ class Leases:
                 _thread.start()
         return lease
 
-    def _dead(self, path: str, seen: tuple[object, ...]) -> bool:
-        owner = owner_of(str(seen[0]).partition(" ")[0])
+    def _dead(self, path: str, look: tuple[object, ...]) -> bool:
+        owner = owner_of(str(look[0]).partition(" ")[0])
         state = owner.state if owner else "foreign"
         if state != "foreign":
             return state == "dead"
         now = time.monotonic()
         before, since = self._seen.get(path, (None, now))
-        self._seen[path] = (seen, since if before == seen else now)
-        return before == seen and now - since > WINDOW
+        self._seen[path] = (look, since if before == look else now)
+        return before == look and now - since > WINDOW
 
 
 def _look(path: str) -> tuple[object, ...] | None:

@@ -47,12 +47,12 @@ def checked_layout(layout: Any) -> dict[str, str]:
         item, depth = todo.pop()
         if not isinstance(item, dict) or depth > DEEPEST:
             raise ValueError("the layout of the value is not a tree of mappings, or is too deep")
-        known = [kind for kind in _KINDS if kind in item]
-        if len(known) != 1 or len(item) != 1 + ("class" in item):
+        kinds = [kind for kind in _KINDS if kind in item]
+        if len(kinds) != 1 or len(item) != 1 + ("class" in item):
             raise OtherFormat(
                 f"its layout has a kind that is not known: {', '.join(map(str, item))[:80]}"
             )
-        todo += [(inner, depth + 1) for inner in _inner(known[0], item, bands)]
+        todo += [(inner, depth + 1) for inner in _inner(kinds[0], item, bands)]
     return bands
 
 
@@ -154,11 +154,13 @@ def is_number(value: Any) -> bool:
 
 
 def _is_payload(value: Any) -> bool:
-    known = (
+    is_payload = (
         isinstance(value, dict) and is_count(value.get("size")) and is_checksum(value.get("xxh3"))
     )
-    sha256, stamp = (value.get("sha256", ""), value.get("stamp", [])) if known else (None, None)
-    return known and isinstance(sha256, str) and isinstance(stamp, list)
+    sha256, stamp = (
+        (value.get("sha256", ""), value.get("stamp", [])) if is_payload else (None, None)
+    )
+    return is_payload and isinstance(sha256, str) and isinstance(stamp, list)
 
 
 def _is_inline(value: Any) -> bool:
@@ -309,12 +311,12 @@ def write(disk: Disk, key: str, about: Metadata, over: bool) -> bool:
     False.
     """
     path = disk.path(key, "json")
-    with disk.temporary(key) as (part, file):
+    with disk.temporary(key) as (temporary, file):
         file.write(seal_record("result", about))
         file.flush()  # without a sync to disk, because torn metadata fail their checksum
-        linked = disk.link(part, path)
+        linked = disk.link(temporary, path)
         if over and not linked:
-            disk.rename(part, path)
+            disk.rename(temporary, path)
     return over or linked
 
 
@@ -397,16 +399,16 @@ def names(disk: Disk) -> Iterator[str]:
     link.
     """
     for folder in _folders(disk):
-        found = (entry.name.rpartition(".") for entry in entries(folder.path))
+        files = (entry.name.rpartition(".") for entry in entries(folder.path))
         yield from sorted(
-            key for key, _, suffix in found if suffix == "json" and key[:2] == folder.name
+            key for key, _, suffix in files if suffix == "json" and key[:2] == folder.name
         )
 
 
 def _folders(disk: Disk) -> list[os.DirEntry[str]]:
-    found = [entry for entry in entries(disk.folder) if _TOP.fullmatch(entry.name)]
+    matching = [entry for entry in entries(disk.folder) if _TOP.fullmatch(entry.name)]
     return sorted(
-        (entry for entry in found if entry.is_dir(follow_symlinks=False)),
+        (entry for entry in matching if entry.is_dir(follow_symlinks=False)),
         key=lambda entry: entry.name,
     )
 

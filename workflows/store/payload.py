@@ -80,24 +80,35 @@ def load(
     """
     from neusee.workflows.store import serialization
 
-    payload, bands = about["payload"], about.get("bands")
+    bands = about.get("bands")
     check = verify == "always" or (verify == "sampled" and _draw.random() < _SAMPLED)
     tensors, compared = [serialization.from_text(*t) for t in about.get("tensors") or ()], 0
-    if payload:
-        path = disk.path(about["key"], "safetensors")
-        stamp = stamp_of(path)
-        if stamp[1] != payload["size"]:
-            raise ValueError(
-                f"the file of tensors has {stamp[1]} bytes instead of {payload['size']} bytes"
-            )
-        due = check or (verify == "sampled" and stamp != payload.get("stamp"))
-        # whatever ``verify`` says: the checksum has no key
-        sha256 = (payload.get("sha256", ""),) if secrets() else ()
-        tensors = serialization.read(path, payload["xxh3"] if due else None, *sha256)
-        compared = payload["size"] if due else 0
+    if about["payload"]:
+        tensors, compared = _tensors_of_file(disk, about, verify, check)
     if bands and verify == "sampled" and not check:
         check = newest(blobs, bands["names"]) > bands["newest"]
     return serialization.unpack(about["layout"], tensors, blobs, check, typed), compared
+
+
+def _tensors_of_file(
+    disk: Disk, about: Metadata, verify: str, check: bool
+) -> tuple[list[Tensor], int]:
+    """Return the tensors in the file of a value, and the number of bytes compared with the
+    checksum: all if ``check``, or if the file is not the one that was written.
+    """
+    from neusee.workflows.store import serialization
+
+    payload, path = about["payload"], disk.path(about["key"], "safetensors")
+    stamp = stamp_of(path)
+    if stamp[1] != payload["size"]:
+        raise ValueError(
+            f"the file of tensors has {stamp[1]} bytes instead of {payload['size']} bytes"
+        )
+    due = check or (verify == "sampled" and stamp != payload.get("stamp"))
+    # whatever ``verify`` says: the checksum has no key
+    sha256 = payload.get("sha256", "") if secrets() else None
+    tensors = serialization.read(path, payload["xxh3"] if due else None, sha256)
+    return tensors, payload["size"] if due else 0
 
 
 def check_kind(value: Any, kind: Any) -> None:
@@ -231,14 +242,16 @@ class SmallResults:
         The new file has at most half of `MOST` bytes.
         """
         self._read_new_lines()
-        kept, size = list[bytes](), 0
+        newest_lines, size = list[bytes](), 0
         for raw in reversed(self._lines.values()):
             size += len(raw) + 1
             if size > MOST // 2:
                 break
-            kept.append(raw)
+            newest_lines.append(raw)
         with suppress(OSError):
-            self._disk.replace("brief.jsonl", b"".join(b"\n" + raw for raw in reversed(kept)))
+            self._disk.replace(
+                "brief.jsonl", b"".join(b"\n" + raw for raw in reversed(newest_lines))
+            )
 
     def _write(self, raw: bytes, flags: int = 0) -> None:
         """Append a line break and a line to the file, so that an incomplete line of a killed
@@ -264,13 +277,13 @@ class SmallResults:
                 self._lines, self._offset = {}, 0
             file.seek(self._offset)
             raw = file.read()
-            whole = raw.rfind(b"\n") if not raw.endswith(b"}") else len(raw)
-            for line in raw[:whole].split(b"\n"):
+            end = raw.rfind(b"\n") if not raw.endswith(b"}") else len(raw)
+            for line in raw[:end].split(b"\n"):
                 if line.startswith(_HEAD):
                     key = line[_KEY].decode(errors="replace")
                     if key.isalnum():  # it may be a part of a path
                         self._lines.pop(key, None)  # keep the newest line last
                         self._lines[key] = line
-            self._file, self._offset = os.fstat(file.fileno()).st_ino, self._offset + max(0, whole)
+            self._file, self._offset = os.fstat(file.fileno()).st_ino, self._offset + max(0, end)
         if self._offset > MOST:
             self.compact()

@@ -67,12 +67,12 @@ class FolderAtUrl:
 
     def ls(self, path: str, detail: bool = False) -> list[Any]:
         """Return the paths in a folder, with ``detail`` each with its time of last change."""
-        with os.scandir(path) as found:
+        with os.scandir(path) as entries:
             if not detail:
-                return [entry.path for entry in found]
+                return [entry.path for entry in entries]
             return [
-                {"name": each.path, "mtime": each.stat(follow_symlinks=False).st_mtime}
-                for each in found
+                {"name": entry.path, "mtime": entry.stat(follow_symlinks=False).st_mtime}
+                for entry in entries
             ]
 
     def cat_file(self, path: str) -> bytes:
@@ -274,12 +274,12 @@ class RemoteFiles:
         def whole() -> int:
             if not self._renames:
                 return put(self._path(name))
-            part = f"{self._root}/tmp/{uuid.uuid4().hex}"
+            temporary = f"{self._root}/tmp/{uuid.uuid4().hex}"
             self._folder(f"{self._root}/tmp")
             self._folder(f"{self._root}/{name[:2]}")
-            size = put(part)
+            size = put(temporary)
             if size >= 0:
-                self._fs.mv(part, self._path(name))
+                self._fs.mv(temporary, self._path(name))
             return size
 
         size = self._attempt("up", whole, int)
@@ -341,12 +341,12 @@ class RemoteFiles:
             return  # a folder in the place of one file
         # a file that cannot be written may be readable
         alone = isinstance(error, PermissionError | FileNotFoundError)
-        for each in (direction,) if alone else _DIRECTIONS:
-            self._resume[each] = time.monotonic() + self._pause[each]
-            self._pause[each] *= 2
-        what = "read" if direction == "down" else "written"
+        for way in (direction,) if alone else _DIRECTIONS:
+            self._resume[way] = time.monotonic() + self._pause[way]
+            self._pause[way] *= 2
+        action = "read" if direction == "down" else "written"
         self.warn(
-            f"{self.url} cannot be {what} ({type(error).__name__}: {error}): results are stored"
+            f"{self.url} cannot be {action} ({type(error).__name__}: {error}): results are stored"
             " only locally"
         )
 
@@ -382,11 +382,11 @@ def _file_system(url: str) -> tuple[Any, str]:
     except ImportError as error:
         raise ModuleNotFoundError(f"a store at {url} needs one more package: {error}") from error
     except ValueError as error:
-        known, scheme = fsspec.available_protocols(), url.partition("://")[0]
-        if scheme in known:
+        schemes, scheme = fsspec.available_protocols(), url.partition("://")[0]
+        if scheme in schemes:
             raise
         raise ValueError(
-            f"no file system has the scheme {scheme}:// of {url}; {nearest(scheme, known)}"
+            f"no file system has the scheme {scheme}:// of {url}; {nearest(scheme, schemes)}"
         ) from error
     path = str(path).rstrip("/")
     if file_system.protocol in ("file", "local", ("file", "local")):
@@ -503,11 +503,11 @@ class RemoteStore(Store):
         for key, about in super().entries():
             here.add(key)
             yield key, about
-        there = sorted(
+        at_url = sorted(
             {name.partition(".")[0] for name in self._remote.names() if ".json" in name} - here
         )
         with ThreadPoolExecutor(16) as pool:
-            for key, remote in zip(there, pool.map(self._remote_metadata, there), strict=True):
+            for key, remote in zip(at_url, pool.map(self._remote_metadata, at_url), strict=True):
                 if remote is not None:
                     yield key, remote
 
@@ -574,8 +574,10 @@ class RemoteStore(Store):
         payload, bands = about["payload"], blobs_in(about["layout"])
         missing = {name: xxh3 for name, xxh3 in bands.items() if not self.blobs.has(name)}
         with ExitStack() as files:
-            part, *parts = (self._part(files, name) for name in (key, *missing))
-            if payload and not self._fetched(_payload_name(key, payload["xxh3"]), part, payload):
+            payload_file, *parts = (self._part(files, name) for name in (key, *missing))
+            if payload and not self._fetched(
+                _payload_name(key, payload["xxh3"]), payload_file, payload
+            ):
                 return False
             with ThreadPoolExecutor(16) as pool:
                 if not all(
@@ -585,48 +587,48 @@ class RemoteStore(Store):
             with self.disk.lock():
                 if not self._is_local(key):
                     self._named(dict(zip(missing, parts, strict=True)), bands)
-                    self._described(key, about, part)
+                    self._described(key, about, payload_file)
         self.journal.append(key, about)
         return True
 
     def _part(self, files: ExitStack, name: str) -> str:
-        part, file = files.enter_context(self.disk.temporary(name))
+        path, file = files.enter_context(self.disk.temporary(name))
         file.close()
-        return part
+        return path
 
     def _named(self, parts: dict[str, str], bands: dict[str, str]) -> None:
         """Give band files that were copied from the URL their final names; raise `ValueError`
         for a wrong checksum.
         """
-        for name, part in parts.items():
+        for name, copied in parts.items():
             self.disk.make_folder(str(self.blobs.root))
-            self.disk.link(part, self.blobs.path(name))
+            self.disk.link(copied, self.blobs.path(name))
         for name, xxh3 in bands.items():
             blob = self.blobs.about(name)
             self.blobs.read([name], (1, *blob.shape), blob.dtype, xxh3=[xxh3])
 
-    def _described(self, key: Key, about: Metadata, part: str) -> None:
+    def _described(self, key: Key, about: Metadata, copied: str) -> None:
         """Give the copied file of tensors of a value its final name, and write the metadata with
         local time stamps.
         """
         about = dict(about)
         if about["payload"]:
             path = self.disk.path(key, "safetensors")
-            self.disk.rename(part, path)
+            self.disk.rename(copied, path)
             about["payload"] = {**about["payload"], "stamp": stamp_of(path)}
         if names := about.get("bands", {}).get("names"):
             about["bands"] = {"names": names, "newest": newest(self.blobs, names)}
         self._write_about(key, about)
         self._lost.discard(key)
 
-    def _fetched(self, name: str, part: str, payload: Metadata) -> bool:
-        """Copy the file ``name`` from the URL to ``part``; return False if the copy fails.
+    def _fetched(self, name: str, path: str, payload: Metadata) -> bool:
+        """Copy the file ``name`` from the URL to ``path``; return False if the copy fails.
 
         Raises `ValueError` for a wrong checksum.
         """
-        if not self._remote.fetch(name, part):
+        if not self._remote.fetch(name, path):
             return False
-        with open(part, "rb") as file:
+        with open(path, "rb") as file:
             xxh3, size = hashlib.file_digest(file, xxhash.xxh3_128).hexdigest(), file.tell()
             os.fsync(file.fileno())
             file.seek(0)

@@ -137,12 +137,12 @@ class Warned:
         format or unsigned.
         """
         if not self._told:
-            what = (
+            reason = (
                 "without a signature by NEUSEE_CACHE_SECRET"
                 if isinstance(error, Unsigned)
                 else "of another version"
             )
-            text = f"results {what} in {self.root} are not read, and count as missing"
+            text = f"results {reason} in {self.root} are not read, and count as missing"
             warnings.warn(
                 f"{text}: `neusee cache gc` removes those that nobody used for a week", stacklevel=4
             )
@@ -402,7 +402,7 @@ class Store(Warned, Maintained):
         """Write the large files of a value, then the metadata that name the files; keep a value
         stored earlier.
         """
-        with self.disk.temporary(key) as (part, file):
+        with self.disk.temporary(key) as (temporary, file):
             if tensors:
                 entry["payload"] = payload.written(file, tensors)
             with self.disk.lock():
@@ -413,7 +413,7 @@ class Store(Warned, Maintained):
                     entry["bands"] = {"names": names, "newest": payload.newest(self.blobs, names)}
                 if tensors:
                     path = self.disk.path(key, "safetensors")
-                    self.disk.rename(part, path)
+                    self.disk.rename(temporary, path)
                     entry["payload"]["stamp"] = payload.stamp_of(path)
                 self._write_about(key, entry)
 
@@ -490,10 +490,10 @@ def compute_once(
     `Store.put_small`.
     """
     with suppress(KeyError):
-        kept = store.get(key, dict if is_dataclass(kind) else kind)
+        stored = store.get(key, dict if is_dataclass(kind) else kind)
         make: Callable[..., T] = kind
         try:
-            return make(**kept) if is_dataclass(kind) else make(kept)
+            return make(**stored) if is_dataclass(kind) else make(stored)
         except (TypeError, ValueError) as error:  # a value with other fields
             store.put_aside(key, error)
     began = time.perf_counter()

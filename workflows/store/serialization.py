@@ -95,7 +95,7 @@ def fits(value: Any, kind: Any) -> bool:
     if origin is typing.Annotated:
         return fits(value, inner[0])
     if origin in (typing.Union, types.UnionType):
-        return any(fits(value, each) for each in inner)
+        return any(fits(value, alternative) for alternative in inner)
     if origin in (list, dict) or (origin is tuple and not hasattr(value, "_fields")):
         return isinstance(value, origin) and _items_fit(value, origin, inner)
     if kind is None or kind is types.NoneType:
@@ -150,12 +150,12 @@ def _annotated(node: Node) -> Iterator[Any]:
 
 def _add(kind: Any) -> None:
     """Add a type and the types in its parts, if they are named tuples."""
-    todo, seen = [kind], set[int]()
+    todo, visited = [kind], set[int]()
     while todo:
         kind = todo.pop()
-        if id(kind) in seen:
+        if id(kind) in visited:
             continue
-        seen.add(id(kind))
+        visited.add(id(kind))
         todo += get_args(kind)
         if _is_named_tuple(kind):
             _types[type_name(kind)] = kind
@@ -418,10 +418,10 @@ def _class_name(item: tuple[Any, ...]) -> str:
     """
     kind = type(item)
     if not is_registered(kind):
-        known = (
+        advice = (
             "annotate the node's result with it" if hasattr(item, "_fields") else "use a NamedTuple"
         )
-        raise TypeError(f"{kind.__module__}.{kind.__qualname__} cannot be stored: {known}")
+        raise TypeError(f"{kind.__module__}.{kind.__qualname__} cannot be stored: {advice}")
     return type_name(kind)
 
 
@@ -447,10 +447,10 @@ def write(file: IO[bytes], tensors: list[Tensor], also: Any = None) -> str:
     ``also`` is a hash object of `hashlib` that receives the same bytes.
     """
     digest = xxhash.xxh3_128()
-    for part in _parts(tensors):
-        file.write(part)
-        for each in (digest, also) if also is not None else (digest,):
-            each.update(part)
+    for piece in _parts(tensors):
+        file.write(piece)
+        for hasher in (digest, also) if also is not None else (digest,):
+            hasher.update(piece)
     return digest.hexdigest()
 
 
@@ -488,8 +488,8 @@ def read(path: str, expected: str | None, sha256: str | None = None) -> list[Ten
     Compare the file with the checksum ``expected`` and the digest ``sha256`` if given. Raises
     `ValueError` for a file that differs, or that `write` did not write.
     """
-    wanted: list[tuple[Any, str | None]] = [(xxhash.xxh3_128, expected), (hashlib.sha256, sha256)]
-    digests = [function() for function, text in wanted if text is not None]
+    checks: list[tuple[Any, str | None]] = [(xxhash.xxh3_128, expected), (hashlib.sha256, sha256)]
+    digests = [function() for function, text in checks if text is not None]
     with open(path, "rb", buffering=0, opener=open_now) as file:
         if may_change(file.fileno()):
             data = _copied(file)
@@ -500,10 +500,10 @@ def read(path: str, expected: str | None, sha256: str | None = None) -> list[Ten
             # map ends the process
             digests_of(file, *digests)
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
-    found = [digest.hexdigest() for digest in digests]
-    if expected is not None and found[0] != expected:
+    hexdigests = [digest.hexdigest() for digest in digests]
+    if expected is not None and hexdigests[0] != expected:
         raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
-    if sha256 is not None and found[-1:] != [sha256]:
+    if sha256 is not None and hexdigests[-1:] != [sha256]:
         raise ValueError("the stored bytes are not those that were signed")
     start = 8 + int.from_bytes(data[:8], "little")
     header = json.loads(data[8:start]) if start <= len(data) else None
@@ -526,9 +526,9 @@ def digests_of(file: IO[bytes], *digests: Any) -> list[str]:
     """Return the digests of a file as texts, each of all its bytes, read piece by piece."""
     piece = memoryview(bytearray(_PIECE if digests else 0))
     while digests and (count := file.readinto(piece)):  # type: ignore[attr-defined]
-        for each in digests:
-            each.update(piece[:count])
-    return [each.hexdigest() for each in digests]
+        for digest in digests:
+            digest.update(piece[:count])
+    return [digest.hexdigest() for digest in digests]
 
 
 def _entry(data: Any, start: int, entry: Any, kind: Any) -> Tensor:

@@ -63,8 +63,8 @@ def owner_of(text: str) -> Owner | None:
     """Return the process that a text such as ``<host>-<number>-<start time>`` names, or None for
     any other text.
     """
-    host, _, rest = text.partition("-")
-    pid, _, began = rest.partition("-")
+    host, _, numbers = text.partition("-")
+    pid, _, began = numbers.partition("-")
     return (
         Owner(host, int(pid), began)
         if len(host) == 12 and pid.isdecimal() and len(pid) < 12
@@ -168,46 +168,46 @@ class Disk:
         caller renamed it.
         """
         self.prepare()
-        part = f"{self.folder}/tmp/{name}.{me()}.{next(_count)}"
+        path = f"{self.folder}/tmp/{name}.{me()}.{next(_count)}"
         try:
-            with open(part, "xb") as file:
-                self.share(part, 0o444)
-                yield part, file
+            with open(path, "xb") as file:
+                self.share(path, 0o444)
+                yield path, file
         finally:
             with suppress(OSError):
-                os.unlink(part)
+                os.unlink(path)
 
     def replace(self, name: str, raw: bytes) -> None:
         """Replace the shared file ``name`` in the root folder of the store by a file with the
         content ``raw``.
         """
-        with self.temporary(name) as (part, file):
+        with self.temporary(name) as (path, file):
             file.write(raw)
             file.flush()
-            self.share(part)
-            self.rename(part, f"{self.folder}/{name}")
+            self.share(path)
+            self.rename(path, f"{self.folder}/{name}")
 
-    def rename(self, part: str, path: str) -> None:
+    def rename(self, temporary: str, path: str) -> None:
         """Rename a complete file to its final name, and replace what has that name; a folder is
         put aside.
         """
         try:
-            os.replace(part, path)
+            os.replace(temporary, path)
         except FileNotFoundError:
             self.make_folder(os.path.dirname(path))
-            os.replace(part, path)
+            os.replace(temporary, path)
         except IsADirectoryError:
             self.put_aside(path)
-            os.replace(part, path)
+            os.replace(temporary, path)
 
-    def link(self, part: str, path: str) -> bool:
+    def link(self, temporary: str, path: str) -> bool:
         """Link a complete file to its final name; return False if a file of that name exists."""
         try:
             try:
-                os.link(part, path)
+                os.link(temporary, path)
             except FileNotFoundError:
                 self.make_folder(os.path.dirname(path))
-                os.link(part, path)
+                os.link(temporary, path)
         except FileExistsError:
             return False
         except OSError as error:
@@ -215,7 +215,7 @@ class Disk:
                 raise
             if os.path.lexists(path):
                 return False
-            os.replace(part, path)
+            os.replace(temporary, path)
         return True
 
     def make_folder(self, folder: str) -> None:
@@ -269,14 +269,14 @@ class Disk:
 
         Leases and badges of other machines stay for ``patience`` seconds, because clocks may jump.
         """
-        gone = []
+        swept = []
         for entry in entries(f"{self.folder}/tmp"):
             with suppress(OSError):
                 if entry.name != ".lock" and _abandoned(entry, patience):
-                    gone.append((entry.path, entry.stat(follow_symlinks=False).st_size))
+                    swept.append((entry.path, entry.stat(follow_symlinks=False).st_size))
                     if not dry:
                         self.unlink(entry.path)
-        return gone
+        return swept
 
     def unlink(self, path: str) -> None:
         """Delete a file below the root folder; raise `OSError` if a folder on the way there is a
@@ -309,9 +309,9 @@ class Disk:
             raise OSError(errno.EPERM, f"{path} is not below {self.folder}")
         opened = [os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY)]
         try:
-            for each in folders:
+            for folder in folders:
                 opened.append(
-                    os.open(each, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=opened[-1])
+                    os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=opened[-1])
                 )
             yield opened[-1], name
         finally:
@@ -340,8 +340,8 @@ def append(path: str, raw: bytes, flags: int = 0) -> int:
         os.close(file)
 
 
-def read_file(path: str, most: int = MOST_READ) -> bytes:
-    """Return the bytes of a file; raise `ValueError` for what is no file or has more than ``most``
+def read_file(path: str, limit: int = MOST_READ) -> bytes:
+    """Return the bytes of a file; raise `ValueError` for what is no file or has more than ``limit``
     bytes.
 
     A pipe or a device in place of the file never makes the caller wait.
@@ -349,15 +349,15 @@ def read_file(path: str, most: int = MOST_READ) -> bytes:
     file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         about = os.fstat(file)
-        if not stat.S_ISREG(about.st_mode) or about.st_size > most:
-            raise ValueError(f"{path} is not a file of at most {most} bytes")
+        if not stat.S_ISREG(about.st_mode) or about.st_size > limit:
+            raise ValueError(f"{path} is not a file of at most {limit} bytes")
         raw = os.read(file, about.st_size)
         while (
             len(raw) != about.st_size
-            and (more := os.read(file, most + 1 - len(raw)))
-            and len(raw) <= most
+            and (chunk := os.read(file, limit + 1 - len(raw)))
+            and len(raw) <= limit
         ):
-            raw += more
+            raw += chunk
         return raw
     finally:
         os.close(file)

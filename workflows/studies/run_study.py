@@ -71,5 +71,5 @@ def study_recipe(
 
 def count_failures(folder: Path) -> int:
     """Return the number of failed tests of a finished study, from its ``provenance.json``."""
-    found: dict[str, Any] = json.loads(text_of(folder / "provenance.json"))
-    return int(found.get("failed", 0))
+    document: dict[str, Any] = json.loads(text_of(folder / "provenance.json"))
+    return int(document.get("failed", 0))

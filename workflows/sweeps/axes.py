@@ -7,7 +7,7 @@ import itertools
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
 from fractions import Fraction
@@ -60,10 +60,13 @@ def values_of(text: str) -> list[str]:
     """Return the values of a list or a range as YAML texts; raise `ValueError` if the text is
     malformed.
     """
-    parts = split(text)
-    if len(parts) > 1 and not all(part.strip() for part in parts):
+    pieces = split(text)
+    if len(pieces) > 1 and not all(piece.strip() for piece in pieces):
         raise ValueError("a value is missing before or after a comma")
-    return [value for part in parts for value in _spanned(part)]
+    values = []
+    for piece in pieces:
+        values += _spanned(piece)
+    return values
 
 
 def spans(text: str) -> bool:
@@ -81,7 +84,7 @@ def _spanned(text: str) -> list[str]:
     name, arguments = function
     try:
         return _FUNCTIONS[name](
-            [part.strip() for part in split(arguments)] if arguments.strip() else []
+            [piece.strip() for piece in split(arguments)] if arguments.strip() else []
         )
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
@@ -167,21 +170,26 @@ def _count(count: int) -> int:
 
 def _numbers(texts: list[str]) -> tuple[list[Fraction], str]:
     """Return the numbers in ``texts`` as exact fractions, and their common unit."""
-    matches = [_NUMBER.fullmatch(text) for text in texts]
-    for text, match in zip(texts, matches, strict=True):
-        if match is None or not math.isfinite(float(match[1])):
-            raise ValueError(f"{text or 'nothing'} is not a number")
-    units = [(match[2] or "").strip() for match in matches if match]
-    if len(set(units)) > 1:
-        several = ", ".join(unit or "none" for unit in dict.fromkeys(units))
+    pairs = [_number(text) for text in texts]
+    units = list(dict.fromkeys(unit for _, unit in pairs))
+    if len(units) > 1:
+        several = ", ".join(unit or "none" for unit in units)
         raise ValueError(f"write all numbers in the same unit instead of {several}")
-    return [Fraction(repr(float(match[1]))) for match in matches if match], units[0]
+    return [number for number, _ in pairs], units[0]
+
+
+def _number(text: str) -> tuple[Fraction, str]:
+    """Return a number as an exact fraction, and its unit."""
+    match = _NUMBER.fullmatch(text)
+    if match is None or not math.isfinite(float(match[1])):
+        raise ValueError(f"{text or 'nothing'} is not a number")
+    return Fraction(repr(float(match[1]))), (match[2] or "").strip()
 
 
 def _written(number: Fraction, unit: str) -> str:
     value = float(number)
-    whole = value.is_integer() and abs(value) < _EXACT
-    return f"{int(value) if whole else value!r} {unit}".strip()
+    is_whole = value.is_integer() and abs(value) < _EXACT
+    return f"{int(value) if is_whole else value!r} {unit}".strip()
 
 
 # --- axes -----------------------------------------------------------------------------------------
@@ -374,25 +382,33 @@ def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Diagnostic]:
                 axis.name,
                 f"axis {axis.name} is also in {first[axis.name].mark}: remove one",
             )
-        twice = [
-            value
-            for value, count in Counter(c.shown for c in axis.coordinates).items()
-            if count > 1
-        ]
-        if twice:
-            yield Diagnostic(
-                axis.mark, axis.name, f"the value {twice[0]} appears twice on the axis: remove one"
-            )
-        there, here = len(axes[0].coordinates), len(axis.coordinates)
-        if paired and there != here:
-            text = f"has {here} values, and {axes[0].name} ({axes[0].mark}) has {there}"
-            yield Diagnostic(
-                axis.mark, axis.name, f"{text}: give paired axes the same number of values"
-            )
+        yield from _repeated(axis)
+        if paired:
+            yield from _unequal(axis, axes[0])
     product = 1 if paired else math.prod(len(axis.coordinates) for axis in axes)
     if product > MOST:
         yield Diagnostic(
             Location("sweep"), "", f"a sweep of {product} points is too long: at most {MOST} points"
+        )
+
+
+def _repeated(axis: Axis) -> Iterator[Diagnostic]:
+    """Yield the first value that an axis has twice."""
+    counts = Counter(c.shown for c in axis.coordinates)
+    twice = [value for value, count in counts.items() if count > 1]
+    if twice:
+        yield Diagnostic(
+            axis.mark, axis.name, f"the value {twice[0]} appears twice on the axis: remove one"
+        )
+
+
+def _unequal(axis: Axis, first: Axis) -> Iterator[Diagnostic]:
+    """Yield that an axis has another number of values than the first of paired axes, if it has."""
+    expected, count = len(first.coordinates), len(axis.coordinates)
+    if expected != count:
+        text = f"has {count} values, and {first.name} ({first.mark}) has {expected}"
+        yield Diagnostic(
+            axis.mark, axis.name, f"{text}: give paired axes the same number of values"
         )
 
 

@@ -55,8 +55,8 @@ def filled(costs: Mapping[str, float], steps: Iterable[str]) -> dict[str, float]
     known times, or 1.
     """
     steps = list(steps)
-    known = [costs[step] for step in steps if step in costs]
-    usual = median(known) if known else 1.0
+    times = [costs[step] for step in steps if step in costs]
+    usual = median(times) if times else 1.0
     return {step: costs.get(step, usual) for step in steps}
 
 
@@ -74,7 +74,7 @@ def best_order(
 
     If each axis changes a fixed set of steps, no other order recomputes less from point to point.
     """
-    weights = filled(costs, {step for job in jobs for step in job.keys})
+    weights = filled(costs, _steps(jobs))
     if paired:
         return _grouped(jobs, weights)
     sizes = [1 + max(job.place[n] for job in jobs) for n in range(len(jobs[0].place))]
@@ -84,18 +84,24 @@ def best_order(
     return [index[place] for place in _there_and_back(sizes, slowest_first)]
 
 
+def _steps(jobs: Iterable[PointJob]) -> set[str]:
+    """Return the names of all steps of jobs."""
+    return set[str]().union(*(job.keys for job in jobs))
+
+
 def sharing(jobs: Sequence[PointJob], costs: Mapping[str, float]) -> Sharing:
     """Count the different results of every step in a sweep, and sum the computing time with and
     without sharing.
     """
-    weights = filled(costs, {step for job in jobs for step in job.keys})
+    weights = filled(costs, _steps(jobs))
     different: dict[Key, float] = {}
     alone, steps = 0.0, 0
     for job in jobs:
         own = {key: weights[step] for step, key in job.keys.items()}
         different |= own
         alone, steps = alone + sum(own.values()), steps + len(own)
-    distinct = Counter(step for step, _ in {pair for job in jobs for pair in job.keys.items()})
+    pairs = set[tuple[str, Key]]().union(*(job.keys.items() for job in jobs))
+    distinct = Counter(step for step, _ in pairs)
     return Sharing(len(jobs), distinct, steps, len(different), alone, sum(different.values()))
 
 
@@ -109,15 +115,15 @@ def work_left(
     in_store = cache(stored)
     work = []
     for job in jobs:
-        weights, fresh, waiting = filled(costs, job.keys), list[float](), list(job.outputs)
+        weights, seconds, waiting = filled(costs, job.keys), list[float](), list(job.outputs)
         while waiting:
             name = waiting.pop()
             key = job.keys[name]
             if key not in computed and not in_store(key):
                 computed.add(key)
-                fresh.append(weights[name])
+                seconds.append(weights[name])
                 waiting += job.sources[name]
-        work.append(sum(fresh))
+        work.append(sum(seconds))
     return work
 
 

@@ -63,10 +63,11 @@ class KeptRecipe:
         ``same`` is given to each call for one ``first``: values found equal are not compared again.
         """
         same = same or Same()
+        names = (f.name for f in fields(Recipe))
         others = {
-            f.name: value
-            for f in fields(Recipe)
-            if (value := getattr(recipe, f.name)) is not getattr(first, f.name)
+            name: getattr(recipe, name)
+            for name in names
+            if getattr(recipe, name) is not getattr(first, name)
         }
         steps = _changed(recipe.steps, first.steps, same.steps)
         values = _changed(recipe.config.settings, first.config.settings, same.values)
@@ -105,12 +106,12 @@ def _changed(
     return changed
 
 
-def _equal(one: Any, other: Any) -> bool:
+def _equal(left: Any, right: Any) -> bool:
     """Return True for equal values that are also written alike, unlike 0.0 and -0.0, or 1, 1.0
     and True.
     """
     with suppress(Exception):  # values such as arrays, whose comparison has no single answer
-        return bool(one == other) and repr(one) == repr(other)
+        return bool(left == right) and repr(left) == repr(right)
     return False
 
 
@@ -218,12 +219,12 @@ def outcomes(
         return _found(plan, number, store, None, device, int(memory()))
 
     with closing(shared(alone, range(len(plan.checked)), workers, apart=True)) as ended:
-        for number, given in ended:
+        for number, returned in ended:
             checked, began = plan.checked[number], time.perf_counter()
-            if given is None:
+            if returned is None:
                 started(checked.point)
             try:
-                found = given[0] if given else _found(plan, number, store, watch, device)
+                outcome = returned[0] if returned else _found(plan, number, store, watch, device)
             except Exception as error:
                 seconds = time.perf_counter() - began
                 error.add_note(f"at point {checked.point.number}: {checked.point.shown}")
@@ -231,9 +232,9 @@ def outcomes(
                 if on_error == "stop":
                     raise
             else:
-                if found.failure:
-                    store.pass_on(found.failure)
-                yield PointOutcome(checked.point, *found[:3], left=clock.left(number))
+                if outcome.failure:
+                    store.pass_on(outcome.failure)
+                yield PointOutcome(checked.point, *outcome[:3], left=clock.left(number))
 
 
 class _Found(NamedTuple):
@@ -258,10 +259,13 @@ def _found(
     began = time.perf_counter()
     recipe = plan.checked[number].kept.recipe
     result = run(recipe, store, watch=watch, device=device, memory=memory, series=plan.series)
-    rows = (row for step, value in result.values.items() for row in numbers_of(step, value))
-    ran = any(step.state == "run" for step in result.done.values())
-    numbers = tuple((step, field, index, number) for step, field, index, number in rows)
-    return _Found("run" if ran else "cached", time.perf_counter() - began, numbers, store.failure)
+    numbers: list[ResultNumber] = []
+    for step, value in result.values.items():
+        rows = numbers_of(step, value)
+        numbers += [(name, field, index, number) for name, field, index, number in rows]
+    ran = any(done.state == "run" for done in result.done.values())
+    state: PointState = "run" if ran else "cached"
+    return _Found(state, time.perf_counter() - began, tuple(numbers), store.failure)
 
 
 def _failed(point: Point, error: Exception, seconds: float, left: float) -> PointOutcome:
@@ -275,11 +279,11 @@ def _failed(point: Point, error: Exception, seconds: float, left: float) -> Poin
 
 
 def _costs(store: Store) -> dict[str, float]:
-    known: dict[str, list[float]] = defaultdict(list)
+    times: dict[str, list[float]] = defaultdict(list)
     for row in store.journal.latest():
         if row["step"] and row["seconds"] is not None:
-            known[row["step"]].append(row["seconds"])
-    return {step: median(seconds) for step, seconds in known.items()}
+            times[row["step"]].append(row["seconds"])
+    return {step: median(seconds) for step, seconds in times.items()}
 
 
 class _Clock:
@@ -289,8 +293,8 @@ class _Clock:
 
     def __init__(self, work: Sequence[float]) -> None:
         # reading the numbers of a stored point also takes time
-        least = sum(work) / 100 / len(work) or 1.0
-        self.work = [max(one, least) for one in work]
+        shortest = sum(work) / 100 / len(work) or 1.0
+        self.work = [max(seconds, shortest) for seconds in work]
         self.todo, self.done, self.points = sum(self.work), 0.0, len(self.work)
         self.began = time.perf_counter()
 
@@ -342,10 +346,10 @@ class _Checker:
         for name in needed(recipe, recipe.outputs):
             step = recipe.steps[name]
             try:
-                found = self.series.known_keys.of(
-                    step, keys, recipe.seed, place(step, self.device)
-                )[0]
-                keys[name] = self._once(found)
+                key = self.series.known_keys.of(step, keys, recipe.seed, place(step, self.device))[
+                    0
+                ]
+                keys[name] = self._once(key)
             except (OSError, LookupError, TypeError) as error:
                 raise RecipeError([Diagnostic(step.mark, name, str(error))]) from error
         sources = tuple((name, recipe.steps[name].sources) for name in keys)

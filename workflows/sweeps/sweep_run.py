@@ -74,11 +74,11 @@ class Sweep:
         each point.
         """
         names = header(self.columns)
-        return [
-            dict(zip(names, row, strict=True))
-            for o in self.outcomes
-            for row in rows_of(o, self.columns)
-        ]
+        rows: list[dict[str, Any]] = []
+        for outcome in self.outcomes:
+            numbers = rows_of(outcome, self.columns)
+            rows += [dict(zip(names, row, strict=True)) for row in numbers]
+        return rows
 
     def table(self) -> str:
         """Return the results of the sweep as a text table, with one line for each point."""
@@ -194,9 +194,10 @@ def write_sweep(
     contains ``partial``.
     """
     name = f"{result.recipe}{'' if result.state == 'complete' else '_partial'}"
-    key = digest(
-        [checked.job.keys[name] for checked in work.plan.checked for name in checked.job.outputs]
-    )
+    keys: list[str] = []
+    for checked in work.plan.checked:
+        keys += [checked.job.keys[output] for output in checked.job.outputs]
+    key = digest(keys)
     with new_run(out / "sweeps", name, key) as folder:
         folder.write_rows(
             "sweep.csv", header(result.columns), (list(row.values()) for row in result.rows)
@@ -237,6 +238,6 @@ def counted(result: Sweep) -> str:
     parts = [
         f"{states.count(state)} {state}" for state in ("run", "cached", "failed") if state in states
     ]
-    rest = result.points - len(states)
-    parts += [f"{rest} not run"] if rest else []
+    missing = result.points - len(states)
+    parts += [f"{missing} not run"] if missing else []
     return f"{result.points} point{'s' * (result.points > 1)}: {', '.join(parts)}"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -44,23 +45,30 @@ def column(axis: Axis) -> AxisColumn:
     Words are unchanged.
     """
     values = [c.value for c in axis.coordinates]
-    quantities = [q for q in map(_quantity, values) if q is not None]
     header = f"{axis.name} (axis)" if axis.name in ("point", *AFTER) else axis.name
-    if len(quantities) == len(values) and len({q.si_unit for q in quantities}) == 1:
-        si, unit = tuple(q.si for q in quantities), quantities[0].si_unit
-        if len({q.unit for q in quantities}) > 1:
-            return AxisColumn(axis.name, f"{header} ({unit})", si, si, unit)
-        return AxisColumn(
-            axis.name,
-            f"{header} ({quantities[0].unit})",
-            tuple(q.number for q in quantities),
-            si,
-            unit,
-        )
+    quantities = _alike(values)
+    if quantities:
+        return _of_quantities(axis.name, header, quantities)
     if all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
         return AxisColumn(axis.name, header, tuple(values), tuple(map(float, values)), "")
     words = tuple(c.shown for c in axis.coordinates)
     return AxisColumn(axis.name, header, words, words, "")
+
+
+def _alike(values: Sequence[Any]) -> list[_Quantity]:
+    """Return the values as quantities if all are quantities of one SI unit, and else none."""
+    quantities = [q for q in map(_quantity, values) if q is not None]
+    one_unit = len({q.si_unit for q in quantities}) == 1
+    return quantities if one_unit and len(quantities) == len(values) else []
+
+
+def _of_quantities(name: str, header: str, quantities: Sequence[_Quantity]) -> AxisColumn:
+    """Return the column of quantities of one SI unit, in their own unit if all have the same."""
+    si, unit = tuple(q.si for q in quantities), quantities[0].si_unit
+    if len({q.unit for q in quantities}) > 1:
+        return AxisColumn(name, f"{header} ({unit})", si, si, unit)
+    numbers = tuple(q.number for q in quantities)
+    return AxisColumn(name, f"{header} ({quantities[0].unit})", numbers, si, unit)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,8 +117,8 @@ def headline(numbers: Sequence[ResultNumber]) -> dict[str, str]:
     Single numbers come first.
     """
     results: dict[str, list[float]] = {}
-    for step, part, _, value in numbers:
-        results.setdefault(f"{step}.{part}".rstrip("."), []).append(value)
+    for step, field, _, value in numbers:
+        results.setdefault(f"{step}.{field}".rstrip("."), []).append(value)
     return {
         name: _range_of(values)
         for name, values in sorted(results.items(), key=lambda item: len(item[1]) > 1)
@@ -122,7 +130,7 @@ def wide(outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> lis
     results.
     """
     results = [headline(outcome.numbers) for outcome in outcomes]
-    names = list(dict.fromkeys(name for result in results for name in result))
+    names = list(dict.fromkeys(itertools.chain.from_iterable(results)))
     rows = [["point", *(c.header for c in columns), *names, "state", "seconds"]]
     for outcome, result in zip(outcomes, results, strict=True):
         cells = [cell_text(cell) for cell in point_cells(outcome.point, columns)]
@@ -179,12 +187,8 @@ def dataset(
     import numpy
     import xarray
 
-    shape = (len(columns[0].si),) if paired else tuple(len(c.si) for c in columns)
-    dims = ("point",) if paired else tuple(c.name for c in columns)
-    coords = {
-        c.name: ("point" if paired else c.name, list(c.si), {"units": c.unit} if c.unit else {})
-        for c in columns
-    }
+    shape, dims = _shape(columns, paired)
+    coords = {c.name: _coordinate(c, paired) for c in columns}
     ran, seconds = numpy.zeros(shape, bool), numpy.full(shape, numpy.nan)
     arrays: dict[str, Any] = {}
     taken = {"ran", "seconds", *coords}
@@ -192,34 +196,53 @@ def dataset(
     for outcome in outcomes:
         place = outcome.point.place[:1] if paired else outcome.point.place
         seconds[place], ran[place] = outcome.seconds, outcome.state != "failed"
-        for step, part, index, value in outcome.numbers:
-            name = _variable(step, part, taken)
-            more = (long[name],) if name in long else ()
+        for name, index, value in _named(outcome, taken):
             if name not in arrays:
-                arrays[name] = numpy.full((*shape, *more), numpy.nan)
-            arrays[name][(*place, index or 0) if more else place] = value
-    results = {
-        name: ((*dims, f"{name} index") if name in long else dims, array)
-        for name, array in arrays.items()
-    }
+                size = (*shape, long[name]) if name in long else shape
+                arrays[name] = numpy.full(size, numpy.nan)
+            arrays[name][(*place, index or 0) if name in long else place] = value
+    results = {name: (_dims(name, dims, long), array) for name, array in arrays.items()}
     own = {"ran": (dims, ran), "seconds": (dims, seconds, {"units": "s"})}
     return xarray.Dataset({**results, **own}, coords, dict(about))
+
+
+def _shape(columns: Sequence[AxisColumn], paired: bool) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Return the sizes and the names of the dimensions of the axes."""
+    if paired:
+        return (len(columns[0].si),), ("point",)
+    return tuple(len(c.si) for c in columns), tuple(c.name for c in columns)
+
+
+def _named(outcome: PointOutcome, taken: Collection[str]) -> Iterator[tuple[str, int | str, float]]:
+    """Yield name, index and value of each number of a point."""
+    for step, field, index, value in outcome.numbers:
+        yield _variable(step, field, taken), index, value
+
+
+def _coordinate(column: AxisColumn, paired: bool) -> tuple[str, list[Any], dict[str, str]]:
+    """Return the coordinate of an axis along its dimension."""
+    units = {"units": column.unit} if column.unit else {}
+    return "point" if paired else column.name, list(column.si), units
+
+
+def _dims(name: str, dims: tuple[str, ...], long: Container[str]) -> tuple[str, ...]:
+    """Return the dimensions of a result: those of the axes, and one of several numbers."""
+    return (*dims, f"{name} index") if name in long else dims
 
 
 def _lengths(outcomes: Sequence[PointOutcome], taken: Collection[str]) -> dict[str, int]:
     """Return the largest length of each result that is an array, over all points of the sweep."""
     long: dict[str, int] = {}
     for outcome in outcomes:
-        for step, part, index, _ in outcome.numbers:
+        for name, index, _ in _named(outcome, taken):
             if index != "":
-                name = _variable(step, part, taken)
                 long[name] = max(long.get(name, 0), int(index) + 1)
     return long
 
 
-def _variable(step: str, part: str, taken: Collection[str]) -> str:
+def _variable(step: str, field: str, taken: Collection[str]) -> str:
     """Return the name of a result in the `xarray.Dataset`, different from the names of all
     coordinates.
     """
-    name = f"{step}.{part}".rstrip(".").replace("/", "_")
+    name = f"{step}.{field}".rstrip(".").replace("/", "_")
     return f"{name} (result)" if name in taken else name

@@ -46,30 +46,30 @@ _MIXTURE = 0.1
 
 
 def with_substitutions(
-    recipe: Recipe, wanted: Iterable[str], pinned: Collection[str] = ()
+    recipe: Recipe, outputs: Iterable[str], pinned: Collection[str] = ()
 ) -> Recipe:
     """Return ``recipe`` with cheaper steps in place of full steps; an exact recipe is returned
     unchanged.
 
-    The errors of the outputs ``wanted`` stay within the tolerance. An image whose scene depends on
+    The errors of ``outputs`` stay within the tolerance. An image whose scene depends on
     a step in ``pinned`` stays in full, because a cube that is being optimised has no low-rank form
     yet. Where well or converter are expected to cut off so much light that the errors exceed the
     tolerance, the steps get smaller limits (`Recipe.tolerance_scale`). A second call changes
     nothing.
     """
-    wanted = frozenset(wanted)
+    outputs = frozenset(outputs)
     planned, again = (
-        _substituted(recipe, wanted, pinned),
-        any(each.within for each in recipe.substitutions),
+        _substituted(recipe, outputs, pinned),
+        any(substitution.within for substitution in recipe.substitutions),
     )
     for _ in range(0 if again else _TRIES):
-        if not any(each.within for each in planned.substitutions):
+        if not any(substitution.within for substitution in planned.substitutions):
             break
-        if (excess := expected_excess(planned, sorted(wanted), _USED)) <= 1.0:
+        if (excess := expected_excess(planned, sorted(outputs), _USED)) <= 1.0:
             break
         scale = planned.tolerance_scale * _SAFE / excess if math.isfinite(excess) else 0.0
         planned = _substituted(
-            replace(planned.unsubstituted or recipe, tolerance_scale=scale), wanted, pinned
+            replace(planned.unsubstituted or recipe, tolerance_scale=scale), outputs, pinned
         )
     return planned
 
@@ -82,7 +82,9 @@ def stricter_scale(recipe: Recipe, over: float) -> float:
     smaller too, because a cube that stays the same may be what was too coarse.
     """
     images = [
-        each.step for each in recipe.substitutions if each.within and each.step in recipe.steps
+        substitution.step
+        for substitution in recipe.substitutions
+        if substitution.within and substitution.step in recipe.steps
     ]
     cubes = [recipe.allowed(name) * _MIXTURE for name in images if recipe.allowed(name) > 0]
     next_power = min((_power_of_ten(limit) / limit for limit in cubes), default=1.0)
@@ -95,27 +97,27 @@ def _power_of_ten(limit: float) -> float:
     return power
 
 
-def _substituted(recipe: Recipe, wanted: frozenset[str], pinned: Collection[str]) -> Recipe:
+def _substituted(recipe: Recipe, outputs: frozenset[str], pinned: Collection[str]) -> Recipe:
     """Return ``recipe`` with cheaper steps that err by at most what `Recipe.allowed` says."""
     if recipe.exact:
         return recipe
-    recipe = without_nothing(recipe, needed(recipe, sorted(wanted)))
-    order = needed(recipe, sorted(wanted))
+    recipe = without_nothing(recipe, needed(recipe, sorted(outputs)))
+    order = needed(recipe, sorted(outputs))
     recipe = _limited(recipe, order)
     images = [
         recipe.steps[n]
         for n in order
-        if recipe.steps[n].node.channel_sum_form is not None and n not in wanted
+        if recipe.steps[n].node.channel_sum_form is not None and n not in outputs
     ]
     if not images or recipe.tolerance * recipe.tolerance_scale <= _LEAST:
         return recipe
     dependent = _dependent(recipe, order, pinned)
-    draft = _Draft(recipe, wanted, _readers(recipe, order), frozenset(dependent))
+    draft = _Draft(recipe, outputs, _readers(recipe, order), frozenset(dependent))
     for image in images:
         if image.name not in pinned and image.wires.get("radiance") not in dependent:
             draft.collapse(image)
     recipe = draft.finished()
-    return _limited(recipe, needed(recipe, sorted(wanted)))
+    return _limited(recipe, needed(recipe, sorted(outputs)))
 
 
 def _limited(recipe: Recipe, order: Sequence[str]) -> Recipe:
@@ -158,13 +160,13 @@ class Asked:
     well: bool
 
 
-def asked_of(recipe: Recipe, image: str, wanted: Iterable[str]) -> Asked | None:
+def asked_of(recipe: Recipe, image: str, outputs: Iterable[str]) -> Asked | None:
     """Return the sums over wavelength bands of ``image`` that outputs need, or None if an output
     needs single bands.
     """
-    names = _readers(recipe, needed(recipe, wanted)).get(image, [])
+    names = _readers(recipe, needed(recipe, outputs)).get(image, [])
     readers = [recipe.steps[name] for name in names]
-    weights = _Draft(recipe, frozenset(wanted), {}).spectral(image, readers)
+    weights = _Draft(recipe, frozenset(outputs), {}).spectral(image, readers)
     return weights and Asked(*weights, tuple(names), _well(readers))
 
 
@@ -228,12 +230,14 @@ class _Draft:
             return self.recipe
         steps = {**self.recipe.steps, **self.added, **self.rewired}
         order = ordered({name: step.sources for name, step in steps.items()}, steps)
-        steps, whole = (
+        steps, unsubstituted = (
             {name: steps[name] for name in order},
             self.recipe.unsubstituted or self.recipe,
         )
         substitutions = (*self.recipe.substitutions, *self.substitutions)
-        return replace(self.recipe, steps=steps, substitutions=substitutions, unsubstituted=whole)
+        return replace(
+            self.recipe, steps=steps, substitutions=substitutions, unsubstituted=unsubstituted
+        )
 
     def _sums(self, reader: Step, image: str) -> bool:
         """Return True if the step ``reader`` needs only sums over wavelength bands of an image."""
@@ -271,24 +275,26 @@ class _Draft:
         if step is None or step.node is not optics.psf or not self._only(step.name, image.name):
             return {"psf": name}
         lens = {p: step.params[p] for p in ("focal_length", "pixel_pitch", "pixel", "sensor")}
-        given = {"pupil": step.wires["pupil"], "radiance": cube, "rows": rows}
+        inputs = {"pupil": step.wires["pupil"], "radiance": cube, "rows": rows}
         within = self.recipe.allowed(image.name) * ESTIMATED
         params = {**lens, "shape": step.params["shape"], "within": within, "largest": largest}
-        chosen = self._add(f"{name}.choice", optics.few_bands, given, params, step)
+        choice = self._add(f"{name}.choice", optics.few_bands, inputs, params, step)
         pupil = self._add(
             f"{name}.pupil",
             optics.pupil_of_bands,
-            {"pupil": given["pupil"], "few": chosen},
+            {"pupil": inputs["pupil"], "few": choice},
             {},
             step,
         )
         few = self._add(f"{name}.few", step.node, {"pupil": pupil}, step.params, step)
-        checked = {"few": chosen, "psf": few, **given}
-        found = self._add(f"{name}.checked", optics.few_bands_checked, checked, lens, step)
+        checked = {"few": choice, "psf": few, **inputs}
+        checked_name = self._add(f"{name}.checked", optics.few_bands_checked, checked, lens, step)
         self.substitutions.append(
-            Substitution(step.name, found, within, "PSFs of few bands are enough for the image")
+            Substitution(
+                step.name, checked_name, within, "PSFs of few bands are enough for the image"
+            )
         )
-        return {"psf": few, "few": found}
+        return {"psf": few, "few": checked_name}
 
     def _only(self, psf: str, image: str) -> bool:
         """Return True if no step but ``image`` reads a PSF on the axis, and an estimate of its

@@ -58,8 +58,8 @@ def _tensor_errors(a: Tensor, b: Tensor) -> tuple[float, float]:
         return 0.0, 0.0
     top, squares, largest = 0.0, 0.0, 0.0
     wide = torch.complex128 if a.is_complex() or b.is_complex() else torch.float64
-    for one, other in zip(_parts(a), _parts(b), strict=True):
-        x, y = one.to(wide).cpu(), other.to(wide).cpu()
+    for piece, other in zip(_parts(a), _parts(b), strict=True):
+        x, y = piece.to(wide).cpu(), other.to(wide).cpu()
         same = (x == y) | (x.isnan() & y.isnan())
         off = (x - y).abs().where(~same, 0.0)
         if not bool(off.isfinite().all()):

@@ -59,8 +59,8 @@ class ErrorBounds:
         one is unknown.
         """
         errors = [self.stated_of(step) for step in steps]
-        known = [error for error in errors if error is not None]
-        return max(known, default=0.0) if len(known) == len(errors) else None
+        stated = [error for error in errors if error is not None]
+        return max(stated, default=0.0) if len(stated) == len(errors) else None
 
     def kind_of(self, step: str) -> Kind:
         """Return whether the error that a run states for a step is a proved bound or an
@@ -96,7 +96,7 @@ class ToleranceNotProven(Exception):
         self.over = over
 
 
-def tolerance_frontier(recipe: Recipe, order: Iterable[str], wanted: Iterable[str]) -> list[str]:
+def tolerance_frontier(recipe: Recipe, order: Iterable[str], outputs: Iterable[str]) -> list[str]:
     """Return the approximate steps whose error bounds must meet the tolerance.
 
     These steps are outputs, or inputs of nodes that give no error bound.
@@ -109,7 +109,7 @@ def tolerance_frontier(recipe: Recipe, order: Iterable[str], wanted: Iterable[st
             frontier |= dict.fromkeys(reads)
         elif reads or _may_err(step):
             inexact.add(name)
-    return list(frontier | dict.fromkeys(name for name in wanted if name in inexact))
+    return list(frontier | dict.fromkeys(name for name in outputs if name in inexact))
 
 
 def unbounded_steps(recipe: Recipe, order: Sequence[str]) -> frozenset[str]:
@@ -143,7 +143,7 @@ def _propagates(step: Step, recipe: Recipe) -> bool:
 def proof(
     recipe: Recipe,
     order: Iterable[str],
-    wanted: Iterable[str],
+    outputs: Iterable[str],
     done: Callable[[str], StepRecord],
     facts_of: FactsOf,
 ) -> ErrorBounds:
@@ -160,37 +160,43 @@ def proof(
         if bound is None:
             continue
         if math.isinf(bound.rms):
-            shares = {source: bounds[source].share for source in step.sources if source in bounds}
-            held |= {source: share for source, share in shares.items() if math.isfinite(share)}
+            held |= _finite_shares(bounds, step.sources)
         bounds[name] = bound
-    shares = {name: bound.share for name, bound in bounds.items()}
-    held |= {name: shares[name] for name in wanted if math.isfinite(shares.get(name, math.inf))}
+    held |= _finite_shares(bounds, outputs)
     final = bounds | _of_one_picture(recipe, bounds, done, facts_of)
-    stated = {name: final[name].share for name in held}
     return ErrorBounds(
-        shares, held, stated, frozenset(name for name, bound in final.items() if bound.estimated)
+        {name: bound.share for name, bound in bounds.items()},
+        held,
+        {name: final[name].share for name in held},
+        frozenset(name for name, bound in final.items() if bound.estimated),
     )
+
+
+def _finite_shares(bounds: Mapping[str, ErrorBound], names: Iterable[str]) -> dict[str, float]:
+    """Return the share of each error among ``names`` that has a bound."""
+    shares = {name: bounds[name].share for name in names if name in bounds}
+    return {name: share for name, share in shares.items() if math.isfinite(share)}
 
 
 def _bound(
     step: Step,
-    known: Mapping[str, ErrorBound],
+    bounds: Mapping[str, ErrorBound],
     done: StepRecord,
     facts_of: FactsOf,
     recipe: Recipe,
     one_draw: bool = False,
 ) -> ErrorBound | None:
-    """Return the error bound of a step's result from the ``known`` bounds of its inputs, or None if
-    it is exact.
+    """Return the error bound of a step's result from the bounds of its inputs in ``bounds``, or
+    None if it is exact.
 
     The bound is the root mean square over all draws of the noise, or with ``one_draw`` that of a
     single draw.
     """
     own = _own(step, done, facts_of, one_draw)
-    sources = [known[source] for source in step.sources if source in known]
+    sources = [bounds[source] for source in step.sources if source in bounds]
     if own is None and not any(bound.rms for bound in sources):
         return None
-    inputs = [_gathered(step.wires.get(i), known) for i in step.node.inputs]
+    inputs = [_gathered(step.wires.get(i), bounds) for i in step.node.inputs]
     facts = facts_of(step.name)
     hook = step.node.hooks.propagate_error if _propagates(step, recipe) else None
     if one_draw and hook is not None:
@@ -331,8 +337,8 @@ def _parts(inputs: list[_Input], *, scattered: bool) -> list[_Input]:
         return replace(error, rms=rms, scattered=0.0)
 
     return [
-        [part(error) for error in given] if isinstance(given, list) else given and part(given)
-        for given in inputs
+        [part(error) for error in errors] if isinstance(errors, list) else errors and part(errors)
+        for errors in inputs
     ]
 
 
@@ -343,8 +349,8 @@ def _gathered(wire: Wire, bounds: Mapping[str, ErrorBound]) -> _Input:
 
 
 def _flat(inputs: Iterable[_Input]) -> Iterator[ErrorBound]:
-    for part in inputs:
-        yield from part if isinstance(part, list) else [part] if part else []
+    for error in inputs:
+        yield from error if isinstance(error, list) else [error] if error else []
 
 
 # --- expected errors ------------------------------------------------------------------------------
@@ -360,20 +366,24 @@ def _flat(inputs: Iterable[_Input]) -> Iterator[ErrorBound]:
 # computed.
 
 
-def expected_excess(recipe: Recipe, wanted: Iterable[str], used: float = 1.0) -> float:
-    """Return the expected ratio of the largest error of the outputs ``wanted`` to its limit; 0 if
+def expected_excess(recipe: Recipe, outputs: Iterable[str], share: float = 1.0) -> float:
+    """Return the expected ratio of the largest error of ``outputs`` to its limit; 0 if
     nothing is known.
 
-    Each cheaper step of ``recipe`` is expected to err by the share ``used`` of what it may err by.
+    Each cheaper step of ``recipe`` is expected to err by this ``share`` of what it may err by.
     """
-    wanted = tuple(wanted)
-    order = needed(recipe, wanted)
-    order = needed(recipe, tolerance_frontier(recipe, order, wanted))
-    within = {each.instead: used * each.within for each in recipe.substitutions if each.instead}
+    outputs = tuple(outputs)
+    order = needed(recipe, outputs)
+    order = needed(recipe, tolerance_frontier(recipe, order, outputs))
+    within = {
+        substitution.instead: share * substitution.within
+        for substitution in recipe.substitutions
+        if substitution.instead
+    }
     ranges = _Ranges(recipe, order)
     records = {name: _record(recipe.steps[name], within, ranges) for name in order}
     try:
-        return proof(recipe, order, wanted, records.__getitem__, ranges.known.get).over(recipe)
+        return proof(recipe, order, outputs, records.__getitem__, ranges.known.get).over(recipe)
     except RunError:  # a rule that needs more than a range
         return 0.0
 
@@ -386,8 +396,8 @@ def _record(step: Step, within: Mapping[str, float], ranges: _Ranges) -> StepRec
     if bound is not None:
         return StepRecord(step.name, "left out", "", 0.0, "", bound=bound)
     error = within.get(step.name, 0.0) + sum(within.get(source, 0.0) for source in step.sources)
-    told = error and step.node.hooks.approximation_error is not None
-    return StepRecord(step.name, "run", "", 0.0, "", error=(error, error) if told else None)
+    stated = error and step.node.hooks.approximation_error is not None
+    return StepRecord(step.name, "run", "", 0.0, "", error=(error, error) if stated else None)
 
 
 class _Ranges:

@@ -50,12 +50,15 @@ def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
             changed[name] = replace(step, wires=without(step, dark))
     if not changed:
         return recipe
-    known = {substitution.step for substitution in recipe.substitutions}
+    already = {substitution.step for substitution in recipe.substitutions}
     why = "its parameters make its result 0"
-    new = tuple(Substitution(name, "", 0.0, why) for name in dark if name not in known)
-    steps, whole = {**recipe.steps, **changed}, recipe.unsubstituted or recipe
+    new = tuple(Substitution(name, "", 0.0, why) for name in dark if name not in already)
+    steps, unsubstituted = {**recipe.steps, **changed}, recipe.unsubstituted or recipe
     return replace(
-        recipe, steps=steps, substitutions=(*recipe.substitutions, *new), unsubstituted=whole
+        recipe,
+        steps=steps,
+        substitutions=(*recipe.substitutions, *new),
+        unsubstituted=unsubstituted,
     )
 
 
@@ -91,11 +94,11 @@ def without(step: Step, dark: Mapping[str, None]) -> dict[str, Wire]:
         if isinstance(wire, str) and wire in dark:
             wires |= dict.fromkeys(group)
         elif isinstance(wire, tuple):
-            kept = [i for i, name in enumerate(wire) if name not in dark]
+            remaining = [i for i, name in enumerate(wire) if name not in dark]
             for name in group:
                 listed = wires.get(name)
                 wires[name] = (
-                    tuple(listed[i] for i in kept) if isinstance(listed, tuple) else listed
+                    tuple(listed[i] for i in remaining) if isinstance(listed, tuple) else listed
                 )
     return wires
 
@@ -129,8 +132,8 @@ class _Later:
 
     __slots__ = ("_find", "_seen")
 
-    def __init__(self, find: Callable[[], TensorStats | None], seen: list[TensorStats]) -> None:
-        self._find, self._seen = find, seen
+    def __init__(self, find: Callable[[], TensorStats | None], asked: list[TensorStats]) -> None:
+        self._find, self._seen = find, asked
 
     def __getattr__(self, name: str) -> Any:
         facts = self._find()
@@ -150,8 +153,8 @@ def judge(
         return SkipDecision(
             _NO_BOUND, False, "the step has no input that could replace its result", ""
         )
-    seen: list[TensorStats] = []
-    facts = [_facts(step.wires.get(name), facts_of, seen) for name in node.inputs]
+    asked: list[TensorStats] = []
+    facts = [_facts(step.wires.get(name), facts_of, asked) for name in node.inputs]
     try:
         bound = float(
             node.hooks.skip_bound(
@@ -162,25 +165,25 @@ def judge(
         raise
     except Exception as error:
         raise RunError(step, [], error) from error
-    if not all(f.finite for f in seen):
+    if not all(f.finite for f in asked):
         return SkipDecision(
             _NO_BOUND, False, "its input is not finite, so its effect has no bound", first
         )
-    known = bound < _NO_BOUND
+    has_bound = bound < _NO_BOUND
     why = (
         f"changes at most {bound:.2g}, tolerance {tolerance:.2g}"
-        if known
+        if has_bound
         else "its effect has no bound"
     )
     return SkipDecision(bound, bound <= tolerance, why, first)
 
 
-def _facts(wire: str | tuple[str, ...] | None, facts_of: FactsOf, seen: list[TensorStats]) -> Any:
+def _facts(wire: str | tuple[str, ...] | None, facts_of: FactsOf, asked: list[TensorStats]) -> Any:
     if wire is None:
         return None
     if isinstance(wire, str):
-        return _Later(lambda: facts_of(wire), seen)
-    return [_facts(name, facts_of, seen) for name in wire]
+        return _Later(lambda: facts_of(wire), asked)
+    return [_facts(name, facts_of, asked) for name in wire]
 
 
 def _number(value: Any) -> Any:
@@ -201,7 +204,11 @@ def skip_share(recipe: Recipe) -> float:
     """Return the share of the tolerance that omitted steps may use, beside the cheaper steps of
     a recipe.
     """
-    return 1.0 - 2 * CHANNELS if any(each.within for each in recipe.substitutions) else 1.0
+    return (
+        1.0 - 2 * CHANNELS
+        if any(substitution.within for substitution in recipe.substitutions)
+        else 1.0
+    )
 
 
 class ErrorBudget:
@@ -264,6 +271,8 @@ class ErrorBudget:
             return {}
         first, *others = parts
         if any(other is not first for other in others):
-            first = {omitted: bound for part in parts for omitted, bound in part.items()}
+            first = {}
+            for bounds in parts:
+                first.update(bounds)
         self._spent[step.name] = first
         return first

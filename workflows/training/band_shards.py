@@ -87,9 +87,11 @@ class Shards:
                 steps.add(name)
             elif sources & (behind | steps):
                 behind.add(name)
-        summed_alone = {
-            n: asked for n in sorted(steps) if (asked := _asked(recipe, n, outputs, behind, live))
-        }
+        summed_alone = {}
+        for name in sorted(steps):
+            asked = _asked(recipe, name, outputs, behind, live)
+            if asked:
+                summed_alone[name] = asked
         rows = {name: _rows(recipe, asked, store) for name, asked in summed_alone.items()}
         return cls(recipe, mesh, count, frozenset(steps), frozenset(behind), rows)
 
@@ -105,8 +107,10 @@ class Shards:
         this process alone.
         """
         if step.name in self.steps:
-            whole = [name for name in step.node.inputs if step.wires.get(name) not in self.steps]
-            inputs = taken(step, inputs, self.own, whole)
+            undivided = [
+                name for name in step.node.inputs if step.wires.get(name) not in self.steps
+            ]
+            inputs = taken(step, inputs, self.own, undivided)
         return call(step, inputs, params, seed, device)
 
     def gathered(self, name: str, value: Any) -> Any:
@@ -138,14 +142,14 @@ class Shards:
             return [Sum(self.mesh)]
         return [Swapped(self.mesh, self.axis(name), self.count) for _ in sent]
 
-    def received(self, name: str, like: Any, found: Sequence[Tensor]) -> Any:
+    def received(self, name: str, like: Any, tensors: Sequence[Tensor]) -> Any:
         """Assemble the result of a step with all spectral bands from the tensors that other
         processes sent.
         """
         if name not in self.rows:
-            return with_band_tensors(like, found)
+            return with_band_tensors(like, tensors)
         exact = self.rows[name].new_zeros(())
-        return Channels(found[0], self.rows[name], exact, largest=exact)
+        return Channels(tensors[0], self.rows[name], exact, largest=exact)
 
 
 def _sampled(recipe: Recipe, name: str) -> set[str]:
@@ -169,9 +173,8 @@ def _mixed(recipe: Recipe, name: str) -> bool:
     """
     while (kind := recipe.steps[name].node.hints["return"]) is not LowRankCube:
         step = recipe.steps[name]
-        through = next(
-            (w for i in step.node.accepts_low_rank if isinstance(w := step.wires.get(i), str)), None
-        )
+        wires = (step.wires.get(name) for name in step.node.accepts_low_rank)
+        through = next((wire for wire in wires if isinstance(wire, str)), None)
         if through is None or LowRankCube not in get_args(kind):
             return False
         name = through
@@ -211,8 +214,8 @@ def _asked(
 
 
 def _rows(recipe: Recipe, asked: Asked, store: Store) -> Tensor:
-    found = run(recipe, store, [asked.bands, asked.responses]).values
-    rows: Tensor = spectra.rows(found[asked.bands], found[asked.responses], well=asked.well)
+    results = run(recipe, store, [asked.bands, asked.responses]).values
+    rows: Tensor = spectra.rows(results[asked.bands], results[asked.responses], well=asked.well)
     return rows
 
 
@@ -230,20 +233,22 @@ class Shared:
 
     made: Mapping[str, Any]  #: results with their autograd graph, at the bands of this process
     values: Mapping[str, Any]  #: detached copies
-    whole: Mapping[str, Any] = field(default_factory=dict)  #: copies with all bands
+    gathered: Mapping[str, Any] = field(default_factory=dict)  #: copies with all bands
     shards: Shards | None = None
 
     @classmethod
     def of(
-        cls, made: Mapping[str, Any], shards: Shards | None = None, whole: Sequence[str] = ()
+        cls, made: Mapping[str, Any], shards: Shards | None = None, gathered: Sequence[str] = ()
     ) -> Shared:
         """Detach results from the autograd graph, and gather all spectral bands of the results
-        named in ``whole``.
+        named in ``gathered``.
         """
         leaves: dict[str, Any] = each_tensor(leaf, dict(made))  # two results may be one tensor
         if shards is None or not leaves:
             return cls(made, leaves)
-        every = {name: _alike(shards.gathered(name, leaves[name]), leaves[name]) for name in whole}
+        every = {
+            name: _alike(shards.gathered(name, leaves[name]), leaves[name]) for name in gathered
+        }
         return cls(made, leaves, every, shards)
 
     @property
@@ -251,26 +256,26 @@ class Shared:
         """Return the detached copies that later steps read; those in ``whole`` have all spectral
         bands.
         """
-        return {**self.values, **self.whole}
+        return {**self.values, **self.gathered}
 
     def back(self) -> None:
         """Propagate the accumulated gradients from the detached copies to the mask."""
-        for name, value in self.whole.items():
-            for own, whole in zip(tensors_in(self.values[name]), tensors_in(value), strict=True):
-                self._to_own(name, own, whole)
+        for name, value in self.gathered.items():
+            for own, copy in zip(tensors_in(self.values[name]), tensors_in(value), strict=True):
+                self._to_own(name, own, copy)
         pairs = zip(tensors_in(dict(self.made)), tensors_in(dict(self.values)), strict=True)
         roots = [(x, leaf.grad) for x, leaf in pairs if x.requires_grad and leaf.grad is not None]
         if roots:
             torch.autograd.backward([x for x, _ in roots], [grad for _, grad in roots])
 
-    def _to_own(self, name: str, own: Tensor, whole: Tensor) -> None:
+    def _to_own(self, name: str, own: Tensor, copy: Tensor) -> None:
         """Sum a gradient over all processes, and keep the part for the spectral bands of this
         process.
         """
         if not own.requires_grad:
             return
         assert self.shards is not None
-        grad = torch.zeros_like(whole) if whole.grad is None else whole.grad
+        grad = torch.zeros_like(copy) if copy.grad is None else copy.grad
         total = gathered_back(self.shards.mesh, grad, self.shards.axis(name), self.shards.count)
         own.grad = total if own.grad is None else own.grad + total
 
@@ -313,12 +318,10 @@ class Pictures:
     ) -> None:
         self.shards = shards
         inner = shards.steps.difference(free)
-        read = {
-            s
-            for n in _live(recipe, free, outputs)
-            if n not in shards.steps
-            for s in recipe.steps[n].sources
-        }
+        read = set[str]()
+        for name in _live(recipe, free, outputs):
+            if name not in shards.steps:
+                read.update(recipe.steps[name].sources)
         self._cut = sorted(inner & (read | set(outputs)))
         within = _used(recipe, [*free, *self._cut], outputs) if self._cut else free
         self._end = as_function(recipe, *within, outputs=outputs, redraw=redraw, **run)
@@ -376,13 +379,13 @@ class _Cut:
         self._sent: list[tuple[Port, tuple[Tensor, ...], Tensor]] = []
         self.values: dict[str, Any] = {}
         for name in names:
-            parts = [shards.sent(name, one[name]) for one in begun]
+            parts = [shards.sent(name, results[name]) for results in begun]
             leaves = []
-            for port, each in zip(
+            for port, tensors in zip(
                 shards.ports(name, parts[0]), zip(*parts, strict=True), strict=True
             ):
-                leaves.append(port.there(each).requires_grad_(each[0].requires_grad))
-                self._sent.append((port, each, leaves[-1]))
+                leaves.append(port.there(tensors).requires_grad_(tensors[0].requires_grad))
+                self._sent.append((port, tensors, leaves[-1]))
             self.values[name] = shards.received(name, begun[0][name], leaves)
 
     def back(self) -> None:
@@ -395,15 +398,17 @@ class _Cut:
         grads: list[Tensor] = []
         for port, sent, leaf in self._sent:
             if leaf.requires_grad:
-                each = port.back(torch.zeros_like(leaf) if leaf.grad is None else leaf.grad)
+                own_grads = port.back(torch.zeros_like(leaf) if leaf.grad is None else leaf.grad)
                 roots += sent
-                grads += each[: len(sent)]
+                grads += own_grads[: len(sent)]
         if roots:
             torch.autograd.backward(roots, grads)
 
 
-def _live(recipe: Recipe, given: Sequence[str], outputs: Sequence[str]) -> list[str]:
-    sources = {name: () if name in given else step.sources for name, step in recipe.steps.items()}
+def _live(recipe: Recipe, computed: Sequence[str], outputs: Sequence[str]) -> list[str]:
+    sources = {
+        name: () if name in computed else step.sources for name, step in recipe.steps.items()
+    }
     return in_order(sources, outputs)
 
 

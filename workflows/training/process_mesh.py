@@ -111,7 +111,9 @@ class Mesh:
         """Replace the gradient of each module parameter by its sum over all processes."""
         if self.size == 1:
             return
-        own = [p for part in parts for p in part.parameters()]
+        own: list[nn.Parameter] = []
+        for module in parts:
+            own += module.parameters()
         for kind in dict.fromkeys(p.dtype for p in own):
             _add([p for p in own if p.dtype == kind])
 
@@ -120,9 +122,9 @@ def _add(own: Sequence[nn.Parameter]) -> None:
     """Sum the gradients of parameters over all processes; a gradient that is None in every
     process stays None.
     """
-    there = torch.tensor([float(p.grad is not None) for p in own]).to(own[0])
+    has_gradient = torch.tensor([float(p.grad is not None) for p in own]).to(own[0])
     grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in own]
-    flat = torch.cat([*(g.reshape(-1) for g in grads), there])
+    flat = torch.cat([*(g.reshape(-1) for g in grads), has_gradient])
     dist.all_reduce(flat)
     *sums, counts = torch.split(flat, [*(p.numel() for p in own), len(own)])
     for p, total, count in zip(own, sums, counts.tolist(), strict=True):
@@ -152,9 +154,9 @@ def shape_of(text: str, world: int) -> tuple[int, int]:
     data, band = map(int, text.split("x"))
     if data * band != world:
         start = f"torchrun --nproc-per-node {data * band} --no-python neusee train ..."
-        there = "there is 1" if world == 1 else f"there are {world}"
+        processes = "there is 1" if world == 1 else f"there are {world}"
         raise MeshError(
-            f"--mesh {text} is for {data * band} processes and {there}: start {start}, or write"
+            f"--mesh {text} is for {data * band} processes and {processes}: start {start}, or write"
             f" {world}x1"
         )
     return data, band
@@ -237,8 +239,8 @@ class Bands:
         """Send the spectral bands of picture j to process j, and return the picture of this
         process with all bands.
         """
-        most = -(-self.count // self.mesh.band)
-        sent = [_filled(x.detach().movedim(self.axis, 0), most) for x in parts]
+        bands_each = -(-self.count // self.mesh.band)
+        sent = [_filled(x.detach().movedim(self.axis, 0), bands_each) for x in parts]
         return _woven(_exchanged(self.mesh, _stacked(self.mesh, sent)), self.axis, self.count)
 
     def back(self, grad: Tensor) -> list[Tensor]:
@@ -246,8 +248,8 @@ class Bands:
         this process.
         """
         own = len(own_bands(self.mesh, self.count))
-        each = _exchanged(self.mesh, _unwoven(self.mesh, grad, self.axis, self.count))
-        return [x[:own].movedim(0, self.axis) for x in each]
+        received = _exchanged(self.mesh, _unwoven(self.mesh, grad, self.axis, self.count))
+        return [x[:own].movedim(0, self.axis) for x in received]
 
 
 class Sum:
@@ -271,12 +273,12 @@ class Sum:
         return list(_from_each(self.mesh, grad.contiguous()))
 
 
-def _filled(x: Tensor, most: int) -> Tensor:
-    """Pad a tensor with zeros to ``most`` spectral bands."""
+def _filled(x: Tensor, count: int) -> Tensor:
+    """Pad a tensor with zeros to ``count`` spectral bands."""
     return (
         x.contiguous()
-        if len(x) == most
-        else torch.cat([x, x.new_zeros(most - len(x), *x.shape[1:])])
+        if len(x) == count
+        else torch.cat([x, x.new_zeros(count - len(x), *x.shape[1:])])
     )
 
 
@@ -289,30 +291,30 @@ def _stacked(mesh: Mesh, parts: Sequence[Tensor]) -> Tensor:
     )
 
 
-def _woven(each: Tensor, axis: int, count: int) -> Tensor:
+def _woven(stack: Tensor, axis: int, count: int) -> Tensor:
     """Reorder a tensor (process, bands of the process, ...) so that one axis has all bands in
     spectral order.
     """
-    return each.transpose(0, 1).flatten(0, 1)[:count].movedim(0, axis).contiguous()
+    return stack.transpose(0, 1).flatten(0, 1)[:count].movedim(0, axis).contiguous()
 
 
 def _unwoven(mesh: Mesh, x: Tensor, axis: int, count: int) -> Tensor:
-    most = -(-count // mesh.band)
-    whole = _filled(x.movedim(axis, 0), most * mesh.band)
-    return whole.reshape(most, mesh.band, *whole.shape[1:]).transpose(0, 1).contiguous()
+    bands_each = -(-count // mesh.band)
+    padded = _filled(x.movedim(axis, 0), bands_each * mesh.band)
+    return padded.reshape(bands_each, mesh.band, *padded.shape[1:]).transpose(0, 1).contiguous()
 
 
-def _added(each: Tensor) -> Tensor:
-    total = each[0].clone()
-    for one in each[1:]:
-        total += one
+def _added(stack: Tensor) -> Tensor:
+    total = stack[0].clone()
+    for summand in stack[1:]:
+        total += summand
     return total
 
 
-def _exchanged(mesh: Mesh, each: Tensor) -> Tensor:
+def _exchanged(mesh: Mesh, stack: Tensor) -> Tensor:
     """Send tensor j of a stack to process j, and return the stack of the received tensors."""
-    received = torch.empty_like(each)
-    dist.all_to_all_single(received, each, group=mesh.group)
+    received = torch.empty_like(stack)
+    dist.all_to_all_single(received, stack, group=mesh.group)
     return received
 
 

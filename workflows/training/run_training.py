@@ -77,9 +77,9 @@ class UnchangedFiles:
             self._stamps[path] = stamp
 
     @staticmethod
-    def _said(path: Path, what: str) -> str:
+    def _said(path: Path, change: str) -> str:
         return (
-            f"the photograph {path} {what}, after this training began with it; the checkpoint"
+            f"the photograph {path} {change}, after this training began with it; the checkpoint"
             " before is kept: put the file back and give the command again to go on, or give the"
             " command as it is to begin anew"
         )
@@ -134,10 +134,10 @@ def write_exports(folder: Path, net: Restorer, settings: Training) -> None:
     name = "best" if (folder / "best.safetensors").is_file() else "network"
     file = folder / f"{name}.safetensors"
     safetensors_need(file, 2.0)
-    whole = copy.deepcopy(net).cpu().float()
-    whole.stored.load_state_dict(load_file(file))
+    network = copy.deepcopy(net).cpu().float()
+    network.stored.load_state_dict(load_file(file))
     for kind in settings.export:
-        export_network(whole, folder / f"{name}.{kind}")
+        export_network(network, folder / f"{name}.{kind}")
 
 
 # --- run training ---------------------------------------------------------------------------------
@@ -441,15 +441,17 @@ class _TrainingLoop(ResumableLoop[Learner]):
         ):
             return {}
         net: Any = self.learner.average.module if self.learner.average else self.learner.net
-        found = self.validation(
+        losses = self.validation(
             net, self.samples, self.learner.shared(self.samples), self.stage == 2
         )
-        self.best = self.best.after(held_out.score_of(found), iterations)
+        self.best = self.best.after(held_out.score_of(losses), iterations)
         better = self.stage == 2 and self.best.iterations == iterations
         if better and self.writes:
             export(self.folder, "best", net.stored.state_dict(), file_metadata(self.learner.net))
-        self.progress(f"stage {self.stage}, iteration {iterations}: {held_out.said(found, better)}")
-        return found
+        self.progress(
+            f"stage {self.stage}, iteration {iterations}: {held_out.said(losses, better)}"
+        )
+        return losses
 
     @property
     def stops_early(self) -> bool:

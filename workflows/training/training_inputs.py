@@ -84,7 +84,7 @@ def _cameras(recipe: Recipe, settings: Training, code: Code) -> CameraInputs:
 def _camera(recipe: Recipe, settings: Training, code: Code) -> CameraInputs:
     named = (settings.picture, settings.truth, settings.psf, settings.light, settings.learn)
     outputs = [name for name in named if name is not None and name in recipe.steps]
-    camera = CameraInputs.of(recipe, outputs, code, given=(settings.scene,))
+    camera = CameraInputs.of(recipe, outputs, code, computed=(settings.scene,))
     scene = recipe.steps.get(settings.scene)
     shape = list(scene.params.get("shape") or ()) if scene else []
     return CameraInputs(
@@ -122,15 +122,15 @@ def _code(network: Network, code: Code) -> dict[str, str]:
     """Return digests of the code that no step of the recipe names: losses, networks, and the
     loop itself.
     """
-    found = {f"neusee.nodes.{name}": code.digest(f"neusee.nodes.{name}") for name in _COMPUTE}
+    digests = {f"neusee.nodes.{name}": code.digest(f"neusee.nodes.{name}") for name in _COMPUTE}
     folder = Path(__file__).parent
     for name in _LOOPS:
-        found[f"neusee/workflows/training/{name}.py"] = outline(
+        digests[f"neusee/workflows/training/{name}.py"] = outline(
             (folder / f"{name}.py").read_bytes()
         ).digest
     if network.architecture is not None:
-        found[f"the network {network.architecture}"] = code_of_class(network.architecture, code)
-    return found
+        digests[f"the network {network.architecture}"] = code_of_class(network.architecture, code)
+    return digests
 
 
 def code_of_class(architecture: Architecture, code: Code) -> str:

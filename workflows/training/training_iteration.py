@@ -53,21 +53,21 @@ from neusee.workflows.training.training_pictures import Sample, Samples
 
 
 def together(
-    pictures: Iterable[tuple[int, Sample]], whole: bool
+    pictures: Iterable[tuple[int, Sample]], by_shape: bool
 ) -> Iterator[tuple[list[int], Sample]]:
-    """Yield the pictures of a batch with their numbers: each alone, or if ``whole`` those of one
+    """Yield the pictures of a batch with their numbers: each alone, or if ``by_shape`` those of one
     size as one sample.
 
     A small picture leaves most of a GPU idle, so that sixteen take little longer there than one. On
     a processor each picture goes alone, so that one picture is in memory at a time.
     """
-    if not whole:
+    if not by_shape:
         yield from (([number], sample) for number, sample in pictures)
         return
     alike: dict[object, dict[int, Sample]] = {}
     for number, sample in pictures:
-        known = sample.given[0] if sample.given else None
-        free = known is None or isinstance(known, FilterFacts)
+        facts = sample.given[0] if sample.given else None
+        free = facts is None or isinstance(facts, FilterFacts)
         shapes = tuple((name, x.shape) for name, x in sample.tensors.items()) if free else number
         alike.setdefault(shapes, {})[number] = sample
     for group in alike.values():
@@ -100,11 +100,11 @@ def joined(samples: list[Sample]) -> Sample:
 
 
 def noted(
-    pictures: Iterable[tuple[int, Sample]], seen: list[Sample]
+    pictures: Iterable[tuple[int, Sample]], record: list[Sample]
 ) -> Iterator[tuple[int, Sample]]:
-    """Yield numbered pictures as they come, and add each to ``seen``."""
+    """Yield numbered pictures as they come, and add each to ``record``."""
     for number, sample in pictures:
-        seen.append(sample)
+        record.append(sample)
         yield number, sample
 
 
@@ -133,8 +133,8 @@ class WarmStart:
         """
         if settings.start is None:
             return None
-        given = recipe.config.settings.get(f"{KEY}.start")
-        source = given.source if given else recipe.name
+        setting = recipe.config.settings.get(f"{KEY}.start")
+        source = setting.source if setting else recipe.name
         file = settings.start
         if file.is_dir():
             file = next(
@@ -316,28 +316,27 @@ class Learner:
         self.generator_optimizer.zero_grad(set_to_none=True)
         self._moment = stage, iteration
         shared = samples.begin(self.height()) if samples.shared else Shared.of({})
-        found = self._mask_suppression(shared, samples) if self.learns else {}
-        batch, seen, pairs = self.stage.batch, list[Sample](), dict[int, tuple[Scales, Scales]]()
-        pictures = noted(samples.batch(shared, stage, iteration * batch, batch), seen)
+        sums = self._mask_suppression(shared, samples) if self.learns else {}
+        batch, record, pairs = self.stage.batch, list[Sample](), dict[int, tuple[Scales, Scales]]()
+        pictures = noted(samples.batch(shared, stage, iteration * batch, batch), record)
         for numbers, sample in together(pictures, self._whole):
             terms, truth, estimate = self._restoration_terms(sample)
             pairs |= _apart(numbers, truth, estimate)
             share = len(numbers) / batch
             _backward([weight * term * share for weight, term in terms.values() if weight])
-            for name, (_, term) in terms.items():
-                found[name] = found.get(name, 0.0) + float(term.detach()) * share
+            _add_terms(sums, terms, share)
         shared.back()
-        found = self.mesh.numbers(found, self._names(), self.device)
-        found["slope"] = self._move(
-            self.generator_optimizer, found, (self.net, self.mask) if self.learns else (self.net,)
+        sums = self.mesh.numbers(sums, self._names(), self.device)
+        sums["slope"] = self._move(
+            self.generator_optimizer, sums, (self.net, self.mask) if self.learns else (self.net,)
         )
         if isinstance(self.net, OwnNetwork):
             self.mesh.share_buffers(self.net)
         if self.average:
             self.average.update_parameters(self.net)
         if self.stage.adversarial:
-            found |= self._train_critics(pairs, self._rng("between", stage, iteration))
-        return found, seen
+            sums |= self._train_critics(pairs, self._rng("between", stage, iteration))
+        return sums, record
 
     @property
     def _whole(self) -> bool:
@@ -385,9 +384,9 @@ class Learner:
         with torch.no_grad():
             peaks: Tensor = metrics.lsr(psf)
         if self.stage.lsr:
-            for one in range(len(psf.clear_peak)):
+            for band in range(len(psf.clear_peak)):
                 loss = checkpoint(
-                    self._suppression, psf.intensity, psf.clear_peak, one, use_reentrant=False
+                    self._suppression, psf.intensity, psf.clear_peak, band, use_reentrant=False
                 )
                 (self.stage.lsr / times * loss).backward()
         return {"LSR": float(peaks.mean()) * (len(peaks) / count) / times}
@@ -443,9 +442,11 @@ class Learner:
             yield
 
     def _errors(self, estimate: Scales, truth: Scales) -> Iterator[Tensor]:
-        how = {} if self.settings.reduction == "mean" else {"reduction": self.settings.reduction}
+        options = (
+            {} if self.settings.reduction == "mean" else {"reduction": self.settings.reduction}
+        )
         for e, t in zip(estimate, truth, strict=True):
-            yield losses.charbonnier(e, t, **how) + losses.fft_l1(e, t, **how)
+            yield losses.charbonnier(e, t, **options) + losses.fft_l1(e, t, **options)
 
     def _train_critics(
         self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator
@@ -454,7 +455,7 @@ class Learner:
         numbers in all processes.
         """
         self.critic_optimizer.zero_grad(set_to_none=True)
-        found, batch = {"critics": 0.0, "penalty": 0.0}, self.stage.batch
+        numbers, batch = {"critics": 0.0, "penalty": 0.0}, self.stage.batch
         for i in range(batch):
             if i not in pairs:
                 for _ in self.critics:
@@ -464,16 +465,16 @@ class Learner:
                 apart = (critic(e) - critic(t)).mean()
                 steep = losses.gradient_penalty(critic_slopes(critic, t, e, rng))
                 _backward([(self.stage.adversarial * apart + self.stage.penalty * steep) / batch])
-                found["critics"] += float(apart.detach()) / batch
-                found["penalty"] += float(steep.detach()) / batch
-        found = self.mesh.numbers(found, tuple(found), self.device)
-        self._move(self.critic_optimizer, found, list(self.critics))
-        return found
+                numbers["critics"] += float(apart.detach()) / batch
+                numbers["penalty"] += float(steep.detach()) / batch
+        numbers = self.mesh.numbers(numbers, tuple(numbers), self.device)
+        self._move(self.critic_optimizer, numbers, list(self.critics))
+        return numbers
 
     def _move(
         self,
         optimiser: torch.optim.Optimizer,
-        found: Mapping[str, float],
+        losses: Mapping[str, float],
         parts: Sequence[nn.Module],
     ) -> float:
         """Apply one optimiser step, and return the largest gradient norm of the modules ``parts``
@@ -485,10 +486,20 @@ class Learner:
         """
         self.mesh.add_gradients(parts)
         largest = math.inf if self.settings.clip is None else self.settings.clip
-        norm = max(float(nn.utils.clip_grad_norm_(part.parameters(), largest)) for part in parts)
-        require_finite({**found, "norm of the gradient": norm})
+        norm = max(
+            float(nn.utils.clip_grad_norm_(module.parameters(), largest)) for module in parts
+        )
+        require_finite({**losses, "norm of the gradient": norm})
         optimiser.step()
         return norm
+
+
+def _add_terms(
+    sums: dict[str, float], terms: Mapping[str, tuple[float, Tensor]], share: float
+) -> None:
+    """Add a share of each term of a loss to the sum of its name."""
+    for name, (_, term) in terms.items():
+        sums[name] = sums.get(name, 0.0) + float(term.detach()) * share
 
 
 def _apart(
@@ -497,9 +508,9 @@ def _apart(
     """Return the true and the restored picture of each number, of pictures that went through the
     network together.
     """
-    each = [[x.chunk(len(numbers)) for x in scales] for scales in (truth, estimate)]
+    pictures = [[x.chunk(len(numbers)) for x in scales] for scales in (truth, estimate)]
     return {
-        n: (Scales(*(x[i] for x in each[0])), Scales(*(x[i] for x in each[1])))
+        n: (Scales(*(x[i] for x in pictures[0])), Scales(*(x[i] for x in pictures[1])))
         for i, n in enumerate(numbers)
     }
 

@@ -42,11 +42,7 @@ def curves(rows: Sequence[Mapping[str, str]]) -> Any:
     first = 1 + max((int(r["iteration"]) for r in rows if r["stage"] == "1"), default=-1)
     for ax, name in zip(axes.flat, names, strict=False):
         for stage, colour in ((1, BLUE), (2, VERMILION)):
-            shown = [row for row in rows if row["stage"] == str(stage) and row[name]]
-            at = [int(row["iteration"]) + first * (stage == 2) for row in shown]
-            values = [float(row[name]) for row in shown]
-            ax.plot(at, values, color=colour, alpha=0.25, linewidth=0.7)
-            ax.plot(at, running_median(values), color=colour, linewidth=1.5, label=f"stage {stage}")
+            _draw_loss(ax, rows, name, stage, first * (stage == 2), colour)
         if name in ("LSR", "L1", "reconstruction", "rate"):
             ax.set_yscale("log", nonpositive="mask")
         ax.set_title(name)
@@ -55,6 +51,19 @@ def curves(rows: Sequence[Mapping[str, str]]) -> Any:
     axes.flat[0].legend()
     figure.supxlabel("iteration")
     return figure
+
+
+def _draw_loss(
+    ax: Any, rows: Sequence[Mapping[str, str]], name: str, stage: int, first: int, colour: str
+) -> None:
+    """Draw a loss and its running median over the iterations of a stage that begins after
+    ``first`` iterations.
+    """
+    shown = [row for row in rows if row["stage"] == str(stage) and row[name]]
+    iterations = [int(row["iteration"]) + first for row in shown]
+    values = [float(row[name]) for row in shown]
+    ax.plot(iterations, values, color=colour, alpha=0.25, linewidth=0.7)
+    ax.plot(iterations, running_median(values), color=colour, linewidth=1.5, label=f"stage {stage}")
 
 
 @drawn
@@ -67,13 +76,7 @@ def held_out_curves(rows: Sequence[Mapping[str, str]], best: int) -> Any:
     """
     figure, axes = canvas(9.0, 6.4, 2, 1, sharex=True)
     first = sum(row["stage"] == "1" for row in rows)
-    name = "reconstruction" if any(row["reconstruction"] for row in rows) else "L1"
-    loss = [(float(_at(row, first)), float(row[name])) for row in rows if row[name]]
-    at, values = zip(*loss, strict=True)
-    axes[0, 0].plot(at, values, color=BLUE, alpha=0.25, linewidth=0.7)
-    axes[0, 0].plot(at, running_median(values), color=BLUE, linewidth=1.5)
-    axes[0, 0].set_yscale("log", nonpositive="mask")
-    axes[0, 0].set_ylabel(f"training: {name} loss")
+    _draw_training(axes[0, 0], rows, first)
     judged = [row for row in rows if row.get("held_out_PSNR")]
     _draw_held_out(axes[1, 0], judged, first)
     for ax in axes[:, 0]:
@@ -99,15 +102,27 @@ def held_out_curves(rows: Sequence[Mapping[str, str]], best: int) -> Any:
     return figure
 
 
+def _draw_training(ax: Any, rows: Sequence[Mapping[str, str]], first: int) -> None:
+    name = "reconstruction" if any(row["reconstruction"] for row in rows) else "L1"
+    loss = [(float(_at(row, first)), float(row[name])) for row in rows if row[name]]
+    iterations, values = zip(*loss, strict=True)
+    ax.plot(iterations, values, color=BLUE, alpha=0.25, linewidth=0.7)
+    ax.plot(iterations, running_median(values), color=BLUE, linewidth=1.5)
+    ax.set_yscale("log", nonpositive="mask")
+    ax.set_ylabel(f"training: {name} loss")
+
+
 def _draw_held_out(ax: Any, judged: Sequence[Mapping[str, str]], first: int) -> None:
-    at = [_at(row, first) for row in judged]
+    iterations = [_at(row, first) for row in judged]
     for who, colour, text in (
         ("held_out", VERMILION, "network"),
         ("input", BLACK, "input of the network"),
     ):
         values = [float(row[f"{who}_PSNR"]) for row in judged]
         style = "--" if who == "input" else "-"
-        ax.plot(at, values, color=colour, linestyle=style, marker=".", linewidth=1.5, label=text)
+        ax.plot(
+            iterations, values, color=colour, linestyle=style, marker=".", linewidth=1.5, label=text
+        )
     with_ends = [row for row in judged if row["held_out_PSNR_low"]]
     low, high = (
         [float(row[f"held_out_PSNR_{end}"]) for row in with_ends] for end in ("low", "high")
@@ -136,7 +151,9 @@ def strip(pictures: Sequence[Tensor]) -> Any:
     x, 3).
     """
     gap = torch.ones(3, pictures[0].shape[-2], _GAP)
-    parts = [part for picture in pictures for part in (picture.detach().cpu(), gap)][:-1]
+    parts = [pictures[0].detach().cpu()]
+    for picture in pictures[1:]:
+        parts += [gap, picture.detach().cpu()]
     return (encoded(torch.cat(parts, -1)) * 255).round().astype("uint8")
 
 
@@ -237,21 +254,17 @@ def _table(judged: Sequence[Mapping[str, str]], facts: Any) -> Section:
     best = facts.get("best")
     states = ([("best", best)] if best else []) + [("last", judged[-1])]
     rows = []
-    for name, found in states:
+    for name, numbers in states:
         for metric, text in _NAMES.items():
-            own = [float(found[key]) for key in (f"held_out_{metric}", f"input_{metric}")]
-            ends = [
-                float(x) if (x := found.get(f"held_out_{metric}_{end}")) else None
-                for end in ("low", "high")
-            ]
-            rows.append(
-                (
-                    name,
-                    text,
-                    f"{own[0]:.4g}",
-                    *(x if x is None else f"{x:.4g}" for x in ends),
-                    f"{own[1]:.4g}",
-                )
+            own = [float(numbers[key]) for key in (f"held_out_{metric}", f"input_{metric}")]
+            low, high = (
+                _four_digits(numbers.get(f"held_out_{metric}_{end}")) for end in ("low", "high")
             )
+            rows.append((name, text, f"{own[0]:.4g}", low, high, f"{own[1]:.4g}"))
     columns = ("state", "metric", "network", "from", "to", "input")
     return Section("Numbers", "Means over photographs, and their 90 % intervals.", columns, rows)
+
+
+def _four_digits(number: str | float | None) -> str | None:
+    """Return a number of the loss table with four digits, or None where the table has none."""
+    return f"{float(number):.4g}" if number else None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -118,12 +119,14 @@ class PosedPictures:
         shown = recipe.steps[settings.picture]
         channels, matrix = (str(shown.wires.get(name)) for name in ("channels", "matrix"))
         if shown.node.path != "restore.colour" or recipe.steps[channels].node.path not in _FILTERS:
-            given = recipe.config.settings.get(f"{KEY}.picture")
+            setting = recipe.config.settings.get(f"{KEY}.picture")
             text = (
                 f"{settings.picture} is {shown.node.path}, and the network {kind} starts from the"
                 f" Wiener filter: use restore: wiener and {KEY}.picture: restored"
             )
-            raise ValueError(f"{given.source if given else recipe.name}   {KEY}.picture   {text}")
+            raise ValueError(
+                f"{setting.source if setting else recipe.name}   {KEY}.picture   {text}"
+            )
         return cls(channels, matrix, kind)
 
     @property
@@ -146,15 +149,15 @@ class PosedPictures:
         float32.
         """
         posed, matrix = values[self.filter], values[self.matrix]
-        told: Tensor = restore.colour(posed.answer * posed.scale + posed.mean, matrix)
-        return told, (posed._make(part.to(dtype) for part in posed), matrix.to(dtype))
+        picture: Tensor = restore.colour(posed.answer * posed.scale + posed.mean, matrix)
+        return picture, (posed._make(tensor.to(dtype) for tensor in posed), matrix.to(dtype))
 
 
-def tensors_of(given: Given) -> dict[str, Tensor]:
+def tensors_of(beside: Given) -> dict[str, Tensor]:
     """Return the tensors by name of what a network needs beside a picture."""
-    if not given:
+    if not beside:
         return {}
-    posed, matrix = given
+    posed, matrix = beside
     return {**{f"given.{name}": x for name, x in posed._asdict().items()}, "given.matrix": matrix}
 
 
@@ -169,15 +172,15 @@ def given_of(tensors: Mapping[str, Tensor]) -> Given:
     )
 
 
-def turned(given: Given, seed: tuple[int, ...]) -> Given:
+def turned(beside: Given, seed: tuple[int, ...]) -> Given:
     """Turn the maps that a network sees beside a picture, as `scene.symmetry` turns the picture
     with the same seed.
     """
-    known = given[0] if given else None
-    if not given or not isinstance(known, FilterFacts):
-        return given
-    seen = {name: symmetry(getattr(known, name), seed) for name in ("answer", "deviation", "maps")}
-    return known._replace(**seen), given[1]
+    facts = beside[0] if beside else None
+    if not beside or not isinstance(facts, FilterFacts):
+        return beside
+    maps = {name: symmetry(getattr(facts, name), seed) for name in ("answer", "deviation", "maps")}
+    return facts._replace(**maps), beside[1]
 
 
 # --- stored pool ----------------------------------------------------------------------------------
@@ -211,34 +214,34 @@ class StoredPool:
     def picture(
         self,
         scene: Tensor,
-        given: Mapping[str, Any],
+        drawn: Mapping[str, Any],
         noise: int,
         compute: Callable[[], dict[str, Tensor]],
     ) -> dict[str, Tensor]:
         """Return the tensors of a picture from the store, or compute and store them before the
         next picture.
         """
-        key = self._key(scene, given, noise)
+        key = self._key(scene, drawn, noise)
         computed: list[bool] = []
 
         def simulated() -> dict[str, Tensor]:
             computed.append(True)
             return compute()
 
-        kept: dict[str, Tensor] = (
+        tensors: dict[str, Tensor] = (
             simulated()
             if is_private(key)
             else compute_once(self.store, key, dict, simulated, _ABOUT)
         )
         self.computed, self.read = self.computed + bool(computed), self.read + (not computed)
-        return {name: x.to(self.device) for name, x in kept.items()}
+        return {name: x.to(self.device) for name, x in tensors.items()}
 
-    def _key(self, scene: Tensor, given: Mapping[str, Any], noise: int) -> str:
+    def _key(self, scene: Tensor, changed: Mapping[str, Any], noise: int) -> str:
         settings, recipe = self.settings, self.recipe
         pixels = scene.detach().cpu().contiguous()
         keys = {settings.scene: hashlib.sha256(pixels.numpy().tobytes()).hexdigest()}
         drawn: dict[str, dict[str, Any]] = {}
-        for reader, value in given.items():
+        for reader, value in changed.items():
             reads, _, param = reader.rpartition(".")
             drawn.setdefault(reads, {})[param] = value
         for name in self._order:
@@ -330,6 +333,7 @@ class TrainingStream:
         held_out: Sequence[Path] = (),
     ) -> None:
         learn = None if frozen else settings.learn
+        learns = {learn} if learn else set[str]()
         self.settings, self.photographs, self.device = settings, photographs, device
         self.seed, self.mesh, self.held_out = recipe.seed, mesh, held_out
         self._pool = settings.pool if frozen else None
@@ -337,34 +341,35 @@ class TrainingStream:
         #: by stage and numbers, of processes that divide the bands
         self._rounds: dict[tuple[int, ...], Sample] = {}
         outputs: tuple[str, ...] = (settings.picture, settings.truth, settings.light, settings.psf)
-        require_steps(recipe, "train", (*outputs, settings.scene, *([learn] if learn else [])))
-        self._inputs = (
-            Inputs.of(recipe, outputs) if recipe.uncertain and recipe.uncertain.names else None
-        )
+        require_steps(recipe, "train", (*outputs, settings.scene, *learns))
+        self._inputs = _uncertain_inputs(recipe, outputs)
         self._mismatch = CameraMismatch.of(recipe, settings)
         self.shape = frame_of(recipe, settings.scene)
         believed = in_precision(frozen or recipe, settings.dtype)
         self._posed = PosedPictures.of(recipe, settings)
-        believed = self._posed.within(believed) if self._posed else believed
+        if self._posed:
+            believed = self._posed.within(believed)
         self._made = self._outputs(2 if frozen else 1)
         recipe, self.psf = self._mismatch.camera(believed, self._made, settings.psf)
         outputs = (*self._made, self.psf)
-        recipe = with_substitutions(
-            replace(recipe, estimates=False), outputs, {learn} if learn else ()
-        )
+        recipe = with_substitutions(replace(recipe, estimates=False), outputs, learns)
         order = needed(recipe, outputs)
-        keeps = self._pool and settings.keep_pool
-        self._stored = StoredPool(recipe, settings, self._made, store, device) if keeps else None
-        self._lasers = [f"{n}.{_LASER[1]}" for n in order if recipe.steps[n].node.path == _LASER[0]]
+        self._stored = self._stored_pool(recipe, store)
+        self._lasers = _parameters_of_lasers(recipe, order)
         self._readers = self._read(believed, order)
         noise, drawn = self._changing(recipe, order)
-        learnt = dependents(recipe, {learn} if learn else (), order)
+        learnt = dependents(recipe, learns, order)
         self.shards = Shards.of(recipe, self.psf, outputs, drawn | learnt, store, mesh)
         drawn |= self.shards.behind
         read = _sources(recipe, drawn) | {self.psf}
-        self._divide(
-            recipe, learn, [n for n in order if n in (learnt - drawn) & read], drawn, noise, store
-        )
+        border = [name for name in order if name in (learnt - drawn) & read]
+        self._divide(recipe, learn, border, drawn, noise, store)
+
+    def _stored_pool(self, recipe: Recipe, store: Store) -> StoredPool | None:
+        """Return the pictures of a pool in the store, or None if there is no pool to keep."""
+        if not self._pool or not self.settings.keep_pool:
+            return None
+        return StoredPool(recipe, self.settings, self._made, store, self.device)
 
     def _changing(self, recipe: Recipe, order: Sequence[str]) -> tuple[set[str], set[str]]:
         """Return the steps that draw noise for each picture, and all steps that change with each
@@ -388,8 +393,8 @@ class TrainingStream:
         """
         stage = self.settings.stages.get(number)
         light = (self.settings.light,) if stage is not None and stage.bsr else ()
-        seen = self._posed.steps if self._posed else (self.settings.picture,)
-        return (*seen, self.settings.truth, *light)
+        shown = self._posed.steps if self._posed else (self.settings.picture,)
+        return (*shown, self.settings.truth, *light)
 
     def _read(self, believed: Recipe, order: Sequence[str]) -> dict[str, Any]:
         """Return the parameters that change with each picture, with the values that the recipe
@@ -399,13 +404,13 @@ class TrainingStream:
         ``train.mismatch``.
         """
         drawn = dict.fromkeys([*(self._inputs.readers if self._inputs else ()), *self._lasers])
-        told, steps = [TOLD + name for name in drawn], set(order)
-        each = [
+        believed_names, steps = [TOLD + name for name in drawn], set(order)
+        changing = [
             name
-            for name in (*drawn, *told, *self._mismatch.moved)
+            for name in (*drawn, *believed_names, *self._mismatch.moved)
             if name.rpartition(".")[0] in steps
         ]
-        return {name: _given(believed, name.removeprefix(TOLD)) for name in each}
+        return {name: _given(believed, name.removeprefix(TOLD)) for name in changing}
 
     def _divide(
         self,
@@ -471,28 +476,31 @@ class TrainingStream:
         for begin in range(0, len(group), self.mesh.band):
             together = group[begin : begin + self.mesh.band]
             mine = together[self.mesh.column] if self.mesh.column < len(together) else None
-            if not self._each.by_band:
-                if mine is not None:
-                    yield (
-                        mine,
-                        self.turned(self(shared.seen, stage, first + mine), stage, first + mine),
-                    )
-                continue
-            key = (stage, *(self._number(stage, first + i) for i in together))
-            if key in self._rounds:  # in the memory of all processes, or of none
-                if mine is not None:
-                    yield mine, self.turned(self._rounds[key], stage, first + mine)
-                continue
-            begun = {
-                i: self._drawn(stage, number) for i, number in zip(together, key[1:], strict=True)
-            }
-            parts = {i: (theta, noise) for i, (theta, noise, _) in begun.items()}
-            with self._each.together(shared, parts, mine) as values:
-                sample = _NOTHING if mine is None else self._sample(values, begun[mine][2])
-                if mine is not None:
-                    yield mine, self.turned(sample, stage, first + mine)
-            if self._pool is not None and stage != HELD_OUT:
-                self._rounds[key] = sample
+            if self._each.by_band:
+                yield from self._round(shared, stage, first, together, mine)
+            elif mine is not None:
+                sample = self(shared.seen, stage, first + mine)
+                yield mine, self.turned(sample, stage, first + mine)
+
+    def _round(
+        self, shared: Shared, stage: int, first: int, together: Sequence[int], mine: int | None
+    ) -> Iterator[tuple[int, Sample]]:
+        """Compute the pictures ``together`` with the processes that divide the bands, and yield the
+        picture of this process.
+        """
+        key = (stage, *(self._number(stage, first + i) for i in together))
+        if key in self._rounds:  # in the memory of all processes, or of none
+            if mine is not None:
+                yield mine, self.turned(self._rounds[key], stage, first + mine)
+            return
+        begun = {i: self._drawn(stage, number) for i, number in zip(together, key[1:], strict=True)}
+        parts = {i: (theta, noise) for i, (theta, noise, _) in begun.items()}
+        with self._each.together(shared, parts, mine) as values:
+            sample = _NOTHING if mine is None else self._sample(values, begun[mine][2])
+            if mine is not None:
+                yield mine, self.turned(sample, stage, first + mine)
+        if self._pool is not None and stage != HELD_OUT:
+            self._rounds[key] = sample
 
     def __call__(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
         """Return the training picture with the given number, which does not depend on order or
@@ -525,9 +533,14 @@ class TrainingStream:
             return Photographs((self.held_out[number],)).crop(
                 self.shape, self.seed, (stage, number)
             )
-        how = self.settings.augment
-        much = how.exposure, how.colour, how.enlarge
-        change = Change.drawn((self.seed, stage, number, 3), how.symmetries == "all", *much)
+        augment = self.settings.augment
+        change = Change.drawn(
+            (self.seed, stage, number, 3),
+            augment.symmetries == "all",
+            augment.exposure,
+            augment.colour,
+            augment.enlarge,
+        )
         return change.of(
             self.photographs.crop(change.frame(self.shape), self.seed, (stage, number)), self.shape
         )
@@ -540,11 +553,11 @@ class TrainingStream:
 
         if self._stored is None or stage == HELD_OUT:
             return simulated()
-        given = {name: theta[name] for name in self._readers}
-        kept = self._stored.picture(
-            theta[self.settings.scene], given, noise, lambda: simulated().tensors
+        changed = {name: theta[name] for name in self._readers}
+        tensors = self._stored.picture(
+            theta[self.settings.scene], changed, noise, lambda: simulated().tensors
         )
-        return Sample.of(kept, drawn)
+        return Sample.of(tensors, drawn)
 
     def _drawn(self, stage: int, number: int) -> tuple[dict[str, Any], int, dict[str, Any]]:
         """Sample the random inputs of a training picture; return the inputs, the noise seed, and
@@ -578,14 +591,14 @@ class TrainingStream:
         """
         light = values.get(self.settings.light, torch.zeros(0))
         dtype = self.settings.dtype
-        picture, given = (
+        picture, beside = (
             self._posed.read(values, dtype) if self._posed else (values[self.settings.picture], ())
         )
         both = [x.to(dtype) for x in (picture, values[self.settings.truth])]
         if self.settings.size is not None:
             both = [resize(picture, *self.settings.size) for picture in both]
         picture, truth = self._patches(torch.stack(both), drawn["noise"])
-        return Sample(picture, truth, light, drawn, given)
+        return Sample(picture, truth, light, drawn, beside)
 
     def _patches(self, both: Tensor, seed: int) -> Tensor:
         """Cut patches from a training picture and the true picture at the same positions, as a
@@ -611,13 +624,25 @@ class TrainingStream:
         return torch.stack([both[..., y : y + patch[0], x : x + patch[1]] for y, x in places], 1)
 
 
+def _uncertain_inputs(recipe: Recipe, outputs: Sequence[str]) -> Inputs | None:
+    if recipe.uncertain and recipe.uncertain.names:
+        return Inputs.of(recipe, outputs)
+    return None
+
+
+def _parameters_of_lasers(recipe: Recipe, order: Sequence[str]) -> list[str]:
+    """Return the parameter of each laser that changes with each picture."""
+    lasers = [name for name in order if recipe.steps[name].node.path == _LASER[0]]
+    return [f"{name}.{_LASER[1]}" for name in lasers]
+
+
 def _given(recipe: Recipe, name: str) -> Any:
     step, _, param = name.rpartition(".")
     return recipe.steps[step].params[param]
 
 
 def _sources(recipe: Recipe, readers: Iterable[str]) -> set[str]:
-    return {source for reader in readers for source in recipe.steps[reader].sources}
+    return set(chain.from_iterable(recipe.steps[reader].sources for reader in readers))
 
 
 # --- several cameras ------------------------------------------------------------------------------
@@ -646,16 +671,24 @@ class SeveralCameras:
     ) -> None:
         recipes = (recipe, *recipe.cameras)
         self.repeats, self._pool = len(recipes), settings.pool
-        seen = [path for path in held_out for _ in recipes]
-        parts = settings, photographs, store, device
-        self._streams = [TrainingStream(each, *parts, each, held_out=seen) for each in recipes]
+        judged: list[Path] = []
+        for path in held_out:
+            judged += [path] * len(recipes)
+        self._streams = [
+            TrainingStream(
+                camera, settings, photographs, store, device, frozen=camera, held_out=judged
+            )
+            for camera in recipes
+        ]
         self.psf = self._streams[0].psf
 
     @property
     def pool_counts(self) -> dict[str, int]:
         """Return how many pictures of the pool came from the store, and how many were simulated."""
         counts = [stream.pool_counts for stream in self._streams]
-        return {name: sum(each[name] for each in counts) for name in counts[0]}
+        return {
+            name: sum(counts_of_camera[name] for counts_of_camera in counts) for name in counts[0]
+        }
 
     def begin(self, height: Any) -> Shared:
         """Return no results: none depends on a mask that is trained."""

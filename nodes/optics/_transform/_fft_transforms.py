@@ -4,6 +4,7 @@ import copy
 import functools
 import math
 from collections.abc import Callable
+from itertools import chain
 from typing import NamedTuple
 
 import torch
@@ -147,7 +148,7 @@ class Banded:
         last = [math.floor(self._at((b + 1) * self.block - 1) + reach) for b in range(self.count)]
         self.width = max(z - a for a, z in zip(first, last, strict=True)) + 1 + _SLACK
         self.runs = _runs([z + 1 - self.width for z in last], first, step * self.block)
-        starts = [start for run in self.runs for start in run.starts]
+        starts = list(chain.from_iterable(run.starts for run in self.runs))
         self.margin = max(0, -min(starts), max(starts) + self.width - n_columns)
         self.weights = torch.empty(0)
 
@@ -158,7 +159,7 @@ class Banded:
         """Set the matrix to ``weigh(row, column)`` within the band and to zero outside; the
         indices are float64.
         """
-        starts = [start for run in self.runs for start in run.starts]
+        starts = list(chain.from_iterable(run.starts for run in self.runs))
         columns = torch.tensor(starts, dtype=torch.float64)[:, None, None] + torch.arange(
             self.width
         )
@@ -176,16 +177,16 @@ class Banded:
         """Return the part of the banded matrix from block ``first`` up to, but without, block
         ``last``.
         """
-        part = copy.copy(self)
-        part.count, part.n_rows = last - first, (last - first) * self.block
-        part.weights, part.runs = self.weights[first:last], []
+        cut = copy.copy(self)
+        cut.count, cut.n_rows = last - first, (last - first) * self.block
+        cut.weights, cut.runs = self.weights[first:last], []
         for run in self.runs:
             a, z = max(run.first, first), min(run.first + run.blocks, last)
             if a < z:
-                part.runs.append(
+                cut.runs.append(
                     _Run(a - first, z - a, run.start + (a - run.first) * run.stride, run.stride)
                 )
-        return part
+        return cut
 
     def left(self, x: Tensor, out: Tensor) -> None:
         """Write ``matrix @ x[margin + n_columns + margin, c]`` to ``out[n_rows, c]``; ``x`` may
@@ -194,8 +195,8 @@ class Banded:
         wide, pitch = x.shape[1], x.stride(0)
         blocks = out.view(self.count, self.block, wide)
         for first, count, start, stride in self.runs:
-            at = (start + self.margin) * pitch + x.storage_offset()
-            view = x.as_strided((count, self.width, wide), (stride * pitch, pitch, 1), at)
+            offset = (start + self.margin) * pitch + x.storage_offset()
+            view = x.as_strided((count, self.width, wide), (stride * pitch, pitch, 1), offset)
             _multiply(self.weights[first : first + count], view, blocks[first : first + count])
 
     def right(self, x: Tensor, out: Tensor) -> None:
@@ -204,8 +205,8 @@ class Banded:
         """
         tall, wide = x.shape
         for first, count, start, stride in self.runs:
-            at = start + self.margin + x.storage_offset()
-            view = x.as_strided((count, tall, self.width), (stride, wide, 1), at)
+            offset = start + self.margin + x.storage_offset()
+            view = x.as_strided((count, tall, self.width), (stride, wide, 1), offset)
             _multiply(
                 view,
                 self.weights[first : first + count].transpose(1, 2),
@@ -344,8 +345,8 @@ def plan(
         length = smooth(length + length // 4, even=True)
         spread = _spread(axis, kernel, pitch, length)
     gather = _gather(axis, kernel, pitch, points, length).to(kind or dtype, device)
-    kept = spread.n_columns + 2 * spread.margin
-    return Plan(gather, spread.to(dtype, device), points, length, kept, axis.sign)
+    frequencies = spread.n_columns + 2 * spread.margin
+    return Plan(gather, spread.to(dtype, device), points, length, frequencies, axis.sign)
 
 
 def _gather(axis: Axis, kernel: Kernel, pitch: float, points: int, length: int) -> Banded:
@@ -356,9 +357,9 @@ def _gather(axis: Axis, kernel: Kernel, pitch: float, points: int, length: int) 
     band = Banded(points, axis.n_in, j0 - pitch * l0, pitch, pitch * kernel.width / 2, _BLOCK)
 
     def weigh(row: Tensor, column: Tensor) -> Tensor:
-        at = (row - l0).clamp_(max=l0)
-        scale = alternating(at + length // 2) * (kernel.peak / kernel.transform(at / length))
-        return kernel((column - j0) / pitch - at) / kernel.peak * scale
+        place = (row - l0).clamp_(max=l0)
+        scale = alternating(place + length // 2) * (kernel.peak / kernel.transform(place / length))
+        return kernel((column - j0) / pitch - place) / kernel.peak * scale
 
     return band.fill(weigh)
 
@@ -368,16 +369,16 @@ def _spread(axis: Axis, kernel: Kernel, pitch: float, length: int) -> Banded:
     interpolation before the FFT.
     """
     k0, fine = (axis.n_out - 1) / 2, axis.alpha * pitch * length
-    kept = odd(math.ceil((axis.n_out - 1) * fine) + kernel.width)
-    q0 = (kept - 1) // 2
-    band = Banded(axis.n_out, kept, q0 - fine * k0, fine, kernel.width / 2, 2 * _BLOCK)
+    frequencies = odd(math.ceil((axis.n_out - 1) * fine) + kernel.width)
+    q0 = (frequencies - 1) // 2
+    band = Banded(axis.n_out, frequencies, q0 - fine * k0, fine, kernel.width / 2, 2 * _BLOCK)
 
     def weigh(row: Tensor, column: Tensor) -> Tensor:
-        at = (row - k0).clamp_(max=k0)
+        place = (row - k0).clamp_(max=k0)
         return (
             alternating(column - q0)
-            * kernel(fine * at - (column - q0))
-            / kernel.transform(axis.alpha * pitch * at)
+            * kernel(fine * place - (column - q0))
+            / kernel.transform(axis.alpha * pitch * place)
         )
 
     return band.fill(weigh)
@@ -456,9 +457,9 @@ def _columns_to_frequencies(y: Plan, half: Tensor, work: Workspace) -> Tensor:
     cropped FFT transposed.
     """
     wide, kind = half.shape[1], y.gather.weights.dtype.to_complex()
-    given = half if kind == half.dtype else work.take("given", *half.shape, dtype=kind).copy_(half)
+    field = half if kind == half.dtype else work.take("given", *half.shape, dtype=kind).copy_(half)
     columns = work.take("columns", y.length, wide, dtype=kind)
-    y.gather.left(_flat(given), _flat(columns[y.padded : y.padded + y.gather.n_rows]))
+    y.gather.left(_flat(field), _flat(columns[y.padded : y.padded + y.gather.n_rows]))
     columns[: y.padded] = 0
     columns[y.padded + y.points :] = 0
     spectrum = work.take("spectrum", wide, y.kept, dtype=half.dtype)
@@ -476,14 +477,17 @@ def _interpolate(
     samples to ``sink``.
     """
     for first in range(0, x.spread.count, _COLUMN_BLOCKS):
-        part = x.spread.part(first, min(first + _COLUMN_BLOCKS, x.spread.count))
-        line = work.take("stripe", part.n_rows, spectrum.shape[1], dtype=spectrum.dtype)
-        part.left(_flat(spectrum), _flat(line))
+        stripe = x.spread.part(first, min(first + _COLUMN_BLOCKS, x.spread.count))
+        line = work.take("stripe", stripe.n_rows, spectrum.shape[1], dtype=spectrum.dtype)
+        stripe.left(_flat(spectrum), _flat(line))
         planes = work.take("stripes", 2, *line.shape).copy_(torch.view_as_real(line).movedim(2, 0))
-        blocks = work.take("tiles", y.spread.count, 2 * part.n_rows, y.spread.block)
+        blocks = work.take("tiles", y.spread.count, 2 * stripe.n_rows, y.spread.block)
         y.spread.right(planes.flatten(0, 1), blocks)
-        start, stop = first * part.block, min(first * part.block + part.n_rows, shape[1])
-        tiles = blocks.view(y.spread.count, 2, part.n_rows, y.spread.block).permute(1, 0, 3, 2)
+        start, stop = (
+            first * stripe.block,
+            min(first * stripe.block + stripe.n_rows, shape[1]),
+        )
+        tiles = blocks.view(y.spread.count, 2, stripe.n_rows, y.spread.block).permute(1, 0, 3, 2)
         _deliver(tiles[..., : stop - start], slice(start, stop), shape[0], sink)
 
 
@@ -492,11 +496,15 @@ def _deliver(tiles: Tensor, columns: slice, n_rows: int, sink: Sink) -> None:
     block.
     """
     block = tiles.shape[2]
-    whole = n_rows // block
-    if whole:
-        sink(slice(0, whole * block), columns, tiles[:, :whole])
-    if whole * block < n_rows:
-        sink(slice(whole * block, n_rows), columns, tiles[:, whole, : n_rows - whole * block])
+    full_blocks = n_rows // block
+    if full_blocks:
+        sink(slice(0, full_blocks * block), columns, tiles[:, :full_blocks])
+    if full_blocks * block < n_rows:
+        sink(
+            slice(full_blocks * block, n_rows),
+            columns,
+            tiles[:, full_blocks, : n_rows - full_blocks * block],
+        )
 
 
 def _flat(x: Tensor) -> Tensor:

@@ -67,32 +67,39 @@ def fused_axis(axis: Axis, dtype: torch.dtype, gathered: torch.dtype, kind: torc
     The weights in front of the FFT are of the type ``gathered``, all else of the type ``kind``.
     """
     kernel = SINGLE if dtype == torch.float32 else DOUBLE
-    pitch, points, length, fine, kept = _grids(axis, kernel)
-    j0, k0, l0, q0 = (axis.n_in - 1) / 2, (axis.n_out - 1) / 2, (points - 1) // 2, (kept - 1) // 2
+    pitch, points, length, fine, frequencies = _grids(axis, kernel)
+    j0, k0, l0, q0 = (
+        (axis.n_in - 1) / 2,
+        (axis.n_out - 1) / 2,
+        (points - 1) // 2,
+        (frequencies - 1) // 2,
+    )
 
     def gather(row: Tensor, column: Tensor) -> Tensor:
-        at = row - l0
-        scale = alternating(at + length // 2) * (kernel.peak / kernel.transform(at / length))
-        return kernel((column - j0) / pitch - at) / kernel.peak * scale
+        place = row - l0
+        scale = alternating(place + length // 2) * (kernel.peak / kernel.transform(place / length))
+        return kernel((column - j0) / pitch - place) / kernel.peak * scale
 
     def spread(row: Tensor, column: Tensor) -> Tensor:
-        at, near = row - k0, column - q0
+        place, near = row - k0, column - q0
         return (
-            alternating(near) * kernel(fine * at - near) / kernel.transform(axis.alpha * pitch * at)
+            alternating(near)
+            * kernel(fine * place - near)
+            / kernel.transform(axis.alpha * pitch * place)
         )
 
     gather_first, gather_weights = _band(
         points, axis.n_in, j0 - pitch * l0, pitch, pitch * kernel.width / 2, gather
     )
     spread_first, spread_weights = _band(
-        axis.n_out, kept, q0 - fine * k0, fine, kernel.width / 2, spread
+        axis.n_out, frequencies, q0 - fine * k0, fine, kernel.width / 2, spread
     )
     turns = torch.view_as_real(
         unit_phasor(torch.arange(length, dtype=torch.float64) / -length, kind)
     )
     arrays = (torch.tensor(_factors(length)), gather_first, spread_first)
     held = (*arrays, gather_weights.to(gathered), spread_weights.to(kind), turns.contiguous())
-    sizes = (axis.n_in, axis.n_out, points, length, length // 2 - l0, length // 2 - q0, kept)
+    sizes = (axis.n_in, axis.n_out, points, length, length // 2 - l0, length // 2 - q0, frequencies)
     widths = (gather_weights.shape[1], spread_weights.shape[1], len(held[0]))
     plan = CAxis(*sizes, *widths, *(x.data_ptr() for x in held))
     plan.held = held
@@ -126,16 +133,16 @@ def _grids(axis: Axis, kernel: Kernel) -> tuple[float, int, int, float, int]:
     return pitch, points, *_length(axis, kernel, pitch, math.ceil(points * kernel.oversampling))
 
 
-def _length(axis: Axis, kernel: Kernel, pitch: float, least: int) -> tuple[int, float, int]:
+def _length(axis: Axis, kernel: Kernel, pitch: float, shortest: int) -> tuple[int, float, int]:
     """Return the FFT length, its samples for each output sample, and the frequencies that are
     kept of it.
     """
-    length = smooth(max(least, _SHORTEST), even=True)
+    length = smooth(max(shortest, _SHORTEST), even=True)
     while True:
         fine = axis.alpha * pitch * length
-        kept = odd(math.ceil((axis.n_out - 1) * fine) + kernel.width)
-        if kept <= length:
-            return length, fine, kept
+        frequencies = odd(math.ceil((axis.n_out - 1) * fine) + kernel.width)
+        if frequencies <= length:
+            return length, fine, frequencies
         length = smooth(length + length // 4, even=True)
 
 
@@ -283,11 +290,11 @@ class FusedPupil:
         """
         sums = [None if grad is None else torch.zeros_like(self.height) for grad in grads]
         gain, band = weight, -1
-        for view, kept in zip(views, fields, strict=True):
+        for view, stored in zip(views, fields, strict=True):
             if view.band != band:
                 gain, band = weight[view.band].contiguous(), view.band
-            field = self.work.take("focal", 2, *gain.shape) if kept is None else kept
-            if kept is None:
+            field = self.work.take("focal", 2, *gain.shape) if stored is None else stored
+            if stored is None:
                 self.forward(view, None, False, field)
             self._adjoint(view, field, gain, sums)
         for grad, added in zip(grads, sums, strict=True):
@@ -314,7 +321,7 @@ class FusedPupil:
             _Pupil(self.kind == torch.float64, *arrays, *turns, pointer(v), pointer(u)), (v, u)
         )
 
-    def _call(self, name: str, rows: Axis, columns: Axis, *given: Any) -> None:
+    def _call(self, name: str, rows: Axis, columns: Axis, *arguments: Any) -> None:
         kind = last_type(*last_work(rows, columns), self.dtype, _LITTLE)
         y, x = (
             fused_axis(rows, self.dtype, self.dtype, kind),
@@ -325,7 +332,7 @@ class FusedPupil:
             self._tiles(label, y, n, kind) for label, n in (("before", x.n_in), ("behind", x.n_out))
         ]
         structures = [
-            ctypes.byref(s) if isinstance(s, ctypes.Structure) else s for s in (y, x, *given)
+            ctypes.byref(s) if isinstance(s, ctypes.Structure) else s for s in (y, x, *arguments)
         ]
         samples = rows.n_in * columns.n_in + rows.n_out * columns.n_out
         threads = min(torch.get_num_threads(), 1 + samples // _ALONE)

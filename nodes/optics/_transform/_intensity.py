@@ -104,14 +104,14 @@ class _Transformed(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> Any:
         saved = ctx.saved_tensors
-        given = [
+        pushed = [
             torch.zeros_like(x) if t is None else t for x, t in zip(saved, tangents, strict=False)
         ]
-        return _Tangent.apply(*saved, *given, ctx.sampling)  # type: ignore[no-untyped-call]
+        return _Tangent.apply(*saved, *pushed, ctx.sampling)  # type: ignore[no-untyped-call]
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
-        return one_by_one(_Transformed.apply, info.batch_size, in_dims, given)
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> Any:
+        return one_by_one(_Transformed.apply, info.batch_size, in_dims, inputs)
 
 
 class _Once(torch.autograd.Function):
@@ -136,12 +136,12 @@ class _Tangent(_Once):
     """
 
     @staticmethod
-    def forward(*given: Any) -> Tensor:
-        return _pushed(Screens.of(*given[:3]), given[3:6], given[6])
+    def forward(*inputs: Any) -> Tensor:
+        return _pushed(Screens.of(*inputs[:3]), inputs[3:6], inputs[6])
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
-        return one_by_one(_Tangent.apply, info.batch_size, in_dims, given)
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> Any:
+        return one_by_one(_Tangent.apply, info.batch_size, in_dims, inputs)
 
 
 class _Gradient(_Once):
@@ -159,8 +159,8 @@ class _Gradient(_Once):
         )
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
-        return one_by_one(_Gradient.apply, info.batch_size, in_dims, given)
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> Any:
+        return one_by_one(_Gradient.apply, info.batch_size, in_dims, inputs)
 
 
 def _computed(
@@ -178,19 +178,19 @@ def _computed(
     with borrowed(sampling.dtype, device) as work:
         pupil = FusedPupil(screens, sampling.dtype, work) if fused else None
         for view in views:
-            kept = (
+            focal = (
                 torch.empty(2, *shape[:: 1 if fused else -1], dtype=sampling.dtype, device=device)
                 if keep
                 else None
             )
             if pupil is not None:
-                pupil.forward(view, intensity[view.band], view.band == done, kept)
+                pupil.forward(view, intensity[view.band], view.band == done, focal)
             else:
                 field = Field(screens, view, sampling.dtype)
                 _power(
-                    field, intensity[view.band], view.band == done, kept, sampling.by_torch, work
+                    field, intensity[view.band], view.band == done, focal, sampling.by_torch, work
                 )
-            fields.append(kept)
+            fields.append(focal)
             done = view.band
     return intensity, fields
 
@@ -216,9 +216,9 @@ def _adjoint(
                 sampling.views, weight, fields, grads
             )
             return grads
-        for view, kept in zip(sampling.views, fields, strict=True):
+        for view, focal in zip(sampling.views, fields, strict=True):
             field = Field(screens, view, weight.dtype)
-            planes = kept if kept is not None else _focal(field, sampling, work)
+            planes = focal if focal is not None else _focal(field, sampling, work)
             _add_gradient(field, planes, weight[view.band], grads, sampling.by_torch, work)
     return grads
 
@@ -281,15 +281,15 @@ def _scaled(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:
 
 
 def _power(
-    field: Field, out: Tensor, add: bool, kept: Tensor | None, method: Method, work: Workspace
+    field: Field, out: Tensor, add: bool, focal: Tensor | None, method: Method, work: Workspace
 ) -> None:
     """Write the weighted intensity |U|^2 of one window of the focal plane to ``out``, or add it
     to ``out``.
     """
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
-        if kept is not None:
-            _keep(kept, rows, columns, patch)
+        if focal is not None:
+            _keep(focal, rows, columns, patch)
         power = _scaled(field.view, patch[0].square().addcmul_(patch[1], patch[1]), rows, columns)
         into = patch_of(out, rows, columns, patch)
         into.add_(power) if add else into.copy_(power)
@@ -297,11 +297,11 @@ def _power(
     propagate(field.view.rows, field.view.columns, field.rows(work), sink, work, method)
 
 
-def _keep(kept: Tensor, rows: slice, columns: slice, patch: Tensor) -> None:
+def _keep(focal: Tensor, rows: slice, columns: slice, patch: Tensor) -> None:
     """Store a patch of the focal field transposed, the memory layout of the fastest transform
     and its adjoint.
     """
-    patch_of(kept.transpose(1, 2), rows, columns, patch).copy_(patch)
+    patch_of(focal.transpose(1, 2), rows, columns, patch).copy_(patch)
 
 
 def _focal(field: Field, sampling: Sampling, work: Workspace) -> Tensor:

@@ -130,8 +130,8 @@ def last_type(first: float, last: float, dtype: torch.dtype, little: float = LIT
 
 def patch_of(x: Tensor, rows: slice, columns: slice, like: Tensor) -> Tensor:
     """Return a view of ``x[..., rows, columns]`` in the shape of the patch ``like``."""
-    part = x[..., rows, columns]
-    return part.view(*x.shape[:-2], *like.shape[1:])
+    view = x[..., rows, columns]
+    return view.view(*x.shape[:-2], *like.shape[1:])
 
 
 def row_chunks(rows: int, columns: int, elements: int = 1 << 19) -> list[tuple[int, int]]:

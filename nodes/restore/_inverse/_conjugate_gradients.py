@@ -41,17 +41,17 @@ class Lowest:
     the mean.
     """
 
-    def __init__(self, seen: Blurred, gain: Tensor, modes: int = MODES) -> None:
+    def __init__(self, problem: Blurred, gain: Tensor, modes: int = MODES) -> None:
         """Build the inverse; `gain` (channel, fy, fx), an approximate inverse's diagonal, scales
         the normal matrix.
         """
-        self.torus = seen.torus
-        count = min(modes, 3 * modes // len(seen.picture), int(math.prod(seen.torus) / SHARE))
-        self.fy, self.fx = (f.to(gain.device) for f in _lowest(seen.torus, max(1, count // 2)))
+        self.torus = problem.torus
+        count = min(modes, 3 * modes // len(problem.picture), int(math.prod(problem.torus) / SHARE))
+        self.fy, self.fx = (f.to(gain.device) for f in _lowest(problem.torus, max(1, count // 2)))
         root = gain[:, self.fy, self.fx].double().sqrt()
         root[:, 0] *= 0.5**0.5  # the mean is its own mirror image
         root = torch.cat([root, root[:, 1:]], 1).flatten()
-        matrix = self._matrix(seen).mul_(root[:, None]).mul_(root)
+        matrix = self._matrix(problem).mul_(root[:, None]).mul_(root)
         matrix.diagonal().add_(_LEAST * matrix.diagonal().max())
         whiten = _inverse(torch.linalg.cholesky(matrix)).mul_(root)
         # lower triangular: numbers beyond `end` are 0
@@ -81,27 +81,27 @@ class Lowest:
         onto[:, -self.fy[mirrored], 0] += step[:, mirrored].conj()
         return rise * (2.0 / (self.torus[0] * self.torus[1]))
 
-    def _matrix(self, seen: Blurred) -> Tensor:
+    def _matrix(self, problem: Blurred) -> Tensor:
         """Return the float64 normal matrix of prior, noise and glare, for real and imaginary
         parts of each channel.
         """
-        transfer = seen.transfer[:, self.fy, self.fx].to(torch.complex128)
-        inverse = 1.0 / seen.power[self.fy, self.fx].double().clamp_min(1e-30)
+        transfer = problem.transfer[:, self.fy, self.fx].to(torch.complex128)
+        inverse = 1.0 / problem.power[self.fy, self.fx].double().clamp_min(1e-30)
         inverse = torch.cat([2.0 * inverse[:1], inverse[1:], inverse[1:]])
-        own, shared = inverse_colour(len(transfer), seen.grey)
+        own, shared = inverse_colour(len(transfer), problem.grey)
         colours = (
             own * torch.eye(len(transfer), dtype=torch.float64, device=inverse.device) - shared
         )
         matrix = inverse.new_zeros(len(transfer), len(inverse), len(transfer), len(inverse))
         matrix.diagonal(dim1=1, dim2=3).copy_(colours[..., None] * inverse)
         for channel, through in enumerate(transfer):
-            weight = torch.fft.rfft2(seen.weight[channel].double(), s=seen.torus)
+            weight = torch.fft.rfft2(problem.weight[channel].double(), s=problem.torus)
             matrix[channel, :, channel] += self._noise(weight, through)
-            if seen.held is not None:
-                held = torch.fft.rfft2(seen.held[channel].double(), s=seen.torus)
+            if problem.held is not None:
+                held = torch.fft.rfft2(problem.held[channel].double(), s=problem.torus)
                 matrix[channel, :, channel] += self._noise(held, torch.ones_like(through))
         size = len(transfer) * len(inverse)
-        return self._without_glare(matrix.view(size, size), seen, transfer)
+        return self._without_glare(matrix.view(size, size), problem, transfer)
 
     def _noise(self, weight: Tensor, through: Tensor) -> Tensor:
         """Return the part of the normal matrix from the noise of one channel, for all pairs of
@@ -124,20 +124,20 @@ class Lowest:
         values = spectrum[torch.where(far, -fy, fy) % y, torch.where(far, x - fx, fx)]
         return torch.where(far, values.conj(), values)
 
-    def _without_glare(self, matrix: Tensor, seen: Blurred, transfer: Tensor) -> Tensor:
+    def _without_glare(self, matrix: Tensor, problem: Blurred, transfer: Tensor) -> Tensor:
         """Subtract from the normal matrix the information lost to unknown glare strengths, and
         return the matrix.
         """
-        if not seen.glare:
+        if not problem.glare:
             return matrix
-        flat = torch.stack(seen.glare).double().flatten(1)
-        weighted = seen.weight.double().flatten() * flat
-        products = with_bounds(weighted @ flat.T, seen.bounded)
+        flat = torch.stack(problem.glare).double().flatten(1)
+        weighted = problem.weight.double().flatten() * flat
+        products = with_bounds(weighted @ flat.T, problem.bounded)
         inverse = torch.linalg.pinv(products, hermitian=True) * (
             2.0 / (self.torus[0] * self.torus[1])
         )
-        shapes = weighted.reshape(-1, *seen.picture.shape)
-        spectra = (torch.fft.rfft2(shape, s=seen.torus)[:, self.fy, self.fx] for shape in shapes)
+        shapes = weighted.reshape(-1, *problem.picture.shape)
+        spectra = (torch.fft.rfft2(shape, s=problem.torus)[:, self.fy, self.fx] for shape in shapes)
         rows = torch.stack([_real(transfer.conj() * s) for s in spectra])
         return matrix.addmm_(rows.T, inverse @ rows, alpha=-1.0)
 
@@ -194,7 +194,7 @@ _PIECE = 2**18  #: numbers of a spectrum worked on at a time, which fit in the c
 
 
 def descend(
-    seen: Blurred, x: Tensor, steps: int, enough: float, inverse: Preconditioner | None = None
+    problem: Blurred, x: Tensor, steps: int, enough: float, inverse: Preconditioner | None = None
 ) -> Tensor:
     """Improve the half spectrum `x` of a picture in place by at most `steps` conjugate-gradient
     steps, and return `x`.
@@ -205,7 +205,7 @@ def descend(
     """
     if steps < 1:
         return x
-    normal, inverse = _Normal(seen), inverse or Preconditioner(seen)
+    normal, inverse = _Normal(problem), inverse or Preconditioner(problem)
     left, way, change = normal.slope(x), torch.empty_like(x), torch.empty_like(x)
     size = inverse(left, way)
     enough = max(enough, 1e-20 * float(size))
@@ -252,10 +252,13 @@ class _Normal:
     covariance of the picture.
     """
 
-    def __init__(self, seen: Blurred) -> None:
-        self.seen, self.weigh = seen, weighing(seen)
-        self.inverse = 1.0 / seen.power.clamp_min(1e-30)
-        self.plane, self.pixels = seen.picture.new_zeros(seen.torus), torch.empty_like(seen.picture)
+    def __init__(self, problem: Blurred) -> None:
+        self.seen, self.weigh = problem, weighing(problem)
+        self.inverse = 1.0 / problem.power.clamp_min(1e-30)
+        self.plane, self.pixels = (
+            problem.picture.new_zeros(problem.torus),
+            torch.empty_like(problem.picture),
+        )
 
     def __call__(self, x: Tensor, result: Tensor) -> Tensor:
         """Write the product of the normal matrix and x to `result`, and return the inner product
@@ -316,28 +319,30 @@ class Preconditioner:
     frequencies.
     """
 
-    def __init__(self, seen: Blurred, modes: int = MODES) -> None:
-        own, shared = inverse_colour(len(seen.picture), seen.grey)
-        known = (seen.weight > 0).sum((-2, -1)).clamp_min(1)
-        mean = (seen.weight.sum((-2, -1)) / known)[:, None, None]
+    def __init__(self, problem: Blurred, modes: int = MODES) -> None:
+        own, shared = inverse_colour(len(problem.picture), problem.grey)
+        count = (problem.weight > 0).sum((-2, -1)).clamp_min(1)
+        mean = (problem.weight.sum((-2, -1)) / count)[:, None, None]
         held = (
-            torch.zeros_like(mean) if seen.held is None else seen.held.mean((-2, -1), keepdim=True)
+            torch.zeros_like(mean)
+            if problem.held is None
+            else problem.held.mean((-2, -1), keepdim=True)
         )
-        self.torus = seen.torus
+        self.torus = problem.torus
         self.gain = torch.empty(
-            seen.transfer.shape, dtype=seen.power.dtype, device=seen.power.device
+            problem.transfer.shape, dtype=problem.power.dtype, device=problem.power.device
         )
-        self.shared = torch.empty_like(seen.power)
+        self.shared = torch.empty_like(problem.power)
         for rows in pieces(self.gain):
-            inverse = 1.0 / seen.power[rows].clamp_min(1e-30)
-            through = seen.transfer[:, rows]
-            told = mean * (through.real.square() + through.imag.square())
-            self.gain[:, rows] = 1.0 / (own * inverse + told + held)
+            inverse = 1.0 / problem.power[rows].clamp_min(1e-30)
+            through = problem.transfer[:, rows]
+            information = mean * (through.real.square() + through.imag.square())
+            self.gain[:, rows] = 1.0 / (own * inverse + information + held)
             self.shared[rows] = (
                 shared * inverse / (1.0 - shared * inverse * self.gain[:, rows].sum(0))
             )
         self.lowest = (
-            Lowest(seen, self.gain, modes) if max(seen.picture.shape[-2:]) <= LOWEST else None
+            Lowest(problem, self.gain, modes) if max(problem.picture.shape[-2:]) <= LOWEST else None
         )
 
     def __call__(self, slope: Tensor, result: Tensor) -> Tensor:
@@ -354,11 +359,11 @@ class Preconditioner:
 
 def inner(a: Tensor, b: Tensor, torus: Size) -> Tensor:
     """Return the inner product of two pictures, given half of their Fourier transforms."""
-    whole = (
+    half_sum = (
         torch.stack([torch.vdot(p.flatten(), q.flatten()) for p, q in zip(a, b, strict=True)]).sum()
         * 2.0
     )
     for column in (0,) if torus[1] % 2 else (0, -1):
-        whole = whole - torch.linalg.vecdot(a[..., column], b[..., column]).sum()
-    total: Tensor = whole.real.double() / (torus[0] * torus[1])
+        half_sum = half_sum - torch.linalg.vecdot(a[..., column], b[..., column]).sum()
+    total: Tensor = half_sum.real.double() / (torus[0] * torus[1])
     return total

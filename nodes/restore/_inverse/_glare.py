@@ -53,17 +53,23 @@ class Light(NamedTuple):
     modes: list[Tensor]
 
 
-def visible(patterns: Sequence[Tensor], nearby: Sequence[Tensor | None], known: Tensor) -> Glare:
+def visible(
+    patterns: Sequence[Tensor], nearby: Sequence[Tensor | None], unclipped: Tensor
+) -> Glare:
     """Return the glare patterns that are nonzero at some known pixel, each scaled to a maximum
     of 1.
     """
-    peaks = [float((pattern.detach().abs() * known).max()) for pattern in patterns]
-    seen = [
+    peaks = [float((pattern.detach().abs() * unclipped).max()) for pattern in patterns]
+    visible_patterns = [
         (p / peak, n if n is None else n / peak)
         for p, n, peak in zip(patterns, nearby, peaks, strict=True)
         if peak
     ]
-    return Glare([p for p, _ in seen], [n for _, n in seen], peaks=[peak for peak in peaks if peak])
+    return Glare(
+        [p for p, _ in visible_patterns],
+        [n for _, n in visible_patterns],
+        peaks=[peak for peak in peaks if peak],
+    )
 
 
 def with_light_around(glare: Glare) -> Glare:
@@ -88,14 +94,18 @@ def square_mean(picture: Tensor, radius: int) -> Tensor:
     for dim in (-2, -1):
         size = picture.shape[dim]
         sums = torch.cat([torch.zeros_like(picture.narrow(dim, 0, 1)), picture.cumsum(dim)], dim)
-        at = torch.arange(size, device=picture.device)
-        upper, lower = (at + radius + 1).clamp(max=size), (at - radius).clamp(min=0)
+        index = torch.arange(size, device=picture.device)
+        upper, lower = (index + radius + 1).clamp(max=size), (index - radius).clamp(min=0)
         picture = (sums.index_select(dim, upper) - sums.index_select(dim, lower)) / (2 * radius + 1)
     return picture
 
 
 def doubted(
-    electrons: Tensor, known: Tensor, glare: Glare, doubt: float, noise: Callable[[Tensor], Tensor]
+    electrons: Tensor,
+    unclipped: Tensor,
+    glare: Glare,
+    doubt: float,
+    noise: Callable[[Tensor], Tensor],
 ) -> tuple[Tensor, Light, Tensor]:
     """Return the weights of pixels, an estimate of the glare, and the mean variance of its pattern
     by these weights.
@@ -104,13 +114,13 @@ def doubted(
     made twice: a pixel then weighs noise / (noise + variance of the glare). ``noise`` returns the
     variance of the noise for the mean of the picture without glare.
     """
-    light = _estimated(electrons, known, glare, doubt)
+    light = _estimated(electrons, unclipped, glare, doubt)
     if not (doubt or light.modes) or not glare.patterns:
-        return known, light, torch.zeros_like(known[:, :1, :1])
-    trusted = known
+        return unclipped, light, torch.zeros_like(unclipped[:, :1, :1])
+    trusted = unclipped
     for _ in range(2):
         own = noise(average(electrons - light.sum, trusted))
-        trusted = known * own / (own + _total(light))
+        trusted = unclipped * own / (own + _total(light))
         light = _estimated(electrons, trusted, glare, doubt)
     return trusted, light, average(_total(light), trusted)
 
@@ -124,12 +134,10 @@ def _estimated(electrons: Tensor, weights: Tensor, glare: Glare, doubt: float) -
     parts = [strength * pattern for strength, pattern in zip(fit, glare.patterns, strict=True)]
     doubtful = zip(fit, glare.around or (), strict=True) if doubt else ()
     own = sum(((doubt * strength * around).square() for strength, around in doubtful), dark)
-    modes = [
-        strength * (other - pattern) / len(others) ** 0.5
-        for strength, pattern, others in zip(fit, glare.patterns, glare.nearby, strict=True)
-        if others is not None
-        for other in others
-    ]
+    modes = []
+    for strength, pattern, others in zip(fit, glare.patterns, glare.nearby, strict=True):
+        if others is not None:
+            modes += [strength * (other - pattern) / len(others) ** 0.5 for other in others]
     return Light(sum(parts, dark), own, modes)
 
 
@@ -154,10 +162,10 @@ def strengths(electrons: Tensor, weights: Tensor, glare: Sequence[Tensor]) -> Te
     products = torch.zeros(len(glare), len(glare) + 1, dtype=torch.float64, device=electrons.device)
     for channel in range(len(electrons)):
         for some in range(0, electrons.shape[-2], _ROWS):
-            at = (channel, slice(some, some + _ROWS))
-            flat = [(p[at] - m[channel]).flatten() for p, m in zip(glare, means, strict=True)]
-            weight = weights[at].flatten()
-            every = torch.stack([*flat, electrons[at].flatten()]).double()
+            block = (channel, slice(some, some + _ROWS))
+            flat = [(p[block] - m[channel]).flatten() for p, m in zip(glare, means, strict=True)]
+            weight = weights[block].flatten()
+            every = torch.stack([*flat, electrons[block].flatten()]).double()
             products += (every[:-1] * weight) @ every.T
     fit: Tensor = torch.linalg.pinv(products[:, :-1], hermitian=True) @ products[:, -1]
     return fit.to(electrons)
@@ -178,13 +186,13 @@ _SAMPLE = 1 << 16
 
 def likeliest_doubt(
     electrons: Tensor,
-    known: Tensor,
+    unclipped: Tensor,
     glare: Glare,
     noise: Callable[[Tensor], Tensor],
-    least: float = 0.0,
+    smallest: float = 0.0,
 ) -> float:
-    """Return the doubt of highest likelihood, at least ``least``, for a picture of which ``known``
-    pixels count.
+    """Return the doubt of highest likelihood, at least ``smallest``, for a picture of which
+    ``unclipped`` pixels count.
 
     Likelihood: what is left of the picture without glare, less the mean of the 3 x 3 pixels around,
             is Gaussian in each
@@ -194,21 +202,21 @@ def likeliest_doubt(
     """
     if not glare.patterns:
         return 0.0
-    whole = _mean_around(known) > 1 - 1e-6  # all of the 3 x 3 pixels are known
+    interior = _mean_around(unclipped) > 1 - 1e-6  # all of the 3 x 3 pixels are known
 
     def likelihood(doubt: float) -> float:
-        trusted, light, _ = doubted(electrons, known, glare, doubt, noise)
-        rest = electrons - light.sum
-        variance = 8 / 9 * (noise(average(rest, trusted)) + light.variance)
+        trusted, light, _ = doubted(electrons, unclipped, glare, doubt, noise)
+        remainder = electrons - light.sum
+        variance = 8 / 9 * (noise(average(remainder, trusted)) + light.variance)
         for mode in light.modes:
             variance = variance + _sharp(mode).square()
-        channels = zip(_sharp(rest), variance, whole, strict=True)
+        channels = zip(_sharp(remainder), variance, interior, strict=True)
         return sum(
             _profile(errors[use].square(), own[use]) for errors, own, use in channels if use.any()
         )
 
     with torch.no_grad():
-        return max((least, *(doubt for doubt in DOUBTS if doubt > least)), key=likelihood)
+        return max((smallest, *(doubt for doubt in DOUBTS if doubt > smallest)), key=likelihood)
 
 
 def _profile(squares: Tensor, variance: Tensor) -> float:
@@ -217,8 +225,8 @@ def _profile(squares: Tensor, variance: Tensor) -> float:
     """
     some = slice(None, None, max(1, len(squares) // _SAMPLE))
     top = float(squares.mean())
-    each = [top * 2 ** (-n / 2) for n in range(_STEPS)]
-    best = max(each, key=lambda scene: _gaussian(squares[some], variance[some] + scene))
+    variances = [top * 2 ** (-n / 2) for n in range(_STEPS)]
+    best = max(variances, key=lambda scene: _gaussian(squares[some], variance[some] + scene))
     return _gaussian(squares, variance + best)
 
 
@@ -270,33 +278,33 @@ _EVALUATIONS = 160  #: of the likelihood
 
 
 def scattered(
-    electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
+    electrons: Tensor, unclipped: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
 ) -> tuple[Tensor, Light, Tensor]:
     """Return what `doubted` returns, for glare in electrons of which a part that the picture
     tells is scattered.
     """
     if glare.smooth is None:
         glare = with_smooth(glare)
-    strength, *shares = _likeliest(electrons, known, glare, noise)
+    strength, *shares = _likeliest(electrons, unclipped, glare, noise)
     light = _light(glare, strength, shares)
     total = sum((mode.square() for mode in light.modes), light.variance)
     # a channel without known pixels has a mean
-    known = torch.where(known.amax((-2, -1), keepdim=True) > 0, known, 1.0)
-    trusted = known
+    unclipped = torch.where(unclipped.amax((-2, -1), keepdim=True) > 0, unclipped, 1.0)
+    trusted = unclipped
     for _ in range(2):
         own = noise(average(electrons - light.sum, trusted))
-        trusted = known * own / (own + total)
+        trusted = unclipped * own / (own + total)
     return trusted, light, average(total, trusted)
 
 
 def speckle(
-    electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
+    electrons: Tensor, unclipped: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
 ) -> Tensor:
     """Return the variance of each pixel by the likeliest speckle of glare: (channel, y, x) e-^2."""
     if not glare.patterns:
         return torch.zeros_like(electrons)
     glare = with_smooth(glare)
-    strength, *shares = _likeliest(electrons, known, glare, noise)
+    strength, *shares = _likeliest(electrons, unclipped, glare, noise)
     return _light(glare, strength, shares).variance
 
 
@@ -321,16 +329,16 @@ def _light(glare: Glare, strength: float, shares: Sequence[float]) -> Light:
     """
     total = variance = torch.zeros_like(glare.patterns[0])
     modes: list[Tensor] = []
-    found = zip(glare.patterns, glare.peaks, glare.nearby, glare.smooth or (), strict=True)
-    for pattern, peak, others, smooth in found:
+    sources = zip(glare.patterns, glare.peaks, glare.nearby, glare.smooth or (), strict=True)
+    for pattern, peak, others, smooth in sources:
         straight = strength * peak * pattern
-        each = [share * peak * wide for share, wide in zip(shares, smooth, strict=True)]
-        wide = sum(each, torch.zeros_like(pattern))
+        scattered_light = [share * peak * wide for share, wide in zip(shares, smooth, strict=True)]
+        wide = sum(scattered_light, torch.zeros_like(pattern))
         total, variance = (
             total + straight + wide,
             variance + _GRAINY * (wide.square() + 2.0 * straight * wide),
         )
-        modes += [_SMOOTH * x for x in each] + [_SIZE * straight]
+        modes += [_SMOOTH * x for x in scattered_light] + [_SIZE * straight]
         if others is not None:
             modes += [strength * peak * (other - pattern) / len(others) ** 0.5 for other in others]
     return Light(total, variance, modes)
@@ -363,7 +371,7 @@ class _Hidden(NamedTuple):
 
 
 def _likeliest(
-    electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
+    electrons: Tensor, unclipped: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
 ) -> tuple[float, ...]:
     """Return the strength of the patterns over that told, and the share scattered over each
     radius: the likeliest.
@@ -372,7 +380,7 @@ def _likeliest(
 
     start = [0.0, *(math.log(share) for share in _SHARES)]
     with torch.no_grad():
-        likelihood = _likelihood(electrons, known, glare, noise)
+        likelihood = _likelihood(electrons, unclipped, glare, noise)
     if likelihood is None:
         return tuple(math.exp(x) for x in start)
     simplex = [
@@ -380,10 +388,10 @@ def _likeliest(
         *([x + 1.2 * (i == j) for j, x in enumerate(start)] for i in range(len(start))),
     ]
     options = {"maxfev": _EVALUATIONS, "xatol": 0.05, "fatol": 0.1, "initial_simplex": simplex}
-    found = minimize(
+    fit = minimize(
         lambda x: -likelihood(x) / _ALIKE - _prior(x), start, method="Nelder-Mead", options=options
     )
-    return tuple(math.exp(x) for x in found.x)
+    return tuple(math.exp(x) for x in fit.x)
 
 
 def _prior(logs: Sequence[float]) -> float:
@@ -396,12 +404,12 @@ def _prior(logs: Sequence[float]) -> float:
 
 
 def _likelihood(
-    electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
+    electrons: Tensor, unclipped: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
 ) -> Callable[[Sequence[float]], float] | None:
     """Return the log likelihood of logarithms of the strength and of what is scattered; None
     where nothing tells.
     """
-    pixels = _pixels(electrons, known, glare, noise)
+    pixels = _pixels(electrons, unclipped, glare, noise)
     if pixels is None:
         return None
     scenes: list[float] = []
@@ -411,39 +419,56 @@ def _likelihood(
         straight, wide = amounts[0] * pixels.light[0], (amounts[1:] * pixels.light[1:]).sum(0)
         speckle = wide.square() + 2.0 * straight * wide
         mean = _average(pixels.whole - straight - wide, pixels.noise / (pixels.noise + speckle))
-        given = (
+        arguments = (
             pixels.picture - (amounts * pixels.parts).sum(0),
             8 / 9 * torch.maximum(pixels.noise, mean),
             _SHARP * speckle,
             mean / mean.norm(),
         )
-        top = float(given[0].square().mean())
+        top = float(arguments[0].square().mean())
         tried = (
             [scenes[-1] * f for f in (0.5, 0.7, 1.0, 1.4, 2.0)]
             if scenes
             else [top * 0.5**n for n in range(20)]
         )
-        best = max((_log_density(*given, scene), scene) for scene in tried)
+        best = max((_log_density(*arguments, scene), scene) for scene in tried)
         scenes[:] = best[1:]
         return best[0] + _log_full(pixels.hidden, amounts[:, :, 0], mean[:, 0])
 
     return likelihood
 
 
+def _light_by_kind(glare: Glare, electrons: Tensor) -> list[Tensor]:
+    """Return the light of all patterns as told: straight, and scattered over each radius."""
+    smooth, dark = glare.smooth or (), torch.zeros_like(electrons)
+    kinds = [glare.patterns]
+    for number in range(len(RADII)):
+        kinds.append([widened[number] for widened in smooth])
+    lights = []
+    for patterns in kinds:
+        weighted = (peak * x for x, peak in zip(patterns, glare.peaks, strict=True))
+        lights.append(sum(weighted, dark).detach())
+    return lights
+
+
+def _hidden_pixels(
+    electrons: Tensor, unclipped: Tensor, lights: Sequence[Tensor], joint: bool
+) -> _Hidden:
+    """Return a sample of the clipped pixels."""
+    sample = tuple(
+        indices[:: max(1, len(indices) // _GLARE_SAMPLE)]
+        for indices in (unclipped == 0).nonzero(as_tuple=True)
+    )
+    rows = sample[0] if joint else torch.zeros_like(sample[0])
+    return _Hidden(torch.stack([x[sample] for x in lights]), electrons[sample], rows)
+
+
 def _pixels(
-    electrons: Tensor, known: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
+    electrons: Tensor, unclipped: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
 ) -> _Pixels | None:
     """Return the pixels of a frame that tell of speckle; None for too few."""
-    kinds = [
-        glare.patterns,
-        *([each[number] for each in glare.smooth or ()] for number in range(len(RADII))),
-    ]
-    peaks, nothing = glare.peaks, torch.zeros_like(electrons)
-    lights = [
-        sum((peak * x for x, peak in zip(kind, peaks, strict=True)), nothing).detach()
-        for kind in kinds
-    ]
-    use = _mean_around(known) > 1 - 1e-6  # all of the 3 x 3 pixels are known
+    lights = _light_by_kind(glare, electrons)
+    use = _mean_around(unclipped) > 1 - 1e-6  # all of the 3 x 3 pixels are known
     dark = noise(torch.zeros_like(average(electrons, torch.ones_like(electrons))))
     together = use.all(0)
     joint = int(together.sum()) >= _FEW
@@ -455,36 +480,36 @@ def _pixels(
         return picture[:, together][:, some] if joint else picture[use][None, some]
 
     parts, light = (
-        torch.stack([picked(x) for x in each]) for each in ([_sharp(x) for x in lights], lights)
+        torch.stack([picked(x) for x in pictures])
+        for pictures in ([_sharp(x) for x in lights], lights)
     )
-    hidden = (known == 0).nonzero(as_tuple=True)
-    hidden = tuple(at[:: max(1, len(at) // _GLARE_SAMPLE)] for at in hidden)
-    rows = hidden[0] if joint else torch.zeros_like(hidden[0])
-    full = _Hidden(torch.stack([x[hidden] for x in lights]), electrons[hidden], rows)
+    full = _hidden_pixels(electrons, unclipped, lights, joint)
     return _Pixels(picked(_sharp(electrons)), parts, light, picked(dark), picked(electrons), full)
 
 
-def _log_density(rest: Tensor, noise: Tensor, speckle: Tensor, grey: Tensor, scene: float) -> float:
+def _log_density(
+    error: Tensor, noise: Tensor, speckle: Tensor, grey: Tensor, scene: float
+) -> float:
     """Return the log density of sharp pictures (channel, pixel).
 
     Speckle is that of one colour, the root of its variance. A scene has the variance ``scene`` in
     each channel, and details of any strength that have the colour ``grey`` in all channels, which
     therefore count for nothing.
     """
-    if len(rest) == 1:
+    if len(error) == 1:
         variance = noise + scene + speckle
-        return -0.5 * float((variance.log() + rest.square() / variance).sum())
+        return -0.5 * float((variance.log() + error.square() / variance).sum())
     inverse, colour = 1.0 / (noise + _COLOUR * speckle + scene), speckle.sqrt()
-    grey = grey.expand_as(rest)
+    grey = grey.expand_as(error)
 
     def products(a: Tensor, b: Tensor) -> Tensor:
         return (a * b * inverse).sum(0)
 
     own, lost = products(colour, colour), products(colour, grey)
-    across, share = products(colour, rest), 1.0 / (1.0 + products(colour, colour))
+    across, share = products(colour, error), 1.0 / (1.0 + products(colour, colour))
     greys = products(grey, grey) - share * lost.square()
-    dull = products(grey, rest) - share * lost * across
-    squares = products(rest, rest) - share * across.square() - dull.square() / greys
+    dull = products(grey, error) - share * lost * across
+    squares = products(error, error) - share * across.square() - dull.square() / greys
     return -0.5 * float((own.log1p() - inverse.log().sum(0) + greys.log() + squares).sum())
 
 
@@ -563,26 +588,26 @@ def nearby_glare(
     }
     camera["shape"] = (glare.shape[-2], glare.shape[-1])
 
-    def seen(around: Pupil, towards: Tensor) -> Tensor:
+    def pattern_of(around: Pupil, towards: Tensor) -> Tensor:
         channels: Tensor = torch.tensordot(
             share, focus(around, towards, **camera).intensity.to(share), 1
         )
         return channels
 
-    own = seen(pupil, direction).sum(dtype=torch.float64)
+    own = pattern_of(pupil, direction).sum(dtype=torch.float64)
     unit = (glare.sum(dtype=torch.float64) / own.where(own > 0, 1.0)).to(share)
-    bowl, found = _bowl(pupil), []
+    bowl, patterns_drawn = _bowl(pupil), []
     for y, x, longer, further in _normal(patterns, rng).tolist():
         moved = direction + pixels * pixel_pitch / focal_length * direction.new_tensor([y, x])
         path = pupil.path + further * defocus * DEFOCUS_WAVELENGTH * bowl
-        found.append(
+        patterns_drawn.append(
             unit
-            * seen(
+            * pattern_of(
                 pupil._replace(path=path, wavelengths=pupil.wavelengths + longer * wavelength),
                 moved,
             )
         )
-    return torch.stack(found)
+    return torch.stack(patterns_drawn)
 
 
 @nearby_glare.check
@@ -613,9 +638,11 @@ def _bowl(pupil: Pupil) -> Tensor:
     the clear aperture.
     """
     side = pupil.aperture.shape[-1]
-    at = torch.arange(side, dtype=torch.float64, device=pupil.path.device) - (side - 1) / 2
+    offset = torch.arange(side, dtype=torch.float64, device=pupil.path.device) - (side - 1) / 2
     rim = pupil.aperture.sum(dtype=torch.float64).clamp_min(1.0) / math.pi
-    return ((at[:, None].square() + at.square()) * (pupil.aperture > 0) / rim).to(pupil.path)
+    return ((offset[:, None].square() + offset.square()) * (pupil.aperture > 0) / rim).to(
+        pupil.path
+    )
 
 
 def _normal(count: int, rng: Generator) -> Tensor:

@@ -65,23 +65,23 @@ class Inverses:
         self._factors: dict[Size, Tensor] = {}
         self._preconditioners: dict[Size, Preconditioner] = {}
 
-    def factor(self, seen: Blurred) -> Tensor:
+    def factor(self, problem: Blurred) -> Tensor:
         """Return the Cholesky factor of the matrix of a small problem."""
-        if seen.torus not in self._factors:
-            self._factors[seen.torus] = _factor(seen)
-        return self._factors[seen.torus]
+        if problem.torus not in self._factors:
+            self._factors[problem.torus] = _factor(problem)
+        return self._factors[problem.torus]
 
-    def preconditioner(self, seen: Blurred) -> Preconditioner:
+    def preconditioner(self, problem: Blurred) -> Preconditioner:
         """Return the preconditioner of a problem."""
-        if max(_size(seen)) > LOWEST:
-            return Preconditioner(seen)
-        if seen.torus not in self._preconditioners:
-            self._preconditioners[seen.torus] = Preconditioner(seen)
-        return self._preconditioners[seen.torus]
+        if max(_size(problem)) > LOWEST:
+            return Preconditioner(problem)
+        if problem.torus not in self._preconditioners:
+            self._preconditioners[problem.torus] = Preconditioner(problem)
+        return self._preconditioners[problem.torus]
 
 
 def most_likely(
-    seen: Blurred,
+    problem: Blurred,
     steps: int = STEPS,
     enough: float = ENOUGH,
     coarser: bool = True,
@@ -95,11 +95,11 @@ def most_likely(
     are made and added.
     """
     inverses = inverses or Inverses()
-    tensors = (seen.picture, seen.weight, seen.transfer, *seen.glare)
+    tensors = (problem.picture, problem.weight, problem.transfer, *problem.glare)
     with torch.no_grad():
-        alone = fixed(seen)
-        lower = seen.picture.new_empty(0) if halvings(_size(seen)) else inverses.factor(alone)
-        enough = enough * float((seen.weight > 0).sum())
+        alone = fixed(problem)
+        lower = problem.picture.new_empty(0) if halvings(_size(problem)) else inverses.factor(alone)
+        enough = enough * float((problem.weight > 0).sum())
         if coarser or lower.numel():
             x = _solved(alone, lower, steps, enough, inverses)
         else:
@@ -107,22 +107,25 @@ def most_likely(
     followed = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     if not (followed or transformed()):
         return x
-    rest = torch.fft.irfft2(seen.slope(x), s=seen.torus)
-    frame = _Frame(seen.torus, seen.grey, steps, seen.bounded)
-    others = (lower, *map(Tensor.detach, (seen.weight, seen.transfer, seen.power, *seen.glare)))
-    pixels: Tensor = _Followed.apply(torch.fft.irfft2(x, s=seen.torus), rest, frame, *others)  # type: ignore[no-untyped-call]
+    residual = torch.fft.irfft2(problem.slope(x), s=problem.torus)
+    frame = _Frame(problem.torus, problem.grey, steps, problem.bounded)
+    others = (
+        lower,
+        *map(Tensor.detach, (problem.weight, problem.transfer, problem.power, *problem.glare)),
+    )
+    pixels: Tensor = _Followed.apply(torch.fft.irfft2(x, s=problem.torus), residual, frame, *others)  # type: ignore[no-untyped-call]
     spectrum: Tensor = torch.fft.rfft2(pixels)
     return spectrum
 
 
-def fixed(seen: Blurred) -> Blurred:
+def fixed(problem: Blurred) -> Blurred:
     """Return the problem without gradients and tangents."""
     parts = {
-        name: getattr(seen, name).detach() for name in ("picture", "weight", "transfer", "power")
+        name: getattr(problem, name).detach() for name in ("picture", "weight", "transfer", "power")
     }
-    held = None if seen.held is None else seen.held.detach()
+    held = None if problem.held is None else problem.held.detach()
     return replace(
-        seen, **parts, glare=tuple(pattern.detach() for pattern in seen.glare), held=held
+        problem, **parts, glare=tuple(pattern.detach() for pattern in problem.glare), held=held
     )
 
 
@@ -141,7 +144,7 @@ class _Followed(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(answer: Tensor, rest: Tensor, frame: _Frame, *fixed: Tensor) -> Tensor:
+    def forward(answer: Tensor, residual: Tensor, frame: _Frame, *fixed: Tensor) -> Tensor:
         return answer.clone()
 
     @staticmethod
@@ -156,8 +159,8 @@ class _Followed(torch.autograd.Function):
         return None, _Solved.apply(grad, ctx.frame, *fixed), None, *(None for _ in fixed)  # type: ignore[no-untyped-call]
 
     @staticmethod
-    def jvp(ctx: Any, answer: Tensor | None, rest: Tensor, *_: None) -> Any:
-        return _Solved.apply(rest, ctx.frame, *ctx.saved_tensors)  # type: ignore[no-untyped-call]
+    def jvp(ctx: Any, answer: Tensor | None, residual_tangent: Tensor, *_: None) -> Any:
+        return _Solved.apply(residual_tangent, ctx.frame, *ctx.saved_tensors)  # type: ignore[no-untyped-call]
 
 
 class _Solved(torch.autograd.Function):
@@ -169,7 +172,7 @@ class _Solved(torch.autograd.Function):
     def forward(right: Tensor, frame: _Frame, *fixed: Tensor) -> Tensor:
         lower, weight, transfer, power, *glare = fixed
         pull, nothing = torch.fft.rfft2(right), torch.zeros_like(weight)
-        seen = Blurred(
+        problem = Blurred(
             nothing,
             weight,
             transfer,
@@ -180,9 +183,9 @@ class _Solved(torch.autograd.Function):
             pull,
             frame.bounded,
         )
-        enough = 1e-10 * float(inner(pull, _spread(seen, pull), seen.torus))
+        enough = 1e-10 * float(inner(pull, _spread(problem, pull), problem.torus))
         solution: Tensor = torch.fft.irfft2(
-            _solved(seen, lower, frame.steps, enough, Inverses()), s=seen.torus
+            _solved(problem, lower, frame.steps, enough, Inverses()), s=problem.torus
         )
         return solution
 
@@ -199,55 +202,64 @@ class _Solved(torch.autograd.Function):
         raise RuntimeError(_ONCE)
 
 
-def _solved(seen: Blurred, lower: Tensor, steps: int, enough: float, inverses: Inverses) -> Tensor:
+def _solved(
+    problem: Blurred, lower: Tensor, steps: int, enough: float, inverses: Inverses
+) -> Tensor:
     """Solve a small problem exactly with the Cholesky factor `lower` of its matrix, and a larger
     problem by steps.
     """
-    return _by_factor(seen, lower) if lower.numel() else _nested(seen, steps, enough, inverses)
-
-
-def _nested(seen: Blurred, steps: int, enough: float, inverses: Inverses) -> Tensor:
-    if not halvings(_size(seen)):
-        return _by_factor(seen, inverses.factor(seen))
-    coarse = halved(seen)
-    start = widened(
-        _nested(coarse, min(4 * steps, MOST), enough / CAREFUL, inverses), coarse.torus, seen.torus
+    return (
+        _by_factor(problem, lower) if lower.numel() else _nested(problem, steps, enough, inverses)
     )
-    return descend(seen, start, steps, enough, inverses.preconditioner(seen))
 
 
-def _size(seen: Blurred) -> Size:
-    y, x = seen.picture.shape[-2:]
+def _nested(problem: Blurred, steps: int, enough: float, inverses: Inverses) -> Tensor:
+    if not halvings(_size(problem)):
+        return _by_factor(problem, inverses.factor(problem))
+    coarse = halved(problem)
+    start = widened(
+        _nested(coarse, min(4 * steps, MOST), enough / CAREFUL, inverses),
+        coarse.torus,
+        problem.torus,
+    )
+    return descend(problem, start, steps, enough, inverses.preconditioner(problem))
+
+
+def _size(problem: Blurred) -> Size:
+    y, x = problem.picture.shape[-2:]
     return y, x
 
 
-def halved(seen: Blurred) -> Blurred:
+def halved(problem: Blurred) -> Blurred:
     """Return the deconvolution problem on pixels twice as wide, where lost variance of the
     picture counts as noise.
     """
-    weight = _pooled(seen.weight)
+    weight = _pooled(problem.weight)
     picture, *glare = (
-        _pooled(seen.weight * p) / weight.clamp_min(1e-30) for p in (seen.picture, *seen.glare)
+        _pooled(problem.weight * p) / weight.clamp_min(1e-30)
+        for p in (problem.picture, *problem.glare)
     )
-    size = (seen.torus[0] // 2, seen.torus[1] // 2)
-    y_mean, x_mean = (_pooling(n, seen.transfer) for n in seen.torus)
-    lost = seen.power.new_zeros(len(seen.transfer))
-    for rows in pieces(seen.transfer):
+    size = (problem.torus[0] // 2, problem.torus[1] // 2)
+    y_mean, x_mean = (_pooling(n, problem.transfer) for n in problem.torus)
+    lost = problem.power.new_zeros(len(problem.transfer))
+    for rows in pieces(problem.transfer):
         passed = (
-            seen.power[rows]
+            problem.power[rows]
             * y_mean[rows, None].abs().square()
-            * x_mean[: seen.transfer.shape[-1]].abs().square()
+            * x_mean[: problem.transfer.shape[-1]].abs().square()
         )
-        through = seen.transfer[:, rows]
-        lost = lost + variance((through.real.square() + through.imag.square()) * passed, seen.torus)
+        through = problem.transfer[:, rows]
+        lost = lost + variance(
+            (through.real.square() + through.imag.square()) * passed, problem.torus
+        )
     up, right = (size[0] + 1) // 2, size[1] // 2 + 1
     y_mean = torch.cat([y_mean[:up], y_mean[len(y_mean) - size[0] + up :]])
-    transfer = narrowed(seen.transfer, size) * y_mean[:, None] * x_mean[:right]
-    power = narrowed(seen.power, size) / 4.0
+    transfer = narrowed(problem.transfer, size) * y_mean[:, None] * x_mean[:right]
+    power = narrowed(problem.power, size) / 4.0
     lost = (lost - variance(transfer.abs().square() * power, size)).clamp_min(0.0)[:, None, None]
-    pull = None if seen.pull is None else narrowed(seen.pull, size)
+    pull = None if problem.pull is None else narrowed(problem.pull, size)
     return replace(
-        seen,
+        problem,
         picture=picture,
         weight=weight / (1.0 + weight * lost),
         transfer=transfer,
@@ -273,7 +285,7 @@ def _pooling(size: int, like: Tensor) -> Tensor:
     return ((1.0 + torch.exp(2j * math.pi * turns)) / 2.0).to(like)
 
 
-def _factor(seen: Blurred) -> Tensor:
+def _factor(problem: Blurred) -> Tensor:
     """Return the Cholesky factor, in float64, of the whitened covariance of the seen pixels of a
     small picture.
 
@@ -281,7 +293,7 @@ def _factor(seen: Blurred) -> Tensor:
     1e-16 of its norm, so that a picture with less noise than that has the factor of a square root
     of the covariance: ten times slower.
     """
-    fine, root, colours = _fine(seen), _root(seen), _colours(seen)
+    fine, root, colours = _fine(problem), _root(problem), _colours(problem)
     rows = [
         torch.cat(
             [colours[i, j] * _covariance(fine, a * b.conj()) for j, b in enumerate(fine.transfer)],
@@ -290,7 +302,7 @@ def _factor(seen: Blurred) -> Tensor:
         for i, a in enumerate(fine.transfer)
     ]
     matrix = root[:, None] * torch.cat(rows) * root
-    patterns = _spread_patterns(seen)
+    patterns = _spread_patterns(problem)
     if float(matrix.detach().abs().sum(-1).max()) > _NOISELESS:
         return _factor_of_root(fine, patterns)
     for pattern in patterns:
@@ -322,81 +334,83 @@ def _factor_of_root(fine: Blurred, patterns: list[Tensor]) -> Tensor:
     return lower
 
 
-def _response(seen: Blurred, transfer: Tensor) -> Tensor:
+def _response(problem: Blurred, transfer: Tensor) -> Tensor:
     """Return the blurred pixels of a channel for a unit of each independent unknown of the
     prior, (pixel, unknown).
     """
-    impulse = torch.fft.irfft2(transfer * seen.power.sqrt(), s=seen.torus)
-    y, x = (torch.arange(count, device=impulse.device) for count in _size(seen))
-    v, u = (torch.arange(count, device=impulse.device) for count in seen.torus)
-    down = (y[:, None] - v) % seen.torus[0]
-    right = (x[:, None] - u) % seen.torus[1]
+    impulse = torch.fft.irfft2(transfer * problem.power.sqrt(), s=problem.torus)
+    y, x = (torch.arange(count, device=impulse.device) for count in _size(problem))
+    v, u = (torch.arange(count, device=impulse.device) for count in problem.torus)
+    down = (y[:, None] - v) % problem.torus[0]
+    right = (x[:, None] - u) % problem.torus[1]
     square: Tensor = impulse[down[:, None, :, None], right[None, :, None, :]]
     return square.reshape(len(y) * len(x), -1)
 
 
-def _colours(seen: Blurred) -> Tensor:
+def _colours(problem: Blurred) -> Tensor:
     """Return the correlations of the channels of the scene."""
-    channels = len(seen.picture)
+    channels = len(problem.picture)
     colours = torch.full(
-        (channels, channels), seen.grey, dtype=torch.float64, device=seen.weight.device
+        (channels, channels), problem.grey, dtype=torch.float64, device=problem.weight.device
     )
     return colours.fill_diagonal_(1.0)
 
 
-def _spread_patterns(seen: Blurred) -> list[Tensor]:
+def _spread_patterns(problem: Blurred) -> list[Tensor]:
     """Return the whitened glare patterns (pixel,), times the standard deviation of their
     strengths.
     """
-    root, patterns = _root(seen), []
-    for number, pattern in enumerate(seen.glare):
+    root, patterns = _root(problem), []
+    for number, pattern in enumerate(problem.glare):
         shape = root * pattern.double().flatten()
-        free = number < len(seen.glare) - seen.bounded
+        free = number < len(problem.glare) - problem.bounded
         patterns.append(shape * (1e4 / shape.norm().clamp_min(1e-15)) if free else shape)
     return patterns
 
 
-def _by_factor(seen: Blurred, lower: Tensor) -> Tensor:
+def _by_factor(problem: Blurred, lower: Tensor) -> Tensor:
     """Return the exact deconvolution of a small picture, given the factor of its matrix that
     `_factor` returns.
     """
-    fine, root = _fine(seen), _root(seen)
+    fine, root = _fine(problem), _root(problem)
     before = (
         torch.zeros_like(fine.transfer)
-        if seen.pull is None
-        else _spread(fine, seen.pull.to(torch.complex128))
+        if problem.pull is None
+        else _spread(fine, problem.pull.to(torch.complex128))
     )
-    residual = (root * (seen.picture.double() - fine.blur(before)).flatten())[:, None]
+    residual = (root * (problem.picture.double() - fine.blur(before)).flatten())[:, None]
     answer = root * torch.cholesky_solve(residual, lower)[:, 0]
-    return (before + _spread(fine, fine.gathered(answer.reshape(seen.picture.shape)))).to(
-        seen.transfer
+    return (before + _spread(fine, fine.gathered(answer.reshape(problem.picture.shape)))).to(
+        problem.transfer
     )
 
 
-def _fine(seen: Blurred) -> Blurred:
-    return replace(seen, transfer=seen.transfer.to(torch.complex128), power=seen.power.double())
+def _fine(problem: Blurred) -> Blurred:
+    return replace(
+        problem, transfer=problem.transfer.to(torch.complex128), power=problem.power.double()
+    )
 
 
-def _root(seen: Blurred) -> Tensor:
-    weight = seen.weight.double().flatten()
+def _root(problem: Blurred) -> Tensor:
+    weight = problem.weight.double().flatten()
     # the gradient of sqrt is infinite at 0
     return weight.where(weight > 0, 1.0).sqrt().where(weight > 0, 0.0)
 
 
-def _covariance(seen: Blurred, passed: Tensor) -> Tensor:
+def _covariance(problem: Blurred, passed: Tensor) -> Tensor:
     """Return the prior covariance of all pairs of picture pixels, given the product of two
     transfer functions.
     """
-    lags = torch.fft.irfft2(passed * seen.power, s=seen.torus)
-    y, x = (torch.arange(n, device=lags.device) for n in seen.picture.shape[-2:])
-    down, right = (y[:, None] - y) % seen.torus[0], (x[:, None] - x) % seen.torus[1]
+    lags = torch.fft.irfft2(passed * problem.power, s=problem.torus)
+    y, x = (torch.arange(n, device=lags.device) for n in problem.picture.shape[-2:])
+    down, right = (y[:, None] - y) % problem.torus[0], (x[:, None] - x) % problem.torus[1]
     square: Tensor = lags[down[:, None, :, None], right[None, :, None, :]]
     return square.reshape(len(y) * len(x), -1)
 
 
-def _spread(seen: Blurred, spectrum: Tensor) -> Tensor:
+def _spread(problem: Blurred, spectrum: Tensor) -> Tensor:
     """Return the prior covariance of the picture, multiplied by half a spectrum."""
-    return seen.power * mixed(spectrum, 1.0 - seen.grey, seen.grey)
+    return problem.power * mixed(spectrum, 1.0 - problem.grey, problem.grey)
 
 
 # --- pulled answer --------------------------------------------------------------------------------
@@ -416,7 +430,7 @@ _MODES = 100
 
 
 def pulled(
-    seen: Blurred, towards: Tensor, precision: Tensor, steps: int = PULLED_STEPS
+    problem: Blurred, towards: Tensor, precision: Tensor, steps: int = PULLED_STEPS
 ) -> tuple[Tensor, Tensor]:
     """Return the change of the filter's answer in the frame, and the blur of this change.
 
@@ -424,24 +438,26 @@ def pulled(
     results are exactly 0 where all of `towards` is. They have derivatives of first order, also with
     respect to the problem itself.
     """
-    y, x = seen.picture.shape[-2:]
+    y, x = problem.picture.shape[-2:]
     right = precision * towards
-    still = replace(seen, picture=torch.zeros_like(seen.picture), held=precision)
+    still = replace(problem, picture=torch.zeros_like(problem.picture), held=precision)
     solver = _Solver(fixed(still), steps)
     with torch.no_grad():
-        change = solver(torch.fft.rfft2(right, s=seen.torus))
-    tensors = (seen.weight, seen.transfer, *seen.glare)
+        change = solver(torch.fft.rfft2(right, s=problem.torus))
+    tensors = (problem.weight, problem.transfer, *problem.glare)
     if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
-        rest = torch.fft.irfft2(
-            replace(still, pull=torch.fft.rfft2(right, s=seen.torus)).slope(change), s=seen.torus
+        residual = torch.fft.irfft2(
+            replace(still, pull=torch.fft.rfft2(right, s=problem.torus)).slope(change),
+            s=problem.torus,
         )
     else:  # what else is in the residual is constant
-        rest = pad(
-            right - precision * seen.first(change), (0, seen.torus[1] - x, 0, seen.torus[0] - y)
+        residual = pad(
+            right - precision * problem.first(change),
+            (0, problem.torus[1] - x, 0, problem.torus[0] - y),
         )
-    whole = torch.fft.irfft2(change, s=seen.torus)
-    pixels: Tensor = _FollowedAnswer.apply(rest, whole, solver)  # type: ignore[no-untyped-call]
-    return pixels[..., :y, :x], seen.blur(torch.fft.rfft2(pixels))
+    torus_change = torch.fft.irfft2(change, s=problem.torus)
+    pixels: Tensor = _FollowedAnswer.apply(residual, torus_change, solver)  # type: ignore[no-untyped-call]
+    return pixels[..., :y, :x], problem.blur(torch.fft.rfft2(pixels))
 
 
 class _Solver:
@@ -449,8 +465,8 @@ class _Solver:
     from 0.
     """
 
-    def __init__(self, seen: Blurred, steps: int) -> None:
-        self.seen, self.steps = seen, steps
+    def __init__(self, problem: Blurred, steps: int) -> None:
+        self.seen, self.steps = problem, steps
         self._inverse: Preconditioner | None = None
 
     def __call__(self, right: Tensor) -> Tensor:
@@ -468,7 +484,7 @@ class _FollowedAnswer(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, rest: Tensor, change: Tensor, solver: _Solver) -> Tensor:
+    def forward(ctx: Any, residual: Tensor, change: Tensor, solver: _Solver) -> Tensor:
         ctx.solver = solver
         return change.clone()
 

@@ -39,14 +39,16 @@ def effective_psf(
     intensity = single(psf.intensity)
     shares = grey_shares(illuminant, responses, bands).to(intensity.device)
     if torch.promote_types(intensity.dtype, dtype) == intensity.dtype:
-        whole: Tensor = torch.tensordot(shares.to(intensity), intensity, 1)
-        return whole
+        kernels: Tensor = torch.tensordot(shares.to(intensity), intensity, 1)
+        return kernels
     # band by band, without a copy of all bands
     planes = zip(shares.to(dtype).T, intensity, strict=True)
-    seen = torch.zeros(len(shares), *intensity.shape[-2:], dtype=dtype, device=intensity.device)
+    kernels_sum = torch.zeros(
+        len(shares), *intensity.shape[-2:], dtype=dtype, device=intensity.device
+    )
     for share, plane in planes:
-        seen = seen + share[:, None, None] * plane.to(dtype)
-    return seen
+        kernels_sum = kernels_sum + share[:, None, None] * plane.to(dtype)
+    return kernels_sum
 
 
 def grey_shares(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
@@ -178,9 +180,9 @@ def blurred(transfer: Tensor, spectrum: Tensor, torus: Size, size: Size) -> Tens
     """Return the first corner (..., channel, *size) of blurred pictures, given half their
     spectra (..., fy, fx).
     """
-    whole = spectrum.expand(*spectrum.shape[:-3], *transfer.shape)
+    spectra = spectrum.expand(*spectrum.shape[:-3], *transfer.shape)
     # one batch of all channels takes twice as long
-    pairs = zip(transfer, whole.unbind(-3), strict=True)
+    pairs = zip(transfer, spectra.unbind(-3), strict=True)
     return torch.stack(
         [torch.fft.irfft2(t * s, s=torus)[..., : size[0], : size[1]] for t, s in pairs], -3
     )
@@ -194,27 +196,27 @@ def gathered(transfer: Tensor, pixels: Tensor, torus: Size) -> Tensor:
     return spectrum
 
 
-def weighing(seen: Blurred) -> Map:
+def weighing(problem: Blurred) -> Map:
     """Return a function that multiplies residuals by the pixel weights and removes the fitted
     glare patterns.
     """
-    if not seen.glare:
-        return lambda residual: seen.weight * residual
-    flat = torch.stack(seen.glare).flatten(1)
-    weighted = seen.weight.flatten() * flat
-    products = with_bounds(weighted.double() @ flat.double().T, seen.bounded)
-    if seen.bounded:  # similar patterns: differences of large sums would lose digits in float32
+    if not problem.glare:
+        return lambda residual: problem.weight * residual
+    flat = torch.stack(problem.glare).flatten(1)
+    weighted = problem.weight.flatten() * flat
+    products = with_bounds(weighted.double() @ flat.double().T, problem.bounded)
+    if problem.bounded:  # similar patterns: differences of large sums would lose digits in float32
         weighted, inverse = _apart(weighted, products), None
     else:
         inverse = torch.linalg.pinv(products, hermitian=True).to(flat)
 
     def weigh(residual: Tensor) -> Tensor:
-        rest, found = seen.weight * residual, weighted @ residual.flatten()
+        weighted_residual, strengths = problem.weight * residual, weighted @ residual.flatten()
         for strength, pattern in zip(
-            found if inverse is None else inverse @ found, weighted, strict=True
+            strengths if inverse is None else inverse @ strengths, weighted, strict=True
         ):
-            rest.addcmul_(strength, pattern.view_as(rest), value=-1.0)
-        return rest
+            weighted_residual.addcmul_(strength, pattern.view_as(weighted_residual), value=-1.0)
+        return weighted_residual
 
     return weigh
 
@@ -241,9 +243,10 @@ def _apart(weighted: Tensor, products: Tensor) -> Tensor:
     even = scale[:, None] * products * scale
     even = even + _ALIKE * torch.eye(len(even), dtype=even.dtype, device=even.device)
     lower = torch.linalg.cholesky(even)
-    pieces = (scale[:, None] * part.double() for part in torch.split(weighted, _PIECE, 1))
+    pieces = (scale[:, None] * patterns.double() for patterns in torch.split(weighted, _PIECE, 1))
     return torch.cat(
-        [torch.linalg.solve_triangular(lower, part, upper=False).to(weighted) for part in pieces], 1
+        [torch.linalg.solve_triangular(lower, piece, upper=False).to(weighted) for piece in pieces],
+        1,
     )
 
 
@@ -295,10 +298,10 @@ def widened(spectrum: Tensor, size: Size, wide: Size) -> Tensor:
     as fine.
     """
     up, down, right = (size[0] + 1) // 2, (size[0] - 1) // 2, (size[1] + 1) // 2
-    whole = spectrum.new_zeros(*spectrum.shape[:-2], wide[0], wide[1] // 2 + 1)
-    whole[..., :up, :right] = 4.0 * spectrum[..., :up, :right]
-    whole[..., wide[0] - down :, :right] = 4.0 * spectrum[..., size[0] - down :, :right]
-    return whole
+    wide_spectrum = spectrum.new_zeros(*spectrum.shape[:-2], wide[0], wide[1] // 2 + 1)
+    wide_spectrum[..., :up, :right] = 4.0 * spectrum[..., :up, :right]
+    wide_spectrum[..., wide[0] - down :, :right] = 4.0 * spectrum[..., size[0] - down :, :right]
+    return wide_spectrum
 
 
 # --- fft grid -------------------------------------------------------------------------------------
@@ -312,8 +315,10 @@ DENSE = 20  #: pixels a side, up to which a picture is solved exactly
 
 def torus(picture: Size, edge: Size) -> Size:
     """Return the size of a periodic grid for the picture and `edge` unknown pixels on each side."""
-    whole = 2 ** halvings(picture)
-    y, x = (whole * _smooth(-(-(n + 2 * e) // whole)) for n, e in zip(picture, edge, strict=True))
+    granule = 2 ** halvings(picture)
+    y, x = (
+        granule * _smooth(-(-(n + 2 * e) // granule)) for n, e in zip(picture, edge, strict=True)
+    )
     return y, x
 
 

@@ -26,6 +26,7 @@ from neusee.nodes.restore._inverse._masked_blur import (
 from neusee.nodes.restore._inverse._wiener import (
     Border,
     Doubt,
+    LaserLight,
     LeastDoubt,
     Scaled,
     Settings,
@@ -76,16 +77,16 @@ def frame_deviation(
         law = fitted_law(problem, scaled.doubt)
         own = _details(problem.first(most_likely(problem, inverses=inverses)))
     drawn = _of_scenes(scaled, law.power, scenes, rng, kernels, inverses)
-    found = _Scenes.of(drawn, scenes, scaled, matrix)
-    noisy, details = torch.zeros_like(found.coarse), found.restored
+    scenes_found = _Scenes.of(drawn, scenes, scaled, matrix)
+    noisy, details = torch.zeros_like(scenes_found.coarse), scenes_found.restored
     for error in _of_noise(scaled, law.noise**0.5, noises, rng, inverses):
         noisy = noisy + _square(scaled.scale / scaled.share * error, matrix) / noises
         details = details + _details(error) / noises
     ratio = _ratio(own, details, problem.weight)
     # a lack of details means little where none could be seen
-    ratio = ratio.where(ratio > 1.0, ratio**found.told)
-    slow = _COARSE * law.low * found.coarse + noisy
-    total: Tensor = ratio * _around(found.fine, _SMOOTH) + ratio.clamp_min(1.0) * _around(
+    ratio = ratio.where(ratio > 1.0, ratio**scenes_found.told)
+    slow = _COARSE * law.low * scenes_found.coarse + noisy
+    total: Tensor = ratio * _around(scenes_found.fine, _SMOOTH) + ratio.clamp_min(1.0) * _around(
         slow, _SMOOTH
     )
     return total.sqrt()
@@ -109,14 +110,16 @@ class _Scenes(NamedTuple):
             len(matrix), *scaled.problem.picture.shape[-2:]
         )
         restored = true = torch.zeros_like(coarse[0])
-        for error, seen in drawn:
+        for error, contrast in drawn:
             smooth = _around(error, _NEAR)
             coarse = coarse + _square(smooth, matrix) / count
             fine = fine + _square(error - smooth, matrix) / count
-            restored = restored + _details(seen) / count
-            true = true + _details(seen + error * scaled.share / scaled.scale) / count
-        told = (_around(restored, _NEAR) / (_SHOWN * _around(true, _NEAR) + _DARK)).clamp(max=1.0)
-        return cls(coarse, fine, restored, told)
+            restored = restored + _details(contrast) / count
+            true = true + _details(contrast + error * scaled.share / scaled.scale) / count
+        resolved = (_around(restored, _NEAR) / (_SHOWN * _around(true, _NEAR) + _DARK)).clamp(
+            max=1.0
+        )
+        return cls(coarse, fine, restored, resolved)
 
 
 def drawn_scene(problem: Blurred, power: Tensor, rng: Generator) -> Tensor:
@@ -133,8 +136,8 @@ def drawn_noise(problem: Blurred, rng: Generator) -> Tensor:
     bounded strength.
     """
     noise = _normal(problem.picture.shape, problem.picture, rng)
-    seen = problem.weight > 0
-    noise = torch.where(seen, noise / problem.weight.where(seen, 1.0).sqrt(), 0.0)
+    unclipped = problem.weight > 0
+    noise = torch.where(unclipped, noise / problem.weight.where(unclipped, 1.0).sqrt(), 0.0)
     for pattern in problem.glare[len(problem.glare) - problem.bounded :]:
         noise = noise + _normal((), noise, rng) * pattern
     return noise
@@ -172,10 +175,10 @@ def _of_scenes(
     for number in range(draws):
         with torch.no_grad():
             scene = drawn_scene(problem, power, rng)
-            seen = blurred(_transfer(scaled, kernels, number), scene, problem.torus, size)
-            found = most_likely(replace(problem, picture=seen), inverses=inverses)
-            each = scaled.pixels(scene - found), problem.first(found)
-        yield each
+            picture = blurred(_transfer(scaled, kernels, number), scene, problem.torus, size)
+            answer = most_likely(replace(problem, picture=picture), inverses=inverses)
+            error_and_contrast = scaled.pixels(scene - answer), problem.first(answer)
+        yield error_and_contrast
 
 
 def _of_noise(
@@ -204,13 +207,15 @@ def _details(contrast: Tensor) -> Tensor:
     return energy
 
 
-def _ratio(found: Tensor, drawn: Tensor, weight: Tensor) -> Tensor:
+def _ratio(energy: Tensor, drawn: Tensor, weight: Tensor) -> Tensor:
     """Return the energy of details (y, x) around each pixel over that of drawn pictures; 1 where
     nothing tells.
     """
-    known = (weight > 0).all(0).to(found)
-    ratio = (_around(found * known, _NEAR) + _DARK) / (_around(drawn * known, _NEAR) + _DARK)
-    return ratio.where(_around(known, _NEAR) > _KNOWN, 1.0)
+    unclipped = (weight > 0).all(0).to(energy)
+    ratio = (_around(energy * unclipped, _NEAR) + _DARK) / (
+        _around(drawn * unclipped, _NEAR) + _DARK
+    )
+    return ratio.where(_around(unclipped, _NEAR) > _KNOWN, 1.0)
 
 
 def _around(pictures: Tensor, side: int) -> Tensor:
@@ -303,13 +308,12 @@ def wiener_spread(
             algorithm 1; Sykulski, Olhede, Guillaumin, Lilly and Early, Biometrika 106, 251 (2019).
     """
     with torch.no_grad():
-        fine, known, light = known_and_light(
-            psf, responses, single(electrons), clipped, glare, nearby, ghosts
-        )
+        light = LaserLight(glare, nearby, ghosts)
+        fine, unclipped, shapes = known_and_light(psf, responses, single(electrons), clipped, light)
         kernels = effective_psf(psf, illuminant, responses, bands, fine.dtype).to(fine)
         white = grey_white(illuminant, responses, bands).to(fine)
         settings = Settings(balance, read_noise, doubt, least_doubt, scatter, border)
-        scaled = posed(fine, known, kernels, light, settings, white)
+        scaled = posed(fine, unclipped, kernels, shapes, settings, white)
     drawn = drawn_deviation if law == "filter" else frame_deviation
     return with_shading(drawn(scaled, matrix, draws, rng).to(single(electrons)), restored, shading)
 
@@ -342,5 +346,9 @@ def drawn_deviation(scaled: Scaled, matrix: Tensor, draws: int, rng: Generator) 
 
 @wiener_spread.check
 def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
-    least, most = float(result.min()), float(result.max())
-    return [Check(f"deviation from {least:.2g} to {most:.2g}", math.isfinite(most) and least >= 0)]
+    lowest, highest = float(result.min()), float(result.max())
+    return [
+        Check(
+            f"deviation from {lowest:.2g} to {highest:.2g}", math.isfinite(highest) and lowest >= 0
+        )
+    ]

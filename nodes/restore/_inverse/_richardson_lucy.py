@@ -3,7 +3,7 @@ rest.
 """
 
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from pydantic import Field
@@ -68,15 +68,19 @@ def richardson_lucy(
     refuse_other_pictures(electrons, psf, responses, clipped, glare)
     size = (electrons.shape[-2], electrons.shape[-1])
     kernels = effective_psf(psf, illuminant, responses, bands).to(electrons)
-    known = _known(clipped, electrons)
-    patterns = [crop(pattern.to(electrons), shape=size) for pattern in glare]
-    patterns = [p / peak for p in patterns if (peak := float((p.detach().abs() * known).max())) > 0]
+    unclipped = _known(clipped, electrons)
+    patterns = []
+    for light in glare:
+        pattern = crop(light.to(electrons), shape=size)
+        peak = float((pattern.detach().abs() * unclipped).max())
+        if peak > 0:
+            patterns.append(pattern / peak)
     wide = torus(size, edge(kernels, size))
     total = kernels.sum((-2, -1), keepdim=True)
     total = torch.where(total > 0, total, 1.0)
     # of sum 1, so that no scale of the PSF overflows
-    transfer = torch.fft.rfft2(wrapped(kernels / total, wide))
-    return _climb(electrons, known, transfer, wide, patterns, iterations, read_noise**2) / total
+    blur = _Blur(torch.fft.rfft2(wrapped(kernels / total, wide)), wide)
+    return _climb(electrons, unclipped, blur, patterns, iterations, read_noise**2) / total
 
 
 @richardson_lucy.check
@@ -95,44 +99,55 @@ def _known(clipped: Tensor, like: Tensor) -> Tensor:
     """Return 1 for each pixel that is not clipped and 0 for the others; a channel without known
     pixels has only 1.
     """
-    known = (~clipped).to(like)
-    return torch.where(known.amax((-2, -1), keepdim=True) > 0, known, 1.0)
+    unclipped = (~clipped).to(like)
+    return torch.where(unclipped.amax((-2, -1), keepdim=True) > 0, unclipped, 1.0)
+
+
+class _Blur(NamedTuple):
+    """The blur of each channel on a periodic grid."""
+
+    transfer: Tensor  #: (channel, fy, fx)
+    grid: tuple[int, int]
+
+    def picture(self, scene: Tensor) -> Tensor:
+        """Return the blurred scene, on the whole grid."""
+        blurred: Tensor = torch.fft.irfft2(self.transfer * torch.fft.rfft2(scene), s=self.grid)
+        return blurred
+
+    def gathered(self, pixels: Tensor) -> Tensor:
+        """Return the adjoint of the blur, applied to the pixels of a picture."""
+        spectrum = torch.fft.rfft2(pixels, s=self.grid)
+        scene: Tensor = torch.fft.irfft2(self.transfer.conj() * spectrum, s=self.grid)
+        return scene
 
 
 def _climb(
     electrons: Tensor,
-    known: Tensor,
-    transfer: Tensor,
-    wide: tuple[int, int],
+    unclipped: Tensor,
+    blur: _Blur,
     patterns: list[Tensor],
     iterations: int,
     variance: float,
 ) -> Tensor:
     """Return the scene after ``iterations`` steps from an even scene of the mean of the picture."""
     y, x = electrons.shape[-2:]
-
-    def seen_from(pixels: Tensor) -> Tensor:
-        gathered: Tensor = torch.fft.irfft2(
-            transfer.conj() * torch.fft.rfft2(pixels, s=wide), s=wide
-        )
-        return gathered
-
-    counts = (electrons + variance).clamp_min(0) * known
-    mean = (electrons * known).sum((-2, -1), keepdim=True) / known.sum((-2, -1), keepdim=True)
-    scene = mean.clamp_min(0).expand(-1, *wide)
-    share = seen_from(known).clamp_min(_UNSEEN)
+    counts = (electrons + variance).clamp_min(0) * unclipped
+    mean = (electrons * unclipped).sum((-2, -1), keepdim=True) / unclipped.sum(
+        (-2, -1), keepdim=True
+    )
+    scene = mean.clamp_min(0).expand(-1, *blur.grid)
+    share = blur.gathered(unclipped).clamp_min(_UNSEEN)
     strengths = [mean.mean().clamp_min(0) for _ in patterns]
     for _ in range(iterations):
-        expected = (
-            torch.fft.irfft2(transfer * torch.fft.rfft2(scene), s=wide)[..., :y, :x].clamp_min(0)
-            + variance
-        )
+        expected = blur.picture(scene)[..., :y, :x].clamp_min(0) + variance
         for strength, pattern in zip(strengths, patterns, strict=True):
             expected = expected + strength * pattern
         ratio = counts / expected.clamp_min(_DARK)
-        scene = torch.where(scene <= _GONE, 0.0, scene * (seen_from(ratio) / share).clamp_min(0))
+        scene = torch.where(
+            scene <= _GONE, 0.0, scene * (blur.gathered(ratio) / share).clamp_min(0)
+        )
         strengths = [
-            s * (p * ratio).sum() / (p * known).sum()
+            s * (p * ratio).sum() / (p * unclipped).sum()
             for s, p in zip(strengths, patterns, strict=True)
         ]
     return scene[..., :y, :x]

@@ -147,28 +147,41 @@ def wiener(
             least squares with a prior, Kaipio and Somersalo, Statistical and Computational Inverse
             Problems, 2005, ch. 3.
     """
-    electrons, light = single(electrons), (glare, nearby, ghosts)
+    electrons, light = single(electrons), LaserLight(glare, nearby, ghosts)
+    view = View(psf, illuminant, responses, bands)
     settings = Settings(balance, read_noise, doubt, least_doubt, scatter, border)
-    scaled = pose(electrons, psf, illuminant, responses, bands, clipped, *light, settings)
+    scaled = pose(electrons, clipped, view, light, settings)
     return (scaled.pixels(most_likely(scaled.problem, coarser=coarser_grids)) + scaled.mean).to(
         electrons
     )
 
 
+class View(NamedTuple):
+    """The PSF of a camera by band, and what its channels see of a grey scene."""
+
+    psf: Psf
+    illuminant: Tensor
+    responses: Tensor
+    bands: Bands
+
+
+class LaserLight(NamedTuple):
+    """Patterns of the light of lasers in a picture, as inputs of `wiener`."""
+
+    glare: list[Tensor] | None
+    nearby: list[Tensor] | None
+    ghosts: list[Tensor] | None = None
+
+
 def known_and_light(
-    psf: Psf,
-    responses: Tensor,
-    electrons: Tensor,
-    clipped: Tensor,
-    glare: list[Tensor] | None,
-    nearby: list[Tensor] | None,
-    ghosts: list[Tensor] | None,
+    psf: Psf, responses: Tensor, electrons: Tensor, clipped: Tensor, light: LaserLight
 ) -> tuple[Tensor, Tensor, Glare]:
     """Return a picture in the type of the computation, 1 for each pixel that is not clipped, and
     the visible glare.
 
     Raises ValueError for inputs that differ in shape or are not finite.
     """
+    glare, nearby, ghosts = light
     refuse_other_pictures(
         electrons, psf, responses, clipped, [*(glare or ()), *(nearby or ()), *(ghosts or ())]
     )
@@ -178,14 +191,14 @@ def known_and_light(
     patterns, others, ghostly = (
         [crop(x.to(fine), shape=size) for x in g or ()] for g in (glare, nearby, ghosts)
     )
-    known = (~clipped).to(fine)
+    unclipped = (~clipped).to(fine)
     return (
         fine,
-        known,
+        unclipped,
         visible(
             [*patterns, *ghostly],
             [*others, *[None] * (len(patterns) + len(ghostly) - len(others))],
-            known,
+            unclipped,
         ),
     )
 
@@ -205,10 +218,13 @@ def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: float) -> list[
 
 def _refuse_other_glare(glare: list[Tensor], nearby: list[Tensor] | None) -> None:
     if nearby and [x.shape[-3:] for x in nearby] != [x.shape for x in glare]:
-        found, wanted = [tuple(x.shape) for x in nearby], [tuple(x.shape) for x in glare]
+        nearby_shapes, glare_shapes = (
+            [tuple(x.shape) for x in nearby],
+            [tuple(x.shape) for x in glare],
+        )
         raise ValueError(
-            f"nearby {found} does not fit glare {wanted}: give one nearby, (pattern, channel, y,"
-            " x), for each glare"
+            f"nearby {nearby_shapes} does not fit glare {glare_shapes}: give one nearby, (pattern,"
+            " channel, y, x), for each glare"
         )
 
 
@@ -252,30 +268,22 @@ class Scaled(NamedTuple):
 
 
 def pose(
-    electrons: Tensor,
-    psf: Psf,
-    illuminant: Tensor,
-    responses: Tensor,
-    bands: Bands,
-    clipped: Tensor,
-    glare: list[Tensor] | None,
-    nearby: list[Tensor] | None,
-    ghosts: list[Tensor] | None,
-    settings: Settings,
+    electrons: Tensor, clipped: Tensor, view: View, light: LaserLight, settings: Settings
 ) -> Scaled:
     """Return the inputs of `wiener` as a linear problem, unsolved; ``settings`` as `Settings`
     says.
     """
-    fine, known, light = known_and_light(psf, responses, electrons, clipped, glare, nearby, ghosts)
-    kernels = effective_psf(psf, illuminant, responses, bands, fine.dtype).to(fine)
-    return posed(
-        fine, known, kernels, light, settings, grey_white(illuminant, responses, bands).to(fine)
+    fine, unclipped, glare = known_and_light(view.psf, view.responses, electrons, clipped, light)
+    kernels = effective_psf(view.psf, view.illuminant, view.responses, view.bands, fine.dtype).to(
+        fine
     )
+    white = grey_white(view.illuminant, view.responses, view.bands).to(fine)
+    return posed(fine, unclipped, kernels, glare, settings, white)
 
 
 def posed(
     electrons: Tensor,
-    known: Tensor,
+    unclipped: Tensor,
     kernels: Tensor,
     glare: Glare,
     settings: Settings,
@@ -288,24 +296,24 @@ def posed(
     """
     frame = (electrons.shape[-2], electrons.shape[-1])
     read, scatter = settings.read_noise, settings.scatter
-    seen, some = known, known.amax((-2, -1), keepdim=True)
-    known = torch.where(some > 0, known, 1.0)
+    with_blind, some = unclipped, unclipped.amax((-2, -1), keepdim=True)
+    unclipped = torch.where(some > 0, unclipped, 1.0)
     share = power_of_two(kernels.sum((-2, -1), keepdim=True).detach())
     # the same bits, and the floors below concern the shape of the PSF, not a grey filter
     kernels = kernels / share
 
-    free, trusted, light, wrong = _found_light(electrons, (known, seen), glare, settings)
+    free, trusted, light, wrong = _found_light(electrons, (unclipped, with_blind), glare, settings)
     picture = electrons - light.sum
     mean = average(picture, trusted)
-    found = average((picture - mean).square(), trusted)
+    total_variance = average((picture - mean).square(), trusted)
     size, transfer, power, passed = _on_torus(kernels, frame, settings.border)
-    told = mean, (found - mean - read**2 - wrong) / passed
-    scale = torch.maximum(told[1], 0.01 * found / passed).clamp_min(1e-6).sqrt()
+    moments = mean, (total_variance - mean - read**2 - wrong) / passed
+    scale = torch.maximum(moments[1], 0.01 * total_variance / passed).clamp_min(1e-6).sqrt()
     if scatter and white is not None and light.modes:
-        trust = trusted.sum((-2, -1), keepdim=True) / known.sum((-2, -1), keepdim=True) * some
+        trust = trusted.sum((-2, -1), keepdim=True) / unclipped.sum((-2, -1), keepdim=True) * some
         mean, scale = (shared_level(x, trust.detach(), white) for x in (mean.clamp_min(1.0), scale))
     noise = settings.balance * picture_noise(electrons, mean, read) + light.variance
-    weight = known * (scale / noise.sqrt()).square()
+    weight = unclipped * (scale / noise.sqrt()).square()
     scaled = tuple(pattern / scale for pattern in (*free, *light.modes))
     problem = Blurred(
         (picture - mean) / scale,
@@ -321,7 +329,7 @@ def posed(
     if not scatter:
         return Scaled(problem, scale, bright, share, kernels)
     full = float(electrons.detach().max())
-    both = told_of_scene(*told, wrong / passed, light, trusted, (some == 0) * full)
+    both = told_of_scene(*moments, wrong / passed, light, trusted, (some == 0) * full)
     return Scaled(
         problem, scale, bright, share, kernels, scene_doubt((mean, scale), both, white, full, light)
     )
@@ -339,9 +347,9 @@ def _on_torus(kernels: Tensor, frame: Size, border: float) -> tuple[Size, Tensor
 
 
 def _found_light(
-    electrons: Tensor, known: tuple[Tensor, Tensor], glare: Glare, settings: Settings
+    electrons: Tensor, unclipped: tuple[Tensor, Tensor], glare: Glare, settings: Settings
 ) -> tuple[list[Tensor], Tensor, Light, Tensor]:
-    """Return the patterns of unknown strength, and what `doubted` returns; ``known`` with and
+    """Return the patterns of unknown strength, and what `doubted` returns; ``unclipped`` with and
     without blind channels.
 
     With `Settings.scatter` the strengths are found too, so that no pattern of unknown strength is
@@ -352,25 +360,27 @@ def _found_light(
         return picture_noise(electrons, mean, settings.read_noise)
 
     if settings.scatter and glare.patterns:
-        return [], *scattered(electrons, known[1], glare, own_noise)
+        return [], *scattered(electrons, unclipped[1], glare, own_noise)
     return glare.patterns, *_doubted(
-        electrons, known[0], glare, (settings.doubt, settings.least_doubt), own_noise
+        electrons, unclipped[0], glare, (settings.doubt, settings.least_doubt), own_noise
     )
 
 
 def _doubted(
     electrons: Tensor,
-    known: Tensor,
+    unclipped: Tensor,
     glare: Glare,
     doubts: tuple[float | None, float],
     noise: Callable[[Tensor], Tensor],
 ) -> tuple[Tensor, Light, Tensor]:
     """Return what `doubted` returns, for a doubt, or None and the least doubt that is found."""
-    doubt, least = doubts
+    doubt, smallest = doubts
     if doubt != 0 and glare.around is None:
         glare = with_light_around(glare)
-    doubt = likeliest_doubt(electrons, known, glare, noise, least) if doubt is None else doubt
-    return doubted(electrons, known, glare, doubt, noise)
+    doubt = (
+        likeliest_doubt(electrons, unclipped, glare, noise, smallest) if doubt is None else doubt
+    )
+    return doubted(electrons, unclipped, glare, doubt, noise)
 
 
 # --- wiener problem -------------------------------------------------------------------------------
@@ -408,9 +418,10 @@ def wiener_problem(
     Raises: ValueError as `restore.wiener`.
     Source: as `restore.wiener`.
     """
-    electrons, light = single(electrons), (glare, nearby, ghosts)
+    electrons, light = single(electrons), LaserLight(glare, nearby, ghosts)
+    view = View(psf, illuminant, responses, bands)
     settings = Settings(balance, read_noise, doubt, least_doubt)
-    return packed(pose(electrons, psf, illuminant, responses, bands, clipped, *light, settings))
+    return packed(pose(electrons, clipped, view, light, settings))
 
 
 @wiener_problem.check
@@ -499,9 +510,10 @@ def filter_facts(
     Raises: ValueError as `restore.wiener`.
     Source: as `restore.wiener`; the maps are ours.
     """
-    electrons, light = single(electrons), (glare, nearby, ghosts)
+    electrons, light = single(electrons), LaserLight(glare, nearby, ghosts)
+    view = View(psf, illuminant, responses, bands)
     settings = Settings(balance, read_noise, doubt, least_doubt)
-    return facts(pose(electrons, psf, illuminant, responses, bands, clipped, *light, settings))
+    return facts(pose(electrons, clipped, view, light, settings))
 
 
 @filter_facts.check
@@ -512,41 +524,41 @@ def _(result: FilterFacts, *inputs: Any, **params: Any) -> list[Check]:
 
 def facts(scaled: Scaled) -> FilterFacts:
     """Return the answer of a posed deconvolution and its maps."""
-    seen, scale = scaled.problem, scaled.scale / scaled.share
-    spectrum = most_likely(seen)
-    answer = seen.first(spectrum)
-    found = maps(seen, answer, answer + scaled.mean / scale, seen.blur(spectrum))
-    return FilterFacts(answer, *found, scale, scaled.mean)
+    problem, scale = scaled.problem, scaled.scale / scaled.share
+    spectrum = most_likely(problem)
+    answer = problem.first(spectrum)
+    deviation_and_maps = maps(problem, answer, answer + scaled.mean / scale, problem.blur(spectrum))
+    return FilterFacts(answer, *deviation_and_maps, scale, scaled.mean)
 
 
 def maps(
-    seen: Blurred, answer: Tensor, brightness: Tensor, blurred: Tensor
+    problem: Blurred, answer: Tensor, brightness: Tensor, blurred: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the predicted deviation and all maps of an answer, its value above black, and its
     blur by the camera.
     """
-    known = (seen.weight > 0).to(answer)
+    unclipped = (problem.weight > 0).to(answer)
     # the slope of sqrt is infinite at 0
-    root = torch.where(seen.weight > 0, seen.weight, 1.0).sqrt() * known
-    free = len(seen.glare) - seen.bounded
-    glare = sum(seen.glare[:free], torch.zeros_like(answer))
-    doubt = sum((mode.square() for mode in seen.glare[free:]), torch.zeros_like(answer))
-    deviation, octaves = _predicted(seen, seen.weight / (1.0 + seen.weight * doubt))
-    each = [
+    root = torch.where(problem.weight > 0, problem.weight, 1.0).sqrt() * unclipped
+    free = len(problem.glare) - problem.bounded
+    glare = sum(problem.glare[:free], torch.zeros_like(answer))
+    doubt = sum((mode.square() for mode in problem.glare[free:]), torch.zeros_like(answer))
+    deviation, octaves = _predicted(problem, problem.weight / (1.0 + problem.weight * doubt))
+    channel_maps = [
         answer,
         brightness.sign() * brightness.abs().clamp_min(1e-12).pow(_GAMMA),
-        seen.picture.asinh(),
-        (root * (seen.picture - blurred)).asinh(),
-        seen.weight.log1p() / 10.0,
-        known,
+        problem.picture.asinh(),
+        (root * (problem.picture - blurred)).asinh(),
+        problem.weight.log1p() / 10.0,
+        unclipped,
         (_BRIGHT / glare.detach().amax().clamp_min(1e-30) * glare).asinh() / 5.0,
         (100.0 * doubt).log1p() / 10.0,
         deviation.log() / 5.0,
     ]
-    return deviation, torch.cat([*each, octaves])
+    return deviation, torch.cat([*channel_maps, octaves])
 
 
-def _predicted(seen: Blurred, weight: Tensor) -> tuple[Tensor, Tensor]:
+def _predicted(problem: Blurred, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Return the deviation of the answer from the scene that the filter expects, and a map for each
     octave.
 
@@ -554,13 +566,13 @@ def _predicted(seen: Blurred, weight: Tensor) -> tuple[Tensor, Tensor]:
     is divided over the pixels by the inverse of 1 + I, where I is the diagonal of B' W B: a pixel
     behind a clipped one is less certain.
     """
-    gain = seen.transfer.abs().square() * weight.mean((-2, -1), keepdim=True) * seen.power
-    untold = _whole_mean(seen.power / (1.0 + gain), seen.torus) / _whole_mean(
-        seen.power, seen.torus
+    gain = problem.transfer.abs().square() * weight.mean((-2, -1), keepdim=True) * problem.power
+    untold = _whole_mean(problem.power / (1.0 + gain), problem.torus) / _whole_mean(
+        problem.power, problem.torus
     )
-    information = _information(seen, weight)
+    information = _information(problem, weight)
     uneven = (1.0 + information.mean((-2, -1), keepdim=True)) / (1.0 + information)
-    return (untold * uneven).clamp(1e-6, 1.0).sqrt(), _octaves(gain / (1.0 + gain), seen)
+    return (untold * uneven).clamp(1e-6, 1.0).sqrt(), _octaves(gain / (1.0 + gain), problem)
 
 
 def _whole_mean(half: Tensor, size: tuple[int, int]) -> Tensor:
@@ -568,28 +580,31 @@ def _whole_mean(half: Tensor, size: tuple[int, int]) -> Tensor:
     return (variance(half, size))[..., None, None]
 
 
-def _information(seen: Blurred, weight: Tensor) -> Tensor:
+def _information(problem: Blurred, weight: Tensor) -> Tensor:
     """Return the diagonal of B' W B for the blur B: the information of the frame on each pixel
     of the scene.
     """
-    squared = torch.fft.rfft2(torch.fft.irfft2(seen.transfer, s=seen.torus).square())
-    whole: Tensor = torch.fft.irfft2(
-        squared.conj() * torch.fft.rfft2(weight, s=seen.torus), s=seen.torus
+    squared = torch.fft.rfft2(torch.fft.irfft2(problem.transfer, s=problem.torus).square())
+    information: Tensor = torch.fft.irfft2(
+        squared.conj() * torch.fft.rfft2(weight, s=problem.torus), s=problem.torus
     )
-    return whole[..., : seen.picture.shape[-2], : seen.picture.shape[-1]].clamp_min(0.0)
+    return information[..., : problem.picture.shape[-2], : problem.picture.shape[-1]].clamp_min(0.0)
 
 
-def _octaves(shares: Tensor, seen: Blurred) -> Tensor:
+def _octaves(shares: Tensor, problem: Blurred) -> Tensor:
     """Return for each octave of frequency a map of the mean of the shares (channel, fy, fx)."""
-    told = shares.mean(0)
-    rows = torch.fft.fftfreq(seen.torus[0], dtype=told.dtype, device=told.device)
-    columns = torch.fft.rfftfreq(seen.torus[1], dtype=told.dtype, device=told.device)
+    mean_share = shares.mean(0)
+    rows = torch.fft.fftfreq(problem.torus[0], dtype=mean_share.dtype, device=mean_share.device)
+    columns = torch.fft.rfftfreq(problem.torus[1], dtype=mean_share.dtype, device=mean_share.device)
     octave = (
         (-torch.hypot(rows[:, None], columns).clamp(1e-9, 0.5).log2() - 1.0)
         .floor()
         .clamp_max(_OCTAVES - 1)
     )
     means = torch.stack(
-        [told[octave == k].mean() if (octave == k).any() else told.mean() for k in range(_OCTAVES)]
+        [
+            mean_share[octave == k].mean() if (octave == k).any() else mean_share.mean()
+            for k in range(_OCTAVES)
+        ]
     )
-    return means[:, None, None].expand(_OCTAVES, *seen.picture.shape[-2:])
+    return means[:, None, None].expand(_OCTAVES, *problem.picture.shape[-2:])

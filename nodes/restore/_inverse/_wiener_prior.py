@@ -94,8 +94,8 @@ def shared_level(level: Tensor, trust: Tensor, white: Tensor) -> Tensor:
     see of a grey scene.
     """
     grey = level / white
-    known = trust.clamp_min(1e-12)
-    common = ((known * grey.log()).sum() / known.sum()).exp()
+    weight = trust.clamp_min(1e-12)
+    common = ((weight * grey.log()).sum() / weight.sum()).exp()
     own = trust / (trust + _TOLD)
     shared: Tensor = white * (own * grey.log() + (1.0 - own) * common.log()).exp()
     return shared
@@ -152,8 +152,8 @@ class SceneDoubt(NamedTuple):
 
 @torch.no_grad()
 def scene_doubt(
-    used: tuple[Tensor, Tensor],
-    told: tuple[Told, Told],
+    mean_and_scale: tuple[Tensor, Tensor],
+    evidence: tuple[Told, Told],
     white: Tensor | None,
     full: float,
     light: Light,
@@ -161,17 +161,17 @@ def scene_doubt(
     """Return what is not known of a scene of which the filter uses a mean and a scale; None where
     glare is known.
 
-    ``used`` by the filter as mean and scale, (channel, 1, 1), ``told`` by the picture of mean and
-    variance. Without ``white``, what the channels see of a grey scene, mean and scale count as
-    known.
+    ``mean_and_scale`` (channel, 1, 1) are those of the filter, ``evidence`` is that of the picture
+    on mean and variance. Without ``white``, what the channels see of a grey scene, mean and scale
+    count as known.
     """
     if not light.modes:
         return None
-    mean, scale = used
+    mean, scale = mean_and_scale
     blotches = _BLOTCHES * light.variance.sqrt() / scale
     if white is None:
         return SceneDoubt(0.0, 1.0, blotches)
-    level, squares = level_and_variance(*told, white, full)
+    level, squares = level_and_variance(*evidence, white, full)
     wrong = (level.deviation.square() + (level.value - mean).square()) / scale.square()
     return SceneDoubt(float(wrong.mean()), float((squares.value / scale.square()).mean()), blotches)
 
@@ -220,13 +220,13 @@ def _hats(size: int) -> Tensor:
     """Return the weights (blotch, pixel) of blotches in the pixels of an axis, whose squares add
     up to 1.
     """
-    at = torch.arange(size) / _BLOTCH
-    hats = (1.0 - (at - torch.arange(size // _BLOTCH + 2)[:, None]).abs()).clamp_min(0.0)
+    position = torch.arange(size) / _BLOTCH
+    hats = (1.0 - (position - torch.arange(size // _BLOTCH + 2)[:, None]).abs()).clamp_min(0.0)
     return hats / hats.square().sum(0).sqrt()
 
 
 def _likely(
-    told: Told, grey: Tensor, middle: float, width: float, own: float, rough: float = 0.0
+    evidence: Told, grey: Tensor, middle: float, width: float, own: float, rough: float = 0.0
 ) -> tuple[Level, float, float]:
     """Return a quantity of each channel, and mean and deviation of the logarithm of what the
     channels share.
@@ -234,30 +234,30 @@ def _likely(
     The shared logarithm is normal, of mean ``middle`` and deviation ``width``; a channel differs
     from ``grey`` times the shared quantity by a relative deviation ``own``.
     """
-    value, errors = told.value.flatten().double(), told.errors.flatten(1).double()
-    known = errors.T @ errors
-    known = known + (_ALONE * known.diagonal() + 1.0).diag()
+    value, errors = evidence.value.flatten().double(), evidence.errors.flatten(1).double()
+    error_covariance = errors.T @ errors
+    error_covariance = error_covariance + (_ALONE * error_covariance.diagonal() + 1.0).diag()
     logs = (
         torch.linspace(-_WIDE, _WIDE, _GRID, dtype=torch.float64, device=value.device) * width
         + middle
     )
     expected = logs.exp()[:, None] * grey
     free = (own * expected).square()
-    whole = known + (free + (rough * expected).square()).diag_embed()
-    rest = value - expected
-    lower = torch.linalg.cholesky(whole)
-    solved = torch.cholesky_solve(rest[..., None], lower)[..., 0]
+    covariance = error_covariance + (free + (rough * expected).square()).diag_embed()
+    deviation = value - expected
+    lower = torch.linalg.cholesky(covariance)
+    solved = torch.cholesky_solve(deviation[..., None], lower)[..., 0]
     half = -0.5 * ((logs - middle) / width).square() - lower.diagonal(dim1=-2, dim2=-1).log().sum(
         -1
     )
-    share = torch.softmax(half - 0.5 * (rest * solved).sum(-1), 0)[:, None]
-    each = (expected + free * solved).clamp_min(0.0)
+    share = torch.softmax(half - 0.5 * (deviation * solved).sum(-1), 0)[:, None]
+    posterior_mean = (expected + free * solved).clamp_min(0.0)
     left = free - free.square() * torch.cholesky_inverse(lower).diagonal(dim1=-2, dim2=-1)
-    mean = (share * each).sum(0)
-    variance = (share * (left.clamp_min(0.0) + (each - mean).square())).sum(0)
+    mean = (share * posterior_mean).sum(0)
+    variance = (share * (left.clamp_min(0.0) + (posterior_mean - mean).square())).sum(0)
     log = float((share[:, 0] * logs).sum())
     spread = float((share[:, 0] * (logs - log).square()).sum().sqrt())
-    level = (x[:, None, None].to(told.value) for x in (mean, variance.sqrt()))
+    level = (x[:, None, None].to(evidence.value) for x in (mean, variance.sqrt()))
     return Level(*level), log, spread
 
 
@@ -311,7 +311,7 @@ def fitted_law(problem: Blurred, doubt: SceneDoubt | None = None) -> FrameLaw:
     )
     far = _squared(size).to(window) > (_LOWEST / min(size)) ** 2
     step = max(1, int(far.sum()) * len(window) // _MOST)
-    found = _sampled(torch.fft.rfft2(contrast * window).abs().square() / area, far, step)
+    periodogram = _sampled(torch.fft.rfft2(contrast * window).abs().square() / area, far, step)
     variance = torch.where(problem.weight > 0, 1.0 / problem.weight.clamp_min(1e-30), 0.0).detach()
     noise = (window.square() * variance).sum((-2, -1), keepdim=True) / area
     level = _sampled(noise.expand(-1, *far.shape), far, step)
@@ -320,9 +320,9 @@ def fitted_law(problem: Blurred, doubt: SceneDoubt | None = None) -> FrameLaw:
     best, slope, strength, factor = float("inf"), 3.0, 0.0, 1.0
     for exponent in torch.linspace(*_SLOPES[:2], int(_SLOPES[2])).tolist():
         law = _sampled(_expected(problem, exponent, lags), far, step)
-        unit = float(found.sum() / law.sum().clamp_min(1e-30))
+        unit = float(periodogram.sum() / law.sum().clamp_min(1e-30))
         loss, times, extra = _likeliest(
-            found, unit * law, level, _before(problem, doubt, exponent) - math.log(unit)
+            periodogram, unit * law, level, _before(problem, doubt, exponent) - math.log(unit)
         )
         if loss < best:
             best, slope, strength, factor = loss, exponent, unit * times, extra
@@ -346,9 +346,9 @@ def _window(problem: Blurred) -> Tensor:
     weight = problem.weight.detach()
     falling = (torch.hann_window(n + 2, periodic=False)[1:-1].to(weight) for n in (y, x))
     sure = []
-    for each in weight:
-        seen = each[each > 0]
-        sure.append(torch.quantile(seen[:: max(1, len(seen) // _SAMPLE)], _SURE))
+    for channel_weight in weight:
+        unclipped = channel_weight[channel_weight > 0]
+        sure.append(torch.quantile(unclipped[:: max(1, len(unclipped) // _SAMPLE)], _SURE))
     own = weight / torch.stack(sure)[:, None, None]
     rows, columns = falling
     return rows[:, None] * columns * own / (1.0 + own)
@@ -364,8 +364,8 @@ def _expected(problem: Blurred, slope: float, lags: Tensor) -> Tensor:
         _lags(n).to(lags.device) % side
         for n, side in zip(lags.shape[-2:], problem.torus, strict=True)
     )
-    whole: Tensor = torch.fft.rfft2(correlation[:, down[:, None], right] * lags).real
-    return whole[:, ::2, ::2].clamp_min(0.0)
+    spectrum: Tensor = torch.fft.rfft2(correlation[:, down[:, None], right] * lags).real
+    return spectrum[:, ::2, ::2].clamp_min(0.0)
 
 
 def _lags(size: int) -> Tensor:
@@ -384,7 +384,7 @@ def _sampled(spectrum: Tensor, far: Tensor, step: int) -> Tensor:
 
 
 def _likeliest(
-    found: Tensor, law: Tensor, noise: Tensor, middle: float
+    periodogram: Tensor, law: Tensor, noise: Tensor, middle: float
 ) -> tuple[float, float, float]:
     """Return the least loss of a law, its strength, and the factor of the noise, which grows while
     the loss falls.
@@ -392,12 +392,12 @@ def _likeliest(
     The logarithm of the strength has the mean ``middle`` before the frame is seen.
     """
     best = (float("inf"), 0.0, 1.0)
-    many = len(found) / _ALIKE
+    many = len(periodogram) / _ALIKE
     for factor in _NOISES:
         here = (float("inf"), 0.0, factor)
         for strength in torch.linspace(*_POWERS[:2], int(_POWERS[2])).exp().tolist():
             expected = strength * law + factor * noise
-            loss = float((expected.log() + found / expected).mean())
+            loss = float((expected.log() + periodogram / expected).mean())
             loss += ((math.log(strength) - middle) / _PRIOR) ** 2 / many
             here = min(here, (loss, strength, factor))
         if here[0] >= best[0]:

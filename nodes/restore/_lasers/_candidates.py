@@ -50,16 +50,23 @@ def line_templates(pupil: Pupil, responses: Tensor, bands: Bands, lens: Lens) ->
     """Return the patterns of spectral lines over the range of the bands."""
     low, high = float(bands.centres.min()), float(bands.centres.max())
     count = max(2, math.ceil((high - low) / _STEP) + 1)
-    at = torch.linspace(low, high, count, dtype=torch.float64)
-    heard = torch.stack([response_at(x, responses.cpu().double(), bands) for x in at])
-    at, heard = at[heard.amax(1) > 0.01 * heard.max()], heard[heard.amax(1) > 0.01 * heard.max()]
-    index = torch.stack([index_at(x, pupil) for x in at])
-    reach = float(at.min()) * lens.focal_length / (2 * float(pupil.pitch) * lens.pixel_pitch)
+    wavelengths = torch.linspace(low, high, count, dtype=torch.float64)
+    heard = torch.stack([response_at(x, responses.cpu().double(), bands) for x in wavelengths])
+    wavelengths, heard = (
+        wavelengths[heard.amax(1) > 0.01 * heard.max()],
+        heard[heard.amax(1) > 0.01 * heard.max()],
+    )
+    index = torch.stack([index_at(x, pupil) for x in wavelengths])
+    reach = (
+        float(wavelengths.min()) * lens.focal_length / (2 * float(pupil.pitch) * lens.pixel_pitch)
+    )
     sides = tuple(2 * min(n - 1, int(reach) - 1, _REACH) + 1 for n in lens.shape)
-    each = pupil._replace(wavelengths=at.to(pupil.wavelengths), index=index.to(pupil.index))
+    line_pupil = pupil._replace(
+        wavelengths=wavelengths.to(pupil.wavelengths), index=index.to(pupil.index)
+    )
     camera = {"focal_length": lens.focal_length, "pixel_pitch": lens.pixel_pitch, "shape": sides}
-    intensity = focus(each, sensor=lens.sensor, **camera).intensity
-    return Templates(at, intensity[:, None], heard)
+    intensity = focus(line_pupil, sensor=lens.sensor, **camera).intensity
+    return Templates(wavelengths, intensity[:, None], heard)
 
 
 def candidates(
@@ -71,7 +78,7 @@ def candidates(
     residual = residual.float()  # a start needs no more
     weights = Weights(*(x.float() for x in weights))
     white, frame = weights(residual), residual.shape[-2:]
-    found: list[Candidate] = []
+    peaks: list[Candidate] = []
     for line, pattern, heard in zip(*templates, strict=True):
         size = _size(frame, pattern)
         own = use.sharp(pattern.to(residual))
@@ -82,7 +89,7 @@ def candidates(
             top, low = heard.to(residual)[:, None, None] * weights(white), by.square()
         product = _correlated(top, own, size).sum(0)
         norm = _correlated(low, own.square(), size).sum(0).clamp_min(0.0)
-        found += _peaks(
+        peaks += _peaks(
             _gain(product, norm),
             product / norm.clamp_min(1e-30),
             float(line),
@@ -90,7 +97,7 @@ def candidates(
             frame,
             count,
         )
-    return _apart(sorted(found, reverse=True), count)
+    return _apart(sorted(peaks, reverse=True), count)
 
 
 def clipped_candidates(
@@ -112,20 +119,20 @@ def clipped_candidates(
     inverse = torch.fft.rfft2(
         torch.stack([weights.pair(*pair) * (1 + (pair[0] != pair[1])) for pair in pairs]), s=size
     )
-    found: list[Candidate] = []
-    for (line, pattern, heard), more in itertools.product(zip(*templates, strict=True), _MORE):
-        share, level = (heard / heard.max()).to(picture), _level(pattern, round(more * clipped))
+    peaks: list[Candidate] = []
+    for (line, pattern, heard), margin in itertools.product(zip(*templates, strict=True), _MORE):
+        share, level = (heard / heard.max()).to(picture), _level(pattern, round(margin * clipped))
         own = use.sharp((share[:, None, None] * pattern.to(picture) / level).clamp_max(1.0))
-        squares = torch.stack([own[one] * own[other] for one, other in pairs])
+        squares = torch.stack([own[first] * own[other] for first, other in pairs])
         product, norm = (
             torch.fft.irfft2((data * torch.fft.rfft2(model, s=size).conj()).sum(0), s=size)
             for data, model in ((both, own), (inverse, squares))
         )
         strength = torch.full_like(norm, full / (level * float(heard.max())))
-        found += _peaks(
+        peaks += _peaks(
             _gain(product, norm.clamp_min(0.0)), strength, float(line), pattern, frame, count
         )
-    return _apart(sorted(found, reverse=True), count)
+    return _apart(sorted(peaks, reverse=True), count)
 
 
 def _size(frame: torch.Size, pattern: Tensor) -> list[int]:
@@ -160,24 +167,24 @@ def _peaks(
     )
     inside, sizes = gain[rows[:, None], columns], strength[rows[:, None], columns]
     best = torch.topk(inside.flatten(), min(3 * count, inside.numel()))
-    found = []
-    for value, at in zip(best.values.tolist(), best.indices.tolist(), strict=True):
-        y, x = divmod(at, frame[1])
-        found.append(
+    spots = []
+    for value, index in zip(best.values.tolist(), best.indices.tolist(), strict=True):
+        y, x = divmod(index, frame[1])
+        spots.append(
             Candidate(value, (y - frame[0] // 2, x - frame[1] // 2), line, float(sizes[y, x]))
         )
-    return _apart(found, count)
+    return _apart(spots, count)
 
 
-def _apart(found: list[Candidate], count: int) -> list[Candidate]:
+def _apart(ranked: list[Candidate], count: int) -> list[Candidate]:
     """Return the first candidates of a list that differ from all earlier ones in place or
     wavelength.
     """
-    kept: list[Candidate] = []
-    for one in found:
-        if len(kept) < count and all(_differ(one, other) for other in kept):
-            kept.append(one)
-    return kept
+    distinct: list[Candidate] = []
+    for candidate in ranked:
+        if len(distinct) < count and all(_differ(candidate, other) for other in distinct):
+            distinct.append(candidate)
+    return distinct
 
 
 def _differ(a: Candidate, b: Candidate) -> bool:
@@ -208,7 +215,10 @@ def nearest_of_many(camera: Camera, data: Data, residual: Tensor, start: Candida
     gains nothing where it is half a pixel off.
     """
     y, x = start.spot
-    tiles = [start._replace(spot=(y + down, x + right)) for down in _TILES for right in _TILES]
+    tiles = [
+        start._replace(spot=(y + down, x + right))
+        for down, right in itertools.product(_TILES, _TILES)
+    ]
     best = max(nearest(camera, data, residual, tile, halves=_COARSE) for tile in tiles)
     return nearest(camera, data, residual, best)
 
@@ -230,13 +240,15 @@ def nearest(
     less than in a fit.
     """
     window, middle = _window(residual, start.spot)
-    seen = Filter(data.use.seen[..., *window], data.use.kernel)
+    local_filter = Filter(data.use.seen[..., *window], data.use.kernel)
     within = Weights(*(x[..., *window] for x in data.weights))
     white, best = within(residual[..., *window]), start._replace(gain=0.0)
     lens = camera.lens._replace(shape=(white.shape[-2], white.shape[-1]))
     down, right = (
-        torch.tensor([at + half - m for half in halves], dtype=torch.float64, device=white.device)
-        for at, m in zip(start.spot, middle, strict=True)
+        torch.tensor(
+            [spot_place + half - m for half in halves], dtype=torch.float64, device=white.device
+        )
+        for spot_place, m in zip(start.spot, middle, strict=True)
     )
     for nm in near:
         wavelength = torch.tensor(
@@ -244,7 +256,7 @@ def nearest(
         )
         heard = start.strength * response_at(wavelength, camera.responses, camera.bands).to(white)
         patterns = grid_patterns(camera.pupil, down, right, wavelength, lens).to(white)
-        light = within(heard[:, None, None] * seen(patterns.flatten(0, 1)[:, None]))
+        light = within(heard[:, None, None] * local_filter(patterns.flatten(0, 1)[:, None]))
         product, norm = (
             (light * white).sum((1, 2, 3)),
             light.square().sum((1, 2, 3)).clamp_min(1e-30),
@@ -266,9 +278,9 @@ def _window(
     middle lies.
     """
     window, middle = [], []
-    for n, at in zip(frame.shape[-2:], spot, strict=True):
+    for n, spot_place in zip(frame.shape[-2:], spot, strict=True):
         side = min(n, _AROUND)
-        first = min(max(round(at) + n // 2 - side // 2, 0), n - side)
+        first = min(max(round(spot_place) + n // 2 - side // 2, 0), n - side)
         window.append(slice(first, first + side))
         middle.append(first + side // 2 - n // 2)
     return (window[0], window[1]), (middle[0], middle[1])

@@ -75,11 +75,11 @@ def lamp_light(
     spectra = spectra * _pixel(fine, finer, lens).to(kinds)
     coarse = torch.fft.irfft2(spectra, s=fine)[..., ::finer, ::finer].roll((y, x), (-2, -1))
     coarse = coarse[..., : 2 * y + 1, : 2 * x + 1]
-    more = _beyond_pupil(torch.einsum("kcb,byx->kcyx", kinds, psf.intensity.to(kinds)), coarse)
+    beyond = _beyond_pupil(torch.einsum("kcb,byx->kcyx", kinds, psf.intensity.to(kinds)), coarse)
     back = phases(torus, torch.tensor([-float(y), -float(x)]).to(kinds))
-    spectra = spectra + _between_pixels(torch.fft.rfft2(more, s=torus) * back, torus, finer)
+    spectra = spectra + _between_pixels(torch.fft.rfft2(beyond, s=torus) * back, torus, finer)
     heard = (responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()).sum(-1)
-    return LampLight(spectra, fine, finer, (heard / heard.max()).to(kinds), (coarse + more)[0])
+    return LampLight(spectra, fine, finer, (heard / heard.max()).to(kinds), (coarse + beyond)[0])
 
 
 def phases(torus: tuple[int, int], move: Tensor) -> Tensor:
@@ -116,14 +116,14 @@ def _fine_patterns(kinds: Tensor, pupil: Pupil, lens: Lens, finer: int) -> Tenso
     pitch = lens.pixel_pitch / finer
     total = torch.zeros(*kinds.shape[:2], *sides).to(kinds)
     for band in range(kinds.shape[-1]):
-        one = pupil._replace(
+        band_pupil = pupil._replace(
             wavelengths=pupil.wavelengths[band][None], index=pupil.index[band][None]
         )
         # samples
-        free = float(one.wavelengths[0]) * lens.focal_length / (float(pupil.pitch) * pitch)
+        free = float(band_pupil.wavelengths[0]) * lens.focal_length / (float(pupil.pitch) * pitch)
         shape = tuple(min(side, 2 * max(int(free / 2) - 1, 0) + 1) for side in sides)
         camera = {"focal_length": lens.focal_length, "pixel_pitch": pitch, "sensor": lens.sensor}
-        light = _framed(focus(one, shape=shape, **camera).intensity[0].to(kinds), sides)
+        light = _framed(focus(band_pupil, shape=shape, **camera).intensity[0].to(kinds), sides)
         total += kinds[:, :, band, None, None] * light
     down, right = (_fading(n, finer).to(kinds) for n in lens.shape)
     return total * down[:, None] * right
@@ -149,13 +149,13 @@ def _pixel(fine: tuple[int, int], finer: int, lens: Lens) -> Tensor:
     return y[:, None] * x
 
 
-def _beyond_pupil(known: Tensor, coarse: Tensor) -> Tensor:
+def _beyond_pupil(inner: Tensor, coarse: Tensor) -> Tensor:
     """Return what patterns have in their window beyond others of odd sides, in the size of the
     latter.
     """
     sides = coarse.shape[-2:]
-    inside = _framed(torch.ones_like(known), sides) > 0
-    return torch.where(inside, _framed(known, sides) - coarse, 0.0)
+    inside = _framed(torch.ones_like(inner), sides) > 0
+    return torch.where(inside, _framed(inner, sides) - coarse, 0.0)
 
 
 def _between_pixels(spectra: Tensor, torus: tuple[int, int], finer: int) -> Tensor:
@@ -248,30 +248,30 @@ class Laser:
         y, x).
         """
         # one picture for all channels before, one for each after
-        seen = of(self._slopes()[:, None])
-        ones = (1,) * (seen.ndim - 2)
+        filtered = of(self._slopes()[:, None])
+        ones = (1,) * (filtered.ndim - 2)
         channels = self.channels().view(-1, *ones)
         heard, spread = self._response(self.values[2])
-        wave = channels * seen[3] + self._response_slope().view(-1, *ones) * seen[0]
+        wave = channels * filtered[3] + self._response_slope().view(-1, *ones) * filtered[0]
         columns = [
-            channels * seen[1],
-            channels * seen[2],
+            channels * filtered[1],
+            channels * filtered[2],
             wave,
-            (channels / self.values[3].clamp_min(1e-9)) * seen[0],
+            (channels / self.values[3].clamp_min(1e-9)) * filtered[0],
         ]
-        columns.append(channels * seen[4])
+        columns.append(channels * filtered[4])
         for i in range(len(heard)):
-            one = torch.zeros_like(heard)
-            one[i] = self.values[3] * spread[i]
-            columns.append(one.view(-1, *ones) * seen[0])
+            unit = torch.zeros_like(heard)
+            unit[i] = self.values[3] * spread[i]
+            columns.append(unit.view(-1, *ones) * filtered[0])
         return torch.stack(columns)
 
     def _slopes(self) -> Tensor:
         """Return the pattern and its change with y, x (pixels), wavelength (nm) and variance
         (nm^2): (5, y, x).
         """
-        camera, at = self.camera, self.values[:3].double()
-        moves = line_moves(camera.pupil, at[:2], at[2] * NANOMETRE, camera.lens, self.fwhm)
+        camera, place = self.camera, self.values[:3].double()
+        moves = line_moves(camera.pupil, place[:2], place[2] * NANOMETRE, camera.lens, self.fwhm)
         moves = moves._replace(wave=moves.wave * NANOMETRE, blur=moves.blur * NANOMETRE**2)
         return torch.stack(list(moves)).to(self.values)
 
@@ -280,8 +280,10 @@ class Laser:
         frame.
         """
         centres, shape = self.camera.bands.centres / NANOMETRE, self.camera.lens.shape
-        most = torch.tensor([1.0, 1.0, 5.0]).to(step)
-        step = torch.cat([torch.maximum(torch.minimum(step[:3], most), -most), step[3:]])
+        longest_step = torch.tensor([1.0, 1.0, 5.0]).to(step)
+        step = torch.cat(
+            [torch.maximum(torch.minimum(step[:3], longest_step), -longest_step), step[3:]]
+        )
         values = self.values + step
         for i in range(2):
             values[i] = values[i].clamp(-0.5 * shape[i] - 1, 0.5 * shape[i] + 1)
@@ -309,11 +311,11 @@ class Laser:
         ends = [self._response(self.values[2] + sign)[0] for sign in (1, -1)]
         return self.values[3] * (ends[0] - ends[1]) / 2.0
 
-    def _pattern(self, at: Tensor) -> Tensor:
+    def _pattern(self, place: Tensor) -> Tensor:
         lens = self.camera.lens
-        at = at.double()  # phases need that
-        towards = at[:2] * (lens.pixel_pitch / lens.focal_length)
-        pattern = line_pattern(self.camera.pupil, towards, at[2] * NANOMETRE, lens, self.fwhm)
+        place = place.double()  # phases need that
+        towards = place[:2] * (lens.pixel_pitch / lens.focal_length)
+        pattern = line_pattern(self.camera.pupil, towards, place[2] * NANOMETRE, lens, self.fwhm)
         return pattern.to(self.values)
 
 
@@ -344,24 +346,24 @@ class Lamp:
         x).
         """
         kinds, channels = self.light.spectra.shape[:2]
-        seen = of(torch.stack([self._pictures(each) for each in self._slopes()]))
-        amounts = seen.new_zeros(kinds * channels, *seen.shape[1:])
+        filtered = of(torch.stack([self._pictures(slope) for slope in self._slopes()]))
+        amounts = filtered.new_zeros(kinds * channels, *filtered.shape[1:])
         for k in range(kinds):
             for c in range(channels):
-                amounts[k * channels + c, c] = seen[2 + k, c]
-        return torch.cat([seen[:2], amounts])
+                amounts[k * channels + c, c] = filtered[2 + k, c]
+        return torch.cat([filtered[:2], amounts])
 
     def _slopes(self) -> Iterator[Tensor]:
         """Yield the spectra of the changes with y, x (pixels) and each kind, one after another
         to save memory.
         """
-        (y, x), whole = self.light.torus, self._spectra()
+        (y, x), spectra = self.light.torus, self._spectra()
         fy, fx = (
             torch.fft.fftfreq(y).to(self.values)[:, None],
             torch.fft.rfftfreq(x).to(self.values),
         )
         for frequency in (fy, fx):
-            yield -2j * torch.pi * self.light.finer * frequency * whole
+            yield -2j * torch.pi * self.light.finer * frequency * spectra
         for kind in self.light.spectra:
             yield kind * self._phase()
 
@@ -383,5 +385,5 @@ class Lamp:
     def _pictures(self, spectra: Tensor) -> Tensor:
         step, (y, x) = self.light.finer, self.light.torus
         rows = torch.fft.ifft(spectra, n=y, dim=-2)[..., : step * self.shape[0] : step, :]
-        whole: Tensor = torch.fft.irfft(rows, n=x, dim=-1)
-        return whole[..., : step * self.shape[1] : step]
+        wide: Tensor = torch.fft.irfft(rows, n=x, dim=-1)
+        return wide[..., : step * self.shape[1] : step]

@@ -59,7 +59,7 @@ _HALVINGS = 60
 
 
 def at_the_aperture(
-    straight: Tensor, spread: Tensor, ideal: Tensor, seen: Tensor
+    straight: Tensor, spread: Tensor, ideal: Tensor, unclipped: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the electrons that a laser would leave behind a clean lens, and the ends of a 90 %
     interval.
@@ -71,16 +71,16 @@ def at_the_aperture(
     Units:  e-.
     """
     # the scatter is a mean over the frame, so that it falls as 1 / side
-    side = min(seen[0].numel() ** 0.5, _MOST)
-    clipped = 1.0 - seen.mean((-2, -1)).to(straight)
+    side = min(unclipped[0].numel() ** 0.5, _MOST)
+    clipped = 1.0 - unclipped.mean((-2, -1)).to(straight)
     size = torch.maximum(straight, spread).clamp_min(1e-30) * (_SIDE / side)
     scatter = (spread.square() - ideal.square()).clamp_min(0.0).sqrt() / size
     faint = math.sqrt(_PLAIN**2 - 1.0) * ideal / size
-    told = scatter > faint
+    measurable = scatter > faint
     hidden = torch.special.ndtr((faint / _USUAL).log() / math.log(_FACTOR))
-    dirty = torch.ones_like(size) if bool(told.any()) else hidden / (1.0 + hidden)
-    scatter = torch.where(told, scatter, faint.clamp_max(_USUAL))
-    width = torch.where(told, _WIDTHS[0], _WIDTHS[1])
+    dirty = torch.ones_like(size) if bool(measurable.any()) else hidden / (1.0 + hidden)
+    scatter = torch.where(measurable, scatter, faint.clamp_max(_USUAL))
+    width = torch.where(measurable, _WIDTHS[0], _WIDTHS[1])
     middle = math.log(_LOST) + _POWER * scatter.log() + _CLIPPED * clipped
     lost = torch.exp(middle[:, None] + width[:, None] * _normal_quantiles().to(size)).clamp_max(
         _ALL
@@ -104,17 +104,17 @@ def _quantiles(
     ``lost`` (channel, node) are equally likely values for a dirty lens, ``dirty`` (channel,) is its
     probability.
     """
-    whole = straight[:, None] * torch.cat([torch.ones_like(lost[:, :1]), lost.exp()], 1)
+    strengths = straight[:, None] * torch.cat([torch.ones_like(lost[:, :1]), lost.exp()], 1)
     weight = torch.cat([1.0 - dirty[:, None], (dirty / lost.shape[1])[:, None].expand_as(lost)], 1)
-    wanted = torch.tensor(_ENDS).to(whole).expand(len(whole), -1)
-    low = (whole.amin(1) - 8.0 * spread)[:, None].expand_as(wanted)
-    high = (whole.amax(1) + 8.0 * spread)[:, None].expand_as(wanted)
+    probabilities = torch.tensor(_ENDS).to(strengths).expand(len(strengths), -1)
+    low = (strengths.amin(1) - 8.0 * spread)[:, None].expand_as(probabilities)
+    high = (strengths.amax(1) + 8.0 * spread)[:, None].expand_as(probabilities)
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
         below = torch.special.ndtr(
-            (middle[..., None] - whole[:, None]) / spread.clamp_min(1e-30)[:, None, None]
+            (middle[..., None] - strengths[:, None]) / spread.clamp_min(1e-30)[:, None, None]
         )
-        short = (weight[:, None] * below).sum(-1) < wanted
+        short = (weight[:, None] * below).sum(-1) < probabilities
         low, high = torch.where(short, middle, low), torch.where(short, high, middle)
     return high[:, 0], high[:, 1:]
 
@@ -204,7 +204,7 @@ def find_lasers(
         precise = max(electrons.shape[-2:]) <= _PRECISE
         frame = electrons.detach().to(torch.float64 if precise else torch.float32)
         plain = Pupil(*(x.detach() for x in pupil))
-        known = Known(
+        frame_and_camera = Known(
             frame,
             (~clipped).to(frame),
             Camera(
@@ -219,8 +219,10 @@ def find_lasers(
             read_noise,
             widths,
         )
-        found = without_scattered(search(known, most, lamps, least, margin), known, least)
-        return _table(found, known, most)
+        lasers = without_scattered(
+            search(frame_and_camera, most, lamps, least, margin), frame_and_camera, least
+        )
+        return _table(lasers, frame_and_camera, most)
 
 
 @find_lasers.preflight
@@ -251,10 +253,10 @@ def _(
     for n in range(count):
         y, x = (result.direction[n] * (focal_length / pixel_pitch)).tolist()
         low, high = (result.wavelength_interval[n] / NANOMETRE).tolist()
-        known = "" if bool(result.identifiable[n].all()) else ", not identifiable"
+        doubt_text = "" if bool(result.identifiable[n].all()) else ", not identifiable"
         texts.append(
             f"{y:+.2f}, {x:+.2f} px, {float(result.wavelength[n]) / NANOMETRE:.1f} nm ({low:.1f} to"
-            f" {high:.1f}){known}"
+            f" {high:.1f}){doubt_text}"
         )
     alone = (
         ""
@@ -289,17 +291,21 @@ def _told(channels: int) -> str:
     return f"{channels} channel{'s' * (channels != 1)}"
 
 
-def _table(found: Found, known: Known, most: int) -> FoundLasers:
+def _table(search_result: Found, frame: Known, rows: int) -> FoundLasers:
     """Return what was found in SI units, the laser of the largest gain first."""
-    at = [n for n, part in enumerate(found.fit.parts) if isinstance(part, Laser)]
-    spread = spreads(found.fit, known.seen) if at else []
-    order = sorted(range(len(at)), key=lambda n: -found.choices[at[n]].gain)
-    result = _empty(most, len(known.electrons))
-    pixel = known.camera.lens.pixel_pitch / known.camera.lens.focal_length
+    laser_indices = [
+        n for n, component in enumerate(search_result.fit.parts) if isinstance(component, Laser)
+    ]
+    spread = spreads(search_result.fit, frame.seen) if laser_indices else []
+    order = sorted(
+        range(len(laser_indices)), key=lambda n: -search_result.choices[laser_indices[n]].gain
+    )
+    result = _empty(rows, len(frame.electrons))
+    pixel = frame.camera.lens.pixel_pitch / frame.camera.lens.focal_length
     for row, n in enumerate(order):
-        part = found.fit.parts[at[n]]
-        assert isinstance(part, Laser)
-        values = torch.cat([part.values[:3], part.channels()]).cpu().double()
+        laser = search_result.fit.parts[laser_indices[n]]
+        assert isinstance(laser, Laser)
+        values = torch.cat([laser.values[:3], laser.channels()]).cpu().double()
         covariance = spread[n].covariance.cpu().double()
         half = NORMAL * covariance.diagonal().sqrt()
         ends = torch.stack([values - half, values + half], -1)
@@ -308,27 +314,27 @@ def _table(found: Found, known: Known, most: int) -> FoundLasers:
             NANOMETRE * values[2],
             NANOMETRE * ends[2],
         )
-        result.fwhm[row] = part.fwhm
+        result.fwhm[row] = laser.fwhm
         result.straight[row], result.straight_spread[row] = values[3:], half[3:] / NORMAL
         light = (result.straight[row], result.straight_spread[row], spread[n].ideal.cpu().double())
         result.strength[row], result.strength_interval[row] = at_the_aperture(
-            *light, known.seen.cpu()
+            *light, frame.seen.cpu()
         )
-        choice = found.choices[at[n]]
+        choice = search_result.choices[laser_indices[n]]
         alone = choice.rival > _RIVAL
         result.identifiable[row, 0] = alone and float(half[:2].max()) < _WIDEST[0]
         result.identifiable[row, 1] = alone and float(half[2]) < _WIDEST[1]
         result.gain[row] = torch.tensor([choice.gain, choice.margin])
         result.correlation[row] = covariance / torch.outer(half / NORMAL, half / NORMAL)
-    return result._replace(number=torch.tensor(len(at)))
+    return result._replace(number=torch.tensor(len(laser_indices)))
 
 
-def _empty(most: int, channels: int) -> FoundLasers:
+def _empty(rows: int, channels: int) -> FoundLasers:
     shapes = ((2,), (), (), (channels,), (2, 2), (2,), (channels, 2))
-    blank = [torch.zeros(most, *shape, dtype=torch.float64) for shape in shapes]
-    certain = torch.zeros(most, 2, dtype=torch.bool)
+    blank = [torch.zeros(rows, *shape, dtype=torch.float64) for shape in shapes]
+    certain = torch.zeros(rows, 2, dtype=torch.bool)
     gain, spread = (
-        torch.zeros(most, *shape, dtype=torch.float64)
+        torch.zeros(rows, *shape, dtype=torch.float64)
         for shape in ((2,), (3 + channels, 3 + channels))
     )
     places, wave, width, size, ends, wave_ends, size_ends = blank
@@ -450,17 +456,20 @@ def _(
     return [Check(f"brightest pixel {float(result.max()):.3g} e-", bool(result.isfinite().all()))]
 
 
-def _drawn(found: FoundLasers, row: int, count: int, rng: Generator) -> Tensor:
+def _drawn(lasers: FoundLasers, row: int, count: int, rng: Generator) -> Tensor:
     """Return draws (draw, value) of direction, wavelength and the strength of each channel of
     one found laser.
     """
-    middle = torch.cat([found.direction[row], found.wavelength[row][None], found.straight[row]])
-    each = (found.direction_interval[row], found.wavelength_interval[row][None])
+    middle = torch.cat([lasers.direction[row], lasers.wavelength[row][None], lasers.straight[row]])
+    intervals = (lasers.direction_interval[row], lasers.wavelength_interval[row][None])
     spread = torch.cat(
-        [*((ends[:, 1] - ends[:, 0]) / (2 * NORMAL) for ends in each), found.straight_spread[row]]
+        [
+            *((ends[:, 1] - ends[:, 0]) / (2 * NORMAL) for ends in intervals),
+            lasers.straight_spread[row],
+        ]
     )
     # the factor reads one triangle alone
-    even = (found.correlation[row] + found.correlation[row].mT) / 2
+    even = (lasers.correlation[row] + lasers.correlation[row].mT) / 2
     lower = torch.linalg.cholesky(even + 1e-9 * torch.eye(len(even)).to(even))
     numbers = torch.randn(
         count, len(middle), generator=rng, device=rng.device, dtype=torch.float64
@@ -469,9 +478,9 @@ def _drawn(found: FoundLasers, row: int, count: int, rng: Generator) -> Tensor:
     return draws
 
 
-def _agree(found: FoundLasers, electrons: Tensor) -> None:
-    if electrons.ndim != 3 or len(electrons) != found.strength.shape[-1]:
+def _agree(lasers: FoundLasers, electrons: Tensor) -> None:
+    if electrons.ndim != 3 or len(electrons) != lasers.strength.shape[-1]:
         raise ValueError(
-            f"electrons {tuple(electrons.shape)} and found lasers of {found.strength.shape[-1]}"
+            f"electrons {tuple(electrons.shape)} and found lasers of {lasers.strength.shape[-1]}"
             " channels do not fit: give the frame in which the lasers were found, (channel, y, x)"
         )

@@ -34,17 +34,17 @@ class Censored(NamedTuple):
     seen: Tensor  #: (channel, y, x), 1 or 0
     spread: Tensor  #: (pixel,), e-, standard deviation of the charge of each clipped pixel
 
-    def misfits(self, rest: Tensor) -> Tensor:
+    def misfits(self, residual: Tensor) -> Tensor:
         """Return numbers (pixel,) whose half square is minus the log likelihood, for the frame
         less all parts, e-.
         """
-        return _root(self._over(rest))[0]
+        return _root(self._over(residual))[0]
 
-    def slopes(self, rest: Tensor, columns: Tensor) -> Tensor:
+    def slopes(self, residual: Tensor, columns: Tensor) -> Tensor:
         """Return how each number falls with each value (value, pixel); ``columns`` is what `lit`
         makes of its light.
         """
-        return _root(self._over(rest))[1] * columns / self.spread
+        return _root(self._over(residual))[1] * columns / self.spread
 
     def lit(self, pictures: Tensor) -> Tensor:
         """Return of pictures (..., channel, y, x) the light of clipped pixels beyond that of
@@ -56,8 +56,8 @@ class Censored(NamedTuple):
         """Return the clipped pixels of pictures: (..., pixel)."""
         return pictures[..., self.seen == 0]
 
-    def _over(self, rest: Tensor) -> Tensor:
-        return self.of(filled(rest, self.seen) - rest) / self.spread
+    def _over(self, residual: Tensor) -> Tensor:
+        return self.of(filled(residual, self.seen) - residual) / self.spread
 
 
 def _root(over: Tensor) -> tuple[Tensor, Tensor]:
@@ -71,14 +71,16 @@ def _root(over: Tensor) -> tuple[Tensor, Tensor]:
     return _WORTH**0.5 * root, _WORTH**0.5 * slope
 
 
-def censored(electrons: Tensor, seen: Tensor, scene: Tensor, read_noise: float) -> Censored | None:
+def censored(
+    electrons: Tensor, unclipped: Tensor, scene: Tensor, read_noise: float
+) -> Censored | None:
     """Return the clipped pixels of a frame, of which ``scene`` is what the parts do not explain;
     None without any.
     """
-    if bool(seen.all()):
+    if bool(unclipped.all()):
         return None
-    variance = electrons.clamp_min(1.0) + read_noise**2 + LOST * masked_variance(scene, seen)
-    return Censored(seen, variance[seen == 0].sqrt())
+    variance = electrons.clamp_min(1.0) + read_noise**2 + LOST * masked_variance(scene, unclipped)
+    return Censored(unclipped, variance[unclipped == 0].sqrt())
 
 
 # --- joint fit ------------------------------------------------------------------------------------
@@ -117,9 +119,9 @@ def fitted(data: Data, parts: Sequence[Laser | Lamp], steps: int) -> Fit:
     """Return the parts after at most ``steps`` steps, each of which lowers the misfit, with the
     slopes at the end.
     """
-    now, left, rest, misfit = _walked(data, tuple(parts), steps)
-    columns = _columns(data, now, left)
-    return Fit(now, misfit, _normal(now, columns), columns, rest)
+    parts_fitted, left, white_residual, misfit = _walked(data, tuple(parts), steps)
+    columns = _columns(data, parts_fitted, left)
+    return Fit(parts_fitted, misfit, _normal(parts_fitted, columns), columns, white_residual)
 
 
 def misfit_of(data: Data, parts: Sequence[Laser | Lamp], steps: int) -> tuple[Parts, float]:
@@ -130,33 +132,34 @@ def misfit_of(data: Data, parts: Sequence[Laser | Lamp], steps: int) -> tuple[Pa
 
 def _walked(data: Data, now: Parts, steps: int) -> tuple[Parts, Tensor, Tensor, float]:
     """Return parts after steps, the frame less their light, the white residual and the misfit."""
-    left, rest, misfit = _misfit(data, now)
+    left, white_residual, misfit = _misfit(data, now)
     for _ in range(steps):
-        better = _step(data, now, left, rest, misfit)
+        better = _step(data, now, left, white_residual, misfit)
         if better is None:
             break
         gained = misfit - better[3]
-        now, left, rest, misfit = better
+        now, left, white_residual, misfit = better
         if gained < _ENOUGH:
             break
-    return now, left, rest, misfit
+    return now, left, white_residual, misfit
 
 
 def _step(
-    data: Data, now: Parts, left: Tensor, rest: Tensor, misfit: float
+    data: Data, now: Parts, left: Tensor, white_residual: Tensor, misfit: float
 ) -> tuple[Parts, Tensor, Tensor, float] | None:
     """Return the parts after one step, and what `_misfit` says of them; None if no step lowers
     the misfit.
     """
     columns = _columns(data, now, left)
     normal = _normal(now, columns)
-    pulled = torch.cat([part.values * part.precision for part in now])
-    slope = columns @ rest - pulled
-    sizes = [len(part.values) for part in now]
+    pulled = torch.cat([component.values * component.precision for component in now])
+    slope = columns @ white_residual - pulled
+    sizes = [len(component.values) for component in now]
     for damping in _DAMPED:
         step = solved(normal + damping * normal.diagonal().diag(), slope).to(slope)
         moved = tuple(
-            part.moved(own) for part, own in zip(now, torch.split(step, sizes), strict=True)
+            component.moved(own)
+            for component, own in zip(now, torch.split(step, sizes), strict=True)
         )
         after, white, new = _misfit(data, moved)
         if new < misfit:
@@ -166,15 +169,19 @@ def _step(
 
 def _columns(data: Data, parts: Parts, left: Tensor) -> Tensor:
     """Return the slopes of what `_misfit` squares: (value, number)."""
-    white = torch.cat([data.weights(part.columns(data.use.__call__)).flatten(1) for part in parts])
+    white = torch.cat(
+        [data.weights(component.columns(data.use.__call__)).flatten(1) for component in parts]
+    )
     if data.clipped is None:
         return white
-    lit = torch.cat([data.clipped.of(part.columns(data.clipped.lit)) for part in parts])
+    lit = torch.cat([data.clipped.of(component.columns(data.clipped.lit)) for component in parts])
     return torch.cat([white, data.clipped.slopes(left, lit)], 1)
 
 
 def _normal(parts: Parts, columns: Tensor) -> Tensor:
-    return products(columns) + torch.cat([part.precision for part in parts]).double().diag()
+    return (
+        products(columns) + torch.cat([component.precision for component in parts]).double().diag()
+    )
 
 
 def products(columns: Tensor) -> Tensor:
@@ -196,8 +203,8 @@ def solved(normal: Tensor, right: Tensor) -> Tensor:
     scale = normal.diagonal().clamp_min(1e-30).rsqrt()
     even = scale[:, None] * normal * scale
     even = even + 1e-12 * torch.eye(len(even)).to(even)
-    each = scale if right.ndim == 1 else scale[:, None]
-    answer: Tensor = each * torch.linalg.solve(even, each * right.to(even))
+    row_scale = scale if right.ndim == 1 else scale[:, None]
+    answer: Tensor = row_scale * torch.linalg.solve(even, row_scale * right.to(even))
     return answer
 
 
@@ -206,13 +213,15 @@ def _misfit(data: Data, parts: Parts) -> tuple[Tensor, Tensor, float]:
     misfit.
     """
     left = data.electrons
-    for part in parts:
-        left = left - part.electrons()
-    rest = data.weights(data.use(left)).flatten()
+    for component in parts:
+        left = left - component.electrons()
+    numbers = data.weights(data.use(left)).flatten()
     if data.clipped is not None:
-        rest = torch.cat([rest, data.clipped.misfits(left)])
-    prior = sum(float((part.precision * part.values.square()).sum()) for part in parts)
-    return left, rest, 0.5 * (float(rest.double().square().sum()) + prior)
+        numbers = torch.cat([numbers, data.clipped.misfits(left)])
+    prior = sum(
+        float((component.precision * component.values.square()).sum()) for component in parts
+    )
+    return left, numbers, 0.5 * (float(numbers.double().square().sum()) + prior)
 
 
 # --- intervals ------------------------------------------------------------------------------------
@@ -240,21 +249,23 @@ class Spread(NamedTuple):
     ideal: Tensor
 
 
-def spreads(fit: Fit, seen: Tensor) -> list[Spread]:
+def spreads(fit: Fit, unclipped: Tensor) -> list[Spread]:
     """Return for each laser how well its values are told.
 
-    ``seen`` (channel, y, x) is 0 for clipped pixels, which the fit has after all others, if at all.
-    The inverse of the second derivatives is enlarged where the slopes of blocks of the frame
+    ``unclipped`` (channel, y, x) is 0 for clipped pixels, which the fit has after all others, if at
+    all. The inverse of the second derivatives is enlarged where the slopes of blocks of the frame
     scatter more than the model says.
     """
     count = len(fit.normal)
     inverse = solved(fit.normal, torch.eye(count).to(fit.normal))
-    each = (fit.columns * fit.rest).double()
-    pictures = each[:, : seen.numel()].view(count, *seen.shape)
-    if each.shape[1] > seen.numel():
-        pictures[:, seen == 0] = each[:, seen.numel() :]  # a clipped pixel has no residual
+    scores_by_number = (fit.columns * fit.rest).double()
+    pictures = scores_by_number[:, : unclipped.numel()].view(count, *unclipped.shape)
+    if scores_by_number.shape[1] > unclipped.numel():
+        pictures[:, unclipped == 0] = scores_by_number[
+            :, unclipped.numel() :
+        ]  # a clipped pixel has no residual
     scores = pictures.sum(1)
-    y, x = (-n % _BLOCK for n in seen.shape[-2:])
+    y, x = (-n % _BLOCK for n in unclipped.shape[-2:])
     blocks = (
         pad(scores, (0, x, 0, y))
         .unfold(1, _BLOCK, _BLOCK)
@@ -265,16 +276,19 @@ def spreads(fit: Fit, seen: Tensor) -> list[Spread]:
     prior = fit.normal - products(fit.columns)
     scattered = inverse @ (blocks @ blocks.T + prior) @ inverse
     growth = (scattered.diagonal() / inverse.diagonal().clamp_min(1e-300)).clamp_min(1.0).sqrt()
-    whole = growth[:, None] * inverse * growth
-    found, first = [], 0
-    for part in fit.parts:
-        own = slice(first, first + len(part.values))
-        first += len(part.values)
-        if isinstance(part, Laser):
-            pixels = int(seen.amin(0).sum())
-            grown, ideal = (_of_channels(part, each[own, own], pixels) for each in (whole, inverse))
-            found.append(Spread(grown, ideal.diagonal()[3:].sqrt()))
-    return found
+    covariance = growth[:, None] * inverse * growth
+    laser_spreads, first = [], 0
+    for component in fit.parts:
+        own = slice(first, first + len(component.values))
+        first += len(component.values)
+        if isinstance(component, Laser):
+            pixels = int(unclipped.amin(0).sum())
+            grown, ideal = (
+                _of_channels(component, matrix[own, own], pixels)
+                for matrix in (covariance, inverse)
+            )
+            laser_spreads.append(Spread(grown, ideal.diagonal()[3:].sqrt()))
+    return laser_spreads
 
 
 def _of_channels(laser: Laser, own: Tensor, pixels: int) -> Tensor:

@@ -44,10 +44,11 @@ def line_pattern(
     """
     offsets, shares = _parts(fwhm)
     patterns = [
-        _pattern(pupil, direction, wavelength + at * deviation(fwhm), lens) for at in offsets
+        _pattern(pupil, direction, wavelength + offset * deviation(fwhm), lens)
+        for offset in offsets
     ]
     return sum(
-        (share * each for share, each in zip(shares, patterns, strict=True)),
+        (share * pattern for share, pattern in zip(shares, patterns, strict=True)),
         torch.zeros_like(patterns[0]),
     )
 
@@ -66,10 +67,10 @@ def _parts(fwhm: Tensor) -> tuple[list[float], list[float]]:
     The sums over them are exact for every polynomial of the wavelength up to degree 5, 9 or 13
     (Gauss and Hermite).
     """
-    at, weights = hermegauss(
-        next((count for most, count in _COUNTS if float(fwhm.detach()) < most), _MOST)
+    nodes, weights = hermegauss(
+        next((count for limit, count in _COUNTS if float(fwhm.detach()) < limit), _MOST)
     )
-    return at.tolist(), (weights / weights.sum()).tolist()
+    return nodes.tolist(), (weights / weights.sum()).tolist()
 
 
 def _pattern(pupil: Pupil, direction: Tensor, wavelength: Tensor, lens: Lens) -> Tensor:
@@ -114,8 +115,8 @@ class _Window(NamedTuple):
         if self.grids is not None:
             light = averaged(light, *self.grids)
         y, x = (
-            _within(pixels, at, reach).to(light)
-            for pixels, at in zip(self.pixels, spot, strict=True)
+            _within(pixels, place, reach).to(light)
+            for pixels, place in zip(self.pixels, spot, strict=True)
         )
         return light * y[:, None] * x
 
@@ -136,8 +137,8 @@ def _share(pupil: Pupil, wavelength: Tensor, reach: Tensor) -> Tensor:
 
 def _turns(samples: int, reach: Tensor, field: Tensor) -> Tensor:
     """Return the factor (sample,) of a phasor's change when the spot moves by a pixel."""
-    at = torch.arange(samples, dtype=torch.float64, device=field.device) - (samples - 1) / 2
-    return 2j * math.pi * (reach * at).to(field)
+    position = torch.arange(samples, dtype=torch.float64, device=field.device) - (samples - 1) / 2
+    return 2j * math.pi * (reach * position).to(field)
 
 
 class Moves(NamedTuple):
@@ -158,11 +159,14 @@ def line_moves(pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens, fwhm:
     """
     wide = fwhm.clamp_min(_NARROW)
     sigma, sums = deviation(wide), [torch.zeros(1)] * 5
-    for at, share in zip(*_parts(wide), strict=True):
-        still, down, right = _moves(pupil, spot, wavelength + at * sigma, lens)
-        by = (share * still, share * down, share * right, share * at / sigma * still)
-        blur = share * (at * at - 1.0) / (2.0 * sigma.square()) * still
-        sums = [total.to(each) + each for total, each in zip(sums, (*by, blur), strict=True)]
+    for offset, share in zip(*_parts(wide), strict=True):
+        still, down, right = _moves(pupil, spot, wavelength + offset * sigma, lens)
+        by = (share * still, share * down, share * right, share * offset / sigma * still)
+        blur = share * (offset * offset - 1.0) / (2.0 * sigma.square()) * still
+        sums = [
+            total.to(contribution) + contribution
+            for total, contribution in zip(sums, (*by, blur), strict=True)
+        ]
     return Moves(*sums)
 
 
@@ -172,14 +176,15 @@ def _moves(
     """Return the pattern of one wavelength, and its slopes along y and x by pixel."""
     field, reach = _field(pupil, wavelength), _reach(pupil, wavelength, lens)
     turn_y, turn_x = (_turns(n, reach, field) for n in field.shape)
-    window, at = _Window.of(lens, field, reach), (spot[0], spot[1])
+    window, spot_place = _Window.of(lens, field, reach), (spot[0], spot[1])
     rows, columns = (_axis(window.places[i], reach, spot[i], field, i) for i in (0, 1))
     both = field @ torch.cat([columns, turn_x * columns]).T
     far, right = (rows @ both).chunk(2, dim=1)
     down = (turn_y * rows) @ both[:, : len(columns)]
-    light = window.seen(far.real.square() + far.imag.square(), at, reach)
+    light = window.seen(far.real.square() + far.imag.square(), spot_place, reach)
     by_pixel = [
-        window.seen(far.real * way.real + far.imag * way.imag, at, reach) for way in (down, right)
+        window.seen(far.real * way.real + far.imag * way.imag, spot_place, reach)
+        for way in (down, right)
     ]
     share = _share(pupil, wavelength, reach).to(light)
     return share * light, 2 * share * by_pixel[0], 2 * share * by_pixel[1]
@@ -193,16 +198,16 @@ def grid_patterns(
     """
     field, reach = _field(pupil, wavelength), _reach(pupil, wavelength, lens)
     window = _Window.of(lens, field, reach)
-    rows = torch.cat([_axis(window.places[0], reach, at, field, 0) for at in down])
-    columns = torch.cat([_axis(window.places[1], reach, at, field, 1) for at in right])
+    rows = torch.cat([_axis(window.places[0], reach, place, field, 0) for place in down])
+    columns = torch.cat([_axis(window.places[1], reach, place, field, 1) for place in right])
     far = rows @ (field @ columns.T)
     light = far.real.square() + far.imag.square()
     tall, wide = (len(places) for places in window.places)
     patterns = [
         torch.stack(
             [
-                window.seen(part, (y, x), reach)
-                for x, part in zip(right, torch.split(row, wide, 1), strict=True)
+                window.seen(columns_of_spot, (y, x), reach)
+                for x, columns_of_spot in zip(right, torch.split(row, wide, 1), strict=True)
             ]
         )
         for y, row in zip(down, torch.split(light, tall), strict=True)
@@ -240,30 +245,32 @@ def index_at(wavelength: Tensor, pupil: Pupil) -> Tensor:
     """Return the index of the mask at a wavelength, by the cubic through the four nearest bands
     or fewer.
     """
-    known, values = pupil.wavelengths.to(wavelength), pupil.index.to(wavelength)
-    count = min(4, len(known))
+    wavelengths, values = pupil.wavelengths.to(wavelength), pupil.index.to(wavelength)
+    count = min(4, len(wavelengths))
     first = int(
-        torch.searchsorted(known.detach(), wavelength.detach()).clamp(
-            count // 2, len(known) - count + count // 2
+        torch.searchsorted(wavelengths.detach(), wavelength.detach()).clamp(
+            count // 2, len(wavelengths) - count + count // 2
         )
     )
-    at, value = (x[first - count // 2 : first - count // 2 + count] for x in (known, values))
+    near, value = (
+        x[first - count // 2 : first - count // 2 + count] for x in (wavelengths, values)
+    )
     total = torch.zeros_like(wavelength)
     for i in range(count):
         others = [j for j in range(count) if j != i]
-        factors = [(wavelength - at[j]) / (at[i] - at[j]) for j in others]
+        factors = [(wavelength - near[j]) / (near[i] - near[j]) for j in others]
         total = total + value[i] * (torch.stack(factors).prod() if factors else 1.0)
     return total
 
 
-def interpolated(at: Tensor, known: Tensor, values: Tensor) -> Tensor:
+def interpolated(place: Tensor, places: Tensor, values: Tensor) -> Tensor:
     """Return values (row,) at one place, linear between known places in rising order and beyond
     their ends.
     """
-    if len(known) == 1:
-        return values[:, 0] + 0.0 * at
-    right = int(torch.searchsorted(known.detach(), at.detach()).clamp(1, len(known) - 1))
-    share = (at - known[right - 1]) / (known[right] - known[right - 1])
+    if len(places) == 1:
+        return values[:, 0] + 0.0 * place
+    right = int(torch.searchsorted(places.detach(), place.detach()).clamp(1, len(places) - 1))
+    share = (place - places[right - 1]) / (places[right] - places[right - 1])
     return values[:, right - 1] * (1.0 - share) + values[:, right] * share
 
 

@@ -29,10 +29,10 @@ class Critic(nn.Module):
     def __init__(self, width: int = 64) -> None:
         super().__init__()
         sizes = [3, width, 2 * width, 4 * width, 8 * width]
-        pairs = [(nn.Conv2d(a, b, 4, 2, 1), nn.LeakyReLU(LEAK)) for a, b in pairwise(sizes)]
-        self.layers = nn.Sequential(
-            *(part for pair in pairs for part in pair), nn.Conv2d(sizes[-1], 1, 3, padding=1)
-        )
+        layers: list[nn.Module] = []
+        for a, b in pairwise(sizes):
+            layers += [nn.Conv2d(a, b, 4, 2, 1), nn.LeakyReLU(LEAK)]
+        self.layers = nn.Sequential(*layers, nn.Conv2d(sizes[-1], 1, 3, padding=1))
 
     def forward(self, picture: Tensor) -> Tensor:
         if min(picture.shape[-2:]) < SMALLEST:

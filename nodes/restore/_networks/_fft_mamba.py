@@ -93,7 +93,7 @@ class DualScan(nn.Module):
         self.D.fill_(1.0)
 
     def forward(self, u: Tensor) -> Tensor:
-        rate, into, out = (single(part) for part in self.read(u).split(self.sizes, -1))
+        rate, into, out = (single(numbers) for numbers in self.read(u).split(self.sizes, -1))
         with torch.autocast(u.device.type, enabled=False):
             return dual_scan(
                 single(u), _step(rate, self.dt_bias), _decay(self.A_log), into, out, self.D
@@ -195,9 +195,9 @@ class _Phase(torch.autograd.Function):
         return torch.atan2(imaginary, real)
 
     @staticmethod
-    def backward(ctx: Any, *seen: Tensor) -> tuple[Tensor, Tensor]:
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor, Tensor]:
         real, imaginary = ctx.saved_tensors
-        slope = seen[0] / (real.square() + imaginary.square() + SMALL)
+        slope = slopes[0] / (real.square() + imaginary.square() + SMALL)
         return -slope * imaginary, slope * real
 
 
@@ -248,8 +248,8 @@ class Frequency(nn.Module):
         with torch.autocast(x.device.type, enabled=False):  # FFTs need full precision
             spectrum = torch.fft.rfft2(x, norm="ortho")
             sorted_ = spectrum.flatten(2).index_select(2, order)
-            seen = self.norm(torch.cat(self._parts(sorted_), 1).transpose(1, 2))
-        value, gate = self.enter(seen).chunk(2, -1)
+            features = self.norm(torch.cat(self._parts(sorted_), 1).transpose(1, 2))
+        value, gate = self.enter(features).chunk(2, -1)
         drawn = single(self.leave(self.scanned(self.scan(F.silu(value))) * F.silu(gate)))
         first, second = drawn.transpose(1, 2).index_select(2, place).chunk(2, 1)
         with torch.autocast(x.device.type, enabled=False):
@@ -299,8 +299,8 @@ class Block(nn.Module):
         self.scale, self.second_scale = Scale(width), Scale(width)
 
     def forward(self, x: Tensor) -> Tensor:
-        seen = self.norm(x)
-        near, far = self.spatial(seen), self.frequency(seen)
+        features = self.norm(x)
+        near, far = self.spatial(features), self.frequency(features)
         share = torch.sigmoid(self.weigh(torch.cat([near.to(far), far], 1)))
         x = x + self.scale(share * near + (1 - share) * far)
         result: Tensor = x + self.second_scale(

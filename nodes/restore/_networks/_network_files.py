@@ -103,19 +103,19 @@ def export_network(net: Restorer, file: Path) -> None:
     low, high = -(-_LEAST // step), _LARGEST // step
     y, x = (torch.export.Dim(name, min=low, max=high) for name in ("rows", "columns"))
     sides = ({2: step * y, 3: step * x},)
-    part = file.with_name(f".{os.getpid()}.{file.name}")
+    unfinished = file.with_name(f".{os.getpid()}.{file.name}")
     try:
         with torch.no_grad(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of packages about their own future
-            _write(graph, example, sides, part)
-        part.replace(file)
+            _write(graph, example, sides, unfinished)
+        unfinished.replace(file)
     except Exception as error:
         said = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
         raise ParameterError(
             "export", f"the network cannot be written as {file.suffix} ({said})"
         ) from error
     finally:
-        part.unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)
 
 
 def _write(graph: nn.Module, example: Tensor, sides: Any, file: Path) -> None:
@@ -306,16 +306,28 @@ def _check_member(file: Path, name: str, data: bytes) -> None:
 
 
 def _graph(file: Path, program: Any) -> Graph:
-    for key, value in _pairs(program):
-        if key == "target" and isinstance(value, str) and not _OPERATOR.fullmatch(value):
-            raise _refused(file, f"calls {value}, and only operators of aten are run")
-        if key in ("in_spec", "out_spec") and isinstance(value, str) and value:
-            _check_containers(file, json.loads(value))
+    _check_calls(file, program)
     module = program["graph_module"]
     if any(_trains(node) for node in module["graph"]["nodes"]):
         raise _refused(
             file, "was exported in training mode: call eval() of the network before torch.export"
         )
+    _check_formulas(file, program, module)
+    return Graph(
+        _sides(file, program, module), str(program.get("torch_version", "of another version"))
+    )
+
+
+def _check_calls(file: Path, program: Any) -> None:
+    for key, value in _pairs(program):
+        if key == "target" and isinstance(value, str) and not _OPERATOR.fullmatch(value):
+            raise _refused(file, f"calls {value}, and only operators of aten are run")
+        if key in ("in_spec", "out_spec") and isinstance(value, str) and value:
+            _check_containers(file, json.loads(value))
+
+
+def _check_formulas(file: Path, program: Any, module: Any) -> None:
+    """Raise ParameterError for a formula of sizes with a name that none needs."""
     formulas = [value for key, value in _pairs(module) if key == "expr_str"]
     for text in (
         *formulas,
@@ -326,17 +338,16 @@ def _graph(file: Path, program: Any) -> Graph:
         wrong = [word for word in re.findall(r"\w+", bare) if not _IN_FORMULA.fullmatch(word)]
         if wrong or not re.fullmatch(r"[\w\s()\[\]'\".,=<>!*/%+-]*", bare):
             raise _refused(file, f"has a formula of sizes with other names: {str(text)[:60]}")
-    return Graph(
-        _sides(file, program, module), str(program.get("torch_version", "of another version"))
-    )
 
 
 def _trains(node: Any) -> bool:
     """Return True for an operator that computes otherwise in training, such as dropout, and is
     told to do so.
     """
-    given = {one.get("name"): one.get("arg", {}).get("as_bool") for one in node["inputs"]}
-    return given.get("training") is True or given.get("train") is True
+    arguments = {
+        argument.get("name"): argument.get("arg", {}).get("as_bool") for argument in node["inputs"]
+    }
+    return arguments.get("training") is True or arguments.get("train") is True
 
 
 def _check_containers(file: Path, spec: Any) -> None:
@@ -349,38 +360,49 @@ def _sides(file: Path, program: Any, module: Any) -> tuple[Side, Side]:
     """Return the sizes of the pictures; raise ParameterError unless one picture gives one of the
     same sizes.
     """
-    signature, values = module["signature"], module["graph"]["tensor_values"]
-    given = [spec["user_input"]["arg"] for spec in signature["input_specs"] if "user_input" in spec]
-    found = [
-        spec["user_output"]["arg"] for spec in signature["output_specs"] if "user_output" in spec
-    ]
-    if (
-        len(given) != 1
-        or len(found) != 1
-        or len(signature["output_specs"]) != 1
-        or "as_tensor" not in given[0]
-    ):
-        many = (
-            f"takes {len(given)} inputs and returns {len(signature['output_specs'])} results, state"
-            " included"
-        )
-        raise _refused(file, f"{many}: {_FIX}")
-    about, result = values[given[0]["as_tensor"]["name"]], values[found[0]["as_tensor"]["name"]]
-    sizes = about["sizes"]
+    picture, result = _picture_and_result(file, module)
+    sizes = picture["sizes"]
     if len(sizes) != 4 or sizes[1].get("as_int") != 3 or sizes[0].get("as_int", 1) != 1:
-        shape = " x ".join(str(size.get("as_int", "any")) for size in sizes)
         raise _refused(
-            file, f"takes pictures {shape}, and a colour picture is 1 x 3 x y x x: {_FIX}"
+            file, f"takes pictures {_shape(sizes)}, and a colour picture is 1 x 3 x y x x: {_FIX}"
         )
-    if about["dtype"] != _FLOAT or result["dtype"] != _FLOAT:
+    if picture["dtype"] != _FLOAT or result["dtype"] != _FLOAT:
         raise _refused(
             file, "takes or returns other numbers than float32: export it with a picture in float32"
         )
     if _plain(result["sizes"]) != _plain(sizes):
-        shape = " x ".join(str(size.get("as_int", "any")) for size in result["sizes"])
+        shape = _shape(result["sizes"])
         raise _refused(file, f"returns {shape} for a picture of other sizes: return the same shape")
     limits = program.get("range_constraints", {})
     return _side(sizes[2], limits), _side(sizes[3], limits)
+
+
+def _picture_and_result(file: Path, module: Any) -> tuple[Any, Any]:
+    """Return type and sizes of the only input and of the only result of a graph."""
+    signature, values = module["signature"], module["graph"]["tensor_values"]
+    user_inputs = [
+        spec["user_input"]["arg"] for spec in signature["input_specs"] if "user_input" in spec
+    ]
+    user_outputs = [
+        spec["user_output"]["arg"] for spec in signature["output_specs"] if "user_output" in spec
+    ]
+    if (
+        len(user_inputs) != 1
+        or len(user_outputs) != 1
+        or len(signature["output_specs"]) != 1
+        or "as_tensor" not in user_inputs[0]
+    ):
+        many = (
+            f"takes {len(user_inputs)} inputs and returns {len(signature['output_specs'])} results,"
+            " state included"
+        )
+        raise _refused(file, f"{many}: {_FIX}")
+    picture = values[user_inputs[0]["as_tensor"]["name"]]
+    return picture, values[user_outputs[0]["as_tensor"]["name"]]
+
+
+def _shape(sizes: Any) -> str:
+    return " x ".join(str(size.get("as_int", "any")) for size in sizes)
 
 
 def _plain(sizes: Any) -> list[Any]:
@@ -398,10 +420,10 @@ def _side(size: Any, limits: Any) -> Side:
     factor = re.match(r"Mul\(Integer\((\d+)\), Symbol|(\d+)\*s\d+$", text)
     times = int(factor[1] or factor[2]) if factor else 1
     limit = limits.get(symbol[0], {}) if symbol else {}
-    most = limit.get("max_val")
+    largest = limit.get("max_val")
     return Side(
         times * int(limit.get("min_val") or 1),
-        math.inf if most is None else times * int(most),
+        math.inf if largest is None else times * int(largest),
         times,
     )
 

@@ -68,7 +68,7 @@ class OwnNetwork(PictureRestorer):
         y, x = fine.shape[-2:]
         return resize(fine, -(-y // 2), -(-x // 2)), fine
 
-    def forward(self, picture: Tensor, *given: Any) -> Tensor:
+    def forward(self, picture: Tensor, *conditions: Any) -> Tensor:
         y, x = picture.shape[-2:]
         return self.called(mirrored(picture, -y % self.multiple, -x % self.multiple))[..., :y, :x]
 
@@ -111,9 +111,9 @@ class OwnNetwork(PictureRestorer):
             text = " ".join(str(error).split()) or type(error).__name__
             frames = traceback.extract_tb(error.__traceback__)
             lines = [
-                one
-                for one in frames
-                if "/torch/" not in one.filename and one.name != "__torch_function__"
+                frame
+                for frame in frames
+                if "/torch/" not in frame.filename and frame.name != "__torch_function__"
             ]
             place = (
                 f"{lines[-1].filename.rpartition('/')[2]}:{lines[-1].lineno}: " if lines[1:] else ""
@@ -172,12 +172,12 @@ def try_network(
     The sides of the picture differ, and no smaller power of two than `multiple` divides them, so
     that a network that needs certain sizes and does not say so fails here.
     """
-    least = math.ceil(_LEAST / net.multiple) | 1
-    y, x = sizes or (net.multiple * least, net.multiple * (least + 2))
+    multiples = math.ceil(_LEAST / net.multiple) | 1
+    y, x = sizes or (net.multiple * multiples, net.multiple * (multiples + 2))
     random = torch.Generator().manual_seed(1)
     picture = torch.rand(1, 3, y, x, generator=random, dtype=torch.float64).to(device, dtype)
     net.to(device, dtype).eval()
-    given = picture.clone()
+    argument = picture.clone()
     try:
         with (
             torch.no_grad(),
@@ -185,7 +185,7 @@ def try_network(
             exact_convolutions(picture, deterministic=True),
         ):
             with _Counting() as counted:
-                first = net.called(given)
+                first = net.called(argument)
             second = net.called(picture.clone())
     except ValueError as error:
         hint = (
@@ -195,7 +195,7 @@ def try_network(
         raise ParameterError(
             "architecture", f"{error}{hint if 'picture 1 x' in str(error) else ''}"
         ) from error
-    if not torch.equal(given, picture):
+    if not torch.equal(argument, picture):
         raise ParameterError("architecture", f"{net.name} {_CHANGES}")
     if first.dtype != dtype:
         raise ParameterError(

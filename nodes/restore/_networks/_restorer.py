@@ -41,12 +41,12 @@ def tiled(change: Callable[[Tensor], Tensor], picture: Tensor, side: int) -> Ten
     total, weights = torch.zeros_like(picture), picture.new_zeros(size)
     rows, columns = (_starts(n, side) for n in size)
     for top, left in product(rows, columns):
-        part = (..., slice(top, top + side), slice(left, left + side))
+        window = (..., slice(top, top + side), slice(left, left + side))
         weight = torch.outer(
             *(_ramp(start, side, n, picture) for start, n in zip((top, left), size, strict=True))
         )
-        total[part] += change(picture[part]) * weight
-        weights[part] += weight
+        total[window] += change(picture[window]) * weight
+        weights[window] += weight
     return total / weights
 
 
@@ -65,9 +65,9 @@ def _ramp(start: int, side: int, length: int, like: Tensor) -> Tensor:
     inside the picture.
     """
     side = min(side, length)
-    at = torch.arange(side, dtype=like.dtype, device=like.device) + 0.5
-    rise = (at / (side * _OVERLAP)).clamp(max=1.0)
-    ramp = torch.ones_like(at)
+    position = torch.arange(side, dtype=like.dtype, device=like.device) + 0.5
+    rise = (position / (side * _OVERLAP)).clamp(max=1.0)
+    ramp = torch.ones_like(position)
     if start > 0:
         ramp = ramp * rise
     if start + side < length:
@@ -92,17 +92,18 @@ class Restorer(nn.Module, ABC):
     """A network that restores pictures (n, 3, y, x) of any size at two scales, a coarse and a fine
     scale.
 
-    ``given`` is what a network needs of a picture beside its pixels; most networks need nothing.
+    ``conditions`` are what a network needs of a picture beside its pixels; most networks need
+    nothing.
     """
 
     multiple: int  #: divisor of the height and width inside the network
 
     @abstractmethod
-    def pyramid(self, picture: Tensor, *given: Any) -> tuple[Tensor, Tensor]:
+    def pyramid(self, picture: Tensor, *conditions: Any) -> tuple[Tensor, Tensor]:
         """Return the restored picture at half the size, rounded up, and at the full size."""
 
-    def forward(self, picture: Tensor, *given: Any) -> Tensor:
-        return self.pyramid(picture, *given)[1]
+    def forward(self, picture: Tensor, *conditions: Any) -> Tensor:
+        return self.pyramid(picture, *conditions)[1]
 
     @abstractmethod
     def begin(self) -> None:
@@ -125,7 +126,7 @@ class PictureRestorer(Restorer):
         multiples of `multiple`.
         """
 
-    def pyramid(self, picture: Tensor, *given: Any) -> tuple[Tensor, Tensor]:
+    def pyramid(self, picture: Tensor, *conditions: Any) -> tuple[Tensor, Tensor]:
         y, x = picture.shape[-2:]
         coarse, fine = self.scales(mirrored(picture, -y % self.multiple, -x % self.multiple))
         return coarse[..., : -(-y // 2), : -(-x // 2)], fine[..., :y, :x]
@@ -186,14 +187,14 @@ def start_network(make: Callable[[], Net], rng: torch.Generator) -> Net:
     net = empty(make).to_empty(device=rng.device)
     gain = getattr(net, "gain", 1.0)
     with torch.no_grad():
-        for part in net.modules():
-            if isinstance(part, LAYERS):
-                nn.init.orthogonal_(part.weight, gain, generator=rng)
-                if part.bias is not None:
-                    part.bias.zero_()
-            elif isinstance(part, nn.LayerNorm):
-                part.reset_parameters()
-            elif callable(start := getattr(part, "start", None)):
+        for module in net.modules():
+            if isinstance(module, LAYERS):
+                nn.init.orthogonal_(module.weight, gain, generator=rng)
+                if module.bias is not None:
+                    module.bias.zero_()
+            elif isinstance(module, nn.LayerNorm):
+                module.reset_parameters()
+            elif callable(start := getattr(module, "start", None)):
                 start(rng)
         if isinstance(net, Restorer):
             net.begin()
@@ -207,8 +208,8 @@ def parameter_groups(
     biases of layers.
     """
     of_layers = [m.bias for m in net.modules() if isinstance(m, LAYERS) and m.bias is not None]
-    known = set(map(id, of_layers))
-    others = [p for p in net.parameters() if id(p) not in known]
+    in_layers = set(map(id, of_layers))
+    others = [p for p in net.parameters() if id(p) not in in_layers]
     return [{"params": others, "lr": weights}, {"params": of_layers, "lr": biases}]
 
 
@@ -249,11 +250,11 @@ def restored_by(
         torch.autocast(picture.device.type, enabled=False),
     ):
         y, x = picture.shape[-2:]
-        whole = picture.float()[None]
-        seen = whole if reduce == 1 else resize(whole, -(-y // reduce), -(-x // reduce))
-        result: Tensor = net(seen) if tile is None else tiled(net, seen, tile)
+        batch = picture.float()[None]
+        reduced = batch if reduce == 1 else resize(batch, -(-y // reduce), -(-x // reduce))
+        result: Tensor = net(reduced) if tile is None else tiled(net, reduced, tile)
         if reduce > 1:
-            result = whole + resize(result - seen, y, x) if detail else resize(result, y, x)
+            result = batch + resize(result - reduced, y, x) if detail else resize(result, y, x)
     return result[0]
 
 

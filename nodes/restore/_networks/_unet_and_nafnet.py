@@ -166,8 +166,8 @@ def _blocks(width: int, count: int) -> nn.Sequential:
 
 
 def _multiplied(x: Tensor) -> Tensor:
-    one, other = x.chunk(2, 1)
-    return one * other
+    first, second = x.chunk(2, 1)
+    return first * second
 
 
 @node()

@@ -17,8 +17,10 @@ from neusee.nodes.restore._inverse._masked_blur import Blurred
 from neusee.nodes.restore._inverse._wiener import (
     MAPS,
     Doubt,
+    LaserLight,
     LeastDoubt,
     Settings,
+    View,
     facts,
     pose,
     unpacked,
@@ -46,14 +48,15 @@ class Informed(Restorer):
     def begin(self) -> None:
         self.body.last.weight.zero_()
 
-    def pyramid(self, picture: Tensor, *given: Any) -> tuple[Tensor, Tensor]:
+    def pyramid(self, picture: Tensor, *conditions: Any) -> tuple[Tensor, Tensor]:
         """Return the restored picture at half and at full size: ``picture`` (n, 3, y, x) and what
         the network changes.
 
-        ``picture`` is what the filter restores; ``given`` are its `FilterFacts`, and the matrix (3,
-        channel) from electrons to colours, of a single picture or of n pictures along a first axis.
+        ``picture`` is what the filter restores; ``conditions`` are its `FilterFacts`, and the
+        matrix (3, channel) from electrons to colours, of a single picture or of n pictures along a
+        first axis.
         """
-        value, matrix = given
+        value, matrix = conditions
         change = self.change(value.answer, value.deviation, value.maps) * value.scale
         fine = picture + torch.einsum("...oc,...cyx->...oyx", matrix.to(change), change).to(picture)
         return resize(fine, -(-picture.shape[-2] // 2), -(-picture.shape[-1] // 2)), fine
@@ -68,11 +71,11 @@ class Informed(Restorer):
         channels, which draws it to grey.
         """
         rows, columns = maps.shape[-2:]
-        each = maps.to(self.body.last.weight).reshape(-1, *maps.shape[-3:])
-        whole = mirrored(each, -rows % self.multiple, -columns % self.multiple)
-        told: Tensor = self.body.change(whole)[..., :rows, :columns].to(answer)
+        batch = maps.to(self.body.last.weight).reshape(-1, *maps.shape[-3:])
+        padded = mirrored(batch, -rows % self.multiple, -columns % self.multiple)
+        numbers: Tensor = self.body.change(padded)[..., :rows, :columns].to(answer)
         free, share, grey = torch.tensor_split(
-            told.reshape(*answer.shape[:-3], -1, rows, columns), 3, -3
+            numbers.reshape(*answer.shape[:-3], -1, rows, columns), 3, -3
         )
         result: Tensor = (
             free * deviation.sqrt() + share * answer + grey * answer.mean(-3, keepdim=True)
@@ -119,15 +122,16 @@ def informed(
     Source: Chen et al., Simple Baselines for Image Restoration, ECCV 2022 (NAFNet), with fewer
             blocks; the maps are ours.
     """
-    electrons, light = single(electrons), (glare, nearby, ghosts)
+    electrons, light = single(electrons), LaserLight(glare, nearby, ghosts)
     if len(electrons) != 3:
         raise ValueError(
             f"electrons {tuple(electrons.shape)} have {len(electrons)} channels, and the network"
             " needs 3"
         )
+    view = View(psf, illuminant, responses, bands)
     settings = Settings(balance, read_noise, doubt, least_doubt, scatter)
-    found = facts(pose(electrons, psf, illuminant, responses, bands, clipped, *light, settings))
-    result = found.answer * found.scale
+    filtered = facts(pose(electrons, clipped, view, light, settings))
+    result = filtered.answer * filtered.scale
     if weights is not None:
         net = (
             loaded(partial(Informed, width), weights)
@@ -139,8 +143,11 @@ def informed(
             exact_convolutions(electrons, deterministic=True),
             torch.autocast(electrons.device.type, enabled=False),
         ):
-            result = result + net.change(found.answer, found.deviation, found.maps) * found.scale
-    return (result + found.mean).to(electrons)
+            result = (
+                result
+                + net.change(filtered.answer, filtered.deviation, filtered.maps) * filtered.scale
+            )
+    return (result + filtered.mean).to(electrons)
 
 
 @informed.preflight
@@ -200,55 +207,63 @@ class Unrolled(Restorer):
             assert isinstance(prior, NAFNet)
             prior.last.weight.zero_()
 
-    def pyramid(self, picture: Tensor, *given: Any) -> tuple[Tensor, Tensor]:
+    def pyramid(self, picture: Tensor, *conditions: Any) -> tuple[Tensor, Tensor]:
         """Return the restored picture at half and at full size: ``picture`` (1, 3, y, x) and what
         the network changes.
 
-        ``picture`` is what the filter restores; ``given`` are the `WienerProblem` whose answer it
-        is, and the matrix (3, channel) from electrons to colours.
+        ``picture`` is what the filter restores; ``conditions`` are the `WienerProblem` whose answer
+        it is, and the matrix (3, channel) from electrons to colours.
         """
-        value, matrix = given
+        value, matrix = conditions
         change = self.change(unpacked(value), value.answer, value.seen) * value.scale
         fine = picture + torch.tensordot(matrix.to(change), change, 1).to(picture)
         return resize(fine, -(-picture.shape[-2] // 2), -(-picture.shape[-1] // 2)), fine
 
-    def change(self, seen: Blurred, answer: Tensor, blurred: Tensor) -> Tensor:
+    def change(self, problem: Blurred, answer: Tensor, blurred: Tensor) -> Tensor:
         """Return what the steps add to the filter's answer (3, y, x), given this answer and its
         blur by the camera.
         """
         added = of_added = torch.zeros_like(answer)
         for prior in self.priors:
-            found, precision = _found(prior, seen, answer + added, blurred + of_added)
-            added, of_added = pulled(seen, added + found, precision, self.iterations)
+            pull, precision = _found(prior, problem, answer + added, blurred + of_added)
+            added, of_added = pulled(problem, added + pull, precision, self.iterations)
         return added
 
 
-def _found(prior: nn.Module, seen: Blurred, x: Tensor, blurred: Tensor) -> tuple[Tensor, Tensor]:
+def _found(prior: nn.Module, problem: Blurred, x: Tensor, blurred: Tensor) -> tuple[Tensor, Tensor]:
     """Return the change of the picture of the step before that a network wants, and its
     precision (channel, y, x).
     """
-    rows, columns = seen.picture.shape[-2:]
+    rows, columns = problem.picture.shape[-2:]
     weight = next(prior.parameters())
-    maps = mirrored(_maps(seen, x, blurred).to(weight)[None], -rows % 8, -columns % 8)
+    maps = mirrored(_maps(problem, x, blurred).to(weight)[None], -rows % 8, -columns % 8)
     change, certain = prior.change(maps)[0, :, :rows, :columns].to(x).split(3)  # type: ignore[operator]
     return change, _PRECISION * torch.exp(
         _REACH * torch.tanh(certain.mean((-2, -1), keepdim=True))
     ).expand_as(change)
 
 
-def _maps(seen: Blurred, x: Tensor, blurred: Tensor) -> Tensor:
+def _maps(problem: Blurred, x: Tensor, blurred: Tensor) -> Tensor:
     """Return what a prior sees (15, y, x): picture, residual over its noise, certainty, seen
     pixels, and glare.
     """
-    known = seen.weight > 0
-    root = torch.where(known, seen.weight, 1.0).sqrt() * known  # the slope of sqrt is infinite at 0
-    residual = root * (seen.picture - blurred)
-    glare = sum(seen.glare, torch.zeros_like(residual))
+    unclipped = problem.weight > 0
+    root = (
+        torch.where(unclipped, problem.weight, 1.0).sqrt() * unclipped
+    )  # the slope of sqrt is infinite at 0
+    residual = root * (problem.picture - blurred)
+    glare = sum(problem.glare, torch.zeros_like(residual))
     brightest = glare.detach().amax().clamp_min(1e-30)
     # 0 for a clipped pixel, 1 for a noise of 0.7 % of the contrast of the scene
-    certain = seen.weight.log1p() / 10.0
+    certain = problem.weight.log1p() / 10.0
     return torch.cat(
-        [x, residual.asinh(), certain, known.to(residual), (_BRIGHT / brightest * glare).asinh()]
+        [
+            x,
+            residual.asinh(),
+            certain,
+            unclipped.to(residual),
+            (_BRIGHT / brightest * glare).asinh(),
+        ]
     )
 
 
@@ -296,14 +311,15 @@ def unrolled(
             38, 394 (2019); Chen et al., Simple Baselines for Image Restoration, ECCV 2022 (NAFNet);
             the maps are ours.
     """
-    electrons, light = single(electrons), (glare, nearby, ghosts)
+    electrons, light = single(electrons), LaserLight(glare, nearby, ghosts)
     if len(electrons) != 3:
         raise ValueError(
             f"electrons {tuple(electrons.shape)} have {len(electrons)} channels, and the network"
             " needs 3"
         )
+    view = View(psf, illuminant, responses, bands)
     settings = Settings(balance, read_noise, doubt, least_doubt)
-    scaled = pose(electrons, psf, illuminant, responses, bands, clipped, *light, settings)
+    scaled = pose(electrons, clipped, view, light, settings)
     problem, spectrum = scaled.problem, most_likely(scaled.problem)
     result = scaled.pixels(spectrum)
     if weights is not None:

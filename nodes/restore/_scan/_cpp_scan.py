@@ -77,12 +77,12 @@ class Scan(torch.autograd.Function):
         return y
 
     @staticmethod
-    def backward(ctx: Any, *seen: Tensor) -> tuple[Tensor, ...]:
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor, ...]:
         refuse_twice()
         *inputs, states = ctx.saved_tensors
         u = inputs[0]
         batch, length, d, n, groups, _ = ctx.sizes
         du, ddt, dA = torch.empty_like(u), torch.empty_like(u), u.new_empty(batch, n, d)
         dB, dC = u.new_empty(groups, batch, length, n), u.new_empty(groups, batch, length, n)
-        _call("backward", ctx.sizes, *inputs, seen[0].contiguous(), states, du, ddt, dA, dB, dC)
+        _call("backward", ctx.sizes, *inputs, slopes[0].contiguous(), states, du, ddt, dA, dB, dC)
         return du, ddt, dA.sum(0).T, dB.sum(0), dC.sum(0)

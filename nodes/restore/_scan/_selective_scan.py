@@ -48,9 +48,9 @@ def selective_scan(
     """
     _check_shapes(u, dt, A, B, C, D)
     kind = _kind(u, dt, A, B, C)
-    chosen = _auto(u, kind) if backend == "auto" else backend
+    backend_used = _auto(u, kind) if backend == "auto" else backend
     with torch.autocast(u.device.type, enabled=False):
-        y = _run(chosen, *(x.to(kind) for x in (u, dt, A, B, C)))
+        y = _run(backend_used, *(x.to(kind) for x in (u, dt, A, B, C)))
         return y if D is None else torch.addcmul(y, D.to(kind), u.to(kind))
 
 
@@ -183,9 +183,9 @@ class _Once(torch.autograd.Function):
         return y.view_as(y)
 
     @staticmethod
-    def backward(ctx: object, *seen: Tensor) -> Tensor:
+    def backward(ctx: object, *slopes: Tensor) -> Tensor:
         _torch_scan.refuse_twice()
-        return seen[0]
+        return slopes[0]
 
 
 def by_mamba(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:

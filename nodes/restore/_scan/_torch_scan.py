@@ -54,8 +54,8 @@ def plan(length: int, width: int, cuda: bool) -> Plan:
     """Divide a sequence of ``length`` time steps with ``width`` numbers each into segments and
     chunks.
     """
-    row, whole = (ROW_CUDA, SEGMENT_CUDA) if cuda else (ROW, SEGMENT)
-    segment = min(length, max(16, whole // width))
+    row, segment_numbers = (ROW_CUDA, SEGMENT_CUDA) if cuda else (ROW, SEGMENT)
+    segment = min(length, max(16, segment_numbers // width))
     chunks = max(1, min(row // width, int(segment**0.5)))
     return Plan(-(-segment // chunks), chunks)
 
@@ -76,9 +76,9 @@ class _Segment:
         """Rearrange one segment of a sequence from (batch, length, m) to (step, chunk, batch,
         m).
         """
-        part = F.pad(x[:, self.rows], (0, 0, 0, self.division.segment - self.size)).contiguous()
+        segment = F.pad(x[:, self.rows], (0, 0, 0, self.division.segment - self.size)).contiguous()
         return (
-            part.view(len(x), self.division.chunks, self.division.steps, -1)
+            segment.view(len(x), self.division.chunks, self.division.steps, -1)
             .permute(2, 1, 0, 3)
             .contiguous()
         )
@@ -94,14 +94,14 @@ class _Segment:
         h = self.pushed[..., None] * self.into[..., None, :]
         return h, _walk(h, list(self.lost.unbind(0)), start)
 
-    def slopes(self, seen: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+    def slopes(self, output_slope: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
         """Return the gradients of all states of a scan, and of the state before the first step in
         float64.
 
-        The gradient of a state is the sum of the gradients through its output, ``seen``, and
-        through the next state, or ``end`` for the last state.
+        The gradient of a state is the sum of the gradients through its output, ``output_slope``,
+        and through the next state, or ``end`` for the last state.
         """
-        g = seen[..., None] * self.out[..., None, :]
+        g = output_slope[..., None] * self.out[..., None, :]
         first, *others = self.lost.unbind(0)
         next_chunk = torch.cat([first[1:], torch.zeros_like(first[:1])])
         at_first = _walk(g, [next_chunk, *others[::-1]], end, back=True)
@@ -111,10 +111,12 @@ class _Segment:
         """Return the gradients of u, dt, B, C (batch, rows, m), A and the state before the first
         step (batch, d, n).
         """
-        seen = self.turn(dy)
-        (h, _), (g, before) = self.states(start), self.slopes(seen, end)
+        output_slope = self.turn(dy)
+        (h, _), (g, before) = self.states(start), self.slopes(output_slope, end)
         pushed = (g @ self.into[..., None])[..., 0]
-        into, out = (seen_by[..., None, :] @ x for seen_by, x in ((self.pushed, g), (seen, h)))
+        into, out = (
+            seen_by[..., None, :] @ x for seen_by, x in ((self.pushed, g), (output_slope, h))
+        )
         g[1:] *= h[:-1]
         g[0, 1:] *= h[-1, :-1]
         g[0, 0] *= start
@@ -145,10 +147,10 @@ def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> T
         now.addcmul_(less, before).add_(before)
         # (1 + e)(1 + l) - 1, exact near 0
         torch.add(less, share, out=further).addcmul_(less, share)
-    left, kept, starts = rows[-1].double(), shares[-1].double(), torch.empty_like(rows[-1])
+    left, through_chunk, starts = rows[-1].double(), shares[-1].double(), torch.empty_like(rows[-1])
     for chunk in range(h.shape[1])[turn]:
         starts[chunk] = start
-        start = (left[chunk] + start).addcmul_(kept[chunk], start)
+        start = (left[chunk] + start).addcmul_(through_chunk[chunk], start)
     h.addcmul_(through, starts).add_(starts)
     return start
 
@@ -175,14 +177,14 @@ class Scan(torch.autograd.Function):
         )
         for rows in _segments(length, ctx.division):
             starts.append(state.to(u))
-            part = _Segment(ctx.division, rows, rate, u, dt, *into_out)
-            h, state = part.states(state)
-            y[:, rows] = part.back((h @ part.out[..., None])[..., 0])
+            segment = _Segment(ctx.division, rows, rate, u, dt, *into_out)
+            h, state = segment.states(state)
+            y[:, rows] = segment.back((h @ segment.out[..., None])[..., 0])
         ctx.save_for_backward(*inputs, torch.stack(starts))
         return y
 
     @staticmethod
-    def backward(ctx: Any, *seen: Tensor) -> tuple[Tensor, ...]:
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor, ...]:
         refuse_twice()
         *inputs, starts = ctx.saved_tensors
         u, dt, rate, *into_out = inputs
@@ -195,10 +197,10 @@ class Scan(torch.autograd.Function):
             for rows, start in reversed(
                 list(zip(_segments(u.shape[1], ctx.division), starts, strict=True))
             ):
-                part = _Segment(ctx.division, rows, rate, u, dt, *into_out)
-                *lines, slope, end = part.gradients(seen[0], start, end)
-                for whole, line in zip((du, ddt, dB, dC), lines, strict=True):
-                    whole[:, rows] = line
+                segment = _Segment(ctx.division, rows, rate, u, dt, *into_out)
+                *lines, slope, end = segment.gradients(slopes[0], start, end)
+                for gradient, line in zip((du, ddt, dB, dC), lines, strict=True):
+                    gradient[:, rows] = line
                 dA += slope
         return du, ddt, dA.to(rate), dB, dC
 
@@ -222,9 +224,9 @@ def dual_scan(
             (batch, length, n) -> as u. In single precision at least.
     """
     heads, length = len(A), u.shape[1]
-    more = -length % chunk  # padding without input and decay changes nothing
+    padding = -length % chunk  # padding without input and decay changes nothing
     x, step, into, out = (
-        F.pad(v, (0, 0, 0, more)).view(len(v), -1, chunk, v.shape[-1]) for v in (u, dt, B, C)
+        F.pad(v, (0, 0, 0, padding)).view(len(v), -1, chunk, v.shape[-1]) for v in (u, dt, B, C)
     )
     x = x.view(*x.shape[:3], heads, -1).movedim(-2, 2)  # batch, chunk, head, position, channel
     step = step.movedim(-1, 2)

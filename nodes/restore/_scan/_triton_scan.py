@@ -44,13 +44,13 @@ def _lost(x):
 
 
 @triton.jit
-def _add(total, missed, more):
-    """Return the sum of ``total`` and ``more``, and the round-off, which is added at the next
+def _add(total, missed, addend):
+    """Return the sum of ``total`` and ``addend``, and the round-off, which is added at the next
     step.
     """
-    more = more + missed
-    now = total + more
-    return now, more - (now - total)
+    addend = addend + missed
+    now = total + addend
+    return now, addend - (now - total)
 
 
 @triton.jit
@@ -72,13 +72,13 @@ def _forward(
     b = tl.program_id(0).to(tl.int64)
     at_d, at_n = tl.program_id(1) * channels + tl.arange(0, channels), tl.arange(0, wide)
     some_d, some_n = at_d < d, at_n < n
-    some, at = some_d[:, None] & some_n[None, :], at_d[:, None] * n + at_n[None, :]
-    rate = tl.load(A + at, mask=some, other=0.0)
+    some, place = some_d[:, None] & some_n[None, :], at_d[:, None] * n + at_n[None, :]
+    rate = tl.load(A + place, mask=some, other=0.0)
     h = tl.zeros([channels, wide], tl.float32)
     missed = tl.zeros([channels, wide], tl.float32)
     chunks = tl.cdiv(length, chunk)
     for k in range(0, chunks):
-        tl.store(states + (b * chunks + k) * d * n + at, h, mask=some)
+        tl.store(states + (b * chunks + k) * d * n + place, h, mask=some)
         for t in range(k * chunk, tl.minimum(k * chunk + chunk, length)):
             row = b * length + t
             step = tl.load(dt + row * d + at_d, mask=some_d, other=0.0)
@@ -116,10 +116,10 @@ def _backward(
     b, block = tl.program_id(0).to(tl.int64), tl.program_id(1).to(tl.int64)
     at_d, at_n = block * channels + tl.arange(0, channels), tl.arange(0, wide)
     some_d, some_n = at_d < d, at_n < n
-    some, at = some_d[:, None] & some_n[None, :], at_d[:, None] * n + at_n[None, :]
+    some, place = some_d[:, None] & some_n[None, :], at_d[:, None] * n + at_n[None, :]
     own = tl.arange(0, channels)[:, None] * wide + at_n[None, :]
     own = own + (b * tl.num_programs(1) + block) * chunk * channels * wide
-    rate = tl.load(A + at, mask=some, other=0.0)
+    rate = tl.load(A + place, mask=some, other=0.0)
     carry = tl.zeros([channels, wide], tl.float32)
     carried = tl.zeros([channels, wide], tl.float32)
     slope = tl.zeros([channels, wide], tl.float32)
@@ -127,7 +127,7 @@ def _backward(
     for back in range(0, chunks):
         k = chunks - 1 - back
         steps = tl.minimum(chunk, length - k * chunk)
-        h = tl.load(states + (b * chunks + k) * d * n + at, mask=some, other=0.0)
+        h = tl.load(states + (b * chunks + k) * d * n + place, mask=some, other=0.0)
         missed = tl.zeros([channels, wide], tl.float32)
         for i in range(0, steps):
             tl.store(room + own + i * channels * wide, h)
@@ -145,24 +145,32 @@ def _backward(
             row = b * length + k * chunk + i
             before = tl.load(room + own + i * channels * wide)
             step = tl.load(dt + row * d + at_d, mask=some_d, other=0.0)
-            given = tl.load(u + row * d + at_d, mask=some_d, other=0.0)
-            seen = tl.load(dy + row * d + at_d, mask=some_d, other=0.0)
+            input_value = tl.load(u + row * d + at_d, mask=some_d, other=0.0)
+            output_slope = tl.load(dy + row * d + at_d, mask=some_d, other=0.0)
             into = tl.load(B + row * n + at_n, mask=some_n, other=0.0)
             out = tl.load(C + row * n + at_n, mask=some_n, other=0.0)
             x = step[:, None] * rate
-            g, carried = _add(carry, carried, seen[:, None] * out[None, :])
-            part = (block * tl.num_programs(0) + b) * length + k * chunk + i
-            tl.store(dB + part * n + at_n, tl.sum(g * (step * given)[:, None], 0), mask=some_n)
-            tl.store(dC + part * n + at_n, tl.sum(h * seen[:, None], 0), mask=some_n)
+            g, carried = _add(carry, carried, output_slope[:, None] * out[None, :])
+            row_of_block = (block * tl.num_programs(0) + b) * length + k * chunk + i
+            tl.store(
+                dB + row_of_block * n + at_n,
+                tl.sum(g * (step * input_value)[:, None], 0),
+                mask=some_n,
+            )
+            tl.store(
+                dC + row_of_block * n + at_n, tl.sum(h * output_slope[:, None], 0), mask=some_n
+            )
             pushed, turned = tl.sum(g * into[None, :], 1), g * (before * tl.exp(x))
             tl.store(du + row * d + at_d, step * pushed, mask=some_d)
-            tl.store(ddt + row * d + at_d, given * pushed + tl.sum(turned * rate, 1), mask=some_d)
+            tl.store(
+                ddt + row * d + at_d, input_value * pushed + tl.sum(turned * rate, 1), mask=some_d
+            )
             here += turned * step[:, None]
             carry, carried = _add(g, carried, _lost(x) * g)
             h = before
         slope += here
         tl.debug_barrier()  # before the memory is written again
-    tl.store(dA + b * d * n + at, slope, mask=some)
+    tl.store(dA + b * d * n + place, slope, mask=some)
 
 
 @functools.cache
@@ -189,32 +197,32 @@ class Scan(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *tensors: Tensor) -> Tensor:
-        given = [x.contiguous() for x in tensors]
-        u, rate = given[0], given[2]
+        inputs = [x.contiguous() for x in tensors]
+        u, rate = inputs[0], inputs[2]
         batch, length, d, n, blocks, chunks = _sizes(u, rate)
         y, states = torch.empty_like(u), u.new_empty(batch, chunks, d, n)
         _forward[(batch, blocks)](
-            *given, y, states, length, d, n, CHANNELS, _wide(n), CHUNK, num_warps=WARPS
+            *inputs, y, states, length, d, n, CHANNELS, _wide(n), CHUNK, num_warps=WARPS
         )
-        ctx.save_for_backward(*given, states)
+        ctx.save_for_backward(*inputs, states)
         return y
 
     @staticmethod
-    def backward(ctx: Any, *seen: Tensor) -> tuple[Tensor, ...]:
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor, ...]:
         refuse_twice()
-        *given, states = ctx.saved_tensors
-        u, rate = given[0], given[2]
+        *inputs, states = ctx.saved_tensors
+        u, rate = inputs[0], inputs[2]
         batch, length, d, n, blocks, _ = _sizes(u, rate)
         du, ddt, dA = torch.empty_like(u), torch.empty_like(u), u.new_empty(batch, d, n)
         dB, dC = u.new_empty(blocks, batch, length, n), u.new_empty(blocks, batch, length, n)
         room = u.new_empty(batch, blocks, CHUNK, CHANNELS, _wide(n))
-        found = (du, ddt, dA, dB, dC)
+        gradients = (du, ddt, dA, dB, dC)
         _backward[(batch, blocks)](
-            *given,
-            seen[0].contiguous(),
+            *inputs,
+            slopes[0].contiguous(),
             states,
             room,
-            *found,
+            *gradients,
             length,
             d,
             n,

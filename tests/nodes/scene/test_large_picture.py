@@ -87,9 +87,9 @@ for channel, code in zip(picture[:, :8, :8], (90, 120, 200)):  # the curve of sR
 """
     # glibc keeps what is freed, as it does now and then by itself
     kept = {"MALLOC_MMAP_THRESHOLD_": str(1 << 30)}
-    for size, memory in (("whole", {}), ("whole", kept), ("small", kept)):  # a process each
+    for size in ("whole", "small"):  # a process each
         words = [sys.executable, "-c", code, tmp_path / "a.png", size]
-        done = subprocess.run(words, capture_output=True, text=True, env={**os.environ, **memory})
+        done = subprocess.run(words, capture_output=True, text=True, env={**os.environ, **kept})
         assert done.returncode == 0, done.stderr
         assert float(done.stdout) < 1.5e9
     Image.new("1", (side + 1, side)).save(tmp_path / "b.png", compress_level=1)

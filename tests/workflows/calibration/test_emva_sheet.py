@@ -406,11 +406,14 @@ def test_no_text_of_the_summary_leaves_its_cell(sheet):
 
 
 @pytest.mark.slow
-def test_the_pdf_has_the_summary_and_every_picture(sheet):
-    pages = emva_pdf.pdf(sheet, "a camera", ["temperature: 25 °C"])
-    assert len(re.findall(rb"/Type /Page\b", pages)) == len(
-        emva_figures.PICTURES
-    )  # without dark current, with a summary
+def test_the_pdf_has_the_summary_and_every_picture(sheet, monkeypatch):
     pictures = emva_figures.pictures(sheet)
     assert list(pictures) == [name for name in emva_figures.PICTURES if name != "dark_current"]
     assert all(png[:4] == b"\x89PNG" for png in pictures.values())
+    few = ("photon_transfer", "dark_current", "snr", "linearity")
+    monkeypatch.setattr(
+        emva_figures, "PICTURES", {name: emva_figures.PICTURES[name] for name in few}
+    )
+    pages = emva_pdf.pdf(sheet, "a camera", ["temperature: 25 °C"])
+    # without dark current, with a summary
+    assert len(re.findall(rb"/Type /Page\b", pages)) == len(few)

@@ -124,10 +124,10 @@ def test_what_has_ended_draws_nothing_more(store, tmp_path, monkeypatch):
         monkeypatch.setattr(emcee_sampler, name, value)
     p = problem(store, SEEN)
     best = mode(p)
-    first = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16, wanted=1)
+    first = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16, effective_size=1)
     assert first.long
     monkeypatch.setattr(emcee.moves.DEMove, "get_proposal", None)
-    again = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16, wanted=1)
+    again = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16, effective_size=1)
     assert again.long
     assert again.steps == first.steps
     assert np.array_equal(again.draws, first.draws)

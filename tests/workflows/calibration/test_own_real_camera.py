@@ -157,8 +157,13 @@ def test_the_sensor_group_has_a_full_well_with_its_uncertainty(tmp_path, monkeyp
     assert np.isfinite(document["least_squares"]["gain"]["error"])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed",
+    [
+        pytest.param(0, marks=pytest.mark.slow),
+        *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2)),  # other numbers alone
+    ],
+)
 def test_clean_cameras_with_the_least_data_are_as_wide_as_statistics(seed, tmp_path):
     """Of 10 fitted levels of 2 frames of 640 x 640 pixels: 2.4 times as wide before."""
     camera = RealCamera(seed, size=(648, 648), lit=18, vignetting=0.1, flicker=0.001, prnu=0.01)

@@ -124,7 +124,7 @@ def test_parameters_have_their_units():
 
 
 @pytest.mark.parametrize(
-    "count", [pytest.param(50, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.long)]
+    "count", [pytest.param(20, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.long)]
 )
 def test_intervals_cover_the_truth(count, monkeypatch):
     """90 % intervals of b0, l and s, by the search that a user's run makes, from rings to interval.
@@ -190,7 +190,7 @@ def test_chains_agree_with_weighted_draws(tmp_path):
     problem, mode = fitted({**TRUTH, "b0": 40.0}, seed=3)
     guide = draw_guide(problem, mode, np.random.default_rng(2))
     chains = emcee_sampler.sample(
-        problem, mode, tmp_path / "draws.h5", seed=1, walkers=32, wanted=300, guide=guide
+        problem, mode, tmp_path / "draws.h5", seed=1, walkers=32, effective_size=300, guide=guide
     )
     draws, weight = weighted(problem, mode, 1)
     mean = weight @ draws

@@ -172,7 +172,7 @@ def test_a_long_list_shows_its_newest_page_and_says_how_to_see_all(tmp_path, mon
         "the newest 50; `neusee cache ls --all` lists all",
         f"60 results, 480 kB by the journal, in {store.root}",
     ]
-    assert len(list(cache_commands.ls_lines(again, whole=True))) == 62
+    assert len(list(cache_commands.ls_lines(again, every=True))) == 62
     for suffix in ("json", "safetensors"):
         (tmp_path / "00" / f"{59:032x}.{suffix}").unlink()
     assert not any("s59" in line for line in cache_commands.ls_lines(Store(tmp_path)))

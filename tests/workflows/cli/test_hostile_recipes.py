@@ -146,6 +146,15 @@ def _is_number(cell):
     return True
 
 
+def commands_of(name):
+    """The commands that meet a recipe: a plan refuses what is refused as `validate` does, and
+    brackets take the reader of YAML seconds.
+    """
+    if HOSTILE[name].runs:
+        return ("validate", "plan", "run")
+    return ("run",) if name.startswith("deep brackets") else ("validate", "run")
+
+
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_recipe_of_a_stranger_does_no_harm(name, told, tmp_path):
     text, make, runs = HOSTILE[name]
@@ -156,7 +165,7 @@ def test_a_recipe_of_a_stranger_does_no_harm(name, told, tmp_path):
     make(folder)
     (folder / "mine.yaml").write_text(text.replace("{secret}", str(tmp_path / "secret")))
     before = tree(tmp_path)
-    for command in ("validate", "plan", "run"):
+    for command in commands_of(name):
         code, said, seen = told(command, "mine.yaml")
         assert code == (0 if runs else 2), said
         assert "Traceback" not in said

@@ -240,27 +240,45 @@ def _():
 """
 
 
+@pytest.fixture(scope="module")
+def ended(place, checked):
+    """What is said of nodes that end their process, and of one that reads the decimal point where a
+    locale with another one can be made.
+    """
+    text = ENDS
+    with pytest.MonkeyPatch.context() as patch:
+        if shutil.which("localedef") and Path("/usr/share/i18n/locales/de_DE").exists():
+            made = place / "locales" / "de_DE.utf8"
+            made.parent.mkdir()
+            words = ["localedef", "-i", "de_DE", "-f", "UTF-8", str(made)]
+            subprocess.run(words, check=False, capture_output=True)
+            patch.setenv("LOCPATH", str(made.parent))
+            patch.setattr(surroundings, "installed_locales", INSTALLED)
+            assert "de_DE.utf8" in INSTALLED(os.environ)
+            text += source_of("comma", "x * ord(locale.str(1.5)[1])")
+        return checked("ends_of_elsewhere", text)
+
+
 @pytest.mark.slow
-def test_a_call_that_ends_its_process_ends_no_check(checked):
-    found = checked("ends_of_elsewhere", ENDS)
-    assert said(found["ends"]).text.endswith(
+def test_a_call_that_ends_its_process_ends_no_check(ended):
+    assert said(ended["ends"]).text.endswith(
         ": the call ends the process, with exit code 0; the rules on values were not tried"
     )
-    assert said(found["crashes"]).text.endswith(
+    assert said(ended["crashes"]).text.endswith(
         ": the call ends the process, with SIGABRT; the rules on values were not tried"
     )
     assert (
         ": in another time zone (TZ) it ends the process, with SIGABRT: "
-        in said(found["crashes_elsewhere"]).text
+        in said(ended["crashes_elsewhere"]).text
     )
-    assert {one.rule for one in found["ends"]} == {
+    assert {one.rule for one in ended["ends"]} == {
         "docstring",
         "signature",
         "hooks",
         "key",
         "elsewhere",
     }
-    assert "finite" in {one.rule for one in found["crashes_elsewhere"]}
+    assert "finite" in {one.rule for one in ended["crashes_elsewhere"]}
 
 
 @pytest.mark.slow
@@ -274,20 +292,10 @@ def test_a_call_without_an_end_is_given_up(checked, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_locale_with_a_decimal_comma_is_taken_where_there_is_one(place, checked, monkeypatch):
-    if shutil.which("localedef") is None or not Path("/usr/share/i18n/locales/de_DE").exists():
+def test_a_locale_with_a_decimal_comma_is_taken_where_there_is_one(ended):
+    if "comma" not in ended:
         pytest.skip("no locale can be made here")
-    made = place / "locales" / "de_DE.utf8"
-    made.parent.mkdir()
-    subprocess.run(
-        ["localedef", "-i", "de_DE", "-f", "UTF-8", str(made)], check=False, capture_output=True
-    )
-    monkeypatch.setenv("LOCPATH", str(made.parent))
-    monkeypatch.setattr(surroundings, "installed_locales", INSTALLED)
-    assert "de_DE.utf8" in INSTALLED(os.environ)
-    found = said(
-        checked("comma_of_elsewhere", source_of("comma", "x * ord(locale.str(1.5)[1])"))["comma"]
-    )
+    found = said(ended["comma"])
     assert found.ok is False
     assert ": in the locale de_DE.utf8 the result differs by " in found.text
 

@@ -19,8 +19,23 @@ from safetensors.numpy import load_file
 ROOT = Path(__file__).parents[3]
 PATIENCE = 300  #: s until a test gives up waiting for a process
 
+#: the program, with other seconds until it gives up a scheduler that is gone, and one that is not
+#: there when it begins
+IMPATIENT = """
+from neusee.workflows.engine import dask_executor
+
+dask_executor.PATIENCE = {patience[0]}
+dask_executor.connected.__defaults__ = ({patience[1]},)
+
+from neusee.__main__ import main
+
+main()
+"""
+
 NODES = '''
-"""Nodes that take their time."""
+"""Nodes that take their time, and hardly a processor."""
+
+import time
 
 import torch
 from torch import Tensor
@@ -36,12 +51,10 @@ def start(*, size: Real) -> Tensor:
 
 
 @node()
-def work(x: Tensor, *, rounds: Real, add: Real) -> Tensor:
-    """Compute long."""
-    y = torch.ones(300, 300)
-    for _ in range(int(rounds)):
-        y = torch.tanh(y @ y / 300)
-    return x + add + 0 * y.sum()
+def work(x: Tensor, *, pause: Real, add: Real) -> Tensor:
+    """Rest, then add."""
+    time.sleep(pause)
+    return x + add
 
 
 @node()
@@ -51,14 +64,14 @@ def both(x: Tensor, y: Tensor) -> Tensor:
 '''
 
 
-def write_lab(folder: Path, steps: int = 4, rounds: int = 300) -> None:
+def write_lab(folder: Path, steps: int = 4, pause: float = 0.4) -> None:
     """Write a recipe ``lab.yaml`` of two chains of long steps, whose sum is the output."""
     (folder / "slow_lab.py").write_text(textwrap.dedent(NODES).lstrip())
     lines = ["  first: {node: slow_lab.start, with: {size: 2}}"]
     for chain in "ab":
         for number in range(steps):
             above = f"{chain}{number - 1}" if number else "first"
-            values = f"{{rounds: {rounds}, add: {number + (chain == 'b')}}}"
+            values = f"{{pause: {pause}, add: {number + (chain == 'b')}}}"
             lines.append(
                 f"  {chain}{number}: {{node: slow_lab.work, from: {{x: {above}}}, with: {values}}}"
             )
@@ -76,13 +89,21 @@ class Command:
     """A command of neusee that runs in a process, whose lines are read as they come."""
 
     def __init__(
-        self, folder: Path, *words: str, within: tuple[str, ...] = (), **environment: str
+        self,
+        folder: Path,
+        *words: str,
+        within: tuple[str, ...] = (),
+        patience: tuple[float, float] | None = None,
+        **environment: str,
     ) -> None:
+        program = ["-m", "neusee"]
+        if patience is not None:
+            program = ["-c", IMPATIENT.format(patience=patience)]
         path = f"{ROOT / '.src'}:{os.environ.get('PYTHONPATH', '')}"
         own = {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "NEUSEE_CACHE": str(folder / "cache")}
         own["DASK_CONFIG"] = str(folder / "dask")  # else dask-jobqueue writes into the home folder
         self.process = subprocess.Popen(
-            [*within, sys.executable, "-m", "neusee", *words],
+            [*within, sys.executable, *program, *words],
             cwd=folder,
             env={**os.environ, **own, **environment},
             stdout=subprocess.PIPE,

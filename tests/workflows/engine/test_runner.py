@@ -215,7 +215,7 @@ def test_an_input_is_read_once_and_only_for_a_step_that_runs(store, monkeypatch)
     run(diamond(count=BIG, outputs="top left right head"), store)
     read, loads = serialization.read, []
     monkeypatch.setattr(
-        serialization, "read", lambda path, xxh3: loads.append(path) or read(path, xxh3)
+        serialization, "read", lambda path, *rest: loads.append(path) or read(path, *rest)
     )
     run(diamond(k=5.0, count=BIG), again(store))
     assert len(loads) == len(set(loads)) == 2
@@ -573,22 +573,17 @@ def chain(n):
 
 
 @pytest.mark.slow
-def test_a_chain_of_ten_thousand_steps_runs(store):
-    steps = chain(10_000)
-    assert run(steps, store).values["s10000"][0] == 10_001
-    assert run(steps, again(store)).values["s10000"][0] == 10_001
-
-
-@pytest.mark.slow
-def test_the_work_of_a_cached_chain_grows_with_its_length(store):
+def test_a_chain_of_five_thousand_steps_runs_and_its_work_grows_with_its_length(store):
+    """Five times as deep as Python may call."""
     work = {}
-    for length in (1000, 8000):
-        run(chain(length), store)
+    for length in (500, 5000):
+        steps = chain(length)
+        assert run(steps, store).values[f"s{length}"][0] == length + 1
         began = time.process_time()
-        run(chain(length), again(store))
+        assert run(steps, again(store)).values[f"s{length}"][0] == length + 1
         work[length] = time.process_time() - began
-    # eight times, and 64 times if each step looked at all others
-    assert work[8000] < 24 * work[1000]
+    # ten times, and 100 times if each step looked at all others
+    assert work[5000] < 30 * work[500]
 
 
 def test_the_result_says_how_much_memory_and_time(store):

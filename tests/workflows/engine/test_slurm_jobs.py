@@ -195,10 +195,11 @@ def test_what_sbatch_refuses_is_one_sentence(lab, slurm):
 
 @pytest.mark.slow
 def test_without_a_worker_the_queue_is_told(lab, slurm):
-    code, text = slurm("--executor", "slurm:2", "--job", "wait=0.1", PENDING="1").end()
+    code, text = slurm("--executor", "slurm:2", "--job", "wait=0.02", PENDING="1").end()
     assert code == 1
     assert (
-        "no worker came within 0.1 min; squeue says: 2 PENDING (Resources)\nfailed: 0 steps" in text
+        "no worker came within 0.02 min; squeue says: 2 PENDING (Resources)\nfailed: 0 steps"
+        in text
     )
     assert len(list((lab / "queue").glob("*/cancelled"))) == 2
     no_page_of_errors(text)

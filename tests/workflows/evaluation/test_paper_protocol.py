@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -172,8 +171,9 @@ def test_a_laser_without_a_law_is_refused():
 
 # --- the whole ------------------------------------------------------------------------------------
 
+#: imports what takes seconds once, and forks for each run: store, and pictures before the kill
 _PROGRAM = """
-import os, signal, sys
+import json, os, signal, sys
 from pathlib import Path
 import neusee
 from neusee.workflows.evaluation import evaluation_scenes
@@ -181,26 +181,50 @@ from neusee.workflows.evaluation.evaluation_points import EvaluationPoints
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
 
-real, last, seen = EvaluationPoints._measure, int(sys.argv[3]), []
+import colour, matplotlib.figure
+import neusee.workflows.evaluation.run_evaluation
 
-def measured(self, *point):
-    if len(seen) == last:
-        os.kill(os.getpid(), signal.SIGKILL)
-    seen.append(1)
-    return real(self, *point)
+real = EvaluationPoints._measure
 
-EvaluationPoints._measure = measured
-print(neusee.evaluate("paper_protocol", changes=sys.argv[4:], data=sys.argv[1], store=Store(Path(sys.argv[2])),
-    pipelines="flat+none, five_half_rings+none, five_half_rings+wiener", strengths=[0, 100], small=16,
-    equal_protection=1e-4, out=sys.argv[2] + "_runs"))
+def evaluated(store, last):
+    seen = []
+
+    def measured(self, *point):
+        if len(seen) == last:
+            os.kill(os.getpid(), signal.SIGKILL)
+        seen.append(1)
+        return real(self, *point)
+
+    EvaluationPoints._measure = measured
+    return str(neusee.evaluate("paper_protocol", changes=sys.argv[3:], data=sys.argv[1], store=Store(Path(store)),
+        pipelines="flat+none, five_half_rings+none, five_half_rings+wiener", strengths=[0, 100], small=16,
+        equal_protection=1e-4, out=store + "_runs"))
+
+ends = []
+for number, (store, last) in enumerate(json.loads(sys.argv[2])):
+    if not (child := os.fork()):
+        Path(f"out{number}").write_text(evaluated(store, last))
+        sys.stderr.flush()
+        os._exit(0)
+    ends.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+print(json.dumps(ends))
 """
 
 
-def protocol(folder, store, last):
-    words = [sys.executable, "-c", _PROGRAM, str(folder), str(store), str(last), *SMALL]
-    return subprocess.run(
-        words, capture_output=True, text=True, cwd=store.parent, env=dict(os.environ), check=False
+def protocols(place, folder, *runs):
+    """Return how each run of the protocol ended: its exit code, and the folder that it wrote."""
+    runs = [(str(place / name), last) for name, last in runs]
+    done = subprocess.run(
+        [sys.executable, "-c", _PROGRAM, str(folder), json.dumps(runs), *SMALL],
+        capture_output=True,
+        text=True,
+        cwd=place,
     )
+    assert done.returncode == 0, done.stderr
+    wrote = [place / f"out{number}" for number in range(len(runs))]
+    return json.loads(done.stdout.splitlines()[-1]), [
+        path.read_text() if path.is_file() else done.stderr for path in wrote
+    ]
 
 
 @pytest.mark.slow
@@ -209,11 +233,10 @@ def test_a_killed_protocol_goes_on_and_its_tables_have_the_same_bytes(tmp_path, 
     clock.
     """
     count = 3 * 2 * 6  # scenes, strengths, and pipelines, half of them at equal protection
-    killed = [protocol(folder, tmp_path / "killed", last) for last in (5, 17)]
-    assert [done.returncode for done in killed] == [-signal.SIGKILL] * 2
-    ended, whole = (protocol(folder, tmp_path / name, 1000) for name in ("killed", "whole"))
-    assert (ended.returncode, whole.returncode) == (0, 0), ended.stderr + whole.stderr
-    first, second = (tmp_path / done.stdout.split()[-1] for done in (ended, whole))
+    runs = ("killed", 5), ("killed", 17), ("killed", 1000), ("whole", 1000)
+    ends, wrote = protocols(tmp_path, folder, *runs)
+    assert ends == [-signal.SIGKILL, -signal.SIGKILL, 0, 0], wrote[-1]
+    first, second = (tmp_path / path.split()[-1] for path in wrote[2:])
     tables = sorted(path.name for path in second.glob("*.csv"))
     assert tables == ["mistold.csv", "points.csv", "protection.csv", "suppression.csv", "table.csv"]
     assert [(first / name).read_bytes() for name in tables] == [

@@ -58,7 +58,16 @@ def test_a_module_without_a_file_is_an_error(digest_with, line):
         digest_with({"engine.runner": f"{line}\n"})
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_every_module_of_the_program_has_a_digest(module):
+def test_every_module_of_the_program_has_a_digest():
     """None imports, at its top, what the digest cannot find."""
-    assert len(engine_digest.engine(module.removesuffix(".__init__"))) == 32
+    wrong = {}
+    for module in MODULES:
+        try:
+            found = engine_digest.engine(module.removesuffix(".__init__"))
+        except LookupError as error:
+            wrong[module] = str(error)
+        else:
+            if len(found) != 32:
+                wrong[module] = found
+    assert len(MODULES) > 100
+    assert wrong == {}

@@ -21,6 +21,7 @@ from neusee.workflows.keys.module_digest import (
     write_memo,
 )
 from neusee.workflows.keys.module_origin import plain
+from tests.workflows.keys.forked_keys import told as keys_in
 
 ROOT = Path(__file__).parents[3]
 ASK = """
@@ -35,13 +36,6 @@ from pathlib import Path
 from neusee.workflows.keys.module_digest import counted
 {change}
 print(counted("thing", "thing 1.0").edited)
-"""
-KEY = """
-import sys
-from pathlib import Path
-from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.recipe.node_families import import_own
-print(Code(Path("code.json")).of(import_own("mine.py", Path.cwd()).value))
 """
 NODE = (
     "from neusee.nodes import node\nfrom thing import part\n\n\n@node()\ndef value():\n    return"
@@ -149,12 +143,15 @@ def test_a_package_that_changes_after_its_import_is_told(tmp_path):
 
 
 def test_the_key_of_an_own_node_has_the_files_of_an_installed_helper(tmp_path):
-    install(tmp_path, body="def part():\n    return 2.0\n")
-    (tmp_path / "mine.py").write_text(NODE)
-    first = told(tmp_path, KEY)
-    assert told(tmp_path, KEY) == first
-    install(tmp_path, body="def part():\n    return 3.0\n")
-    assert told(tmp_path, KEY) not in ("", first)
+    folders = [tmp_path / name for name in ("one", "again", "other")]
+    for folder, number in zip(folders, (2.0, 2.0, 3.0), strict=True):
+        install(folder, body=f"def part():\n    return {number}\n")
+        (folder / "mine.py").write_text(NODE)
+    first, again, other = (keys_in(folder)[0] for folder in folders)
+    assert re.fullmatch(r"[0-9a-f]{32}", first), first
+    assert again == first
+    assert re.fullmatch(r"[0-9a-f]{32}", other), other
+    assert other != first
 
 
 def test_a_package_whose_stamps_are_known_is_not_read_again(tmp_path, monkeypatch):

@@ -339,7 +339,7 @@ def test_a_number_a_band_is_a_list(store, monkeypatch):
 
 @pytest.mark.slow
 def test_several_threads_run_several_recipes_on_one_store(store):
-    scales = [float(i % 7) for i in range(70)]
+    scales = [float(i % 7) for i in range(28)]
     with ThreadPoolExecutor(8) as pool:
         results = list(pool.map(lambda scale: small(scale).run(store), scales))
     for scale, result in zip(scales, results, strict=True):
@@ -350,7 +350,7 @@ def test_several_threads_run_several_recipes_on_one_store(store):
 
 def test_several_threads_read_the_code_of_nodes_at_once(tmp_path):
     with ThreadPoolExecutor(8) as pool:
-        results = list(pool.map(lambda i: small(1.0).run(Store(tmp_path / str(i))), range(24)))
+        results = list(pool.map(lambda i: small(1.0).run(Store(tmp_path / str(i))), range(12)))
     assert len({result.done["half"].key for result in results}) == 1
 
 

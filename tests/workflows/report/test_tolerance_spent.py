@@ -157,7 +157,9 @@ def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
 @pytest.mark.slow
 def test_the_command_line_shows_what_stands_in(tmp_path, monkeypatch):
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
-    done = CliRunner().invoke(app, ["run", "first_light", *SMALL, "--out", str(tmp_path / "runs")])
+    done = CliRunner().invoke(
+        app, ["run", "first_light", *SMALL, "outputs=[raw]", "--out", str(tmp_path / "runs")]
+    )
     assert done.exit_code == 0, done.output
     assert "cube.mixture" in done.output
     assert "cheaper  image[mask] (at most" in done.output
@@ -167,7 +169,15 @@ def test_the_command_line_shows_what_stands_in(tmp_path, monkeypatch):
 def test_the_command_line_shows_a_run_that_could_not_prove_its_tolerance(tmp_path, monkeypatch):
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(cheaper_steps, "_LEAST", 0.0)  # so fine a tolerance would not even be tried
-    words = ["run", "first_light", *SMALL, "tolerance=1e-7", "--out", str(tmp_path / "runs")]
+    words = [
+        "run",
+        "first_light",
+        *SMALL,
+        "tolerance=1e-7",
+        "outputs=[raw]",
+        "--out",
+        str(tmp_path / "runs"),
+    ]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     assert "cheaper" not in done.output

@@ -17,6 +17,7 @@ from neusee.workflows.safety.safety_estimate import (
     state_of_finding,
 )
 
+pytestmark = pytest.mark.usefixtures("without_remedies")
 QUICK = [
     "safety.draws=100",
     "safety.protection.mask=null",
@@ -111,12 +112,14 @@ def test_a_verdict_that_is_not_judged_names_what_is_judged():
 
 
 @pytest.fixture(scope="module")
-def continuous():
-    return estimate(load("safety_pointer", [*QUICK, "lasers.pointer.power=50 W"]))
+def continuous(without_remedies):
+    return estimate(
+        load("safety_pointer", [*QUICK, "safety.dazzle=null", "lasers.pointer.power=50 W"])
+    )
 
 
 @pytest.fixture(scope="module")
-def pulsed():
+def pulsed(without_remedies):
     return estimate(load("safety_car_lidar", QUICK))
 
 
@@ -147,9 +150,17 @@ def test_a_part_has_a_reason_only_where_it_is_not_judged(energy, state):
     """Pulses of picoseconds have an upper end of their threshold: far beyond it, damage is sure
     and needs no excuse.
     """
-    alone = ["safety.protection={}", "safety.dazzle=null", "lasers.lidar.pulse_duration=10 ps"]
+    alone = ["safety.protection={}", "lasers.lidar.pulse_duration=10 ps"]
     (verdict,) = estimate(
-        load("safety_car_lidar", [*QUICK[:1], *alone, f"lasers.lidar.pulse_energy={energy}"])
+        load(
+            "safety_car_lidar",
+            [
+                "safety.draws=100",
+                "safety.dazzle=null",
+                *alone,
+                f"lasers.lidar.pulse_energy={energy}",
+            ],
+        )
     ).damage
     pulse = verdict.rows[0]
     assert (pulse.part, pulse.state, verdict.state) == ("pulse", state, state)

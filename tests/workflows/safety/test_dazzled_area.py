@@ -16,6 +16,7 @@ from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.safety.run_safety import document
 from neusee.workflows.safety.safety_estimate import estimate
 
+pytestmark = pytest.mark.usefixtures("without_remedies")
 #: a window of 243 pixels of the pointer's camera, and a pupil fine enough for 0.2 % of the picture
 SMALL = [
     "safety.dazzle.share=0.002",
@@ -38,7 +39,7 @@ def store(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def said(store):
+def said(store, without_remedies):
     return document(estimate(load("safety_pointer", [*SMALL, "safety.draws=1000"]), store))
 
 

@@ -9,6 +9,9 @@ import pytest
 from neusee.workflows import RecipeError, Store, load
 from neusee.workflows.safety.safety_estimate import estimate, prepare
 
+#: the peak behind the plain lens alone: no mask, and no light beside the peak
+ALONE = ["safety.protection={}", "safety.dazzle=null"]
+pytestmark = pytest.mark.usefixtures("without_remedies")
 FOCAL, WAVELENGTH, POWER, DIVERGENCE, DISTANCE = 0.11, 532e-9, 5e-3, 1e-3, 1e4
 CAMERA = [
     "laser=pointer", f"lasers.pointer.distance={DISTANCE} m", "+safety=camera", "safety.draws=100", "doe=flat",
@@ -44,7 +47,7 @@ def judged(recipe, store):
 
 
 def override(folder, diameter):
-    return load("first_light", [*CAMERA, f"optics.diameter={diameter}"], folder)
+    return load("first_light", [*CAMERA, *ALONE, f"optics.diameter={diameter}"], folder)
 
 
 def own_recipe(folder, diameter):
@@ -66,7 +69,7 @@ def own_recipe(folder, diameter):
     (folder / "mine.yaml").write_text(
         f"defaults:\n{defaults}\noutputs: [peak]\noptics: {{diameter: {diameter}}}\n"
     )
-    return load(str(folder / "mine.yaml"), CAMERA[1:], folder)
+    return load(str(folder / "mine.yaml"), [*CAMERA[1:], *ALONE], folder)
 
 
 def own_group(folder, diameter):
@@ -83,18 +86,20 @@ def own_group(folder, diameter):
     mask = "mask: {material: fused silica, wrap_at: null, levels: null, max_height: null}\n"
     (folder / "optics" / "mine.yaml").write_text(f"# My lens.\n{lens}{rest}{mask}")
     return load(
-        "first_light", ["optics=mine", *(word for word in CAMERA if "optics" not in word)], folder
+        "first_light",
+        ["optics=mine", *(word for word in CAMERA if "optics" not in word), *ALONE],
+        folder,
     )
 
 
 def from_python(folder, diameter):
-    return load("first_light", CAMERA, folder, optics={"diameter": diameter})
+    return load("first_light", [*CAMERA, *ALONE], folder, optics={"diameter": diameter})
 
 
 def drawn(folder, diameter):
     return load(
         "first_light",
-        [*CAMERA, f'optics.diameter="lognormal({diameter}, 1.05)"'.replace('"', "")],
+        [*CAMERA, *ALONE, f'optics.diameter="lognormal({diameter}, 1.05)"'.replace('"', "")],
         folder,
     )
 
@@ -114,7 +119,7 @@ def test_the_ratio_to_the_threshold_grows_with_the_fourth_power_of_the_diameter(
     ratios = []
     for millimetres in (5, 8.0784, 11, 25):
         exposure, limit = judged(
-            load("first_light", [*CAMERA, f"optics.diameter={millimetres} mm"]), store
+            load("first_light", [*CAMERA, *ALONE, f"optics.diameter={millimetres} mm"]), store
         )
         ratios.append(exposure / limit / millimetres**4)
     assert ratios == pytest.approx([ratios[0]] * 4, rel=1e-3)

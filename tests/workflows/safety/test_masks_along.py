@@ -18,6 +18,8 @@ END = 1.03  # ends of intervals agree within this factor
 CAREFUL = 0.08  #: on the careful side, since what an interpolation may miss counts upward
 LIMIT = 0.03  # limits at the distance of the recipe agree within this share
 
+pytestmark = pytest.mark.usefixtures("without_remedies")
+
 RECIPE = """
 defaults: [camera: lens_only, optics: lens_only, doe: {doe}, safety: masked_dazzle]
 optics: {{focal_length: {focal_length} m, diameter: {diameter} m, spot_pitch: {spot_pitch} m, samples: {samples}}}
@@ -295,9 +297,13 @@ def drawn_case(kind: str, seed: int) -> Case:
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "seed"), [("axicon", 1), ("five_half_rings", 2), ("smooth_random", 3)]
+    ("kind", "seed"),
+    [
+        pytest.param("axicon", 1, marks=pytest.mark.long),  # a smaller one is above
+        pytest.param("five_half_rings", 2, marks=pytest.mark.slow),
+        pytest.param("smooth_random", 3, marks=pytest.mark.slow),
+    ],
 )
 def test_drawn_cameras_behind_masks(kind, seed, tmp_path):
     check(drawn_case(kind, seed), tmp_path)

@@ -12,6 +12,7 @@ from neusee.workflows import Store, load
 from neusee.workflows.safety.run_safety import document
 from neusee.workflows.safety.safety_estimate import estimate, scatter_text
 
+pytestmark = pytest.mark.usefixtures("without_remedies")
 SAMPLES, SENSOR, SCENE = 256, 96, 128
 FOCAL, DIAMETER, PITCH, WAVELENGTH = 0.11, SAMPLES * 31.55e-6, 2.9e-6, 532e-9
 SHARE, WELL, EFFICIENCY, EXPOSURE = 0.5, 25500, 0.56, 0.1

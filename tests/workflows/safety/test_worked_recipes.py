@@ -17,6 +17,7 @@ from neusee.workflows import load
 from neusee.workflows.safety.run_safety import document
 from neusee.workflows.safety.safety_estimate import estimate
 
+pytestmark = pytest.mark.usefixtures("without_remedies")
 PLANCK_LIGHT = 6.62607015e-34 * 299792458.0
 FOCUSED = [
     "+safety.lens.focus=laser",

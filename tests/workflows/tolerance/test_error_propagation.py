@@ -483,7 +483,12 @@ def test_a_second_attempt_is_made_only_where_smaller_limits_can_help(
     whatever the limits are.
     """
     made, execution = [], runner.Execution
-    monkeypatch.setattr(runner, "Execution", lambda *args: made.append(args[0]) or execution(*args))
+
+    def counted(*args, **named):
+        made.append(args[0])
+        return execution(*args, **named)
+
+    monkeypatch.setattr(runner, "Execution", counted)
     steps = [step("l", light), step("r", rough, {"digits": 0}, x="l"), step("f", first, pair="r")]
     steps += [step("out", magnified, {"times": times}, x="f")]
     result = run(recipe(*steps), store)

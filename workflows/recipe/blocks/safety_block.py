@@ -156,9 +156,9 @@ class Laser(SettingsBlock):
         """Return the beam with ``values`` in place of its own; raise `ParameterError` for values
         that disagree.
         """
-        given = {name: getattr(self, name) for name in BEAM}
-        given |= {name: value for name, value in (values or {}).items() if name in BEAM}
-        return beam(**given, convention=self.convention)
+        parameters = {name: getattr(self, name) for name in BEAM}
+        parameters |= {name: value for name, value in (values or {}).items() if name in BEAM}
+        return beam(**parameters, convention=self.convention)
 
     @model_validator(mode="after")
     def _has_one_air(self) -> Laser:
@@ -410,18 +410,18 @@ def _laws(
     block: Value, diagnostics: list[Diagnostic], files: dict[Where, str]
 ) -> tuple[DamageLaw, ...]:
     """Return the thresholds of damage in the file of the user; report a mistake in the file."""
-    given = block.below(("damage", "file"))
-    if given is None or not isinstance(given.data, str):
+    file = block.below(("damage", "file"))
+    if file is None or not isinstance(file.data, str):
         return ()
-    path = (Path(given.mark.folder) / Path(given.data).expanduser()).resolve()
-    files[given.path] = str(path)
+    path = (Path(file.mark.folder) / Path(file.data).expanduser()).resolve()
+    files[file.path] = str(path)
     try:
-        refuse_outside(path, given.mark)
+        refuse_outside(path, file.mark)
         if not path.is_file():
             raise ValueError(f"no such file: {path}")
         return read_damage_laws(path)
     except (ValueError, OSError) as error:
-        diagnostics.append(Diagnostic(given.mark, given.name, str(error)))
+        diagnostics.append(Diagnostic(file.mark, file.name, str(error)))
         return ()
 
 
@@ -429,7 +429,7 @@ def _validated(model: type[Model], block: Value, diagnostics: list[Diagnostic]) 
     try:
         return model.model_validate(block.plain)
     except ValidationError as error:
-        diagnostics += (located(block, model, each) for each in error.errors())
+        diagnostics += (located(block, model, details) for details in error.errors())
         return None
 
 
@@ -456,13 +456,15 @@ def _laser_of(
         str(name): value
         for name, value in (root.items[LASERS].items if LASERS in root.items else {}).items()
     }
-    given = block.child("laser")
-    if given is not None and given.data is not None:
-        if str(given.data) not in lasers:
-            message = f"{given.data} is no laser of the recipe; {nearest(str(given.data), lasers)}"
-            diagnostics.append(Diagnostic(given.mark, given.name, message))
+    setting = block.child("laser")
+    if setting is not None and setting.data is not None:
+        if str(setting.data) not in lasers:
+            message = (
+                f"{setting.data} is no laser of the recipe; {nearest(str(setting.data), lasers)}"
+            )
+            diagnostics.append(Diagnostic(setting.mark, setting.name, message))
             return None
-        name = str(given.data)
+        name = str(setting.data)
     elif len(lasers) != 1:
         several = f"the recipe has the lasers {', '.join(lasers)}: write safety.laser=NAME"
         diagnostics.append(

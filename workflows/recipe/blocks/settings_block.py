@@ -43,11 +43,13 @@ def read_block(
     ``plain`` is the plain data of the block, and ``context`` has what the models of the settings
     need to know of the recipe. Mistakes in the block add diagnostics, and the settings are None.
     """
-    block, rest = composed.root.items[key], composed.without(key)
+    block, without_block = composed.root.items[key], composed.without(key)
     try:
-        return rest, model.model_validate(plain, context=context)
+        return without_block, model.model_validate(plain, context=context)
     except ValidationError as error:
-        return rest.with_problems(located(block, model, each) for each in error.errors()), None
+        return without_block.with_problems(
+            located(block, model, details) for details in error.errors()
+        ), None
 
 
 def located(block: Value, model: type[BaseModel], error: Any) -> Diagnostic:
@@ -78,6 +80,11 @@ def _fields(model: type[BaseModel], path: Sequence[int | str]) -> list[str]:
         if key in model.model_fields:
             annotation: Any = model.model_fields[str(key)].annotation
             model = next(
-                (each for each in get_args(annotation) if hasattr(each, "model_fields")), annotation
+                (
+                    model_class
+                    for model_class in get_args(annotation)
+                    if hasattr(model_class, "model_fields")
+                ),
+                annotation,
             )
     return list(model.model_fields)

@@ -445,15 +445,15 @@ class Training(SettingsBlock):
                 f"export: the filter before the network {kind} is in no graph of torch.export or"
                 " ONNX"
             )
-        given = {"learn": self.learn, "size": self.size, "patch": self.patch}
+        not_for_both = {"learn": self.learn, "size": self.size, "patch": self.patch}
         if self.augment.pooled != "none" and kind == "unrolled":
-            given["augment.pooled"] = "none"
-        wrong = next((name for name, value in given.items() if value is not None), None)
+            not_for_both["augment.pooled"] = "none"
+        wrong = next((name for name, value in not_for_both.items() if value is not None), None)
         if wrong:
             text = f"the network {kind} restores a whole picture behind a fixed mask"
             raise ValueError(
                 f"{wrong}: {text}: write {wrong}:"
-                f" {given[wrong] if wrong == 'augment.pooled' else 'null'}"
+                f" {not_for_both[wrong] if wrong == 'augment.pooled' else 'null'}"
             )
         return self
 
@@ -536,9 +536,9 @@ def _missing(block: Value, training: Training) -> Iterator[Diagnostic]:
         (block, training.start, "start"),
         (block.items.get("mask"), training.mask.start, "start"),
     ):
-        given = outer.child(key) if outer else None
-        if given is not None and path is not None:
-            yield from _outside(path, given)
+        named = outer.child(key) if outer else None
+        if named is not None and path is not None:
+            yield from _outside(path, named)
 
 
 def _outside(path: Path, value: Value) -> Iterator[Diagnostic]:
@@ -546,18 +546,18 @@ def _outside(path: Path, value: Value) -> Iterator[Diagnostic]:
     link in a folder.
     """
     links = (
-        (each for each in path.rglob("*") if each.is_symlink())
+        (link for link in path.rglob("*") if link.is_symlink())
         if is_strange() and path.is_dir()
         else ()
     )
     try:
-        for each in (path, *links):
-            refuse_outside(each, value.mark)
+        for inner in (path, *links):
+            refuse_outside(inner, value.mark)
     except ValueError as error:
         yield Diagnostic(value.mark, value.name, str(error))
 
 
-def _wrong_network(given: Value, training: Training) -> Iterator[Diagnostic]:
+def _wrong_network(block: Value, training: Training) -> Iterator[Diagnostic]:
     """Yield a diagnostic for each setting of the packaged networks, and for a class that fails
     on a small picture.
     """
@@ -566,7 +566,7 @@ def _wrong_network(given: Value, training: Training) -> Iterator[Diagnostic]:
     network = training.network
     if network.architecture is None:
         if alone := next(
-            (value for name in _OF_CLASS[1:] if (value := given.child(name)) and value.plain), None
+            (value for name in _OF_CLASS[1:] if (value := block.child(name)) and value.plain), None
         ):
             yield Diagnostic(
                 alone.mark,
@@ -574,7 +574,7 @@ def _wrong_network(given: Value, training: Training) -> Iterator[Diagnostic]:
                 "is of a class of your own: name it by architecture: mynet.MyClass",
             )
         return
-    for name, value in given.items.items():
+    for name, value in block.items.items():
         if name not in _OF_CLASS and not Path(value.mark.folder).is_relative_to(packaged()):
             text = (
                 f"{name} is of the networks of neusee: write parameters: {{{name}: {value.plain}}}"
@@ -583,13 +583,13 @@ def _wrong_network(given: Value, training: Training) -> Iterator[Diagnostic]:
             yield Diagnostic(value.mark, value.name, text)
     try:
         net = own_network(network.architecture, network.parameters, network.multiple)
-        if not any(one.requires_grad for one in net.parameters()):
+        if not any(parameter.requires_grad for parameter in net.parameters()):
             raise ParameterError(
                 "architecture", f"{network.architecture} has nothing to train: it has no parameters"
             )
         try_network(net, training.dtype)
     except ParameterError as error:
-        value = given.child(error.parameter) or given.items["architecture"]
+        value = block.child(error.parameter) or block.items["architecture"]
         yield Diagnostic(value.mark, value.name, str(error))
 
 
@@ -646,12 +646,12 @@ class LiftTraining(SettingsBlock):
         """Return the learning rate at an iteration: a linear warm-up, then half a cosine from
         `rate` to `min_rate`.
         """
-        least, rising = (
+        lowest, rising = (
             min(self.min_rate, self.rate),
             min(1.0, (iteration + 1) / max(self.warmup, 1)),
         )
         return rising * (
-            least + (self.rate - least) * half_cosine(math.pi * iteration / self.iterations)
+            lowest + (self.rate - lowest) * half_cosine(math.pi * iteration / self.iterations)
         )
 
 

@@ -292,15 +292,18 @@ class Joint:
         """Return the joint distribution of the quantities ``names``, marginalised over all other
         quantities.
         """
-        at = [self.names.index(name) for name in names]
+        columns = [self.names.index(name) for name in names]
         if self.draws is not None:
-            return Joint.of_draws(names, self.draws[:, at])
-        whole = self.factor @ self.factor.T
-        scale = np.sqrt(np.diag(whole))
+            return Joint.of_draws(names, self.draws[:, columns])
+        covariance = self.factor @ self.factor.T
+        scale = np.sqrt(np.diag(covariance))
         joint = Joint.of_normal(
-            names, self.mean[at], self.sd[at], (whole / scale / scale[:, None])[np.ix_(at, at)]
+            names,
+            self.mean[columns],
+            self.sd[columns],
+            (covariance / scale / scale[:, None])[np.ix_(columns, columns)],
         )
-        return joint if self.bounds is None else replace(joint, bounds=self.bounds[at])
+        return joint if self.bounds is None else replace(joint, bounds=self.bounds[columns])
 
 
 def _scores(draws: FloatArray) -> FloatArray:
@@ -342,7 +345,9 @@ def read_posterior(path: Path, mark: Location | None = None) -> Posterior:
     """
     if any(sign in str(path) for sign in "*?["):
         path = max(
-            map(Path, glob(str(path))), key=lambda each: (each.stat().st_mtime, each), default=path
+            map(Path, glob(str(path))),
+            key=lambda match: (match.stat().st_mtime, match),
+            default=path,
         )
     if path.is_dir():
         path = path / "posterior.json"
@@ -371,13 +376,16 @@ def _document(path: Path, mark: Location | None) -> Posterior:
     from ruamel.yaml.error import YAMLError
 
     try:
-        doc: Any = YAML(typ="safe", pure=True).load(text_of(path, most=_LARGEST))
+        doc: Any = YAML(typ="safe", pure=True).load(text_of(path, max_bytes=_LARGEST))
     except YAMLError as error:
         raise ValueError(f"{path.name} cannot be read: {' '.join(str(error).split())}") from None
     if not isinstance(doc, dict):
         raise ValueError(f"{path.name} must contain a mapping of keys to values")
-    if "parameters" not in doc:
-        return summary(doc)
+    return _calibrated(doc, path, mark) if "parameters" in doc else summary(doc)
+
+
+def _calibrated(doc: Mapping[str, Any], path: Path, mark: Location | None) -> Posterior:
+    """Return the posterior of a calibration, whose draws stand in a file beside it."""
     if doc.get("failed"):
         failed = [check["name"] for check in doc.get("checks", ()) if check["mark"] == "fail"]
         checks = "1 check fails" if doc["failed"] == 1 else f"{doc['failed']} checks fail"
@@ -391,9 +399,8 @@ def _document(path: Path, mark: Location | None) -> Posterior:
     }
     posterior = _drawn(columns, {name: str(row["unit"]) for name, row in rows.items()})
     untold = tuple(name for name in rows if name not in columns)
-    return replace(
-        posterior, kinds={name: str(row["kind"]) for name, row in rows.items()}, untold=untold
-    )
+    kinds = {name: str(row["kind"]) for name, row in rows.items()}
+    return replace(posterior, kinds=kinds, untold=untold)
 
 
 def _drawn(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Posterior:
@@ -415,29 +422,22 @@ def _drawn(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Poste
     )
 
 
-def summary(given: Mapping[str, Any]) -> Posterior:
+def summary(moments: Mapping[str, Any]) -> Posterior:
     """Return the normal posterior with the given means, and with standard deviations or a
     covariance matrix.
     """
-    joint = _normal(given)
-    return Posterior(joint, units={str(name): read_any(x)[1] for name, x in given["mean"].items()})
+    joint = _normal(moments)
+    return Posterior(
+        joint, units={str(name): read_any(x)[1] for name, x in moments["mean"].items()}
+    )
 
 
-def _normal(given: Mapping[str, Any]) -> Joint:
-    if strange := sorted(set(given) - {"mean", "sd", "correlation", "covariance"}):
-        raise ValueError(
-            f"unknown key {strange[0]}: give mean, sd and perhaps correlation, or mean and"
-            " covariance"
-        )
-    if not isinstance(given.get("mean"), dict) or ("sd" in given) == ("covariance" in given):
-        raise ValueError(
-            "a summary needs mean: {name: value}, and either sd: {name: value} or covariance:"
-            " [[…], …]"
-        )
-    names = [str(name) for name in given["mean"]]
-    mean = np.array([_si(x) for x in given["mean"].values()])
-    if "covariance" in given:
-        covariance = _matrix(given["covariance"])
+def _normal(moments: Mapping[str, Any]) -> Joint:
+    _refuse_other_moments(moments)
+    names = [str(name) for name in moments["mean"]]
+    mean = np.array([_si(x) for x in moments["mean"].values()])
+    if "covariance" in moments:
+        covariance = _matrix(moments["covariance"])
         sd = np.sqrt(np.diag(covariance).clip(0)) if covariance.ndim == 2 else np.zeros(0)
         if sd.shape != mean.shape or not (sd > 0).all():
             raise ValueError(
@@ -445,11 +445,27 @@ def _normal(given: Mapping[str, Any]) -> Joint:
                 " variances"
             )
         return Joint.of_normal(names, mean, sd, covariance / sd / sd[:, None])
-    if not isinstance(given["sd"], dict) or set(map(str, given["sd"])) != set(names):
+    if not isinstance(moments["sd"], dict) or set(map(str, moments["sd"])) != set(names):
         raise ValueError("sd must have a value for each name in mean, and no other names")
-    sd = np.array([_si(given["sd"][name]) for name in given["mean"]])
-    correlation = _matrix(given["correlation"]) if "correlation" in given else np.eye(len(names))
+    sd = np.array([_si(moments["sd"][name]) for name in moments["mean"]])
+    correlation = (
+        _matrix(moments["correlation"]) if "correlation" in moments else np.eye(len(names))
+    )
     return Joint.of_normal(names, mean, sd, correlation)
+
+
+def _refuse_other_moments(moments: Mapping[str, Any]) -> None:
+    """Raise ValueError for a summary without means, or without one statement of their spread."""
+    if strange := sorted(set(moments) - {"mean", "sd", "correlation", "covariance"}):
+        raise ValueError(
+            f"unknown key {strange[0]}: give mean, sd and perhaps correlation, or mean and"
+            " covariance"
+        )
+    if not isinstance(moments.get("mean"), dict) or ("sd" in moments) == ("covariance" in moments):
+        raise ValueError(
+            "a summary needs mean: {name: value}, and either sd: {name: value} or covariance:"
+            " [[…], …]"
+        )
 
 
 def _si(text: Any) -> float:
@@ -459,9 +475,9 @@ def _si(text: Any) -> float:
     return number
 
 
-def _matrix(given: Any) -> FloatArray:
+def _matrix(rows: Any) -> FloatArray:
     try:
-        return np.array(given, np.float64)
+        return np.array(rows, np.float64)
     except (TypeError, ValueError):
         raise ValueError(
             "a matrix must be a list of rows of numbers, all of the same length"

@@ -144,7 +144,7 @@ def _arguments(text: str) -> list[str]:
             parts.append("")
         else:
             parts[-1] += sign
-    return [part.strip() for part in parts]
+    return [argument.strip() for argument in parts]
 
 
 def _numbers(arguments: Sequence[str]) -> _Numbers:
@@ -157,10 +157,10 @@ def _numbers(arguments: Sequence[str]) -> _Numbers:
     return _Numbers(tuple(number for number, _, _ in read), unit, reciprocal)
 
 
-def _plain(argument: str, what: str) -> float:
+def _plain(argument: str, meaning: str) -> float:
     number, unit, _ = read_written(argument)
     if unit:
-        raise ValueError(f"{what} is a number without a unit, such as 1.1, not {argument}")
+        raise ValueError(f"{meaning} is a number without a unit, such as 1.1, not {argument}")
     return number
 
 
@@ -389,13 +389,13 @@ def read_mismatch(
     """Return the differences that ``train.mismatch`` states, by the path of the value in the
     recipe ``root``.
     """
-    found = {}
+    differences = {}
     for path, leaf in _laws(block):
         try:
-            found[path] = _difference(path, leaf, root)
+            differences[path] = _difference(path, leaf, root)
         except ValueError as error:
             diagnostics.append(Diagnostic(leaf.mark, f"{block.name}.{path}", str(error)))
-    return found
+    return differences
 
 
 def _laws(block: Value, above: str = "") -> Iterator[tuple[str, Value]]:
@@ -411,7 +411,7 @@ def _difference(path: str, leaf: Value, root: Value) -> Difference:
     if own is None:
         raise ValueError(
             f"the recipe has no value {path};"
-            f" {nearest(path, [each.name for each in root.leaves()])}"
+            f" {nearest(path, [recipe_value.name for recipe_value in root.leaves()])}"
         )
     value, unit = _own(path, own)
     law = (

@@ -119,19 +119,26 @@ def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
             root = put(root, path, BROKEN)
             continue
         root = put(root, path, written(law.median, law.unit))
-    given = root.items.get(KEY)
-    if given is None and not laws and len(diagnostics) == len(composed.diagnostics):
+    block = root.items.get(KEY)
+    if block is None and not laws and len(diagnostics) == len(composed.diagnostics):
         return composed, None
     notes = [
         f"{path} is {law.text}: this run uses {_rounded(law.median, law.unit)}"
         for path, law in laws.items()
     ]
     reader = _Reader(root.without(KEY), laws, diagnostics)
-    if given is not None:
-        reader.read(given)
+    if block is not None:
+        reader.read(block)
     settled = replace(composed, root=reader.root, diagnostics=tuple(diagnostics))
-    rest = (tuple(reader.standings), (*notes, *reader.notes), reader.source, reader.units)
-    return settled, Uncertain(replace(settled, diagnostics=()), laws, reader.joint, *rest)
+    return settled, Uncertain(
+        replace(settled, diagnostics=()),
+        laws,
+        reader.joint,
+        standings=tuple(reader.standings),
+        notes=(*notes, *reader.notes),
+        source=reader.source,
+        units=reader.units,
+    )
 
 
 def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
@@ -148,14 +155,14 @@ def _laws_in(block: Value) -> tuple[tuple[Where, Value], ...]:
     """Return the distributions in a block, which the points of a sweep share where they have the
     same block.
     """
-    found: list[tuple[Where, Value]] = []
+    laws: list[tuple[Where, Value]] = []
     stack: list[tuple[Where, Value]] = [((), block)]
     while stack:
         path, value = stack.pop()
         if is_law(value.data):
-            found.append((path, value))
+            laws.append((path, value))
         stack += [((*path, key), child) for key, child in value.items.items()]
-    return tuple(found)
+    return tuple(laws)
 
 
 def put(root: Value, path: Where, data: Any, mark: Location | None = None) -> Value:
@@ -179,32 +186,32 @@ class _Reader:
         self.units: dict[str, str] = {}
         self.source = ""
 
-    def read(self, given: Value) -> None:
+    def read(self, block: Value) -> None:
         """Read the posterior that a recipe names, and put its values into the recipe; report
         each mistake.
         """
-        if given.data is None:
+        if block.data is None:
             return
-        items = given.items if isinstance(given.data, dict) else {"file": given}
+        items = block.items if isinstance(block.data, dict) else {"file": block}
         if strange := [v for key, v in items.items() if key not in (*_KEYS, *_SUMMARY)]:
             return self._fail(
                 strange[0].key, strange[0].name, f"unknown; {nearest(strange[0].name, _KEYS)}"
             )
         try:
-            posterior = self._posterior(given, items)
+            posterior = self._posterior(block, items)
         except ValueError as error:
-            place = items.get("covariance") or items.get("correlation") or given
+            place = items.get("covariance") or items.get("correlation") or block
             return self._fail(place.mark, place.name, str(error))
         try:
             use = self._use(items.get("use"), posterior)
             pairs = self._pairs(items.get("values"), posterior)
         except ValueError as error:
-            return self._fail(given.mark, KEY, str(error))
-        self._apply(posterior, pairs, use, given.mark)
+            return self._fail(block.mark, KEY, str(error))
+        self._apply(posterior, pairs, use, block.mark)
 
-    def _posterior(self, given: Value, items: Mapping[Any, Value]) -> Posterior:
+    def _posterior(self, block: Value, items: Mapping[Any, Value]) -> Posterior:
         if any(key in items for key in _SUMMARY):
-            self.source = f"summary at {given.mark}"
+            self.source = f"summary at {block.mark}"
             return summary({key: _flat(v) for key, v in items.items() if key in _SUMMARY})
         file = items.get("file")
         if file is None or not isinstance(file.data, str):
@@ -215,8 +222,8 @@ class _Reader:
         self.source = file.data
         return read_posterior(Path(file.mark.folder) / Path(file.data).expanduser(), file.mark)
 
-    def _use(self, given: Value | None, posterior: Posterior) -> str | int:
-        use = "mean" if given is None else given.data
+    def _use(self, setting: Value | None, posterior: Posterior) -> str | int:
+        use = "mean" if setting is None else setting.data
         draws = posterior.joint.draws
         if use in ("mean", "nominal"):
             return str(use)
@@ -230,35 +237,12 @@ class _Reader:
         number = f", or the number of a draw, 0 to {len(draws) - 1}" if draws is not None else ""
         raise ValueError(f"use = {use}: write mean, nominal (the recipe's own value){number}")
 
-    def _pairs(self, given: Value | None, posterior: Posterior) -> dict[str, str]:
+    def _pairs(self, setting: Value | None, posterior: Posterior) -> dict[str, str]:
         """Return the name in the posterior for each value that the recipe takes from it, by the
         value's recipe path.
         """
         names = posterior.joint.names
-        if given is not None and not isinstance(given.data, dict):
-            raise ValueError(
-                "values must be a mapping: write values: {path in the recipe: name in the"
-                " posterior}"
-            )
-        if given is not None:
-            pairs = {path: str(name) for path, name in _flat(given).items()}
-            if wrong := [name for name in pairs.values() if name not in names]:
-                now = POSTERIOR_NAMES.get(wrong[0])
-                hint = (
-                    f"called {now} now"
-                    if now in names
-                    else f"not in the posterior; {nearest(wrong[0], names)}"
-                )
-                raise ValueError(f"values: {wrong[0]} is {hint}")
-        else:
-            all_pairs = {name if "." in name else f"{_BLOCK}.{name}": name for name in names}
-            pairs = {
-                path: name for path, name in all_pairs.items() if self._value(path) is not None
-            }
-            if lost := [name for path, name in all_pairs.items() if path not in pairs]:
-                self.notes.append(
-                    f"this recipe does not have these values of the posterior: {', '.join(lost)}"
-                )
+        pairs = self._own_pairs(names) if setting is None else _stated_pairs(setting, names)
         if wrong := [path for path in pairs if self._value(path) is None]:
             raise ValueError(f"values: the recipe has no value at the path {wrong[0]}")
         if not pairs:
@@ -266,12 +250,24 @@ class _Reader:
                 f"no value of the recipe is in the posterior, which contains {', '.join(names)}"
             )
         own = [name for name in posterior.untold if self._value(f"{_BLOCK}.{name}") is not None]
-        if own and given is None:
+        if own and setting is None:
             self.notes.append(
                 f"the posterior does not tell {', '.join(own)}: the recipe's own value counts as"
                 " certain"
             )
         self._conventions(posterior, pairs)
+        return pairs
+
+    def _own_pairs(self, names: Sequence[str]) -> dict[str, str]:
+        """Return the name in the posterior for each value of the recipe that has the same name; say
+        which names have no value.
+        """
+        all_pairs = {name if "." in name else f"{_BLOCK}.{name}": name for name in names}
+        pairs = {path: name for path, name in all_pairs.items() if self._value(path) is not None}
+        if lost := [name for path, name in all_pairs.items() if path not in pairs]:
+            self.notes.append(
+                f"this recipe does not have these values of the posterior: {', '.join(lost)}"
+            )
         return pairs
 
     def _conventions(self, posterior: Posterior, pairs: Mapping[str, str]) -> None:
@@ -303,7 +299,7 @@ class _Reader:
     def _apply(
         self, posterior: Posterior, pairs: Mapping[str, str], use: str | int, mark: Location
     ) -> None:
-        kept = {}
+        taken = {}
         for path, name in pairs.items():
             value = self._value(path)
             assert value is not None
@@ -324,12 +320,12 @@ class _Reader:
             if fault := _unit_fault(name, posterior.units.get(name, ""), unit):
                 self._fail(mark, KEY, fault)
                 continue
-            kept[path] = name
+            taken[path] = name
             self.units[path] = unit
             self._stand(posterior, path, name, own, use, mark)
-        if kept:
-            joint = posterior.joint.only(tuple(kept.values()))
-            self.joint = replace(joint, names=tuple(kept))
+        if taken:
+            joint = posterior.joint.only(tuple(taken.values()))
+            self.joint = replace(joint, names=tuple(taken))
 
     def _stand(
         self, posterior: Posterior, path: str, name: str, own: float, use: str | int, mark: Location
@@ -339,17 +335,28 @@ class _Reader:
         """
         joint, unit, kind = posterior.joint, self.units[path], posterior.kinds.get(name, "estimate")
         i = joint.names.index(name)
-        used, why = own, "recipe"
+        nominal, why = own, "recipe"
         if isinstance(use, int):
             assert joint.draws is not None
-            used, why = float(joint.draws[use, i]), f"draw {use}"
+            nominal, why = float(joint.draws[use, i]), f"draw {use}"
         elif kind == "estimate" and use == "mean":
-            used, why = float(joint.mean[i]), "mean"
-        if used != own:
-            self.root = put(self.root, tuple(path.split(".")), written(used, unit), mark)
-        numbers = (float(joint.mean[i]), float(joint.sd[i]), *joint.interval(name))
-        words = (unit, joint.below(name, own), _rounded(used, unit), why)
-        standing = Standing(path, _rounded(own, unit), kind, *numbers, *words)
+            nominal, why = float(joint.mean[i]), "mean"
+        if nominal != own:
+            self.root = put(self.root, tuple(path.split(".")), written(nominal, unit), mark)
+        low, high = joint.interval(name)
+        standing = Standing(
+            path,
+            own=_rounded(own, unit),
+            kind=kind,
+            mean=float(joint.mean[i]),
+            sd=float(joint.sd[i]),
+            low=low,
+            high=high,
+            unit=unit,
+            below=joint.below(name, own),
+            used=_rounded(nominal, unit),
+            why=why,
+        )
         self.standings.append(standing)
         if standing.far:
             law = f"{standing.mean:.6g} ± {standing.sd:.2g} {unit}".rstrip()
@@ -376,6 +383,24 @@ def _unit_fault(name: str, unit: str, own: str) -> str:
             f" {own or 'no unit'}"
         )
     return ""
+
+
+def _stated_pairs(setting: Value, names: Sequence[str]) -> dict[str, str]:
+    """Return the name in the posterior for each value by its path, as a recipe states them."""
+    if not isinstance(setting.data, dict):
+        raise ValueError(
+            "values must be a mapping: write values: {path in the recipe: name in the posterior}"
+        )
+    pairs = {path: str(name) for path, name in _flat(setting).items()}
+    if wrong := [name for name in pairs.values() if name not in names]:
+        now = POSTERIOR_NAMES.get(wrong[0])
+        hint = (
+            f"called {now} now"
+            if now in names
+            else f"not in the posterior; {nearest(wrong[0], names)}"
+        )
+        raise ValueError(f"values: {wrong[0]} is {hint}")
+    return pairs
 
 
 def _flat(value: Value) -> Any:

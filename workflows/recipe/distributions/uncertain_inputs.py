@@ -72,19 +72,19 @@ def within_allowed(uncertain: Uncertain, negligible: float) -> tuple[Uncertain, 
     laws, notes = dict(uncertain.laws), dict[str, str]()
     problems: list[Diagnostic] = []
     for name, law in uncertain.laws.items():
-        part = _allowed_part(uncertain, name, partial(_law_value, law))
-        if not part.reason:
+        allowed = _allowed_part(uncertain, name, partial(_law_value, law))
+        if not allowed.reason:
             continue
-        low, high = _bound(law, part.low), _bound(law, part.high)
-        if part.outside > negligible or _is_single(law, low, high):
-            problems.append(_refusal(uncertain, name, law.text, part, _advice(law, low, high)))
+        low, high = _bound(law, allowed.low), _bound(law, allowed.high)
+        if allowed.outside > negligible or _is_single(law, low, high):
+            problems.append(_refusal(uncertain, name, law.text, allowed, _advice(law, low, high)))
             continue
         laws[name] = law.truncated(low, high)
-        notes[name] = _statement(law, laws[name], part)
+        notes[name] = _statement(law, laws[name], allowed)
     joint = uncertain.joint
     if joint is not None:
-        joint, found = _joint_within(uncertain, joint, negligible, problems)
-        notes |= found
+        joint, joint_notes = _joint_within(uncertain, joint, negligible, problems)
+        notes |= joint_notes
     if problems:
         raise RecipeError(problems)
     return replace(uncertain, laws=laws, joint=joint), notes
@@ -172,11 +172,11 @@ def _bound_text(bound: float, unit: str) -> str:
 
 
 def _refusal(
-    uncertain: Uncertain, name: str, text: str, part: AllowedPart, advice: str
+    uncertain: Uncertain, name: str, text: str, allowed: AllowedPart, advice: str
 ) -> Diagnostic:
-    share = f"{part.outside:.2g}" if part.outside < 1e-3 else f"{part.outside:.2%}"
+    share = f"{allowed.outside:.2g}" if allowed.outside < 1e-3 else f"{allowed.outside:.2%}"
     message = (
-        f"{share} of this distribution lies outside the allowed values ({part.reason}): {advice}"
+        f"{share} of this distribution lies outside the allowed values ({allowed.reason}): {advice}"
     )
     return Diagnostic(_mark(uncertain, name), f"{name} = {text}", message)
 
@@ -187,15 +187,15 @@ def _mark(uncertain: Uncertain, name: str) -> Location:
     return value.mark
 
 
-def _statement(law: Law, cut: Law, part: AllowedPart) -> str:
+def _statement(law: Law, cut: Law, allowed: AllowedPart) -> str:
     """Return what was cut off a distribution, and how far its mean and standard deviation moved."""
     (mean, sd), (new_mean, new_sd) = law.shape.moments(), cut.shape.moments()
     moved = (
         f"its mean moves by {(new_mean - mean) / sd:+.2g} sd, and its sd by {new_sd / sd - 1:+.2%}"
     )
     return (
-        f"{part.outside:.2g} of it lies outside the allowed values ({part.reason}) and is cut off;"
-        f" {moved}"
+        f"{allowed.outside:.2g} of it lies outside the allowed values ({allowed.reason}) and is"
+        f" cut off; {moved}"
     )
 
 
@@ -211,24 +211,24 @@ def _joint_within(
     notes = dict[str, str]()
     for i, name in enumerate(joint.names):
         column = np.sort(joint.draws[:, i])
-        part = _allowed_part(uncertain, name, partial(_sample, column))
-        if not part.reason:
+        limits = _allowed_part(uncertain, name, partial(_sample, column))
+        if not limits.reason:
             continue
-        low, high = (_sample(column, score) for score in (part.low, part.high))
+        low, high = (_sample(column, score) for score in (limits.low, limits.high))
         inside = (joint.draws[:, i] >= low) & (joint.draws[:, i] <= high)
         outside = 1.0 - float(inside.mean())
         if outside > negligible:
-            found = replace(part, low=-math.inf, high=-_score(outside))
+            excess = replace(limits, low=-math.inf, high=-_score(outside))
             problems.append(
                 _refusal(
-                    uncertain, name, uncertain.said(name), found, "remove these rows of the table"
+                    uncertain, name, uncertain.said(name), excess, "remove these rows of the table"
                 )
             )
             continue
         allowed &= inside
         notes[name] = (
             f"{int((~inside).sum())} of its {len(inside)} rows lie outside the allowed values"
-            f" ({part.reason}) and are left out"
+            f" ({limits.reason}) and are left out"
         )
     return (joint if allowed.all() else Joint.of_draws(joint.names, joint.draws[allowed])), notes
 
@@ -268,10 +268,10 @@ def _normal_within(
     notes = dict[str, str]()
     for i, name in enumerate(joint.names):
         mean, sd = float(joint.mean[i]), float(joint.sd[i])
-        part = _allowed_part(uncertain, name, partial(_normal_value, mean, sd))
-        if not part.reason:
+        allowed = _allowed_part(uncertain, name, partial(_normal_value, mean, sd))
+        if not allowed.reason:
             continue
-        if part.outside > negligible:
+        if allowed.outside > negligible:
             advice = (
                 "give a smaller standard deviation, or draws in a file with allowed values only"
             )
@@ -279,11 +279,11 @@ def _normal_within(
                 f"normal({written(mean, uncertain.units[name])},"
                 f" {written(sd, uncertain.units[name])})"
             )
-            problems.append(_refusal(uncertain, name, text, part, advice))
+            problems.append(_refusal(uncertain, name, text, allowed, advice))
             continue
-        bounds[i] = part.low, part.high
+        bounds[i] = allowed.low, allowed.high
         notes[name] = (
-            f"{part.outside:.2g} of it lies outside the allowed values ({part.reason}) and is"
+            f"{allowed.outside:.2g} of it lies outside the allowed values ({allowed.reason}) and is"
             " cut off"
         )
     return (joint if not notes else replace(joint, bounds=bounds)), notes
@@ -355,11 +355,11 @@ class Inputs:
             (uncertain, {}) if negligible is None else within_allowed(uncertain, negligible)
         )
         readers = _all_readers(recipe, uncertain, outputs)
-        used = {name for inputs in readers.values() for _, name in inputs}
-        if not used:
+        with_effect = {name for inputs in readers.values() for _, name in inputs}
+        if not with_effect:
             raise NothingDrawn(f"no output depends on {', '.join(uncertain.names)}")
-        idle = tuple(name for name in uncertain.names if name not in used)
-        drawn = only_values(uncertain, used)
+        idle = tuple(name for name in uncertain.names if name not in with_effect)
+        drawn = only_values(uncertain, with_effect)
         return cls(recipe, drawn, drawn.names, idle, readers, notes)
 
     @property
@@ -432,13 +432,13 @@ class Inputs:
         from scipy.special import ndtri
         from scipy.stats import qmc
 
-        each = -(-count // SCRAMBLES)
+        per_sequence = -(-count // SCRAMBLES)
         streams = [np.random.default_rng([seed, 3, n]) for n in range(SCRAMBLES)]
         sequences = [
-            qmc.Sobol(len(self.names), seed=rng).random_base2((each - 1).bit_length())
+            qmc.Sobol(len(self.names), seed=rng).random_base2((per_sequence - 1).bit_length())
             for rng in streams
         ]
-        u = np.stack([s[:each] for s in sequences], 1).reshape(-1, len(self.names))[:count]
+        u = np.stack([s[:per_sequence] for s in sequences], 1).reshape(-1, len(self.names))[:count]
         z = np.asarray(ndtri(u.clip(_EDGE, 1 - _EDGE)), np.float64)
         return InputDraws(z, self.at(z))
 
@@ -470,8 +470,10 @@ def only_values(uncertain: Uncertain, names: Collection[str]) -> Uncertain:
     """Return those uncertain values of a recipe whose paths are in ``names``."""
     laws = {name: law for name, law in uncertain.laws.items() if name in names}
     joint = uncertain.joint
-    kept = [name for name in joint.names if name in names] if joint else []
-    return replace(uncertain, laws=laws, joint=joint.only(kept) if joint and kept else None)
+    remaining = [name for name in joint.names if name in names] if joint else []
+    return replace(
+        uncertain, laws=laws, joint=joint.only(remaining) if joint and remaining else None
+    )
 
 
 def _all_readers(
@@ -540,12 +542,12 @@ def _changed(before: Any, after: Any) -> Iterator[tuple[Index, Any]]:
         and len(after) == len(before)
     ):
         for i, (a, b) in enumerate(zip(before, after, strict=True)):
-            yield from (((i, *rest), new) for rest, new in _changed(a, b))
+            yield from (((i, *inner), new) for inner, new in _changed(a, b))
     elif (
         isinstance(after, Mapping) and isinstance(before, Mapping) and after.keys() == before.keys()
     ):
         for key, b in after.items():
-            yield from (((key, *rest), new) for rest, new in _changed(before[key], b))
+            yield from (((key, *inner), new) for inner, new in _changed(before[key], b))
     elif before != after:
         yield (), after
 
@@ -568,8 +570,8 @@ def _label(uncertain: Uncertain, name: str) -> str:
     if joint is None or name not in joint.names:
         return name
     i = joint.names.index(name)
-    whole: FloatArray = joint.factor @ joint.factor.T
-    correlated = np.abs(whole[i]) > _CORRELATED
+    covariance: FloatArray = joint.factor @ joint.factor.T
+    correlated = np.abs(covariance[i]) > _CORRELATED
     if correlated[:i].any():
         return f"rest of {name}"
     return f"{name} and correlated values" if correlated[i + 1 :].any() else name

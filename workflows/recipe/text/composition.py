@@ -190,7 +190,7 @@ class Groups:
         below = [self.option(choice, (*open_, file)) for choice in choices]
         if None in below or len(self.diagnostics) > before:
             return None
-        parts = tuple(part for part in (*below, root) if part is not None)
+        parts = tuple(level for level in (*below, root) if level is not None)
         return self.merge(parts) if len(parts) > 1 else root
 
     def _absent(self, choice: Choice, open_: tuple[Path, ...]) -> str:
@@ -198,17 +198,17 @@ class Groups:
         use.
         """
         group, name = choice.group, str(choice.option)
-        known = self.names()
-        if group not in known:
-            return f"no group {group}; {nearest(group, known)}"
-        if name in known[group] and open_:
+        options = self.names()
+        if group not in options:
+            return f"no group {group}; {nearest(group, options)}"
+        if name in options[group] and open_:
             chain = " -> ".join(shown(path, self.folder) for path in (*open_, open_[0]))
             return f"options extend each other in a circle: {chain}"
-        return f"no option {name} in {group}; {nearest(name, known[group])}"
+        return f"no option {name} in {group}; {nearest(name, options[group])}"
 
     def _say_hidden(self, group: str, name: str, file: Path) -> None:
-        rest = self.folders[self.folders.index(file.parent.parent) + 1 :]
-        hidden = option_file(group, name, rest)
+        later_folders = self.folders[self.folders.index(file.parent.parent) + 1 :]
+        hidden = option_file(group, name, later_folders)
         if hidden is not None:
             ours = "the packaged option" if hidden.parent.parent == packaged() else str(hidden)
             self.notes.append(f"{group}: {name} is {shown(file, self.folder)}, which hides {ours}")
@@ -223,17 +223,17 @@ def choices_of(root: Value, diagnostics: list[Diagnostic], group: str = "") -> I
     """Yield the entries in the list ``defaults`` of a recipe, or of an option of ``group``;
     report wrong entries.
     """
-    given = root.items.get("defaults")
-    if given is None:
+    block = root.items.get("defaults")
+    if block is None:
         return
-    if not isinstance(given.data, list):
+    if not isinstance(block.data, list):
         form = "options of this group, such as `[small]`" if group else "`group: option`"
         diagnostics.append(
-            Diagnostic(given.mark, "defaults", f"must be a list of {form}, not {kind(given)}")
+            Diagnostic(block.mark, "defaults", f"must be a list of {form}, not {kind(block)}")
         )
         return
     lines: dict[tuple[str, str], int] = {}
-    for entry in given.data:
+    for entry in block.data:
         pair = _pair(entry, group)
         if pair is None:
             diagnostics.append(Diagnostic(entry.mark, entry.name, _INNER if group else _FORM))
@@ -334,7 +334,7 @@ def locate(recipe: str | Path, folder: Path) -> Path:
         path = folder / Path(recipe).expanduser()
         if path.exists() and not path.is_dir():
             return path
-        there = [
+        similar_files = [
             str(p.relative_to(folder))
             for p in path.parent.glob("*.yaml")
             if p.is_relative_to(folder)
@@ -342,7 +342,9 @@ def locate(recipe: str | Path, folder: Path) -> Path:
         raise RecipeError(
             [
                 Diagnostic(
-                    Location("recipe"), str(recipe), f"no such file; {nearest(str(recipe), there)}"
+                    Location("recipe"),
+                    str(recipe),
+                    f"no such file; {nearest(str(recipe), similar_files)}",
                 )
             ]
         )
@@ -394,13 +396,13 @@ class Composer:
                 )
             except RecipeError as error:
                 diagnostics += error.diagnostics
-        choices, rest = _choose(self._document.root, overrides, self._groups(diagnostics))
-        chosen = tuple(choices)
-        if chosen not in self._known:
-            self._known[chosen] = self._with_options(chosen)
-        below = self._known[chosen]
+        choices, values = _choose(self._document.root, overrides, self._groups(diagnostics))
+        selection = tuple(choices)
+        if selection not in self._known:
+            self._known[selection] = self._with_options(selection)
+        below = self._known[selection]
         root, diagnostics = below.root, [*diagnostics, *below.diagnostics]
-        for override in rest:
+        for override in values:
             root = apply(root, override, diagnostics, [choice.group for choice in choices])
         return replace(below, root=root, diagnostics=tuple(diagnostics))
 
@@ -413,9 +415,9 @@ class Composer:
         options = [groups.option(choice) for choice in choices if choice.option is not None]
         root = _merged((*(option for option in options if option is not None), document.root))
         replaced = tuple(_replaced(document.root, choices, groups))
-        told, notes = tuple(groups.diagnostics), (*self._hides, *groups.notes)
+        diagnostics, notes = tuple(groups.diagnostics), (*self._hides, *groups.notes)
         return Composed(
-            self._path.stem, document.title, root, told, None not in options, replaced, notes
+            self._path.stem, document.title, root, diagnostics, None not in options, replaced, notes
         )
 
 
@@ -440,7 +442,7 @@ def merge(below: Value, above: Value) -> Value:
     if above.path == ("nodes",) and isinstance(below.data, list) and isinstance(above.data, list):
         joined = [*below.data, *above.data]
         return replace(
-            above, data=[replace(part, path=("nodes", i)) for i, part in enumerate(joined)]
+            above, data=[replace(entry, path=("nodes", i)) for i, entry in enumerate(joined)]
         )
     if not isinstance(below.data, dict) or not isinstance(above.data, dict) or _new_step(above):
         return above
@@ -457,7 +459,7 @@ def _merged(parts: tuple[Value, ...]) -> Value:
     """
     mark = parts[-1].mark
     return functools.reduce(
-        merge, (part.without("defaults") for part in parts), Value({}, mark, mark, ())
+        merge, (level.without("defaults") for level in parts), Value({}, mark, mark, ())
     )
 
 
@@ -475,19 +477,19 @@ def _choose(
     of single values.
     """
     choices = {choice.group: choice for choice in choices_of(root, groups.diagnostics)}
-    names, rest = functools.cache(groups.names), []
+    names, value_overrides = functools.cache(groups.names), []
     for o in overrides:
         group, data = o.path[0], o.value.data if o.value else None
         values = len(o.path) > 1 or isinstance(data, dict | list)
         if values or (group not in choices and (group in root.items or group not in names())):
-            rest.append(o)
+            value_overrides.append(o)
         elif message := _group_fault(o, choices):
             groups.diagnostics.append(Diagnostic(o.mark, o.text, message))
         elif o.sign == "~":
             del choices[group]
         else:
             choices[group] = Choice(group, None if data is None else str(data), o.mark, o.text)
-    return list(choices.values()), rest
+    return list(choices.values()), value_overrides
 
 
 def _replaced(
@@ -496,10 +498,10 @@ def _replaced(
     """Yield the path of each value in an option that the recipe names and an argument replaces
     or removes.
     """
-    chosen = {choice.group: choice for choice in choices}
+    final_choices = {choice.group: choice for choice in choices}
     silent = replace(groups, diagnostics=[], notes=[])
     for written in choices_of(root, []):
-        now = chosen.get(written.group)
+        now = final_choices.get(written.group)
         if written.option is None or (now and now.option == written.option):
             continue
         option = silent.option(written)

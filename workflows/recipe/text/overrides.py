@@ -112,13 +112,13 @@ def _follow(root: Value, path: tuple[str, ...]) -> tuple[Trail, tuple[str, ...]]
     """
     trail: Trail = []
     here = root
-    for n, part in enumerate(path):
+    for n, name in enumerate(path):
         items = here.items
         key: str | int = (
-            int(part) if part not in items and part.isdecimal() and int(part) in items else part
+            int(name) if name not in items and name.isdecimal() and int(name) in items else name
         )
         if key not in items:
-            return [*trail, (here, part)], path[n:]
+            return [*trail, (here, name)], path[n:]
         trail.append((here, key))
         here = items[key]
     return trail, ()
@@ -159,9 +159,9 @@ def _suggest(root: Value, path: tuple[str, ...], groups: Iterable[str]) -> str:
     typing error.
     """
     here, similar = root, list[str]()
-    for part in path:
+    for name in path:
         names = {*map(str, here.items), *((*RESERVED, *groups) if here is root else ())}
-        close = difflib.get_close_matches(part, names, 1)
+        close = difflib.get_close_matches(name, names, 1)
         if not close:
             break
         similar += close
@@ -213,8 +213,8 @@ def _parsed_again(trail: Trail, missing: tuple[str, ...], o: Override) -> Value 
     )
 
 
-def _key(part: str | int) -> str | int:
-    return int(part) if isinstance(part, str) and part.isdecimal() else part
+def _key(name: str | int) -> str | int:
+    return int(name) if isinstance(name, str) and name.isdecimal() else name
 
 
 def arguments_in(value: Value) -> Iterator[Location]:
@@ -257,26 +257,15 @@ def overrides_of(values: Mapping[str, Any], folder: Path) -> list[Override]:
     return overrides
 
 
-def _read(key: str, given: Any, mark: Location) -> Iterator[Override]:
+def _read(key: str, argument: Any, mark: Location) -> Iterator[Override]:
     """Yield the overrides that one keyword argument contains: one override for each value in a
     mapping.
     """
-    if key.startswith("~") and given is not None:
-        raise RecipeError(
-            [
-                Diagnostic(
-                    mark, key, f"~ removes a value and cannot set one: write {{{key!r}: None}}"
-                )
-            ]
-        )
-    try:
-        named = read_override(key if key.startswith("~") else f"{key}=null", mark)
-    except RecipeError as error:
-        raise RecipeError([Diagnostic(mark, key, p.message) for p in error.diagnostics]) from None
+    named = _named(key, argument, mark)
     if named.sign:
-        yield named if named.sign == "~" else _override(named, named.path, given)
+        yield named if named.sign == "~" else _override(named, named.path, argument)
         return
-    stack = [(named.path, given)]
+    stack = [(named.path, argument)]
     while stack:
         path, value = stack.pop()
         if isinstance(value, Mapping) and value and not _whole_step(path, value):
@@ -288,41 +277,57 @@ def _read(key: str, given: Any, mark: Location) -> Iterator[Override]:
             yield _override(named, path, value)
 
 
+def _named(key: str, argument: Any, mark: Location) -> Override:
+    """Return the override that the name of a keyword argument says, without its value."""
+    if key.startswith("~") and argument is not None:
+        raise RecipeError(
+            [
+                Diagnostic(
+                    mark, key, f"~ removes a value and cannot set one: write {{{key!r}: None}}"
+                )
+            ]
+        )
+    try:
+        return read_override(key if key.startswith("~") else f"{key}=null", mark)
+    except RecipeError as error:
+        raise RecipeError([Diagnostic(mark, key, p.message) for p in error.diagnostics]) from None
+
+
 def _whole_step(path: tuple[str, ...], value: Mapping[Any, Any]) -> bool:
     return len(path) == 2 and path[0] == "steps" and "node" in value
 
 
-def _override(named: Override, path: tuple[str, ...], given: Any) -> Override:
+def _override(named: Override, path: tuple[str, ...], argument: Any) -> Override:
     name = ".".join(path)
     mark = named.mark if path == named.path else replace(named.mark, file=f"argument {name}")
-    value = _value(given, mark, path)
+    value = _value(argument, mark, path)
     shown = flow(value.plain)
     shown = shown if len(shown) <= _LONGEST else shown[: _LONGEST - 1] + "…"
     return Override(f"{named.sign}{name}={shown}", named.sign, path, value, mark)
 
 
-def _value(given: Any, mark: Location, path: Where) -> Value:
+def _value(argument: Any, mark: Location, path: Where) -> Value:
     """Return a recipe `Value` with the data of a Python value and the location of the argument
     that contains it.
     """
-    if isinstance(given, Mapping):
+    if isinstance(argument, Mapping):
         data = {
             _python_key(key, mark, path): _value(item, mark, (*path, str(key)))
-            for key, item in given.items()
+            for key, item in argument.items()
         }
         return Value(data, mark, mark, path)
-    if isinstance(given, list | tuple | range):
+    if isinstance(argument, list | tuple | range):
         return Value(
-            [_value(item, mark, (*path, i)) for i, item in enumerate(given)], mark, mark, path
+            [_value(item, mark, (*path, i)) for i, item in enumerate(argument)], mark, mark, path
         )
-    if isinstance(given, os.PathLike):
-        return Value(os.fspath(given), mark, mark, path)
-    if given is None or isinstance(given, bool | int | float | str):
-        return Value(given, mark, mark, path)
+    if isinstance(argument, os.PathLike):
+        return Value(os.fspath(argument), mark, mark, path)
+    if argument is None or isinstance(argument, bool | int | float | str):
+        return Value(argument, mark, mark, path)
     # a number or an array of numpy or torch
-    listed = given.tolist() if hasattr(given, "tolist") else given
+    listed = argument.tolist() if hasattr(argument, "tolist") else argument
     if not isinstance(listed, bool | int | float | str | list):
-        message = f"a recipe cannot contain a value of type {type(given).__name__}: {_ALLOWED}"
+        message = f"a recipe cannot contain a value of type {type(argument).__name__}: {_ALLOWED}"
         raise RecipeError([Diagnostic(mark, dotted(path), message)])
     return _value(listed, mark, path)
 

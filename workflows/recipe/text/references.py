@@ -21,6 +21,9 @@ _REFERENCE = re.compile(r"\$\{([^${}]*)\}")
 _DEEPEST = 50  #: longest chain of references
 _MOST_VALUES = 100_000  #: values to which references may expand one value
 _MOST_CHARACTERS = 100_000  #: characters to which references may expand one text
+#: what to do about a block that lacks values, in a recipe and in an option of the user
+_ADVICE_IN_RECIPE = "give them, or name an option that has them in `defaults`"
+_ADVICE_IN_OPTION = "extend an option that has them, such as `defaults: [small]`"
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +48,8 @@ class Scope:
             return self.items[parts[1]], parts[2:], ""
         if not dims:
             return None, [], f"${{{'.'.join(parts)}}} needs `each` in steps.{self.step}"
-        rest = "".join(f".{part}" for part in parts[1 if parts[0] == "item" else 2 :])
-        return None, [], f"write {' or '.join(f'${{each.{dim}{rest}}}' for dim in dims)}"
+        below = "".join(f".{name}" for name in parts[1 if parts[0] == "item" else 2 :])
+        return None, [], f"write {' or '.join(f'${{each.{dim}{below}}}' for dim in dims)}"
 
 
 class References:
@@ -84,13 +87,12 @@ class References:
         value does not exist.
         """
         if isinstance(value.data, dict):
-            children = [
-                (key, child, self.resolve(child, scope)) for key, child in value.data.items()
-            ]
-            kept = [each for each in children if each[2].data is not ABSENT]
-            return replace(
-                value, data={key: replace(resolved, key=child.key) for key, child, resolved in kept}
-            )
+            data = {}
+            for key, child in value.data.items():
+                resolved = self.resolve(child, scope)
+                if resolved.data is not ABSENT:
+                    data[key] = replace(resolved, key=child.key)
+            return replace(value, data=data)
         if isinstance(value.data, list):
             items = (self.resolve(child, scope) for child in value.data)
             return replace(value, data=[item for item in items if item.data is not ABSENT])
@@ -233,9 +235,9 @@ class References:
                 if parts[0] not in ("item", "each"):
                     self._target(match[1], text, Scope({}, ""))
                     continue
-                rest = parts[1 if parts[0] == "item" else 2 :]
+                below = parts[1 if parts[0] == "item" else 2 :]
                 blocks = ((dim, self.root.items[dim].items) for dim in dims or self.root.items)
-                self.used |= {(dim, name, *rest) for dim, block in blocks for name in block}
+                self.used |= {(dim, name, *below) for dim, block in blocks for name in block}
 
     def finish(self) -> None:
         """Report values of the recipe that no step uses, and references to values that do not
@@ -248,35 +250,28 @@ class References:
         misspelt = set()
         for leaf in self._unused():
             meant = self._meant(leaf) or ()
-            if _is_packaged(leaf) and meant not in targets:
+            if meant not in targets and self._may_be_unused(leaf):
                 self.spare.add(leaf.path)
-                continue
-            if (
-                leaf.path in self.replaced
-                and meant not in targets
-                and leaf.mark.line
-                and leaf.key.line
-            ):
-                self.spare.add(leaf.path)
-                self.notes.append(
-                    f"{leaf.name} ({leaf.mark}) is not used with {self.replaced[leaf.path]}"
-                )
                 continue
             misspelt.add(meant)
-            if now := instead(leaf.name):
-                self.diagnostics.append(Diagnostic(leaf.key, leaf.name, now))
-                continue
-            shown = dotted(meant[-1:] if meant[:-1] == leaf.path[:-1] else meant)
-            hint = f"; did you mean {shown}?" if shown else ": no step refers to this value"
-            user = f" (needed at {targets[meant].mark})" if meant in targets else ""
-            code = "" if shown else UNREAD
-            self.diagnostics.append(Diagnostic(leaf.key, leaf.name, f"unknown{hint}{user}", code))
+            self.diagnostics.append(_unknown(leaf, meant, targets.get(meant)))
         lacking = [(path, problem) for path, problem in self.lacking if path not in misspelt]
-        whole = dict(self._incomplete({path for path, _ in lacking}))
-        self.diagnostics += whole.values()
+        incomplete = dict(self._incomplete({path for path, _ in lacking}))
+        self.diagnostics += incomplete.values()
         self.diagnostics += [
-            problem for path, problem in lacking if path[0] not in whole or len(path) != 2
+            problem for path, problem in lacking if path[0] not in incomplete or len(path) != 2
         ]
+
+    def _may_be_unused(self, leaf: Value) -> bool:
+        """Return True for a value of a packaged option, and for one of an option that an argument
+        replaces, which is noted.
+        """
+        if _is_packaged(leaf):
+            return True
+        if leaf.path not in self.replaced or not leaf.mark.line or not leaf.key.line:
+            return False
+        self.notes.append(f"{leaf.name} ({leaf.mark}) is not used with {self.replaced[leaf.path]}")
+        return True
 
     def _incomplete(self, lacking: set[Where]) -> Iterator[tuple[str | int, Diagnostic]]:
         """Yield one diagnostic for each block of the user that lacks values, at the block
@@ -287,21 +282,17 @@ class References:
             paths = sorted(
                 dotted(path[1:]) for path in lacking if path[0] == key and len(path) == 2
             )
-            if (
-                block is None
-                or not block.mark.line
-                or _place(block) == "packaged"
-                or not isinstance(block.data, dict)
-            ):
+            if block is None or not block.mark.line or not isinstance(block.data, dict):
                 continue
-            if len(paths) < (3 if _place(block) == "recipe" else 1):
+            place = _place(block)
+            if place == "packaged" or len(paths) < (3 if place == "recipe" else 1):
                 continue
             names = ", ".join(paths[:6]) + (f" and {len(paths) - 6} more" if len(paths) > 6 else "")
-            needs = f"lacks {names}, which steps need"
-            how = "extend an option that has them, such as `defaults: [small]`"
-            if _place(block) == "recipe":
-                how = "give them, or name an option that has them in `defaults`"
-            yield key, Diagnostic(block.key, str(key), f"{needs}: {how}")
+            advice = _ADVICE_IN_RECIPE if place == "recipe" else _ADVICE_IN_OPTION
+            yield (
+                key,
+                Diagnostic(block.key, str(key), f"lacks {names}, which steps need: {advice}"),
+            )
 
     def _unused(self) -> list[Value]:
         blocks = (block for key, block in self.root.items.items() if key not in RESERVED)
@@ -316,9 +307,23 @@ class References:
         """
         if now := new_name(leaf.name):
             return tuple(now.split("."))
-        known = {*self.used, *self.offered, *(path for path, _ in self.lacking)}
-        known |= {(name,) for name in (*RESERVED, "defaults")} if len(leaf.path) == 1 else set()
-        return _nearest(leaf.path, known)
+        candidates = {*self.used, *self.offered, *(path for path, _ in self.lacking)}
+        candidates |= (
+            {(name,) for name in (*RESERVED, "defaults")} if len(leaf.path) == 1 else set()
+        )
+        return _nearest(leaf.path, candidates)
+
+
+def _unknown(leaf: Value, meant: Where, needed: Diagnostic | None) -> Diagnostic:
+    """Return the diagnostic for a value that no step uses; ``needed`` is the one of a missing value
+    that the user probably ``meant``.
+    """
+    if now := instead(leaf.name):
+        return Diagnostic(leaf.key, leaf.name, now)
+    shown = dotted(meant[-1:] if meant[:-1] == leaf.path[:-1] else meant)
+    hint = f"; did you mean {shown}?" if shown else ": no step refers to this value"
+    user = f" (needed at {needed.mark})" if needed else ""
+    return Diagnostic(leaf.key, leaf.name, f"unknown{hint}{user}", "" if shown else UNREAD)
 
 
 def _place(block: Value) -> Literal["packaged", "option", "recipe"]:
@@ -338,12 +343,12 @@ def _is_packaged(leaf: Value) -> bool:
     return leaf.key.line > 0 and leaf.mark.line > 0 and Path(leaf.mark.folder).parent == packaged()
 
 
-def _nearest(path: Where, known: set[Where]) -> Where | None:
-    """Return the path in ``known`` with the last name most similar to that of ``path``, if
+def _nearest(path: Where, candidates: set[Where]) -> Where | None:
+    """Return the path in ``candidates`` with the last name most similar to that of ``path``, if
     possible in its block.
     """
-    paths_by_name = {str(other[-1]): other for other in sorted(known, key=str)}
-    beside = {str(other[-1]): other for other in known if other[:-1] == path[:-1]}
+    paths_by_name = {str(other[-1]): other for other in sorted(candidates, key=str)}
+    beside = {str(other[-1]): other for other in candidates if other[:-1] == path[:-1]}
     for paths in (beside, paths_by_name):
         close = difflib.get_close_matches(str(path[-1]), paths, 1, 0.75)
         if close:

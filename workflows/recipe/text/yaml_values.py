@@ -373,9 +373,9 @@ def read(path: Path, shown: str) -> Document:
 def _document(text: str, shown: str, folder: str) -> Document:
     root = parse(text, Location(shown, 1, 1, folder))
     if not isinstance(root.data, dict):
-        what = "the file is empty" if root.data is None else f"the file contains {kind(root)}"
+        problem = "the file is empty" if root.data is None else f"the file contains {kind(root)}"
         raise RecipeError(
-            [Diagnostic(Location(shown, 1, 1), "", f"{what}: write a mapping, `key: value`")]
+            [Diagnostic(Location(shown, 1, 1), "", f"{problem}: write a mapping, `key: value`")]
         )
     first = text.lstrip().partition("\n")[0].strip()
     return Document(root, visible(first.lstrip("# ")) if first.startswith("#") else "")
@@ -514,12 +514,12 @@ class _Builder:
         self.size[id(node)] = 1 + sum(self.size.get(id(child), 1) for child in children)
         self._refuse_many(self.size[id(node)], _MOST, value.mark, value.path)
 
-    def _refuse_many(self, count: int, most: int, mark: Location, path: Where) -> None:
-        if count > most:
+    def _refuse_many(self, count: int, limit: int, mark: Location, path: Where) -> None:
+        if count > limit:
             raise RecipeError(
                 [
                     Diagnostic(
-                        mark, dotted(path), f"aliases expand this value to more than {most} values"
+                        mark, dotted(path), f"aliases expand this value to more than {limit} values"
                     )
                 ]
             )
@@ -556,8 +556,8 @@ def _fault(text: str) -> str:
     """Return what is wrong with the text of a scalar that would harm a reader or the program, or
     an empty text.
     """
-    if found := CONTROL.search(text):
-        return f"has the control character {visible(found[0])}: remove it"
+    if control := CONTROL.search(text):
+        return f"has the control character {visible(control[0])}: remove it"
     if len(text) > _DIGITS and _INT.fullmatch(text):
         return f"has {len(text)} digits, more than the limit of {_DIGITS}"
     return ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from neusee.workflows.graph.recipe_graph import in_order
 from neusee.workflows.placement.heft_schedule import Schedule
@@ -166,19 +166,19 @@ def broken(name: str, letters: int, copies: str = "") -> str:
     if len(name + copies) <= letters:
         return name + copies
     cuts = [i + 1 for i, sign in enumerate(name[:-1]) if sign in "_. " and i < letters]
-    at = cuts[-1] if cuts else letters
+    cut = cuts[-1] if cuts else letters
     room = max(letters - len(copies), 3)
-    first, rest = name[:at].rstrip(), name[at:]
-    if len(rest) > room:
-        rest = f"{rest[: room // 2]}…{rest[-(room - room // 2 - 1) :]}"
-    return f"{first}\n{rest}{copies}"
+    first, second = name[:cut].rstrip(), name[cut:]
+    if len(second) > room:
+        second = f"{second[: room // 2]}…{second[-(room - room // 2 - 1) :]}"
+    return f"{first}\n{second}{copies}"
 
 
 def _legend(figure: Any, looks: Iterable[str]) -> None:
     from matplotlib.patches import Patch
 
-    used = [k for k in LOOKS if k in set(looks)]
-    patches = [Patch(facecolor=LOOKS[k][0], edgecolor="#444444", label=LOOKS[k][1]) for k in used]
+    kinds = [k for k in LOOKS if k in set(looks)]
+    patches = [Patch(facecolor=LOOKS[k][0], edgecolor="#444444", label=LOOKS[k][1]) for k in kinds]
     figure.legend(handles=patches, loc="outside upper center", ncols=len(patches), fontsize=10)
 
 
@@ -201,6 +201,15 @@ _BETWEEN = 0.06  #: space between the axes, as a share of their mean height
 _STEP_HEIGHT, _LANE_HEIGHT = 0.2, 0.3
 
 
+class _Chart(NamedTuple):
+    """What the bars of a Gantt chart show."""
+
+    plan: Spans
+    ran: Spans
+    colour: Mapping[str, str]  #: of each lane
+    scale: float  #: of a second, in the unit of the axis
+
+
 @drawn
 def timeline(*, schedule: Schedule, rows: Iterable[Row]) -> Any:
     """Draw a Gantt chart by device and by step, with hollow bars for predicted times and solid bars
@@ -210,25 +219,20 @@ def timeline(*, schedule: Schedule, rows: Iterable[Row]) -> Any:
     """
     ran = {step: (lane, began, seconds) for step, lane, began, seconds in rows}
     plan = {slot.task: (slot.device, slot.start, slot.end - slot.start) for slot in schedule.slots}
-    used = dict.fromkeys(lane for lane, _, _ in (*plan.values(), *ran.values()))
-    lanes = [
-        *(lane for lane in schedule.peak if lane in used),
-        *(lane for lane in used if lane not in schedule.peak),
-    ]
+    lanes = _lanes_in_use(schedule, plan, ran)
     steps = _shown(plan, ran)
-    end = (
-        max((start + took for _, start, took in (*plan.values(), *ran.values())), default=0.0)
-        or 1.0
-    )
+    spans = (*plan.values(), *ran.values())
+    end = max((start + took for _, start, took in spans), default=0.0) or 1.0
     scale, unit = _unit(end)
     heights = (_LANE_HEIGHT * max(len(lanes), 2) + 0.25, _STEP_HEIGHT * max(len(steps), 3) + 0.25)
     figure, axes = canvas(
         10.0, sum(heights) + 1.1, 2, 1, layout=None, sharex=True, height_ratios=heights
     )
     colour = dict(zip(lanes, itertools.cycle(_COLOURS), strict=False))
-    _lanes(axes[0, 0], colour, plan, ran, scale)
+    chart = _Chart(plan, ran, colour, scale)
+    _lanes(axes[0, 0], chart)
     critical = {slot.task for slot in schedule.critical_path()}
-    _steps(axes[1, 0], steps, plan, ran, colour, scale, critical)
+    _steps(axes[1, 0], steps, chart, critical)
     left = len(plan.keys() | ran.keys()) - len(steps)
     xlabel = f"time ({unit})" + (f"; the {left} shortest steps have no row" if left else "")
     axes[1, 0].set(xlabel=xlabel, xlim=(-0.004 * end * scale, end * scale * 1.01))
@@ -236,6 +240,15 @@ def timeline(*, schedule: Schedule, rows: Iterable[Row]) -> Any:
     _gantt_legend(figure)
     _place(figure, [*lanes, *steps])
     return figure
+
+
+def _lanes_in_use(schedule: Schedule, plan: Spans, ran: Spans) -> list[str]:
+    """Return the lanes of planned and of actual steps, those of the schedule first."""
+    in_use = dict.fromkeys(lane for lane, _, _ in (*plan.values(), *ran.values()))
+    return [
+        *(lane for lane in schedule.peak if lane in in_use),
+        *(lane for lane in in_use if lane not in schedule.peak),
+    ]
 
 
 def _shown(plan: Spans, ran: Spans) -> list[str]:
@@ -246,10 +259,11 @@ def _shown(plan: Spans, ran: Spans) -> list[str]:
     return sorted(longest[:_MOST], key=lambda s: (ran.get(s) or plan[s])[1])
 
 
-def _lanes(ax: Any, colour: Mapping[str, str], plan: Spans, ran: Spans, scale: float) -> None:
+def _lanes(ax: Any, chart: _Chart) -> None:
     """Draw two rows of bars for each device: the predicted times of its steps above, the actual
     times below.
     """
+    plan, ran, colour, scale = chart
     for y, lane in enumerate(colour):
         planned = [(start * scale, took * scale) for on, start, took in plan.values() if on == lane]
         done = [(start * scale, took * scale) for on, start, took in ran.values() if on == lane]
@@ -264,18 +278,11 @@ def _lanes(ax: Any, colour: Mapping[str, str], plan: Spans, ran: Spans, scale: f
         tick.set(color=shade, fontweight="bold")
 
 
-def _steps(
-    ax: Any,
-    steps: Sequence[str],
-    plan: Spans,
-    ran: Spans,
-    colour: Mapping[str, str],
-    scale: float,
-    critical: set[str],
-) -> None:
+def _steps(ax: Any, steps: Sequence[str], chart: _Chart, critical: set[str]) -> None:
     """Draw one row for each step, and write the predicted and the actual duration of the step at
     the right.
     """
+    plan, ran, colour, scale = chart
     right: dict[str, Any] = {"transform": ax.get_yaxis_transform(), "va": "center"}
     for y, step in enumerate(steps):
         if step in plan:
@@ -310,7 +317,8 @@ def _place(figure: Any, names: Sequence[str]) -> None:
     renderer, (width, height) = figure.canvas.get_renderer(), figure.get_size_inches()
     top, bottom = figure.axes
     longest = sorted(names, key=len)[-_MEASURED:]
-    labels = [t for ax in (top, bottom) for t in ax.get_yticklabels() if t.get_text() in longest]
+    names_beside = [*top.get_yticklabels(), *bottom.get_yticklabels()]
+    labels = [text for text in names_beside if text.get_text() in longest]
     times = sorted(bottom.texts, key=lambda text: len(text.get_text()))[-_MEASURED:]
     left, right = (
         max((text.get_window_extent(renderer).width for text in texts), default=0.0) / figure.dpi
@@ -342,9 +350,9 @@ def _title(plan: Spans, ran: Spans) -> str:
         for word, spans in (("planned", plan), ("took", ran))
         if spans
     }
-    known = sum(step in plan for step in ran)
-    if plan and known < len(ran):
-        ends["planned"] += f" for {known} of {len(ran)} steps"
+    predicted = sum(step in plan for step in ran)
+    if plan and predicted < len(ran):
+        ends["planned"] += f" for {predicted} of {len(ran)} steps"
     return ", ".join(f"{word} {end}" for word, end in ends.items()) or "nothing to run"
 
 

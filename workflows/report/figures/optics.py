@@ -98,12 +98,12 @@ def psf(*, plain: Psf, mask: Psf, bands: Bands, pixel_pitch: float) -> Any:
     figure, axes = canvas(13.0, 6.6, 2, 4)
     figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
     shown: Any = None
-    for row, (arm, each) in enumerate({"plain lens": plain, "with mask": mask}.items()):
+    for row, (arm, arm_psf) in enumerate({"plain lens": plain, "with mask": mask}.items()):
         for column, wavelength in enumerate(_WAVELENGTHS):
             shown = _spot(
-                axes[row, column], each, *nearest(bands.centres, wavelength), pixel_pitch, arm
+                axes[row, column], arm_psf, *nearest(bands.centres, wavelength), pixel_pitch, arm
             )
-        _encircled(axes[row, 3], each, bands, pixel_pitch, arm)
+        _encircled(axes[row, 3], arm_psf, bands, pixel_pitch, arm)
     bar = figure.colorbar(shown, ax=axes[:, :3].ravel().tolist(), fraction=0.025, pad=0.01)
     bar.set_label("log₁₀ (pixel / peak of the clear lens)", fontsize=10)
     bar.ax.tick_params(labelsize=9)
@@ -305,8 +305,8 @@ def _height(
     extent = (-half[1], half[1], -half[0], half[0])
     microns = (heights[::step, ::step].double() * 1e6).numpy()
     shown = ax.imshow(microns, origin="lower", extent=extent, cmap="cividis")
-    what = "mm" if own else "samples"
-    ax.set(title=file.name, xlabel=f"u ({what})", ylabel=f"v ({what})")
+    unit_name = "mm" if own else "samples"
+    ax.set(title=file.name, xlabel=f"u ({unit_name})", ylabel=f"v ({unit_name})")
     ax.grid(False)
     bar = figure.colorbar(shown, ax=ax, fraction=0.046, pad=0.03)
     bar.set_label("height (µm)", fontsize=9)

@@ -96,8 +96,11 @@ def png_of(figure: Any) -> bytes:
         engine.execute(figure)
     drawn_part = figure.get_tightbbox(figure.canvas.get_renderer()).padded(_MARGIN)
     figure.set_layout_engine(None)
-    more = {"metadata": {"Software": "neusee"}, "pil_kwargs": {"compress_level": _COMPRESSION}}
-    figure.savefig(out, format="png", bbox_inches=drawn_part, **more)
+    png_options = {
+        "metadata": {"Software": "neusee"},
+        "pil_kwargs": {"compress_level": _COMPRESSION},
+    }
+    figure.savefig(out, format="png", bbox_inches=drawn_part, **png_options)
     return out.getvalue()
 
 
@@ -235,22 +238,21 @@ def _place(ax: Any, point: PointLabel, taken: list[Any], renderer: Any, framed: 
     style |= {"bbox": _FRAME} if framed else {}
     for x, y in _OFFSETS:
         side = "left" if x > 0 else "right" if x < 0 else "center"
-        at = {"xytext": (x, y), "textcoords": "offset points", "ha": side}
-        text = ax.annotate(point.text, (point.x, point.y), **at, fontsize=9, **style)
+        placement = {"xytext": (x, y), "textcoords": "offset points", "ha": side}
+        text = ax.annotate(point.text, (point.x, point.y), **placement, fontsize=9, **style)
         text.set_in_layout(False)
         box = text.get_window_extent(renderer)
-        whole = (
-            inside.x0 <= box.x0
-            and box.x1 <= inside.x1
-            and inside.y0 <= box.y0
-            and box.y1 <= inside.y1
-        )
-        if whole and not any(
-            box.padded(_APART, _APART * framed).overlaps(other) for other in taken
-        ):
+        padded = box.padded(_APART, _APART * framed)
+        if _contains(inside, box) and not any(padded.overlaps(other) for other in taken):
             taken.append(box)
             return
         text.remove()
+
+
+def _contains(outer: Any, box: Any) -> bool:
+    """Return True if a box lies in another one."""
+    across = bool(outer.x0 <= box.x0 and box.x1 <= outer.x1)
+    return across and bool(outer.y0 <= box.y0 and box.y1 <= outer.y1)
 
 
 def plain_ticks(axis: Any) -> None:

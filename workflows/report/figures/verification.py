@@ -122,23 +122,25 @@ def laser_trial(step: Callable[..., Any], psf: Psf, size: int = 192) -> Tensor:
     core = psf.intensity[band : band + 1, top : top + 2 * half, left : left + 2 * half]
     kernel = Psf(core / core.sum(), psf.clear_peak[band : band + 1])
     scene = torch.rand(1, size, size, generator=torch.Generator().manual_seed(3))
-    at = size // 2 - 11
+    position = size // 2 - 11
     return torch.tensor(
-        [_errors(step, scene, kernel, strength, at, half) for strength in STRENGTHS]
+        [_errors(step, scene, kernel, strength, position, half) for strength in STRENGTHS]
     ).T
 
 
 def _errors(
-    step: Callable[..., Any], scene: Tensor, psf: Psf, strength: float, at: int, half: int
+    step: Callable[..., Any], scene: Tensor, psf: Psf, strength: float, position: int, half: int
 ) -> list[float]:
     point = torch.zeros_like(scene)
-    point[..., at, at] = strength
+    point[..., position, position] = strength
     spot = torch.zeros_like(scene)
-    spot[..., at - half : at + half, at - half : at + half] = strength * psf.intensity
+    spot[..., position - half : position + half, position - half : position + half] = (
+        strength * psf.intensity
+    )
     double = psf._replace(intensity=psf.intensity.double())
     truth = step(scene.double(), double) + spot.double()
     results = (step(scene, psf) + spot, step(scene + point, psf))
-    down, across = (torch.arange(n) - at for n in scene.shape[-2:])
+    down, across = (torch.arange(n) - position for n in scene.shape[-2:])
     far = torch.hypot(down[:, None].double(), across[None, :].double()) > 16
     return [
         float(((x.double() - truth).abs()[..., far]).max() / (scene.max() - scene.min()))
@@ -171,11 +173,11 @@ def transfer(*, measured: Tensor) -> Any:
     ax = axes[0, 0]
     lit = signal > 0
     clipped = lit & (variance < _CLIPPED * predicted)
-    seen = lit & ~clipped & (variance > 0)
-    light, floor = signal[seen], float(predicted[0].sqrt())
+    unclipped = lit & ~clipped & (variance > 0)
+    light, floor = signal[unclipped], float(predicted[0].sqrt())
     ax.loglog(
         light.numpy(),
-        variance[seen].sqrt().numpy(),
+        variance[unclipped].sqrt().numpy(),
         "o",
         color=BLACK,
         markersize=4,
@@ -183,13 +185,13 @@ def transfer(*, measured: Tensor) -> Any:
     )
     ax.loglog(
         light.numpy(),
-        predicted[seen].sqrt().numpy(),
+        predicted[unclipped].sqrt().numpy(),
         "-",
         color="#777777",
         linewidth=1.2,
         label="predicted",
     )
-    shot = (predicted[seen] - predicted[0]).clamp_min(0.0).sqrt()
+    shot = (predicted[unclipped] - predicted[0]).clamp_min(0.0).sqrt()
     ax.loglog(light.numpy(), shot.numpy(), "--", color=BLUE, label="shot noise, slope ½")
     if floor > 0:  # a sensor without noise has no floor, which a logarithmic axis could not show
         ax.axhline(floor, color=GREEN, linestyle="-.", label=f"dark noise, {floor:.3g} DN, slope 0")
@@ -197,9 +199,11 @@ def transfer(*, measured: Tensor) -> Any:
     ax.axvline(
         full, color=VERMILION, linestyle=":", label=f"largest signal, {full:,.0f} DN above dark"
     )
-    least = min([x for x in (floor, *variance[seen].sqrt().tolist()) if x > 0], default=1.0) / 3
+    lowest = (
+        min([x for x in (floor, *variance[unclipped].sqrt().tolist()) if x > 0], default=1.0) / 3
+    )
     if bool(clipped.any()):
-        heights = variance[clipped].sqrt().clamp_min(1.3 * least)
+        heights = variance[clipped].sqrt().clamp_min(1.3 * lowest)
         ax.loglog(
             signal[clipped].numpy(),
             heights.numpy(),
@@ -207,7 +211,7 @@ def transfer(*, measured: Tensor) -> Any:
             label="clipped: noise at most as drawn",
             **_OPEN,
         )
-    ax.set_ylim(least, 3 * max(float(predicted.max().sqrt()), least))
+    ax.set_ylim(lowest, 3 * max(float(predicted.max().sqrt()), lowest))
     title = "photon-transfer curve of this sensor"
     ax.set(title=title, xlabel="mean above dark (DN)", ylabel="standard deviation (DN)")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2)

@@ -112,7 +112,7 @@ def steps(diagrams: Sequence[tuple[str, Sequence[Line], float]]) -> Any:
     """
     columns = min(3, len(diagrams))
     rows = -(-len(diagrams) // columns)
-    styles = _styles(line.name for _, lines, _ in diagrams for line in lines)
+    styles = _styles(line.name for line in itertools.chain(*(lines for _, lines, _ in diagrams)))
     width = 3.9 * columns + 0.4
     across = min(int(width / _ENTRY), 1 + len(styles))
     below = max(0.7, 0.25 * math.ceil((1 + len(styles)) / across))
@@ -131,11 +131,10 @@ def steps(diagrams: Sequence[tuple[str, Sequence[Line], float]]) -> Any:
         ax.set_ylabel("error")
     for ax in list(axes.flat)[len(diagrams) :]:
         ax.set_axis_off()
-    handles = {
-        label: h
-        for ax in axes.flat
-        for h, label in zip(*ax.get_legend_handles_labels(), strict=True)
-    }
+    handles: dict[str, Any] = {}
+    for ax in axes.flat:
+        marks, labels = ax.get_legend_handles_labels()
+        handles |= dict(zip(labels, marks, strict=True))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=across)
     _place_labels(figure, shown)
     return figure
@@ -161,7 +160,7 @@ def promises(
     ax.set_xlabel("tolerance")
     ax.set_ylabel("error")
     ax.invert_xaxis()
-    _draw_exact_level(ax, [e for errors in measured.values() for e in errors], EXACT)
+    _draw_exact_level(ax, itertools.chain.from_iterable(measured.values()), EXACT)
     ax.set_ylim(bottom=min(ax.get_ylim()[0], EXACT / 5))
     figure.legend(*ax.get_legend_handles_labels(), loc="outside right upper")
     return figure
@@ -185,8 +184,8 @@ def _draw_diagram(
     ax, lines, styles, exact = diagram
     ax.set_xscale("log")
     ax.set_yscale("log")
-    dots = [d for line in lines for d in line.dots]
-    y = [max(e, exact) for d in dots for e in (d.error, d.most or d.error)]
+    dots = _dots(lines)
+    y = [max(d.error, exact) for d in dots] + [max(d.most or d.error, exact) for d in dots]
     # set limits first: with automatic limits, matplotlib warns of errors that differ in the last
     # digit only
     ax.set_xlim(*_axis_limits([*(d.seconds for d in dots), *seconds], 10.0, 1.5))
@@ -197,12 +196,17 @@ def _draw_diagram(
     _draw_exact_level(ax, [d.error for d in dots], exact)
 
 
-def _axis_limits(values: Sequence[float], least: float, margin: float) -> tuple[float, float]:
+def _dots(lines: Sequence[Line]) -> list[Dot]:
+    """Return the dots of all lines."""
+    return list(itertools.chain(*(line.dots for line in lines)))
+
+
+def _axis_limits(values: Sequence[float], ratio: float, margin: float) -> tuple[float, float]:
     """Return the limits of a logarithmic axis: a margin around all values, and a ratio of at
-    least ``least``.
+    least ``ratio``.
     """
     low, high = min(values) / margin, max(values) * margin
-    wider = math.sqrt(max(1.0, least / (high / low)))
+    wider = math.sqrt(max(1.0, ratio / (high / low)))
     return low / wider, high * wider
 
 
@@ -211,8 +215,8 @@ def _draw(ax: Any, line: Line, colour: str, mark: str, exact: float) -> None:
     error of the point.
     """
     y = np.maximum([d.error for d in line.dots], exact)
-    least = np.maximum([d.error if d.least is None else d.least for d in line.dots], exact)
-    most = np.maximum([d.error if d.most is None else d.most for d in line.dots], exact)
+    lower = np.maximum([d.error if d.least is None else d.least for d in line.dots], exact)
+    upper = np.maximum([d.error if d.most is None else d.most for d in line.dots], exact)
     style = {"color": colour, "marker": mark, "markersize": 7, "capsize": 3, "label": line.name}
     style |= (
         {"linewidth": 2.0, "alpha": 1.0, "zorder": 3}
@@ -222,7 +226,7 @@ def _draw(ax: Any, line: Line, colour: str, mark: str, exact: float) -> None:
     ax.errorbar(
         [d.seconds for d in line.dots],
         y,
-        yerr=np.maximum([y - least, most - y], 0.0),
+        yerr=np.maximum([y - lower, upper - y], 0.0),
         **{"zorder": 2} | style,
     )
 
@@ -235,20 +239,20 @@ def _ring_own_setting(ax: Any, lines: Sequence[Line]) -> None:
         "markeredgecolor": BLACK,
         "linestyle": "",
     }
-    for dot in [d for line in lines for d in line.dots if d.own][:1]:
-        at = [dot.seconds], [max(dot.error, EXACT)]
-        ax.plot(*at, **ring, markeredgewidth=1.6, label="the recipe's own settings", zorder=4)
+    for dot in [d for d in _dots(lines) if d.own][:1]:
+        place = [dot.seconds], [max(dot.error, EXACT)]
+        ax.plot(*place, **ring, markeredgewidth=1.6, label="the recipe's own settings", zorder=4)
 
 
 def _draw_exact_level(ax: Any, errors: Iterable[float], exact: float) -> None:
     if any(e < exact for e in errors):
         ax.axhline(exact, color=_GREY, linewidth=0.8, linestyle=":")
-        at = ax.get_yaxis_transform()
+        transform = ax.get_yaxis_transform()
         ax.text(
             0.01,
             exact / 1.2,
             "smaller errors, and no error",
-            transform=at,
+            transform=transform,
             va="top",
             fontsize=9,
             color=_GREY,
@@ -259,14 +263,14 @@ def _place_labels(figure: Any, diagrams: Sequence[Diagram]) -> None:
     """Write the label of each point of the diagrams where the label covers no marker, no note
     and no other label.
     """
-    points = {
-        ax: [
-            PointLabel(d.seconds, max(d.error, exact), d.label, styles[line.name][0])
-            for line in lines
-            for d in line.dots
-        ]
-        for ax, lines, styles, exact in diagrams
-    }
+    points: dict[Any, list[PointLabel]] = {}
+    for ax, lines, styles, exact in diagrams:
+        points[ax] = []
+        for line in lines:
+            colour = styles[line.name][0]
+            points[ax] += [
+                PointLabel(d.seconds, max(d.error, exact), d.label, colour) for d in line.dots
+            ]
     place_labels(figure, points)
 
 
@@ -371,35 +375,43 @@ def count_missed(points: Points) -> int:
 
 def lead(recipe: Recipe, points: Points) -> str:
     """Return the summary of the accuracy study in a few sentences."""
-    own, whole, chosen = _own(points), _whole(points), choices(points)
-    sentences = []
-    if own is not None:
-        sentences.append(
-            f"With its own tolerance of {power_of_ten(recipe.tolerance)}, the recipe takes"
-            f" {own.seconds:.3g} s; its largest error is {own.most:.2g}, at the output"
-            f" {_worst_output(own)}."
-        )
-    if own is not None and whole is not None:
-        ratio = whole.seconds / own.seconds
-        sentences.append(
-            f"The full computation takes {whole.seconds:.3g} s, {ratio:.1f} times as long."
-        )
-    sentences.append(f"{sum(c.held for c in chosen)} of {len(chosen)} tolerances were held.")
-    if whole is not None and (beyond := sum(_beyond_rounding(c, points) for c in chosen)):
-        sentences.append(
-            f"{beyond} cannot be tested: rounding gives the full computation itself an error of"
-            f" {whole.most:.1g}."
-        )
-    if (ratio_of_times := median_ratio(chosen)) is not None:
-        sentences.append(
-            f"At the median, the engine's choice takes {ratio_of_times:.2f} times as long as the"
-            " cheapest setting."
-        )
+    sentences = [*_times(recipe, points), *_kept_tolerances(points)]
     load = max((p.found.load for p in points), default=0.0)
     if load > _BUSY:
         busy = f"The machine was busy with other work ({load:.1f} processes for each core)"
         sentences.append(f"{busy}: run times are too long and vary.")
     return " ".join(sentences)
+
+
+def _times(recipe: Recipe, points: Points) -> Iterator[str]:
+    """Yield how long the recipe and the full computation take."""
+    own, full = _own(points), _whole(points)
+    if own is None:
+        return
+    yield (
+        f"With its own tolerance of {power_of_ten(recipe.tolerance)}, the recipe takes"
+        f" {own.seconds:.3g} s; its largest error is {own.most:.2g}, at the output"
+        f" {_worst_output(own)}."
+    )
+    if full is not None:
+        ratio = full.seconds / own.seconds
+        yield f"The full computation takes {full.seconds:.3g} s, {ratio:.1f} times as long."
+
+
+def _kept_tolerances(points: Points) -> Iterator[str]:
+    """Yield how many tolerances were held, and how good the choices are."""
+    full, judged = _whole(points), choices(points)
+    yield f"{sum(c.held for c in judged)} of {len(judged)} tolerances were held."
+    if full is not None and (beyond := sum(_beyond_rounding(c, points) for c in judged)):
+        yield (
+            f"{beyond} cannot be tested: rounding gives the full computation itself an error of"
+            f" {full.most:.1g}."
+        )
+    if (ratio_of_times := median_ratio(judged)) is not None:
+        yield (
+            f"At the median, the engine's choice takes {ratio_of_times:.2f} times as long as the"
+            " cheapest setting."
+        )
 
 
 def _own(points: Points) -> WorkPrecisionPoint | None:
@@ -414,32 +426,37 @@ def _beyond_rounding(choice: ToleranceChoice, points: Points) -> bool:
     """Return True if the measured error exceeds the tolerance, but by at most the rounding
     error.
     """
-    whole = _whole(points)
-    rounding = _NO_WORSE * whole.most if whole else 0.0
+    full = _whole(points)
+    rounding = _NO_WORSE * full.most if full else 0.0
     return not choice.held and choice.chosen.most <= choice.tolerance + rounding
 
 
 def pictures(result: AccuracyResult) -> dict[str, bytes]:
     """Return the diagrams of the accuracy study's page by name, as PNG bytes."""
-    drawn = {}
+    images = {}
     sound = [p for p in result.points if p.sound]
     if sound:
         front = [(p.seconds, p.error) for p in pareto_front(sound)]
         title = f"{result.recipe.name}: error against run time"
-        drawn["work_precision"] = work_precision(
+        images["work_precision"] = work_precision(
             _lines(result.recipe, sound), front, result.recipe.tolerance, title
         )
     if asked := choices(sound):
-        chosen = [choice.chosen.found for choice in asked]
-        measured = {
-            name: [max(point.errors[name]) for point in chosen] for name in chosen[0].errors
-        }
-        drawn["promises"] = promises(
-            [c.tolerance for c in asked], measured, [point.bound for point in chosen]
-        )
+        images["promises"] = _promises(asked)
     if measured_steps := [s for s in result.steps if s.variants]:
-        drawn["steps"] = steps([_diagram(s) for s in measured_steps])
-    return drawn
+        images["steps"] = steps([_diagram(s) for s in measured_steps])
+    return images
+
+
+def _promises(asked: Sequence[ToleranceChoice]) -> bytes:
+    """Return the diagram of the measured against the requested error of the engine's choices."""
+    measurements = [choice.chosen.found for choice in asked]
+    measured = {
+        name: [max(point.errors[name]) for point in measurements] for name in measurements[0].errors
+    }
+    bounds = [point.bound for point in measurements]
+    picture: bytes = promises([c.tolerance for c in asked], measured, bounds)
+    return picture
 
 
 def sections(result: AccuracyResult, drawn: Mapping[str, bytes]) -> list[Section]:
@@ -523,7 +540,7 @@ def _chosen(points: Points) -> Section:
 
 def _outputs(points: Points, picture: bytes | None) -> list[Section]:
     """Return the errors of all outputs in tables of a few columns each, which fit the page."""
-    names = list(dict.fromkeys(name for p in points for name in p.found.errors))
+    names = list(dict.fromkeys(itertools.chain(*(p.found.errors for p in points))))
     groups = [names[i : i + _ABREAST] for i in range(0, len(names), _ABREAST)] or [[]]
     text = (
         "The largest error of each output over the seeds; a dash where the setting changes the"
@@ -582,7 +599,7 @@ def _steps(tried: Sequence[StepTried], picture: bytes | None) -> Section:
 
 
 def _not_varied(result: AccuracyResult) -> Section:
-    rows = [(what, "", why) for what, _, why in (text.partition(": ") for text in result.without)]
+    rows = [(knob, "", why) for knob, _, why in (text.partition(": ") for text in result.without)]
     rows += [
         (p.trial.line, p.trial.label, p.found.refused) for p in result.points if p.found.refused
     ]

@@ -146,8 +146,8 @@ def _slow_steps(
     """Yield (recipe, step name, share of run time) of each slow step, and of slow steps that
     replace other steps.
     """
-    whole = next((p.found.steps for p in points if p.trial.line == KEEP_ALL), {})
-    for name, share in steps_that_matter(recipe, whole):
+    seconds = next((p.found.steps for p in points if p.trial.line == KEEP_ALL), {})
+    for name, share in steps_that_matter(recipe, seconds):
         yield recipe, name, share
     own = next((p.found.steps for p in points if p.trial.own), {})
     cheaper = with_substitutions(recipe, recipe.outputs)

@@ -73,20 +73,20 @@ def knobs(recipe: Recipe, quick: bool = False) -> Knobs:
     """Return the recipe parameters that trade accuracy for run time; ``quick`` selects fewer
     values of each.
     """
-    found: list[Knob] = []
+    varied: list[Knob] = []
     without: list[str] = []
-    for what, turned in (
+    for kind, turned in (
         ("bands", _bands(recipe, quick)),
         ("pupil samples at the same width", _samples(recipe, quick)),
         ("window of the PSF", _windows(recipe, quick)),
         ("precision", _precisions(recipe)),
     ):
-        mine = [knob if isinstance(knob, str) else replace(knob, what=what) for knob in turned]
-        found += [knob for knob in mine if isinstance(knob, Knob) and len(knob.changes) > 1]
-        without += [f"{what}: {knob}" for knob in mine if isinstance(knob, str)]
+        mine = [knob if isinstance(knob, str) else replace(knob, what=kind) for knob in turned]
+        varied += [knob for knob in mine if isinstance(knob, Knob) and len(knob.changes) > 1]
+        without += [f"{kind}: {knob}" for knob in mine if isinstance(knob, str)]
         if not mine:
-            without.append(f"{what}: this recipe has no such value")
-    return Knobs(tuple(found), tuple(without))
+            without.append(f"{kind}: this recipe has no such value")
+    return Knobs(tuple(varied), tuple(without))
 
 
 def finest(recipe: Recipe) -> Recipe:
@@ -124,11 +124,11 @@ def _samples(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
     if others := _others(recipe, "pitch", pitches[0]):
         yield f"{', '.join(others)} would keep the old pitch, which is written elsewhere"
         return
-    at, other = samples[0].path, pitches[0].path
+    path, other = samples[0].path, pitches[0].path
     settings = [
-        (n, str(n), (f"{at}={n}", f"{other}={own * pitch / n!r} m")) for n in _sizes(own, quick)
+        (n, str(n), (f"{path}={n}", f"{other}={own * pitch / n!r} m")) for n in _sizes(own, quick)
     ]
-    yield _knob(at, settings, own)
+    yield _knob(path, settings, own)
 
 
 def _sizes(own: int, quick: bool) -> list[int]:
@@ -172,7 +172,9 @@ def _knob(path: str, settings: Sequence[tuple[Any, str, tuple[str, ...]]], own: 
     return Knob(
         path,
         "",
-        tuple(Change(label, () if value == own else how) for value, label, how in settings),
+        tuple(
+            Change(label, () if value == own else overrides) for value, label, overrides in settings
+        ),
     )
 
 
@@ -194,7 +196,7 @@ def _places(
     """Return the recipe paths that set ``parameter``, for steps that return ``gives`` and also
     have ``beside``.
     """
-    found: dict[str, _Place] = {}
+    places: dict[str, _Place] = {}
     for name in needed(recipe, recipe.outputs):
         step = recipe.steps[name]
         if parameter not in step.params or (beside and beside not in step.params):
@@ -203,9 +205,9 @@ def _places(
             continue
         path = _written(recipe, step, parameter)
         if path is not None:
-            before = found[path].steps if path in found else ()
-            found[path] = _Place(path, step.params[parameter], (*before, step))
-    return list(found.values())
+            before = places[path].steps if path in places else ()
+            places[path] = _Place(path, step.params[parameter], (*before, step))
+    return list(places.values())
 
 
 def _written(recipe: Recipe, step: Step, parameter: str) -> str | None:
@@ -231,18 +233,19 @@ def _others(recipe: Recipe, parameter: str, place: _Place) -> list[str]:
     """Return the names of other steps that read the value at ``place``, or that have an equal
     pitch at another path.
     """
-    mine = {step.name for step in place.steps}
     if parameter == "pitch":
-        apart = (
-            s
-            for s in recipe.steps.values()
-            if parameter in s.params and s.params[parameter] == place.value
-        )
-        return [s.name for s in apart if _written(recipe, s, parameter) != place.path]
-    others = (s for s in recipe.steps.values() if s.name not in mine)
-    return [
-        s.name
-        for s in others
-        for p in s.params
-        if _written(recipe, s, p) == place.path and p in s.param_marks
-    ]
+        return _equal_elsewhere(recipe, parameter, place)
+    mine = {step.name for step in place.steps}
+    names: list[str] = []
+    for step in recipe.steps.values():
+        if step.name not in mine:
+            read = [p for p in step.params if _written(recipe, step, p) == place.path]
+            names += [step.name for p in read if p in step.param_marks]
+    return names
+
+
+def _equal_elsewhere(recipe: Recipe, parameter: str, place: _Place) -> list[str]:
+    """Return the names of steps whose parameter has the value of ``place`` from another path."""
+    having = [step for step in recipe.steps.values() if parameter in step.params]
+    equal = [step for step in having if step.params[parameter] == place.value]
+    return [step.name for step in equal if _written(recipe, step, parameter) != place.path]

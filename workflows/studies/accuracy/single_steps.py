@@ -94,12 +94,12 @@ def steps_that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tupl
     for name in seconds:
         if name in recipe.steps:
             items[_ITEM.sub("", name)].append(name)
-    whole = sum(seconds.values()) or 1.0
-    found = [
-        (max(names, key=seconds.__getitem__), sum(seconds[n] for n in names) / whole)
+    total = sum(seconds.values()) or 1.0
+    shares = [
+        (max(names, key=seconds.__getitem__), sum(seconds[n] for n in names) / total)
         for names in items.values()
     ]
-    return sorted((f for f in found if f[1] > SHARE), key=lambda f: -f[1])
+    return sorted((f for f in shares if f[1] > SHARE), key=lambda f: -f[1])
 
 
 def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: float) -> StepTried:
@@ -113,9 +113,13 @@ def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: fl
         )
     key = _key(recipe, name, patience, store)
     compute = partial(_measure, recipe, step, store, patience)
-    found = compute_once(store, key, StepMeasurement, compute, {"step": f"study accuracy: {name}"})
-    keep_variants(recipe, name, [tuple(variant.values()) for variant in found.variants], store)
-    return StepTried(name, step.node.path, share, found)
+    measurement = compute_once(
+        store, key, StepMeasurement, compute, {"step": f"study accuracy: {name}"}
+    )
+    keep_variants(
+        recipe, name, [tuple(variant.values()) for variant in measurement.variants], store
+    )
+    return StepTried(name, step.node.path, share, measurement)
 
 
 def _key(recipe: Recipe, name: str, patience: float, store: Store) -> str:
@@ -145,12 +149,15 @@ def _measure(recipe: Recipe, step: Step, store: Store, patience: float) -> StepM
                 refused="the reference fails on the inputs and on every part of the inputs"
             )
         size, truth, seconds = afforded
-        part = cut_inputs(step.node, inputs, size)
-        variants = [asdict(variant) for variant in _variants(step, part, truth, recipe.seed)]
-    whole = all(
-        a.shape == b.shape for a, b in zip(tensors_in(inputs), tensors_in(part), strict=True)
+        small_inputs = cut_inputs(step.node, inputs, size)
+        variants = [
+            asdict(variant) for variant in _variants(step, small_inputs, truth, recipe.seed)
+        ]
+    complete = all(
+        a.shape == b.shape
+        for a, b in zip(tensors_in(inputs), tensors_in(small_inputs), strict=True)
     )
-    return StepMeasurement(variants, seconds, "" if whole else _cut_text(step.node, size))
+    return StepMeasurement(variants, seconds, "" if complete else _cut_text(step.node, size))
 
 
 def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> Any:
@@ -167,9 +174,12 @@ def _largest(
     for size in _CUTS:
         if best is not None and best[2] * _GROWTH > patience:
             break
-        part = cut_inputs(step.node, inputs, size)
+        small_inputs = cut_inputs(step.node, inputs, size)
         try:
-            best = (size, *_time_once(partial(_call, step, step.node.hooks.reference, part, seed)))
+            best = (
+                size,
+                *_time_once(partial(_call, step, step.node.hooks.reference, small_inputs, seed)),
+            )
         except Exception:  # a small part of a picture may be no valid input; a larger part may be
             continue
     return best
@@ -194,23 +204,37 @@ def _calls(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Ca
     calls: dict[tuple[str, str], Callable[[], Any]] = {
         (USED, ""): partial(_call, step, node, inputs, seed)
     }
-    own = step.params.get("precision")
-    for word in allowed_words(step, "precision") if own is not None else ():
-        if word != own:
-            calls[_PRECISION, word] = partial(_call, step, node, inputs, seed, precision=word)
-    if "precision" not in step.params and any(x.dtype == torch.float32 for x in tensors_in(inputs)):
-        double = each_tensor(lambda x: x.double() if x.dtype == torch.float32 else x, inputs)
+    for word in _other_precisions(step):
+        calls[_PRECISION, word] = partial(_call, step, node, inputs, seed, precision=word)
+    if "precision" not in step.params and any(map(_is_single, tensors_in(inputs))):
+        double = each_tensor(lambda x: x.double() if _is_single(x) else x, inputs)
         calls[_PRECISION, "double"] = partial(_call, step, node, double, seed)
     for factor in _ALLOWANCES if "within" in step.params else ():
         within = step.params["within"] * factor
         label = f"{within:.0e}".replace("e-0", "e-")
         calls["allowed error", label] = partial(_call, step, node, inputs, seed, within=within)
-    for share in _WINDOWS if any(isinstance(x, Psf) for x in inputs) else ():
-        smaller = [_inner(x, share) if isinstance(x, Psf) else x for x in inputs]
+    for share, smaller in _smaller_windows(inputs):
         calls["window of the PSF", f"{share:g}"] = partial(_call, step, node, smaller, seed)
     if node.hooks.skip_bound is not None:
         calls["left out", ""] = lambda: inputs[0]
     return calls
+
+
+def _other_precisions(step: Step) -> list[str]:
+    """Return the words for a precision that a step does not have; none without this parameter."""
+    own = step.params.get("precision")
+    return [] if own is None else [w for w in allowed_words(step, "precision") if w != own]
+
+
+def _is_single(x: Tensor) -> bool:
+    return x.dtype == torch.float32
+
+
+def _smaller_windows(inputs: list[Any]) -> Iterator[tuple[float, list[Any]]]:
+    """Yield the inputs with smaller windows of their PSFs, and the share; none without a PSF."""
+    if any(isinstance(x, Psf) for x in inputs):
+        for share in _WINDOWS:
+            yield share, [_inner(x, share) if isinstance(x, Psf) else x for x in inputs]
 
 
 def _inner(psf: Psf, share: float) -> Psf:

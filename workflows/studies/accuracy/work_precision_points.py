@@ -123,10 +123,10 @@ class PointCache:
         if recipe is None:
             return WorkPrecisionPoint(trial, PointMeasurement(refused=trial.refused))
         key = self.key(recipe)
-        found = compute_once(
+        measurement = compute_once(
             self.store, key, PointMeasurement, lambda: self._measure(recipe), _ABOUT
         )
-        return WorkPrecisionPoint(trial, found)
+        return WorkPrecisionPoint(trial, measurement)
 
     def time_again(self, point: WorkPrecisionPoint, number: int) -> WorkPrecisionPoint:
         """Return a measurement with the time of cold run ``number`` added, or unchanged if the
@@ -135,10 +135,10 @@ class PointCache:
         recipe, seconds = point.trial.recipe, point.found.seconds
         if recipe is None or not seconds or seconds[0] >= _QUICK:
             return point
-        one = compute_once(
+        timed = compute_once(
             self.store, digest(self.key(recipe), number), list, lambda: [self._time(recipe)], _ABOUT
         )
-        return WorkPrecisionPoint(point.trial, replace(point.found, seconds=[*seconds, *one]))
+        return WorkPrecisionPoint(point.trial, replace(point.found, seconds=[*seconds, *timed]))
 
     def _time(self, recipe: Recipe) -> float:
         self._warm_up(recipe)
@@ -206,23 +206,23 @@ class PointCache:
         """Return the errors of each output for all seeds, without outputs whose shape differs
         from the reference.
         """
-        found = compare_outputs(values, self.truth(0))
+        by_output = compare_outputs(values, self.truth(0))
         for seed in range(1, self.seeds):
             again = run(replace(recipe, seed=recipe.seed + seed), store, device=self.device)
             for name, errors in compare_outputs(again.values, self.truth(seed)).items():
-                found[name] += errors
-        return found
+                by_output[name] += errors
+        return by_output
 
 
 def compare_outputs(values: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, list[float]]:
     """Return the error of each output by name, without outputs whose shape differs from the
     reference.
     """
-    found: dict[str, list[float]] = {}
+    errors: dict[str, list[float]] = {}
     for name, value in values.items():
         with suppress(ValueError):
-            found[name] = [error_of(value, truth[name])]
-    return found
+            errors[name] = [error_of(value, truth[name])]
+    return errors
 
 
 # --- pareto line ----------------------------------------------------------------------------------

@@ -113,7 +113,7 @@ def study(
     study_run = StudyRun("calibration", recipe, command)
     with one_thread():
         simulator = SensorSimulator(
-            recipe, store, pixels, sampler or partial(walk_draws, how=move), move
+            recipe, store, pixels, sampler or partial(walk_draws, move_name=move), move
         )
         simulated = list(_simulate_all(simulator, simulations, progress))
         sensitive, reason = _sensitivity(recipe, move)
@@ -130,10 +130,10 @@ def _simulate_all(
     simulator: SensorSimulator, count: int, progress: Progress
 ) -> Iterator[SensorSimulation]:
     for number in range(count):
-        found = simulator.simulation(number)
-        if found.refused:
-            progress(f"simulation {number}: {found.refused}")
-        yield found
+        simulation = simulator.simulation(number)
+        if simulation.refused:
+            progress(f"simulation {number}: {simulation.refused}")
+        yield simulation
         if (number + 1) % _EVERY == 0 or number + 1 == count:
             progress(f"{number + 1} of {count} simulations")
 

@@ -61,7 +61,7 @@ class PosteriorDraws:
 
 
 def walk_draws(
-    problem: SensorPosterior, mode: LaplaceFit, seed: int, how: str = "de", count: int = DRAWS
+    problem: SensorPosterior, mode: LaplaceFit, seed: int, move_name: str = "de", count: int = DRAWS
 ) -> PosteriorDraws:
     """Return ``count`` posterior draws from a Markov chain that is thinned to one step per
     autocorrelation time.
@@ -70,7 +70,7 @@ def walk_draws(
     needs few draws.
     """
     run = emcee_sampler.start_ensemble(
-        problem, mode, _NOT_KEPT, 0, seed, WALKERS, emcee_sampler.move(how)
+        problem, mode, _NOT_KEPT, 0, seed, WALKERS, emcee_sampler.move(move_name)
     )
     steps = _FIRST
     while True:
@@ -78,13 +78,13 @@ def walk_draws(
         chain = run.backend.get_chain(discard=steps // 2)
         tau = emcee_sampler.autocorrelation_time(chain)
         apart = max(1, round(min(tau, len(chain))))
-        seen = chain[::apart].reshape(-1, chain.shape[-1])
-        enough = len(chain) >= _APART * tau and len(seen) >= 2 * count and _steady(chain)
+        draws = chain[::apart].reshape(-1, chain.shape[-1])
+        enough = len(chain) >= _APART * tau and len(draws) >= 2 * count and _steady(chain)
         if enough or steps >= _LONGEST:
             break
         steps = int(_GROWTH * steps)
     rng = np.random.default_rng([seed, 2])
-    taken = seen[rng.choice(len(seen), min(count, len(seen)), replace=False)]
+    taken = draws[rng.choice(len(draws), min(count, len(draws)), replace=False)]
     return PosteriorDraws(
         taken, tau, enough, emcee_sampler.stranded(run.backend.get_log_prob(discard=steps // 2))
     )
@@ -225,7 +225,9 @@ class SensorSimulator:
         """Simulate frames of a sensor with the parameters ``truth``, and return statistics of
         each light level.
         """
-        values = {f"{step}.{name}": x for step in self.exposed for name, x in truth.items()}
+        values: dict[str, float] = {}
+        for step in self.exposed:
+            values |= {f"{step}.{name}": x for name, x in truth.items()}
         recipe = replace(self.recipe, seed=seed)
         with TemporaryDirectory(prefix="neusee-") as folder, torch.no_grad():
             frames = as_function(recipe, *values, outputs=[self._source], store=Store(folder))
@@ -239,8 +241,8 @@ class SensorSimulator:
         step = self.recipe.steps[self.nominal.step]
         free = [self._source, *(f"{step.name}.{name}" for name in self.nominal.names)]
 
-        def function(told: bool) -> Callable[[Any], Any]:
-            changed = replace(step, params={**step.params, "told": told})
+        def function(detailed: bool) -> Callable[[Any], Any]:
+            changed = replace(step, params={**step.params, "told": detailed})
             recipe = replace(self.recipe, steps={**self.recipe.steps, step.name: changed})
             return as_function(recipe, *free, outputs=[step.name], store=store)
 
@@ -284,15 +286,15 @@ def rank_truth(
     mean and truth.
     """
     values = {name: x.numpy() for name, x in problem.parameters(drawn.samples).items()}
-    found = SensorSimulation(
+    simulation = SensorSimulation(
         dict(truth), tau=drawn.tau, independent=drawn.independent, stranded=drawn.stranded
     )
     for name, x in values.items():
-        found.rank[name] = rank = int((x < truth[name]).sum())
+        simulation.rank[name] = rank = int((x < truth[name]).sum())
         # exactly 90 % of uniform ranks
-        found.inside[name] = _TAIL * (len(x) + 1) <= rank < (1 - _TAIL) * (len(x) + 1)
-        found.z[name] = float((x.mean() - truth[name]) / x.std(ddof=1))
-    return found
+        simulation.inside[name] = _TAIL * (len(x) + 1) <= rank < (1 - _TAIL) * (len(x) + 1)
+        simulation.z[name] = float((x.mean() - truth[name]) / x.std(ddof=1))
+    return simulation
 
 
 # --- rank uniformity ------------------------------------------------------------------------------
@@ -494,5 +496,5 @@ def _value(x: FloatArray, weights: FloatArray, kind: str) -> float:
         return float(weights @ x)
     order = np.argsort(x)
     share = 1.0 - _TAIL if kind == "upper" else _TAIL
-    at = int(np.searchsorted(np.cumsum(weights[order]), share))
-    return float(x[order[min(at, len(x) - 1)]])
+    index = int(np.searchsorted(np.cumsum(weights[order]), share))
+    return float(x[order[min(index, len(x) - 1)]])

@@ -83,14 +83,14 @@ def scenes(recipe: Recipe) -> dict[str, Recipe | str]:
     """Return the recipe with each simpler scene by name, or the reason why the recipe cannot
     have the scene.
     """
-    found: dict[str, Recipe | str] = {"everything in full": replace(recipe, exact=True)}
-    found["as the recipe chooses"] = recipe
+    recipes: dict[str, Recipe | str] = {"everything in full": replace(recipe, exact=True)}
+    recipes["as the recipe chooses"] = recipe
     for scene, overrides in _overrides(recipe).items():
         try:
-            found[scene] = _changed(recipe, overrides)
+            recipes[scene] = _changed(recipe, overrides)
         except RecipeError as error:
-            found[scene] = "; ".join(problem.message for problem in error.diagnostics)
-    return found
+            recipes[scene] = "; ".join(problem.message for problem in error.diagnostics)
+    return recipes
 
 
 def _changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
@@ -105,25 +105,33 @@ def _changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
 
 
 def _overrides(recipe: Recipe) -> Mapping[str, Sequence[str]]:
-    settings = recipe.config.settings
-    lasers = [name for name in settings if name.startswith("lasers.")]
-    window = sorted({name.partition("[")[0] for name in _window_steps(recipe)})
-    every = {
-        "no laser": ["lasers={}"] if lasers else [],
-        "clean window": [f"steps.{name}=null" for name in window],
-        "grey scene": [_GREY] if "scene" in recipe.steps and "scene.shape" in settings else [],
+    no_laser, clean_window = _no_laser(recipe), _clean_window(recipe)
+    lift = [_LIFT] if "cube" in recipe.steps else []
+    one_wavelength = [*_bands(recipe, "549 nm", "551 nm", 1), *lift]
+    changes = {
+        "no laser": no_laser,
+        "clean window": clean_window,
+        "grey scene": _grey_scene(recipe),
         "narrow band, 540 to 560 nm": _bands(recipe, "540 nm", "560 nm", 3),
-        "one wavelength": [
-            *_bands(recipe, "549 nm", "551 nm", 1),
-            *([_LIFT] if "cube" in recipe.steps else []),
-        ],
+        "one wavelength": one_wavelength,
+        "one wavelength, no laser, clean window": [*no_laser, *clean_window, *one_wavelength],
     }
-    least = [o for name in ("no laser", "clean window", "one wavelength") for o in every[name]]
-    return {
-        name: o
-        for name, o in {**every, "one wavelength, no laser, clean window": least}.items()
-        if o
-    }
+    return {scene: overrides for scene, overrides in changes.items() if overrides}
+
+
+def _no_laser(recipe: Recipe) -> list[str]:
+    has_laser = any(name.startswith("lasers.") for name in recipe.config.settings)
+    return ["lasers={}"] if has_laser else []
+
+
+def _clean_window(recipe: Recipe) -> list[str]:
+    names = {name.partition("[")[0] for name in _window_steps(recipe)}
+    return [f"steps.{name}=null" for name in sorted(names)]
+
+
+def _grey_scene(recipe: Recipe) -> list[str]:
+    has_shape = "scene" in recipe.steps and "scene.shape" in recipe.config.settings
+    return [_GREY] if has_shape else []
 
 
 def _window_steps(recipe: Recipe) -> set[str]:
@@ -148,17 +156,22 @@ def _bands(recipe: Recipe, start: str, stop: str, count: int) -> list[str]:
 
 
 def _cost(scene: str, recipe: Recipe, store: Store) -> SceneCost:
-    results: list[Result] = []
     try:
-        while not results or (max(r.seconds for r in results) < _QUICK and len(results) < _TIMES):
-            results.append(run_cold(recipe, store))
+        result = _median_run(recipe, store)
     except RunError as error:
         return SceneCost(scene, float("nan"), 0.0, 0, (), f"{error.step}: {error.cause}")
-    result = sorted(results, key=lambda r: r.seconds)[len(results) // 2]
     ran = [done.seconds for done in result.done.values() if done.state == "run"]
     left_out = [done.step for done in result.done.values() if done.state == "left out"]
     replaced = [economy.step for economy in result.recipe.substitutions]
     return SceneCost(scene, result.seconds, sum(ran), len(ran), (*left_out, *replaced))
+
+
+def _median_run(recipe: Recipe, store: Store) -> Result:
+    """Return the run of median time; a quick one is repeated."""
+    results = [run_cold(recipe, store)]
+    while max(r.seconds for r in results) < _QUICK and len(results) < _TIMES:
+        results.append(run_cold(recipe, store))
+    return sorted(results, key=lambda r: r.seconds)[len(results) // 2]
 
 
 # --- leave out study ------------------------------------------------------------------------------
@@ -278,7 +291,7 @@ def _cells(r: OmissionRow) -> tuple[Any, ...]:
 
 
 def _lead(recipe: Recipe, result: LeaveOutResult) -> str:
-    chosen = [row for row in result.rows if row.taken]
+    taken = [row for row in result.rows if row.taken]
     worst = max((p.rms for p in result.output_errors), default=0.0)
     held = (
         "All stated errors hold"
@@ -287,7 +300,7 @@ def _lead(recipe: Recipe, result: LeaveOutResult) -> str:
     )
     return (
         f"{held}. Of {len(result.rows)} possible omissions with a known bound, the recipe chooses"
-        f" {len(chosen)} at its tolerance of {recipe.tolerance:.2g}. The largest error of an output"
+        f" {len(taken)} at its tolerance of {recipe.tolerance:.2g}. The largest error of an output"
         f" is then {worst:.2g}, relative to the full computation."
     )
 
@@ -342,7 +355,7 @@ def _omissions(result: LeaveOutResult) -> Section:
         "holds",
     )
     cells = [(_cells(row), row) for row in result.rows]
-    rows = [(name, _HOW[kind], *rest, _HELD[row.holds]) for (name, kind, *rest), row in cells]
+    rows = [(name, _HOW[kind], *numbers, _HELD[row.holds]) for (name, kind, *numbers), row in cells]
     return Section(
         "Each omission", text, columns, rows, marks=_marks(result.rows, len(columns) - 1)
     )
@@ -371,7 +384,7 @@ def _bars(costs: Sequence[SceneCost]) -> Any:
     names = [cost.scene for cost in costs]
     inside = [min(cost.computing, cost.seconds) for cost in costs]
     ax.barh(names, inside, color=BLUE, label="in the steps")
-    beside = [cost.seconds - part for cost, part in zip(costs, inside, strict=True)]
+    beside = [cost.seconds - in_steps for cost, in_steps in zip(costs, inside, strict=True)]
     ax.barh(names, beside, left=inside, color=_WAITING, label="in the engine and the store")
     for row, cost in enumerate(costs):
         ax.annotate(f" {cost.seconds:.3g} s", (cost.seconds, row), va="center", fontsize=9)

@@ -83,22 +83,22 @@ def _exchanged(wire: Wire, exchange: Mapping[str, str]) -> Wire:
     return wire and exchange.get(wire, wire)
 
 
-def omissions(full: Recipe, chosen: Result, facts_of: FactsOf) -> Iterator[Omission]:
+def omissions(full: Recipe, result: Result, facts_of: FactsOf) -> Iterator[Omission]:
     """Yield each way to leave out steps of the full computation ``full`` for which the error has
     a bound.
     """
     order = needed(full, full.outputs)
-    yield from _stand_ins(full, order, chosen)
+    yield from _stand_ins(full, order, result)
     for name in order:
-        done = chosen.done.get(name)
+        done = result.done.get(name)
         why = done.why if done is not None and done.state == "left out" else ""
         taken = done is None or bool(why)
-        for found in (
+        for omission in (
             _handed_on(full.steps[name], facts_of),
             _not_added(full, order, name, facts_of),
         ):
-            if found is not None and math.isfinite(found.bound):
-                yield replace(found, taken=taken, why=why or found.why)
+            if omission is not None and math.isfinite(omission.bound):
+                yield replace(omission, taken=taken, why=why or omission.why)
 
 
 def _handed_on(step: Step, facts_of: FactsOf) -> Omission | None:
@@ -119,33 +119,47 @@ def _handed_on(step: Step, facts_of: FactsOf) -> Omission | None:
 
 def _not_added(recipe: Recipe, order: list[str], name: str, facts_of: FactsOf) -> Omission | None:
     step = recipe.steps[name]
-    at = _adding(recipe, order, name) if step.node.hooks.zero_bound is not None else ()
-    if not at:
+    readers = _adding(recipe, order, name) if step.node.hooks.zero_bound is not None else ()
+    if not readers:
         return None
     largest = _largest(step, facts_of)
     why = f"no element above {largest:.2g}"
     return Omission(
-        name, "not added", {name: ""}, _share(largest, recipe, at, facts_of), why, False, at
+        name,
+        "not added",
+        {name: ""},
+        _share(largest, recipe, readers, facts_of),
+        why,
+        False,
+        readers,
     )
 
 
-def _stand_ins(full: Recipe, order: list[str], chosen: Result) -> Iterator[Omission]:
+def _stand_ins(full: Recipe, order: list[str], result: Result) -> Iterator[Omission]:
     """Yield the `Omission` that computes sums over spectral bands instead of images of all bands.
 
     All images are replaced together, because two images that a step compares must be computed in
     the same way.
     """
     sparse = with_substitutions(replace(full, exact=False, estimates=False), full.outputs)
-    exchange = {
-        economy.step: economy.instead for economy in sparse.substitutions if economy.instead
-    }
-    if not exchange:
+    standing = [economy for economy in sparse.substitutions if economy.instead]
+    if not standing:
         return
+    exchange = {economy.step: economy.instead for economy in standing}
     beside = tuple(step for name, step in sparse.steps.items() if name not in full.steps)
-    at = tuple(n for n in order if not set(exchange.values()).isdisjoint(sparse.steps[n].sources))
-    taken = {economy.step for economy in chosen.recipe.substitutions} >= exchange.keys()
-    why = next(economy.why for economy in sparse.substitutions if economy.instead)
-    yield Omission(", ".join(exchange), "stands in", exchange, math.nan, why, taken, at, beside)
+    instead = set(exchange.values())
+    readers = tuple(n for n in order if not instead.isdisjoint(sparse.steps[n].sources))
+    taken = {economy.step for economy in result.recipe.substitutions} >= exchange.keys()
+    yield Omission(
+        name=", ".join(exchange),
+        kind="stands in",
+        exchange=exchange,
+        bound=math.nan,
+        why=standing[0].why,
+        taken=taken,
+        at=readers,
+        beside=beside,
+    )
 
 
 def _adding(recipe: Recipe, order: list[str], name: str) -> tuple[str, ...]:
@@ -185,16 +199,21 @@ def _facts(wire: Wire, facts_of: FactsOf) -> TensorStats | list[TensorStats | No
     return [facts_of(name) for name in wire] if isinstance(wire, tuple) else wire and facts_of(wire)  # type: ignore[return-value]
 
 
-def _share(largest: float, recipe: Recipe, at: tuple[str, ...], facts_of: FactsOf) -> float:
-    """Return ``largest`` over the largest element in the results of steps ``at``, or infinity if
+def _share(largest: float, recipe: Recipe, readers: tuple[str, ...], facts_of: FactsOf) -> float:
+    """Return ``largest`` over the largest element in the results of the ``readers``, or infinity if
     not tensors.
     """
     if largest == 0:
         return 0.0
-    if any(recipe.steps[name].node.hints.get("return") is not Tensor for name in at):
+    if any(recipe.steps[name].node.hints.get("return") is not Tensor for name in readers):
         return math.inf
-    tops = [max(abs(f.min), abs(f.max)) if (f := facts_of(name)) else 0.0 for name in at]
-    return largest / min(tops) if min(tops) > 0 else math.inf
+    top = min(_top(facts_of(name)) for name in readers)
+    return largest / top if top > 0 else math.inf
+
+
+def _top(facts: TensorStats | None) -> float:
+    """Return the largest absolute value of a result, or 0 where nothing is known of it."""
+    return max(abs(facts.min), abs(facts.max)) if facts else 0.0
 
 
 # --- omission rows --------------------------------------------------------------------------------
@@ -292,10 +311,10 @@ class OmissionComparison:
             yield compute_once(self.store, key, OmissionRow, compute, _ABOUT)
 
     def _row(self, omission: Omission, alone: Recipe) -> OmissionRow:
-        seen = run(alone, self.store, tuple(omission.value_of(name) for name in omission.at))
-        bounds = _bounds(omission, seen)
+        result = run(alone, self.store, tuple(omission.value_of(name) for name in omission.at))
+        bounds = _bounds(omission, result)
         pairs = {
-            name: (seen.values[omission.value_of(name)], self.truth.value(name))
+            name: (result.values[omission.value_of(name)], self.truth.value(name))
             for name in omission.at
         }
         largest = max(largest_error(*pair) for pair in pairs.values())
@@ -309,7 +328,9 @@ class OmissionComparison:
             largest,
             *self._reached(omission, alone, changed=largest > 0),
             self._seconds(self.full, alone) - self._seconds(alone, self.full),
-            all(self._holds(omission, bound, pairs[name], seen) for name, bound in bounds.items()),
+            all(
+                self._holds(omission, bound, pairs[name], result) for name, bound in bounds.items()
+            ),
         )
 
     def _reached(
@@ -354,11 +375,11 @@ class OmissionComparison:
             ).values()
         )
 
-    def _seconds(self, one: Recipe, other: Recipe) -> float:
-        """Return the run time of the steps that recipe ``one`` needs and recipe ``other`` does
+    def _seconds(self, recipe: Recipe, other: Recipe) -> float:
+        """Return the run time of the steps that ``recipe`` needs and recipe ``other`` does
         not need.
         """
-        keys = resolve(one, order := needed(one, one.outputs), self.store).keys
+        keys = resolve(recipe, order := needed(recipe, recipe.outputs), self.store).keys
         only = [keys[name] for name in order if name not in set(needed(other, other.outputs))]
         return sum(float((self.store.about(key) or {}).get("seconds", 0.0)) for key in only)
 
@@ -367,10 +388,10 @@ class OmissionComparison:
             [resolve(r, needed(r, r.outputs), self.store).keys[n] for n in r.outputs]
             for r in (self.full, alone)
         ]
-        chosen = [[name, self.chosen.keys[name]] for name in self.recipe.outputs]
+        chosen_keys = [[name, self.chosen.keys[name]] for name in self.recipe.outputs]
         details = [omission.name, omission.kind, repr(omission.bound), omission.why, omission.taken]
         return digest(
-            "leave-out", outputs, chosen, details, engine("studies.leave_out.left_out_steps")
+            "leave-out", outputs, chosen_keys, details, engine("studies.leave_out.left_out_steps")
         )
 
 
@@ -390,7 +411,8 @@ def _bounds(omission: Omission, result: Result) -> dict[str, float]:
     """
     if omission.kind != "stands in":
         return dict.fromkeys(omission.at, omission.bound)
-    return {name: bound for name in omission.at if (bound := result.proof.of(name)) is not None}
+    bounds = {name: result.proof.of(name) for name in omission.at}
+    return {name: bound for name, bound in bounds.items() if bound is not None}
 
 
 def least_error(value: Tensor, reference: Tensor) -> float:
@@ -408,5 +430,5 @@ def least_error(value: Tensor, reference: Tensor) -> float:
     top = float(reference.double().abs().max()) + _SURE * (
         float(change.std()) if count > 1 else 0.0
     )
-    least = math.sqrt(max(mean - _SURE * error, 0.0))
-    return least / top if top > 0 else least
+    lowest = math.sqrt(max(mean - _SURE * error, 0.0))
+    return lowest / top if top > 0 else lowest

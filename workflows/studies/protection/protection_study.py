@@ -191,7 +191,7 @@ def under_attack(result: ProtectionResult) -> Any:
         )
         ax.xaxis.label.set_fontsize(9)
     axes[0, 0].set_yscale("log")
-    top = max(max(map(max, one["information"])) for one in result.attack.values())
+    top = max(max(map(max, measures["information"])) for measures in result.attack.values())
     axes[0, 0].set_ylim(top * 1e-5, top * 2)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
@@ -269,16 +269,16 @@ def _said(result: ProtectionResult, measure: str) -> str:
     """Return where the mask wins by one measure: medians over the draws, with intervals."""
     draws = np.array([result.drawn[n][measure] for n in LIGHTS])
     own = np.median(draws, axis=1)
-    at = crossing(own.tolist())
-    if at == 0.0:
+    light = crossing(own.tolist())
+    if light == 0.0:
         return f"by the {MEASURES[measure]} it loses at every light, by {-own.max():.1f} dB or more"
-    most = int(own.argmax())
-    by = f"by {own[most]:.1f} dB ({_ends(draws[most], '.1f')}) at {LIGHTS[most]:g} e- a pixel"
-    if math.isinf(at):
+    peak = int(own.argmax())
+    by = f"by {own[peak]:.1f} dB ({_ends(draws[peak], '.1f')}) at {LIGHTS[peak]:g} e- a pixel"
+    if math.isinf(light):
         return f"by the {MEASURES[measure]} it wins at every light, {by}"
     where = [crossing(row) for row in draws.T.tolist()]
     return (
-        f"by the {MEASURES[measure]} it wins below {at:.0f} e- a pixel ({_ends(where, '.0f')}),"
+        f"by the {MEASURES[measure]} it wins below {light:.0f} e- a pixel ({_ends(where, '.0f')}),"
         f" {by}"
     )
 
@@ -364,14 +364,13 @@ def _fields(result: ProtectionResult) -> Section:
     text = """Share of the pixels in % that are not full, for a laser in the middle of fields of
         several sizes. A wider field is left out where the samples of the recipe's pupil do not
         carry it: `optics=neusee` carries 2048."""
-    at = (4, 8, 11)
-    strengths = [10 ** (0.75 * i) for i in at]
+    indices = (4, 8, 11)
+    strengths = [10 ** (0.75 * i) for i in indices]
     columns = ("protection", "field (pixels)", *(f"strength {s:.0e}" for s in strengths))
-    rows = [
-        (name, side, *(round(100 * seen[i], 2) for i in at))
-        for name, one in result.fields.items()
-        for side, seen in one.items()
-    ]
+    rows = []
+    for name, sides in result.fields.items():
+        for side, shares in sides.items():
+            rows.append((name, side, *(round(100 * shares[i], 2) for i in indices)))
     return Section("Fields", text, columns, rows)
 
 
@@ -454,7 +453,7 @@ def study(
 def _document(result: ProtectionResult, conditions: Sequence[Condition]) -> dict[str, Any]:
     return {
         "protection": result.own,
-        "draws": [one.plain for one in conditions],
+        "draws": [condition.plain for condition in conditions],
         "laws": asdict(_LAWS),
         "rivals": {name: rival.said for name, rival in result.rivals.items()},
         "gain": _texts(result.gain[result.own]),

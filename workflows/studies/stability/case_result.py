@@ -110,7 +110,7 @@ def slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
     has no gradient.
     """
     with torch.enable_grad():
-        usual = _slopes(inputs, lambda given: run(step, step.node.fn, given, seed))
+        usual = _slopes(inputs, lambda values: run(step, step.node.fn, values, seed))
         if usual is None:
             return None
         truth = true_slopes(step, inputs, seed)
@@ -123,9 +123,10 @@ def moved_slopes(step: Step, inputs: list[Any], seed: int, draws: int, unit: flo
     """
     with torch.enable_grad():
         truth = true_slopes(step, inputs, seed)
-        each = [true_slopes(step, inputs, seed, moved=(draw, unit)) for draw in range(draws)]
+        drawn = [true_slopes(step, inputs, seed, moved=(draw, unit)) for draw in range(draws)]
     return max(
-        (_apart(slopes, truth, inputs) for slopes in each if slopes and finite(slopes)), default=0.0
+        (_apart(slopes, truth, inputs) for slopes in drawn if slopes and finite(slopes)),
+        default=0.0,
     )
 
 
@@ -156,11 +157,11 @@ def true_slopes(
     step: Step,
     inputs: list[Any],
     seed: int,
-    part: int | None = None,
+    number: int | None = None,
     moved: tuple[int, float] | None = None,
 ) -> list[Tensor] | None:
-    """Return the gradients of the reference in float64: of a ``part`` of the result, at inputs
-    that `rounded` moved.
+    """Return the gradients of the reference in float64: of the tensor ``number`` of the result, at
+    inputs that `rounded` moved.
     """
     wide = (
         rounded(inputs, *moved)
@@ -177,13 +178,15 @@ def true_slopes(
         else [partial(in_double, step)]
     )
 
-    def of(way: Any, given: list[Any]) -> Any:
-        value = way(given, seed)
-        return value if part is None else tensors_in(value)[part]
+    def of(way: Any, values: list[Any]) -> Any:
+        value = way(values, seed)
+        return value if number is None else tensors_in(value)[number]
 
-    return next(
-        (slopes for way in ways if (slopes := _slopes(wide, partial(of, way), leaves))), None
-    )
+    for way in ways:
+        slopes = _slopes(wide, partial(of, way), leaves)
+        if slopes:
+            return slopes
+    return None
 
 
 def _slopes(inputs: list[Any], fn: Any, ids: list[int] | None = None) -> list[Tensor] | None:
@@ -231,15 +234,15 @@ def _near(x: Tensor) -> float:
     return 10.0 ** round(math.log10(top) + 0.123) if LEAST < top < math.inf else 1.0
 
 
-def terms(step: Step, inputs: list[Any], truth: Tensor, part: int, seed: int) -> float:
+def terms(step: Step, inputs: list[Any], truth: Tensor, number: int, seed: int) -> float:
     """Return the sum of the terms of a scalar result f(x), sum |x df/dx|, beside which their
     rounding counts.
 
-    Where terms cancel, f is smaller than this sum, which is 0 if it is not finite. ``part`` is the
-    position of ``truth`` among the scalars that the step returns.
+    Where terms cancel, f is smaller than this sum, which is 0 if it is not finite. ``number`` is
+    the position of ``truth`` among the scalars that the step returns.
     """
     with torch.enable_grad():
-        slopes = true_slopes(step, inputs, seed, part) or []
+        slopes = true_slopes(step, inputs, seed, number) or []
     moved = sum(
         float((x.double() * g).abs().sum())
         for x, g in zip(pictures_in(inputs), slopes, strict=False)
@@ -304,14 +307,14 @@ def judge_step(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell
     """Test a step in an extreme case and return the test result, or None if the case changes no
     input of the step.
     """
-    given = _changed_inputs(inputs, case)
-    if given is None:
+    changed = _changed_inputs(inputs, case)
+    if changed is None:
         return None
     try:
         return (
-            _seen(step, inputs, given, case, seed)
+            _seen(step, inputs, changed, case, seed)
             if case.expect == "seen"
-            else _compared(step, given, case, seed)
+            else _compared(step, changed, case, seed)
         )
     except Refused as refused:
         return Cell("pass", f"refused: {refused}")
@@ -323,17 +326,19 @@ def _changed_inputs(inputs: Sequence[Any], case: Case) -> list[Any] | None:
     """Return a step's inputs with the pictures changed for an extreme case, or None if no input
     is a picture.
     """
-    given = list(inputs)
+    changed = list(inputs)
     if case.alike:
-        if len(given) < 2 or not all(isinstance(x, Tensor) and is_picture(x) for x in given[:2]):
+        if len(changed) < 2 or not all(
+            isinstance(x, Tensor) and is_picture(x) for x in changed[:2]
+        ):
             return None
-        given[1] = given[0].clone()
+        changed[1] = changed[0].clone()
     if case.inputs is not None:
-        if not pictures_in(given):
+        if not pictures_in(changed):
             return None
         change = case.inputs
-        given = each_tensor(lambda x: change(x) if is_picture(x) else x, given)
-    return given
+        changed = each_tensor(lambda x: change(x) if is_picture(x) else x, changed)
+    return changed
 
 
 # --- errors of results ----------------------------------------------------------------------------
@@ -343,33 +348,60 @@ def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
     with torch.no_grad():
         value, truth = as_used(step, inputs, seed), _truth(step, inputs, seed)
     if not finite(value):
-        overflows = Cell("pass", "overflows visibly, as the reference does in single precision")
-        return Cell("fail", "not finite") if _fits_single_precision(truth) else overflows
-    bound = max([step.node.rtol, ROUNDING, *(HALVES.get(x.dtype, 0.0) for x in tensors_in(value))])
+        return _overflow(truth)
+    bound = max([step.node.rtol, ROUNDING, *_roundings(value)])
+    error = _dim_error(value, truth) if _is_dim(step, case) else _error(value, truth)
     # of a gradient, as of its input
-    coarse = max((HALVES.get(x.dtype, 0.0) for x in tensors_in(inputs)), default=0.0)
-    slope_bound, moved = max(SLOPE, _STEEPER * bound, 2 * coarse), 0.0
-    dim = case.expect == "dim part" and step.node.path.startswith(_LIGHT)
-    error, slope = (
-        _dim_error(value, truth) if dim else _error(value, truth),
-        slope_error(step, inputs, seed),
-    )
+    coarse = max(_roundings(inputs), default=0.0)
+    slope, slope_bound = slope_error(step, inputs, seed), max(SLOPE, _STEEPER * bound, 2 * coarse)
     if error > bound and all(x.ndim == 0 for x in tensors_in(truth)):
-        scalars = enumerate(zip(tensors_in(value), tensors_in(truth), strict=True))
-        error = max(
-            over(a, b, max(LEAST, terms(step, inputs, b, i, seed))) for i, (a, b) in scalars
-        )
-    precision, unit = ("single", SINGLE) if step.node.path in _LARGEST else ("double", DOUBLE)
-    if slope is not None and slope > slope_bound and not coarse:
-        moved = moved_slopes(step, inputs, seed, _ROUNDINGS, unit)
+        error = _error_beside_terms(step, inputs, value, truth, seed)
+    steep = slope is not None and slope > slope_bound and not coarse
+    precision, unit = _input_precision(step)
+    moved = moved_slopes(step, inputs, seed, _ROUNDINGS, unit) if steep else 0.0
     cell = _marked(error, bound, slope, max(slope_bound, moved))
-    if moved > slope_bound and cell.mark != "fail":
-        changes = (
-            f"four roundings of the inputs in {precision} precision alone change the gradient by"
-            f" {moved:.1e}"
-        )
-        return replace(cell, mark="warn", note=f"ill-conditioned: {changes}")
-    return cell
+    return _ill_conditioned(cell, moved, precision) if moved > slope_bound else cell
+
+
+def _input_precision(step: Step) -> tuple[str, float]:
+    """Return the precision in which the inputs of a step are rounded, and its unit."""
+    return ("single", SINGLE) if step.node.path in _LARGEST else ("double", DOUBLE)
+
+
+def _overflow(truth: Any) -> Cell:
+    """Return the outcome of a result that is not finite."""
+    if _fits_single_precision(truth):
+        return Cell("fail", "not finite")
+    return Cell("pass", "overflows visibly, as the reference does in single precision")
+
+
+def _roundings(value: Any) -> list[float]:
+    """Return the largest relative rounding of each tensor in half precision, and 0 of others."""
+    return [HALVES.get(x.dtype, 0.0) for x in tensors_in(value)]
+
+
+def _is_dim(step: Step, case: Case) -> bool:
+    """Return True if only the dim elements of the result count."""
+    return case.expect == "dim part" and step.node.path.startswith(_LIGHT)
+
+
+def _error_beside_terms(step: Step, inputs: list[Any], value: Any, truth: Any, seed: int) -> float:
+    """Return the largest error of scalars, each relative to the sum of its terms."""
+    errors = []
+    for i, (a, b) in enumerate(zip(tensors_in(value), tensors_in(truth), strict=True)):
+        errors.append(over(a, b, max(LEAST, terms(step, inputs, b, i, seed))))
+    return max(errors)
+
+
+def _ill_conditioned(cell: Cell, moved: float, precision: str) -> Cell:
+    """Return the outcome of a step whose gradient moves with the rounding of its inputs."""
+    if cell.mark == "fail":
+        return cell
+    changes = (
+        f"four roundings of the inputs in {precision} precision alone change the gradient by"
+        f" {moved:.1e}"
+    )
+    return replace(cell, mark="warn", note=f"ill-conditioned: {changes}")
 
 
 def _truth(step: Step, inputs: list[Any], seed: int) -> Any:
@@ -381,9 +413,9 @@ def _marked(error: float, bound: float, slope: float | None, steeper: float) -> 
     """Return the outcome of a test: pass if errors are below half of their bounds, warn up to
     the bounds, else fail.
     """
-    used = [error / bound] if slope is None else [error / bound, slope / steeper]
-    within = all(share <= 1.0 for share in used)  # NaN is not within its bound
-    near = within and max(used) > _NEAR
+    shares = [error / bound] if slope is None else [error / bound, slope / steeper]
+    within = all(share <= 1.0 for share in shares)  # NaN is not within its bound
+    near = within and max(shares) > _NEAR
     mark: Mark = "warn" if near else "pass" if within else "fail"
     return Cell(
         mark, "near its bound" * near, error, bound, slope, None if slope is None else steeper
@@ -418,12 +450,12 @@ def _fits_single_precision(truth: Any) -> bool:
 # --- NaN and infinity -----------------------------------------------------------------------------
 
 
-def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed: int) -> Cell:
+def _seen(step: Step, inputs: Sequence[Any], changed: list[Any], case: Case, seed: int) -> Cell:
     """Return a test result that fails if a step's result does not show NaN or infinity of an
     input picture.
     """
     notes = [
-        _one_seen(step, _with_one_changed(i, inputs, given), seed)
+        _one_seen(step, _with_one_changed(i, inputs, changed), seed)
         for i in range(len(pictures_in(inputs)))
     ]
     hidden = [note for note in notes if note.startswith("hidden")]
@@ -433,27 +465,27 @@ def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed:
     return Cell("pass", f"as stated: {stated}" if hidden else "; ".join(dict.fromkeys(notes)))
 
 
-def _one_seen(step: Step, given: list[Any], seed: int) -> str:
+def _one_seen(step: Step, inputs: list[Any], seed: int) -> str:
     """Return how a step treats NaN or infinity in an input: refused, seen in the result, as a
     large number, hidden.
     """
     with torch.no_grad():
         try:
-            value = as_used(step, given, seed)
+            value = as_used(step, inputs, seed)
         except Refused as refused:
             return f"refused: {refused}"
         if not finite(value):
             return "seen"
-        bad = next(float(x[~x.isfinite()][0]) for x in pictures_in(given) if not finite(x))
+        bad = next(float(x[~x.isfinite()][0]) for x in pictures_in(inputs) if not finite(x))
         if math.isnan(bad):
             return "hidden: a finite result in spite of NaN"
-        large = each_tensor(lambda x: x.nan_to_num(posinf=_HUGE, neginf=-_HUGE), given)
+        large = each_tensor(lambda x: x.nan_to_num(posinf=_HUGE, neginf=-_HUGE), inputs)
         limit = run(step, step.node.fn, large, seed)
         same = finite(limit) and largest_error(value, limit) <= max(step.node.rtol, ROUNDING)
         return "like a large number" if same else "hidden: another result than for a large number"
 
 
-def _with_one_changed(which: int, inputs: Sequence[Any], given: Sequence[Any]) -> list[Any]:
-    swap = {id(pictures_in(inputs)[which]): pictures_in(given)[which]}
+def _with_one_changed(which: int, inputs: Sequence[Any], changed: Sequence[Any]) -> list[Any]:
+    swap = {id(pictures_in(inputs)[which]): pictures_in(changed)[which]}
     only: list[Any] = each_tensor(lambda x: swap.get(id(x), x), list(inputs))
     return only

@@ -379,36 +379,31 @@ def with_size(steps: Mapping[str, Step], size: Size) -> dict[str, Step]:
     """Reduce the pixels, pupil samples and spectral bands of the steps, and keep the pupil
     diameters.
     """
-    sides = [
-        side
-        for step in steps.values()
-        for name in ("shape",)
-        for side in step.params.get(name) or ()
-    ]
-    part = size.pixels / max(sides, default=size.pixels)
-    return {name: replace(step, params=_smaller(step, size, part)) for name, step in steps.items()}
+    largest = [max(step.params["shape"]) for step in steps.values() if step.params.get("shape")]
+    scale = size.pixels / max(largest, default=size.pixels)
+    return {name: replace(step, params=_smaller(step, size, scale)) for name, step in steps.items()}
 
 
-def _smaller(step: Step, size: Size, part: float) -> dict[str, Any]:
+def _smaller(step: Step, size: Size, scale: float) -> dict[str, Any]:
     params = dict(step.params)
     if params.get("shape"):
-        params["shape"] = tuple(max(1, round(side * part)) for side in params["shape"])
+        params["shape"] = tuple(max(1, round(side * scale)) for side in params["shape"])
     if "samples" in params:
         params["pitch"] = params["pitch"] and params["pitch"] * params["samples"] / size.samples
         params["samples"] = size.samples
     if step.node.path == "spectra.bands":
         params["count"] = size.bands
     if step.node.path == "doe.pixelwise":
-        params["file"] = (
-            # its samples do not fit the small pupil: a random height map of its depth takes its
-            # place
-            None
-        )
+        # its samples do not fit the small pupil: a random height map of its depth takes its place
+        params["file"] = None
     if params.get("angle"):
-        params["angle"] = tuple(a * min(part, 1.0) for a in params["angle"])
-    return params | {
-        k: min(v, params[k]) for k, v in _SMALLER.items() if step.node.random and k in params
-    }
+        params["angle"] = tuple(a * min(scale, 1.0) for a in params["angle"])
+    return params | (_limited(params) if step.node.random else {})
+
+
+def _limited(params: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters of a random node that are limited for a quick test."""
+    return {name: min(limit, params[name]) for name, limit in _SMALLER.items() if name in params}
 
 
 def with_parameters(steps: Mapping[str, Step], case: Case) -> dict[str, Step]:

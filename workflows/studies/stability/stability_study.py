@@ -66,11 +66,11 @@ def grid_picture(entries: Sequence[Entry]) -> Any:
             nodes[first:],
             across,
         )
-    how = (
+    measure = (
         "largest error over the largest element, of the result or (g) of its gradient, whichever is"
         " nearer its bound"
     )
-    text = f"{how};  ! warn, × fail;  r refused, s seen, – no number to compare"
+    text = f"{measure};  ! warn, × fail;  r refused, s seen, – no number to compare"
     figure.supxlabel(textwrap.fill(text, int(width / _LETTER)), fontsize=9)
     return figure
 
@@ -218,10 +218,10 @@ def _rows(
     usual = CaseRecipe.of(recipe, USUAL, code)
     for number, case in enumerate(cases, 1):
         chain = usual if case is USUAL else CaseRecipe.of(recipe, case, code, usual)
-        found = list(_row(chain, set(unchanged_steps(chain, usual)), store, own))
-        yield from found
-        bad = sum(row.cell.mark == "fail" for row in found)
-        progress(f"[{number}/{len(cases)}] {case.name}: {len(found)} steps, {bad} fail")
+        cells = list(_row(chain, set(unchanged_steps(chain, usual)), store, own))
+        yield from cells
+        bad = sum(row.cell.mark == "fail" for row in cells)
+        progress(f"[{number}/{len(cases)}] {case.name}: {len(cells)} steps, {bad} fail")
     code.save()
 
 

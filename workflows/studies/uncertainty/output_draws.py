@@ -99,13 +99,13 @@ def _of_sequences(x: FloatArray, count: int) -> float:
     Sobol sequence.
     """
     squares = (x - x.mean()) ** 2
-    each = np.array([squares[i::count].mean() for i in range(count)])
-    return float(each.std(ddof=1) / math.sqrt(count) / each.mean() / 2)
+    means = np.array([squares[i::count].mean() for i in range(count)])
+    return float(means.std(ddof=1) / math.sqrt(count) / means.mean() / 2)
 
 
-def worst_known(found: Mapping[str, Scatter]) -> str:
+def worst_known(scatter: Mapping[str, Scatter]) -> str:
     """Return the name of the quantity whose standard deviation has the largest relative error."""
-    return max(found, key=lambda each: found[each].error)
+    return max(scatter, key=lambda name: scatter[name].error)
 
 
 # --- allowed draws --------------------------------------------------------------------------------
@@ -173,7 +173,7 @@ def refuse_combinations(inputs: Inputs, ends: ShapesFloatArray, draws: AllowedDr
     if problems:
         raise RecipeError(problems)
     if draws.left_out:
-        what = (
+        fault = (
             f"{draws.left_out} of the first {draws.tried} draws have values that are not allowed"
             " together"
         )
@@ -181,7 +181,7 @@ def refuse_combinations(inputs: Inputs, ends: ShapesFloatArray, draws: AllowedDr
         assert value is not None
         advice = "give narrower or truncated distributions"
         raise RecipeError(
-            [Diagnostic(value.mark, ", ".join(inputs.names), f"{what} ({draws.reason}): {advice}")]
+            [Diagnostic(value.mark, ", ".join(inputs.names), f"{fault} ({draws.reason}): {advice}")]
         )
 
 
@@ -243,23 +243,25 @@ class OutputDraws:
         store does not have.
         """
         keys = [self.key(row) for row in values]
-        found = [kept and kept["numbers"] for kept in map(self._kept, keys)]
-        lacking = [i for i, numbers in enumerate(found) if numbers is None]
+        stored = [record and record["numbers"] for record in map(self._kept, keys)]
+        lacking = [i for i, numbers in enumerate(stored) if numbers is None]
         for i, result in zip(lacking, self._results([values[i] for i in lacking]), strict=True):
-            found[i] = self._keep(keys[i], result)
-        return [numbers for numbers in found if numbers is not None]
+            stored[i] = self._keep(keys[i], result)
+        return [numbers for numbers in stored if numbers is not None]
 
     def pictures(self, values: FloatArray) -> dict[str, tuple[Tensor, Tensor]]:
         """Return mean and standard deviation of each output picture over the draws, and store
         each draw's numbers.
         """
         keys = [self.key(row) for row in values]
-        whole = digest("uncertainty pictures", keys)
+        pictures_key = digest("uncertainty pictures", keys)
         if (first := self._kept(keys[0])) is not None and not first["pictures"]:
             return {}
-        found: dict[str, tuple[Tensor, Tensor]]
-        found = compute_once(self.store, whole, dict, lambda: self._sums(keys, values), _ABOUT)
-        return found
+        moments: dict[str, tuple[Tensor, Tensor]]
+        moments = compute_once(
+            self.store, pictures_key, dict, lambda: self._sums(keys, values), _ABOUT
+        )
+        return moments
 
     def _sums(self, keys: Sequence[str], values: FloatArray) -> dict[str, tuple[Tensor, Tensor]]:
         sums = dict[str, _Sum]()
@@ -302,8 +304,8 @@ class OutputDraws:
 
     def _kept(self, key: str) -> dict[str, Any] | None:
         with suppress(KeyError):
-            found: dict[str, Any] = self.store.get(key)
-            return found
+            record: dict[str, Any] = self.store.get(key)
+            return record
         return None
 
     def _keep(self, key: str, result: Mapping[str, Any]) -> Numbers:
@@ -336,11 +338,11 @@ class OutputDraws:
         values = self._named(row)
         try:
             with torch.no_grad():
-                found: dict[str, Any] = self._function(self.inputs.theta(values))
+                result: dict[str, Any] = self._function(self.inputs.theta(values))
         except (RuntimeError, ValueError) as error:
-            at = ", ".join(f"{name} = {value:.6g}" for name, value in values.items())
-            raise ValueError(f"the recipe fails at the input values {at}: {error}") from error
-        return found
+            place = ", ".join(f"{name} = {value:.6g}" for name, value in values.items())
+            raise ValueError(f"the recipe fails at the input values {place}: {error}") from error
+        return result
 
     def _named(self, row: FloatArray) -> dict[str, float]:
         return dict(zip(self.inputs.names, map(float, row), strict=True))
@@ -348,11 +350,11 @@ class OutputDraws:
 
 def quantities(result: Mapping[str, Any]) -> Numbers:
     """Return all numbers in ``result`` by step and field, without pictures."""
-    found: Numbers = {}
+    numbers: Numbers = {}
     for step, value in result.items():
         for _, field, _, number in () if _is_picture(value) else numbers_of(step, value):
-            found.setdefault(f"{step}.{field}" if field else step, []).append(number)
-    return found
+            numbers.setdefault(f"{step}.{field}" if field else step, []).append(number)
+    return numbers
 
 
 def _reached_steps(inputs: Inputs, order: Sequence[str]) -> set[str]:

@@ -117,12 +117,12 @@ def _product(values: Sequence[FloatArray], power: Powers) -> FloatArray:
 
 def _low_degrees(degrees: Sequence[int]) -> tuple[Powers, ...]:
     """Return the degrees of the candidate terms in rising order of their hyperbolic norm."""
-    found: list[tuple[float, Powers]] = []
+    candidates: list[tuple[float, Powers]] = []
     for together in range(1, min(_TOGETHER, len(degrees)) + 1):
         for inputs in combinations(range(len(degrees)), together):
             for power in _degrees_of(inputs, degrees):
-                found.append((_norm(power), power))
-    return tuple(power for _, power in sorted(found)[:_CANDIDATES])
+                candidates.append((_norm(power), power))
+    return tuple(power for _, power in sorted(candidates)[:_CANDIDATES])
 
 
 def _norm(power: Powers) -> float:
@@ -299,9 +299,9 @@ def indices(shapes: Sequence[Shape], z: FloatArray, y: FloatArray) -> SobolIndic
     parts: list[FloatArray] = []
     missed = np.empty(len(y))
     for number in range(GROUPS):
-        kept = group != number
-        without = fit_polynomial(candidates, normal, kept)
-        missed[~kept] = normal[~kept] - without.at(candidates.columns[~kept])
+        training = group != number
+        without = fit_polynomial(candidates, normal, training)
+        missed[~training] = normal[~training] - without.at(candidates.columns[~training])
         parts.append(_shares(without, candidates, len(shapes)))
     explained = float(np.clip(1.0 - (missed**2).mean() / normal.var(), 0.0, 1.0))
     scattered = np.stack(parts)

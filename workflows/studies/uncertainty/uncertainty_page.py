@@ -59,8 +59,8 @@ def tornado(
     """
     columns = min(2, len(swings))
     rows = -(-len(swings) // columns)
-    most = max(map(len, swings.values()))
-    figure, axes = canvas(6.6 * columns, (0.34 * most + 1.3) * rows, rows, columns)
+    longest = max(map(len, swings.values()))
+    figure, axes = canvas(6.6 * columns, (0.34 * longest + 1.3) * rows, rows, columns)
     figure.get_layout_engine().set(h_pad=_APART)
     for ax, (name, bars) in zip(axes.flat, swings.items(), strict=False):
         _bars(ax, sorted(bars, key=lambda bar: abs(bar[2] - bar[1])), middles[name])
@@ -112,11 +112,11 @@ def bands(curves: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]], axi
     for (ax, below), (family, (x, members)) in zip(axes.T, curves.items(), strict=True):
         for (name, draws), colour in zip(members.items(), _COLOURS * len(members), strict=False):
             _band(ax, below, x, draws, colour, name)
-        least, most = (
+        lowest, highest = (
             min(float(d.min()) for d in members.values()),
             max(float(d.max()) for d in members.values()),
         )
-        if least > 0 and most / least > _WIDE:
+        if lowest > 0 and highest / lowest > _WIDE:
             ax.set_yscale("log")
         ax.set_title(f"{family}: median and middle 90 %")
         below.set_xlabel(axis)
@@ -137,13 +137,13 @@ def transfer(draws: FloatArray) -> Any:
     ax, below = axes[:, 0]
     signal, predicted = _at_one_signal(draws, 2)
     flat = _at_one_signal(draws, 1)[1]
-    whole = np.median(flat / predicted, axis=0) > _CLIPPED
+    unclipped = np.median(flat / predicted, axis=0) > _CLIPPED
     _band(ax, below, signal, predicted, BLUE, "predicted: middle 90 %")
-    if whole.any():
-        _band(ax, below, signal[whole], flat[:, whole], ORANGE, "flat fields: middle 90 %")
-    if not whole.all():
+    if unclipped.any():
+        _band(ax, below, signal[unclipped], flat[:, unclipped], ORANGE, "flat fields: middle 90 %")
+    if not unclipped.all():
         ax.axvspan(
-            signal[~whole].min(),
+            signal[~unclipped].min(),
             signal.max(),
             color=_GREY,
             alpha=0.15,
@@ -168,9 +168,9 @@ def _band(ax: Any, below: Any, x: FloatArray, draws: FloatArray, colour: str, na
     low, middle, up = np.quantile(draws, [0.05, 0.5, 0.95], axis=0)
     ax.fill_between(x, low, up, color=colour, alpha=0.35, linewidth=0, label=name)
     ax.plot(x, middle, color=colour, linewidth=1.0)
-    seen = np.abs(middle) > _SLIGHT * np.abs(middle).max()
-    share = [100 * (end[seen] / middle[seen] - 1) for end in (low, up)]
-    below.fill_between(x[seen], *share, color=colour, alpha=0.35, linewidth=0.8)
+    visible = np.abs(middle) > _SLIGHT * np.abs(middle).max()
+    share = [100 * (end[visible] / middle[visible] - 1) for end in (low, up)]
+    below.fill_between(x[visible], *share, color=colour, alpha=0.35, linewidth=0.8)
 
 
 def _at_one_signal(draws: FloatArray, column: int) -> tuple[FloatArray, FloatArray]:
@@ -212,19 +212,19 @@ def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) ->
         ax.set_axis_off()
     figure.supylabel("draws", fontsize=10)
     figure.legend(
-        *(found[:1] for found in axes.flat[0].get_legend_handles_labels()),
+        *(legend[:1] for legend in axes.flat[0].get_legend_handles_labels()),
         loc="outside lower center",
     )
     return figure
 
 
 @drawn
-def pictures(found: Mapping[str, tuple[Tensor, Tensor]]) -> Any:
+def pictures(moments: Mapping[str, tuple[Tensor, Tensor]]) -> Any:
     """Draw the mean of each output picture over the draws, and the standard deviation averaged
     over the colours.
     """
-    figure, axes = canvas(9.6, 4.2 * len(found), len(found), 2)
-    for (left, right), (name, (mean, sd)) in zip(axes, found.items(), strict=True):
+    figure, axes = canvas(9.6, 4.2 * len(moments), len(moments), 2)
+    for (left, right), (name, (mean, sd)) in zip(axes, moments.items(), strict=True):
         white = high(mean.clamp_min(0))
         three = mean.ndim == 3 and mean.shape[0] == 3
         shown = encoded(mean / white) if three else (mean[0] if mean.ndim == 3 else mean).numpy()
@@ -364,8 +364,8 @@ def _curves(
     spectral = True
     for name, values in result.values.items():
         count = values.shape[1]
-        known = np.isfinite(values).all() and not result.scatter[name].is_constant
-        if count < 3 or not known or _node_of(result, name) == _TRANSFER:
+        varies = np.isfinite(values).all() and not result.scatter[name].is_constant
+        if count < 3 or not varies or _node_of(result, name) == _TRANSFER:
             continue
         over_bands = len(wavelengths) == count
         spectral &= over_bands
@@ -400,10 +400,10 @@ def lead(result: UncertaintyResult) -> str:
     strange = (
         f" NaN or infinite in some draw: {', '.join(result.strange)}." if result.strange else ""
     )
-    known = "; ".join([*_known(result), *_exceptions(result)])
+    precision = "; ".join([*_known(result), *_exceptions(result)])
     return (
         f"{count} {kind} of {', '.join(result.inputs.names)}:"
-        f" {known}.{strange}\n\n{'; '.join(values)}."
+        f" {precision}.{strange}\n\n{'; '.join(values)}."
     )
 
 
@@ -422,8 +422,8 @@ def _known(result: UncertaintyResult) -> list[str]:
         ]
     if result.error <= result.wanted:
         return [f"{which} is known to {result.error:.1%}", *others]
-    known = f"the standard deviation of {result.worst} is known to {result.error:.1%} only"
-    return [known, f"{result.wanted:.1%} was requested", *others]
+    sentence = f"the standard deviation of {result.worst} is known to {result.error:.1%} only"
+    return [sentence, f"{result.wanted:.1%} was requested", *others]
 
 
 def _exceptions(result: UncertaintyResult) -> list[str]:
@@ -502,13 +502,13 @@ def _posterior(result: UncertaintyResult) -> list[Section]:
 
 
 def _numbers(result: UncertaintyResult, picture: bytes | None) -> Section:
-    how = (
+    method = (
         f"from {result.sequences} scrambled Sobol sequences"
         if result.sequences
         else "by the jackknife"
     )
     text = (
-        f"Error: the relative error of the standard deviation, {how}. For a curve, the worst"
+        f"Error: the relative error of the standard deviation, {method}. For a curve, the worst"
         " element counts."
     )
     columns = ("quantity", "at the medians", "mean", "sd", "error", "5 %", "95 %")

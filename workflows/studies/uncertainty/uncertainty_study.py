@@ -126,10 +126,10 @@ def _inputs(recipe: Recipe) -> Inputs:
         raise StudyRefused(str(error)) from error
 
 
-def _points(inputs: Inputs, seed: int, most: int, points: str) -> InputDraws:
+def _points(inputs: Inputs, seed: int, limit: int, points: str) -> InputDraws:
     if points == "sobol":
-        return inputs.sobol(SCRAMBLES * 2 ** int(np.log2(max(most, LEAST) / SCRAMBLES)), seed)
-    return inputs.independent(most if inputs.most is None else min(most, inputs.most), seed)
+        return inputs.sobol(SCRAMBLES * 2 ** int(np.log2(max(limit, LEAST) / SCRAMBLES)), seed)
+    return inputs.independent(limit if inputs.most is None else min(limit, inputs.most), seed)
 
 
 def _ends(inputs: Inputs) -> FloatArray:
@@ -145,47 +145,49 @@ def _one_at_a_time(inputs: Inputs, score: float) -> FloatArray:
     """Return input values with one input at each of two opposite normal scores, and all others
     at their medians.
     """
-    z = [sign * score * direction for direction in np.eye(len(inputs.names)) for sign in (-1, 1)]
+    z = []
+    for direction in np.eye(len(inputs.names)):
+        z += [-score * direction, score * direction]
     return inputs.at(np.stack(z))
 
 
-def _chosen(until: Sequence[str], there: Sequence[str]) -> tuple[str, ...]:
-    """Return the names ``there`` that ``until`` means, or all; raise `StudyRefused` for a name
+def _chosen(until: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the ``names`` that ``until`` means, or all; raise `StudyRefused` for a name
     of none of them.
     """
     if not until:
-        return tuple(there)
+        return tuple(names)
     decide = dict[str, None]()
     for name in until:
-        meant = _means(name, there)
+        meant = _means(name, names)
         if not meant:
             raise StudyRefused(
                 f"--until {name}: no output with numbers has this name; there are"
-                f" {', '.join(there)}"
+                f" {', '.join(names)}"
             )
         decide |= dict.fromkeys(meant)
-    return tuple(name for name in there if name in decide)
+    return tuple(name for name in names if name in decide)
 
 
 def _deciding(
-    until: Sequence[str], there: Sequence[str], constant: Sequence[str]
+    until: Sequence[str], varying: Sequence[str], constant: Sequence[str]
 ) -> tuple[str, ...]:
     """Return the numbers that decide when to stop; raise `StudyRefused` for an output that
     depends on no input.
     """
-    still = [name for name in until if _means(name, constant) and not _means(name, there)]
+    still = [name for name in until if _means(name, constant) and not _means(name, varying)]
     if still:
         raise StudyRefused(
             f"--until {still[0]}: this output depends on no uncertain input, and does not vary"
         )
-    return _chosen(until, there)
+    return _chosen(until, varying)
 
 
-def _means(name: str, there: Sequence[str]) -> list[str]:
-    """Return the names ``there`` of an output or of a single quantity."""
+def _means(name: str, quantities: Sequence[str]) -> list[str]:
+    """Return those of ``quantities`` of an output or of a single quantity."""
     return [
         quantity
-        for quantity in there
+        for quantity in quantities
         if quantity == name or quantity.startswith((f"{name}.", f"{name}["))
     ]
 
@@ -301,19 +303,19 @@ def _swings(
     """Return each output number with one input at its 5 % and 95 % quantile; skip numbers
     proportional to others.
     """
-    found: dict[str, list[tuple[str, float, float]]] = {}
+    swings: dict[str, list[tuple[str, float, float]]] = {}
     for name, x in values.items():
-        known = np.isfinite(x).all() and np.isfinite([end[name] for end in ends]).all()
-        varies = known and x.shape[1] == 1 and not scattered[name].is_constant
-        if varies and not any(_proportional(x[:, 0], values[other][:, 0]) for other in found):
-            each = zip(inputs.labels, ends[1::2], ends[2::2], strict=True)
-            found[name] = [(label, low[name][0], high[name][0]) for label, low, high in each]
-    return found
+        finite = np.isfinite(x).all() and np.isfinite([end[name] for end in ends]).all()
+        varies = finite and x.shape[1] == 1 and not scattered[name].is_constant
+        if varies and not any(_proportional(x[:, 0], values[other][:, 0]) for other in swings):
+            pairs = zip(inputs.labels, ends[1::2], ends[2::2], strict=True)
+            swings[name] = [(label, low[name][0], high[name][0]) for label, low, high in pairs]
+    return swings
 
 
 def _proportional(x: FloatArray, y: FloatArray) -> bool:
-    at = int(np.abs(y).argmax())
-    return y[at] != 0 and bool(np.allclose(x * y[at], y * x[at], rtol=1e-9, atol=0.0))
+    index = int(np.abs(y).argmax())
+    return y[index] != 0 and bool(np.allclose(x * y[index], y * x[index], rtol=1e-9, atol=0.0))
 
 
 def _document(result: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
@@ -339,7 +341,9 @@ def _document(result: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
 
 def _plain(result: UncertaintyResult, name: str) -> dict[str, Any]:
     s = result.scatter[name]
-    arrays = {what: getattr(s, what).tolist() for what in ("mean", "sd", "low", "high")}
+    arrays = {
+        statistic: getattr(s, statistic).tolist() for statistic in ("mean", "sd", "low", "high")
+    }
     return {"error": s.error, "middle": list(result.middle[name]), **arrays}
 
 
@@ -348,12 +352,11 @@ def _report(result: UncertaintyResult) -> StudyReport:
     draws = zip(result.inputs.names, result.points.values.T, strict=True)
     files: dict[str, Content] = {"draws.npz": _npz({**dict(draws), **result.values})}
     if result.pictures:
-        named = (
-            (f"{name} {what}", x)
-            for name, both in result.pictures.items()
-            for what, x in zip(_KEPT, both, strict=True)
-        )
-        files["pictures.npz"] = _npz({name: x.numpy() for name, x in named})
+        arrays = {}
+        for name, moments in result.pictures.items():
+            for statistic, x in zip(_KEPT, moments, strict=True):
+                arrays[f"{name} {statistic}"] = x.numpy()
+        files["pictures.npz"] = _npz(arrays)
     return StudyReport(
         f"{result.inputs.recipe.name}: uncertainty",
         lead(result),

@@ -50,9 +50,9 @@ class Pairs:
                 f"train_lift: step {settings.picture} gives no random pictures: use a"
                 " spectra.leaves step"
             )
-        known = recipe.run(store, [bands, settings.measured], device=device)
-        self.bands: Bands = known[bands]
-        self.measured: Tensor = known[settings.measured]
+        results = recipe.run(store, [bands, settings.measured], device=device)
+        self.bands: Bands = results[bands]
+        self.measured: Tensor = results[settings.measured]
         need_mst_plus_plus_bands(self.bands)
         self._draw = as_function(
             recipe, outputs=self._names, store=store, device=device, redraw=random
@@ -96,7 +96,7 @@ class LiftLearner:
     def parts(self) -> dict[str, Any]:
         """Return by name the objects whose state a checkpoint must contain."""
         parts = {"net": self.net, "optimiser": self.optimiser, "average": self.average}
-        return {name: part for name, part in parts.items() if part}
+        return {name: member for name, member in parts.items() if member}
 
     def iterate(self, iteration: int) -> Losses:
         """Train the network on one batch of pictures, and return the losses.

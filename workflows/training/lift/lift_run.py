@@ -76,18 +76,18 @@ def lifted_spectra(
     """
     figure, axes = canvas(13.0, 2.6, 1, 6)
     y, x = shown.shape[-2:]
-    at = [(y * (2 * i + 1) // 10, x * (2 * ((3 * i) % 5) + 1) // 10) for i in range(5)]
+    pixels = [(y * (2 * i + 1) // 10, x * (2 * ((3 * i) % 5) + 1) // 10) for i in range(5)]
     picture(axes[0, 0], encoded(shown), "picture")
     axes[0, 0].plot(
-        [c for _, c in at],
-        [r for r, _ in at],
+        [c for _, c in pixels],
+        [r for r, _ in pixels],
         "o",
         color=BLACK,
         markerfacecolor="white",
         markersize=5,
     )
     nm = (centres * 1e9).cpu().numpy()
-    for number, (ax, (row, column)) in enumerate(zip(axes[0, 1:], at, strict=True), 1):
+    for number, (ax, (row, column)) in enumerate(zip(axes[0, 1:], pixels, strict=True), 1):
         ax.plot(nm, truth[:, row, column].cpu().numpy(), color=BLACK, linewidth=1.5, label="truth")
         for name, cube in estimates.items():
             ax.plot(
@@ -99,7 +99,8 @@ def lifted_spectra(
     figure.legend(*axes[0, 1].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     figure.supxlabel("wavelength (nm)")
     place_labels(
-        figure, {axes[0, 0]: [PointLabel(c, r, str(i), BLACK) for i, (r, c) in enumerate(at, 1)]}
+        figure,
+        {axes[0, 0]: [PointLabel(c, r, str(i), BLACK) for i, (r, c) in enumerate(pixels, 1)]},
     )
     return figure
 

@@ -106,9 +106,9 @@ class RecordedInputs:
                 return None
             stated = written.pop("digest")
             for name in ("photographs", "held_out"):
-                written[name] = tuple(RecordedFile(**each) for each in written[name])
+                written[name] = tuple(RecordedFile(**recorded) for recorded in written[name])
             written["files"] = {
-                setting: RecordedFile(**each) for setting, each in written["files"].items()
+                setting: RecordedFile(**recorded) for setting, recorded in written["files"].items()
             }
             record = cls(**written)
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
@@ -142,15 +142,15 @@ class CameraInputs:
 
     @classmethod
     def of(
-        cls, recipe: Recipe, outputs: Iterable[str], code: Code, given: Sequence[str] = ()
+        cls, recipe: Recipe, outputs: Iterable[str], code: Code, computed: Sequence[str] = ()
     ) -> CameraInputs:
-        """Return what decides the ``outputs`` of a recipe; the caller computes the steps ``given``,
-        which do not count.
+        """Return what decides the ``outputs`` of a recipe; the steps ``computed`` by the
+        caller do not count.
 
         Raises ValueError with place and fix for code of the user that reads what cannot be
         followed.
         """
-        order = [name for name in needed(recipe, outputs) if name not in given]
+        order = [name for name in needed(recipe, outputs) if name not in computed]
         steps = {name: _origin(recipe.steps[name], recipe.seed, code) for name in order}
         values = {"seed": recipe.seed, "tolerance": recipe.tolerance, "exact": recipe.exact}
         return cls(values, steps, _laws(recipe))
@@ -227,7 +227,7 @@ def identity(value: Any) -> Any:
             if f.name not in _WORDS_ONLY
         }
     if isinstance(value, tuple | list):
-        return [identity(part) for part in value]
+        return [identity(item) for item in value]
     return plain(value)
 
 
@@ -254,12 +254,12 @@ class EarlierTraining:
     def __str__(self) -> str:
         listed = [f"  {change}" for change in self.changes[:_SHOWN]]
         hidden = len(self.changes) - _SHOWN
-        more = [f"  and {hidden} more"] if hidden > 0 else []
+        ending = [f"  and {hidden} more"] if hidden > 0 else []
         head = (
             f"begins anew, because its inputs are not those of {self.folder.name}, which stays as"
             " it is:"
         )
-        return "\n".join([head, *listed, *more])
+        return "\n".join([head, *listed, *ending])
 
 
 def prepare_folder(
@@ -294,7 +294,7 @@ def why_anew(
     runs, stem = folder.parent, folder.name.rpartition("_")[0]
     earlier = list(_earlier(runs, stem, inputs, recipe, store))
     if earlier:
-        return min(earlier, key=lambda each: (len(each.changes), -_began(each.folder)))
+        return min(earlier, key=lambda training: (len(training.changes), -_began(training.folder)))
     silent = next((path.parent for path in sorted(runs.glob(f"{stem}_*/state.pt"))), None)
     if silent is None:
         return None
@@ -450,15 +450,13 @@ def _recipe_of(camera: str, recipe: Recipe) -> Recipe:
 
 
 def _read(origin: Mapping[str, Any]) -> str:
-    names = [
-        name
-        for source in origin["inputs"]
-        for name in ([source] if isinstance(source, str) else source or [])
-    ]
+    names: list[str] = []
+    for source in origin["inputs"]:
+        names += [source] if isinstance(source, str) else source or []
     return ", ".join(names) or "nothing"
 
 
 def _code(old: Mapping[str, str], new: Mapping[str, str], store: Store) -> Iterator[str]:
-    for what in _differing(old, new):
-        found = edits(store.root, old.get(what, ""), new.get(what, ""))
-        yield from found or [f"the code of {what} changed"]
+    for module in _differing(old, new):
+        changes = edits(store.root, old.get(module, ""), new.get(module, ""))
+        yield from changes or [f"the code of {module} changed"]

@@ -36,15 +36,15 @@ _NAMES = {"relief": "mask"}  #: names in a state of version 0.1, with the presen
 
 def write_whole(path: Path, data: bytes) -> None:
     """Replace a file atomically: an interrupted write leaves the old file unchanged."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with part.open("wb") as file:
+        with partial.open("wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        part.replace(path)
+        partial.replace(path)
     except BaseException:
-        part.unlink(missing_ok=True)
+        partial.unlink(missing_ok=True)
         raise
 
 
@@ -79,7 +79,7 @@ class StateFile:
                 raise ValueError(f"the training state has format {state['edition']}, not {_FORMAT}")
             if "parts" in state:
                 state["parts"] = {
-                    _NAMES.get(name, name): part for name, part in state["parts"].items()
+                    _NAMES.get(name, name): member for name, member in state["parts"].items()
                 }
         except (
             RuntimeError,
@@ -164,8 +164,8 @@ def export(
     """Write tensors and metadata to the file ``<name>.safetensors`` in a folder."""
     from safetensors.torch import save
 
-    whole = {key: x.detach().cpu().contiguous().clone() for key, x in tensors.items()}
-    write_whole(folder / f"{name}.safetensors", save(whole, about or None))
+    copies = {key: x.detach().cpu().contiguous().clone() for key, x in tensors.items()}
+    write_whole(folder / f"{name}.safetensors", save(copies, about or None))
 
 
 # --- resumable loop -------------------------------------------------------------------------------
@@ -279,8 +279,8 @@ class ResumableLoop(ABC, Generic[L]):
         self.begin_stage()
         if state:
             self.recall(state)
-            for name, part in self.learner.parts().items():
-                part.load_state_dict(state["parts"][name])
+            for name, member in self.learner.parts().items():
+                member.load_state_dict(state["parts"][name])
             self.rows.cut(self.stage, self.iteration, self.writes)
             self.progress(
                 f"continues {f'in stage {self.stage} ' if self.stage else ''}after {self.iteration}"
@@ -295,21 +295,29 @@ class ResumableLoop(ABC, Generic[L]):
         if self.writes and self.iteration < iterations:
             remove_crate(self.folder)
         while self.iteration < iterations and not self.stops_early:
-            began = time.perf_counter()
-            try:
-                losses = self.iterate()
-            except NotFinite as error:
-                raise self._dumped(error) from error
-            losses |= self.validate(self.iteration + 1)
-            losses["seconds"] = time.perf_counter() - began
-            self.rows.add(self.stage, self.iteration, losses)
-            self.iteration += 1
+            losses = self._next_row()
             ended = self.iteration == iterations or self.stops_early
-            if self.writes and (ended or self.iteration % self.show_every == 0):
-                self.show()
+            self._show_at_intervals(ended)
             self.note(losses)
             if not ended and self.iteration % self.keep_every == 0:
                 self.keep()
+
+    def _show_at_intervals(self, ended: bool) -> None:
+        if self.writes and (ended or self.iteration % self.show_every == 0):
+            self.show()
+
+    def _next_row(self) -> Losses:
+        """Compute one iteration, and add its losses and its time to the loss table."""
+        began = time.perf_counter()
+        try:
+            losses = self.iterate()
+        except NotFinite as error:
+            raise self._dumped(error) from error
+        losses |= self.validate(self.iteration + 1)
+        losses["seconds"] = time.perf_counter() - began
+        self.rows.add(self.stage, self.iteration, losses)
+        self.iteration += 1
+        return losses
 
     def note(self, losses: Losses) -> None:
         """Pass the losses of the last training iteration to the callback function ``watch``."""
@@ -350,7 +358,7 @@ class ResumableLoop(ABC, Generic[L]):
         write_crate(self.folder, self.folder.name, about | {"began": self.began})
 
     def _packed(self, **about: Any) -> dict[str, Any]:
-        parts = {name: part.state_dict() for name, part in self.learner.parts().items()}
+        parts = {name: member.state_dict() for name, member in self.learner.parts().items()}
         return {
             "stage": self.stage,
             "iteration": self.iteration,

@@ -78,52 +78,52 @@ def _row(terms: Terms, psf: Any, exposure: dict[str, Any], own: dict[str, Any]) 
     """Return error and information of a mask, whose own limit is lower by what is uncertain, and
     of the best stop.
     """
-    seen, found = terms.seen(), {"light": exposure["light"]}
+    sight, row = terms.seen(), {"light": exposure["light"]}
     for name in ("filtered_error", "information"):
-        found[name] = float(getattr(losses, name)(psf, *seen, **{**exposure, **own}))
-        found[f"{name} of the stop"], width, passed = losses.best_stop(
-            terms.plain(), *seen, **exposure, measure=name
+        row[name] = float(getattr(losses, name)(psf, *sight, **{**exposure, **own}))
+        row[f"{name} of the stop"], width, passed = losses.best_stop(
+            terms.plain(), *sight, **exposure, measure=name
         )
         if name == "filtered_error":
-            found |= {"stop": width, "filter of the stop": passed}
-    return found
+            row |= {"stop": width, "filter of the stop": passed}
+    return row
 
 
-def section(found: dict[str, Any]) -> Section:
+def section(facts: dict[str, Any]) -> Section:
     """Return the section of the report page that compares a mask with the best stop at the same
     peak limit.
     """
     limit = (
         "no peak limit"
-        if found["limit"] is None
-        else f"a peak of at most {found['limit']:.3g} of the clear lens"
+        if facts["limit"] is None
+        else f"a peak of at most {facts['limit']:.3g} of the clear lens"
     )
     text = f"""Error of the Wiener-filtered picture of a natural scene over its variance, and
-        information per frequency, both for {limit}. The mask has an LSR of {found["lsr"]:.3g} in
-        its worst band and in the worst state of what is uncertain, a stop of {found["stop"]:.3g}
-        and a grey filter of {found["filter"]:.3g}. The rival is the round stop, as a share of the
+        information per frequency, both for {limit}. The mask has an LSR of {facts["lsr"]:.3g} in
+        its worst band and in the worst state of what is uncertain, a stop of {facts["stop"]:.3g}
+        and a grey filter of {facts["filter"]:.3g}. The rival is the round stop, as a share of the
         aperture, with the grey filter that has the least error at the same limit. A gain above 0 is
         in favour of the mask. Unknown glare and clipping are neglected."""
     listed, marks = [], dict[tuple[int, int], Mark]()
-    for number, row in enumerate(found["rows"]):
+    for number, row in enumerate(facts["rows"]):
         mask, stop = (
             _DECIBELS * row["filtered_error"],
             _DECIBELS * row["filtered_error of the stop"],
         )
-        bits, least = -row["information"], -row["information of the stop"]
+        bits, stop_bits = -row["information"], -row["information of the stop"]
         marks[number, 3] = "pass" if mask < stop else "fail"
-        marks[number, 8] = "pass" if bits > least else "fail"
-        own = (row["stop"], row["filter of the stop"], bits, least, bits - least)
+        marks[number, 8] = "pass" if bits > stop_bits else "fail"
+        own = (row["stop"], row["filter of the stop"], bits, stop_bits, bits - stop_bits)
         listed.append((row["light"], mask, stop, stop - mask, *own))
     return Section("Behind a peak limit", text, _COLUMNS, listed, marks=marks)
 
 
-def line(found: dict[str, Any]) -> str:
+def line(facts: dict[str, Any]) -> str:
     """Return the gain of a mask over the best stop by light of the scene as a line of text."""
     gains = ", ".join(
         f"{_DECIBELS * (row['filtered_error of the stop'] - row['filtered_error']):+.2f} dB at"
         f" {row['light']:g} e-"
-        for row in found["rows"]
+        for row in facts["rows"]
     )
     return f"filtered error against the best stop and filter: {gains}"
 
@@ -179,20 +179,15 @@ def history(rows: Sequence[Mapping[str, float]]) -> Any:
     """Draw the loss of a mask design and the loss terms over the iterations, with a curve for
     each optimisation.
     """
-    names = [
-        name
-        for name in dict.fromkeys(n for row in rows for n in row)
-        if name not in ("start", "iteration")
-    ]
+    columns = dict.fromkeys(itertools.chain.from_iterable(rows))
+    names = [name for name in columns if name not in ("start", "iteration")]
     figure, axes = canvas(3.6 * max(len(names), 2), 3.2, 1, len(names))
     starts = sorted({row["start"] for row in rows})
     looks = dict(zip(starts, itertools.cycle(itertools.product(_STYLES, _COLOURS)), strict=False))
     for ax, name in zip(axes[0], names, strict=True):
         for start in starts:
             own = [row for row in rows if row["start"] == start]
-            style, colour = looks[start]
-            look = {"linestyle": style, "color": colour, "linewidth": 1.2, "label": f"{start:g}"}
-            ax.plot([row["iteration"] for row in own], [row[name] for row in own], **look)
+            _draw_term(ax, own, name, looks[start], f"{start:g}")
         ax.set_title(name)
         ax.set_xlabel("iteration")
         ax.ticklabel_format(axis="y", useOffset=False)
@@ -201,6 +196,21 @@ def history(rows: Sequence[Mapping[str, float]]) -> Any:
             *axes[0, 0].get_legend_handles_labels(), title="start", loc="outside right upper"
         )
     return figure
+
+
+def _draw_term(
+    ax: Any, rows: Sequence[Mapping[str, float]], name: str, look: tuple[str, str], label: str
+) -> None:
+    """Draw a term of the loss of one optimisation over its iterations."""
+    style, colour = look
+    ax.plot(
+        [row["iteration"] for row in rows],
+        [row[name] for row in rows],
+        linestyle=style,
+        color=colour,
+        linewidth=1.2,
+        label=label,
+    )
 
 
 def sections(

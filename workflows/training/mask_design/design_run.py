@@ -12,6 +12,7 @@ import json
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,12 @@ from neusee.workflows.training.loop.recorded_inputs import (
     RecordedInputs,
 )
 from neusee.workflows.training.loop.resumable_loop import Progress, StateFile
-from neusee.workflows.training.mask_design.design_page import against_stops, line
+from neusee.workflows.training.mask_design.design_page import (
+    against_stops,
+    line,
+    pictures,
+    sections,
+)
 from neusee.workflows.training.mask_design.design_terms import Fabrication, Terms, stopped
 from neusee.workflows.training.mask_design.mask_optimisers import LearntMask, descend, evolve
 
@@ -58,8 +64,8 @@ _OPTIMISES = (
 )
 MASK = 0  #: the number of the stage that designs the mask, before stage 1
 _LEARNT_WITH = {
-    used.__module__
-    for used in (
+    callable_object.__module__
+    for callable_object in (
         half_rings,
         Polynomials,
         PARAMETRISATIONS["doe.pixelwise"],
@@ -91,11 +97,11 @@ def design(
     need_steps(recipe.steps, settings)
     code = Code((store or Store()).code_memo)
     key = design_inputs(recipe, settings, code).digest
-    kept = StateFile(state_file(out, recipe.name, key))
-    mask = DesignedMask.of(recipe, settings, store, kept, progress, device)
+    state = StateFile(state_file(out, recipe.name, key))
+    mask = DesignedMask.of(recipe, settings, store, state, progress, device)
     with new_run(out, f"{recipe.name}_mask", key) as folder:
         mask.write(folder)
-    kept.path.unlink(missing_ok=True)
+    state.path.unlink(missing_ok=True)
     return folder.path
 
 
@@ -132,10 +138,10 @@ def design_in(
             f"training stage 1 has begun in {folder}: remove this folder, or change a value of"
             " train.mask"
         )
-    kept = StateFile(folder / "mask.state")
+    state = StateFile(folder / "mask.state")
     files = RunFolder(folder, {"began": timestamp()})
-    DesignedMask.of(recipe, training.design, store, kept, progress, device).write(files, command)
-    kept.path.unlink(missing_ok=True)
+    DesignedMask.of(recipe, training.design, store, state, progress, device).write(files, command)
+    state.path.unlink(missing_ok=True)
     write_crate(folder, folder.name, files.said)
 
 
@@ -156,17 +162,17 @@ class DesignedMask:
         recipe: Recipe,
         settings: MaskTraining,
         store: Store | None,
-        kept: StateFile,
+        state: StateFile,
         progress: Progress,
         device: str,
     ) -> DesignedMask:
-        """Optimise a mask, or continue from the checkpoint ``kept``, and compute the figures of
+        """Optimise a mask, or continue from the checkpoint ``state``, and compute the figures of
         merit of the mask.
         """
         learning = Terms(_at(recipe, settings), settings, store, device)
         progress(f"fabrication: {Fabrication.of(recipe, settings)}")
         optimise = evolve if learning.settings.kind == "five_half_rings" else descend
-        learnt = optimise(learning, kept, progress)
+        learnt = optimise(learning, state, progress)
         full = _full(learning, learnt, recipe, settings, store, device)
         with torch.no_grad():
             height = learnt.height(full.stop).detach().to("cpu", torch.float32).contiguous()
@@ -209,12 +215,10 @@ class DesignedMask:
     def _report(self, shown: Sequence[str]) -> StudyReport:
         from safetensors.torch import save
 
-        from neusee.workflows.training.mask_design.design_page import pictures, sections
-
         terms, history = self.terms, self.learnt.history
         with torch.no_grad():
             drawings = pictures(terms, self.height.to(terms.device), self.learnt)
-        header = list(dict.fromkeys(name for row in history for name in row))
+        header = list(dict.fromkeys(chain.from_iterable(history)))
         tables = {
             "history.csv": (header, [[row.get(name, "") for name in header] for row in history])
         }
@@ -266,8 +270,8 @@ def design_inputs(recipe: Recipe, settings: MaskTraining, code: Code) -> Recorde
     """Return everything that can change a designed mask: steps with their files and code,
     settings and own code.
     """
-    seen = (settings.illuminant, settings.responses) if settings.weights.coloured else ()
-    named = (settings.psf, settings.plain, settings.height, *seen)
+    coloured = (settings.illuminant, settings.responses) if settings.weights.coloured else ()
+    named = (settings.psf, settings.plain, settings.height, *coloured)
     outputs = [name for name in named if name in recipe.steps]
     camera = CameraInputs.of(recipe, outputs, code)
     if settings.at:
@@ -305,7 +309,7 @@ def mask_figures(terms: Terms, height: Tensor) -> dict[str, Any]:
         psf = terms.psf(height)
         lsr, bsr = metrics.lsr(psf), metrics.bsr(psf)
         mtf, limits = metrics.mtf(psf), metrics.limits(psf)
-    each = {
+    by_band = {
         "wavelength": terms.bands.centres,
         "lsr": lsr,
         "bsr": bsr,
@@ -317,9 +321,11 @@ def mask_figures(terms: Terms, height: Tensor) -> dict[str, Any]:
         "rms_mtf_bound": limits.passed,
         "median_mtf_bound": limits.median,
     }
-    plain_values = {name: [float(x) for x in value] for name, value in each.items()}
+    plain_values = {name: [float(x) for x in value] for name, value in by_band.items()}
     means = {
-        name: float(value.double().mean()) for name, value in each.items() if name != "wavelength"
+        name: float(value.double().mean())
+        for name, value in by_band.items()
+        if name != "wavelength"
     }
     return {
         "mean": means,

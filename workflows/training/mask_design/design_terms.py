@@ -83,10 +83,10 @@ class CameraLaws:
     def values(self, state: State) -> dict[str, Any]:
         """Return the parameters of the recipe in a state."""
         defocus, _, *turns = (spread * x for spread, x in zip(self.spreads, state, strict=True))
-        found: dict[str, Any] = {name: at + defocus for name, at in self.defocus.items()}
-        return found | {
-            name: tuple(a + b for a, b in zip(at, turns, strict=True))
-            for name, at in self.angle.items()
+        params: dict[str, Any] = {name: nominal + defocus for name, nominal in self.defocus.items()}
+        return params | {
+            name: tuple(a + b for a, b in zip(nominal, turns, strict=True))
+            for name, nominal in self.angle.items()
         }
 
     def moved(self, bands: Bands, state: State) -> Bands:
@@ -106,13 +106,13 @@ class CameraLaws:
         For d = 1 these are the points of Gauss-Hermite quadrature.
         """
         unknown = [place for place, spread in enumerate(self.spreads) if spread]
-        found = [(NOMINAL, 1 - len(unknown) / 3)]
+        points = [(NOMINAL, 1 - len(unknown) / 3)]
         for place in unknown:
             for far in (-_FAR, _FAR):
                 state = [0.0] * len(self.spreads)
                 state[place] = far
-                found.append(((state[0], state[1], state[2], state[3]), 1 / 6))
-        return found
+                points.append(((state[0], state[1], state[2], state[3]), 1 / 6))
+        return points
 
 
 # --- learnt shade ---------------------------------------------------------------------------------
@@ -243,11 +243,11 @@ class Terms:
         self._function = as_function(
             self.recipe, *free, outputs=[settings.psf], store=store, device=device
         )
-        seen = [settings.illuminant, settings.responses] if settings.weights.coloured else []
+        sight = [settings.illuminant, settings.responses] if settings.weights.coloured else []
         stop = self.mask_step.wires.get("stop")
         stops = [stop] if isinstance(stop, str) else []
-        done = run(self.recipe, store, [self._bands, settings.plain, *seen, *stops], device=device)
-        self._seen: list[Tensor] = [done[name] for name in seen]
+        done = run(self.recipe, store, [self._bands, settings.plain, *sight, *stops], device=device)
+        self._seen: list[Tensor] = [done[name] for name in sight]
         self.bands: Bands = done[self._bands]
         self._plain: Psf = done[settings.plain]
         self._stop: Stop | None = done[stops[0]] if stops else None
@@ -271,17 +271,17 @@ class Terms:
     def psf(
         self,
         height: Tensor,
-        chosen: Sequence[int] | None = None,
+        indices: Sequence[int] | None = None,
         state: State = NOMINAL,
         stop: Tensor | None = None,
     ) -> Psf:
-        """Return the PSF of a mask from its height map, for the spectral bands ``chosen`` or for
+        """Return the PSF of a mask from its height map, for the spectral bands ``indices`` or for
         all bands.
 
         ``state`` moves what is uncertain, in standard deviations. ``stop`` is the amplitude of a
         learnt stop.
         """
-        bands = self.laws.moved(_some(self.bands, chosen), state)
+        bands = self.laws.moved(_some(self.bands, indices), state)
         values: dict[str, Any] = {
             self.settings.height: height,
             self._bands: bands,
@@ -305,17 +305,17 @@ class Terms:
         pupil: Pupil = function({self.settings.height: height})[name]
         return pupil
 
-    def plain(self, chosen: Sequence[int] | None = None) -> Psf:
-        """Return the PSF of the lens without a mask, for the spectral bands ``chosen`` or for
+    def plain(self, indices: Sequence[int] | None = None) -> Psf:
+        """Return the PSF of the lens without a mask, for the spectral bands ``indices`` or for
         all bands.
         """
-        psf: Psf = _some(self._plain, chosen)
+        psf: Psf = _some(self._plain, indices)
         return psf
 
     def parts(
         self,
         height: Tensor,
-        chosen: Sequence[int] | None = None,
+        indices: Sequence[int] | None = None,
         number: int | None = None,
         stop: Tensor | None = None,
     ) -> dict[str, Tensor]:
@@ -329,19 +329,19 @@ class Terms:
         points = self.laws.points() if number is None else [(self.laws.drawn(number), 1.0)]
         if self.laws.certain:
             points = [(NOMINAL, 1.0)]
-        each = [(self._parts(height, chosen, state, stop), share) for state, share in points]
+        by_state = [(self._parts(height, indices, state, stop), share) for state, share in points]
         return {
-            name: torch.stack([share * part[name] for part, share in each]).sum()
-            for name in each[0][0]
+            name: torch.stack([share * terms[name] for terms, share in by_state]).sum()
+            for name in by_state[0][0]
         }
 
     def _parts(
-        self, height: Tensor, chosen: Sequence[int] | None, state: State, stop: Tensor | None
+        self, height: Tensor, indices: Sequence[int] | None, state: State, stop: Tensor | None
     ) -> dict[str, Tensor]:
         settings, weights, psf = (
             self.settings,
             self.settings.weights,
-            self.psf(height, chosen, state, stop),
+            self.psf(height, indices, state, stop),
         )
         sums = {}
         if weights.lsr:
@@ -354,7 +354,7 @@ class Terms:
         if weights.wiener:  # not a sum over bands, because each channel depends on all bands
             terms["wiener"] = losses.wiener(
                 psf,
-                *self.seen(chosen),
+                *self.seen(indices),
                 noise=settings.noise_share,
                 colour=settings.colour,
                 up_to=settings.up_to,
@@ -362,7 +362,7 @@ class Terms:
         for name in ("filtered_error", "information"):
             if getattr(weights, name):
                 shared = {**self.exposure(), **self.passed(stop), "power": settings.power}
-                terms[name] = getattr(losses, name)(psf, *self.seen(chosen), **shared)
+                terms[name] = getattr(losses, name)(psf, *self.seen(indices), **shared)
         return terms
 
     def passed(self, stop: Tensor | None = None) -> dict[str, Any]:
@@ -385,12 +385,12 @@ class Terms:
             "up_to": s.up_to,
         }
 
-    def seen(self, chosen: Sequence[int] | None = None) -> tuple[Tensor, Tensor, Bands]:
-        """Return illuminant, responses and bands, for the spectral bands ``chosen`` or for all
+    def seen(self, indices: Sequence[int] | None = None) -> tuple[Tensor, Tensor, Bands]:
+        """Return illuminant, responses and bands, for the spectral bands ``indices`` or for all
         bands.
         """
-        light, responses = (x if chosen is None else x[..., list(chosen)] for x in self._seen)
-        return light, responses, _some(self.bands, chosen)
+        light, responses = (x if indices is None else x[..., list(indices)] for x in self._seen)
+        return light, responses, _some(self.bands, indices)
 
     def _suppression(self, psf: Psf) -> Tensor:
         """Return the laser suppression loss summed over bands, which is constant below the
@@ -442,13 +442,13 @@ def _bands_step(recipe: Recipe, psf: str) -> str:
     return names[0]
 
 
-def _some(value: Any, chosen: Sequence[int] | None) -> Any:
-    """Return the part of a PSF or other spectral value at the bands ``chosen``, or the whole
+def _some(value: Any, indices: Sequence[int] | None) -> Any:
+    """Return the part of a PSF or other spectral value at the bands ``indices``, or the whole
     value if None.
     """
-    if chosen is None:
+    if indices is None:
         return value
-    rows = torch.tensor(list(chosen))
+    rows = torch.tensor(list(indices))
     changed = {name: getattr(value, name) for name in band_names(value)}
     return value._replace(
         **{name: x.index_select(0, rows.to(x.device)) for name, x in changed.items()}

@@ -218,11 +218,11 @@ def _step(
 
 
 def _parts(
-    terms: Terms, shape: nn.Module, chosen: Sequence[int] | None = None, number: int | None = None
+    terms: Terms, shape: nn.Module, bands: Sequence[int] | None = None, number: int | None = None
 ) -> dict[str, Tensor]:
     """Return the terms of the loss of a trainable mask, in its stop if this is learnt."""
     stop = shape.round(terms.stop) if isinstance(shape, Stopped) else None
-    return terms.parts(shape(terms.stop), chosen, number, stop)
+    return terms.parts(shape(terms.stop), bands, number, stop)
 
 
 def _losses_line(row: dict[str, float]) -> str:
@@ -257,11 +257,11 @@ def half_ring_height(genes: Any, settings: MaskTraining) -> Callable[[Stop], Ten
     its parameters.
     """
     *slopes, side, turn = (float(gene) for gene in genes)
-    given = {"waves": tuple(slopes), "alternate": side >= 0.5, "orientation": turn}
+    numbers = {"waves": tuple(slopes), "alternate": side >= 0.5, "orientation": turn}
 
     def height(stop: Stop) -> Tensor:
         made: Tensor = half_rings(
-            stop, **given, wavelength=settings.wavelength, material=settings.material
+            stop, **numbers, wavelength=settings.wavelength, material=settings.material
         )
         return made
 
@@ -304,24 +304,24 @@ def evolve(terms: Terms, state: StateFile, progress: Progress) -> LearntMask:
     import numpy as np
 
     settings = terms.settings
-    if (most := _steepest(terms)) < settings.slopes[1]:
+    if (steepest := _steepest(terms)) < settings.slopes[1]:
         progress(
-            f"slopes above {most:.3g} waves are too steep for the samples of the pupil: use more"
-            " samples"
+            f"slopes above {steepest:.3g} waves are too steep for the samples of the pupil: use"
+            " more samples"
         )
     loss, history = _LossOfGenes(terms, state, progress), list[dict[str, float]]()
     populations: list[tuple[float, Any]] = []
     bounds = np.array([settings.slopes] * 5 + [(0.0, 1.0), (0.0, math.pi)])
     for start in range(settings.starts):
-        least, genes = _population(loss, bounds, start, history, progress)
+        lowest, genes = _population(loss, bounds, start, history, progress)
         slopes = [round(float(x), 2) for x in genes[:5]]
-        progress(f"start {start + 1} of {settings.starts}: {least:.5g}, slopes {slopes}")
-        populations.append((least, genes))
+        progress(f"start {start + 1} of {settings.starts}: {lowest:.5g}, slopes {slopes}")
+        populations.append((lowest, genes))
     state.write({"values": loss.known})
-    least, genes = min(populations, key=lambda pair: pair[0])
+    lowest, genes = min(populations, key=lambda pair: pair[0])
     *waves, side, turn = (float(x) for x in genes)
     numbers = {"waves": waves, "alternate": side >= 0.5, "orientation": turn}
-    return LearntMask(half_ring_height(genes, settings), least, numbers, history)
+    return LearntMask(half_ring_height(genes, settings), lowest, numbers, history)
 
 
 def _population(
@@ -352,7 +352,7 @@ def _population(
             progress(f"generation {number + 1} of {settings.iterations}: {history[-1]['loss']:.5g}")
 
     try:
-        found = differential_evolution(
+        optimum = differential_evolution(
             loss,
             bounds,
             maxiter=settings.iterations,
@@ -365,14 +365,14 @@ def _population(
         )
         if settings.polish:  # on all bands, because a tenth of a wave changes the peak
             loss.chosen = None
-            simplex = found.x + np.concatenate(
+            simplex = optimum.x + np.concatenate(
                 [np.zeros((1, len(low))), 0.01 * np.diag(high - low)]
             )
             fine = {"maxfev": settings.polish, "initial_simplex": np.clip(simplex, low, high)}
-            found = minimize(loss, found.x, method="Nelder-Mead", bounds=bounds, options=fine)
+            optimum = minimize(loss, optimum.x, method="Nelder-Mead", bounds=bounds, options=fine)
     except RuntimeError as error:  # scipy raises this for any error of the loss
         raise error.__cause__ if isinstance(error.__cause__, DesignError) else error from None
-    return float(found.fun), found.x
+    return float(optimum.fun), optimum.x
 
 
 def _steepest(terms: Terms) -> float:

@@ -212,8 +212,8 @@ def test_bounds_hold_and_are_not_loose(drawn_bound):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("drawn_bound", [looseness, top_holds])
-def test_bounds_hold_over_a_thousand_draws_and_are_not_loose(drawn_bound):
-    found = [drawn_bound(seed) for seed in range(1000)]
+def test_bounds_hold_over_many_draws_and_are_not_loose(drawn_bound):
+    found = [drawn_bound(seed) for seed in range(300)]
     assert statistics.median(found) < 30
     for n in range(6):
         assert statistics.median(found[n::6]) < 100, n

@@ -7,7 +7,7 @@ import torch
 
 from neusee.nodes.optics._band_image import reach
 from neusee.nodes.optics._channel_image import majorant_by_cell
-from neusee.nodes.optics._convolution_plan import Given, passed
+from neusee.nodes.optics._convolution_plan import ImageFacts, passed
 
 
 def image_of(off, kernel, reflect):
@@ -29,7 +29,7 @@ def given_of(psf, size, reflect):
     rows = torch.tensor([[1.0, 0.2, 0.5], [0.1, 0.7, 0.3]], dtype=torch.float64)
     basis, nothing = torch.ones(3, 1, dtype=torch.float64), torch.zeros(2, 3, dtype=torch.float64)
     gram = torch.ones(1, 1, dtype=torch.float64)
-    return Given(
+    return ImageFacts(
         rows, basis, nothing, gram[0], gram, 9 if reflect else 1, passed(psf), size, reflect
     )
 

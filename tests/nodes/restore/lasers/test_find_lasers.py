@@ -289,11 +289,11 @@ def test_one_channel_takes_no_lamp_for_a_laser(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("mask", "strength"),
-    [("plain", 1e3), ("plain", 1e5), ("half_ring", 1e5), ("cubic", 1e3), ("half_ring", 1e2)],
+    [("plain", 1e5), ("cubic", 1e3), ("half_ring", 1e2)],
 )
 def test_lasers_of_any_strength_are_found(mask, strength):
     laser = own.Laser((-11.6, 8.4), 588e-9, strength)
-    found = found_in(frame_of([laser], mask, "leaves", seed=11, side=96), mask)
+    found = found_in(frame_of([laser], mask, "leaves", seed=11), mask)
     assert int(found.number) == 1
     assert (found.direction[0] / PIXEL).tolist() == pytest.approx(laser.spot, abs=0.2)
     assert float(found.wavelength[0]) == pytest.approx(laser.wavelength, abs=5e-9)
@@ -302,7 +302,7 @@ def test_lasers_of_any_strength_are_found(mask, strength):
 @pytest.mark.slow
 def test_two_lasers_are_two():
     lasers = [own.Laser((-20.6, 8.4), 588e-9, 1e3), own.Laser((15.2, -12.1), 470e-9, 2e3)]
-    found = found_in(frame_of(lasers, seed=12, side=96), "half_ring")
+    found = found_in(frame_of(lasers, seed=12), "half_ring")
     assert int(found.number) == 2
     assert sorted((found.wavelength[:2] * 1e9).tolist()) == pytest.approx([470, 588], abs=5)
 
@@ -310,8 +310,4 @@ def test_two_lasers_are_two():
 @pytest.mark.slow
 @pytest.mark.parametrize("mask", ["plain", "half_ring"])
 def test_lamps_are_no_lasers(mask):
-    for seed in (21, 22):
-        assert (
-            int(found_in(frame_of([], mask, "leaves", seed=seed, lamps=2, side=96), mask).number)
-            == 0
-        )
+    assert int(found_in(frame_of([], mask, "leaves", seed=21, lamps=2), mask).number) == 0

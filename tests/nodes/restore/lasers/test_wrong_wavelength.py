@@ -16,7 +16,6 @@ PIXEL, SIDE = own.PITCH / own.FOCAL, 64
     [
         # a fit at 427 nm in place of 439 nm, with responses 5 deviations from those of the camera
         ("cubic", 5),
-        ("cubic", 23),  # 435 in place of 424 nm, with responses 2 deviations away
         # 477 in place of 438 nm, 3 pixels away
         pytest.param("half_ring", 26, marks=pytest.mark.slow),
     ],

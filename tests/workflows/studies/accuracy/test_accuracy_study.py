@@ -434,15 +434,15 @@ def test_a_diagram_is_drawn_of_errors_that_are_zero(tmp_path):
 @pytest.mark.slow
 def test_first_light_in_small(tmp_path):
     small = [
-        "optics.samples=96",
-        "optics.pitch=84.15 um",
-        "optics.bands=7",
+        "optics.samples=64",
+        "optics.pitch=126.2 um",
+        "optics.bands=4",
         "optics.window=[24, 24]",
     ]
     small += ["scene.shape=[32, 32]", "sensor.shape=[24, 24]", "laser=none", "outputs=[raw, lsr]"]
     recipe = load("first_light", small)
     folder = study(
-        recipe, Store(tmp_path / "store"), tmp_path / "runs", [], print, seeds=2, quick=True
+        recipe, Store(tmp_path / "store"), tmp_path / "runs", [], print, seeds=1, quick=True
     )
     asked = [r for r in rows_of(folder) if r["line"] == "tolerance"]
     assert asked

@@ -282,12 +282,12 @@ def test_points_of_sobol_find_the_same_with_fewer(tmp_path, store):
         tmp_path,
         most=512,
         points="sobol",
-        error=0.02,
+        error=0.04,
     )
     doc = json.loads((folder / "provenance.json").read_text())
     wanted = math.sqrt(4 * 10.5**2 * 0.5**2 + 2 * 0.5**4) / 0.37**2
     assert doc["quantities"]["transfer"]["sd"][2] == pytest.approx(wanted, rel=0.06)
-    assert doc["draws"] <= 256
+    assert doc["draws"] <= 128
 
 
 @pytest.mark.slow
