@@ -7,7 +7,6 @@ from typing import Annotated, Any, NamedTuple
 
 import torch
 from pydantic import Field
-from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.laser._beam import (
@@ -21,6 +20,7 @@ from neusee.nodes.laser._beam import (
     curvature_radius,
     plain,
 )
+from neusee.nodes.laser._damage_laws import double
 from neusee.nodes.optics._lens import refuse_impossible_f_number
 from neusee.nodes.optics._pupil_grid import clear_area, gaussian_over
 from neusee.nodes.spectra._bands import mean_wavelength
@@ -89,7 +89,7 @@ def wavefront(
         return Wavefront(*torch.zeros(2, dtype=torch.float64))
     beam = _shaped(line, _Geometry(waist, divergence, m_squared, convention, distance))
     return Wavefront(
-        _scalar(beam_radius(beam, distance) ** -2), _scalar(1 / curvature_radius(beam, distance))
+        double(beam_radius(beam, distance) ** -2), double(1 / curvature_radius(beam, distance))
     )
 
 
@@ -172,18 +172,14 @@ def light(
         / spot
     )
     return LaserLight(
-        even_peak=_scalar(even),
-        flux=_scalar(flux),
-        irradiance=_scalar(irradiance),
-        power=_scalar(through),
-        peak=_scalar(mean * peak),
-        pulses=_scalar(pulses),
-        pulse_fluence=_scalar((beam.pulse_energy or 0.0) * peak),
+        even_peak=double(even),
+        flux=double(flux),
+        irradiance=double(irradiance),
+        power=double(through),
+        peak=double(mean * peak),
+        pulses=double(pulses),
+        pulse_fluence=double((beam.pulse_energy or 0.0) * peak),
     )
-
-
-def _scalar(value: float | Tensor) -> Tensor:
-    return torch.as_tensor(value, dtype=torch.float64)
 
 
 @light.check

@@ -95,6 +95,7 @@ def serve() -> None:
     """Fork a child for each line that comes in, and tell its number."""
     import torch
 
+    import neusee.workflows.engine.runner  # noqa: F401  # that no fork imports it again
     from neusee.workflows.engine.cost_model import shipped
 
     shipped()  # a file that another user may not read

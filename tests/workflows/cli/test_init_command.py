@@ -3,8 +3,6 @@
 import os
 import re
 import shlex
-import subprocess
-import sys
 
 import pytest
 import typer
@@ -14,6 +12,7 @@ from typer.testing import CliRunner
 from neusee.workflows.cli.app import app
 from neusee.workflows.cli.project_commands import FILES, NEXT
 from neusee.workflows.recipe.loading import load
+from tests.workflows.forked_commands import Commands
 
 
 def init(*words):
@@ -90,11 +89,12 @@ def test_a_new_folder_runs_and_passes_its_tests_and_takes_more(tmp_path):
         "neusee validate other_camera.yaml sensor=night_sensor",
         "pytest -q -p no:cacheprovider nodes tests sensor",
     ]
+    forks = Commands()
     for command in commands:
-        words = [sys.executable, "-m", *shlex.split(command)]
-        done = subprocess.run(
-            words, cwd=tmp_path, env=env, capture_output=True, text=True, check=False
-        )
+        program, *words = shlex.split(command)
+        code = f"import runpy\nrunpy.run_module({program!r}, run_name='__main__')"
+        done = forks(*words, cwd=tmp_path, env=env, code=code)
         assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+    forks.close()
     assert "5 passed" in done.stdout
     assert (tmp_path / "runs" / "latest" / "ro-crate-metadata.json").is_file()

@@ -9,16 +9,14 @@ import json
 import os
 import shutil
 import socket
-import subprocess
 from pathlib import Path
 
 import pytest
 
 from neusee.workflows.store.remote_store import RemoteStore
-from tests.workflows.store.other_users import FIRST, GROUP, SECOND, STRANGER, command_of
+from tests.workflows.store.other_users import FIRST, GROUP, SECOND, STRANGER, who
 from tests.workflows.store.whole_cache import ABOUT, fill, key_of, values_of
 
-ROOT = Path(__file__).parents[3]
 PATIENCE = 300  #: s until a process that waits counts as blocked
 
 TRY = """
@@ -64,29 +62,24 @@ for number, folder in enumerate(folders):
 """
 
 
-def tried(user, how, folders, groups=str(GROUP)):
+@pytest.fixture
+def tried(users):
     """What a user's process says of caches, by folder: before and after it stored the values
     itself.
     """
-    place = folders[0].parents[1]
-    home = place / f"home-{user}"
-    home.mkdir(exist_ok=True)
-    os.chown(home, user, user)
-    environment = {
-        **os.environ,
-        "HOME": str(home),
-        "OMP_NUM_THREADS": "1",
-        "PYTHONDONTWRITEBYTECODE": "1",
-    }
-    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    words = [TRY, how, str(home), str(PATIENCE), *map(str, folders)]
-    command = command_of(place, user, groups, 0o022, *words)
-    done = subprocess.run(
-        command, env=environment, cwd=home, capture_output=True, text=True, check=False
-    )
-    lines = done.stdout.splitlines()
-    assert done.returncode == 0, f"{lines[-1:]}: {done.stderr[-2000:]}"
-    return {Path(line.partition(" ")[0]): json.loads(line.partition(" ")[2]) for line in lines}
+
+    def tried(user, how, folders, groups=(GROUP,)):
+        home = folders[0].parents[1] / f"home-{user}"
+        home.mkdir(exist_ok=True)
+        os.chown(home, user, user)
+        environment = {**os.environ, "HOME": str(home), "OMP_NUM_THREADS": "1"}
+        words = [how, str(home), str(PATIENCE), *map(str, folders)]
+        done = users(*words, cwd=home, env=environment, code=TRY, user=who(user, groups))
+        lines = done.stdout.splitlines()
+        assert done.returncode == 0, f"{lines[-1:]}: {done.stderr[-2000:]}"
+        return {Path(line.partition(" ")[0]): json.loads(line.partition(" ")[2]) for line in lines}
+
+    return tried
 
 
 def socket_at(path):
@@ -213,7 +206,7 @@ def of_number_one(root):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", OBSTACLES)
-def test_a_member_of_the_group_waits_for_no_obstacle_and_reads_nothing_wrong(cases, kind):
+def test_a_member_of_the_group_waits_for_no_obstacle_and_reads_nothing_wrong(cases, tried, kind):
     right, folders = cases(of_number_one, kind, MORE)
     known = {
         n: ("None", "'null'", *pair)
@@ -226,14 +219,14 @@ def test_a_member_of_the_group_waits_for_no_obstacle_and_reads_nothing_wrong(cas
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", OBSTACLES)
-def test_a_user_who_may_only_read_waits_for_no_obstacle_and_changes_nothing(cases, kind):
+def test_a_user_who_may_only_read_waits_for_no_obstacle_and_changes_nothing(cases, tried, kind):
     right, folders = cases(of_number_one, kind, MORE)
     known = {
         n: ("None", "'null'", *pair)
-        for n, pair in tried(STRANGER, "folder", [right], "")[right].items()
+        for n, pair in tried(STRANGER, "folder", [right], ())[right].items()
     }
     before = [seen(folder) for folder in folders]
-    said = tried(STRANGER, "folder", folders, "")
+    said = tried(STRANGER, "folder", folders, ())
     assert wrong(said, known) == []
     assert [seen(folder) for folder in folders] == before
 
@@ -249,12 +242,12 @@ def there(root):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", OBSTACLES)
 @pytest.mark.parametrize("user", [SECOND, STRANGER], ids=["of the group", "who may only read"])
-def test_a_folder_at_a_url_is_read_beside_an_own_one(cases, kind, user):
+def test_a_folder_at_a_url_is_read_beside_an_own_one(cases, tried, kind, user):
     """What is loaded there and what is computed is stored in the own folder, whatever lies in
     the other one.
     """
     pytest.importorskip("fsspec")
-    groups = str(GROUP) if user == SECOND else ""
+    groups = (GROUP,) if user == SECOND else ()
     right, folders = cases(there, kind)
     before = [seen(folder) for folder in [right, *folders]]
     said = tried(user, "url", [right, *folders], groups)

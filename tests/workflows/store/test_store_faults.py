@@ -217,11 +217,12 @@ def killed(ward: Ward, count: int) -> None:
 
 @pytest.mark.slow
 def test_a_killed_run_does_no_harm(ward):
-    killed(ward, 5)
+    killed(ward, 8)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_fifty_killed_runs_do_no_harm(ward):
+    """`test_a_killed_run_does_no_harm` kills eight."""
     killed(ward, 50)
 
 
@@ -229,7 +230,7 @@ def test_fifty_killed_runs_do_no_harm(ward):
 def test_killed_crowds_do_no_harm(ward):
     """Four runs of the same steps at once, of which one after the other is killed."""
     draw = random.Random(4)
-    for i in range(12):
+    for i in range(6):
         crowd = [ward.server.start(**ward.job(level=float(i))) for _ in range(4)]
         for child in crowd[:3]:
             time.sleep(draw.uniform(0.0, 0.05))
@@ -268,7 +269,7 @@ def test_damage_is_seen_and_mended(ward, suffix, damage):
 
 @pytest.mark.slow
 @settings(
-    max_examples=25,
+    max_examples=12,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
@@ -306,7 +307,7 @@ def test_damage_beside_the_results_costs_nothing(ward):
 # full and read-only disks
 
 
-@pytest.mark.parametrize("free", [0, 1, 3, 10, 50, 85, 130, 200])  # kB; a value has 80 kB
+@pytest.mark.parametrize("free", [0, 3, 50, 85, 200])  # kB; a value has 80 kB
 def test_a_full_disk_costs_one_warning(disk, free):
     ballast = disk.store / "ballast"
     ballast.write_bytes(bytes((1024 - free) * 1024))
