@@ -1,6 +1,4 @@
-"""The package colour-science, imported without what it changes: how NumPy prints every number of
-the process.
-"""
+"""The package colour-science, imported without what it changes: how NumPy prints every number of the process."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Ctrl-C: the signal becomes one `KeyboardInterrupt`, which no library swallows, and a second
-one ends at once.
-"""
+"""Ctrl-C: the signal becomes one `KeyboardInterrupt`, which no library swallows, and a second one ends at once."""
 
 from __future__ import annotations
 
@@ -11,7 +9,7 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
-from neusee.workflows.cli.commands_and_exit_codes import INTERRUPTED
+from neusee.workflows.cli.command_list import INTERRUPTED
 
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
@@ -19,9 +17,7 @@ if TYPE_CHECKING:
 
 STOPPED = "stopped; finished results are kept, and the same command goes on from there"
 said: list[str] = []  #: the sentences that this command has printed because it was stopped
-#: seconds in which several signals are one press of the keys: a shell and its terminal may both
-#: send
-_ONE_PRESS = 1.0
+_ONE_PRESS = 1.0  #: seconds in which several signals are one press of the keys: a shell and its terminal may both send
 
 
 def say_stopped(sentence: str = STOPPED) -> None:
@@ -44,9 +40,7 @@ class Interrupts:
         return self._first > 0
 
     def watch(self) -> None:
-        """Take the signal, unless it is ignored, as in a script that runs the program in the
-        background.
-        """
+        """Take the signal, unless it is ignored, as in a script that runs the program in the background."""
         if threading.current_thread() is not threading.main_thread():
             return
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -69,9 +63,7 @@ class Interrupts:
         raise KeyboardInterrupt
 
     def _swallowed(self, problem: UnraisableHookArgs) -> None:
-        """Raise an interrupt again that came while Python could not raise it, such as in a
-        callback of a library.
-        """
+        """Raise an interrupt again that came while Python could not raise it, such as in a callback of a library."""
         if problem.exc_type is KeyboardInterrupt:
             self._was_swallowed = True
             signal.raise_signal(signal.SIGINT)

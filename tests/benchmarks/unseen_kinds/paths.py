@@ -72,9 +72,7 @@ CASES = [
             return picture(np.genfromtxt(tables() / "gain.txt"))
         """,
         files={
-            "where.py": (
-                "from pathlib import Path\n\ndef tables():\n    return Path.cwd() / 'lab'\n"
-            ),
+            "where.py": "from pathlib import Path\n\ndef tables():\n    return Path.cwd() / 'lab'\n",
             "lab/gain.txt": TWO,
         },
     ),

@@ -1,6 +1,4 @@
-"""The second run of the default recipe: from the cache, and hardly slower than its largest
-import.
-"""
+"""The second run of the default recipe: from the cache, and hardly slower than its largest import."""
 
 from __future__ import annotations
 

@@ -1,20 +1,12 @@
-"""The street at night: what the recipe restores is nearer to the scene than the picture before
-restoration.
-"""
+"""The street at night: what the recipe restores is nearer to the scene than the picture before restoration."""
 
 import pytest
 
 from neusee.workflows import Store, load
 
-SMALL = [
-    "optics.samples=128",
-    "optics.pitch=63.11 um",
-    "optics.window=[128, 128]",
-    "optics.bands=7",
-    "scene.shape=[128, 128]",
-    "sensor.shape=[112, 112]",
-    "outputs=[developed_quality, restored_quality]",
-]
+SMALL = ["optics.samples=128", "optics.pitch=63.11 um", "optics.window=[128, 128]", "optics.bands=7",
+         "scene.shape=[128, 128]", "sensor.shape=[112, 112]",
+         "outputs=[developed_quality, restored_quality]"]  # fmt: skip
 
 
 def gains(words, folder):

@@ -1,6 +1,4 @@
-"""What is nothing by its parameters is not computed, and the result is what it was, to the last
-bit.
-"""
+"""What is nothing by its parameters is not computed, and the result is what it was, to the last bit."""
 
 from dataclasses import replace
 
@@ -25,22 +23,9 @@ SMALL = [
     "steps.restored_quality=null",
     "outputs=[raw, peak, lsr]",
 ]
-CLEAN = [f"dirt.{name}=0" for name in ("dust", "scratches", "smudges")] + [
-    "dirt.grease=0 waves",
-    "dirt.dents=0 waves",
-]
-LASER = {
-    "laser_psf",
-    "laser_pupil",
-    "laser_photons",
-    "spot",
-    "direction",
-    "line",
-    "laser_index",
-    "laser_responses",
-    "light",
-    "wavefront",
-}
+CLEAN = [f"dirt.{name}=0" for name in ("dust", "scratches", "smudges")] + ["dirt.grease=0 waves", "dirt.dents=0 waves"]
+LASER = {"laser_psf", "laser_pupil", "laser_photons", "spot", "direction", "line", "laser_index", "laser_responses",
+         "light", "wavefront"}  # fmt: skip
 
 
 def recipe(*changes, flare="dirty_windshield"):
@@ -48,10 +33,7 @@ def recipe(*changes, flare="dirty_windshield"):
 
 
 def asked(found):
-    return {
-        name.partition("[")[0]
-        for name in needed(with_substitutions(found, found.outputs), found.outputs)
-    }
+    return {name.partition("[")[0] for name in needed(with_substitutions(found, found.outputs), found.outputs)}
 
 
 CASES = [
@@ -63,9 +45,7 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("changes", "gone"), CASES, ids=["all", "no light", "no ghosts", "no energy", "clean"]
-)
+@pytest.mark.parametrize(("changes", "gone"), CASES, ids=["all", "no light", "no ghosts", "no energy", "clean"])
 def test_only_what_is_nothing_goes(changes, gone):
     everything = asked(recipe())
     assert everything >= LASER | {"ghosts", "ghost_photons", "dirt"}
@@ -76,9 +56,7 @@ def test_a_little_is_not_nothing():
     assert asked(recipe("lasers.green.strength=1e-30")) == asked(recipe())
 
 
-@pytest.mark.parametrize(
-    "changes", [("lasers.green.strength=0",), CLEAN, ("ghosts.count=0",)], ids=str
-)
+@pytest.mark.parametrize("changes", [("lasers.green.strength=0",), CLEAN, ("ghosts.count=0",)], ids=str)
 def test_the_result_is_the_same(changes, tmp_path):
     found = recipe("tolerance=0", *changes)
     spared = run(found, Store(tmp_path / "a"))

@@ -1,0 +1,160 @@
+"""The Wiener filter unrolled: steps that alternate a learned prior and the filter, and the node that runs them."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from neusee.nodes import Check, node
+from neusee.nodes._half_precision import single
+from neusee.nodes._mirror_padding import mirrored
+from neusee.nodes.bicubic_resize import resize
+from neusee.nodes.exact_convolution import exact_convolutions
+from neusee.nodes.network_weights import loaded, same_layout
+from neusee.nodes.restore._inverse._hidden_pixels import most_likely
+from neusee.nodes.restore._inverse._masked_blur import Blurred
+from neusee.nodes.restore._inverse._pulled_answer import STEPS, pulled
+from neusee.nodes.restore._inverse._wiener import Doubt, LeastDoubt, Settings, pose
+from neusee.nodes.restore._inverse._wiener_problem import unpacked
+from neusee.nodes.restore._networks._nafnet import NAFNet
+from neusee.nodes.restore._networks._restorer import Restorer
+from neusee.nodes.units import Count, DataFile, Electrons, Layers
+from neusee.nodes.values import Bands, Psf
+
+Steps = Annotated[Count, Field(le=16)]
+_MAPS = 15  #: maps that a prior sees: five of each of three channels
+_PRECISION, _REACH = 10.0, 5.0  #: of what a network says, at first, and the range of its logarithm to either side
+_BRIGHT = 1e3  #: of a glare pattern of maximum 1, so that its far rings are seen
+
+
+class Unrolled(Restorer):
+    """Steps of the Wiener filter, each with a second prior that a network finds in the picture of the step before.
+
+    In step k a network says what the picture is, c, and how precisely it knows this; the step returns the most likely
+    picture under the frame, the prior of the filter, and c. A network with precision 0 leaves the filter's answer.
+    """
+
+    def __init__(self, width: int = 16, steps: int = 2, iterations: int = STEPS) -> None:
+        super().__init__()
+        self.iterations = iterations  #: of the conjugate gradients in each step
+        self.priors = nn.ModuleList(NAFNet(width, (1, 1, 1), 1, inputs=_MAPS, outputs=6) for _ in range(steps))
+        self.multiple = 8
+
+    def begin(self) -> None:
+        for prior in self.priors:
+            assert isinstance(prior, NAFNet)
+            prior.last.weight.zero_()
+
+    def pyramid(self, picture: Tensor, *given: Any) -> tuple[Tensor, Tensor]:
+        """Return the restored picture at half and at full size: ``picture`` (1, 3, y, x) and what the network changes.
+
+        ``picture`` is what the filter restores; ``given`` are the `WienerProblem` whose answer it is, and the matrix
+        (3, channel) from electrons to colours.
+        """
+        value, matrix = given
+        change = self.change(unpacked(value), value.answer, value.seen) * value.scale
+        fine = picture + torch.tensordot(matrix.to(change), change, 1).to(picture)
+        return resize(fine, -(-picture.shape[-2] // 2), -(-picture.shape[-1] // 2)), fine
+
+    def change(self, seen: Blurred, answer: Tensor, blurred: Tensor) -> Tensor:
+        """Return what the steps add to the filter's answer (3, y, x), given this answer and its blur by the camera."""
+        added = of_added = torch.zeros_like(answer)
+        for prior in self.priors:
+            found, precision = _found(prior, seen, answer + added, blurred + of_added)
+            added, of_added = pulled(seen, added + found, precision, self.iterations)
+        return added
+
+
+def _found(prior: nn.Module, seen: Blurred, x: Tensor, blurred: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the change of the picture of the step before that a network wants, and its precision (channel, y, x)."""
+    rows, columns = seen.picture.shape[-2:]
+    weight = next(prior.parameters())
+    maps = mirrored(_maps(seen, x, blurred).to(weight)[None], -rows % 8, -columns % 8)
+    change, certain = prior.change(maps)[0, :, :rows, :columns].to(x).split(3)  # type: ignore[operator]
+    return change, _PRECISION * torch.exp(_REACH * torch.tanh(certain.mean((-2, -1), keepdim=True))).expand_as(change)
+
+
+def _maps(seen: Blurred, x: Tensor, blurred: Tensor) -> Tensor:
+    """Return what a prior sees (15, y, x): picture, residual over its noise, certainty, seen pixels, and glare."""
+    known = seen.weight > 0
+    root = torch.where(known, seen.weight, 1.0).sqrt() * known  # the slope of sqrt is infinite at 0
+    residual = root * (seen.picture - blurred)
+    glare = sum(seen.glare, torch.zeros_like(residual))
+    brightest = glare.detach().amax().clamp_min(1e-30)
+    certain = seen.weight.log1p() / 10.0  # 0 for a clipped pixel, 1 for a noise of 0.7 % of the contrast of the scene
+    return torch.cat([x, residual.asinh(), certain, known.to(residual), (_BRIGHT / brightest * glare).asinh()])
+
+
+@node(rtol=1e-5, additive_inputs=[("glare", "nearby"), ("ghosts",)])
+def unrolled(
+    electrons: Tensor,
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    clipped: Tensor,
+    glare: list[Tensor] | None = None,
+    nearby: list[Tensor] | None = None,
+    ghosts: list[Tensor] | None = None,
+    *,
+    weights: DataFile | None = None,
+    width: Layers = 16,
+    steps: Steps = 2,
+    balance: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0,
+    doubt: Doubt = 0.0,
+    least_doubt: LeastDoubt = 0.0,
+    read_noise: Electrons,
+) -> Tensor:
+    """Deconvolve a picture by `restore.wiener` with a learned prior: the filter and a network take turns.
+
+    Each of the ``steps`` asks a small NAFNet of its own what the picture is, c, and how precisely it knows this (one
+    precision R for each channel), and gives the most likely picture under the frame, the prior of the filter and a
+    Gaussian prior of mean c and precision R in the frame. Beyond the frame the precision is 0. The network sees the
+    picture of the step before, the residual y - B x over its noise, how certain each pixel is, which pixels are not
+    clipped, and the glare. Without ``weights`` the restorer is the filter, and so it is where the network's precision
+    is 0.
+
+    Shapes: as `restore.wiener`, of three channels -> (channel, y, x).
+    Units:  as `restore.wiener`.
+    Error:  the filter's own; in each step conjugate gradients leave 2e-3 to 4e-3 of what the network adds (64 pixels a
+            side, behind a half-ring and five half-rings); the network is float32, 1e-5. Gradients of first order only;
+            the weights receive none. Of the restoration, the error that the training reached: a network may invent
+            what the frame does not tell.
+    Raises: ParameterError before the run where the weights do not fit; ValueError as `restore.wiener`, and for a
+            sensor without three channels.
+    Source: unrolling with a data term in each step: Aggarwal et al., MoDL, IEEE Trans. Med. Imaging 38, 394 (2019);
+            Chen et al., Simple Baselines for Image Restoration, ECCV 2022 (NAFNet); the maps are ours.
+    """
+    electrons, light = single(electrons), (glare, nearby, ghosts)
+    if len(electrons) != 3:
+        raise ValueError(f"electrons {tuple(electrons.shape)} have {len(electrons)} channels, and the network needs 3")
+    settings = Settings(balance, read_noise, doubt, least_doubt)
+    scaled = pose(electrons, psf, illuminant, responses, bands, clipped, *light, settings)
+    problem, spectrum = scaled.problem, most_likely(scaled.problem)
+    result = scaled.pixels(spectrum)
+    if weights is not None:
+        net = loaded(partial(Unrolled, width, steps), weights).requires_grad_(False).eval().to(electrons.device)
+        with exact_convolutions(electrons, deterministic=True), torch.autocast(electrons.device.type, enabled=False):
+            change = net.change(problem, problem.first(spectrum), problem.blur(spectrum))
+        result = result + change * scaled.scale / scaled.share
+    return (result + scaled.mean).to(electrons)
+
+
+@unrolled.preflight
+def _(*, weights: Path | None = None, width: int = 16, steps: int = 2, **others: Any) -> list[str]:
+    """Raise ParameterError if the file of weights belongs to another network; say where there is none."""
+    if weights is None:
+        return ["without weights the unrolled restorer is the Wiener filter: train them, and give restore.weights"]
+    same_layout(partial(Unrolled, width, steps), weights, width)
+    return []
+
+
+@unrolled.check
+def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: Any) -> list[Check]:
+    share = float(inputs[4].any(-3).double().mean())
+    ratio = float(result.mean() / electrons.mean())
+    finite = bool(torch.isfinite(result).all())
+    return [Check(f"{share:.2%} of pixels clipped, restored mean {ratio:.2f} of raw mean", finite)]

@@ -1,0 +1,229 @@
+"""Results stored by wavelength band: if one of 31 bands has changed, only this band is computed and written.
+
+A node that declares its bands computes each band to the same bits whatever the other bands are. Each band therefore has
+its own key, a digest of this band of the inputs and of everything else that determines the band. The store keeps the
+band of the result as a blob with this key as name. Hashing the inputs is cheap, because every input is read only once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
+from math import ceil
+from typing import Any
+
+import torch
+import xxhash
+from torch import Tensor
+
+from neusee.nodes import Node
+from neusee.nodes.values import BAND_FIELDS, band_names
+from neusee.workflows.graph.recipe_graph import Step
+from neusee.workflows.keys.cache_key import digest, plain
+from neusee.workflows.keys.written_params import written
+from neusee.workflows.store.band_files import Blobs, Damaged, Stacked, bytes_of
+from neusee.workflows.store.serialization import pack
+
+LEAST = 1 << 22  #: bytes; a smaller result is kept as one tensor
+_ALIGN = 64  #: bytes; a kernel may take another path at another alignment
+_TRIES = 3  #: attempts that may find damaged bands before all bands are computed
+
+Evaluate = Callable[[Sequence[Any]], Any]  #: a function from the inputs of a step to its result
+
+
+def call_by_band(step: Step, inputs: Sequence[Any], evaluate: Evaluate, code: str, blobs: Blobs, parts: int = 1) -> Any:
+    """Return the result of ``step``; compute only the wavelength bands that the store ``blobs`` does not contain.
+
+    ``code`` is the digest of the code of the node. More passes over the bands, ``parts``, need less memory. Tensors
+    that can be stored by band are returned as `Stacked`, which `plain_of` converts to plain tensors.
+    """
+    count = band_count(step, inputs)
+    if count < 2:
+        return evaluate(inputs)
+    keys = band_keys(step, inputs, code)
+    fields = range(_fields(step))
+    for _ in range(_TRIES):
+        missing = [i for i, key in enumerate(keys) if not all(blobs.has(f"{key}.{n}") for n in fields)]
+        if len(missing) == count and parts == 1:
+            break
+        try:
+            return _gathered(step, inputs, evaluate, keys, missing, ceil(count / parts), blobs)
+        except Damaged:  # the next attempt finds the damaged band missing
+            continue
+    return _stacked(step, evaluate(inputs), keys)
+
+
+def plain_of(value: Any) -> Any:
+    """Return ``value`` with every `Stacked` tensor (stored by band) replaced by an ordinary PyTorch tensor."""
+    if isinstance(value, Stacked):
+        return value.tensor
+    return value._make(map(plain_of, value)) if type(value) in BAND_FIELDS else value
+
+
+def band_count(step: Step, inputs: Sequence[Any]) -> int:
+    """Return the number of bands that a step computes independently of each other; 0 if the step has no such bands."""
+    named = zip(step.node.inputs, inputs, strict=False)
+    banded = [(axis, value) for name, value in named if (axis := _axis(step, name, value)) is not None]
+    if any(not isinstance(value, Tensor) and type(value) not in BAND_FIELDS for _, value in banded):
+        return 0  # a low-rank cube has no slice of one band
+    found = {x.shape[axis] for axis, value in banded for x in band_tensors(value) if _has(x, axis)}
+    return found.pop() if len(found) == 1 else 0
+
+
+def bands_in(node: Node, inputs: Sequence[Any]) -> int:
+    """Return the number of bands that a node computes one by one, from inputs that may have no values; at least 1."""
+    for name, value in zip(node.inputs, inputs, strict=False):
+        axis = node.bands.get(name) if node.bands else None
+        if axis is not None and (isinstance(value, Tensor) or type(value) in BAND_FIELDS):
+            return max((x.shape[axis] for x in band_tensors(value) if _has(x, axis)), default=1)
+    return 1
+
+
+def band_keys(step: Step, inputs: Sequence[Any], code: str) -> list[str]:
+    """Return the cache key of each wavelength band: a digest of node, code, parameters and this band of the inputs."""
+    params = {name: plain(value) for name, value in step.params.items()}
+    same: list[Any] = ["band", step.node.path, code, params, *([said] if (said := written(step)) else [])]
+    each: list[list[str]] = []
+    for name, value in zip(step.node.inputs, inputs, strict=False):
+        axis = _axis(step, name, value)
+        same.append([name, axis, content(value if axis is None else _without_bands(value))])
+        if axis is not None:
+            each += [[_hashed(part) for part in x.unbind(axis)] for x in band_tensors(value)]
+    return [digest(same, list(band)) for band in zip(*each, strict=True)]
+
+
+def content(value: Any) -> list[Any]:
+    """Return a JSON value that identifies a result: its layout, and type, shape and digest of each tensor."""
+    layout, tensors = pack(value)
+    return [layout, [_hashed(x) for x in tensors]]
+
+
+def _hashed(x: Tensor) -> str:
+    return f"{x.dtype} {tuple(x.shape)} {xxhash.xxh3_128_hexdigest(bytes_of(x))}"
+
+
+def _axis(step: Step, name: str, value: Any) -> int | None:
+    return None if value is None or step.node.bands is None else step.node.bands.get(name)
+
+
+def band_tensors(value: Any) -> list[Tensor]:
+    """Return the tensors of a result that have an axis of wavelength bands."""
+    if isinstance(value, Tensor):
+        return [value]
+    return [getattr(value, name) for name in band_names(value)]
+
+
+def with_band_tensors(value: Any, tensors: Sequence[Tensor]) -> Any:
+    """Return ``value`` with ``tensors`` in place of its tensors that have an axis of wavelength bands."""
+    if isinstance(value, Tensor):
+        return tensors[0]
+    return value._replace(**dict(zip(band_names(value), tensors, strict=True)))
+
+
+def _without_bands(value: Any) -> Any:
+    return None if isinstance(value, Tensor) else value._replace(**dict.fromkeys(BAND_FIELDS[type(value)]))
+
+
+def _has(x: Tensor, axis: int) -> bool:
+    return -x.dim() <= axis < x.dim()
+
+
+def taken(step: Step, inputs: Sequence[Any], which: list[int], of: Collection[str] | None = None) -> list[Any]:
+    """Return the inputs of a step, reduced to the wavelength bands with the indices ``which``.
+
+    If ``of`` names inputs, only these inputs are reduced.
+    """
+    found = list(inputs)
+    for i, (name, value) in enumerate(zip(step.node.inputs, inputs, strict=False)):
+        axis = _axis(step, name, value)
+        if axis is not None and (of is None or name in of):
+            found[i] = with_band_tensors(value, [_slices(x, axis, which) for x in band_tensors(value)])
+    return found
+
+
+def _slices(x: Tensor, axis: int, which: list[int]) -> Tensor:
+    """Return the bands of a tensor with the indices ``which``, as a view if the memory layout allows."""
+    if which == list(range(which[0], which[0] + len(which))):
+        part = x.narrow(axis, which[0], len(which))
+        if part.is_contiguous() and part.data_ptr() % _ALIGN == 0:
+            return part
+    return x.index_select(axis, torch.tensor(which, device=x.device))
+
+
+def _fields(step: Step) -> int:
+    """Return the number of tensors in the result of a step."""
+    kind = step.node.hints["return"]
+    return len(kind._fields) if kind in BAND_FIELDS else 1
+
+
+def _rebuilt(step: Step, items: list[Any]) -> Any:
+    kind = step.node.hints["return"]
+    return kind._make(items) if kind in BAND_FIELDS else items[0]
+
+
+def _stacked(step: Step, value: Any, keys: list[str]) -> Any:
+    """Return a large result as `Stacked` tensors with a key for each band, and any other result unchanged."""
+    tensors = band_tensors(value)
+    leading = all(x.shape[0] == len(keys) and _leads(step, x) for x in tensors)
+    if not leading or sum(x.nbytes for x in tensors) < LEAST:
+        return value
+    items = [Stacked(x, tuple(f"{key}.{n}" for key in keys)) for n, x in enumerate(tensors)]
+    return _rebuilt(step, items)
+
+
+def _leads(step: Step, x: Tensor) -> bool:
+    """Return True if the bands are the first axis of a tensor, so that each band is contiguous in memory."""
+    assert step.node.bands is not None
+    return _has(x, step.node.bands["return"]) and step.node.bands["return"] % x.dim() == 0
+
+
+def _gathered(
+    step: Step, inputs: Sequence[Any], evaluate: Evaluate, keys: list[str], missing: list[int], size: int, blobs: Blobs
+) -> Any:
+    """Compute missing bands of a result in groups of ``size`` bands, and assemble all bands.
+
+    Raises `Damaged` if a stored band is damaged.
+    """
+    assert step.node.bands is not None
+    axis = step.node.bands["return"]
+    stacks = [_Stack(axis, [f"{key}.{n}" for key in keys], blobs) for n in range(_fields(step))]
+    for start in range(0, len(missing), size):
+        which = missing[start : start + size]
+        for stack, x in zip(stacks, band_tensors(evaluate(taken(step, inputs, which))), strict=True):
+            stack.add(which, x)
+    return _rebuilt(step, [stack.whole() for stack in stacks])
+
+
+class _Stack:
+    """A tensor that is assembled from bands; computed bands go to the store, or to memory if writing fails."""
+
+    def __init__(self, axis: int, names: list[str], blobs: Blobs) -> None:
+        self.axis, self.names, self.blobs = axis, names, blobs
+        self.held: Tensor | None = None
+        self.inside: set[int] = set()  # indices of the bands in memory
+
+    def add(self, which: list[int], x: Tensor) -> None:
+        """Add the computed wavelength bands ``x`` with the indices ``which`` to the tensor."""
+        axis = self.axis % x.dim()
+        slices = x.unbind(axis)
+        if axis == 0:
+            with suppress(OSError):
+                self.blobs.write_all([self.names[i] for i in which], slices)
+                return
+        if self.held is None:
+            self.held = x.new_empty(*x.shape[:axis], len(self.names), *x.shape[axis + 1 :])
+        for i, part in zip(which, slices, strict=True):
+            self.held.select(axis, i).copy_(part)
+        self.inside.update(which)
+
+    def whole(self) -> Tensor | Stacked:
+        """Return all wavelength bands as one tensor; raise `Damaged` if a stored band is damaged."""
+        blob = self.blobs.about(self.names[0]) if self.held is None else None
+        if blob is not None:
+            shape = (len(self.names), *blob.shape)
+            return Stacked(self.blobs.read(self.names, shape, blob.dtype), tuple(self.names))
+        assert self.held is not None
+        for i in set(range(len(self.names))) - self.inside:
+            part = self.held.select(self.axis, i)
+            part.copy_(self.blobs.read([self.names[i]], (1, *part.shape), part.dtype)[0])
+        return self.held

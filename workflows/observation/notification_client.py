@@ -1,0 +1,121 @@
+"""The process that answers stopped calls, as its parent sees it: started once, and again after a fork or its death."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import neusee
+from neusee.workflows.observation.notification_server import HEADER
+from neusee.workflows.observation.recorded_call import Record
+
+PR_SET_PTRACER = 0x59616D61
+_PROBE = b"neusee: may the process that answers read this memory?"
+_SCRIPT = (
+    "import sys; sys.path.insert(0, sys.argv[1]); from neusee.workflows.observation.notification_server import serve; "
+    "serve(int(sys.argv[2]), int(sys.argv[3]))"
+)
+_PATIENCE = 20.0  #: s until a process that was just started answers, on a machine with much else to do
+
+
+class NoServer(Exception):
+    """Error where no process answers stopped calls: it could not be started, may not read this process, or died."""
+
+
+class NotificationClient:
+    """A running process that answers the stopped calls of this process."""
+
+    def __init__(self) -> None:
+        """Start the process; raise `NoServer` if it does not answer or may not read the memory of this process."""
+        self.process = os.getpid()
+        self._is_of_parent = False  #: True in a fork, which cannot see whether the server of its parent has ended
+        self._server: subprocess.Popen[bytes] | None = None
+        self._socket, theirs = socket.socketpair()
+        try:
+            with theirs:
+                self._server = self._started(theirs)
+            self._ask_for_sight(self._server.pid)
+        except (OSError, ValueError) as error:
+            self.close()
+            raise NoServer(f"the process that watches a step did not start: {error}") from error
+
+    def _started(self, theirs: socket.socket) -> subprocess.Popen[bytes]:
+        """Start the server in a session of its own: a Ctrl-C and the end of a terminal do not reach it."""
+        source = str(Path(neusee.__file__).parents[1])
+        # as the interpreter is, without the settings, paths and start-up files of the user
+        command = [sys.executable, "-I", "-S", "-c", _SCRIPT, source, str(theirs.fileno()), str(self.process)]
+        quiet = subprocess.DEVNULL
+        return subprocess.Popen(
+            command,
+            stdin=quiet,
+            stdout=quiet,
+            stderr=quiet,
+            cwd="/",
+            pass_fds=[theirs.fileno()],
+            start_new_session=True,
+        )
+
+    def _ask_for_sight(self, server: int) -> None:
+        """Let the server read the memory of this process, and see that it does."""
+        ctypes.CDLL(None).prctl(PR_SET_PTRACER, ctypes.c_ulong(server), 0, 0, 0)  # where Yama asks for it
+        probe = ctypes.create_string_buffer(_PROBE)
+        self._socket.settimeout(_PATIENCE)
+        if self._asked(b"P", ctypes.addressof(probe)) != _PROBE.decode():
+            raise ValueError("it may not read the memory of this process")
+        self._socket.settimeout(None)
+
+    def observe_here(self) -> None:
+        """Let the server answer for the process that calls this: a fork of that which started it, while that waits."""
+        self._is_of_parent = self.process != os.getpid()
+        self.process = os.getpid()
+        self._socket.sendall(b"O" + self.process.to_bytes(HEADER - 1, "little"))
+        self._ask_for_sight(self.server())
+
+    def hand_over(self, listener: int) -> None:
+        """Let the server answer the calls of a listener, whose observation begins; raise `NoServer` if it is dead."""
+        try:
+            socket.send_fds(self._socket, [b"L".ljust(HEADER, b"\0")], [listener])
+        except OSError as error:
+            raise NoServer(str(error)) from error
+
+    def records(self) -> list[Record]:
+        """Return what was recorded since the last listener; raise `NoServer` if the server is dead."""
+        try:
+            return [Record(*record) for record in self._asked(b"R", 0)]
+        except (OSError, ValueError) as error:
+            raise NoServer("the process that watches a step ended") from error
+
+    def server(self) -> int:
+        """Return the number of the process that answers."""
+        return self._server.pid if self._server is not None else 0
+
+    def alive(self) -> bool:
+        """Return True if the server is that of this process, not of the process that it was forked from, and runs."""
+        if self.process != os.getpid() or self._server is None:
+            return False
+        return self._is_of_parent or self._server.poll() is None
+
+    def close(self) -> None:
+        """Let the server end as soon as no thread is left whose calls it answers; nobody waits for that."""
+        self._socket.close()
+        if self._server is not None and self._server.poll() is None:
+            self._server.returncode = 0  # no status is wanted, and so no warning that it still runs
+
+    def _asked(self, kind: bytes, number: int) -> Any:
+        self._socket.sendall(kind + number.to_bytes(HEADER - 1, "little"))
+        return json.loads(self._exactly(int.from_bytes(self._exactly(8), "little")))
+
+    def _exactly(self, length: int) -> bytes:
+        found = b""
+        while len(found) < length:
+            part = self._socket.recv(length - len(found))
+            if not part:
+                raise ValueError("it ended")
+            found += part
+        return found

@@ -1,0 +1,161 @@
+"""The processes that `torchrun` starts for one training, arranged in a mesh with the axes data and band.
+
+Processes along the data axis have different pictures. Processes along the band axis share the optics of the same
+pictures by wavelength. Gradients are added over all processes, so that networks, optimisers and state stay equal in all
+processes. A single process is a mesh of 1 x 1, which sends no messages.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import nn
+
+
+class MeshError(ValueError):
+    """Error for an argument ``--mesh`` that contradicts the number of processes, the recipe or another argument."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """The position of one training process in a mesh of ``data`` x ``band`` processes."""
+
+    data: int = 1
+    band: int = 1
+    rank: int = 0
+    group: Any = None  #: the process group (torch.distributed) of the processes with the same pictures
+
+    @property
+    def size(self) -> int:
+        """Return the number of processes in the mesh."""
+        return self.data * self.band
+
+    @property
+    def row(self) -> int:
+        """Return the index of this process along the data axis of the process mesh."""
+        return self.rank // self.band
+
+    @property
+    def column(self) -> int:
+        """Return the index of this process along the band axis of the process mesh."""
+        return self.rank % self.band
+
+    @property
+    def first(self) -> bool:
+        """Return True if this is process 0, the only process that writes files."""
+        return self.rank == 0
+
+    def __str__(self) -> str:
+        return f"{self.data}x{self.band}"
+
+    # --- messages among all ---------------------------------------------------------------------------------------
+
+    def wait(self) -> None:
+        """Wait until all processes of the mesh have called this method."""
+        if self.size > 1:
+            dist.barrier()
+
+    def agree(self, about: str) -> None:
+        """Raise MeshError unless all processes pass the same text, which states folder, stage and iteration."""
+        if self.size == 1:
+            return
+        texts: list[Any] = [None] * self.size
+        dist.all_gather_object(texts, about)
+        for rank, other in enumerate(texts):
+            if other != texts[0]:
+                raise MeshError(f"process 0 is in {texts[0]}, process {rank} is in {other}: use one shared folder")
+
+    def numbers(self, own: Mapping[str, float], names: Sequence[str], device: str) -> dict[str, float]:
+        """Sum the numbers with the given names, such as losses, over all processes, and return the sums by name."""
+        if self.size == 1:
+            return dict(own)
+        total = torch.tensor([own.get(name, 0.0) for name in names], dtype=torch.float64, device=device)
+        dist.all_reduce(total)
+        return dict(zip(names, total.tolist(), strict=True))
+
+    def share_buffers(self, net: nn.Module) -> None:
+        """Copy the buffers of a network, such as the running means of a batch norm, from the first process to all."""
+        if self.size > 1:
+            for buffer in net.buffers():
+                dist.broadcast(buffer, 0)
+
+    def add_gradients(self, parts: Iterable[nn.Module]) -> None:
+        """Replace the gradient of each module parameter by its sum over all processes."""
+        if self.size == 1:
+            return
+        own = [p for part in parts for p in part.parameters()]
+        for kind in dict.fromkeys(p.dtype for p in own):
+            _add([p for p in own if p.dtype == kind])
+
+
+def _add(own: Sequence[nn.Parameter]) -> None:
+    """Sum the gradients of parameters over all processes; a gradient that is None in every process stays None."""
+    there = torch.tensor([float(p.grad is not None) for p in own]).to(own[0])
+    grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in own]
+    flat = torch.cat([*(g.reshape(-1) for g in grads), there])
+    dist.all_reduce(flat)
+    *sums, counts = torch.split(flat, [*(p.numel() for p in own), len(own)])
+    for p, total, count in zip(own, sums, counts.tolist(), strict=True):
+        p.grad = total.view_as(p).clone() if count else None
+
+
+ALONE = Mesh()
+
+
+def processes() -> tuple[int, int]:
+    """Return index and number of the processes that `torchrun` started, from the variables RANK and WORLD_SIZE."""
+    return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
+
+
+def shape_of(text: str, world: int) -> tuple[int, int]:
+    """Parse a process mesh such as ``4x2`` as (4, 2), or an empty text as (world, 1).
+
+    Raises MeshError for a malformed text, or unless the product is ``world``, the number of processes.
+    """
+    if not text:
+        return world, 1
+    if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", text):
+        raise MeshError(f"--mesh {text}: write DATAxBAND, such as 4x2")
+    data, band = map(int, text.split("x"))
+    if data * band != world:
+        start = f"torchrun --nproc-per-node {data * band} --no-python neusee train ..."
+        there = "there is 1" if world == 1 else f"there are {world}"
+        raise MeshError(f"--mesh {text} is for {data * band} processes and {there}: start {start}, or write {world}x1")
+    return data, band
+
+
+def device_here(device: str) -> str:
+    """Return the name of this process's device, such as ``cuda:1`` for the second process on a machine."""
+    local = os.environ.get("LOCAL_RANK", "0")
+    return f"cuda:{local}" if device == "cuda" and processes()[1] > 1 else device
+
+
+@contextmanager
+def joined(text: str, device: str) -> Iterator[Mesh]:
+    """Return a context in which this process belongs to the process mesh ``text``, the argument of ``--mesh``.
+
+    Raises MeshError if the mesh contradicts the number of processes.
+    """
+    rank, world = processes()
+    data, band = shape_of(text, world)
+    if world == 1:
+        yield ALONE
+        return
+    if device.startswith("cuda"):
+        torch.cuda.set_device(device)
+        dist.init_process_group("nccl", device_id=torch.device(device))
+    else:
+        dist.init_process_group("gloo")
+    groups = [dist.new_group(list(range(row * band, (row + 1) * band))) for row in range(data)]
+    mesh = Mesh(data, band, rank, groups[rank // band])
+    yield mesh
+    object.__setattr__(mesh, "group", None)  # threads of a group that is held would run on while Python shuts down
+    groups.clear()
+    dist.destroy_process_group()  # not after an error, because this process would wait for processes that have ended
