@@ -159,6 +159,7 @@ def test_what_was_seen_is_said_and_no_more(kinds):
 
 @pytest.mark.slow
 def test_rounding_by_threads_is_no_fault_and_its_size_is_said(kinds):
+    """A million products are summed in float32; how large the rounding is depends on how the BLAS of a machine sums."""
     found = said(kinds["many_threads"])
     assert found.ok is True
     assert found.text.startswith("the same bits in 10 changed surroundings: folder, locale (C), hash seed, time zone, ")
