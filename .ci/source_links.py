@@ -1,4 +1,6 @@
-"""The links of ``.src/neusee``, made where a source distribution is installed for editing: an archive holds none."""
+"""The links of ``.src/neusee``, made where a source distribution is installed for editing: an
+archive holds none.
+"""
 
 from pathlib import Path
 from typing import Any

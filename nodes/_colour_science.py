@@ -1,4 +1,6 @@
-"""The package colour-science, imported without what it changes: how NumPy prints every number of the process."""
+"""The package colour-science, imported without what it changes: how NumPy prints every number of
+the process.
+"""
 
 from __future__ import annotations
 

@@ -1,10 +1,11 @@
 """C++ sources compiled for the processor of this machine on first use and then reused.
 
-The sources need only a compiler, no headers of torch or Python. They compile in seconds, and a library works with any
-version of both. A library is compiled in a temporary folder and moved by an atomic rename: two processes that compile
-at once both get a valid library, and a process that is killed leaves no lock behind.
-The variable ``CXX`` names the compiler. Its options come last and so win: ``CXX="g++ -march=x86-64-v3"`` compiles for
-AVX2, and a name that is no program leaves the work to torch.
+The sources need only a compiler, no headers of torch or Python. They compile in seconds, and a
+library works with any version of both. A library is compiled in a temporary folder and moved by an
+atomic rename: two processes that compile at once both get a valid library, and a process that is
+killed leaves no lock behind. The variable ``CXX`` names the compiler. Its options come last and so
+win: ``CXX="g++ -march=x86-64-v3"`` compiles for AVX2, and a name that is no program leaves the work
+to torch.
 """
 
 import ctypes
@@ -18,7 +19,8 @@ import tempfile
 import warnings
 from pathlib import Path
 
-#: the processor's FMA changes a result within rounding where a source allows it; each module declares its own sources
+#: the processor's FMA changes a result within rounding where a source allows it; each module
+#: declares its own sources
 __depends__ = (
     "_vector.h",
     "unaffected:file",
@@ -40,32 +42,60 @@ VECTOR = Path(__file__).with_name("_vector.h")
 
 
 class NoCompilerError(RuntimeError):
-    """The error of a machine on which a C++ source cannot be compiled; the message gives the reason in one line."""
+    """The error of a machine on which a C++ source cannot be compiled; the message gives the
+    reason in one line.
+    """
 
 
 def folder() -> Path:
-    """Return the folder of the compiled libraries: ``$XDG_CACHE_HOME/neusee/build``, else ``~/.cache/neusee/build``.
+    """Return the folder of the compiled libraries: ``$XDG_CACHE_HOME/neusee/build``, else
+    ``~/.cache/neusee/build``.
 
-    The folder must outlive the process, or each process would compile. No result is kept there or depends on it.
+    The folder must outlive the process, or each process would compile. No result is kept there or
+    depends on it.
     """
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "neusee" / "build"
 
 
 def _processor() -> str:
-    """Return a text that identifies the processor, because different machines may share a home folder."""
+    """Return a text that identifies the processor, because different machines may share a home
+    folder.
+    """
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         lines = []
-    facts = [next((x for x in lines if x.startswith(word)), "") for word in ("model name", "flags", "Features")]
+    facts = [
+        next((x for x in lines if x.startswith(word)), "")
+        for word in ("model name", "flags", "Features")
+    ]
     return "\n".join([platform.platform(), platform.machine(), platform.processor(), *facts])
+
+
+def _compiler() -> str:
+    """Return the command of the C++ compiler; raise `NoCompilerError` if there is none."""
+    compiler = (
+        os.environ.get("CXX")
+        or shutil.which("g++")
+        or shutil.which("c++")
+        or shutil.which("clang++")
+    )
+    if compiler is None:
+        raise NoCompilerError("no C++ compiler is installed: install g++, or set CXX to a compiler")
+    return compiler
+
+
+def _first_error(done: subprocess.CompletedProcess[str]) -> str:
+    """Return the first line of a compiler that names an error, or its exit status."""
+    for line in done.stderr.splitlines():
+        if "error" in line:
+            return line.strip()
+    return f"exit status {done.returncode}"
 
 
 def _compile(code: Path, rounding: str, where: Path) -> None:
     """Compile the C++ source to the file ``where``; raise `NoCompilerError` if that fails."""
-    compiler = os.environ.get("CXX") or shutil.which("g++") or shutil.which("c++") or shutil.which("clang++")
-    if compiler is None:
-        raise NoCompilerError("no C++ compiler is installed: install g++, or set CXX to a compiler")
+    compiler = _compiler()
     try:
         where.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=where.parent) as aside:
@@ -75,8 +105,7 @@ def _compile(code: Path, rounding: str, where: Path) -> None:
             command = [*words, *FLAGS, rounding, *options, str(code), "-o", str(library)]
             done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
             if done.returncode:
-                reason = next((x for x in done.stderr.splitlines() if "error" in x), f"exit status {done.returncode}")
-                raise NoCompilerError(f"{compiler} failed: {reason.strip()}")
+                raise NoCompilerError(f"{compiler} failed: {_first_error(done)}")
             os.replace(library, where)
     except (OSError, subprocess.SubprocessError) as error:
         raise NoCompilerError(f"{compiler} could not be run: {error}") from error
@@ -86,10 +115,13 @@ def _compile(code: Path, rounding: str, where: Path) -> None:
 def _library(
     sources: tuple[Path, ...], rounding: str, build: Path, compiler: str | None
 ) -> ctypes.CDLL | NoCompilerError:
-    """Return the compiled library, or the error of the single attempt to compile for this folder and compiler."""
+    """Return the compiled library, or the error of the single attempt to compile for this folder
+    and compiler.
+    """
     texts = [source.read_text(encoding="utf-8") for source in (*sources, VECTOR)]
     words = [*texts, *FLAGS, rounding, compiler or "", _processor()]
-    name = f"{sources[0].stem.strip('_')}_{hashlib.sha256(chr(0).join(words).encode()).hexdigest()[:32]}.so"
+    digest = hashlib.sha256(chr(0).join(words).encode()).hexdigest()[:32]
+    name = f"{sources[0].stem.strip('_')}_{digest}.so"
     try:
         if not (build / name).is_file():
             _compile(sources[0], rounding, build / name)
@@ -101,28 +133,32 @@ def _library(
 
 
 def load(*sources: Path, rounding: str = FUSED) -> ctypes.CDLL:
-    """Return the library of the first source, compiled if needed, with the other sources as its headers.
+    """Return the library of the first source, compiled if needed, with the other sources as its
+    headers.
 
-    With the rounding `UNFUSED`, the result of a source whose vector lanes never meet has the same bits for every width
-    of a vector and every compiler. Raises `NoCompilerError` if the source cannot be compiled.
+    With the rounding `UNFUSED`, the result of a source whose vector lanes never meet has the same
+    bits for every width of a vector and every compiler. Raises `NoCompilerError` if the source
+    cannot be compiled.
     """
-    found = _library(sources, rounding, folder(), os.environ.get("CXX"))
-    if isinstance(found, NoCompilerError):
-        raise found
-    return found
+    library = _library(sources, rounding, folder(), os.environ.get("CXX"))
+    if isinstance(library, NoCompilerError):
+        raise library
+    return library
 
 
-def compiled(what: str, *sources: Path, rounding: str = FUSED) -> bool:
-    """Return True if the library of ``what`` is available, compiled if needed; otherwise warn once and return False."""
+def compiled(task: str, *sources: Path, rounding: str = FUSED) -> bool:
+    """Return True if the library of ``task`` is available, compiled if needed; otherwise warn
+    once and return False.
+    """
     try:
         load(*sources, rounding=rounding)
     except NoCompilerError as error:
-        _say_once(what, str(error))
+        _say_once(task, str(error))
         return False
     return True
 
 
 @functools.cache
-def _say_once(what: str, why: str) -> None:
-    text = f"the C++ of the {what} is not compiled and torch computes the {what} more slowly: {why}"
+def _say_once(task: str, why: str) -> None:
+    text = f"the C++ of the {task} is not compiled and torch computes the {task} more slowly: {why}"
     warnings.warn(text, stacklevel=5)

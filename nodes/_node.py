@@ -1,53 +1,298 @@
-"""Nodes: functions that compute one step of a recipe, with typed parameters and attached functions (hooks).
-
-The signature defines the node. Arguments before ``*`` are data from other steps.
-Arguments after ``*`` are parameters from the recipe, and the engine gives the random
-generator for a parameter named ``rng``.
-
-    @node(rtol=0.0)
-    def digitize(electrons: Tensor, *, gain: Gain, bits: Bits = 16) -> Tensor: ...
-
-    @digitize.reference        # slow and simple form in float64; a test compares to rtol
-    @digitize.skip_bound       # upper bound of the change if the step is skipped
-    @digitize.propagate_error  # upper bound of the error that errors of the inputs cause
-    @digitize.rounding_error   # the same with what rounding to whole numbers adds, an estimate
-    @digitize.preflight        # checks the parameters before anything runs
-    @digitize.check            # checks that the result is plausible
-    @digitize.shape            # shape and type of the result, before anything runs
-    @digitize.expected_range   # least and largest element of the result, a guess before anything runs
-    @digitize.work             # memory and number of operations beside what the shapes say
-    @digitize.example          # the arguments of one small call, on which `neusee check` tries the node
-
-``digitize.hooks`` has each attached function under the name of its decorator; `nodes/_hooks.py` lists all hooks.
-"""
+"""Nodes: functions for one step of a recipe, with error bounds, checks and other hooks."""
 
 from __future__ import annotations
 
 import functools
 import importlib
 import inspect
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Literal, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_type_hints
 
 from pydantic import BaseModel, create_model
 
-from neusee.nodes._error_bound import ErrorBound, TensorStats
-from neusee.nodes._hooks import Check, Hooks
-from neusee.nodes.file_parameters import as_paths, is_file
 from neusee.nodes.own_modules import import_missing, own_files
-from neusee.nodes.parameter_model import ParameterModel
+from neusee.nodes.parameters import ParameterModel, as_paths, is_file
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+# --- error bound ----------------------------------------------------------------------------------
+
+# Statistics and error bounds of tensors, which an engine reads in place of the tensors.
+
+
+_FEW = 64  #: up to this many elements, a loop in Python is faster than five calls of torch
+#: elements of one part, and elements that are summed in the precision of the tensor
+_PART, _ROW = 1 << 17, 1 << 10
+_SUMMED = 1e-4  #: relative round-off of a sum, which float32 rows of 1024 elements keep far below
+
+
+@dataclass(frozen=True, slots=True)
+class TensorStats:
+    """Statistics of a tensor, such as range and sum, which are stored so that the tensor need
+    not be loaded.
+    """
+
+    shape: tuple[int, ...]
+    dtype: str
+    min: float
+    max: float
+    sum: float
+    support: int  #: elements that are not zero
+    finite: bool
+
+    @classmethod
+    def of(cls, value: Any) -> TensorStats | None:
+        """Return the statistics of a tensor, or of the first tensor in a named tuple; return
+        None for other values.
+        """
+        # here, so that a command that computes nothing need not import torch
+        from torch import Tensor
+
+        if isinstance(value, tuple | list) and value:
+            return cls.of(value[0])
+        if not isinstance(value, Tensor):
+            return None
+        x = value.detach()
+        shape, dtype = tuple(x.shape), str(x.dtype).removeprefix("torch.")
+        if x.numel() == 0:
+            return cls(shape, dtype, math.nan, math.nan, 0.0, 0, True)
+        x = x.abs() if x.is_complex() else x
+        few = x.reshape(-1).tolist() if x.numel() <= _FEW else []
+        if few and math.isfinite(total := float(sum(few))):
+            return cls(
+                shape,
+                dtype,
+                float(min(few)),
+                float(max(few)),
+                total,
+                sum(v != 0 for v in few),
+                True,
+            )
+        low, high, total, support = _measure(x.reshape(-1))
+        finite = all(map(math.isfinite, (low, high, total)))
+        return cls(shape, dtype, low, high, total, support, finite)
+
+    @property
+    def largest_rms(self) -> float:
+        """Return the largest root mean square that a tensor of this count, minimum, maximum and sum
+        can have.
+
+        The squares are largest where all elements but one are at an end of the range. Without a
+        finite sum, every element may be at the farther end.
+        """
+        low, high, count = self.min, self.max, math.prod(self.shape)
+        farthest = max(abs(low), abs(high))
+        if count == 0 or high <= low or not math.isfinite(self.sum):
+            return farthest
+        at_top = min(max((self.sum - count * low) / (high - low), 0.0), count)
+        between = low + (at_top - math.floor(at_top)) * (high - low)
+        at_bottom = max(count - math.floor(at_top) - 1, 0)
+        squares = math.floor(at_top) * high**2 + between**2 + at_bottom * low**2
+        return min(farthest, math.sqrt(squares / count) * (1 + _SUMMED))
+
+
+def _measure(flat: Tensor) -> tuple[float, float, float, int]:
+    """Return minimum, maximum, sum and number of nonzero elements of a flat tensor, in parts for
+    the CPU cache.
+    """
+    import torch
+
+    small = flat.dtype == torch.bool or (flat.is_floating_point() and flat.element_size() < 4)
+    parts = [_measure_piece(piece, small) for piece in torch.split(flat, _PART)]
+    lows, highs, sums, counts = (torch.stack(values) for values in zip(*parts, strict=True))
+    low, high, total = (float(x) for x in (lows.min(), highs.max(), sums.sum()))
+    # the sum of a row overflowed
+    if math.isinf(total) and math.isfinite(low) and math.isfinite(high):
+        total = float(sum(piece.sum(dtype=torch.float64) for piece in torch.split(flat, _PART)))
+    return low, high, total, int(counts.sum())
+
+
+def _measure_piece(piece: Tensor, small: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return minimum, maximum, sum and number of nonzero elements of a piece, in float32 if its
+    type is ``small``.
+    """
+    import torch
+
+    piece = piece.float() if small else piece
+    rows = piece.view(-1, _ROW) if piece.numel() % _ROW == 0 else piece[None]
+    low, high = torch.aminmax(piece)
+    return low, high, rows.sum(1).sum(dtype=torch.float64), torch.count_nonzero(piece)
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorBound:
+    """A bound, or an estimate, of the error of an input of a node, with the statistics of this
+    input.
+    """
+
+    rms: float  #: bound of the root mean square error over the elements, in the unit of the input
+    stats: TensorStats | None = None
+    #: bound of the error of the largest element, as a share of this element; None if it is unknown
+    peak: float | None = None
+    #: True if the error counts an estimate; else it is a proved upper bound
+    estimated: bool = False
+    #: part of `rms` that changes from element to element like noise; the other part is like the
+    #: light itself
+    scattered: float = 0.0
+
+    @property
+    def top(self) -> float:
+        """Return the largest absolute element of the input, or 0 if nothing is known of the
+        input.
+        """
+        return max(abs(self.stats.min), abs(self.stats.max)) if self.stats else 0.0
+
+    @property
+    def share(self) -> float:
+        """Return the bound of the rms error of a node input, relative to the largest absolute
+        element of the input.
+        """
+        if self.rms == 0.0:
+            return 0.0
+        return self.rms / self.top if self.top > 0 else math.inf
+
+    @property
+    def largest(self) -> float:
+        """Return the bound of the relative error of the largest element of a node input, or inf
+        if unknown.
+        """
+        return 0.0 if self.rms == 0.0 else math.inf if self.peak is None else self.peak
+
+
+# --- hooks ----------------------------------------------------------------------------------------
+
+# Hooks: the functions that are attached to a node, such as bounds of its error and checks of its
+# result.
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One finding about the result of a node, such as ``Check("phase step 0.31 turn < 0.5",
+    True)``.
+    """
+
+    text: str
+    ok: bool = True
+
+
+@dataclass(slots=True)
+class Hooks:
+    """The functions attached to a node (hooks), such as ``check``, which ``@digitize.check``
+    attaches.
+    """
+
+    #: slow float64 form: same arguments, same result within ``rtol``
+    reference: Callable[..., Any] | None = None
+    #: (`TensorStats` of each input, *, parameters): bound of ``max |with - without| / max |with|``
+    #: if the step is left out and its first input is used instead; for a random node, in root mean
+    #: square over the noise
+    skip_bound: Callable[..., float] | None = None
+    #: (`TensorStats` of the first input, *, parameters): the factor by which the root mean square
+    #: of one draw of the noise exceeds `skip_bound` in one of 10 000 draws
+    skip_draw: Callable[..., float] | None = None
+    #: True if `skip_bound` is an estimate and no bound, for which a recipe with ``estimates:
+    #: false`` omits nothing
+    skip_estimated: bool = False
+    #: (`TensorStats` of the first input, *, parameters): the scale of `skip_bound`, such as the
+    #: full well, because a later step cuts off larger values
+    skip_scale: Callable[..., float] | None = None
+    #: (`TensorStats` of each input, None for an absent input, *, parameters): bound of the result's
+    #: largest element; where the bound is 0, the step and the steps that only feed this step are
+    #: left out
+    zero_bound: Callable[..., float] | None = None
+    #: (`ErrorBound` of each input, *, result: TensorStats, parameters): the error that errors of
+    #: the inputs cause in the result; both errors are upper bounds in root mean square; a list
+    #: input has a list, an absent input None; an `ErrorBound` in place of a number also tells the
+    #: error of the largest element; without this hook the inputs must satisfy the tolerance
+    #: themselves, because the error of the result is not known
+    propagate_error: Callable[..., float | ErrorBound] | None = None
+    #: (the same arguments): the error that one of 10 000 draws of the noise exceeds, where
+    #: `propagate_error` gives that of all draws; a run states it and does not hold it to the
+    #: tolerance
+    propagate_draw: Callable[..., float] | None = None
+    #: (the same arguments): the error of the result from errors like noise (`ErrorBound.scattered`,
+    #: here as ``rms``); without this hook `propagate_error` holds for these errors too
+    propagate_scattered: Callable[..., float] | None = None
+    #: (rms error of the result as `propagate_error` gives it, *, result: TensorStats, parameters):
+    #: the rms error with what rounding to whole numbers adds; an estimate, which a run states and
+    #: does not hold to the tolerance
+    rounding_error: Callable[..., float] | None = None
+    #: True if `propagate_error` or `approximation_error` gives an estimate and no bound, which a
+    #: recipe with ``estimates: false`` does not use
+    estimated: bool = False
+    #: (result): the error of a cheaper form relative to its largest element, in root mean square
+    #: and for the largest element alone; both include the cheaper forms of the inputs, and not what
+    #: was left out of the inputs
+    approximation_error: Callable[[Any], tuple[float, float]] | None = None
+    #: (parameters): True if the result is the same for every band
+    band_invariant: Callable[[Mapping[str, Any]], bool] | None = None
+    #: (*, parameters): notes for the user, before anything runs; may raise `ParameterError`; an
+    #: argument with the name of an input receives what is known of that input before the run, as
+    #: ``shape`` gives it, else None
+    preflight: Callable[..., Sequence[str]] | None = None
+    #: (result, *inputs, **parameters): findings, once after computing
+    check: Callable[..., Sequence[Check]] | None = None
+    #: (what is known of each input, None where nothing is, **parameters): what is known of the
+    #: result before the run: tensors on the device ``meta``, which have a shape and a type but no
+    #: values; a tensor of few numbers may have values. A rule that fails, such as one that needs an
+    #: unknown input, leaves the result unknown
+    shape: Callable[..., Any] | None = None
+    #: (`TensorStats` of each input, *, parameters): least and largest element of the result as a
+    #: plan expects them before the run, no bound; an input of which nothing is known raises
+    #: LookupError where it is read
+    expected_range: Callable[..., tuple[float, float]] | None = None
+    #: (): the arguments of one small call by name, on which `neusee check` tries the node
+    example: Callable[[], Mapping[str, Any]] | None = None
+    #: (result, *inputs, **parameters), all as for ``shape``: bytes of memory during the run beside
+    #: inputs and result, and number of operations, both up to a constant factor, which is measured
+    work: Callable[..., tuple[float, float]] | None = None
+
+
+# --- node -----------------------------------------------------------------------------------------
+
+# Nodes: functions that compute one step of a recipe, with typed parameters and attached functions
+# (hooks).
+#
+# The signature defines the node. Arguments before ``*`` are data from other steps. Arguments after
+# ``*`` are parameters from the recipe, and the engine gives the random generator for a parameter
+# named ``rng``.
+#
+#     @node(rtol=0.0)
+#     def digitize(electrons: Tensor, *, gain: Gain, bits: Bits = 16) -> Tensor: ...
+#
+#     @digitize.reference        # slow and simple form in float64; a test compares to rtol
+#     @digitize.skip_bound       # upper bound of the change if the step is skipped
+#     @digitize.propagate_error  # upper bound of the error that errors of the inputs cause
+#     @digitize.rounding_error   # the same with what rounding to whole numbers adds, an estimate
+#     @digitize.preflight        # checks the parameters before anything runs
+#     @digitize.check            # checks that the result is plausible
+#     @digitize.shape            # shape and type of the result, before anything runs
+#     @digitize.expected_range   # least and largest element of the result, guessed before a run
+#     @digitize.work             # memory and number of operations beside what the shapes say
+#     @digitize.example          # arguments of one small call, for `neusee check`
+#
+# ``digitize.hooks`` has each attached function under the name of its decorator; `nodes/_node.py`
+# lists all hooks.
+
 
 Device = Literal["any", "cpu", "gpu"]
 Fn = TypeVar("Fn", bound=Callable[..., Any])
-_registered: dict[tuple[str, str], Node] = {}  #: every node of this process, the newest of each module and name
+#: every node of this process, the newest of each module and name
+_registered: dict[tuple[str, str], Node] = {}
 
 
 class ParameterError(ValueError):
-    """The error that the ``preflight`` of a node raises for a wrong parameter, before any step runs.
+    """The error that the ``preflight`` of a node raises for a wrong parameter, before any step
+    runs.
 
-    Args: the name of the parameter, and one sentence with the value and the fix. The name ``direction.angle`` means the
+    Args: the name of the parameter, and one sentence with the value and the fix. The name
+            ``direction.angle`` means the
     parameter ``angle`` of the step that computes the input ``direction``.
     """
 
@@ -68,10 +313,12 @@ def _attaches(hook: str) -> Callable[[Any, Fn], Fn]:
 
 
 class Node:
-    """A function that computes one step of a recipe, with typed parameters and hooks such as checks.
+    """A function that computes one step of a recipe, with typed parameters and hooks such as
+    checks.
 
-    Two cheaper forms may replace a node where a recipe's tolerance allows it: ``channel_sum_form`` gives
-    `Channels` instead of all bands, and ``low_rank_form`` gives a `LowRankCube` instead of a cube.
+    Two cheaper forms may replace a node where a recipe's tolerance allows it: ``channel_sum_form``
+    gives `Channels` instead of all bands, and ``low_rank_form`` gives a `LowRankCube` instead of a
+    cube.
     """
 
     def __init__(
@@ -96,27 +343,47 @@ class Node:
         self.channel_sum_form: Node | None = None
         self.low_rank_form: Node | None = None
         self.hooks = Hooks()
-        pars = inspect.signature(fn).parameters.values()
+        self._read_signature()
+        self.bands = bands and self._declared(bands)
+        self.before_run = before_run
+        self._require_texts(depends)
+        self.depends = tuple(depends)
+        #: the declared variables of the environment at the import, which a module may read only
+        #: then
+        self.environment = {name: os.environ.get(name) for name in _variables(depends)}
+        self._refuse_inputs_before_run()
+        _registered[fn.__module__, fn.__name__] = self
+
+    def _read_signature(self) -> None:
+        """Read inputs, optional inputs, random numbers and parameters from the function."""
+        pars = inspect.signature(self.fn).parameters.values()
         data = [p for p in pars if p.kind is p.POSITIONAL_OR_KEYWORD]
         self.inputs = tuple(p.name for p in data)
         self.optional = frozenset(p.name for p in data if p.default is not p.empty)
         self.random = any(p.name == "rng" for p in pars)
         self._keyword_only = [p for p in pars if p.kind is p.KEYWORD_ONLY and p.name != "rng"]
-        self.bands = bands and self._declared(bands)
-        self.before_run = before_run
-        if isinstance(depends, str) or not all(isinstance(entry, str) and entry for entry in depends):
+
+    def _require_texts(self, depends: Sequence[str]) -> None:
+        """Raise ValueError for declared dependencies that are no list of texts."""
+        if isinstance(depends, str) or not all(
+            isinstance(entry, str) and entry for entry in depends
+        ):
             raise ValueError(
-                f'{self.path}: depends={depends!r} must be a list of texts, such as ["table.csv", "env:X"]'
+                f'{self.path}: depends={depends!r} must be a list of texts, such as ["table.csv",'
+                ' "env:X"]'
             )
-        self.depends = tuple(depends)
-        #: the declared variables of the environment at the import, which a module may read only then
-        self.environment = {name: os.environ.get(name) for name in _variables(depends)}
-        if before_run and (self.inputs or self.random):
-            raise ValueError(f"{self.path}: before_run needs a node without inputs and without rng: omit before_run")
-        _registered[fn.__module__, fn.__name__] = self
+
+    def _refuse_inputs_before_run(self) -> None:
+        """Raise ValueError for a node that a run computes first although it needs something."""
+        if self.before_run and (self.inputs or self.random):
+            raise ValueError(
+                f"{self.path}: before_run needs a node without inputs and without rng: omit"
+                " before_run"
+            )
 
     def __call__(self, *inputs: Any, **params: Any) -> Any:
-        """Call the function of the node directly, with gradients, without parameter validation and without cache.
+        """Call the function of the node directly, with gradients, without parameter validation and
+        without cache.
 
         A text for a parameter that is a file is a path, as in a recipe.
         """
@@ -130,47 +397,73 @@ class Node:
         return f"<node {self.path}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle a node as module and name, so that the process that unpickles the node imports the code.
+        """Pickle a node as module and name, so that the process that unpickles the node imports the
+        code.
 
-        Files of the user that this process has imported are named too: a result of their nodes may be an input. So is
-        the name in a recipe, whose family a recipe may choose.
+        Files of the user that this process has imported are named too: a result of their nodes may
+        be an input. So is the name in a recipe, whose family a recipe may choose.
         """
         return _imported, (self.fn.__module__, self.fn.__name__, own_files(), self.path)
 
     @functools.cached_property
     def path(self) -> str:
         """Return the name of the node in a recipe, such as ``sensor.digitize``."""
-        parts = [p for p in self.fn.__module__.removeprefix("neusee.nodes.").split(".") if not p.startswith("_")]
+        parts = [
+            p
+            for p in self.fn.__module__.removeprefix("neusee.nodes.").split(".")
+            if not p.startswith("_")
+        ]
         return ".".join([*parts, self.fn.__name__])
 
     def _declared(self, bands: Mapping[str, int]) -> Mapping[str, int]:
         unknown = sorted(bands.keys() - {*self.inputs, "return"})
         if unknown or "return" not in bands or len(bands) < 2:
-            raise ValueError(f"{self.path}: bands={dict(bands)} must name 'return' and at least one of {self.inputs}")
+            raise ValueError(
+                f"{self.path}: bands={dict(bands)} must name 'return' and at least one of"
+                f" {self.inputs}"
+            )
         if self.random:
             raise ValueError(
-                f"{self.path} draws random numbers, so each band would depend on the other bands: omit bands="
+                f"{self.path} draws random numbers, so each band would depend on the other bands:"
+                " omit bands="
             )
         return MappingProxyType(dict(bands))
 
     @functools.cached_property
     def hints(self) -> dict[str, Any]:
-        """Return the type annotation of each argument and of the result of the node, with ``Annotated`` metadata."""
+        """Return the type annotation of each argument and of the result of the node, with
+        ``Annotated`` metadata.
+        """
         return get_type_hints(self.fn, include_extras=True)
 
     @functools.cached_property
     def params(self) -> type[BaseModel]:
-        """Return the pydantic model that validates the parameters of the node and rejects unknown parameters."""
-        fields = {p.name: (self.hints[p.name], ... if p.default is p.empty else p.default) for p in self._keyword_only}
+        """Return the pydantic model that validates the parameters of the node and rejects
+        unknown parameters.
+        """
+        fields = {
+            p.name: (self.hints[p.name], ... if p.default is p.empty else p.default)
+            for p in self._keyword_only
+        }
         model: type[BaseModel] = create_model(
             self.fn.__name__, __base__=ParameterModel, __module__=self.fn.__module__, **fields
         )  # type: ignore[call-overload]
         return model
 
     reference, preflight, check = _attaches("reference"), _attaches("preflight"), _attaches("check")
-    skip_bound, skip_scale, zero_bound = _attaches("skip_bound"), _attaches("skip_scale"), _attaches("zero_bound")
-    propagate_error, approximation_error = _attaches("propagate_error"), _attaches("approximation_error")
-    propagate_scattered, rounding_error = _attaches("propagate_scattered"), _attaches("rounding_error")
+    skip_bound, skip_scale, zero_bound = (
+        _attaches("skip_bound"),
+        _attaches("skip_scale"),
+        _attaches("zero_bound"),
+    )
+    propagate_error, approximation_error = (
+        _attaches("propagate_error"),
+        _attaches("approximation_error"),
+    )
+    propagate_scattered, rounding_error = (
+        _attaches("propagate_scattered"),
+        _attaches("rounding_error"),
+    )
     propagate_draw, skip_draw = _attaches("propagate_draw"), _attaches("skip_draw")
     band_invariant = _attaches("band_invariant")
     expected_range = _attaches("expected_range")
@@ -178,7 +471,9 @@ class Node:
 
     @property
     def preflight_inputs(self) -> tuple[str, ...]:
-        """Return the names of those inputs of the node that the hook ``preflight`` receives before the run."""
+        """Return the names of those inputs of the node that the hook ``preflight`` receives
+        before the run.
+        """
         hook = self.hooks.preflight
         return tuple(name for name in _arguments(hook) if name in self.inputs) if hook else ()
 
@@ -189,7 +484,9 @@ def _arguments(hook: Callable[..., Any]) -> tuple[str, ...]:
 
 
 def registered_nodes() -> tuple[Node, ...]:
-    """Return every node that this process has defined or imported, the newest of each module and name."""
+    """Return every node that this process has defined or imported, the newest of each module and
+    name.
+    """
     return tuple(_registered.values())
 
 
@@ -217,21 +514,27 @@ def node(
     before_run: bool = False,
     depends: Sequence[str] = (),
 ) -> Callable[[Callable[..., Any]], Node]:
-    """Return the decorator that turns a function into a node; ``rtol`` is the allowed error relative to the reference.
+    """Return the decorator that turns a function into a node; ``rtol`` is the allowed error
+    relative to the reference.
 
     Args:
-        bands: the axis of the bands of some inputs and of the result (``return``). Band i of the result depends only
-            on band i of these inputs and on the whole of every other input, and is the same to the last bit for any
-            other bands in the stack. In a named tuple, only the fields in `values.BAND_FIELDS` have this axis.
+        bands: the axis of the bands of some inputs and of the result (``return``). Band i of the
+            result depends only on band i of these inputs and on the whole of every other input, and
+            is the same to the last bit for any other bands in the stack. In a named tuple, only the
+            fields in `values.BAND_FIELDS` have this axis.
         accepts_channel_sums: inputs that may be `Channels` instead of an image of all bands.
-        needs_band_invariant: inputs that must be the same for every band if an image is given as `Channels`.
+        needs_band_invariant: inputs that must be the same for every band if an image is given as
+            `Channels`.
         accepts_low_rank: inputs that may be a `LowRankCube` instead of a cube.
-        additive_inputs: groups of inputs; the first input of a group is optional or a list, and changes nothing where
-            its values are zero. The other inputs of the group are used only with the first input.
-        before_run: True for a node without inputs and with a result of few numbers, which is also computed when a
-            recipe is checked, so that the preflight of another node can use the result.
-        depends: what the code reads and no import shows: files beside the module, ``env:NAME``, names of modules. The
-            page ``recipes/guide/code_changes.md`` lists the constructs that need an entry.
+        additive_inputs: groups of inputs; the first input of a group is optional or a list, and
+            changes nothing where its values are zero. The other inputs of the group are used only
+            with the first input.
+        before_run: True for a node without inputs and with a result of few numbers, which is also
+            computed when a recipe is checked, so that the preflight of another node can use the
+            result.
+        depends: what the code reads and no import shows: files beside the module, ``env:NAME``,
+            names of modules. The page ``recipes/guide/code_changes.md`` lists the constructs that
+            need an entry.
     """
     return lambda fn: Node(
         fn,
@@ -247,4 +550,13 @@ def node(
     )
 
 
-__all__ = ["Check", "ErrorBound", "Hooks", "Node", "ParameterError", "TensorStats", "node", "registered_nodes"]
+__all__ = [
+    "Check",
+    "ErrorBound",
+    "Hooks",
+    "Node",
+    "ParameterError",
+    "TensorStats",
+    "node",
+    "registered_nodes",
+]

@@ -1,4 +1,5 @@
-"""Times of the imports of modules: whether a file was edited after its import is decided by these times.
+"""Times of the imports of modules: whether a file was edited after its import is decided by these
+times.
 
 Python keeps no such time, and without byte code no record of the source that it has read.
 """
@@ -10,11 +11,14 @@ import time
 from collections.abc import Sequence
 from types import ModuleType
 
-_SLACK = 1_000_000_000  #: ns by which a clock that is corrected slowly may differ from the steady one
+#: ns by which a clock that is corrected slowly may differ from the steady one
+_SLACK = 1_000_000_000
 
 
 class Moment:
-    """The moment at which it was made, as a time that what happens later has not, even if the clock is set back."""
+    """The moment at which it was made, as a time that what happens later has not, even if the
+    clock is set back.
+    """
 
     def __init__(self, clock: int | None = None, steady: int | None = None) -> None:
         """Take the times (ns) of both clocks at the moment, by default those of now."""
@@ -22,7 +26,9 @@ class Moment:
         self._steady = time.monotonic_ns() if steady is None else steady
 
     def time(self) -> int:
-        """Return the time (ns) of the moment by the clock as it is set now, or as it was then if that is earlier."""
+        """Return the time (ns) of the moment by the clock as it is set now, or as it was then if
+        that is earlier.
+        """
         by_now = time.time_ns() - (time.monotonic_ns() - self._steady)
         return by_now if by_now < self._clock - _SLACK else self._clock
 
@@ -32,10 +38,14 @@ _FIRST = Moment()
 
 
 class _Clock:
-    """A finder on ``sys.meta_path`` that finds no module, and notes when the import of each module begins."""
+    """A finder on ``sys.meta_path`` that finds no module, and notes when the import of each
+    module begins.
+    """
 
     @staticmethod
-    def find_spec(name: str, path: Sequence[str] | None = None, target: ModuleType | None = None) -> None:
+    def find_spec(
+        name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> None:
         _began[name] = Moment()
 
 

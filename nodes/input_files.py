@@ -1,20 +1,238 @@
-"""Limits of input files, and checks that read the content of a file once, before the run."""
+"""Limits of input files: the memory that reading needs, and checks before the run."""
 
 import csv
 import functools
+import os
+import resource
+import stat
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from io import BufferedReader, TextIOWrapper
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from neusee.nodes import ParameterError
-from neusee.nodes.input_size import lines_of
 
-PIXELS = 64_000_000  #: of a picture, at most; a PNG of this size takes 1.3 GB of memory to decode and convert
+# --- input size -----------------------------------------------------------------------------------
+
+# Bytes that a reader of a file would need, compared with the memory that is left before anything is
+# allocated.
+#
+# A reader finds the bytes in the header alone and asks `needs`. Files are opened without waiting: a
+# pipe, a device or a socket in the place of a file is refused, because it never ends, or never
+# begins.
+
+
+#: what is free decides whether a file is read, and no result; the files are those of the system, or
+#: of an argument
+__depends__ = ["unaffected:file", "unaffected:resource", "unaffected:_measures", "unaffected:time"]
+SMALL = 16 << 20  #: bytes that every reader may take without asking
+TEXT = 64 << 20  #: bytes of a text that is read as a whole, at most
+LINE = 1_000_000  #: characters of a line of a table, at most
+_GROUP = Path("/sys/fs/cgroup")
+_KINDS = (
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISDIR, "a folder"),
+)
+
+
+class Room(NamedTuple):
+    """Memory that this process may still use, and its limit if one was set, in bytes."""
+
+    free: float
+    limit: float | None = None
+
+
+class BeyondMemory(ParameterError):
+    """Error of a reader whose file needs more memory than is left."""
+
+
+def needs(count: float, file: Path | str, content: str, parameter: str = "file") -> None:
+    """Raise `BeyondMemory` if a reader would need more than the memory that is left: ``count``
+    bytes.
+
+    ``content`` says what the bytes are, such as ``30 pages of 4000 x 3000 pixels``.
+    """
+    if count <= SMALL:
+        return
+    room = _measures[-1]()
+    if count <= room.free:
+        return
+    free = max(room.free, 0.0)
+    if room.limit is None:
+        room_text, remedy = f"the {in_bytes(free)} that are free", "free memory"
+    else:
+        room_text = f"the {in_bytes(free)} that are left of the limit of {in_bytes(room.limit)}"
+        remedy = "raise the limit by --memory"
+    text = (
+        f"{file} would need {in_bytes(count)} of memory to read ({content}), more than {room_text}"
+    )
+    raise BeyondMemory(parameter, f"{text}: {remedy}, crop the file, or give another file")
+
+
+def measured_by(measure: Callable[[], Room]) -> None:
+    """Let ``measure`` say from now on what memory is left, as the program does that has a limit."""
+    _measures[1:] = [measure]
+
+
+def free_memory() -> Room:
+    """Return the memory that is free on this machine, in its control group, and below the limit
+    of addresses.
+    """
+    rooms = [float("inf")]
+    with suppress(OSError, ValueError, StopIteration):
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        rooms.append(
+            1024.0
+            * next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
+        )
+    with suppress(OSError, ValueError):
+        limit = int((_GROUP / "memory.max").read_text())
+        statistics = dict(
+            line.split() for line in (_GROUP / "memory.stat").read_text().splitlines()
+        )
+        rooms.append(
+            float(
+                limit
+                - int((_GROUP / "memory.current").read_text())
+                + int(statistics["inactive_file"])
+            )
+        )
+    addresses = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if addresses != resource.RLIM_INFINITY:
+        with suppress(OSError, ValueError):
+            pages = int(Path("/proc/self/statm").read_text().split()[0])
+            rooms.append(float(addresses - pages * resource.getpagesize()))
+    return Room(min(rooms))
+
+
+_measures: list[Callable[[], Room]] = [free_memory]  #: the last one counts
+
+
+def in_bytes(count: float) -> str:
+    """Return a number of bytes as text with a unit."""
+    for unit, scale in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= scale:
+            return f"{count / scale:.3g} {unit}"
+    return f"{count:.0f} bytes"
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+def kind_of(mode: int) -> str:
+    """Return what stands in the place of a file, such as ``a pipe``, or an empty text for a
+    regular file.
+    """
+    return (
+        "" if stat.S_ISREG(mode) else next((kind for fits, kind in _KINDS if fits(mode)), "no file")
+    )
+
+
+def refuse_other_than_file(file: Path | str, parameter: str = "file") -> None:
+    """Raise ParameterError for a pipe, a device, a socket or a folder; a file that is missing
+    passes.
+    """
+    try:
+        mode = os.stat(file).st_mode
+    except OSError:
+        return
+    _refuse(file, mode, parameter)
+
+
+def _refuse(file: Path | str, mode: int, parameter: str) -> None:
+    if kind := kind_of(mode):
+        raise ParameterError(
+            parameter, f"{file} is not a regular file but {kind}: give the path of a file"
+        )
+
+
+def opened(file: Path | str, parameter: str = "file") -> BufferedReader:
+    """Open a regular file to read its bytes, without waiting for a pipe; raise ParameterError
+    for anything else.
+    """
+    refuse_other_than_file(file, parameter)  # some devices do something when they are opened
+    number = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        _refuse(file, os.fstat(number).st_mode, parameter)
+    except BaseException:
+        os.close(number)
+        raise
+    return os.fdopen(number, "rb")
+
+
+def head_of(file: Path | str, count: int) -> bytes:
+    """Return the first bytes of a file."""
+    with opened(file) as bytes_in:
+        return bytes_in.read(count)
+
+
+def bytes_of(file: Path | str, copies: float = 1.0, parameter: str = "file") -> bytes:
+    """Return all bytes of a file, of which the caller makes ``copies``, the first one included."""
+    with opened(file, parameter) as bytes_in:
+        size = os.fstat(bytes_in.fileno()).st_size
+        needs(copies * size, file, f"a file of {in_bytes(size)}", parameter)
+        return bytes_in.read(size + 1)
+
+
+def text_of(
+    file: Path | str, encoding: str = "utf-8", errors: str = "strict", max_bytes: int = TEXT
+) -> str:
+    """Return the text of a file of at most ``max_bytes`` bytes, with ``\\n`` at the end of each
+    line.
+    """
+    with opened(file) as bytes_in:
+        size = os.fstat(bytes_in.fileno()).st_size
+        if size > max_bytes:
+            limit = f"more than the limit of {in_bytes(max_bytes)} for such a file"
+            raise ParameterError(
+                "file", f"{file} has {in_bytes(size)}, {limit}: give a shorter file"
+            )
+        needs(8.0 * size, file, f"a text of {in_bytes(size)}")
+        return (
+            bytes_in.read(max_bytes)
+            .decode(encoding, errors)
+            .replace("\r\n", "\n")
+            .replace("\r", "\n")
+        )
+
+
+def lines_of(file: Path, copies: float = 1.0) -> Iterator[str]:
+    """Yield the lines of a table in UTF-8, each with its end; refuse a line that is too long to be
+    one of a table.
+
+    ``copies`` are bytes that the caller keeps for each byte of the file.
+    """
+    with opened(file) as bytes_in:
+        size = os.fstat(bytes_in.fileno()).st_size
+        needs(copies * size, file, f"a table of {in_bytes(size)}")
+        with TextIOWrapper(bytes_in, encoding="utf-8-sig", newline="") as text:
+            number = 0
+            while line := text.readline(LINE + 1):
+                number += 1
+                if len(line) > LINE:
+                    fix = "break the line, or give another file"
+                    raise ParameterError(
+                        "file", f"{file.name}:{number} has more than {LINE} characters: {fix}"
+                    )
+                yield line
+
+
+# --- input files ----------------------------------------------------------------------------------
+
+# Limits of input files, and checks that read the content of a file once, before the run.
+
+
+#: of a picture, at most; a PNG of this size takes 1.3 GB of memory to decode and convert
+PIXELS = 64_000_000
 VALUES = 1_000_000_000  #: numbers in a cube, a height map or a frame, at most; 4 GB as float32
 ROWS = 1_000_000  #: lines of a table, at most
-__depends__ = ["unaffected:time"]  #: the clock decides whether a file is read again, and no result
-_SETTLED = 2_000_000_000  #: ns after a change of a file in which a second change may not change its times
+#: ns after a change of a file in which a second change may not change its times
+_SETTLED = 2_000_000_000
 _CELLS = 8.0  #: bytes in memory for each byte of a table, in texts of cells of several digits
 _SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "vertical bars"}
 
@@ -22,27 +240,40 @@ Result = TypeVar("Result")
 
 
 def refuse_large_picture(file: Path, rows: int, columns: int) -> None:
-    """Raise ParameterError for a picture whose header states more pixels than the limit, before it is decoded."""
+    """Raise ParameterError for a picture whose header states more pixels than the limit, before
+    it is decoded.
+    """
     if rows * columns > PIXELS:
-        text = f"{file.name} has {columns} x {rows} pixels, more than the limit of {PIXELS / 1e6:g} million: "
-        raise ParameterError("file", f"{text}reduce it, such as by magick {file.name} -resize 50% small{file.suffix}")
+        text = (
+            f"{file.name} has {columns} x {rows} pixels, more than the limit of {PIXELS / 1e6:g}"
+            " million: "
+        )
+        raise ParameterError(
+            "file", f"{text}reduce it, such as by magick {file.name} -resize 50% small{file.suffix}"
+        )
 
 
 def refuse_large_array(file: Path, shape: Sequence[int]) -> None:
-    """Raise ParameterError for an array whose header states more values than the limit, before it is read."""
-    count = functools.reduce(lambda one, other: one * int(other), shape, 1)
+    """Raise ParameterError for an array whose header states more values than the limit, before
+    it is read.
+    """
+    count = functools.reduce(lambda product, other: product * int(other), shape, 1)
     if count > VALUES:
         sizes = " x ".join(map(str, shape))
-        text = f"{file.name} has {sizes} values, more than the limit of {VALUES / 1e6:g} million: give a smaller array"
+        text = (
+            f"{file.name} has {sizes} values, more than the limit of {VALUES / 1e6:g} million: give"
+            " a smaller array"
+        )
         raise ParameterError("file", text)
 
 
 def file_version(file: Path) -> tuple[int, ...] | None:
-    """Return numbers that differ for each version of a file, or None for a file that has just been changed.
+    """Return numbers that differ for each version of a file, or None for a file that has just been
+    changed.
 
-    The numbers are device, inode, size, and the times of the last change of content and of the entry, which no program
-    can set. A second change within a tick of the clock leaves them as they are, so that a file younger than two seconds
-    has no version yet.
+    The numbers are device, inode, size, and the times of the last change of content and of the
+    entry, which no program can set. A second change within a tick of the clock leaves them as they
+    are, so that a file younger than two seconds has no version yet.
     """
     about = file.stat()
     changed = max(about.st_mtime_ns, about.st_ctime_ns)
@@ -52,7 +283,9 @@ def file_version(file: Path) -> tuple[int, ...] | None:
 
 
 def once_per_version(check: Callable[..., Result]) -> Callable[..., Result]:
-    """Return a function that remembers the results of ``check`` until the file, its first argument, changes."""
+    """Return a function that remembers the results of ``check`` until the file, its first
+    argument, changes.
+    """
 
     @functools.lru_cache(maxsize=256)
     def remembered(version: tuple[int, ...], *arguments: Any) -> Result:
@@ -69,9 +302,15 @@ def once_per_version(check: Callable[..., Result]) -> Callable[..., Result]:
 
 
 def not_finite(file: Path, count: int) -> str:
-    """Return the message for a file with values that are NaN or infinite, or an empty text for a count of 0."""
+    """Return the message for a file with values that are NaN or infinite, or an empty text for a
+    count of 0.
+    """
     fix = "replace these values by finite numbers, such as 0"
-    return f"{file.name} holds {count} values that are not finite (NaN or infinity): {fix}" if count else ""
+    return (
+        f"{file.name} holds {count} values that are not finite (NaN or infinity): {fix}"
+        if count
+        else ""
+    )
 
 
 def csv_rows(file: Path) -> Iterator[tuple[int, list[str]]]:
@@ -79,7 +318,8 @@ def csv_rows(file: Path) -> Iterator[tuple[int, list[str]]]:
 
     A line that begins with ``#`` is a comment, such as the source of the table.
 
-    Raises ValueError for text that is not UTF-8, for another separator than a comma, and for more rows than the limit.
+    Raises ValueError for text that is not UTF-8, for another separator than a comma, and for more
+    rows than the limit.
     """
     reader = csv.reader("" if line.startswith("#") else line for line in lines_of(file, _CELLS))
     first = True
@@ -94,10 +334,16 @@ def csv_rows(file: Path) -> Iterator[tuple[int, list[str]]]:
             first = False
             yield reader.line_num, row
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{file.name} is not a CSV file in UTF-8 ({error}): save the table as CSV") from None
+        raise ValueError(
+            f"{file.name} is not a CSV file in UTF-8 ({error}): save the table as CSV"
+        ) from None
 
 
 def _refuse_separator(file: Path, header: list[str]) -> None:
-    found = next((name for mark, name in _SEPARATORS.items() if len(header) == 1 and mark in header[0]), None)
-    if found:
-        raise ValueError(f"{file.name} separates its columns by {found}: separate the columns by commas")
+    separator = next(
+        (name for mark, name in _SEPARATORS.items() if len(header) == 1 and mark in header[0]), None
+    )
+    if separator:
+        raise ValueError(
+            f"{file.name} separates its columns by {separator}: separate the columns by commas"
+        )

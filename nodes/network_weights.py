@@ -9,15 +9,18 @@ import torch
 from torch import Tensor, nn
 
 from neusee.nodes import ParameterError
-from neusee.nodes.array_bytes import safetensors_need
+from neusee.nodes.file_headers import safetensors_need
 from neusee.nodes.input_files import once_per_version
 
 Net = TypeVar("Net", bound=nn.Module)
-OPTIONS = "neusee.options"  #: metadata key of the options of a network, which the tensors may not show
+#: metadata key of the options of a network, which the tensors may not show
+OPTIONS = "neusee.options"
 
 
 def empty(make: Callable[[], Net]) -> Net:
-    """Build a network on the meta device, without memory for the tensors and without use of random numbers."""
+    """Build a network on the meta device, without memory for the tensors and without use of
+    random numbers.
+    """
     with torch.device("meta"):
         return make()
 
@@ -33,13 +36,17 @@ def loaded(make: Callable[[], Net], weights: Path) -> Net:
 
 
 def file_metadata(net: nn.Module) -> dict[str, str]:
-    """Return the metadata for the weights file of a network: the ``options`` of the network as JSON, or nothing."""
+    """Return the metadata for the weights file of a network: the ``options`` of the network as
+    JSON, or nothing.
+    """
     options = getattr(net, "options", None)
     return {} if options is None else {OPTIONS: json.dumps(options, sort_keys=True)}
 
 
 def same_layout(make: Callable[[], nn.Module], weights: Path, width: int) -> None:
-    """Raise ParameterError unless a weights file fits a network: names, shapes, options, and finite numbers."""
+    """Raise ParameterError unless a weights file fits a network: names, shapes, options, and
+    finite numbers.
+    """
     net = empty(make)
     fits(net, weights, f"this network (width {width})", getattr(net, "options", {}))
 
@@ -47,7 +54,8 @@ def same_layout(make: Callable[[], nn.Module], weights: Path, width: int) -> Non
 def fits(net: nn.Module, weights: Path, called: str, options: Mapping[str, Any]) -> None:
     """Raise ParameterError unless a weights file fits a module, which messages name ``called``.
 
-    ``options`` are those of the network, with which the options in the metadata of the file must agree.
+    ``options`` are those of the network, with which the options in the metadata of the file must
+    agree.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -58,7 +66,9 @@ def fits(net: nn.Module, weights: Path, called: str, options: Mapping[str, Any])
             stored = {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
             trained = (tensors.metadata() or {}).get(OPTIONS)
     except SafetensorError as error:
-        raise ParameterError("weights", f"{weights.name} is not a safetensors file: {error}") from error
+        raise ParameterError(
+            "weights", f"{weights.name} is not a safetensors file: {error}"
+        ) from error
     if trained is not None:
         _same_options(_options(trained, weights), options, weights)
     for name in sorted(shapes | stored):
@@ -71,20 +81,28 @@ def fits(net: nn.Module, weights: Path, called: str, options: Mapping[str, Any])
 
 @once_per_version
 def _not_finite(weights: Path) -> str:
-    """Return a message for the first tensor in a weights file with values that are not finite, or an empty text."""
+    """Return a message for the first tensor in a weights file with values that are not finite,
+    or an empty text.
+    """
     from safetensors import safe_open
 
     safetensors_need(weights, parameter="weights")
     with safe_open(weights, framework="pt") as tensors:
-        found = (wrong_weights(weights, name, tensors.get_tensor(name)) for name in tensors.keys())  # noqa: SIM118
-        return next(filter(None, found), "")
+        wrong = (wrong_weights(weights, name, tensors.get_tensor(name)) for name in tensors.keys())  # noqa: SIM118
+        return next(filter(None, wrong), "")
 
 
 def wrong_weights(weights: Path, name: str, tensor: Tensor) -> str:
-    """Return a message for a tensor of network weights with values that are not finite, or an empty text."""
+    """Return a message for a tensor of network weights with values that are not finite, or an
+    empty text.
+    """
     count = int((~torch.isfinite(tensor)).sum())
     fix = "train the network again, or give an earlier file"
-    return f"{weights.name}: {name} holds {count} values that are not finite (NaN or infinity): {fix}" if count else ""
+    return (
+        f"{weights.name}: {name} holds {count} values that are not finite (NaN or infinity): {fix}"
+        if count
+        else ""
+    )
 
 
 def _options(text: str, weights: Path) -> Mapping[str, Any]:
@@ -93,18 +111,25 @@ def _options(text: str, weights: Path) -> Mapping[str, Any]:
     except ValueError:
         options = None
     if not isinstance(options, dict):
-        raise ParameterError("weights", f"{weights.name} has damaged options ({text[:40]!r}): copy the file again")
+        raise ParameterError(
+            "weights", f"{weights.name} has damaged options ({text[:40]!r}): copy the file again"
+        )
     return options
 
 
 def _same_options(trained: Mapping[str, Any], options: Mapping[str, Any], weights: Path) -> None:
-    """Raise ParameterError if the options in a weights file differ from the options of the network to load.
+    """Raise ParameterError if the options in a weights file differ from the options of the network
+    to load.
 
-    The tensor names and shapes can be equal all the same, and the network would compute other results.
+    The tensor names and shapes can be equal all the same, and the network would compute other
+    results.
     """
     for name in options:
         if name in trained and trained[name] != options[name]:
-            text = f"{weights.name} was trained with {name}: {_word(trained[name])}, and this network has {name}: "
+            text = (
+                f"{weights.name} was trained with {name}: {_word(trained[name])}, and this network"
+                f" has {name}: "
+            )
             fix = "name that class" if name == "class" else f"write {name}: {_word(trained[name])}"
             raise ParameterError("weights", f"{text}{_word(options[name])}; {fix}")
 

@@ -1,7 +1,8 @@
-"""Rules for the shape and type of a result, and tensors on the device ``meta``, which have no values.
+"""Rules for the shape and type of a result, and tensors on the device ``meta``, which have no
+values.
 
-A rule has the arguments of its node; an input of which nothing is known is None, and a rule that needs it
-fails. Files ``_result_shapes.py`` attach the rules to the nodes.
+A rule has the arguments of its node; an input of which nothing is known is None, and a rule that
+needs it fails. Files ``_result_shapes.py`` attach the rules to the nodes.
 """
 
 from __future__ import annotations
@@ -17,10 +18,13 @@ _MOST = 2**60  #: bytes of a tensor; more than any machine has, and torch cannot
 
 
 def blank(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Return a tensor without values, on the device ``meta``; raise OverflowError above 2**60 bytes."""
+    """Return a tensor without values, on the device ``meta``; raise OverflowError above 2**60
+    bytes.
+    """
     if math.prod(shape) * dtype.itemsize > _MOST:
         raise OverflowError(
-            f"a result of {' x '.join(map(str, shape))} values exceeds 2**60 bytes: choose smaller sizes"
+            f"a result of {' x '.join(map(str, shape))} values exceeds 2**60 bytes: choose smaller"
+            " sizes"
         )
     return torch.empty(shape, dtype=dtype, device="meta")
 
@@ -31,15 +35,19 @@ def double(*shape: int) -> Tensor:
 
 
 def at_least_single(*tensors: Tensor) -> torch.dtype:
-    """Return the type of a result that is computed in float32, or in the widest type of ``tensors`` if wider."""
-    found = torch.float32
+    """Return the type of a result that is computed in float32, or in the widest type of
+    ``tensors`` if wider.
+    """
+    dtype = torch.float32
     for x in tensors:
-        found = torch.promote_types(found, x.dtype)
-    return found
+        dtype = torch.promote_types(dtype, x.dtype)
+    return dtype
 
 
 def like_first(first: Tensor, *inputs: Any, **params: Any) -> Tensor:
-    """Return the shape of the first input, in float32 or in the type of the first input if it is wider."""
+    """Return the shape of the first input, in float32 or in the type of the first input if it is
+    wider.
+    """
     return blank(*first.shape, dtype=at_least_single(first))
 
 
@@ -49,7 +57,9 @@ def scalars(kind: type) -> Callable[..., Any]:
 
 
 def transform_operations(*sizes: int) -> float:
-    """Return the number of operations of a fast Fourier transform of an array with the given sizes, N log2 N."""
+    """Return the number of operations of a fast Fourier transform of an array with the given
+    sizes, N log2 N.
+    """
     count = math.prod(sizes)
     return count * math.log2(count + 1)
 

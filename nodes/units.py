@@ -2,10 +2,12 @@
 
 A parameter with a dimension must carry a unit in the recipe, so that no reader mistakes
 micrometres for nanometres. Inside the program every quantity is in SI units, e- or DN.
-A gain is K of EMVA 1288 inside the program, DN/e-; a recipe may also give the reciprocal, ``0.37 e-/DN``.
+A gain is K of EMVA 1288 inside the program, DN/e-; a recipe may also give the reciprocal, ``0.37
+e-/DN``.
 
-Every type of a number states its least and its greatest value: what physics allows, or what no camera, laser or optic
-comes near. A value beyond is a mistake of the recipe, such as a unit that slipped, and is refused before any work.
+Every type of a number states its least and its greatest value: what physics allows, or what no
+camera, laser or optic comes near. A value beyond is a mistake of the recipe, such as a unit that
+slipped, and is refused before any work.
 """
 
 from __future__ import annotations
@@ -15,13 +17,23 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from glob import glob
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
 _SCALE: dict[str, dict[str, float]] = {
-    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9, "km": 1e3},
+    "m": {
+        "m": 1.0,
+        "cm": 1e-2,
+        "mm": 1e-3,
+        "um": 1e-6,
+        "µm": 1e-6,
+        "μm": 1e-6,
+        "nm": 1e-9,
+        "km": 1e3,
+    },
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "ps": 1e-12, "fs": 1e-15},
     "rad": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180.0},
     "K": {"K": 1.0},
@@ -49,10 +61,14 @@ _NUMBER = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
 
 
 def read_quantity(value: Any, si: str) -> float:
-    """Convert a text such as ``"550 nm"`` to the SI unit ``si``; raise ValueError for a wrong or missing unit."""
+    """Convert a text such as ``"550 nm"`` to the SI unit ``si``; raise ValueError for a wrong or
+    missing unit.
+    """
     match = _NUMBER.fullmatch(str(value).strip())
     if isinstance(value, bool) or match is None:
-        raise ValueError(f"is not a quantity: write a number and a unit, such as '1 {_USUAL.get(si, si)}'")
+        raise ValueError(
+            f"is not a quantity: write a number and a unit, such as '1 {_USUAL.get(si, si)}'"
+        )
     number, unit = float(match[1]), match[2].strip()
     if not unit:
         raise ValueError(f"needs a unit: write {_with_unit(match[1], si)}")
@@ -79,7 +95,8 @@ def _in_si(number: float, si: str, unit: str) -> float:
 
 
 def read_any(text: Any) -> tuple[float, str]:
-    """Convert a text such as ``"550 nm"`` or ``0.56`` to a finite number and its SI unit, "" for no unit.
+    """Convert a text such as ``"550 nm"`` or ``0.56`` to a finite number and its SI unit, "" for no
+    unit.
 
     Raises ValueError for other text.
     """
@@ -88,14 +105,15 @@ def read_any(text: Any) -> tuple[float, str]:
 
 
 def read_written(text: Any) -> tuple[float, str, bool]:
-    """Return the number in a text, the SI unit, and True if the number has a reciprocal unit such as e-/DN.
+    """Return the number in a text, the SI unit, and True if the number has a reciprocal unit such
+    as e-/DN.
 
-    A number with a reciprocal unit is not converted, because the reciprocal of a normal distribution, such as that of
-    0.37 e-/DN, is not normal.
+    A number with a reciprocal unit is not converted, because the reciprocal of a normal
+    distribution, such as that of 0.37 e-/DN, is not normal.
     """
     match = _NUMBER.fullmatch(str(text).strip())
     unit = match[2].strip() if match else ""
-    si = next((si for si, known in _SCALE.items() if unit in known), "")
+    si = next((si for si, units in _SCALE.items() if unit in units), "")
     if isinstance(text, bool) or match is None or (unit and not si):
         raise ValueError(f"{text} is neither a number nor a quantity, such as 0.5 or '1 um'")
     if not math.isfinite(float(match[1])):
@@ -105,7 +123,9 @@ def read_written(text: Any) -> tuple[float, str, bool]:
 
 @dataclass(frozen=True)
 class QuantityReader:
-    """Reader of a quantity with a unit, such as ``550 nm``, which returns the number in the SI unit ``si``."""
+    """Reader of a quantity with a unit, such as ``550 nm``, which returns the number in the SI
+    unit ``si``.
+    """
 
     si: str
 
@@ -118,9 +138,13 @@ def _reader(si: str) -> BeforeValidator:
 
 
 def in_words(number: float, si: str) -> str:
-    """Return a quantity as text in the unit that a reader would use, such as ``10 mm`` for 0.01 m; "" has no unit."""
+    """Return a quantity as text in the unit that a reader would use, such as ``10 mm`` for 0.01
+    m; "" has no unit.
+    """
     units = {
-        unit: scale for unit, scale in _SCALE.get(si, {}).items() if unit.isascii() and unit not in (*_RECIPROCAL, "cm")
+        unit: scale
+        for unit, scale in _SCALE.get(si, {}).items()
+        if unit.isascii() and unit not in (*_RECIPROCAL, "cm")
     }
     if si == "rad" and abs(number) > 0.1:
         return f"{math.degrees(number):.6g} deg"
@@ -141,12 +165,12 @@ class ElectronsPerSecond(NamedTuple):
 def _read_dark_current(value: Any) -> float | ElectronsPerSecond:
     number, unit = str(value).strip(), "e-/s"
     by_time = not isinstance(value, bool) and number.endswith(tuple(_SCALE[unit]))
-    found = read_quantity(value, unit) if by_time else read_quantity(value, "e-")
-    if found < 0:
+    current = read_quantity(value, unit) if by_time else read_quantity(value, "e-")
+    if current < 0:
         raise ValueError("the dark current must be 0 or more")
-    if found > _MOST_DARK:
+    if current > _MOST_DARK:
         raise ValueError(f"the dark current must be at most {_MOST_DARK:.0e} e-")
-    return ElectronsPerSecond(found) if by_time else found
+    return ElectronsPerSecond(current) if by_time else current
 
 
 #: electrons of one exposure, or electrons per second
@@ -156,50 +180,70 @@ DarkCurrent = Annotated[
 ]
 
 # lengths, in metres
-Length = Annotated[float, Field(ge=-1e9, le=1e9), _reader("m")]  #: any sign, to the distance of the Moon
+#: any sign, to the distance of the Moon
+Length = Annotated[float, Field(ge=-1e9, le=1e9), _reader("m")]
 PositiveLength = Annotated[float, Field(gt=0, le=1e9), _reader("m")]
 Wavelength = Annotated[float, Field(ge=100e-9, le=20e-6), _reader("m")]  #: 100 nm to 20 µm
-Linewidth = Annotated[float, Field(ge=1e-18, le=20e-6), _reader("m")]  #: from 1 kHz of a visible laser to a whole band
-Distance = Annotated[float, Field(ge=1e-6, le=1e9), _reader("m")]  #: from a contact to the distance of the Moon
-Visibility = Annotated[float, Field(ge=1, le=1e6), _reader("m")]  #: dense fog to air without particles, 300 km
-FocalLength = Annotated[float, Field(ge=1e-6, le=1e4), _reader("m")]  #: from a microlens to the largest telescope
-Diameter = Annotated[float, Field(ge=1e-6, le=100), _reader("m")]  #: from a microlens to the largest telescope
-BeamRadius = Annotated[float, Field(ge=10e-9, le=100), _reader("m")]  #: no beam is narrower than its light
-LengthUnit = Annotated[float, Field(ge=1e-15, le=1), _reader("m")]  #: in which a file of heights counts
-PixelPitch = Annotated[float, Field(ge=100e-9, le=10e-3), _reader("m")]  #: pixels of sensors have 0.5 µm to 1 mm
+#: from 1 kHz of a visible laser to a whole band
+Linewidth = Annotated[float, Field(ge=1e-18, le=20e-6), _reader("m")]
+#: from a contact to the distance of the Moon
+Distance = Annotated[float, Field(ge=1e-6, le=1e9), _reader("m")]
+#: dense fog to air without particles, 300 km
+Visibility = Annotated[float, Field(ge=1, le=1e6), _reader("m")]
+#: from a microlens to the largest telescope
+FocalLength = Annotated[float, Field(ge=1e-6, le=1e4), _reader("m")]
+#: from a microlens to the largest telescope
+Diameter = Annotated[float, Field(ge=1e-6, le=100), _reader("m")]
+#: no beam is narrower than its light
+BeamRadius = Annotated[float, Field(ge=10e-9, le=100), _reader("m")]
+#: in which a file of heights counts
+LengthUnit = Annotated[float, Field(ge=1e-15, le=1), _reader("m")]
+#: pixels of sensors have 0.5 µm to 1 mm
+PixelPitch = Annotated[float, Field(ge=100e-9, le=10e-3), _reader("m")]
 SensorLength = Annotated[float, Field(ge=1e-9, le=10), _reader("m")]  #: on the sensor
 PupilPitch = Annotated[float, Field(ge=1e-9, le=10), _reader("m")]  #: between samples of a pupil
 Depth = Annotated[float, Field(ge=1e-10, le=10e-3), _reader("m")]  #: of a relief, from one atom on
-Height = Annotated[float, Field(ge=-10e-3, le=10e-3), _reader("m")]  #: of a surface, or an optical path, any sign
+#: of a surface, or an optical path, any sign
+Height = Annotated[float, Field(ge=-10e-3, le=10e-3), _reader("m")]
 
 # times, in seconds
-Time = Annotated[float, Field(ge=1e-18, le=1e9), _reader("s")]  #: from an attosecond pulse to 30 years
-Exposure = Annotated[float, Field(ge=1e-12, le=1e6), _reader("s")]  #: from the fastest gated sensor to 12 days
+#: from an attosecond pulse to 30 years
+Time = Annotated[float, Field(ge=1e-18, le=1e9), _reader("s")]
+#: from the fastest gated sensor to 12 days
+Exposure = Annotated[float, Field(ge=1e-12, le=1e6), _reader("s")]
 Delay = Annotated[float, Field(ge=0, le=1e9), _reader("s")]  #: from 0
 Frequency = Annotated[float, Field(ge=1e-9, le=1e12), _reader("Hz")]  #: hertz
 
 # angles, in radians
 Angle = Annotated[float, Field(ge=-math.tau, le=math.tau), _reader("rad")]  #: one turn to each side
-PositiveAngle = Annotated[float, Field(ge=1e-9, le=math.pi), _reader("rad")]  #: from the largest telescope's on
+#: from the largest telescope's on
+PositiveAngle = Annotated[float, Field(ge=1e-9, le=math.pi), _reader("rad")]
 
 # light, temperature and charge
 Temperature = Annotated[float, Field(ge=1, le=1e6), _reader("K")]  #: kelvin
-Power = Annotated[float, Field(ge=1e-18, le=1e16), _reader("W")]  #: watt, from a few photons to the strongest pulse
-Energy = Annotated[float, Field(ge=1e-21, le=1e7), _reader("J")]  #: joule, from a part of a photon to the largest laser
+#: watt, from a few photons to the strongest pulse
+Power = Annotated[float, Field(ge=1e-18, le=1e16), _reader("W")]
+#: joule, from a part of a photon to the largest laser
+Energy = Annotated[float, Field(ge=1e-21, le=1e7), _reader("J")]
 Illuminance = Annotated[float, Field(ge=0, le=1e8), _reader("lx")]  #: lux; the sun gives 1.3e5
-Luminance = Annotated[float, Field(ge=0, le=1e11), _reader("cd/m2")]  #: candela per square metre; the sun has 1.6e9
+#: candela per square metre; the sun has 1.6e9
+Luminance = Annotated[float, Field(ge=0, le=1e11), _reader("cd/m2")]
 Electrons = Annotated[float, Field(ge=0, le=1e12), _reader("e-")]  #: electron
-Gain = Annotated[float, Field(ge=1e-9, le=1e6), _reader("DN/e-")]  #: K of EMVA 1288, DN per electron
+#: K of EMVA 1288, DN per electron
+Gain = Annotated[float, Field(ge=1e-9, le=1e6), _reader("DN/e-")]
 
 # numbers without a unit
 Waves = Annotated[float, Field(ge=-1e5, le=1e5), _reader("waves")]  #: optical path in wavelengths
-Slope = Annotated[float, Field(ge=-1e5, le=1e5)]  #: optical path in wavelengths that a mask adds at its rim
+#: optical path in wavelengths that a mask adds at its rim
+Slope = Annotated[float, Field(ge=-1e5, le=1e5)]
 Charge = Annotated[int, Field(ge=-1000, le=1000)]  #: turns of phase around the axis of a vortex
 Fraction = Annotated[float, Field(ge=0, le=1)]  #: number in [0, 1]
 Transmittance = Annotated[float, Field(gt=0, le=1)]  #: share of the light that passes, above 0
-Efficiency = Annotated[float, Field(ge=1e-6, le=1)]  #: electrons per photon; far beyond its band a sensor has 1e-6
+#: electrons per photon; far beyond its band a sensor has 1e-6
+Efficiency = Annotated[float, Field(ge=1e-6, le=1)]
 Strength = Annotated[float, Field(ge=0, le=1e18)]  #: multiple of what saturates a pixel
-Ratio = Annotated[float, Field(gt=0, le=1e9)]  #: of two quantities of one kind, such as a contrast or a weight
+#: of two quantities of one kind, such as a contrast or a weight
+Ratio = Annotated[float, Field(gt=0, le=1e9)]
 Spread = Annotated[float, Field(ge=0, le=100)]  #: standard deviation over its mean
 Count = Annotated[int, Field(ge=1, le=10**9)]  #: whole number from 1
 Layers = Annotated[int, Field(ge=1, le=4096)]  #: of a network: channels, blocks or states
@@ -220,7 +264,8 @@ class NumberRange:
 def number_ranges(hint: Any) -> Iterator[NumberRange]:
     """Yield the range of each number that a type annotation of a parameter contains.
 
-    A number of a tuple, a list, a mapping or a union counts by itself; True and False are no numbers.
+    A number of a tuple, a list, a mapping or a union counts by itself; True and False are no
+    numbers.
     """
     yield from _ranges(hint, ())
 
@@ -229,32 +274,42 @@ def _ranges(hint: Any, metadata: tuple[Any, ...]) -> Iterator[NumberRange]:
     if get_origin(hint) is Annotated:
         yield from _ranges(get_args(hint)[0], (*metadata, *_constraints(hint)))
     elif hint in (int, float):
-        limits = [(name, getattr(part, name)) for part in metadata for name in _LIMITS if hasattr(part, name)]
-        least = [value for name, value in limits if name in ("ge", "gt")]
-        greatest = [value for name, value in limits if name in ("le", "lt")]
-        yield NumberRange(max(least, default=None), min(greatest, default=None), _unit_of(metadata))
+        lowest = max(_stated(metadata, "ge", "gt"), default=None)
+        greatest = min(_stated(metadata, "le", "lt"), default=None)
+        yield NumberRange(lowest, greatest, _unit_of(metadata))
     elif get_origin(hint) is not Literal:
-        for part in get_args(hint):
-            yield from _ranges(part, () if get_origin(hint) in _CONTAINERS else metadata)
+        for argument in get_args(hint):
+            yield from _ranges(argument, () if get_origin(hint) in _CONTAINERS else metadata)
 
 
-_LIMITS = ("ge", "gt", "le", "lt")
 _CONTAINERS = (tuple, list, dict)
+
+
+def _stated(metadata: tuple[Any, ...], *limits: str) -> list[Any]:
+    """Return the values of the named limits that constraints state."""
+    values = []
+    for constraint in metadata:
+        values += [getattr(constraint, name) for name in limits if hasattr(constraint, name)]
+    return values
 
 
 def _constraints(hint: Any) -> Iterator[Any]:
     """Yield the single constraints of an annotated type; `Field` holds several."""
-    for part in hint.__metadata__:
-        yield from getattr(part, "metadata", None) or (part,)
+    for constraint in hint.__metadata__:
+        yield from getattr(constraint, "metadata", None) or (constraint,)
 
 
 def _unit_of(metadata: tuple[Any, ...]) -> str:
-    readers = [part.func for part in metadata if isinstance(part, BeforeValidator)]
+    readers = [
+        constraint.func for constraint in metadata if isinstance(constraint, BeforeValidator)
+    ]
     return next((reader.si for reader in readers if isinstance(reader, QuantityReader)), "")
 
 
 class IsFile:
-    """The annotation of a file parameter, which makes the content of the file part of the cache key."""
+    """The annotation of a file parameter, which makes the content of the file part of the cache
+    key.
+    """
 
 
 def _existing(path: Path) -> Path:
@@ -279,7 +334,7 @@ def files_of(written: Any) -> list[Path]:
     The files of a pattern or a folder are sorted by name.
     """
     if isinstance(written, list | tuple):
-        return [path for each in written for path in files_of(each)]
+        return list(chain.from_iterable(files_of(entry) for entry in written))
     path = Path(written)
     try:
         if path.is_file():
@@ -287,11 +342,17 @@ def files_of(written: Any) -> list[Path]:
     except OSError as error:
         raise ValueError(f"{str(path)[:40]}… cannot be read: {error.strerror}") from None
     inside = path.iterdir() if path.is_dir() else map(Path, glob(str(written)))
-    files = sorted(each for each in inside if each.is_file() and not each.name.startswith("."))
+    files = sorted(file for file in inside if _is_visible_file(file))
     if not files:
         raise ValueError(f"no such file, and no folder or pattern that matches a file: {path}")
     return files
 
 
+def _is_visible_file(path: Path) -> bool:
+    return path.is_file() and not path.name.startswith(".")
+
+
 #: one or more files: a path, a folder, a pattern such as ``dark/*.png``, or a list of these
-DataFiles = Annotated[tuple[Path, ...], BeforeValidator(files_of, json_schema_input_type=str | list[str]), IsFile()]
+DataFiles = Annotated[
+    tuple[Path, ...], BeforeValidator(files_of, json_schema_input_type=str | list[str]), IsFile()
+]

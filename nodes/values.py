@@ -13,11 +13,14 @@ from torch import Tensor
 
 
 class Bands(NamedTuple):
-    """The spectral bands of a scene (for example 31 bands) or of one laser line (for example 5 bands)."""
+    """The spectral bands of a scene (for example 31 bands) or of one laser line (for example 5
+    bands).
+    """
 
     centres: Tensor  #: (band,) float64, m
     widths: Tensor  #: (band,) float64, m
-    weights: Tensor  #: (band,) float64; for a scene all 1; for a laser line the share of the energy in each band
+    #: (band,) float64; for a scene all 1; for a laser line the share of the energy in each band
+    weights: Tensor
 
 
 class Stop(NamedTuple):
@@ -32,48 +35,62 @@ class Stop(NamedTuple):
 
 
 class Dirt(NamedTuple):
-    """The effect of dirt on the camera window, as transmission and optical path in the plane of the pupil."""
+    """The effect of dirt on the camera window, as transmission and optical path in the plane of
+    the pupil.
+    """
 
     amplitude: Tensor  #: (v, u) transmission of the field in [0, 1]
     path: Tensor  #: (v, u) added optical path, m
 
 
 class Wavefront(NamedTuple):
-    """The light of a laser across the pupil, which is uneven and curved if the laser is near or its beam narrow.
+    """The light of a laser across the pupil, which is uneven and curved if the laser is near or its
+    beam narrow.
 
     A laser that fills the pupil evenly from a great distance has the value 0 in both fields.
     """
 
-    taper: Tensor  #: () float64, 1/m2; the amplitude falls as exp(-taper r^2) with the distance r from the axis
-    curvature: Tensor  #: () float64, 1/m, of the diverging wavefront: the added path is curvature r^2 / 2
+    #: () float64, 1/m2; the amplitude falls as exp(-taper r^2) with the distance r from the axis
+    taper: Tensor
+    #: () float64, 1/m, of the diverging wavefront: the added path is curvature r^2 / 2
+    curvature: Tensor
 
 
 class LaserLight(NamedTuple):
-    """The light of a laser in absolute units, mean over one exposure; 0 for a laser that is given by its strength."""
+    """The light of a laser in absolute units, mean over one exposure; 0 for a laser that is
+    given by its strength.
+    """
 
     even_peak: (
-        Tensor  #: () float64, W/m2 at the peak on the sensor, if the axis irradiance filled a clear, focused lens
+        #: () float64, W/m2 at the peak on the sensor, if the axis irradiance filled a clear,
+        #: focused lens
+        Tensor
     )
     flux: Tensor  #: () float64, W behind the lens, if the axis irradiance filled the clear aperture
     irradiance: Tensor  #: () float64, W/m2 at the lens, on the axis of the beam
     power: Tensor  #: () float64, W into the aperture of the lens
     peak: Tensor  #: () float64, W/m2 at the peak on the sensor behind the clear, focused lens
     pulses: Tensor  #: () float64, pulses within the exposure; 0 for a continuous laser
-    pulse_fluence: Tensor  #: () float64, J/m2 of one pulse at the peak on the sensor; 0 for a continuous laser
+    #: () float64, J/m2 of one pulse at the peak on the sensor; 0 for a continuous laser
+    pulse_fluence: Tensor
 
 
 class Shade(NamedTuple):
-    """The light that a grey filter, a smaller stop and notch filters in the pupil of one arm let through."""
+    """The light that a grey filter, a smaller stop and notch filters in the pupil of one arm let
+    through.
+    """
 
     amplitude: Tensor  #: (v, u) transmission of the field in [0, 1], the same at every wavelength
-    notches: Tensor  #: (notch, 3) float64: centre in m, full width at half maximum in m, depth in [0, 1]
+    #: (notch, 3) float64: centre in m, full width at half maximum in m, depth in [0, 1]
+    notches: Tensor
 
 
 class Pupil(NamedTuple):
     """The complex pupil function of each band, stored as real factors.
 
     The field of band b is ``amplitude * exp(2 pi i (index[b] * height + path) / wavelengths[b])``.
-    The factors are stored because 31 complex fields of 2160 x 2160 take 1.2 GB and the factors 75 MB.
+    The factors are stored because 31 complex fields of 2160 x 2160 take 1.2 GB and the factors 75
+    MB.
     """
 
     aperture: Tensor  #: (v, u) clear aperture: 1 inside, 0 outside
@@ -84,29 +101,41 @@ class Pupil(NamedTuple):
     #: (band,) float64, refractive index of the mask minus the index of air
     wavelengths: Tensor  #: (band,) float64, m
     pitch: Tensor  #: () float64, m between samples, both axes
-    notches: Tensor = torch.zeros(0, 3, dtype=torch.float64)  #: (notch, 3) of `Shade`; no row: no notch filter
-    diameter: Tensor = torch.zeros((), dtype=torch.float64)  #: () float64, m, of the clear aperture; 0: not known
+    #: (notch, 3) of `Shade`; no row: no notch filter
+    notches: Tensor = torch.zeros(0, 3, dtype=torch.float64)
+    #: () float64, m, of the clear aperture; 0: not known
+    diameter: Tensor = torch.zeros((), dtype=torch.float64)
 
 
 class Psf(NamedTuple):
-    """Point-spread functions: the fraction of the light through the clear pupil that reaches each pixel."""
+    """Point-spread functions: the fraction of the light through the clear pupil that reaches
+    each pixel.
+    """
 
     intensity: Tensor  #: (band, y, x); the sum over an infinite plane is the transmitted share
-    clear_peak: Tensor  #: (band,) float64: pixel on the axis for the same lens without mask, dirt and aberrations
-    #: (band,) float64, highest spatial frequency that the clear aperture passes, cycles per pixel; empty: not known
+    #: (band,) float64: pixel on the axis for the same lens without mask, dirt and aberrations
+    clear_peak: Tensor
+    #: (band,) float64, highest spatial frequency that the clear aperture passes, cycles per pixel;
+    #: empty: not known
     cut_off: Tensor = torch.zeros(0, dtype=torch.float64)
-    #: (band,) float64, side in pixels of the square over which each pixel averages; 0: points; empty: points
+    #: (band,) float64, side in pixels of the square over which each pixel averages; 0: points;
+    #: empty: points
     averaged: Tensor = torch.zeros(0, dtype=torch.float64)
 
 
 class LowRankCube(NamedTuple):
-    """A low-rank approximation of a spectral cube: band b is about ``sum_k basis[b, k] planes[k]``."""
+    """A low-rank approximation of a spectral cube: band b is about ``sum_k basis[b, k]
+    planes[k]``.
+    """
 
     planes: Tensor  #: (k, y, x), the strongest plane first
     basis: Tensor  #: (band, k) float64
-    residual_max: Tensor  #: (k + 1, band) float64: bound of |band b minus the first r planes|, r = 0 to k
-    residual_rms: Tensor = torch.zeros(0, 0, dtype=torch.float64)  #: root mean square of this difference, or empty
-    residual_map: Tensor = torch.zeros(0, 0)  #: (y, x) bound of |band minus all planes| in any band, or empty
+    #: (k + 1, band) float64: bound of |band b minus the first r planes|, r = 0 to k
+    residual_max: Tensor
+    #: root mean square of this difference, or empty
+    residual_rms: Tensor = torch.zeros(0, 0, dtype=torch.float64)
+    #: (y, x) bound of |band minus all planes| in any band, or empty
+    residual_map: Tensor = torch.zeros(0, 0)
 
 
 class Channels(NamedTuple):
@@ -114,31 +143,40 @@ class Channels(NamedTuple):
 
     planes: Tensor  #: (row, y, x)
     rows: Tensor  #: (row, band) float64
-    bound: Tensor  #: () float64, upper bound of the root mean square error over max |plane|, for the worst row
-    kept: Tensor = torch.zeros(5, dtype=torch.int64)  #: counts of planes, kernels, bands, PSF rows and PSF columns
-    largest: Tensor = torch.tensor(torch.inf, dtype=torch.float64)  #: upper bound of the relative error of max |plane|
-    estimated: Tensor = torch.zeros(2, dtype=torch.float64)  #: estimates, beside `bound` and `largest`, by `FewBands`
+    #: () float64, upper bound of the root mean square error over max |plane|, for the worst row
+    bound: Tensor
+    #: counts of planes, kernels, bands, PSF rows and PSF columns
+    kept: Tensor = torch.zeros(5, dtype=torch.int64)
+    #: upper bound of the relative error of max |plane|
+    largest: Tensor = torch.tensor(torch.inf, dtype=torch.float64)
+    #: estimates, beside `bound` and `largest`, by `FewBands`
+    estimated: Tensor = torch.zeros(2, dtype=torch.float64)
 
 
 class FewBands(NamedTuple):
-    """A choice of few bands whose PSFs represent all: the PSF of band b is ``sum_j share[b, j]`` times that of j."""
+    """A choice of few bands whose PSFs represent all: the PSF of band b is ``sum_j share[b, j]``
+    times that of j.
+    """
 
     share: Tensor  #: (band, j) float64; each row sums to 1
     used: Tensor  #: (j,) int64, which bands, rising
-    error: Tensor  #: () float64, estimate of the root mean square error of the image over its brightest pixel
+    #: () float64, estimate of the root mean square error of the image over its brightest pixel
+    error: Tensor
     largest: Tensor  #: () float64, estimate of the relative error of the brightest pixel
 
 
 class Levels(NamedTuple):
-    """Statistics of flat-field frames at several illuminances, from which sensor parameters are fitted.
+    """Statistics of flat-field frames at several illuminances, from which sensor parameters are
+    fitted.
 
-    A level with clipped or coarsely quantised numbers also has a histogram: a cell counts how often one number occurs
-    in one level.
+    A level with clipped or coarsely quantised numbers also has a histogram: a cell counts how often
+    one number occurs in one level.
     """
 
     photons: Tensor  #: (level,) float64, mean photons per pixel and exposure; 0 in the dark
     exposure: Tensor  #: (level,) float64, s
-    pixels: Tensor  #: (level,) float64, count of the pixels of all frames, from which `mean` is computed
+    #: (level,) float64, count of the pixels of all frames, from which `mean` is computed
+    pixels: Tensor
     mean: Tensor  #: (level,) float64, DN
     variance: Tensor  #: (level,) float64, DN2
     degrees_of_freedom: Tensor  #: (level,) float64, of the variance
@@ -148,27 +186,39 @@ class Levels(NamedTuple):
 
 
 class FoundLasers(NamedTuple):
-    """Lasers that were found in a frame, the most certain first; a row beyond ``number`` is 0 and no laser."""
+    """Lasers that were found in a frame, the most certain first; a row beyond ``number`` is 0
+    and no laser.
+    """
 
     number: Tensor  #: () int64, of lasers
     direction: Tensor  #: (laser, 2) float64, rad, (n_y, n_x)
     wavelength: Tensor  #: (laser,) float64, m
     fwhm: Tensor  #: (laser,) float64, m, width of the line, the best of those that were tried
-    strength: Tensor  #: (laser, channel) float64, electrons over all of the pattern behind a clean and clear pupil
-    direction_interval: Tensor  #: (laser, 2, 2) float64, rad: lower and upper end (90 %) along each axis
+    #: (laser, channel) float64, electrons over all of the pattern behind a clean and clear pupil
+    strength: Tensor
+    #: (laser, 2, 2) float64, rad: lower and upper end (90 %) along each axis
+    direction_interval: Tensor
     wavelength_interval: Tensor  #: (laser, 2) float64, m: lower and upper end (90 %)
     strength_interval: Tensor  #: (laser, channel, 2) float64, electrons: lower and upper end (90 %)
     identifiable: Tensor  #: (laser, 2) bool: True where the frame tells direction, and wavelength
-    gain: Tensor  #: (laser, 2) float64: log likelihood gained by the laser, and beyond what a lamp there gains
-    correlation: Tensor  #: (laser, value, value) float64, of n_y, n_x, wavelength and `straight` of each channel
-    straight: Tensor  #: (laser, channel) float64, electrons that follow the pattern: ``strength`` less what dirt takes
-    straight_spread: Tensor  #: (laser, channel) float64, electrons, standard deviation of ``straight``
+    #: (laser, 2) float64: log likelihood gained by the laser, and beyond what a lamp there gains
+    gain: Tensor
+    #: (laser, value, value) float64, of n_y, n_x, wavelength and `straight` of each channel
+    correlation: Tensor
+    #: (laser, channel) float64, electrons that follow the pattern: ``strength`` less what dirt
+    #: takes
+    straight: Tensor
+    #: (laser, channel) float64, electrons, standard deviation of ``straight``
+    straight_spread: Tensor
 
 
 class Shading(NamedTuple):
-    """The smooth transmission that frames of one camera share: dirt on lens and window, and fall-off to the corners."""
+    """The smooth transmission that frames of one camera share: dirt on lens and window, and
+    fall-off to the corners.
+    """
 
-    transmission: Tensor  #: (y, x) by which a frame is divided; its geometric mean is 1; 1 where not identifiable
+    #: (y, x) by which a frame is divided; its geometric mean is 1; 1 where not identifiable
+    transmission: Tensor
     spread: Tensor  #: (y, x) standard deviation of its logarithm, of what the division leaves
     estimate: Tensor  #: (knot y, knot x) float64, posterior mean of the logarithm
     deviation: Tensor  #: (knot y, knot x) float64, posterior standard deviation of the logarithm
@@ -180,15 +230,19 @@ class Shading(NamedTuple):
 
 
 class WienerProblem(NamedTuple):
-    """The deconvolution of `restore.wiener`: a linear problem for a scene of mean 0 and variance 1, and its answer."""
+    """The deconvolution of `restore.wiener`: a linear problem for a scene of mean 0 and variance
+    1, and its answer.
+    """
 
     picture: Tensor  #: (channel, y, x), without the glare, of mean 0 and in units of ``scale``
     weight: Tensor  #: (channel, y, x), 1 / variance of the noise; 0 where a pixel is clipped
     psf: Tensor  #: (channel, any, any), of a sum near 1
     glare: Tensor  #: (pattern, channel, y, x), patterns that are added with any strength
-    doubts: Tensor  #: (pattern, channel, y, x), patterns that are added with a strength of mean 0 and variance 1
+    #: (pattern, channel, y, x), patterns that are added with a strength of mean 0 and variance 1
+    doubts: Tensor
     answer: Tensor  #: (channel, y, x), what the filter restores, in units of ``scale``
-    seen: Tensor  #: (channel, y, x), the blurred answer, in which light from beyond the frame counts too
+    #: (channel, y, x), the blurred answer, in which light from beyond the frame counts too
+    seen: Tensor
     scale: Tensor  #: (channel, 1, 1) e-, of the answer behind a perfect lens
     mean: Tensor  #: (channel, 1, 1) e-, of the scene behind a perfect lens
 
@@ -196,7 +250,8 @@ class WienerProblem(NamedTuple):
 class FilterFacts(NamedTuple):
     """What `restore.wiener` finds in a picture and knows of it, as maps that a network can see."""
 
-    answer: Tensor  #: (channel, y, x), what the filter restores, of mean 0 and in units of ``scale``
+    #: (channel, y, x), what the filter restores, of mean 0 and in units of ``scale``
+    answer: Tensor
     deviation: Tensor  #: (channel, y, x), predicted error of the answer, in units of ``scale``
     maps: Tensor  #: (map, y, x), in the order that `restore.filter_facts` states
     scale: Tensor  #: (channel, 1, 1) e-, of the answer behind a perfect lens
@@ -204,20 +259,31 @@ class FilterFacts(NamedTuple):
 
 
 class MeasuredPsf(NamedTuple):
-    """PSFs that frames of point sources gave, at the nodes of a grid over the frame, and how sure they are.
+    """PSFs that frames of point sources gave, at the nodes of a grid over the frame, and how sure
+    they are.
 
-    Node (i, j) lies in the middle of its zone, which is one of rows x columns equal parts of the frame.
+    Node (i, j) lies in the middle of its zone, which is one of rows x columns equal parts of the
+    frame.
     """
 
     kernels: Tensor  #: (row, column, channel, y, x) float64, each of sum 1
-    deviation: Tensor  #: (row, column, channel, y, x) float64, standard deviation of each pixel of the kernels
-    draws: Tensor  #: (draw, row, column, channel, y, x) float32, kernels that the frames allow as well
-    places: Tensor  #: (point, 4) float64: file from 0, y and x of each point in pixels, and its signal in e-
-    fit: Tensor  #: (channel,) float64, chi-square of the frames per seen pixel, 1 for a model as good as the noise
-    outside: Tensor  #: (channel,) float64, bound of the light beyond the window, as a share of the light within
-    support: Tensor  #: (row, column) float64, number of points at the node that would tell its PSF as well
+    #: (row, column, channel, y, x) float64, standard deviation of each pixel of the kernels
+    deviation: Tensor
+    #: (draw, row, column, channel, y, x) float32, kernels that the frames allow as well
+    draws: Tensor
+    #: (point, 4) float64: file from 0, y and x of each point in pixels, and its signal in e-
+    places: Tensor
+    #: (channel,) float64, chi-square of the frames per seen pixel, 1 for a model as good as the
+    #: noise
+    fit: Tensor
+    #: (channel,) float64, bound of the light beyond the window, as a share of the light within
+    outside: Tensor
+    #: (row, column) float64, number of points at the node that would tell its PSF as well
+    support: Tensor
     inflation: (
-        Tensor  #: (row, column) float64, of the variance of the PSF, because points tell several at once; 1 is best
+        #: (row, column) float64, of the variance of the PSF, because points tell several at once; 1
+        #: is best
+        Tensor
     )
 
 
@@ -230,5 +296,7 @@ BAND_FIELDS: dict[type, tuple[str, ...]] = {
 
 
 def band_names(value: object) -> list[str]:
-    """Return the names of the fields with one entry per band; a field of values that are not known is empty."""
+    """Return the names of the fields with one entry per band; a field of values that are not
+    known is empty.
+    """
     return [name for name in BAND_FIELDS.get(type(value), ()) if getattr(value, name).numel()]

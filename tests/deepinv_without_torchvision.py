@@ -1,9 +1,10 @@
 """deepinv for tests, with a stand-in for torchvision where torchvision is not installed.
 
-deepinv imports torchvision for data sets, plots, rotations and saved pictures. The operators, the algorithms and the
-denoisers that the tests use need none of it. A torchvision of PyPI belongs to a torch for CUDA, and the tests run with
-the torch for the CPU, so that this file puts empty modules of the same names in its place. Every name that deepinv 0.5
-asks for while it is imported stands in `NAMES`; whoever calls one of these names is told that it is a stand-in.
+deepinv imports torchvision for data sets, plots, rotations and saved pictures. The operators, the
+algorithms and the denoisers that the tests use need none of it. A torchvision of PyPI belongs to a
+torch for CUDA, and the tests run with the torch for the CPU, so that this file puts empty modules
+of the same names in its place. Every name that deepinv 0.5 asks for while it is imported stands in
+`NAMES`; whoever calls one of these names is told that it is a stand-in.
 """
 
 from __future__ import annotations
@@ -32,7 +33,9 @@ def _refusing(name: str) -> type:
     def refuse(*_: Any, **__: Any) -> None:
         raise NotImplementedError(f"{name} is a stand-in of the tests for torchvision")
 
-    return type(name.rpartition(".")[2], (), {"__init__": refuse, "NEAREST": None, "BILINEAR": None})
+    return type(
+        name.rpartition(".")[2], (), {"__init__": refuse, "NEAREST": None, "BILINEAR": None}
+    )
 
 
 def put_stand_in() -> None:

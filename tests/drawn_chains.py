@@ -9,7 +9,9 @@ ENSEMBLES, STEPS, WALKERS = 4, 250, 8
 
 
 def drawn_chains(problem, mode, file, *, seed, **how):
-    """Return weighted draws of the posterior as chains: independent, so that every check of chains holds."""
+    """Return weighted draws of the posterior as chains: independent, so that every check of
+    chains holds.
+    """
     rng = np.random.default_rng(seed)
     samples, log = draw_samples(problem, mode, rng)
     at = rng.choice(len(samples), ENSEMBLES * STEPS * WALKERS, p=weights(log))

@@ -1,4 +1,6 @@
-"""Small files that would take gigabytes of memory, or would never end, each with the reader that meets it."""
+"""Small files that would take gigabytes of memory, or would never end, each with the reader that
+meets it.
+"""
 
 import os
 import socket
@@ -13,7 +15,7 @@ MB = 1_000_000
 _ZEROS = bytes(MB)
 
 
-# --- pictures ---------------------------------------------------------------------------------------------------------
+# --- pictures -------------------------------------------------------------------------------------
 
 
 def exr(path, channels=("R", "G", "B"), size=(30_000, 30_000), deep=False, parts=1):
@@ -24,7 +26,9 @@ def exr(path, channels=("R", "G", "B"), size=(30_000, 30_000), deep=False, parts
     if parts == 1:
         OpenEXR.File({}, planes).write(str(path))
     else:
-        OpenEXR.File([OpenEXR.Part({}, planes, name=f"p{i}") for i in range(parts)]).write(str(path))
+        OpenEXR.File([OpenEXR.Part({}, planes, name=f"p{i}") for i in range(parts)]).write(
+            str(path)
+        )
     raw = bytearray(path.read_bytes())
     place = -1
     while (place := raw.find(b"dataWindow\0box2i\0", place + 1)) >= 0:
@@ -36,11 +40,17 @@ def exr(path, channels=("R", "G", "B"), size=(30_000, 30_000), deep=False, parts
 
 
 def tiff(path, pages, shape=(3000, 4000), tile=0):
-    """Write a TIFF file of 16 bits whose pages share one strip of zeros, or state a tile of ``tile`` x ``tile``."""
+    """Write a TIFF file of 16 bits whose pages share one strip of zeros, or state a tile of
+    ``tile`` x ``tile``.
+    """
     strip = zlib.compress(bytes(2 * shape[0] * shape[1]), 1)
     raw, place = bytearray(b"II*\0" + struct.pack("<I", 8 + len(strip)) + strip), 8 + len(strip)
     tags = {256: shape[1], 257: shape[0], 258: 16, 259: 8, 262: 1, 277: 1}
-    tags |= {322: tile, 323: tile, 324: 8, 325: len(strip)} if tile else {273: 8, 278: shape[0], 279: len(strip)}
+    tags |= (
+        {322: tile, 323: tile, 324: 8, 325: len(strip)}
+        if tile
+        else {273: 8, 278: shape[0], 279: len(strip)}
+    )
     for number in range(pages):
         raw += struct.pack("<H", len(tags))
         for tag, value in sorted(tags.items()):
@@ -56,7 +66,9 @@ def png(path, side, colour=0, depth=8):
     chunks += [(b"IDAT", zlib.compress(_ZEROS)), (b"IEND", b"")]
     raw = b"\x89PNG\r\n\x1a\n"
     for kind, data in chunks:
-        raw += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        raw += (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
     path.write_bytes(raw)
 
 
@@ -71,18 +83,29 @@ def jpeg(path, side):
     path.write_bytes(raw)
 
 
-# --- arrays -----------------------------------------------------------------------------------------------------------
+# --- arrays ---------------------------------------------------------------------------------------
 
 
 def fits(path, side):
-    cards = ["SIMPLE  =                    T", "BITPIX  =                   16", "NAXIS   =                    2"]
-    cards += [f"NAXIS1  = {side:20d}", f"NAXIS2  = {side:20d}", "BZERO   =              32768.0", "END"]
+    cards = [
+        "SIMPLE  =                    T",
+        "BITPIX  =                   16",
+        "NAXIS   =                    2",
+    ]
+    cards += [
+        f"NAXIS1  = {side:20d}",
+        f"NAXIS2  = {side:20d}",
+        "BZERO   =              32768.0",
+        "END",
+    ]
     path.write_bytes("".join(card.ljust(80) for card in cards).ljust(2880).encode() + bytes(2880))
     os.truncate(path, 5760 + 2 * side * side)  # the numbers are a hole in the file
 
 
 def npy(path, shape, dtype="<f4", hole=False):
-    """Write a .npy file whose header states ``shape``; its numbers are missing, or a hole in the file."""
+    """Write a .npy file whose header states ``shape``; its numbers are missing, or a hole in the
+    file.
+    """
     head = str({"descr": dtype, "fortran_order": False, "shape": shape}).encode().ljust(117) + b"\n"
     path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head + bytes(64))
     if hole:
@@ -95,7 +118,9 @@ def npy_head(shape, dtype="<f8"):
 
 
 def zipped(path, members):
-    """Write a zip archive of compressed files: the first bytes of each, and the megabytes of zeros behind them."""
+    """Write a zip archive of compressed files: the first bytes of each, and the megabytes of
+    zeros behind them.
+    """
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, (head, megabytes) in members.items():
             with archive.open(name, "w", force_zip64=True) as file:
@@ -118,12 +143,17 @@ def checkpoint(path, megabytes=120):
     memory = io.BytesIO()
     torch.save({"w": torch.zeros(4)}, memory)
     with zipfile.ZipFile(memory) as plain:
-        members = {name: (plain.read(name), megabytes * name.endswith("data/0")) for name in plain.namelist()}
+        members = {
+            name: (plain.read(name), megabytes * name.endswith("data/0"))
+            for name in plain.namelist()
+        }
     zipped(path, members)
 
 
 def mat(path, name, megabytes=120, lies=False):
-    """Write a .mat file of one compressed array of zeros; if it ``lies``, its dimensions state one number."""
+    """Write a .mat file of one compressed array of zeros; if it ``lies``, its dimensions state
+    one number.
+    """
     count = megabytes * MB // 8
     body = struct.pack("<IIII", 6, 8, 6, 0) + struct.pack("<IIii", 5, 8, 1, 1 if lies else count)
     body += struct.pack("<II", 1, len(name)) + name.encode().ljust(-(-len(name) // 8) * 8, b"\0")
@@ -138,8 +168,12 @@ def mat(path, name, megabytes=120, lies=False):
 
 
 def safetensors(path, count, header=None):
-    """Write a .safetensors file whose header states a tensor of ``count`` numbers, or a length of ``header``."""
-    text = f'{{"height":{{"dtype":"F32","shape":[{count}],"data_offsets":[0,{4 * count}]}}}}'.encode()
+    """Write a .safetensors file whose header states a tensor of ``count`` numbers, or a length
+    of ``header``.
+    """
+    text = (
+        f'{{"height":{{"dtype":"F32","shape":[{count}],"data_offsets":[0,{4 * count}]}}}}'.encode()
+    )
     path.write_bytes(struct.pack("<Q", header or len(text)) + text + bytes(64))
 
 
@@ -162,7 +196,7 @@ def chain(path):
     path.write_bytes(seal + content)
 
 
-# --- texts and what is no file ----------------------------------------------------------------------------------------
+# --- texts and what is no file --------------------------------------------------------------------
 
 
 def long_line(path, megabytes=12):

@@ -1,4 +1,6 @@
-"""The machines that stand in for those of the guide: a scheduler of dask, and the processes of `torchrun`."""
+"""The machines that stand in for those of the guide: a scheduler of dask, and the processes of
+`torchrun`.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from torch.distributed import TCPStore
 from tests.guide_commands import ROOT
 from tests.guide_stand_ins import StandIn
 
-#: what `torchrun` does, with one process that imports what takes seconds and is forked for each rank
+#: what `torchrun` does, with one process that imports what takes seconds and is forked for each
+#: rank
 RANKS = """
 import os, signal, sys
 import colour, matplotlib.figure, torch._dynamo
@@ -40,7 +43,9 @@ while children:
 
 @contextlib.contextmanager
 def scheduler(found: StandIn | None) -> Iterator[str]:
-    """Start a scheduler of dask with one worker on this machine if a stand-in asks for one; yield its address."""
+    """Start a scheduler of dask with one worker on this machine if a stand-in asks for one;
+    yield its address.
+    """
     if not found or "LOCAL" not in found.instead.values():
         yield ""
         return
@@ -54,11 +59,19 @@ def scheduler(found: StandIn | None) -> Iterator[str]:
 
 def together(arguments: list[str], count: int) -> None:
     """Run a command in several processes, as `torchrun` starts them."""
-    store = TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)  # of this process: its port is its own
+    # of this process: its port is its own
+    store = TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)
     ranks = {"WORLD_SIZE": f"{count}", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": f"{store.port}"}
-    start = {"TORCHELASTIC_USE_AGENT_STORE": "True", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / ".src")}
+    start = {
+        "TORCHELASTIC_USE_AGENT_STORE": "True",
+        "OMP_NUM_THREADS": "1",
+        "PYTHONPATH": str(ROOT / ".src"),
+    }
     done = subprocess.run(
-        [sys.executable, "-c", RANKS, *arguments], env={**os.environ, **ranks, **start}, capture_output=True, text=True
+        [sys.executable, "-c", RANKS, *arguments],
+        env={**os.environ, **ranks, **start},
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr[-6000:]
     print(done.stdout)

@@ -1,4 +1,6 @@
-"""Values that no number of a recipe can have, written in place of each number of the packaged recipes."""
+"""Values that no number of a recipe can have, written in place of each number of the packaged
+recipes.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +75,9 @@ def _has_number(value: Any) -> bool:
 
 
 def _unit(value: Any) -> str | None:
-    """Return the unit that is written behind a number, "" without a unit; None if the text is not a number."""
+    """Return the unit that is written behind a number, "" without a unit; None if the text is
+    not a number.
+    """
     if value is None or isinstance(value, dict):
         return None
     try:
@@ -92,7 +96,14 @@ def _texts(value: Any) -> Iterator[str]:
     shown = [str(part) for part in value]
     for number in NUMBERS:
         yield _list([f"{number} {_unit(value[0]) or ''}".strip(), *shown[1:]])
-    yield from ("[]", _list(shown * 7), _list(shown[:-1] or [_list(shown)]), "red", "true", _list(["red"] * len(shown)))
+    yield from (
+        "[]",
+        _list(shown * 7),
+        _list(shown[:-1] or [_list(shown)]),
+        "red",
+        "true",
+        _list(["red"] * len(shown)),
+    )
 
 
 def _list(parts: list[str]) -> str:
@@ -101,7 +112,9 @@ def _list(parts: list[str]) -> str:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a check of a changed recipe gave: the recipe, or the diagnostics of its refusal, or what must not be."""
+    """What a check of a changed recipe gave: the recipe, or the diagnostics of its refusal, or
+    what must not be.
+    """
 
     case: Case
     recipe: Recipe | None = None
@@ -110,7 +123,9 @@ class Outcome:
 
 
 def outcome(case: Case) -> Outcome:
-    """Check a changed recipe; a warning, an error of Python and a refusal without a place are faults."""
+    """Check a changed recipe; a warning, an error of Python and a refusal without a place are
+    faults.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         try:
@@ -144,7 +159,8 @@ SMALL = {
 
 
 def fault_of_run(case: Case, folder: Path) -> str | None:
-    """Return what must not be in a small run of a changed recipe, "" for a good run, and None for a refusal.
+    """Return what must not be in a small run of a changed recipe, "" for a good run, and None for a
+    refusal.
 
     A warning, an error of a step and an output that is not finite must not be.
     """
@@ -159,7 +175,9 @@ def fault_of_run(case: Case, folder: Path) -> str | None:
             result = run(recipe, Store(folder))
         except Exception as error:
             return f"{type(error).__name__}: {error}"
-    wrong = [name for name, value in result.values.items() if not all(map(_is_finite, tensors_of(value)))]
+    wrong = [
+        name for name, value in result.values.items() if not all(map(_is_finite, tensors_of(value)))
+    ]
     return f"not finite: {', '.join(wrong)}" if wrong else ""
 
 

@@ -8,10 +8,11 @@ from torch.utils._pytree import tree_leaves
 
 
 class LiveBytes(TorchDispatchMode):
-    """Counts, while it is entered, the storage of each tensor that an operation gives, until nobody holds it.
+    """Counts, while it is entered, the storage of each tensor that an operation gives, until nobody
+    holds it.
 
-    What an operation takes for itself and gives back, such as a plan of a transform, is not seen; what was there before
-    counts from when it is first looked at. ``peak`` is the most at once.
+    What an operation takes for itself and gives back, such as a plan of a transform, is not seen;
+    what was there before counts from when it is first looked at. ``peak`` is the most at once.
     """
 
     def __init__(self):

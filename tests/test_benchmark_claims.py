@@ -18,7 +18,9 @@ RESULTS = Path(__file__).parent / "benchmarks" / "RESULTS.md"
 
 @pytest.mark.parametrize("count", [6, 9, 10, 20, 101])
 def test_the_interval_of_a_median_is_the_narrowest_that_holds_it_often_enough(count):
-    """The median lies below the value of rank k with the probability of at most k of ``count`` fair coins."""
+    """The median lies below the value of rank k with the probability of at most k of ``count``
+    fair coins.
+    """
     low, high = median_ranks(count)
     assert high == count - 1 - low
     assert 1 - 2 * binom.cdf(low, count, 0.5) >= 0.95
@@ -32,7 +34,9 @@ def test_a_ratio_is_of_the_same_turn():
 
 
 def test_every_ratio_of_the_page_lies_in_its_interval():
-    rows = re.findall(r"\| ([0-9.]+) \(([0-9.]+) to ([0-9.]+)\) \|", PAGE.read_text(encoding="utf-8"))
+    rows = re.findall(
+        r"\| ([0-9.]+) \(([0-9.]+) to ([0-9.]+)\) \|", PAGE.read_text(encoding="utf-8")
+    )
     assert rows
     for row in rows:
         middle, low, high = map(float, row)

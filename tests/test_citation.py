@@ -1,4 +1,6 @@
-"""The metadata that others read: CITATION.cff and pyproject.toml say the same, and no more than is tested."""
+"""The metadata that others read: CITATION.cff and pyproject.toml say the same, and no more than
+is tested.
+"""
 
 import re
 import sys
@@ -37,18 +39,27 @@ def test_citation_and_package_say_the_same(citation):
     assert citation["version"] == neusee.__version__
     assert citation["title"] == PROJECT["name"]
     assert citation["license"] == PROJECT["license"]
-    assert [author["name"] for author in citation["authors"]] == [author["name"] for author in PROJECT["authors"]]
+    assert [author["name"] for author in citation["authors"]] == [
+        author["name"] for author in PROJECT["authors"]
+    ]
     assert set(citation["keywords"]) <= set(PROJECT["keywords"])
 
 
 def test_every_version_of_python_is_tested_or_said_to_be_untested():
-    named = [c.rpartition(" ")[2] for c in PROJECT["classifiers"] if re.fullmatch(r".* :: 3\.\d+", c)]
-    low, high = (tuple(map(int, part.split("."))) for part in re.findall(r"\d+\.\d+", PROJECT["requires-python"]))
+    named = [
+        c.rpartition(" ")[2] for c in PROJECT["classifiers"] if re.fullmatch(r".* :: 3\.\d+", c)
+    ]
+    low, high = (
+        tuple(map(int, part.split(".")))
+        for part in re.findall(r"\d+\.\d+", PROJECT["requires-python"])
+    )
     allowed = [f"3.{minor}" for minor in range(low[1], high[1])]
     (tested, untested) = re.search(
         r"Tested with Python ([\d., and]*?); ([\d., and]*?) are allowed and untested",
         " ".join((ROOT / "README.md").read_text().split()),
     ).groups()
     assert re.findall(r"3\.\d+", tested) == named
-    assert re.findall(r"3\.\d+", untested) == [version for version in allowed if version not in named]
+    assert re.findall(r"3\.\d+", untested) == [
+        version for version in allowed if version not in named
+    ]
     assert low <= sys.version_info[:2] < high

@@ -32,7 +32,8 @@ def test_a_sound_figure_has_no_fault():
 
 def far_apart(figure, ax):
     ax.loglog([0.3, 1e5], [1e-17, 1e-5])
-    ax.set(xlim=(0.15, 6e5), ylim=(4e-18, 2e-4))  # the numbers 0.1 and 1e-18 are just outside, and hidden
+    # the numbers 0.1 and 1e-18 are just outside, and hidden
+    ax.set(xlim=(0.15, 6e5), ylim=(4e-18, 2e-4))
 
 
 def by_markers(figure, ax):
@@ -61,7 +62,9 @@ FAULTS = {
     "an empty panel": lambda figure, ax: figure.add_axes((0.7, 0.7, 0.2, 0.2)),
     "no point of any line": lambda figure, ax: ax.set_xlim(5, 6),
     "a picture without one finite value": lambda figure, ax: ax.imshow(np.full((2, 2), np.nan)),
-    "texts overlap: 'one' and 'other'": lambda figure, ax: [ax.text(2, 4, word) for word in ("one", "other")],
+    "texts overlap: 'one' and 'other'": lambda figure, ax: [
+        ax.text(2, 4, word) for word in ("one", "other")
+    ],
     "text of 6 points": lambda figure, ax: ax.text(2, 4, "small", fontsize=6),
     "drawn far beyond the canvas": beyond,
     "entries that look the same: squares, a twin": twins,

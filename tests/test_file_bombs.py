@@ -1,4 +1,5 @@
-"""Files of strangers that would take gigabytes, or would never end: each is refused in one sentence and little memory.
+"""Files of strangers that would take gigabytes, or would never end: each is refused in one sentence
+and little memory.
 
 All are read by one child process, whose readers may use 100 MB more than it holds.
 """
@@ -13,7 +14,8 @@ import pytest
 from tests import file_bombs as bombs
 
 LEFT = 100 * bombs.MB  #: bytes that readers may use
-MOST = 130 * bombs.MB  #: bytes by which the process may grow: what a reader was allowed, and libraries
+#: bytes by which the process may grow: what a reader was allowed, and libraries
+MOST = 130 * bombs.MB
 MEMORY = "more than the"  #: in each sentence about memory
 OTHER = "is not a regular file but"
 
@@ -111,31 +113,31 @@ from pathlib import Path
 import h5py
 
 from neusee.nodes import calibrate, scene
-from neusee.nodes.array_bytes import hdf5_needs
+from neusee.nodes.file_headers import hdf5_needs
 from neusee.nodes.calibrate import frame_header
-from neusee.nodes.calibrate._frames._emva_descriptor import _parsed as descriptor
+from neusee.nodes.calibrate._emva_descriptor import _parsed as descriptor
 from neusee.nodes.doe._height_map_files import map_header
 from neusee.nodes.input_files import csv_rows
 from neusee.nodes.network_weights import fits
-from neusee.nodes.restore._networks._exported_network import exported_network
-from neusee.nodes.scene._cube_files import size_and_type, wrong_values
+from neusee.nodes.restore._networks._network_files import exported_network
+from neusee.nodes.scene._hyperspectral import size_and_type, wrong_values
 from neusee.nodes.scene._exr_picture import picture_size
 from neusee.nodes.scene._photograph import read_header
-from neusee.nodes.scene._photograph_folder import list_photographs
+from neusee.nodes.scene._photograph import list_photographs
 from neusee.nodes.sensor._frame_file import read_frame
 from neusee.nodes.spectra._measured_reflectances import _read as reflectances
-from neusee.nodes.spectra._mst_lift_node import _read as lift_weights
+from neusee.nodes.spectra._mst_plus_plus import _read as lift_weights
 from neusee.nodes.units import _existing as existing
 from neusee.workflows import load
 from neusee.workflows.calibration.emcee_sampler import _read as chain
 from neusee.workflows.comparison.run_record import _json as record
-from neusee.workflows.engine.memory_use import process_memory
-from neusee.workflows.engine.memory_watch import limited
-from neusee.workflows.keys.code_memo import read_memo, read_parts
-from neusee.workflows.recipe.distributions.joint import read_posterior
-from neusee.workflows.recipe.distributions.sample_table import read_columns
+from neusee.workflows.engine.machine_resources import process_memory
+from neusee.workflows.engine.memory_limits import limited
+from neusee.workflows.keys.module_digest import read_memo, read_parts
+from neusee.workflows.recipe.distributions.joint_distribution import read_posterior
+from neusee.workflows.recipe.distributions.joint_distribution import read_columns
 from neusee.workflows.store.lease import _look as look
-from neusee.workflows.training.loop.checkpoint import StateFile
+from neusee.workflows.training.loop.resumable_loop import StateFile
 import PIL.Image, astropy.io.fits, kornia_rs, scipy.io, torch, torch.export
 
 
@@ -199,7 +201,9 @@ for name, (file, code) in json.load(sys.stdin).items():
 
 @pytest.fixture(scope="module")
 def answers(tmp_path_factory):
-    """What the child says of each bomb: the text of the error, the bytes by which it grew, and the seconds."""
+    """What the child says of each bomb: the text of the error, the bytes by which it grew, and
+    the seconds.
+    """
     folder, jobs = tmp_path_factory.mktemp("bombs"), {}
     for number, (name, (make, file, code, _)) in enumerate(BOMBS.items()):
         path = folder / str(number) / file
@@ -208,9 +212,15 @@ def answers(tmp_path_factory):
         jobs[name] = (str(path), code)
     done = subprocess.run(
         [sys.executable, "-c", READ.replace("LEFT", str(LEFT))],
-        input=json.dumps(jobs), capture_output=True, text=True, cwd=folder, timeout=1200,
-    )  # fmt: skip
-    found = {name: (text, *numbers) for name, text, *numbers in map(json.loads, done.stdout.splitlines())}
+        input=json.dumps(jobs),
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        timeout=1200,
+    )
+    found = {
+        name: (text, *numbers) for name, text, *numbers in map(json.loads, done.stdout.splitlines())
+    }
     assert set(found) == set(BOMBS), done.stderr[-2000:]
     return found | {"paths": {name: path for name, (path, _) in jobs.items()}}
 

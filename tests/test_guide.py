@@ -1,4 +1,6 @@
-"""The README and the guide: commands parse, recipes load, links resolve, Python names exist, the glossary is whole."""
+"""The README and the guide: commands parse, recipes load, links resolve, Python names exist, the
+glossary is whole.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +9,7 @@ import builtins
 import importlib
 import re
 import shlex
+from pathlib import Path
 
 import pytest
 import typer
@@ -36,7 +39,18 @@ README = ROOT / "README.md"
 
 COMMANDS = get_command(app.app)
 #: these commands take a recipe in words
-LOADS = {"run", "validate", "plan", "why", "config", "train", "calibrate", "evaluate", "study", "safety"}
+LOADS = {
+    "run",
+    "validate",
+    "plan",
+    "why",
+    "config",
+    "train",
+    "calibrate",
+    "evaluate",
+    "study",
+    "safety",
+}
 TERM = re.compile(r"- \*\*(?P<term>[^*]+)\*\*(?: \([^)]*(?:\([^)]*\))?[^)]*\))?: .+\. [^.].*\.")
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:typer")
@@ -53,7 +67,10 @@ def folder(tmp_path_factory):
 
 def parsed(words: list[str]) -> tuple[str, dict]:
     """Return the path of a command and its values, parsed and not run."""
-    context, command = COMMANDS.make_context("neusee", list(words), resilient_parsing=False), COMMANDS
+    context, command = (
+        COMMANDS.make_context("neusee", list(words), resilient_parsing=False),
+        COMMANDS,
+    )
     path, rest = [], list(words)
     while hasattr(command, "resolve_command"):
         name, command, rest = command.resolve_command(context, rest)
@@ -62,9 +79,19 @@ def parsed(words: list[str]) -> tuple[str, dict]:
     return " ".join(path), context.params
 
 
-@pytest.mark.parametrize("words", cases(lines))
-def test_every_command_line_parses_and_its_recipe_loads(words, folder, monkeypatch):
+def test_every_command_line_parses_and_its_recipe_loads(folder, monkeypatch):
     monkeypatch.chdir(folder)
+    wrong = []
+    for case in cases(lines):
+        try:
+            parse_and_load(*case.values, folder)
+        except (Exception, SystemExit) as error:
+            wrong.append(f"{case.id}, {case.values[0]}: {error!r}")
+    assert not wrong, "\n".join(wrong)
+
+
+def parse_and_load(words: str, folder: Path) -> None:
+    """Parse a command line and load its recipe, as the command would."""
     command, values = parsed(shlex.split(words))
     if command.split()[0] not in {*LOADS, "sweep"}:
         return
@@ -78,7 +105,9 @@ def test_every_command_line_parses_and_its_recipe_loads(words, folder, monkeypat
         return
     recipe = load(name, changes, folder)
     if command == "why":
-        assert any(step.partition("[")[0] == values["step"].partition("[")[0] for step in recipe.steps)
+        assert any(
+            step.partition("[")[0] == values["step"].partition("[")[0] for step in recipe.steps
+        )
     if command == "plan" and values["devices"]:
         assert read_machines(values["devices"]).devices
     if command == "train":
@@ -88,25 +117,33 @@ def test_every_command_line_parses_and_its_recipe_loads(words, folder, monkeypat
         compose_pipelines(name, changes, read_pipelines(asked, folder), folder)
 
 
-# --- what pages say ---------------------------------------------------------------------------------------------------
+# --- what pages say -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("page", "least"), [("README", 11), ("commands", 20), ("own_frames", 6), ("recipes", 6)])
+@pytest.mark.parametrize(
+    ("page", "least"), [("README", 11), ("commands", 20), ("own_frames", 6), ("recipes", 6)]
+)
 def test_the_command_lines_are_found(page, least):
     assert len(next(lines(path) for path in WRITTEN if path.stem == page)) >= least
 
 
-@pytest.mark.parametrize("words", ["runn", "study accurracy", "run --bogus", "evaluate --scenes none"])
+@pytest.mark.parametrize(
+    "words", ["runn", "study accurracy", "run --bogus", "evaluate --scenes none"]
+)
 def test_a_wrong_command_line_does_not_parse(words):
     with pytest.raises(Exception, match=r"(?i)no such|should be a valid|is not a valid"):
         parsed(words.split())
 
 
-@pytest.mark.parametrize("page", WRITTEN, ids=lambda page: page.stem)
-def test_every_command_that_is_named_exists(page):
+def test_every_command_that_is_named_exists():
     context = typer.Context(COMMANDS)
-    for spoken in re.findall(r"`neusee ([^`]*)`", page.read_text(encoding="utf-8")):
-        words = [word for word in shlex.split(spoken) if re.fullmatch("[a-z-]+", word) and not word.startswith("-")]
+    texts = "\n".join(page.read_text(encoding="utf-8") for page in WRITTEN)
+    for spoken in re.findall(r"`neusee ([^`]*)`", texts):
+        words = [
+            word
+            for word in shlex.split(spoken)
+            if re.fullmatch("[a-z-]+", word) and not word.startswith("-")
+        ]
         if words:
             command = COMMANDS.get_command(context, words[0])
             assert command is not None, spoken
@@ -116,13 +153,20 @@ def test_every_command_that_is_named_exists(page):
 
 def test_the_page_of_commands_has_every_command():
     text = (GUIDE / "commands.md").read_text(encoding="utf-8")
-    assert re.findall(r"^\| `neusee (\w+)` \|", text, re.MULTILINE) == COMMANDS.list_commands(typer.Context(COMMANDS))
+    assert re.findall(r"^\| `neusee (\w+)` \|", text, re.MULTILINE) == COMMANDS.list_commands(
+        typer.Context(COMMANDS)
+    )
 
 
-@pytest.mark.parametrize("page", WRITTEN, ids=lambda page: page.stem)
-def test_every_relative_link_resolves(page):
-    links = re.findall(r"\]\((?!https?:|reference/)([^)#]+)", page.read_text(encoding="utf-8"))
-    assert not [link for link in links if not (page.parent / link).is_file()]
+def test_every_relative_link_resolves():
+    links = [
+        (page, link)
+        for page in WRITTEN
+        for link in re.findall(
+            r"\]\((?!https?:|reference/)([^)#]+)", page.read_text(encoding="utf-8")
+        )
+    ]
+    assert not [(page.name, link) for page, link in links if not (page.parent / link).is_file()]
 
 
 def test_the_index_has_one_line_for_each_page():
@@ -137,14 +181,20 @@ def test_the_gallery_has_a_section_with_command_picture_and_time_for_each_recipe
     sections = dict(re.findall(r"^## `(\w+)`\n(.*?)(?=^## )", text, re.MULTILINE | re.DOTALL))
     assert sorted(sections) == sorted(path.stem for path in (ROOT / "recipes").glob("*.yaml"))
     for name, section in sections.items():
-        assert re.search(rf"^    neusee (run|train|safety|evaluate) {name}\b", section, re.MULTILINE), name
+        assert re.search(
+            rf"^    neusee (run|train|safety|evaluate) {name}\b", section, re.MULTILINE
+        ), name
         assert "<!-- picture " in section, name
         assert re.search(r"^Time: (\d+ s\b|half an hour|hours|days)", section, re.MULTILINE), name
 
 
 def test_the_gallery_credits_each_picture_that_ships():
     credits = (GUIDE / "gallery.md").read_text(encoding="utf-8").partition("## Credits")[2]
-    shown = {path.name for kind in ("jpg", "exr") for path in (ROOT / "recipes" / "samples").glob(f"*.{kind}")}
+    shown = {
+        path.name
+        for kind in ("jpg", "exr")
+        for path in (ROOT / "recipes" / "samples").glob(f"*.{kind}")
+    }
     assert shown
     assert not [name for name in shown if f"`{name}`" not in credits]
 
@@ -170,24 +220,46 @@ def test_every_python_block_compiles_and_its_names_exist(code):
     modules = {}
     for item in (item for item in tree.body if isinstance(item, ast.ImportFrom | ast.Import)):
         for alias in item.names:
-            module = importlib.import_module(item.module if isinstance(item, ast.ImportFrom) else alias.name)
-            modules[alias.asname or alias.name] = getattr(module, alias.name) if hasattr(item, "module") else module
+            module = importlib.import_module(
+                item.module if isinstance(item, ast.ImportFrom) else alias.name
+            )
+            modules[alias.asname or alias.name] = (
+                getattr(module, alias.name) if hasattr(item, "module") else module
+            )
     for item in ast.walk(tree):
-        if isinstance(item, ast.Attribute) and isinstance(item.value, ast.Name) and item.value.id in modules:
+        if (
+            isinstance(item, ast.Attribute)
+            and isinstance(item.value, ast.Name)
+            and item.value.id in modules
+        ):
             assert hasattr(modules[item.value.id], item.attr), f"{item.value.id}.{item.attr}"
         if isinstance(item, ast.Name) and isinstance(item.ctx, ast.Load):
             assert item.id in modules or f"{item.id}" in assigned(tree), item.id
 
 
 def assigned(tree: ast.Module) -> set[str]:
-    """Return the names that a block gives values: by assignment, as a function or as an argument, and the built-ins."""
-    names = {item.id for item in ast.walk(tree) if isinstance(item, ast.Name) and isinstance(item.ctx, ast.Store)}
+    """Return the names that a block gives values: by assignment, as a function or as an
+    argument, and the built-ins.
+    """
+    names = {
+        item.id
+        for item in ast.walk(tree)
+        if isinstance(item, ast.Name) and isinstance(item.ctx, ast.Store)
+    }
     names |= {item.name for item in ast.walk(tree) if isinstance(item, ast.FunctionDef)}
-    return names | {item.arg for item in ast.walk(tree) if isinstance(item, ast.arg)} | set(dir(builtins))
+    return (
+        names
+        | {item.arg for item in ast.walk(tree) if isinstance(item, ast.arg)}
+        | set(dir(builtins))
+    )
 
 
 def test_the_glossary_has_one_whole_line_for_each_term():
-    entries = [line for line in (GUIDE / "glossary.md").read_text(encoding="utf-8").splitlines() if line[:2] == "- "]
+    entries = [
+        line
+        for line in (GUIDE / "glossary.md").read_text(encoding="utf-8").splitlines()
+        if line[:2] == "- "
+    ]
     assert not [line for line in entries if not TERM.fullmatch(line)]
     terms = [TERM.fullmatch(line)["term"].lower() for line in entries]
     assert 35 <= len(terms) <= 60

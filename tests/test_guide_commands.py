@@ -1,4 +1,6 @@
-"""Every command and every block of the README and the guide runs: as it stands, or as a stand-in that says why."""
+"""Every command and every block of the README and the guide runs: as it stands, or as a stand-in
+that says why.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +22,13 @@ from PIL import Image
 
 from neusee.workflows.cli import app
 from neusee.workflows.cli.handbook_reference import reference_pages
-from neusee.workflows.handbook import command_pictures
+from neusee.workflows.handbook import guide_pages as command_pictures
 from neusee.workflows.handbook.guide_pages import pictures_of, read_pages
 from neusee.workflows.handbook.site_build import build_handbook
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe import node_families
-from neusee.workflows.report import graph_ahead, run_pictures
+from neusee.workflows.report import files_beside as graph_ahead
+from neusee.workflows.report import run_pictures
 from neusee.workflows.report.figures import style
 from neusee.workflows.report.run_pictures import graphs
 from neusee.workflows.simulation import simulate_recipe
@@ -44,7 +47,16 @@ from tests.guide_commands import (
     write_reader_files,
 )
 from tests.guide_machines import scheduler, together
-from tests.guide_stand_ins import LABORATORY, LIGHT, SMALL_OPTIONS, STAND_INS, NotDeclared, StandIn, stand_in, typed
+from tests.guide_stand_ins import (
+    LABORATORY,
+    LIGHT,
+    SMALL_OPTIONS,
+    STAND_INS,
+    NotDeclared,
+    StandIn,
+    stand_in,
+    typed,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:typer")
 
@@ -57,20 +69,29 @@ for _text in read_pages().values():
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A folder with the reader's files, small options of the packaged groups, and one cache for all commands."""
+    """A folder with the reader's files, small options of the packaged groups, and one cache for
+    all commands.
+    """
     place = tmp_path_factory.mktemp("guide")
     write_reader_files(place)
     Image.new("L", (2, 2)).save(place / "no_graph.png")
     for name, text in SMALL_OPTIONS.items():
-        for folder, options in (("options", text), ("all_bands", re.sub(", bands: [0-9]+", "", text))):
+        for folder, options in (
+            ("options", text),
+            ("all_bands", re.sub(", bands: [0-9]+", "", text)),
+        ):
             path = place / folder / f"{name}.yaml"
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(f"# A small stand-in.\ndefaults: [{path.stem}]\n{options}\n", encoding="utf-8")
+            path.write_text(
+                f"# A small stand-in.\ndefaults: [{path.stem}]\n{options}\n", encoding="utf-8"
+            )
     return place
 
 
 def small_png(figure) -> bytes:
-    """Return a figure as a small PNG without the search for a layout, which takes most of the time."""
+    """Return a figure as a small PNG without the search for a layout, which takes most of the
+    time.
+    """
     from io import BytesIO
 
     figure.set_layout_engine("none")
@@ -81,7 +102,9 @@ def small_png(figure) -> bytes:
 
 @pytest.fixture
 def reader(place, monkeypatch, tmp_path):
-    """Stand in the folder of the reader, and forget afterwards which modules the commands imported from there."""
+    """Stand in the folder of the reader, and forget afterwards which modules the commands
+    imported from there.
+    """
     monkeypatch.chdir(place)
     monkeypatch.setenv("NEUSEE_CACHE", str(place / "cache"))
     monkeypatch.setattr(style, "png_of", small_png)
@@ -90,7 +113,9 @@ def reader(place, monkeypatch, tmp_path):
 
 
 def carry_out(words: str, place: Path, monkeypatch) -> None:
-    """Run a command of a page, or its stand-in, and ask for exit code 0; draw no figures that no page shows."""
+    """Run a command of a page, or its stand-in, and ask for exit code 0; draw no figures that no
+    page shows.
+    """
     found, own = stand_in(words, place), tuple(typed(words, None))
     asked = SHOWN.get(own, set())
     with monkeypatch.context() as patch, scheduler(found) as address:
@@ -121,7 +146,9 @@ def no_picture(place: Path, file: Path, **_) -> None:
 
 
 def other_graphs(recipe, states) -> list:
-    """Return the graphs of a run under keys of their own, so that a page that shows one finds no picture of nothing."""
+    """Return the graphs of a run under keys of their own, so that a page that shows one finds no
+    picture of nothing.
+    """
     return [(digest("no picture", key), arguments) for key, arguments in graphs(recipe, states)]
 
 
@@ -131,7 +158,9 @@ def shown_by(words: tuple[str, ...], place: Path) -> Path:
 
 
 def write_frame(place: Path, monkeypatch) -> None:
-    """Run the command of the page that takes a frame, and let the next commands find it in the folder `runs`."""
+    """Run the command of the page that takes a frame, and let the next commands find it in the
+    folder `runs`.
+    """
     words = 'run half_ring "outputs=[raw]"'
     carry_out(words, place, monkeypatch)
     taken, latest = shown_by(tuple(typed(words, None)), place) / "latest", place / "runs" / "latest"
@@ -150,26 +179,38 @@ def run_here(page):
 
 
 def timed(found):
-    """Return test cases of which those that simulate a picture are marked slow."""
-    quick = {*LIGHT, "safety"} - {"compare", "handbook"}
+    """Return test cases of which those that compute more than a plan are marked slow: the site
+    shows their pictures, and finds them there.
+    """
+    quick = {*LIGHT} - {"compare", "handbook"}
     return [
-        pytest.param(*case.values, id=case.id, marks=[] if case.values[0].split()[0] in quick else [pytest.mark.slow])
+        pytest.param(
+            *case.values,
+            id=case.id,
+            marks=[] if case.values[0].split()[0] in quick else [pytest.mark.slow],
+        )
         for case in found
     ]
 
 
-@pytest.mark.parametrize("words", timed(cases(run_here)))
+#: the measured sensor comes first, so that the commands that take it find it
+COMMANDS = sorted(cases(run_here), key=lambda case: case.values[0] != LABORATORY)
+
+
+@pytest.mark.parametrize("words", timed(COMMANDS))
 def test_every_command_runs(words, place, reader, tmp_path, monkeypatch, capfd):
     if words.split()[0] in ("new", "init", "check"):
         shutil.copytree(place / "my", tmp_path / "my")
         shutil.copytree(place / "mylab", tmp_path / "mylab") if words.startswith("check") else None
         monkeypatch.chdir(tmp_path)
         monkeypatch.syspath_prepend(str(tmp_path))  # as if the package were installed
-        if words in ("check bloom.py", "check mylab.optics --json"):  # checked is what `neusee new` writes
+        # checked is what `neusee new` writes
+        if words in ("check bloom.py", "check mylab.optics --json"):
             carry_out("new node bloom", place, monkeypatch)
             shutil.copy("bloom.py", tmp_path / "mylab" / "optics.py")
     if words.startswith("compare"):
-        carry_out("run first_light seed=7", place, monkeypatch)  # as it stands, in the folder `runs`
+        # as it stands, in the folder `runs`
+        carry_out("run first_light seed=7", place, monkeypatch)
         for name in set(re.findall(r"runs/\w+|\d{4}-\w+-\w+", words)):
             shutil.copytree((place / "runs" / "latest").resolve(), place / "runs" / Path(name).name)
     if words == "train train_demonstration --stage 2":
@@ -182,9 +223,10 @@ def test_every_command_runs(words, place, reader, tmp_path, monkeypatch, capfd):
     assert capfd.readouterr().out
 
 
-# --- nothing is left out ----------------------------------------------------------------------------------------------
+# --- nothing is left out --------------------------------------------------------------------------
 
-EXPORTED = "my/restore/exported.yaml"  #: has a test of its own, because a file of torch.export takes seconds to write
+#: has a test of its own, because a file of torch.export takes seconds to write
+EXPORTED = "my/restore/exported.yaml"
 SPOKEN = [words for page in WRITTEN for words in lines(page)]
 
 
@@ -197,7 +239,7 @@ def test_every_indented_line_is_a_command_or_says_who_runs_it():
 
 
 def test_every_command_is_run_as_it_stands_or_with_its_stand_in(place):
-    cased = {case.values[0] for case in cases(run_here)}
+    cased = {case.values[0] for case in COMMANDS}
     assert cased | ALONE == set(SPOKEN)
     found = {words: stand_in(words, place) for words in cased}
     assert all(each is None or each.why for each in found.values())
@@ -205,7 +247,9 @@ def test_every_command_is_run_as_it_stands_or_with_its_stand_in(place):
     assert set(STAND_INS) <= cased
 
 
-@pytest.mark.parametrize("words", ["train new", "evaluate first_light", "study stability", "calibrate my/frames.yaml"])
+@pytest.mark.parametrize(
+    "words", ["train new", "evaluate first_light", "study stability", "calibrate my/frames.yaml"]
+)
 def test_a_large_command_without_a_stand_in_is_refused(words, place):
     with pytest.raises(NotDeclared, match=f"neusee {words}: say in STAND_INS how"):
         stand_in(words, place)
@@ -219,16 +263,21 @@ def test_a_word_that_a_stand_in_replaces_stands_in_the_command():
 def test_every_file_of_the_reader_is_used_by_a_command_or_by_another_file():
     files = dict(named_files())
     texts = "\n".join(
-        [*SPOKEN, *files.values(), *(each.values[0] for each in cases(lambda page: blocks(page, "python")))]
+        [
+            *SPOKEN,
+            *files.values(),
+            *(each.values[0] for each in cases(lambda page: blocks(page, "python"))),
+        ]
     )
     for path, text in files.items():
         rest = texts.replace(text, "")
         name = Path(path)
         by_option = re.search(rf"\b{name.parent.name}(=|: ){name.stem}\b", rest)
-        assert by_option or name.name in rest or name.suffix == ".py" or path == EXPORTED, path  # Python blocks run
+        # Python blocks run
+        assert by_option or name.name in rest or name.suffix == ".py" or path == EXPORTED, path
 
 
-# --- blocks -----------------------------------------------------------------------------------------------------------
+# --- blocks ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -244,22 +293,33 @@ def test_every_python_block_runs(code, place, reader, tmp_path, monkeypatch):
     if 'torch.export.save(whole, "net.pt2")' in code:
         monkeypatch.chdir(place)
         shutil.copy(tmp_path / "net.pt2", place)
-        carry_out("run my/train_smallnet.yaml restore=exported restore.weights=net.pt2", place, monkeypatch)
+        carry_out(
+            "run my/train_smallnet.yaml restore=exported restore.weights=net.pt2",
+            place,
+            monkeypatch,
+        )
 
 
 def test_the_package_of_the_page_on_nodes_has_a_family(reader, tmp_path, monkeypatch):
     ((text,),) = [found for page in WRITTEN if (found := blocks(page, "toml"))]
     written = tomllib.loads(text)
-    assert written["build-system"] == {"requires": ["hatchling"], "build-backend": "hatchling.build"}
+    assert written["build-system"] == {
+        "requires": ["hatchling"],
+        "build-backend": "hatchling.build",
+    }
     project, site = written["project"], tmp_path / "site"
     (site / "mylab").mkdir(parents=True)
     (site / "mylab" / "__init__.py").touch()
     shutil.copy(reader / "my" / "bloom.py", site / "mylab" / "nodes.py")
     about = site / f"{project['name']}-{project['version']}.dist-info"  # as pip leaves it
     about.mkdir()
-    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n")
+    (about / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    )
     points = project["entry-points"].items()
-    entries = [line for name, found in points for line in (f"[{name}]", *map(" = ".join, found.items()))]
+    entries = [
+        line for name, found in points for line in (f"[{name}]", *map(" = ".join, found.items()))
+    ]
     (about / "entry_points.txt").write_text("\n".join(entries) + "\n")
     monkeypatch.syspath_prepend(str(site))
     importlib.invalidate_caches()
@@ -270,17 +330,21 @@ def test_the_package_of_the_page_on_nodes_has_a_family(reader, tmp_path, monkeyp
 @pytest.mark.parametrize("line", [line for line, who in OTHER_LINES.items() if who == "a shell"])
 def test_a_shell_takes_the_variable_and_the_program_knows_it(line):
     name, _, value = line.removeprefix("export ").partition("=")
-    done = subprocess.run(["sh", "-euc", f"{line}\nenv"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        ["sh", "-euc", f"{line}\nenv"], capture_output=True, text=True, check=True
+    )
     assert f"{name}={os.path.expandvars(value.strip(chr(34)))}" in done.stdout.splitlines()
     assert f"| `{name}` |" in (ROOT / "recipes" / "guide" / "cache.md").read_text(encoding="utf-8")
 
 
-# --- the site ---------------------------------------------------------------------------------------------------------
+# --- the site -------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def small_pictures(reader, monkeypatch):
-    """Let the build of the handbook take its pictures from the stand-ins of the commands, which run if none did."""
+    """Let the build of the handbook take its pictures from the stand-ins of the commands, which
+    run if none did.
+    """
     written = {tuple(shlex.split(words)): words for words in SPOKEN}
 
     def run(words, *_):
@@ -300,19 +364,24 @@ def small_pictures(reader, monkeypatch):
 def test_the_handbook_is_built_strictly_with_every_picture(small_pictures, tmp_path):
     pytest.importorskip("material")
     said: list[str] = []
-    page = build_handbook(tmp_path / "handbook", reference_pages(GUIDE.parent), True, said.append, strict=True)
+    page = build_handbook(
+        tmp_path / "handbook", reference_pages(GUIDE.parent), True, said.append, strict=True
+    )
     wanted = {(p.words, p.file) for text in read_pages().values() for p in pictures_of(text)}
     files = sorted((page.parent / "pictures").iterdir())
     assert len(files) == len(wanted) > 40
     for path in files:
         with Image.open(path) as picture:
-            frame = picture.size == (24, 24)  #: digital numbers of SMALL_SENSOR, of which PIL keeps the upper byte
+            #: digital numbers of SMALL_SENSOR, of which PIL keeps the upper byte
+            frame = picture.size == (24, 24)
             assert frame or min(picture.size) > 30, path
             grey = picture.convert("L")
         numbers = read_image_png_u16(str(path), "rgb") if frame else grey
         assert len(np.unique(np.asarray(numbers))) > 10, path
     shown = {
-        name for html in page.parent.rglob("*.html") for name in re.findall(r"pictures/(\w+\.png)", html.read_text())
+        name
+        for html in page.parent.rglob("*.html")
+        for name in re.findall(r"pictures/(\w+\.png)", html.read_text())
     }
     assert shown == {path.name for path in files}
     assert not [line for line in said if line.startswith("no picture")]

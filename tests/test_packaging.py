@@ -1,4 +1,6 @@
-"""What is built from this folder: the files of the wheel and of the source archive, and links where one edits."""
+"""What is built from this folder: the files of the wheel and of the source archive, and links
+where one edits.
+"""
 
 import importlib.util
 import subprocess
@@ -13,10 +15,13 @@ import neusee
 
 ROOT = Path(__file__).parents[1]
 ROOMS = ("nodes", "workflows", "recipes")
-SAFELY = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # Python 3.11.0 to 3.11.3 have no filter
+# Python 3.11.0 to 3.11.3 have no filter
+SAFELY = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(importlib.util.find_spec("hatchling") is None, reason="hatchling is not installed"),
+    pytest.mark.skipif(
+        importlib.util.find_spec("hatchling") is None, reason="hatchling is not installed"
+    ),
 ]
 
 
@@ -25,7 +30,10 @@ def built(tmp_path_factory):
     """The wheel and the source archive, built without a network."""
     folder = tmp_path_factory.mktemp("dist")
     subprocess.run(
-        [sys.executable, "-m", "hatchling", "build", "-d", folder], cwd=ROOT, check=True, capture_output=True
+        [sys.executable, "-m", "hatchling", "build", "-d", folder],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
     )
     (wheel,), (archive,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
     return wheel, archive
@@ -34,8 +42,15 @@ def built(tmp_path_factory):
 def source():
     """Every file of the program, by its path below the package."""
     hidden = ("__pycache__",)
-    rooms = [p for room in ROOMS for p in (ROOT / room).rglob("*") if p.is_file() and not set(hidden) & set(p.parts)]
-    package = [ROOT / ".src" / "neusee" / name for name in ("__init__.py", "__main__.py", "py.typed")]
+    rooms = [
+        p
+        for room in ROOMS
+        for p in (ROOT / room).rglob("*")
+        if p.is_file() and not set(hidden) & set(p.parts)
+    ]
+    package = [
+        ROOT / ".src" / "neusee" / name for name in ("__init__.py", "__main__.py", "py.typed")
+    ]
     return {str(p.relative_to(ROOT)) for p in rooms} | {p.name for p in package}
 
 
@@ -43,14 +58,18 @@ def test_the_wheel_holds_every_file_once(built):
     names = zipfile.ZipFile(built[0]).namelist()
     assert len(names) == len(set(names))
     here = {
-        name.removeprefix("neusee/") for name in names if not name.startswith(f"neusee-{neusee.__version__}.dist-info")
+        name.removeprefix("neusee/")
+        for name in names
+        if not name.startswith(f"neusee-{neusee.__version__}.dist-info")
     }
     assert here == source()
     assert any(name.endswith("licenses/LICENSE") for name in names)
 
 
 def test_the_version_is_that_of_the_package(built):
-    assert [path.name.split("-")[1].removesuffix(".tar.gz") for path in built] == [neusee.__version__] * 2
+    assert [path.name.split("-")[1].removesuffix(".tar.gz") for path in built] == [
+        neusee.__version__
+    ] * 2
 
 
 def test_the_source_archive_holds_all_that_builds_and_checks_it(built):
@@ -60,9 +79,19 @@ def test_the_source_archive_holds_all_that_builds_and_checks_it(built):
     assert len(names) == len(set(names))
     package = {f".src/neusee/{name}" if "/" not in name else name for name in source()}
     tests = {str(p.relative_to(ROOT)) for p in (ROOT / "tests").rglob("*.py")}
-    whole = {"README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff", "pyproject.toml", ".ci/run", ".ci/source_links.py"}
+    whole = {
+        "README.md",
+        "LICENSE",
+        "CHANGELOG.md",
+        "CITATION.cff",
+        "pyproject.toml",
+        ".ci/run",
+        ".ci/source_links.py",
+    }
     assert package | tests | whole <= set(names)
-    assert [name for name in names if name.startswith(tuple(f".src/neusee/{room}" for room in ROOMS))] == []
+    assert [
+        name for name in names if name.startswith(tuple(f".src/neusee/{room}" for room in ROOMS))
+    ] == []
 
 
 def test_a_wheel_made_of_the_source_archive_is_the_same(built, tmp_path):
@@ -82,10 +111,17 @@ def test_an_unpacked_archive_that_is_installed_for_editing_gets_its_links(built,
     build = f"import hatchling.build; hatchling.build.build_editable({str(tmp_path)!r})"
     subprocess.run([sys.executable, "-c", build], cwd=unpacked, check=True, capture_output=True)
     links = [unpacked / ".src" / "neusee" / room for room in ROOMS]
-    assert [link.is_symlink() and link.resolve() == unpacked / link.name for link in links] == [True] * 3
+    assert [link.is_symlink() and link.resolve() == unpacked / link.name for link in links] == [
+        True
+    ] * 3
     env = {"PYTHONPATH": str(unpacked / ".src"), "PATH": ""}
     code = "import neusee.nodes; print(neusee.nodes.__file__)"
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=env,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stdout.startswith(str(unpacked))

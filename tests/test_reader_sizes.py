@@ -1,7 +1,8 @@
-"""Every reader of a file states its size: which memory it needs is known before anything is allocated.
+"""Every reader of a file states its size: which memory it needs is known before anything is
+allocated.
 
-A function that calls a reader of a library, or opens a file, must call one of `STATES` as well, or stand in `NO_SIZE`
-with the reason why the file cannot be one of a stranger.
+A function that calls a reader of a library, or opens a file, must call one of `STATES` as well, or
+stand in `NO_SIZE` with the reason why the file cannot be one of a stranger.
 """
 
 import ast
@@ -13,12 +14,14 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FILES = sorted([*ROOT.glob("nodes/**/*.py"), *ROOT.glob("workflows/**/*.py")])
 
-#: functions that compare the bytes of a file with the memory that is left, or read a file that they have compared
+#: functions that compare the bytes of a file with the memory that is left, or read a file that they
+#: have compared
 STATES = re.compile(
     r"(needs|picture_needs|pages_need|tiff_needs|exr_needs|npy_needs|npz_needs|archive_needs|safetensors_need|"
     r"mat_needs|fits_needs|hdf5_needs|bytes_of|text_of|lines_of|head_of|opened)"
 )
-#: functions of libraries that read a file of pictures, arrays or tables, by the end of what is called
+#: functions of libraries that read a file of pictures, arrays or tables, by the end of what is
+#: called
 READERS = re.compile(
     r"(.*\.)?(load_file|safe_open|loadmat|whosmat|HDFBackend|ZipFile|read_image_\w+|fromfile|memmap|loadtxt|"
     r"genfromtxt|imread|imopen|read_csv|read_excel|read_table|open_dataset|open_dataarray|open_mfdataset|from_netcdf|"
@@ -34,7 +37,8 @@ LAST = re.compile(
 )
 WRITES = re.compile(r"[wxa][bt+]*")
 
-#: functions that need state no size, each with the reason: the file is one of the program, or of the system
+#: functions that need state no size, each with the reason: the file is one of the program, or of
+#: the system
 SYSTEM = "the system answers in a few kilobytes"
 SOURCE = "source code that is installed, or that the user runs"
 PACKAGED = "a file of the package"
@@ -42,56 +46,61 @@ OWN = "a file that this function has just written"
 WRITTEN = "it writes, and reads nothing"
 HEADER = "the header alone; what reads the numbers states their size"
 CHECKED = "the caller has compared all that the archive holds"
-STORE = "a file of the cache, opened without waiting, whose length its record states or whose kind has a limit"
+STORE = (
+    "a file of the cache, opened without waiting, whose length its record states or whose kind has"
+    " a limit"
+)
 OPENS = "it opens the file for others, without waiting for a pipe"
 DIGEST = "a digest, in pieces of a few kilobytes, opened without waiting"
 NO_SIZE = {
     "nodes/_cpp_library.py:_library": SOURCE,
     "nodes/_cpp_library.py:_processor": SYSTEM,
-    "nodes/calibrate/_frames/_frame_headers.py:_fits": HEADER,
-    "nodes/calibrate/_frames/_image_files.py:fits_header": HEADER,
-    "nodes/calibrate/_frames/_image_files.py:fits_image": HEADER,
-    "nodes/input_size.py:free_memory": SYSTEM,
-    "nodes/input_size.py:opened": OPENS,
+    "nodes/calibrate/_frame_files.py:_header_of_fits": HEADER,
+    "nodes/calibrate/_frame_files.py:fits_header": HEADER,
+    "nodes/calibrate/_frame_files.py:fits_image": HEADER,
+    "nodes/input_files.py:free_memory": SYSTEM,
+    "nodes/input_files.py:opened": OPENS,
     "nodes/own_modules.py:_helpers": SOURCE,
-    "nodes/restore/_networks/_exported_network.py:_check_member": CHECKED,
-    "nodes/restore/_networks/_exported_network.py:_checked": CHECKED,
-    "nodes/restore/_networks/_exported_network.py:exported_network": CHECKED,
-    "workflows/answers/installed_program.py:_devices": SYSTEM,
-    "workflows/answers/installed_program.py:program_state": SOURCE,
-    "workflows/answers/stored_results.py:_digest_by": DIGEST,
+    "nodes/restore/_networks/_network_files.py:_check_member": CHECKED,
+    "nodes/restore/_networks/_network_files.py:_checked": CHECKED,
+    "nodes/restore/_networks/_network_files.py:exported_network": CHECKED,
+    "workflows/answers/repeated_command.py:_devices": SYSTEM,
+    "workflows/answers/repeated_command.py:program_state": SOURCE,
+    "workflows/answers/witnesses.py:_digest_by": DIGEST,
     "workflows/answers/witnesses.py:file_digest": DIGEST,
     "workflows/calibration/emcee_sampler.py:_write": OWN,
-    "workflows/engine/step_process.py:_called": "a file in memory that the fork of this function has just written",
+    "workflows/engine/step_process.py:_called": (
+        "a file in memory that the fork of this function has just written"
+    ),
     "workflows/calibration/emcee_sampler.py:_write_draws": WRITTEN,
     "workflows/cli/catalogue.py:_uses": PACKAGED,
     "workflows/cli/catalogue.py:glossary_lines": PACKAGED,
     "workflows/cli/handbook_command.py:handbook": WRITTEN,
     "workflows/cli/handbook_reference.py:uses_of_nodes": PACKAGED,
-    "workflows/cli/init_command.py:init": PACKAGED,
-    "workflows/cli/new_command.py:new": PACKAGED,
-    "workflows/engine/cost_laws.py:_file": PACKAGED,
-    "workflows/engine/memory_use.py:_free_memory": SYSTEM,
-    "workflows/engine/memory_use.py:_reclaimable": SYSTEM,
-    "workflows/engine/memory_use.py:resident": SYSTEM,
-    "workflows/engine/memory_use.py:process_memory": SYSTEM,
-    "workflows/engine/memory_use.py:there_is": SYSTEM,
-    "workflows/engine/processors.py:free_processors": SYSTEM,
-    "workflows/observation/stopped_task.py:memory": SYSTEM,
-    "workflows/observation/stopped_task.py:status": SYSTEM,
-    "workflows/explain/code_changes.py:_lines": SOURCE,
+    "workflows/cli/project_commands.py:init": PACKAGED,
+    "workflows/cli/project_commands.py:new": PACKAGED,
+    "workflows/engine/cost_model.py:_file": PACKAGED,
+    "workflows/engine/machine_resources.py:_free_memory": SYSTEM,
+    "workflows/engine/machine_resources.py:_reclaimable": SYSTEM,
+    "workflows/engine/machine_resources.py:resident": SYSTEM,
+    "workflows/engine/machine_resources.py:process_memory": SYSTEM,
+    "workflows/engine/machine_resources.py:there_is": SYSTEM,
+    "workflows/engine/machine_resources.py:free_processors": SYSTEM,
+    "workflows/observation/system_calls.py:memory": SYSTEM,
+    "workflows/observation/system_calls.py:status": SYSTEM,
+    "workflows/explain/change_causes.py:_lines": SOURCE,
     "workflows/frames/frame_folder.py:_found": "read_table of frames, whose lines `csv_rows` reads",
     "workflows/handbook/guide_pages.py:read_pages": PACKAGED,
-    "workflows/keys/code_memo.py:module": SOURCE,
-    "workflows/keys/engine_digest.py:engine": SOURCE,
-    "workflows/keys/loaded_source.py:_edited": SOURCE,
-    "workflows/keys/loaded_source.py:source_of": SOURCE,
+    "workflows/keys/module_digest.py:module": SOURCE,
+    "workflows/keys/code_digest.py:engine": SOURCE,
+    "workflows/keys/module_digest.py:_edited": SOURCE,
+    "workflows/keys/module_digest.py:source_of": SOURCE,
     "workflows/keys/module_origin.py:_text": SOURCE,
-    "workflows/keys/process_settings.py:workflows_digest": SOURCE,
-    "workflows/keys/regular_file.py:opened": OPENS,
+    "workflows/keys/loaded_state.py:workflows_digest": SOURCE,
+    "workflows/keys/sealed_files.py:opened": OPENS,
     "workflows/recipe/text/renamed_keys.py:module": PACKAGED,
     "workflows/report/contents.py:module": PACKAGED,
-    "workflows/report/crate_sources.py:_samples": PACKAGED,
+    "workflows/report/run_crate.py:_samples": PACKAGED,
     "workflows/report/data_exports.py:exr": WRITTEN,
     "workflows/report/paper_readings.py:module": PACKAGED,
     "workflows/report/study_page.py:compiled": PACKAGED,
@@ -99,15 +108,15 @@ NO_SIZE = {
     "workflows/store/band_files.py:_fill": STORE,
     "workflows/store/band_files.py:about": STORE,
     "workflows/store/derived_files.py:_digest": DIGEST,
-    "workflows/store/environment.py:_is_checkout": SOURCE,
+    "workflows/store/cache_settings.py:_is_checkout": SOURCE,
     "workflows/store/journal.py:_newest_lines": STORE,
     "workflows/store/journal.py:_opened": OPENS,
     "workflows/store/journal.py:_read_new_lines": STORE,
     "workflows/store/journal.py:totals": STORE,
     "workflows/store/lease.py:_look": STORE,
-    "workflows/store/maintenance.py:pin": WRITTEN,
-    "workflows/store/process_owner.py:_process": SYSTEM,
-    "workflows/store/process_owner.py:host": SYSTEM,
+    "workflows/store/eviction.py:pin": WRITTEN,
+    "workflows/store/shared_folder.py:_process": SYSTEM,
+    "workflows/store/shared_folder.py:host": SYSTEM,
     "workflows/store/remote_store.py:_fetched": OWN,
     "workflows/store/serialization.py:read": STORE,
     "workflows/store/shared_folder.py:_abandoned": STORE,
@@ -116,18 +125,20 @@ NO_SIZE = {
     "workflows/store/shared_folder.py:append": WRITTEN,
     "workflows/store/shared_folder.py:open_now": OPENS,
     "workflows/store/shared_folder.py:read_file": STORE,
-    "workflows/store/small_results.py:_read_new_lines": STORE,
+    "workflows/store/payload.py:_read_new_lines": STORE,
     "workflows/training/lift/lift_run.py:lift_inputs": SOURCE,
     "workflows/training/mask_design/design_run.py:design_inputs": SOURCE,
     "workflows/training/training_inputs.py:_code": SOURCE,
     "workflows/training/training_page.py:write_page": OWN,
 }
 
-# --- what a file says -------------------------------------------------------------------------------------------------
+# --- what a file says -----------------------------------------------------------------------------
 
 
 def functions(tree):
-    """Every innermost function with its name and all that stands in it; what stands outside is in ``module``."""
+    """Every innermost function with its name and all that stands in it; what stands outside is
+    in ``module``.
+    """
     inner = {ast.FunctionDef, ast.AsyncFunctionDef}
     found = []
 
@@ -149,10 +160,13 @@ def functions(tree):
 
 
 def reads(items):
-    """The readers in a function: what is called, and what is only named, such as a function of a table of readers."""
+    """The readers in a function: what is called, and what is only named, such as a function of a
+    table of readers.
+    """
     calls = {id(item.func): item for item in items if isinstance(item, ast.Call)}
     for item in items:
-        if not LAST.fullmatch(getattr(item, "attr", getattr(item, "id", ""))):  # the text of every item takes seconds
+        # the text of every item takes seconds
+        if not LAST.fullmatch(getattr(item, "attr", getattr(item, "id", ""))):
             continue
         if id(item) in calls:
             is_reader = READERS.fullmatch(ast.unparse(item)) and not _writes(calls[id(item)])
@@ -163,7 +177,9 @@ def reads(items):
 
 
 def _is_handed_on(item):
-    return re.fullmatch(r"(np|numpy|torch)\.load|\w+\.(read_image_\w+|load_file|loadmat|imread)", ast.unparse(item))
+    return re.fullmatch(
+        r"(np|numpy|torch)\.load|\w+\.(read_image_\w+|load_file|loadmat|imread)", ast.unparse(item)
+    )
 
 
 def _writes(call):
@@ -174,10 +190,16 @@ def _writes(call):
 
 
 def stateless(path, tree):
-    """The functions of a file that read and state no size: ``file:function`` with what they call."""
+    """The functions of a file that read and state no size: ``file:function`` with what they
+    call.
+    """
     for name, items in functions(tree):
         found = sorted(set(reads(items)))
-        called = {getattr(item.func, "attr", getattr(item.func, "id", "")) for item in items if type(item) is ast.Call}
+        called = {
+            getattr(item.func, "attr", getattr(item.func, "id", ""))
+            for item in items
+            if type(item) is ast.Call
+        }
         if found and not any(map(STATES.fullmatch, called)):
             yield f"{path.relative_to(ROOT).as_posix()}:{name}", found
 
@@ -186,7 +208,7 @@ def parsed(path):
     return ast.parse(path.read_text())
 
 
-# --- the tests --------------------------------------------------------------------------------------------------------
+# --- the tests ------------------------------------------------------------------------------------
 
 
 def test_every_reader_states_its_size():
@@ -220,4 +242,8 @@ def test_a_new_reader_without_a_size_is_found(code):
 def test_a_reader_that_states_its_size_is_none_of_them():
     code = "def _new(file):\n    npy_needs(file, 1.0)\n    return np.load(file)\n"
     assert not list(stateless(ROOT / "nodes" / "new.py", ast.parse(code)))
-    assert not list(stateless(ROOT / "nodes" / "new.py", ast.parse("def _new(file):\n    open(file, 'wb').write(b'')")))
+    assert not list(
+        stateless(
+            ROOT / "nodes" / "new.py", ast.parse("def _new(file):\n    open(file, 'wb').write(b'')")
+        )
+    )

@@ -1,4 +1,5 @@
-"""The machinery that reads a recipe, runs its steps in order, stores their results and reports on the run.
+"""The machinery that reads a recipe, runs its steps in order, stores their results and reports on
+the run.
 
     from neusee.workflows import load
     result = load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}).run()
@@ -16,9 +17,8 @@ if TYPE_CHECKING:
     from neusee.workflows.engine.runner import Result, run
     from neusee.workflows.engine.step_job import Executor
     from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
-    from neusee.workflows.graph.recipe_graph import Recipe, Step
+    from neusee.workflows.graph.recipe_graph import Event, Recipe, Step, StepRecord
     from neusee.workflows.graph.run_error import RunError
-    from neusee.workflows.graph.step_record import Event, StepRecord
     from neusee.workflows.placement.tasks_and_devices import Schedule
     from neusee.workflows.priors.recipe_physics import as_physics
     from neusee.workflows.recipe.loading import load, recipes
@@ -32,8 +32,8 @@ _HOME = {
     "Diagnostic": "graph.diagnostics",
     "RecipeError": "graph.diagnostics",
     "RunError": "graph.run_error",
-    "StepRecord": "graph.step_record",
-    "Event": "graph.step_record",
+    "StepRecord": "graph.recipe_graph",
+    "Event": "graph.recipe_graph",
     "load": "recipe.loading",
     "recipes": "recipe.loading",
     "Result": "engine.runner",

@@ -1,22 +1,27 @@
-"""What a laser does to a camera: a YAML recipe runs as a graph of cached, differentiable physical steps.
+"""What a laser does to a camera: a YAML recipe runs as a graph of cached, differentiable physical
+steps.
 
     import neusee
 
     recipe = neusee.load("laser_free", doe="axicon", sensor={"read_noise": "20 e-"})
     result = neusee.run(recipe, outputs=["lsr[mask]", "raw[mask]"])
     result.metrics()["lsr[mask]"], result.numpy("raw[mask]")
-    table = neusee.sweep("laser_free", axes={"doe": ["axicon", "vortex"]}, changes={"outputs": ["lsr[mask]"]}).table()
+    table = neusee.sweep("laser_free", axes={"doe": ["axicon", "vortex"]}, changes={"outputs":
+    ["lsr[mask]"]}).table()
 
-The first argument of every verb is the name or the file of a recipe, and all options are given by name. `run` returns
-values, `sweep` a table over values of parameters, `train` trains a mask and its restoration, `evaluate` compares masks
-and restorers, `calibrate` finds the posterior of a sensor, and `study` measures how accurate the numbers of a recipe
-are. `run`, `train`, `calibrate` and `study` also take a recipe that `load` returned.
+The first argument of every verb is the name or the file of a recipe, and all options are given by
+name. `run` returns values, `sweep` a table over values of parameters, `train` trains a mask and its
+restoration, `evaluate` compares masks and restorers, `calibrate` finds the posterior of a sensor,
+and `study` measures how accurate the numbers of a recipe are. `run`, `train`, `calibrate` and
+`study` also take a recipe that `load` returned.
 
-A caller may want to catch `RecipeError` (a mistake in a recipe, before anything runs), `RunError` (a step failed) and
-`ParameterError` (a node refuses a parameter). ``recipes/guide/exceptions.md`` lists every exception with the functions
-that raise it, ``recipes/guide/torch_func.md`` the nodes that work under `torch.func`, ``neusee --help`` the commands.
+A caller may want to catch `RecipeError` (a mistake in a recipe, before anything runs), `RunError`
+(a step failed) and `ParameterError` (a node refuses a parameter). ``recipes/guide/exceptions.md``
+lists every exception with the functions that raise it, ``recipes/guide/torch_func.md`` the nodes
+that work under `torch.func`, ``neusee --help`` the commands.
 
-A name is imported when a caller first uses the name, so ``import neusee`` is fast and loads neither torch nor pydantic.
+A name is imported when a caller first uses the name, so ``import neusee`` is fast and loads neither
+torch nor pydantic.
 """
 
 TYPE_CHECKING = False  # as in `typing`, whose import takes longer than the rest of this file

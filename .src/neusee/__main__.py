@@ -1,4 +1,6 @@
-"""``python -m neusee``, which is ``neusee``; Ctrl-C during the first imports ends the program with one sentence."""
+"""``python -m neusee``, which is ``neusee``; Ctrl-C during the first imports ends the program
+with one sentence.
+"""
 
 import sys
 

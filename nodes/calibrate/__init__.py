@@ -1,59 +1,84 @@
-"""Calibration nodes, which estimate the constants of a sensor with uncertainties from frames of flat light."""
+"""Calibration nodes, which estimate the constants of a sensor with uncertainties from frames of
+flat light.
+"""
 
 from neusee.nodes.calibrate import _result_shapes  # noqa: F401  attaches the shape rules
-from neusee.nodes.calibrate._budget._camera_sources import (
-    STATISTICS,
-    camera_sources,
-    source_freedom,
-    variance_shares,
-)
-from neusee.nodes.calibrate._budget._laboratory import Laboratory, laboratory_contributions
-from neusee.nodes.calibrate._budget._sheet_budget import MODEL, sheet_budgets
-from neusee.nodes.calibrate._budget._traceability import Traceability
-from neusee.nodes.calibrate._budget._uncertainty_budget import COVERAGE, NOT_INVOLVED, NOT_STATED, Budget, Contribution
-from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
-from neusee.nodes.calibrate._frames._emva_descriptor import (
+from neusee.nodes.calibrate._camera_likelihood import camera, expected_levels
+from neusee.nodes.calibrate._emva_descriptor import (
     descriptor,
     descriptor_frames,
     descriptor_release,
     descriptor_series,
     refuse_descriptor,
 )
-from neusee.nodes.calibrate._frames._frame_headers import FrameHeader, frame_divisor, frame_header, frame_means
-from neusee.nodes.calibrate._frames._frame_statistics import levels, reduce
-from neusee.nodes.calibrate._frames._hot_pixels import hot_pixels
-from neusee.nodes.calibrate._frames._level_frames import frames
-from neusee.nodes.calibrate._frames._moment_table import table
-from neusee.nodes.calibrate._frames._saturation_signal import SaturationSignal, saturation_signal
-from neusee.nodes.calibrate._frames._simulated_frames import expose
-from neusee.nodes.calibrate._likelihood._camera_likelihood import camera, expected_levels
-from neusee.nodes.calibrate._likelihood._likelihood_node import density
-from neusee.nodes.calibrate._likelihood._linear_sensor import Likelihood
-from neusee.nodes.calibrate._likelihood._sufficient_statistics import Sufficient, sufficient
-from neusee.nodes.calibrate._prior._camera_prior import CAMERA_NAMES, CameraCoordinates, camera_prior
-from neusee.nodes.calibrate._prior._first_guess import guess, guess_camera
-from neusee.nodes.calibrate._prior._free_parameters import Prior, Ridge
-from neusee.nodes.calibrate._prior._sensor_prior import NAMES, Coordinates, prior
-from neusee.nodes.calibrate._scatter._point_source import Rings, point_source
-from neusee.nodes.calibrate._scatter._scatter_likelihood import guess_scatter, stray_light
-from neusee.nodes.calibrate._scatter._scatter_prior import SCATTER_NAMES, ScatterCoordinates, stray_prior
-from neusee.nodes.calibrate._sheet._general_model import general_model
-from neusee.nodes.calibrate._sheet._nonuniformity import Nonuniformity, SpatialSeries, spatial_series
-from neusee.nodes.calibrate._sheet._patterns import (
+from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
+from neusee.nodes.calibrate._emva_quantities import Quantity
+from neusee.nodes.calibrate._emva_sheet import EmvaSheet, emva_sheet, general_model
+from neusee.nodes.calibrate._frame_files import (
+    FrameHeader,
+    frame_divisor,
+    frame_header,
+    frame_means,
+)
+from neusee.nodes.calibrate._frame_pairs import CLEAN_PAIRS, FrameTest, Hidden, Stack, open_errors
+from neusee.nodes.calibrate._frame_statistics import (
+    SaturationSignal,
+    levels,
+    reduce,
+    saturation_signal,
+)
+from neusee.nodes.calibrate._inspection import inspect_frames
+from neusee.nodes.calibrate._laboratory import Laboratory, Traceability, laboratory_contributions
+from neusee.nodes.calibrate._level_frames import expose, frames, hot_pixels
+from neusee.nodes.calibrate._moment_table import table
+from neusee.nodes.calibrate._nonuniformity import (
     DefectHistogram,
+    Nonuniformity,
     Profiles,
+    SpatialSeries,
     Spectrogram,
     defects,
     profiles,
+    spatial_series,
     spectrogram,
     without_trend,
 )
-from neusee.nodes.calibrate._sheet._quantity import Quantity
-from neusee.nodes.calibrate._sheet._sheet import EmvaSheet, emva_sheet
-from neusee.nodes.calibrate._validity._frame_pairs import FrameTest, Stack
-from neusee.nodes.calibrate._validity._hidden_faults import CLEAN_PAIRS, Hidden, open_errors
-from neusee.nodes.calibrate._validity._inspection import inspect_frames
-from neusee.nodes.calibrate._validity._number_tests import coarse
+from neusee.nodes.calibrate._number_tests import coarse
+from neusee.nodes.calibrate._priors import (
+    CAMERA_NAMES,
+    NAMES,
+    CameraCoordinates,
+    Coordinates,
+    Prior,
+    Ridge,
+    camera_prior,
+    guess,
+    guess_camera,
+    prior,
+)
+from neusee.nodes.calibrate._scatter_likelihood import (
+    Rings,
+    guess_scatter,
+    point_source,
+    stray_light,
+)
+from neusee.nodes.calibrate._scatter_prior import SCATTER_NAMES, ScatterCoordinates, stray_prior
+from neusee.nodes.calibrate._sensor_likelihood import Likelihood, Sufficient, density, sufficient
+from neusee.nodes.calibrate._sheet_budget import (
+    MODEL,
+    STATISTICS,
+    camera_sources,
+    sheet_budgets,
+    source_freedom,
+    variance_shares,
+)
+from neusee.nodes.calibrate._uncertainty_budget import (
+    COVERAGE,
+    NOT_INVOLVED,
+    NOT_STATED,
+    Budget,
+    Contribution,
+)
 
 __all__ = [
     "CAMERA_NAMES",

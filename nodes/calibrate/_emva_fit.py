@@ -1,4 +1,6 @@
-"""A least-squares fit of the linear camera model, as EMVA 1288 prescribes; slower fits start from this estimate."""
+"""A least-squares fit of the linear camera model, as EMVA 1288 prescribes; slower fits start
+from this estimate.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ _QUANTIZATION = 1.0 / 12.0  #: DN2, of rounding to the nearest number
 
 
 class LeastSquares(NamedTuple):
-    """The results of a photon-transfer measurement, float64 scalars; errors are standard errors from noise alone."""
+    """The results of a photon-transfer measurement, float64 scalars; errors are standard errors
+    from noise alone.
+    """
 
     gain: Tensor  #: K, DN/e-
     efficiency: Tensor  #: electrons per photon
@@ -33,46 +37,60 @@ class LeastSquares(NamedTuple):
 
 @node(rtol=1e-9)
 def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
-    """Fit gain and quantum efficiency by lines through the origin, and estimate temporal dark noise and dark current.
+    """Fit gain and quantum efficiency by lines through the origin, and estimate temporal dark noise
+    and dark current.
 
-    The slope of mean over photons is the responsivity, and the slope of variance over mean is the gain, after
-    subtraction of the dark level of the nearest exposure. The level of the greatest variance marks saturation; only
-    levels up to ``share`` of saturation are fitted.
+    The slope of mean over photons is the responsivity, and the slope of variance over mean is the
+    gain, after subtraction of the dark level of the nearest exposure. The level of the greatest
+    variance marks saturation; only levels up to ``share`` of saturation are fitted.
 
     Shapes: levels (level,) -> ten scalars.
     Units:  K DN/e-; temporal dark noise, saturation e-; dark current e-/s.
-    Error:  valid as far as the camera is linear and the light is Poisson. Every level has the same weight, as in the
-            standard, so that the brightest levels dominate. Rounding in the converter is assumed to add 1/12 DN2;
-            dithered rounding adds up to 1/6. The errors omit the scatter of means in x, drift and non-linearity,
-            which are larger in real cameras.
-    Raises: ValueError without a dark level, without two lit levels of different light below saturation, and for a
-            camera without response.
+    Error:  valid as far as the camera is linear and the light is Poisson. Every level has the same
+            weight, as in the standard, so that the brightest levels dominate. Rounding in the
+            converter is assumed to add 1/12 DN2; dithered rounding adds up to 1/6. The errors omit
+            the scatter of means in x, drift and non-linearity, which are larger in real cameras.
+    Raises: ValueError without a dark level, without two lit levels of different light below
+            saturation, and for a camera without response.
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
     """
     dark = levels.photons == 0
     if not bool(dark.any()):
-        raise ValueError("the offset of the camera is unknown without dark frames: give frames without light")
+        raise ValueError(
+            "the offset of the camera is unknown without dark frames: give frames without light"
+        )
     if int((~dark).sum()) < 2:
         raise ValueError(
-            f"{int((~dark).sum())} lit level(s) cannot define a line: give two or more different light levels"
+            f"{int((~dark).sum())} lit level(s) cannot define a line: give two or more different"
+            " light levels"
         )
     nearest = (levels.exposure[~dark, None] - levels.exposure[dark]).abs().argmin(1)
     lit = without_histograms(levels, ~dark)
     below = without_histograms(levels, dark.nonzero().squeeze(1)[nearest])
     mean, variance = lit.mean - below.mean, lit.variance - below.variance
     full = mean[lit.variance.argmax()]
-    used = (mean <= share * full).nonzero().squeeze(1)
-    if len(set(lit.photons[used].tolist())) < 2:
-        raise ValueError(f"{len(used)} lit level(s) below {share:.0%} of saturation ({float(full):.4g} DN above the "
-                         "dark level) cannot define a line: give two or more different light levels there")  # fmt: skip
-    gain, response = _slope(mean[used], variance[used]), _slope(lit.photons[used], mean[used])
+    fitted = (mean <= share * full).nonzero().squeeze(1)
+    if len(set(lit.photons[fitted].tolist())) < 2:
+        raise ValueError(
+            f"{len(fitted)} lit level(s) below {share:.0%} of saturation ({float(full):.4g} DN"
+            " above the dark level) cannot define a line: give two or more different light levels"
+            " there"
+        )
+    gain, response = (
+        _slope(mean[fitted], variance[fitted]),
+        _slope(lit.photons[fitted], mean[fitted]),
+    )
     if not (float(gain) > 0 and float(response) > 0):
-        raise ValueError(f"slopes {float(gain):.3g} DN/e- and {float(response):.3g} DN/photon are not positive: more "
-                         "light must raise mean and variance; check `photons` of each level")  # fmt: skip
-    of_lit, of_dark = ((2 * x.variance.square() / x.degrees_of_freedom)[used] for x in (lit, below))
-    gain_error = _error(mean[used], of_lit, of_dark, nearest[used]) / gain
-    of_lit, of_dark = ((x.variance / x.pixels)[used] for x in (lit, below))
-    response_error = _error(lit.photons[used], of_lit, of_dark, nearest[used]) / response
+        raise ValueError(
+            f"slopes {float(gain):.3g} DN/e- and {float(response):.3g} DN/photon are not positive:"
+            " more light must raise mean and variance; check `photons` of each level"
+        )
+    of_lit, of_dark = (
+        (2 * x.variance.square() / x.degrees_of_freedom)[fitted] for x in (lit, below)
+    )
+    gain_error = _error(mean[fitted], of_lit, of_dark, nearest[fitted]) / gain
+    of_lit, of_dark = ((x.variance / x.pixels)[fitted] for x in (lit, below))
+    response_error = _error(lit.photons[fitted], of_lit, of_dark, nearest[fitted]) / response
     noise, noise_error = _dark_noise(levels, dark)
     efficiency = response / gain
     return LeastSquares(
@@ -85,15 +103,16 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
         gain_error * gain,
         efficiency * torch.hypot(gain_error, response_error),
         torch.hypot(noise_error, gain_error * noise) / gain,
-        torch.tensor(float(len(used)), dtype=torch.float64),
+        torch.tensor(float(len(fitted)), dtype=torch.float64),
     )
 
 
 @least_squares.check
 def _(result: LeastSquares, levels: Levels, **params: float) -> list[Check]:
     text = (
-        f"K {float(result.gain):.4g} DN/e-, QE {float(result.efficiency):.3g}, temporal dark noise "
-        f"{float(result.temporal_dark_noise):.4g} e-, from {int(result.fitted)} of {len(levels.mean)} levels"
+        f"K {float(result.gain):.4g} DN/e-, QE {float(result.efficiency):.3g}, temporal dark noise"
+        f" {float(result.temporal_dark_noise):.4g} e-, from {int(result.fitted)} of"
+        f" {len(levels.mean)} levels"
     )
     return [Check(text, 0.0 < float(result.efficiency) <= 1.0)]
 
@@ -109,8 +128,12 @@ def _slope(x: Tensor, y: Tensor) -> Tensor:
 
 
 def _error(x: Tensor, own: Tensor, dark: Tensor, which: Tensor) -> Tensor:
-    """Return the standard error of a fitted slope; ``which`` gives the dark level subtracted from each point."""
-    shared = torch.zeros(int(which.max()) + 1, dtype=x.dtype, device=x.device).index_add_(0, which, x * dark.sqrt())
+    """Return the standard error of a fitted slope; ``which`` gives the dark level subtracted
+    from each point.
+    """
+    shared = torch.zeros(int(which.max()) + 1, dtype=x.dtype, device=x.device).index_add_(
+        0, which, x * dark.sqrt()
+    )
     return (x.square() @ own + shared.square().sum()).sqrt() / (x @ x)
 
 
@@ -119,14 +142,20 @@ def _shortest_dark(levels: Levels, dark: Tensor) -> Tensor:
 
 
 def _dark_noise(levels: Levels, dark: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the temporal dark noise without rounding noise and its standard error (infinite for 0 noise), in DN."""
-    variance, freedom = (x[_shortest_dark(levels, dark)] for x in (levels.variance, levels.degrees_of_freedom))
+    """Return the temporal dark noise without rounding noise and its standard error (infinite for
+    0 noise), in DN.
+    """
+    variance, freedom = (
+        x[_shortest_dark(levels, dark)] for x in (levels.variance, levels.degrees_of_freedom)
+    )
     noise = (variance - _QUANTIZATION).clamp_min(0.0).sqrt()
     return noise, torch.where(noise > 0, variance / (2 * freedom).sqrt() / noise, math.inf)
 
 
 def _dark_current(levels: Levels, dark: Tensor) -> Tensor:
-    """Return the slope of the dark signal over exposure, DN/s, or NaN if all dark levels have the same exposure."""
+    """Return the slope of the dark signal over exposure, DN/s, or NaN if all dark levels have
+    the same exposure.
+    """
     time, signal = levels.exposure[dark], levels.mean[dark]
     apart = time - time.mean()
     return torch.where(time.max() > time.min(), (apart @ signal) / (apart @ apart), math.nan)

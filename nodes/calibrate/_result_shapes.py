@@ -1,11 +1,13 @@
-"""Shapes of the results of the calibration nodes; the number of histogram cells is only known from values."""
+"""Shapes of the results of the calibration nodes; the number of histogram cells is only known
+from values.
+"""
 
 from typing import Any
 
 from torch import Tensor
 
 from neusee.nodes.calibrate._emva_fit import LeastSquares, least_squares
-from neusee.nodes.calibrate._frames._simulated_frames import expose
+from neusee.nodes.calibrate._level_frames import expose
 from neusee.nodes.shape_rules import blank, scalars
 
 least_squares.shape(scalars(LeastSquares))

@@ -1,18 +1,32 @@
 """Masks (diffractive optical elements): height maps and materials."""
 
 from neusee.nodes.doe import _result_shapes  # noqa: F401  attaches the shape rules
-from neusee.nodes.doe._analytic_masks import axicon, cubic, flat, half_rings, spiral_axicon, vortex, zernike
-from neusee.nodes.doe._equal_filter import equal_filter
-from neusee.nodes.doe._fabrication_limits import fabricate
+from neusee.nodes.doe._analytic_masks import (
+    axicon,
+    cubic,
+    flat,
+    half_rings,
+    spiral_axicon,
+    vortex,
+    zernike,
+)
+from neusee.nodes.doe._fabrication import fabricate, height_error, smooth
 from neusee.nodes.doe._glass_table import index_rows
-from neusee.nodes.doe._height_error import height_error
 from neusee.nodes.doe._height_map_files import read_height_map, size_metadata
-from neusee.nodes.doe._minimum_feature import smooth
-from neusee.nodes.doe._parametrisations import PARAMETRISATIONS, Drawn, Modes, Pixels, Rings, Written
-from neusee.nodes.doe._polynomial_height_maps import LearntStop, Polynomials, Streak
+from neusee.nodes.doe._parametrisations import (
+    PARAMETRISATIONS,
+    Drawn,
+    LearntStop,
+    Modes,
+    Pixels,
+    Polynomials,
+    Rings,
+    Streak,
+    Written,
+)
 from neusee.nodes.doe._refractive_index import Glass, Material, index_curve, material, wave_height
 from neusee.nodes.doe._sampled_height_map import height_map, pixelwise
-from neusee.nodes.doe._shade import shade
+from neusee.nodes.doe._shade import equal_filter, shade
 from neusee.nodes.doe._unet_height_map import unet
 
 __all__ = [

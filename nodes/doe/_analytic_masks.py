@@ -11,8 +11,13 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import node
-from neusee.nodes.doe._height_from_phase import height_checks, height_from_phase
-from neusee.nodes.doe._refractive_index import AnyGlass, Glass, refuse_material
+from neusee.nodes.doe._refractive_index import (
+    AnyGlass,
+    Glass,
+    height_checks,
+    height_from_phase,
+    refuse_material,
+)
 from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, polar
 from neusee.nodes.optics._zernike import surface
 from neusee.nodes.units import Angle, Charge, Count, Height, Slope, Wavelength
@@ -32,8 +37,11 @@ def flat(stop: Stop) -> Tensor:
 
 
 @node()
-def vortex(stop: Stop, *, charge: Charge, wavelength: Wavelength = 550e-9, material: Glass = "fused silica") -> Tensor:
-    """Return the height map of a vortex, phi = charge * theta, whose phase ramp has its step on the -u axis.
+def vortex(
+    stop: Stop, *, charge: Charge, wavelength: Wavelength = 550e-9, material: Glass = "fused silica"
+) -> Tensor:
+    """Return the height map of a vortex, phi = charge * theta, whose phase ramp has its step on the
+    -u axis.
 
     Shapes: stop -> (v, u).
     Units:  m.
@@ -45,8 +53,11 @@ def vortex(stop: Stop, *, charge: Charge, wavelength: Wavelength = 550e-9, mater
 
 
 @node()
-def axicon(stop: Stop, *, waves: Slope, wavelength: Wavelength = 550e-9, material: Glass = "fused silica") -> Tensor:
-    """Return the height map of an axicon, phi = 2 pi waves r, which turns the focal spot into a ring.
+def axicon(
+    stop: Stop, *, waves: Slope, wavelength: Wavelength = 550e-9, material: Glass = "fused silica"
+) -> Tensor:
+    """Return the height map of an axicon, phi = 2 pi waves r, which turns the focal spot into a
+    ring.
 
     Shapes: stop -> (v, u).
     Units:  waves at the rim; result m.
@@ -59,7 +70,12 @@ def axicon(stop: Stop, *, waves: Slope, wavelength: Wavelength = 550e-9, materia
 
 @node()
 def spiral_axicon(
-    stop: Stop, *, waves: Slope, charge: Charge, wavelength: Wavelength = 550e-9, material: Glass = "fused silica"
+    stop: Stop,
+    *,
+    waves: Slope,
+    charge: Charge,
+    wavelength: Wavelength = 550e-9,
+    material: Glass = "fused silica",
 ) -> Tensor:
     """Return the height map of an axicon with a vortex: phi = 2 pi waves r + charge * theta.
 
@@ -70,12 +86,17 @@ def spiral_axicon(
     """
     grid = grid_of(stop)
     radius, azimuth = polar(grid)
-    return height_from_phase(2 * math.pi * waves * radius + charge * azimuth, grid, wavelength, material)
+    return height_from_phase(
+        2 * math.pi * waves * radius + charge * azimuth, grid, wavelength, material
+    )
 
 
 @node()
-def cubic(stop: Stop, *, waves: Slope, wavelength: Wavelength = 550e-9, material: Glass = "fused silica") -> Tensor:
-    """Return the height map of phi = 2 pi waves (u**3 + v**3), which gives an MTF without zeros over a long focus.
+def cubic(
+    stop: Stop, *, waves: Slope, wavelength: Wavelength = 550e-9, material: Glass = "fused silica"
+) -> Tensor:
+    """Return the height map of phi = 2 pi waves (u**3 + v**3), which gives an MTF without zeros
+    over a long focus.
 
     Shapes: stop -> (v, u).
     Units:  waves at the rim on an axis; result m.
@@ -87,7 +108,9 @@ def cubic(stop: Stop, *, waves: Slope, wavelength: Wavelength = 550e-9, material
     return height_from_phase(2 * math.pi * waves * (u**3 + v**3), grid, wavelength, material)
 
 
-def _half_rings(grid: PupilGrid, waves: tuple[float, ...], alternate: bool, orientation: float) -> Tensor:
+def _half_rings(
+    grid: PupilGrid, waves: tuple[float, ...], alternate: bool, orientation: float
+) -> Tensor:
     """Return the phase of the half-ring mask, in rad."""
     v, u = axes(grid)
     square = v.square() + u.square()
@@ -108,18 +131,23 @@ def half_rings(
     wavelength: Wavelength = 550e-9,
     material: Glass = "fused silica",
 ) -> Tensor:
-    """Return the height map that focuses each annulus to half a ring: phi = 2 pi a r sgn(cos(theta - orientation)).
+    """Return the height map that focuses each annulus to half a ring: phi = 2 pi a r sgn(cos(theta
+    - orientation)).
 
-    Each annulus of equal area has one slope a, from the axis outwards; ``alternate`` flips the side of every second
-    annulus. The phase is odd about the axis, so the amplitude of the point-spread function is real.
+    Each annulus of equal area has one slope a, from the axis outwards; ``alternate`` flips the side
+    of every second annulus. The phase is odd about the axis, so the amplitude of the point-spread
+    function is real.
 
     Shapes: stop -> (v, u).
     Units:  waves at the rim; orientation rad; result m.
     Error:  1e-7 of the height (float32).
-    Source: our reading of Wirth et al., Opt. Lett. 45, 2179 (2020), whose formula we could not consult.
+    Source: our reading of Wirth et al., Opt. Lett. 45, 2179 (2020), whose formula we could not
+            consult.
     """
     grid = grid_of(stop)
-    return height_from_phase(_half_rings(grid, waves, alternate, orientation), grid, wavelength, material)
+    return height_from_phase(
+        _half_rings(grid, waves, alternate, orientation), grid, wavelength, material
+    )
 
 
 @node()
@@ -130,7 +158,8 @@ def zernike(
     wavelength: Wavelength = 550e-9,
     material: Glass = "fused silica",
 ) -> Tensor:
-    """Return the height map of a sum of Zernike polynomials, given root mean square optical paths by Noll number.
+    """Return the height map of a sum of Zernike polynomials, given root mean square optical paths
+    by Noll number.
 
     Shapes: stop -> (v, u).
     Units:  m of optical path at ``wavelength``; result m of height.
@@ -142,7 +171,9 @@ def zernike(
     return height_from_phase(phase, grid, wavelength, material)
 
 
-def _refuse_wavelength(*, wavelength: float = 550e-9, material: AnyGlass = "fused silica", **params: Any) -> list[str]:
+def _refuse_wavelength(
+    *, wavelength: float = 550e-9, material: AnyGlass = "fused silica", **params: Any
+) -> list[str]:
     return refuse_material("wavelength", material, torch.tensor([wavelength], dtype=torch.float64))
 
 

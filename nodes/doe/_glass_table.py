@@ -1,4 +1,6 @@
-"""The refractive index of a glass of the user: Sellmeier coefficients, or a table of the index by wavelength."""
+"""The refractive index of a glass of the user: Sellmeier coefficients, or a table of the index
+by wavelength.
+"""
 
 import re
 from pathlib import Path
@@ -11,21 +13,32 @@ from typing_extensions import TypedDict
 
 from neusee.nodes import ParameterError
 from neusee.nodes.input_files import once_per_version
-from neusee.nodes.spectra._spectral_tables import Table
+from neusee.nodes.spectra._cie_tables import Table
 from neusee.nodes.spectra._table_files import LENGTHS, Curves, Rows, curves, refused, table_rows
 from neusee.nodes.units import Real, Wavelength
 
-_AREAS = {"um^2": 1.0, "um2": 1.0, "µm^2": 1.0, "µm2": 1.0, "µm²": 1.0, "um²": 1.0, "nm^2": 1e-6, "nm2": 1e-6}
+_AREAS = {
+    "um^2": 1.0,
+    "um2": 1.0,
+    "µm^2": 1.0,
+    "µm2": 1.0,
+    "µm²": 1.0,
+    "um²": 1.0,
+    "nm^2": 1e-6,
+    "nm2": 1e-6,
+}
 _COLUMNS = (
-    "write a header such as wavelength (um),n (1) and two columns, or B (1),C (um^2),from (nm),to (nm) with one row "
-    "for each term of the Sellmeier formula"
+    "write a header such as wavelength (um),n (1) and two columns, or B (1),C (um^2),from (nm),to"
+    " (nm) with one row for each term of the Sellmeier formula"
 )
 _FROM_AIR, _LARGEST = 1.0, 5.0  #: no glass has an index outside these
 _AREA = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*)")
 
 
 def _area(value: Any) -> float:
-    """Return an area in um^2 from a text with a unit, such as ``0.0135 um^2``; raise ValueError for other values."""
+    """Return an area in um^2 from a text with a unit, such as ``0.0135 um^2``; raise ValueError
+    for other values.
+    """
     match = _AREA.fullmatch(str(value).strip())
     if match is None or isinstance(value, bool):
         raise ValueError("is not a quantity: write a number and a unit, such as '0.0135 um^2'")
@@ -39,7 +52,9 @@ Area = Annotated[float, BeforeValidator(_area, json_schema_input_type=str)]  #: 
 
 @with_config(ConfigDict(extra="forbid"))
 class Sellmeier(TypedDict):
-    """Coefficients of n^2 = 1 + sum of B w^2 / (w^2 - C), and the range of wavelengths over which they were fitted."""
+    """Coefficients of n^2 = 1 + sum of B w^2 / (w^2 - C), and the range of wavelengths over
+    which they were fitted.
+    """
 
     B: Annotated[tuple[Real, ...], Field(min_length=1)]
     C: tuple[Area, ...]  #: um^2
@@ -60,7 +75,8 @@ SELLMEIER_SCHEMA = {
 
 
 def glass_index(glass: Path | Sellmeier, wavelengths: Tensor) -> Tensor:
-    """Return the refractive index of a glass at wavelengths in m; the result is differentiable and keeps the dtype.
+    """Return the refractive index of a glass at wavelengths in m; the result is differentiable and
+    keeps the dtype.
 
     Raises ValueError for wavelengths outside the range of the table or the coefficients.
     """
@@ -70,31 +86,39 @@ def glass_index(glass: Path | Sellmeier, wavelengths: Tensor) -> Tensor:
         outside = f"{first * 1e9:.5g} nm" if first < low else f"{last * 1e9:.5g} nm"
         extent = f"{low * 1e9:.5g} to {high * 1e9:.5g} nm"
         fix = "an index is not extrapolated: give a longer range, or other wavelengths"
-        raise ValueError(f"the index of {_name(glass)} is known from {extent}, not at {outside}; {fix}")
-    known = _from_file(glass) if isinstance(glass, Path) else glass
-    return _interpolated(known, wavelengths) if isinstance(known, Table) else _formula(known, wavelengths)
+        raise ValueError(
+            f"the index of {_name(glass)} is known from {extent}, not at {outside}; {fix}"
+        )
+    index_data = _from_file(glass) if isinstance(glass, Path) else glass
+    return (
+        _interpolated(index_data, wavelengths)
+        if isinstance(index_data, Table)
+        else _formula(index_data, wavelengths)
+    )
 
 
 def glass_range(glass: Path | Sellmeier) -> tuple[float, float]:
     """Return the wavelengths in m between which the index of a glass is known."""
-    known = _from_file(glass) if isinstance(glass, Path) else glass
-    if isinstance(known, Table):
-        return float(known.wavelengths[0]), float(known.wavelengths[-1])
-    return known["range"]
+    index_data = _from_file(glass) if isinstance(glass, Path) else glass
+    if isinstance(index_data, Table):
+        return float(index_data.wavelengths[0]), float(index_data.wavelengths[-1])
+    return index_data["range"]
 
 
 def index_rows(file: Path) -> tuple[Tensor, Tensor] | None:
-    """Return the wavelengths in m and the indices in the rows of a file, or None for a file of coefficients."""
-    known = _from_file(file)
-    return (known.wavelengths, known.values[0]) if isinstance(known, Table) else None
+    """Return the wavelengths in m and the indices in the rows of a file, or None for a file of
+    coefficients.
+    """
+    index_data = _from_file(file)
+    return (index_data.wavelengths, index_data.values[0]) if isinstance(index_data, Table) else None
 
 
 def refuse_glass(glass: Path | Sellmeier) -> None:
     """Raise ParameterError for a glass without a plausible index anywhere in its range."""
     try:
-        known = _from_file(glass) if isinstance(glass, Path) else glass
-        if not isinstance(known, Table):
-            _refuse_coefficients(known, _name(glass))
+        index_data = _from_file(glass) if isinstance(glass, Path) else glass
+        if not isinstance(index_data, Table):
+            _refuse_coefficients(index_data, _name(glass))
     except (OSError, ValueError) as error:
         if isinstance(glass, Path):
             raise refused("material", _COLUMNS, error) from None
@@ -106,20 +130,27 @@ def _name(glass: Path | Sellmeier) -> str:
 
 
 def _refuse_coefficients(glass: Sellmeier, name: str) -> None:
-    """Raise ValueError for coefficients that give no plausible index at some wavelength of their range."""
+    """Raise ValueError for coefficients that give no plausible index at some wavelength of their
+    range.
+    """
     low, high = glass["range"]
     if len(glass["B"]) != len(glass["C"]):
-        raise ValueError(f"{len(glass['B'])} coefficients B for {len(glass['C'])} C: give one C for each B")
+        raise ValueError(
+            f"{len(glass['B'])} coefficients B for {len(glass['C'])} C: give one C for each B"
+        )
     if not low < high:
         raise ValueError(
-            f"the range {low * 1e9:g} to {high * 1e9:g} nm of {name} is empty: exchange the two wavelengths"
+            f"the range {low * 1e9:g} to {high * 1e9:g} nm of {name} is empty: exchange the two"
+            " wavelengths"
         )
     index = _formula(glass, torch.linspace(low, high, 1001, dtype=torch.float64))
     wrong = ~((index > _FROM_AIR) & (index < _LARGEST))
     if wrong.any():
         worst = low + (high - low) * int(wrong.nonzero()[0]) / 1000
         fix = "give C in um^2 as in a data sheet, not its root, and a range without resonance"
-        raise ValueError(f"{name} give no index between 1 and {_LARGEST:g} at {worst * 1e9:.4g} nm: {fix}")
+        raise ValueError(
+            f"{name} give no index between 1 and {_LARGEST:g} at {worst * 1e9:.4g} nm: {fix}"
+        )
 
 
 def _formula(glass: Sellmeier, wavelengths: Tensor) -> Tensor:
@@ -129,14 +160,16 @@ def _formula(glass: Sellmeier, wavelengths: Tensor) -> Tensor:
 
 
 def _interpolated(table: Table, wavelengths: Tensor) -> Tensor:
-    """Interpolate a table by the polynomial through the four nearest rows, or through all rows if there are fewer."""
+    """Interpolate a table by the polynomial through the four nearest rows, or through all rows
+    if there are fewer.
+    """
     count = min(4, len(table.wavelengths))
-    at, values = table.wavelengths.to(wavelengths), table.values[0].to(wavelengths)
+    table_wavelengths, values = table.wavelengths.to(wavelengths), table.values[0].to(wavelengths)
     flat = wavelengths.reshape(-1)
-    right = torch.searchsorted(at, flat.detach())
-    first = (right - count // 2).clamp(0, len(at) - count)
+    right = torch.searchsorted(table_wavelengths, flat.detach())
+    first = (right - count // 2).clamp(0, len(table_wavelengths) - count)
     rows = first[:, None] + torch.arange(count, device=flat.device)
-    x, y = at[rows], values[rows]
+    x, y = table_wavelengths[rows], values[rows]
     apart = x[:, :, None] - x[:, None, :]
     own = torch.eye(count, dtype=torch.bool, device=flat.device)
     ratios = (flat[:, None, None] - x[:, None, :]) / apart.masked_fill(own, 1.0)
@@ -150,48 +183,64 @@ def _from_file(file: Path) -> Table | Sellmeier:
     rows = table_rows(file)
     if rows.columns[0].quantity.upper() == "B":
         return _coefficients(file, rows)
-    found = curves(file, ("1",))
-    if len(found.values) != 1:
-        raise ValueError(f"{file.name} has {len(found.values) + 1} columns in place of 2")
-    low = (found.values <= _FROM_AIR) | (found.values >= _LARGEST)
-    found.refuse(low, lambda n: f"{n:g} is no refractive index: write n, between 1 and {_LARGEST:g}, and not n - 1")
-    _refuse_gap(found)
-    return found.table()
+    index_curve = curves(file, ("1",))
+    if len(index_curve.values) != 1:
+        raise ValueError(f"{file.name} has {len(index_curve.values) + 1} columns in place of 2")
+    low = (index_curve.values <= _FROM_AIR) | (index_curve.values >= _LARGEST)
+    index_curve.refuse(
+        low,
+        lambda n: (
+            f"{n:g} is no refractive index: write n, between 1 and {_LARGEST:g}, and not n - 1"
+        ),
+    )
+    _refuse_gap(index_curve)
+    return index_curve.table()
 
 
-def _refuse_gap(found: Curves) -> None:
-    """Raise ValueError for a gap between two rows in which the cubic leaves the straight line by more than half a step.
+def _refuse_gap(index_curve: Curves) -> None:
+    """Raise ValueError for a gap between two rows in which the cubic leaves the straight line by
+    more than half a step.
 
-    The step is the largest of the gap and its neighbours. A few rows close together decide the slope in a wide gap.
+    The step is the largest of the gap and its neighbours. A few rows close together decide the
+    slope in a wide gap.
     """
-    table = found.table()
-    at, values = table.wavelengths, table.values[0]
-    middle = (at[1:] + at[:-1]) / 2
+    table = index_curve.table()
+    wavelengths, values = table.wavelengths, table.values[0]
+    middle = (wavelengths[1:] + wavelengths[:-1]) / 2
     off = (_interpolated(table, middle) - (values[1:] + values[:-1]) / 2).abs()
     steps = torch.nn.functional.pad(values.diff().abs(), (1, 1))
     wrong = (off > 1e-5 + torch.stack([steps[:-2], steps[1:-1], steps[2:]]).amax(0) / 2).nonzero()
     if len(wrong):
         row = int(wrong[0])
-        ends = f"{float(at[row]) * 1e9:g} and {float(at[row + 1]) * 1e9:g} nm"
+        ends = f"{float(wavelengths[row]) * 1e9:g} and {float(wavelengths[row + 1]) * 1e9:g} nm"
         fix = "give rows there, in steps as small as beside the gap"
         raise ValueError(
-            f"{found.file.name}:{found.lines[row + 1]}: the rows do not tell the index between {ends}: {fix}"
+            f"{index_curve.file.name}:{index_curve.lines[row + 1]}: the rows do not tell the"
+            f" index between {ends}: {fix}"
         )
 
 
 def _coefficients(file: Path, rows: Rows) -> Sellmeier:
     names = [column.quantity.lower() for column in rows.columns]
     if names != ["b", "c", "from", "to"]:
-        raise ValueError(f"{file.name} has the columns {', '.join(c.heading for c in rows.columns)}")
+        raise ValueError(
+            f"{file.name} has the columns {', '.join(c.heading for c in rows.columns)}"
+        )
     _, c, low, high = (column.unit for column in rows.columns)
     if c not in _AREAS or low not in LENGTHS or high not in LENGTHS:
-        raise ValueError(f"{file.name}: C needs a unit such as um^2, and from and to need a unit such as nm")
+        raise ValueError(
+            f"{file.name}: C needs a unit such as um^2, and from and to need a unit such as nm"
+        )
     values = rows.values
     if len({tuple(row) for row in values[:, 2:]}) > 1:
-        raise ValueError(f"{file.name}: from and to differ between the rows: repeat the one range in each row")
+        raise ValueError(
+            f"{file.name}: from and to differ between the rows: repeat the one range in each row"
+        )
     ends = float(values[0, 2]) * LENGTHS[low], float(values[0, 3]) * LENGTHS[high]
     glass = Sellmeier(
-        B=tuple(map(float, values[:, 0])), C=tuple(float(x) * _AREAS[c] for x in values[:, 1]), range=ends
+        B=tuple(map(float, values[:, 0])),
+        C=tuple(float(x) * _AREAS[c] for x in values[:, 1]),
+        range=ends,
     )
     _refuse_coefficients(glass, f"{file.name}: the coefficients")
     return glass

@@ -1,8 +1,9 @@
 """Files with the height map of a mask: .npy, .safetensors, grey .png, .exr and .mat.
 
-Beside the heights, a file other than .npy may state ``unit``, the height of the value 1, ``depth``, the height of white
-in a .png, and ``pitch``, the distance of the samples, each as a text with a unit, such as ``1 um``. These stand in the
-metadata of .safetensors, in a text chunk of .png, in the header of .exr and in a variable of .mat.
+Beside the heights, a file other than .npy may state ``unit``, the height of the value 1, ``depth``,
+the height of white in a .png, and ``pitch``, the distance of the samples, each as a text with a
+unit, such as ``1 um``. These stand in the metadata of .safetensors, in a text chunk of .png, in the
+header of .exr and in a variable of .mat.
 """
 
 from pathlib import Path
@@ -14,22 +15,38 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.nodes import ParameterError
-from neusee.nodes.array_bytes import mat_needs, npy_needs, safetensors_need
-from neusee.nodes.input_files import once_per_version, refuse_large_array
-from neusee.nodes.input_size import head_of, refuse_other_than_file
-from neusee.nodes.picture_bytes import picture_needs
+from neusee.nodes.file_headers import mat_needs, npy_needs, picture_needs, safetensors_need
+from neusee.nodes.input_files import (
+    head_of,
+    once_per_version,
+    refuse_large_array,
+    refuse_other_than_file,
+)
 from neusee.nodes.scene._spectral_exr import exr_header, exr_parts
 from neusee.nodes.units import read_quantity
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-_GREYS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}  #: the level of white in each mode of a grey picture
+#: the level of white in each mode of a grey picture
+_GREYS = {"L": 255, "I;16": 65535, "I;16B": 65535, "I": 65535}
 _WORDS = ("unit", "depth", "pitch")  #: what a file may state beside the heights
 _HALF = ("float16", "F16", "BF16")  #: names of types with 8 or 11 bits
 _SINGLE = 4  #: bytes of a height
 _MAT_73 = b"MATLAB 7.3 MAT-file"
-_REAL_MAT = {"double", "single", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "logical"}
+_REAL_MAT = {
+    "double",
+    "single",
+    "int8",
+    "int16",
+    "int32",
+    "int64",
+    "uint8",
+    "uint16",
+    "uint32",
+    "uint64",
+    "logical",
+}
 
 
 class MapHeader(NamedTuple):
@@ -40,7 +57,9 @@ class MapHeader(NamedTuple):
 
 
 def size_metadata(pitch: float) -> dict[str, str]:
-    """Return the metadata of a .safetensors file whose samples are ``pitch`` m apart, as `map_header` reads it."""
+    """Return the metadata of a .safetensors file whose samples are ``pitch`` m apart, as
+    `map_header` reads it.
+    """
     return {"pitch": f"{pitch * 1e6:.12g} um"}
 
 
@@ -52,7 +71,8 @@ def map_header(file: Path) -> MapHeader:
     suffix = file.suffix.lower()
     if suffix not in _HEADERS:
         raise ParameterError(
-            "file", f"{file.name}: a height map is read from .exr, .mat, .npy, .safetensors or grey .png"
+            "file",
+            f"{file.name}: a height map is read from .exr, .mat, .npy, .safetensors or grey .png",
         )
     refuse_other_than_file(file)
     try:
@@ -60,7 +80,9 @@ def map_header(file: Path) -> MapHeader:
     except ParameterError:
         raise
     except (SafetensorError, OSError, ValueError, EOFError, SyntaxError, RuntimeError) as error:
-        raise ParameterError("file", f"{file.name} cannot be read as a height map: {error}") from error
+        raise ParameterError(
+            "file", f"{file.name} cannot be read as a height map: {error}"
+        ) from error
     refuse_large_array(file, header.shape)
     return header
 
@@ -68,7 +90,8 @@ def map_header(file: Path) -> MapHeader:
 def read_height_map(file: Path, depth: float, unit: float = 1.0) -> Tensor:
     """Read a height map in m, float32, from a file.
 
-    ``depth`` is the height of white in a picture, and ``unit`` the height of the value 1 in any other file.
+    ``depth`` is the height of white in a picture, and ``unit`` the height of the value 1 in any
+    other file.
     """
     suffix = file.suffix.lower()
     if suffix == ".png":
@@ -98,17 +121,21 @@ def _array(file: Path, suffix: str) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(_native(values)))
 
 
-def _stated(file: Path, found: dict[str, Any]) -> dict[str, float]:
+def _stated(file: Path, header: dict[str, Any]) -> dict[str, float]:
     """Return the lengths, in m, that the header of a file states as texts with a unit."""
     lengths = {}
     for word in _WORDS:
-        if word in found:
+        if word in header:
             try:
-                lengths[word] = read_quantity(found[word], "m")
+                lengths[word] = read_quantity(header[word], "m")
             except ValueError as error:
-                raise ParameterError("file", f"{file.name}: {word} = {found[word]} in the header {error}") from None
+                raise ParameterError(
+                    "file", f"{file.name}: {word} = {header[word]} in the header {error}"
+                ) from None
             if lengths[word] <= 0:
-                raise ParameterError("file", f"{file.name}: {word} = {found[word]} in the header must be above 0")
+                raise ParameterError(
+                    "file", f"{file.name}: {word} = {header[word]} in the header must be above 0"
+                )
     return lengths
 
 
@@ -133,14 +160,17 @@ def _safetensors(file: Path) -> MapHeader:
 def _png(file: Path) -> MapHeader:
     with _levels(file) as picture:
         return MapHeader(
-            (picture.height, picture.width), _stated(file, {str(word): text for word, text in picture.info.items()})
+            (picture.height, picture.width),
+            _stated(file, {str(word): text for word, text in picture.info.items()}),
         )
 
 
 def _exr(file: Path) -> MapHeader:
     header, _, size = exr_header(file)
     refuse_large_array(file, size)
-    _refuse_other_than_numbers(file, str(_array(file, ".exr").dtype).removeprefix("torch."), real=True)
+    _refuse_other_than_numbers(
+        file, str(_array(file, ".exr").dtype).removeprefix("torch."), real=True
+    )
     return MapHeader(size, _stated(file, header))
 
 
@@ -151,20 +181,27 @@ def _mat(file: Path) -> MapHeader:
     if np.iscomplexobj(_mat_value(file, name)):  # the header of a .mat file does not say
         _refuse_other_than_numbers(file, "complex", real=False)
     words = {word: _mat_value(file, word) for word in _WORDS if word in _mat_listed(file)}
-    return MapHeader(size, _stated(file, {word: " ".join(map(str, np.ravel(text))) for word, text in words.items()}))
+    return MapHeader(
+        size,
+        _stated(file, {word: " ".join(map(str, np.ravel(text))) for word, text in words.items()}),
+    )
 
 
 _HEADERS = {".npy": _npy, ".safetensors": _safetensors, ".png": _png, ".exr": _exr, ".mat": _mat}
 
 
 def _refuse_other_than_numbers(file: Path, kind: str, real: bool) -> None:
-    """Raise ParameterError for values that are not real numbers, or that are too coarse for heights."""
+    """Raise ParameterError for values that are not real numbers, or that are too coarse for
+    heights.
+    """
     if not real:
         text = f"{file.name} holds values of type {kind}: save the heights as real numbers, in m"
         raise ParameterError("file", text)
     if kind in _HALF:
         coarse = "which resolve 1/2000 of a height, and no height below 0.06 um in m"
-        raise ParameterError("file", f"{file.name} holds 16-bit floats ({kind}), {coarse}: save 32-bit floats")
+        raise ParameterError(
+            "file", f"{file.name} holds 16-bit floats ({kind}), {coarse}: save 32-bit floats"
+        )
 
 
 def _levels(file: Path) -> "Image":
@@ -176,7 +213,9 @@ def _levels(file: Path) -> "Image":
     if picture.mode not in _GREYS:
         picture.close()
         raise ParameterError(
-            "file", f"{file.name} is {picture.mode}, not grey: store one grey level per sample, in 8 or 16 bits"
+            "file",
+            f"{file.name} is {picture.mode}, not grey: store one grey level per sample, in 8 or 16"
+            " bits",
         )
     picture_needs(file, picture, 8 + 8 + _SINGLE)  # levels and heights in float64, and the result
     return picture
@@ -185,8 +224,10 @@ def _levels(file: Path) -> "Image":
 def _name(file: Path, names: list[str]) -> str:
     if "height" in names or len(names) == 1:
         return "height" if "height" in names else names[0]
-    found = ", ".join(sorted(names)) or "nothing"
-    raise ParameterError("file", f"{file.name} holds {found}: name the tensor of the height map 'height'")
+    tensors = ", ".join(sorted(names)) or "nothing"
+    raise ParameterError(
+        "file", f"{file.name} holds {tensors}: name the tensor of the height map 'height'"
+    )
 
 
 def _mat_listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
@@ -195,16 +236,27 @@ def _mat_listed(file: Path) -> dict[str, tuple[tuple[int, ...], str]]:
 
     if head_of(file, len(_MAT_73)) == _MAT_73:
         fix = f"save it in MATLAB by save('{file.name}', 'height', '-v7')"
-        raise ParameterError("file", f"{file.name} is a .mat file of version 7.3, which is HDF5: {fix}")
+        raise ParameterError(
+            "file", f"{file.name} is a .mat file of version 7.3, which is HDF5: {fix}"
+        )
     mat_needs(file)
     try:
         return {name: (tuple(size), kind) for name, size, kind in whosmat(file)}
     except Exception as error:  # scipy raises many kinds of errors for foreign bytes
-        raise ParameterError("file", f"{file.name} cannot be read as a .mat file: {error}") from None
+        raise ParameterError(
+            "file", f"{file.name} cannot be read as a .mat file: {error}"
+        ) from None
 
 
 def _mat_name(file: Path) -> str:
-    return _name(file, [name for name, (_, kind) in _mat_listed(file).items() if name not in _WORDS or kind != "char"])
+    return _name(
+        file,
+        [
+            name
+            for name, (_, kind) in _mat_listed(file).items()
+            if name not in _WORDS or kind != "char"
+        ],
+    )
 
 
 def _mat_value(file: Path, name: str) -> NDArray[Any]:

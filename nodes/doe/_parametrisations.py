@@ -1,44 +1,65 @@
-"""Trainable height maps: pixels, Zernike polynomials, rings and a network, each for any sampling of the pupil.
-
-A module is called with the stop and returns the height map (v, u), float32 in m, at least 0. The trained numbers do not
-depend on the sampling, so that a mask that was trained on few samples can be evaluated on many samples.
-"""
+"""Trainable height maps: pixels, polynomials, rings and a network, at any sampling."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from neusee.nodes.bicubic_resize import enlarge
-from neusee.nodes.doe._analytic_masks import axicon, cubic, half_rings, spiral_axicon, vortex, zernike
-from neusee.nodes.doe._height_from_phase import height_from_phase
-from neusee.nodes.doe._minimum_feature import smooth
-from neusee.nodes.doe._refractive_index import Material
+from neusee.nodes.doe._analytic_masks import (
+    axicon,
+    cubic,
+    half_rings,
+    spiral_axicon,
+    vortex,
+    zernike,
+)
+from neusee.nodes.doe._fabrication import smooth
+from neusee.nodes.doe._refractive_index import Material, height_from_phase
 from neusee.nodes.doe._sampled_height_map import height_range, pixelwise
 from neusee.nodes.doe._unet_height_map import HeightNet, fresh, height_of
 from neusee.nodes.network_weights import loaded
-from neusee.nodes.optics._phase_screen import screen
 from neusee.nodes.optics._pupil_grid import PupilGrid, axes, grid_of, inside, pupil_grid
-from neusee.nodes.optics._zernike import combine
+from neusee.nodes.optics._zernike import combine, screen
+from neusee.nodes.resampling import enlarge
 from neusee.nodes.values import Stop
 
+# --- parametrisations -----------------------------------------------------------------------------
+
+# Trainable height maps: pixels, Zernike polynomials, rings and a network, each for any sampling of
+# the pupil.
+#
+# A module is called with the stop and returns the height map (v, u), float32 in m, at least 0. The
+# trained numbers do not depend on the sampling, so that a mask that was trained on few samples can
+# be evaluated on many samples.
+
+
 Make = Callable[[Stop], Tensor]
-Start = Callable[[Stop, Mapping[str, Any], torch.Generator], nn.Module]  #: from a stop and parameters of a node
-_END = 0.01  #: share of the depth at both ends that a start avoids, because the sigmoid has almost no slope there
+#: from a stop and parameters of a node
+Start = Callable[[Stop, Mapping[str, Any], torch.Generator], nn.Module]
+#: share of the depth at both ends that a start avoids, because the sigmoid has almost no slope
+#: there
+_END = 0.01
 _ROOM = 0.05  #: share of a formula's depth that is free above and below its height map
 
 
 class Pixels(nn.Module):
-    """A trainable height map of ``grid`` x ``grid`` pixels, limited to ``max_height`` by a sigmoid, resampled smoothly.
+    """A trainable height map of ``grid`` x ``grid`` pixels, limited to ``max_height`` by a sigmoid,
+    resampled smoothly.
 
-    The heights start from a smooth random height map with features of ``scale`` diameters, or from ``start``.
+    The heights start from a smooth random height map with features of ``scale`` diameters, or from
+    ``start``.
     """
 
     def __init__(
-        self, grid: int, max_height: float, scale: float, rng: torch.Generator, start: Tensor | None = None
+        self,
+        grid: int,
+        max_height: float,
+        scale: float,
+        rng: torch.Generator,
+        start: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.max_height = max_height
@@ -59,13 +80,16 @@ class Pixels(nn.Module):
 
 
 class Modes(nn.Module):
-    """A trainable height map of ``count`` Zernike polynomials from Noll number 4 on, with root mean squares in waves.
+    """A trainable height map of ``count`` Zernike polynomials from Noll number 4 on, with root mean
+    squares in waves.
 
-    Numbers 1 to 3 are absent: piston changes nothing, and tilt only shifts the spot. The start is a random sum of
-    ``waves`` root mean square.
+    Numbers 1 to 3 are absent: piston changes nothing, and tilt only shifts the spot. The start is a
+    random sum of ``waves`` root mean square.
     """
 
-    def __init__(self, count: int, waves: float, wavelength: float, material: Material, rng: torch.Generator) -> None:
+    def __init__(
+        self, count: int, waves: float, wavelength: float, material: Material, rng: torch.Generator
+    ) -> None:
         super().__init__()
         self.wavelength, self.material = wavelength, material
         drawn = torch.randn(count, generator=rng, dtype=torch.float64)
@@ -74,26 +98,39 @@ class Modes(nn.Module):
 
     def _polynomials_on(self, grid: PupilGrid) -> Tensor:
         v, u = axes(grid, self.waves.device)
-        each = [combine({4 + k: 1.0}, v, u).expand(grid.samples, grid.samples) for k in range(len(self.waves))]
-        return torch.stack(each).where(inside(grid, v.device), 0.0).to(torch.float32)
+        polynomials = [
+            combine({4 + k: 1.0}, v, u).expand(grid.samples, grid.samples)
+            for k in range(len(self.waves))
+        ]
+        return torch.stack(polynomials).where(inside(grid, v.device), 0.0).to(torch.float32)
 
     def forward(self, stop: Stop) -> Tensor:
         """Return the height map (v, u) on the pupil grid of ``stop``."""
         grid = grid_of(stop)
         basis = self._polynomials(grid)
         phase = (2 * math.pi * self.waves) @ basis.flatten(1)
-        return height_from_phase(phase.view(grid.samples, grid.samples), grid, self.wavelength, self.material)
+        return height_from_phase(
+            phase.view(grid.samples, grid.samples), grid, self.wavelength, self.material
+        )
 
 
 class Rings(nn.Module):
-    """A trainable height map of ``count`` annuli of equal area, each with a phase gradient a and a step c, in waves.
+    """A trainable height map of ``count`` annuli of equal area, each with a phase gradient a and a
+    step c, in waves.
 
-    phi = 2 pi (a r + c), times the sign of u if ``sided``. If ``count`` is a multiple of five, five half-rings are a
-    special case. The start has the slopes of the half-rings, alternating by fifths, plus ``noise`` random waves.
+    phi = 2 pi (a r + c), times the sign of u if ``sided``. If ``count`` is a multiple of five, five
+    half-rings are a special case. The start has the slopes of the half-rings, alternating by
+    fifths, plus ``noise`` random waves.
     """
 
     def __init__(
-        self, count: int, sided: bool, noise: float, wavelength: float, material: Material, rng: torch.Generator
+        self,
+        count: int,
+        sided: bool,
+        noise: float,
+        wavelength: float,
+        material: Material,
+        rng: torch.Generator,
     ) -> None:
         super().__init__()
         self.sided, self.wavelength, self.material = sided, wavelength, material
@@ -105,7 +142,12 @@ class Rings(nn.Module):
 
     def _annuli_on(self, grid: PupilGrid) -> Tensor:
         v, u = axes(grid, self.slopes.device)
-        return ((v.square() + u.square()) * len(self.slopes)).floor().long().clamp(max=len(self.slopes) - 1)
+        return (
+            ((v.square() + u.square()) * len(self.slopes))
+            .floor()
+            .long()
+            .clamp(max=len(self.slopes) - 1)
+        )
 
     def forward(self, stop: Stop) -> Tensor:
         """Return the height map (v, u) on the pupil grid of ``stop``."""
@@ -118,10 +160,17 @@ class Rings(nn.Module):
 
 
 class Drawn(nn.Module):
-    """A trainable height map on ``grid`` samples, from the network ``net`` of `doe.unet` or a new random network."""
+    """A trainable height map on ``grid`` samples, from the network ``net`` of `doe.unet` or a
+    new random network.
+    """
 
     def __init__(
-        self, width: int, grid: int, max_height: float, rng: torch.Generator, net: HeightNet | None = None
+        self,
+        width: int,
+        grid: int,
+        max_height: float,
+        rng: torch.Generator,
+        net: HeightNet | None = None,
     ) -> None:
         super().__init__()
         self.grid, self.max_height, self.net = grid, max_height, net or fresh(width, grid, rng)
@@ -132,7 +181,9 @@ class Drawn(nn.Module):
 
 
 class Written(nn.Module):
-    """A height map smoothed by `doe.smooth` to ``feature``, so that training uses no details too fine for the tool."""
+    """A height map smoothed by `doe.smooth` to ``feature``, so that training uses no details too
+    fine for the tool.
+    """
 
     def __init__(self, shape: Make, feature: float) -> None:
         super().__init__()
@@ -144,7 +195,7 @@ class Written(nn.Module):
         return height
 
 
-# --- the start, from a step -------------------------------------------------------------------------------------------
+# --- the start, from a step -----------------------------------------------------------------------
 
 
 def _pixels(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
@@ -154,26 +205,154 @@ def _pixels(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Pixe
 
 
 def _freed(mask: Callable[..., Tensor]) -> Start:
-    """Return a function that starts trainable pixels at a formula's height map, away from the ends of their sigmoid."""
+    """Return a function that starts trainable pixels at a formula's height map, away from the
+    ends of their sigmoid.
+    """
 
     def start(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Pixels:
         height = mask(stop, **params)
         room = _ROOM * float(height.amax())
-        return Pixels(int(stop.samples), float(height.amax()) + 2 * room, 1.0, rng, (height + room).to(rng.device))
+        return Pixels(
+            int(stop.samples),
+            float(height.amax()) + 2 * room,
+            1.0,
+            rng,
+            (height + room).to(rng.device),
+        )
 
     return start
 
 
 def _drawn(stop: Stop, params: Mapping[str, Any], rng: torch.Generator) -> Drawn:
-    width, grid, weights = params["width"], min(params["grid"], int(stop.samples)), params["weights"]
+    width, grid, weights = (
+        params["width"],
+        min(params["grid"], int(stop.samples)),
+        params["weights"],
+    )
     net = None if weights is None else loaded(lambda: HeightNet(width), weights).to(rng.device)
     return Drawn(width, grid, params["max_height"], rng, net)
 
 
-#: For each node, a function that returns a trainable height map, started at the height map of the node.
-#: `doe.flat` is absent because the suppression has no gradient at a flat height map.
+#: For each node, a function that returns a trainable height map, started at the height map of the
+#: node. `doe.flat` is absent because the suppression has no gradient at a flat height map.
 PARAMETRISATIONS: dict[str, Start] = {
     "doe.pixelwise": _pixels,
     "doe.unet": _drawn,
-    **{mask.path: _freed(mask) for mask in (half_rings, axicon, spiral_axicon, vortex, cubic, zernike)},
+    **{
+        mask.path: _freed(mask)
+        for mask in (half_rings, axicon, spiral_axicon, vortex, cubic, zernike)
+    },
 }
+
+
+# --- polynomial height maps -----------------------------------------------------------------------
+
+# Trainable height maps of few numbers: products of Legendre polynomials, and polynomials along one
+# direction.
+#
+# A module is called with the stop and returns the height map (v, u), float32 in m, at least 0, for
+# any sampling.
+
+
+def legendre(position: Tensor, degree: int) -> list[Tensor]:
+    """Return the Legendre polynomials of degree 0 to ``degree``, with a root mean square of 1
+    over [-1, 1].
+    """
+    plain = [torch.ones_like(position), position]
+    for k in range(1, degree):
+        plain.append(((2 * k + 1) * position * plain[k] - k * plain[k - 1]) / (k + 1))
+    return [math.sqrt(2 * k + 1) * polynomial for k, polynomial in enumerate(plain[: degree + 1])]
+
+
+class Polynomials(nn.Module):
+    """A trainable height map of products of Legendre polynomials in both axes of the pupil, up to a
+    total degree.
+
+    Piston and tilt are absent: piston changes nothing, and tilt only shifts the spot. Defocus,
+    astigmatism, coma and the cubic mask are special cases. The numbers are root mean squares in
+    waves over the square about the stop; the start is a random sum of ``waves`` root mean square.
+    """
+
+    def __init__(
+        self, degree: int, waves: float, wavelength: float, material: Material, rng: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.degree, self.wavelength, self.material = degree, wavelength, material
+        drawn = torch.randn(len(list(self._exponents())), generator=rng, dtype=torch.float64)
+        self.waves = nn.Parameter((waves * drawn / drawn.norm()).to(torch.float32))
+        self._products = lru_cache(maxsize=1)(self._products_on)
+
+    def _exponents(self) -> Iterator[tuple[int, int]]:
+        for total in range(2, self.degree + 1):
+            for i in range(total + 1):
+                yield i, total - i
+
+    def _products_on(self, grid: PupilGrid) -> Tensor:
+        rows, columns = (legendre(axis, self.degree) for axis in axes(grid, self.waves.device))
+        return torch.stack([rows[i] * columns[j] for i, j in self._exponents()]).to(torch.float32)
+
+    def forward(self, stop: Stop) -> Tensor:
+        """Return the height map (v, u) on the pupil grid of ``stop``."""
+        grid = grid_of(stop)
+        phase = torch.tensordot(2 * math.pi * self.waves, self._products(grid), 1)
+        return height_from_phase(phase, grid, self.wavelength, self.material)
+
+
+class Streak(nn.Module):
+    """A trainable height map that varies along one direction and throws the light into a line, as
+    cylinders do.
+
+    The phase is a sum of Legendre polynomials of degree 2 to ``degree`` in t = u cos a + v sin a.
+    Learnt are the angle ``a`` in radians and the root mean square of each polynomial in waves. The
+    start has a random angle and a random sum of ``waves`` root mean square.
+    """
+
+    def __init__(
+        self, degree: int, waves: float, wavelength: float, material: Material, rng: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.wavelength, self.material = wavelength, material
+        drawn = torch.randn(degree - 1, generator=rng, dtype=torch.float64)
+        self.waves = nn.Parameter((waves * drawn / drawn.norm()).to(torch.float32))
+        self.angle = nn.Parameter(
+            (math.pi * torch.rand(1, generator=rng, dtype=torch.float64)).to(torch.float32)
+        )
+
+    def forward(self, stop: Stop) -> Tensor:
+        """Return the height map (v, u) on the pupil grid of ``stop``."""
+        grid = grid_of(stop)
+        v, u = axes(grid, self.waves.device)
+        along = u * self.angle.cos() + v * self.angle.sin()
+        polynomials = legendre(along, len(self.waves) + 1)[2:]
+        phase = torch.tensordot(2 * math.pi * self.waves.to(along), torch.stack(polynomials), 1)
+        return height_from_phase(phase, grid, self.wavelength, self.material)
+
+
+class LearntStop(nn.Module):
+    """A round stop whose diameter is learnt, as a share of that of the lens, above ``least`` and at
+    most 1.
+
+    The rim is one sample wide, so that the amplitude has a gradient; `doe.shade` has a sharp rim.
+    """
+
+    def __init__(self, diameter: float = 0.95, least: float = 0.1) -> None:
+        super().__init__()
+        self.least = least
+        share = torch.tensor((diameter - least) / (1 - least), dtype=torch.float64)
+        self.logit = nn.Parameter(torch.logit(share).to(torch.float32).reshape(1))
+
+    def diameter(self) -> Tensor:
+        """Return the diameter of the stop over that of the lens, ()."""
+        share: Tensor = torch.sigmoid(self.logit)[0]
+        return self.least + (1 - self.least) * share
+
+    def forward(self, stop: Stop) -> Tensor:
+        """Return the amplitude (v, u) that the stop lets through on the pupil grid of ``stop``,
+        float32 in [0, 1].
+        """
+        grid = grid_of(stop)
+        v, u = axes(grid, self.logit.device)
+        samples = grid.diameter / grid.pitch
+        # a stop of diameter 1 is open up to the rim of the lens
+        rim = self.diameter().double() * (1 + 1 / samples)
+        return (0.5 + (rim - torch.hypot(v, u)) * (samples / 2)).clamp(0, 1).to(torch.float32)

@@ -4,14 +4,19 @@ from typing import Any
 
 from torch import Tensor
 
-from neusee.nodes.doe._analytic_masks import axicon, cubic, flat, half_rings, spiral_axicon, vortex, zernike
-from neusee.nodes.doe._equal_filter import equal_filter
-from neusee.nodes.doe._fabrication_limits import fabricate
-from neusee.nodes.doe._height_error import height_error
-from neusee.nodes.doe._minimum_feature import smooth
+from neusee.nodes.doe._analytic_masks import (
+    axicon,
+    cubic,
+    flat,
+    half_rings,
+    spiral_axicon,
+    vortex,
+    zernike,
+)
+from neusee.nodes.doe._fabrication import fabricate, height_error, smooth
 from neusee.nodes.doe._refractive_index import material
 from neusee.nodes.doe._sampled_height_map import pixelwise
-from neusee.nodes.doe._shade import shade
+from neusee.nodes.doe._shade import equal_filter, shade
 from neusee.nodes.doe._unet_height_map import unet
 from neusee.nodes.shape_rules import blank, double, like_first
 from neusee.nodes.values import Bands, Shade, Stop
@@ -31,7 +36,9 @@ for node in (flat, vortex, axicon, spiral_axicon, cubic, half_rings, zernike, pi
 
 
 @unet.work
-def _(result: Tensor, *inputs: Any, grid: int = 270, width: int = 32, **params: Any) -> tuple[float, float]:
+def _(
+    result: Tensor, *inputs: Any, grid: int = 270, width: int = 32, **params: Any
+) -> tuple[float, float]:
     side = min(grid, len(result))
     return 4.0 * width * side**2, float(width * side) ** 2 + result.numel()
 

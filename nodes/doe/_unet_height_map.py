@@ -1,4 +1,6 @@
-"""Height map computed by a network from the pupil coordinates alone: smooth, with a million parameters."""
+"""Height map computed by a network from the pupil coordinates alone: smooth, with a million
+parameters.
+"""
 
 from functools import partial
 from itertools import pairwise
@@ -10,19 +12,22 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from neusee.nodes import node
-from neusee.nodes.bicubic_resize import enlarge
-from neusee.nodes.doe._height_from_phase import height_checks
+from neusee.nodes.doe._refractive_index import height_checks
 from neusee.nodes.network_weights import loaded, same_layout
+from neusee.nodes.resampling import enlarge
 from neusee.nodes.units import Count, DataFile, Depth, Layers
 from neusee.nodes.values import Stop
 
-PITCH = 15.0  #: frequency of the first layer's sines: about four periods across the pupil at the start
+#: frequency of the first layer's sines: about four periods across the pupil at the start
+PITCH = 15.0
 
 
 class HeightNet(nn.Module):
-    """A network of four downsampling and four upsampling convolutions, from (u, v) to one logit for each sample.
+    """A network of four downsampling and four upsampling convolutions, from (u, v) to one logit for
+    each sample.
 
-    Sines follow the first convolution, so that the height map can be less smooth than the coordinates.
+    Sines follow the first convolution, so that the height map can be less smooth than the
+    coordinates.
     """
 
     def __init__(self, width: int = 32) -> None:
@@ -40,26 +45,34 @@ class HeightNet(nn.Module):
             passed.append(F.silu(layer(_edged(passed[-1]))))
         x = passed[-1]
         for layer, skip in zip(self.up, passed[-2::-1], strict=True):
-            x = F.silu(layer(_edged(torch.cat([enlarge(x, skip.shape[-2], skip.shape[-1]), skip], dim=1))))
+            x = F.silu(
+                layer(_edged(torch.cat([enlarge(x, skip.shape[-2], skip.shape[-1]), skip], dim=1)))
+            )
         logits: Tensor = self.last(_edged(x))[0, 0]
         return logits
 
 
 def _edged(x: Tensor) -> Tensor:
-    """Pad a tensor with its outermost rows and columns, because zeros would add a frame to the height map."""
+    """Pad a tensor with its outermost rows and columns, because zeros would add a frame to the
+    height map.
+    """
     x = torch.cat([x[..., :1, :], x, x[..., -1:, :]], dim=-2)
     return torch.cat([x[..., :1], x, x[..., -1:]], dim=-1)
 
 
 def coordinates(grid: int, device: torch.device | None = None) -> Tensor:
-    """Return the input (2, grid, grid) of the height network: u and v from -1 to 1 across the pupil grid."""
+    """Return the input (2, grid, grid) of the height network: u and v from -1 to 1 across the
+    pupil grid.
+    """
     line = (torch.arange(grid, dtype=torch.float64, device=device) - (grid - 1) / 2) * (2 / grid)
     v, u = torch.meshgrid(line, line, indexing="ij")
     return torch.stack([u, v]).to(torch.float32)
 
 
 def height_of(net: nn.Module, samples: int, grid: int, max_height: float) -> Tensor:
-    """Return the height map (samples, samples) of a network, 0 to ``max_height``, differentiable in the weights."""
+    """Return the height map (samples, samples) of a network, 0 to ``max_height``, differentiable
+    in the weights.
+    """
     like = next(net.parameters())
     logits = net(coordinates(min(grid, samples), like.device).to(like))
     return max_height * torch.sigmoid(enlarge(logits, samples, samples))
@@ -68,7 +81,8 @@ def height_of(net: nn.Module, samples: int, grid: int, max_height: float) -> Ten
 def fresh(width: int, grid: int, rng: torch.Generator) -> HeightNet:
     """Return a new height network with random orthogonal weights and zero biases.
 
-    The last layer is scaled to logits of mean 0 and standard deviation 1, so that the height map is far from flat.
+    The last layer is scaled to logits of mean 0 and standard deviation 1, so that the height map is
+    far from flat.
     """
     net = HeightNet(width).to(rng.device)
     with torch.no_grad():
@@ -96,16 +110,22 @@ def unet(
 ) -> Tensor:
     """Compute the height map by a UNet of the pupil coordinates: max_height * sigmoid(UNet(u, v)).
 
-    The network has ``grid`` samples. The bicubic resampling precedes the sigmoid, which keeps all heights in range.
-    The coordinates are relative, so that the height map is as wide as the pupil: ``weights`` state no size.
+    The network has ``grid`` samples. The bicubic resampling precedes the sigmoid, which keeps all
+    heights in range. The coordinates are relative, so that the height map is as wide as the pupil:
+    ``weights`` state no size.
 
     Shapes: stop -> (v, u).
     Units:  m.
     Error:  1e-6 of max_height (float32).
-    Source: "Learning to See Through Flare", "Neural Representation of the DOE"; the layer widths are ours.
+    Source: "Learning to See Through Flare", "Neural Representation of the DOE"; the layer widths
+            are ours.
     """
     samples = int(stop.samples)
-    net = fresh(width, min(grid, samples), rng) if weights is None else loaded(partial(HeightNet, width), weights)
+    net = (
+        fresh(width, min(grid, samples), rng)
+        if weights is None
+        else loaded(partial(HeightNet, width), weights)
+    )
     return height_of(net, samples, grid, max_height).detach()
 
 

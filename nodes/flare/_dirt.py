@@ -1,18 +1,125 @@
-"""Dirt on the window in front of the lens, with statistics that do not depend on the sampling of the pupil."""
+"""Dirt on the window: grains and scratches, the same at any sampling of the pupil."""
 
 import math
-from typing import Annotated, Any
+from collections.abc import Sequence
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from pydantic import Field
+from torch import Tensor
 
 from neusee.nodes import Check, TensorStats, node
-from neusee.nodes.flare._grains_and_scratches import Grain, Scratch, stamp
-from neusee.nodes.optics._phase_screen import factors
 from neusee.nodes.optics._pupil_grid import PupilGrid, grid_of, inside, stripes
-from neusee.nodes.optics._zernike import surface
+from neusee.nodes.optics._zernike import factors, surface
 from neusee.nodes.units import Fraction, Waves
 from neusee.nodes.values import Dirt, Stop
+
+# --- grains and scratches -------------------------------------------------------------------------
+
+# Round grains and scratches on glass, drawn with their correct area at any sampling of the pupil.
+
+
+class Grain(NamedTuple):
+    """A round grain; position (from the centre) and radius are in diameters of the stop."""
+
+    v: float
+    u: float
+    radius: float
+    opacity: float  #: opacity for the field; 1 is black
+
+
+class Scratch(NamedTuple):
+    """A scratched line through points; positions (from the centre) and width are in diameters of
+    the stop.
+    """
+
+    points: Sequence[tuple[float, float]]  #: (v, u)
+    width: float
+    opacity: float
+
+
+def stamp(amplitude: Tensor, marks: Sequence[Grain | Scratch], grid: PupilGrid) -> Tensor:
+    """Darken the pupil amplitude (v, u) in place by each grain and scratch, and return the
+    amplitude.
+    """
+    scale, middle = grid.diameter / grid.pitch, (grid.samples - 1) / 2
+    for mark in marks:
+        points = [(mark.v, mark.u)] if isinstance(mark, Grain) else list(mark.points)
+        places = [(v * scale + middle, u * scale + middle) for v, u in points]
+        size = scale * (2 * mark.radius if isinstance(mark, Grain) else mark.width)
+        _darken(amplitude, places, size, mark.opacity)
+    return amplitude
+
+
+def _darken(
+    amplitude: Tensor, places: list[tuple[float, float]], size: float, opacity: float
+) -> None:
+    window = _window(places, size / 2 + 1, amplitude.shape[-1])
+    if window is None:
+        return
+    rows, columns = window
+    y = torch.arange(rows.start, rows.stop, dtype=torch.float32, device=amplitude.device)[:, None]
+    x = torch.arange(columns.start, columns.stop, dtype=torch.float32, device=amplitude.device)[
+        None, :
+    ]
+    cover = amplitude.new_zeros(len(y), x.shape[1])
+    for start, end in zip(places, places[1:] or places, strict=False):
+        near = _window([start, end], size / 2 + 1, amplitude.shape[-1])
+        if near is None:
+            continue
+        v, u = (
+            slice(n.start - w.start, n.stop - w.start) for n, w in zip(near, window, strict=True)
+        )
+        new = _cover(_distance(y[v], x[:, u], start, end), size, len(places) == 1)
+        cover[v, u] = torch.maximum(cover[v, u], new)
+    amplitude[rows, columns] *= 1 - opacity * cover
+
+
+def _window(
+    places: list[tuple[float, float]], margin: float, samples: int
+) -> tuple[slice, slice] | None:
+    """Return the rows and columns of samples that a grain or scratch can touch, or None if it is
+    outside the grid.
+    """
+    spans = []
+    for axis in (0, 1):
+        low = max(int(min(place[axis] for place in places) - margin), 0)
+        high = min(int(max(place[axis] for place in places) + margin) + 2, samples)
+        if high <= low:
+            return None
+        spans.append(slice(low, high))
+    return spans[0], spans[1]
+
+
+def _distance(y: Tensor, x: Tensor, start: tuple[float, float], end: tuple[float, float]) -> Tensor:
+    """Return the distance of each sample, in samples, from the line between two points."""
+    along_y, along_x = end[0] - start[0], end[1] - start[1]
+    length = along_y**2 + along_x**2
+    share = (
+        ((y - start[0]) * along_y + (x - start[1]) * along_x) / length
+        if length > 0
+        else torch.zeros_like(y + x)
+    )
+    share = share.clamp(0, 1)
+    return torch.hypot(y - start[0] - share * along_y, x - start[1] - share * along_x)
+
+
+def _cover(distance: Tensor, size: float, round_: bool) -> Tensor:
+    """Return the covered share of each sample under a grain or scratch ``size`` samples wide; the
+    shares sum to the area.
+    """
+    if round_:
+        square = size**2 / 4
+        edge = math.sqrt(max(square - 1 / 12, 1 / 4))
+        return min(3 * square, 1.0) * (edge + 0.5 - distance).clamp(0, 1)
+    return ((size + 1) / 2 - distance).clamp(0, min(size, 1.0))
+
+
+# --- dirt -----------------------------------------------------------------------------------------
+
+# Dirt on the window in front of the lens, with statistics that do not depend on the sampling of the
+# pupil.
+
 
 Mean = Annotated[float, Field(ge=0, le=10_000)]  #: expected number
 Part = Annotated[float, Field(gt=0, le=1)]  #: relative to the diameter of the pupil
@@ -39,20 +146,24 @@ def dirt(
     dents: Rms = 0.0,
     rng: torch.Generator,
 ) -> Dirt:
-    """Add the dirt of a windshield to the pupil: grains of dust, scratches, a greasy film, smudges and dents.
+    """Add the dirt of a windshield to the pupil: grains of dust, scratches, a greasy film, smudges
+    and dents.
 
-    dust, scratches: expected numbers (Wu et al.: 30 each). The radius of the largest grain is drawn about
-        ``dust_radius``, the width of the widest scratch about ``scratch_width``. A scratch has up to 16 steps, none
-        longer than ``scratch_length``. All lengths are relative to the diameter.
-    grease: root mean square of a phase screen with correlation length ``grease_scale`` (0.02 to 0.2).
-    smudges: opacity of the field under the thickest of the soft patches, whose size is ``smudge_scale``.
-    dents: root mean square of Zernike terms 4 to 15 (0.1 to 2 waves). With all five at zero the glass is clean.
+    dust, scratches: expected numbers (Wu et al.: 30 each). The radius of the largest grain is drawn
+        about ``dust_radius``, the width of the widest scratch about ``scratch_width``. A scratch
+        has up to 16 steps, none longer than ``scratch_length``. All lengths are relative to the
+        diameter.
+    grease: root mean square of a phase screen with correlation length ``grease_scale`` (0.02 to
+    0.2). smudges: opacity of the field under the thickest of the soft patches, whose size is
+    ``smudge_scale``. dents: root mean square of Zernike terms 4 to 15 (0.1 to 2 waves). With all
+    five at zero the glass is clean.
 
     Shapes: stop -> Dirt (v, u).
     Units:  grease, dents waves at 550 nm; result amplitude 1, path m.
-    Error:  covered area of a mark: 1 % from 3 samples across, 10 % at 1 sample, unbiased at any size.
-    Source: numbers, sizes and opacities of dust and scratches: Wu et al., ICCV 2021 (arXiv 2011.12485), relative to
-        their 6000 samples; grease, smudges and dents are ours.
+    Error:  covered area of a mark: 1 % from 3 samples across, 10 % at 1 sample, unbiased at any
+            size.
+    Source: numbers, sizes and opacities of dust and scratches: Wu et al., ICCV 2021 (arXiv
+        2011.12485), relative to their 6000 samples; grease, smudges and dents are ours.
     """
     grid = grid_of(stop)
     grains_rng, lines_rng, film_rng, patches_rng, dents_rng = _streams(5, rng)
@@ -62,7 +173,9 @@ def dirt(
     bends = _dents(WAVE * dents, dents_rng)
     amplitude, path = (torch.empty(grid.samples, grid.samples) for _ in range(2))
     for rows in stripes(grid):
-        amplitude[rows] = 1 - smudges * torch.sigmoid(3 * (patches[0][rows] @ patches[1])) if smudges else 1.0
+        amplitude[rows] = (
+            1 - smudges * torch.sigmoid(3 * (patches[0][rows] @ patches[1])) if smudges else 1.0
+        )
         path[rows] = WAVE * grease * (film[0][rows] @ film[1]) if grease else 0.0
         if bends:
             path[rows] += surface(bends, grid, rows=rows)
@@ -70,24 +183,37 @@ def dirt(
 
 
 def _streams(count: int, rng: torch.Generator) -> list[torch.Generator]:
-    """Create one random generator for each kind of dirt, so that more dust leaves the scratches unchanged."""
+    """Create one random generator for each kind of dirt, so that more dust leaves the scratches
+    unchanged.
+    """
     seeds = torch.randint(2**62, (count,), generator=rng, device=rng.device).tolist()
     return [torch.Generator(rng.device).manual_seed(seed) for seed in seeds]
 
 
 def _uniform(rng: torch.Generator, low: float = 0.0, high: float = 1.0) -> float:
-    return low + (high - low) * float(torch.rand((), generator=rng, device=rng.device, dtype=torch.float64))
+    return low + (high - low) * float(
+        torch.rand((), generator=rng, device=rng.device, dtype=torch.float64)
+    )
 
 
 def _about(mean: float, spread: float, rng: torch.Generator) -> float:
     """Sample a normal distribution, and replace a negative number by 0."""
-    return max(mean + spread * float(torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)), 0.0)
+    return max(
+        mean
+        + spread * float(torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)),
+        0.0,
+    )
 
 
 def _grains(mean: float, radius: float, rng: torch.Generator) -> list[Grain]:
     largest = _about(radius, radius / 2, rng)
     return [
-        Grain(_uniform(rng, -0.5, 0.5), _uniform(rng, -0.5, 0.5), _uniform(rng) * largest, _uniform(rng, 0.5, 1.0))
+        Grain(
+            _uniform(rng, -0.5, 0.5),
+            _uniform(rng, -0.5, 0.5),
+            _uniform(rng) * largest,
+            _uniform(rng, 0.5, 1.0),
+        )
         for _ in range(round(_about(mean, mean / 6, rng)))
     ]
 
@@ -109,7 +235,9 @@ def _scratch(length: float, widest: float, rng: torch.Generator) -> Scratch:
 
 
 def _dents(rms: float, rng: torch.Generator) -> dict[int, float]:
-    """Return random Zernike coefficients of the dents in a window, whose root sum of squares is ``rms``."""
+    """Return random Zernike coefficients of the dents in a window, whose root sum of squares is
+    ``rms``.
+    """
     draw = torch.randn(len(DENT_TERMS), generator=rng, device=rng.device, dtype=torch.float64)
     parts = (rms * draw / draw.norm()).tolist()
     return dict(zip(DENT_TERMS, parts, strict=True)) if rms else {}
@@ -117,13 +245,21 @@ def _dents(rms: float, rng: torch.Generator) -> dict[int, float]:
 
 @dirt.zero_bound
 def _(
-    stop: TensorStats, *, dust: float, scratches: float, grease: float, smudges: float, dents: float, **_: Any
+    stop: TensorStats,
+    *,
+    dust: float,
+    scratches: float,
+    grease: float,
+    smudges: float,
+    dents: float,
+    **_: Any,
 ) -> float:
-    """Return an upper bound of the change of the pupil field by dirt, at 400 nm or longer; 0 for a clean window.
+    """Return an upper bound of the change of the pupil field by dirt, at 400 nm or longer; 0 for a
+    clean window.
 
-    A grain or a scratch may be black. A film is a sum of normal numbers, which the generator keeps below 8.6, so that
-    the film stays below 31 times its root mean square. The twelve terms of a dent together reach sqrt(50) times their
-    root mean square, at the rim.
+    A grain or a scratch may be black. A film is a sum of normal numbers, which the generator keeps
+    below 8.6, so that the film stays below 31 times its root mean square. The twelve terms of a
+    dent together reach sqrt(50) times their root mean square, at the rim.
     """
     if not any((dust, scratches, grease, smudges, dents)):
         return 0.0
@@ -135,7 +271,10 @@ def _(
 @dirt.check
 def _(result: Dirt, stop: Stop, **_: Any) -> list[Check]:
     passed, rms = _effect(result, grid_of(stop))
-    text = f"dirt passes {passed:.4f} of the light, bends it by {rms:.3g} waves root mean square at 550 nm"
+    text = (
+        f"dirt passes {passed:.4f} of the light, bends it by {rms:.3g} waves root mean square at"
+        " 550 nm"
+    )
     low, high = (float(x) for x in torch.aminmax(result.amplitude))
     return [
         Check(text, passed > 0),
@@ -144,11 +283,15 @@ def _(result: Dirt, stop: Stop, **_: Any) -> list[Check]:
 
 
 def _effect(dirt: Dirt, grid: PupilGrid) -> tuple[float, float]:
-    """Return the share of the light that passes the dirt, and the root mean square path in the dirt, in waves."""
+    """Return the share of the light that passes the dirt, and the root mean square path in the
+    dirt, in waves.
+    """
     sums = torch.zeros(4, dtype=torch.float64)
     for rows in stripes(grid):
         open_ = inside(grid, dirt.path.device, rows)
         light, waves = dirt.amplitude[rows][open_].double(), dirt.path[rows][open_].double() / WAVE
-        sums += torch.stack([open_.sum(), light.square().sum(), waves.sum(), waves.square().sum()]).cpu()
+        sums += torch.stack(
+            [open_.sum(), light.square().sum(), waves.sum(), waves.square().sum()]
+        ).cpu()
     passed, mean, square = (sums[1:] / sums[0]).tolist()
     return passed, math.sqrt(max(square - mean**2, 0.0))

@@ -1,4 +1,6 @@
-"""Ghosts: reflections between the surfaces of the lens, in paraxial form, without a lens prescription."""
+"""Ghosts: reflections between the surfaces of the lens, in paraxial form, without a lens
+prescription.
+"""
 
 import math
 from typing import Annotated, Any, NamedTuple
@@ -8,7 +10,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, TensorStats, node
-from neusee.nodes._half_precision import single
+from neusee.nodes.precision import single
 from neusee.nodes.units import FocalLength, Fraction, PixelPitch, SensorLength
 from neusee.nodes.values import Bands
 
@@ -36,20 +38,22 @@ def ghosts(
     radius: SensorLength = 300e-6,
     rng: torch.Generator,
 ) -> Tensor:
-    """Return the reflections of a laser spot in the lens: discs on the line through the spot and the optical axis.
+    """Return the reflections of a laser spot in the lens: discs on the line through the spot and
+    the optical axis.
 
-    Ghost j is a defocused image of the round stop: a disc of radius r_j (U(0.1, 1) * ``radius``), centred at s_j times
-    the position of the source, with s_j from U(-``spread``, ``spread``), and coloured by two quarter-wave coatings.
-    All ghosts together carry ``energy`` times the energy of the spot inside the window, over all bands; light that
-    falls outside the window is lost. The spot itself is not dimmed.
+    Ghost j is a defocused image of the round stop: a disc of radius r_j (U(0.1, 1) * ``radius``),
+    centred at s_j times the position of the source, with s_j from U(-``spread``, ``spread``), and
+    coloured by two quarter-wave coatings. All ghosts together carry ``energy`` times the energy of
+    the spot inside the window, over all bands; light that falls outside the window is lost. The
+    spot itself is not dimmed.
 
     Shapes: (band, y, x), bands, direction (2,) (n_y, n_x) -> (band, y, x).
     Units:  as the spot (W/m2); direction rad.
-    Error:  energy of a ghost inside the window 1e-6; the edge of a ghost is one pixel wide, and no ghost is smaller
-            than one pixel.
+    Error:  energy of a ghost inside the window 1e-6; the edge of a ghost is one pixel wide, and no
+            ghost is smaller than one pixel.
     Raises: ValueError where spot and bands differ in the number of bands.
-    Source: Hullin et al., ACM Trans. Graph. 30, 108 (2011), reduced to first order; coatings: Hecht, Optics,
-        single quarter-wave layer.
+    Source: Hullin et al., ACM Trans. Graph. 30, 108 (2011), reduced to first order; coatings:
+        Hecht, Optics, single quarter-wave layer.
     """
     if spot.ndim != 3 or spot.shape[0] != bands.centres.numel():
         raise ValueError(
@@ -58,74 +62,110 @@ def ghosts(
         )
     drawn = _draw(count, spread, radius, rng)
     spot = single(spot)
-    flux = spot.sum(-1).sum(-1, dtype=torch.float64)  # a float64 copy of the spot would be twice as large
+    # a float64 copy of the spot would be twice as large
+    flux = spot.sum(-1).sum(-1, dtype=torch.float64)
     y, x = (focal_length * n / pixel_pitch for n in direction.tolist())
     total = torch.zeros_like(spot)
     for ghost, colour in zip(drawn, _colours(drawn, bands.centres, flux), strict=True):
         centre = (ghost.magnification * y, ghost.magnification * x)
-        _add(total, (energy * colour * flux).to(spot.dtype), centre, _in_pixels(ghost.radius, pixel_pitch))
+        _add(
+            total,
+            (energy * colour * flux).to(spot.dtype),
+            centre,
+            _in_pixels(ghost.radius, pixel_pitch),
+        )
     return total
 
 
 def _draw(count: int, spread: float, radius: float, rng: torch.Generator) -> list[_Ghost]:
     draw = torch.rand(count, 5, generator=rng, device=rng.device, dtype=torch.float64).tolist()
     sizes = [math.exp(2 * row[2]) for row in draw]
-    found = []
+    drawn = []
     for (position, r, _, *coats), size in zip(draw, sizes, strict=True):
         first, second = (400e-9 + 300e-9 * coat for coat in coats)
-        magnification, drawn_radius = spread * (2 * position - 1), radius * (_SMALLEST + (1 - _SMALLEST) * r)
-        found.append(_Ghost(magnification, drawn_radius, size / sum(sizes), (first, second)))
-    return found
+        magnification, drawn_radius = (
+            spread * (2 * position - 1),
+            radius * (_SMALLEST + (1 - _SMALLEST) * r),
+        )
+        drawn.append(_Ghost(magnification, drawn_radius, size / sum(sizes), (first, second)))
+    return drawn
 
 
 def _reflected(wavelengths: Tensor, tuned: float) -> Tensor:
-    """Return the reflectance of a quarter-wave layer: 0.05 at the tuned wavelength, at most 1 elsewhere."""
+    """Return the reflectance of a quarter-wave layer: 0.05 at the tuned wavelength, at most 1
+    elsewhere.
+    """
     return 0.05 + 0.95 * torch.cos(torch.pi / 2 * tuned / wavelengths).square()
 
 
 def _colours(drawn: list[_Ghost], wavelengths: Tensor, flux: Tensor) -> list[Tensor]:
-    """Return the gain of each ghost in each band, scaled so that all ghosts together carry the flux of the spot."""
-    raw = [g.share * _reflected(wavelengths, g.tuned[0]) * _reflected(wavelengths, g.tuned[1]) for g in drawn]
+    """Return the gain of each ghost in each band, scaled so that all ghosts together carry the
+    flux of the spot.
+    """
+    raw = [
+        g.share * _reflected(wavelengths, g.tuned[0]) * _reflected(wavelengths, g.tuned[1])
+        for g in drawn
+    ]
     moved = torch.stack(raw).sum(0).mul(flux).sum() if raw else flux.sum()
     dark = moved <= 0  # false for NaN, so that NaN reaches the result
-    whole = torch.where(dark, 0.0, flux.sum() / moved.where(~dark, 1.0))
-    return [gain * whole for gain in raw]
+    scale = torch.where(dark, 0.0, flux.sum() / moved.where(~dark, 1.0))
+    return [gain * scale for gain in raw]
 
 
 def _in_pixels(radius: float, pixel_pitch: float) -> float:
-    """Return the radius of a ghost in pixels, at least 0.5, so that every ghost covers the centre of a pixel."""
+    """Return the radius of a ghost in pixels, at least 0.5, so that every ghost covers the
+    centre of a pixel.
+    """
     return max(radius / pixel_pitch, 0.5)
 
 
 def _add(total: Tensor, energy: Tensor, centre: tuple[float, float], radius: float) -> None:
-    """Add the part of a ghost's disc that lies inside the image to ``total``; the whole disc carries ``energy``."""
+    """Add the part of a ghost's disc that lies inside the image to ``total``; the whole disc
+    carries ``energy``.
+    """
     height, width = total.shape[-2:]
     y, x = centre[0] + height // 2, centre[1] + width // 2
     rows, columns = _reach(y, radius), _reach(x, radius)
     disc = (radius + 0.5 - torch.hypot((rows - y)[:, None], (columns - x)[None, :])).clamp(0, 1)
-    seen = (disc / disc.sum())[_part(rows, height), _part(columns, width)].to(total)
-    if seen.numel():
+    inside = (disc / disc.sum())[_part(rows, height), _part(columns, width)].to(total)
+    if inside.numel():
         top, left = max(int(rows[0]), 0), max(int(columns[0]), 0)
-        total[:, top : top + seen.shape[0], left : left + seen.shape[1]] += energy[:, None, None] * seen
+        total[:, top : top + inside.shape[0], left : left + inside.shape[1]] += (
+            energy[:, None, None] * inside
+        )
 
 
 def _reach(middle: float, radius: float) -> Tensor:
-    """Return the pixel indices along one axis that a ghost's disc can touch, also outside the image, as float64."""
+    """Return the pixel indices along one axis that a ghost's disc can touch, also outside the
+    image, as float64.
+    """
     first, last = math.floor(middle - radius) - 1, math.ceil(middle + radius) + 1
     return torch.arange(first, last + 1, dtype=torch.float64)
 
 
 def _part(numbers: Tensor, samples: int) -> slice:
-    """Return the slice of the pixel indices ``numbers`` that lies inside the image, or an empty slice."""
+    """Return the slice of the pixel indices ``numbers`` that lies inside the image, or an empty
+    slice.
+    """
     first = int(numbers[0])
     return slice(min(max(-first, 0), len(numbers)), max(samples - first, 0))
 
 
 @ghosts.zero_bound
-def _(spot: TensorStats, *_: Any, pixel_pitch: float, count: int, energy: float, radius: float, **__: Any) -> float:
-    """Return an upper bound of the ghosts' brightest pixel: all reflected light in one band of the smallest ghost.
+def _(
+    spot: TensorStats,
+    *_: Any,
+    pixel_pitch: float,
+    count: int,
+    energy: float,
+    radius: float,
+    **__: Any,
+) -> float:
+    """Return an upper bound of the ghosts' brightest pixel: all reflected light in one band of the
+    smallest ghost.
 
-    The samples of a disc of half a pixel or more sum to the area of the disc, pi (r^2 + 1 / 12), within 16 %.
+    The samples of a disc of half a pixel or more sum to the area of the disc, pi (r^2 + 1 / 12),
+    within 16 %.
     """
     if count == 0 or energy == 0:
         return 0.0
@@ -136,14 +176,22 @@ def _(spot: TensorStats, *_: Any, pixel_pitch: float, count: int, energy: float,
 @ghosts.expected_range
 def _(
     spot: TensorStats, *_: Any, pixel_pitch: float, energy: float, radius: float, **__: Any
-) -> tuple[float, float]:  # fmt: skip
-    """Return the brightness of a ghost of medium size, if the light of the spot fell on one pixel."""
+) -> tuple[float, float]:
+    """Return the brightness of a ghost of medium size, if the light of the spot fell on one
+    pixel.
+    """
     return 0.0, energy * spot.max / max(1.0, math.pi * _in_pixels(radius / 2, pixel_pitch) ** 2)
 
 
 @ghosts.check
 def _(result: Tensor, spot: Tensor, *_: Any, energy: float, **__: Any) -> list[Check]:
-    whole, moved = (float(x.sum(-1).sum(dtype=torch.float64)) for x in (spot, result))
-    seen = moved / whole if whole > 0 else 0.0
-    bounded = seen <= energy * (1 + 1e-3)
-    return [Check(f"ghosts in the window have {seen:.3g} of the spot's energy; {energy:.3g} is reflected", bounded)]
+    spot_energy, moved = (float(x.sum(-1).sum(dtype=torch.float64)) for x in (spot, result))
+    ghost_share = moved / spot_energy if spot_energy > 0 else 0.0
+    bounded = ghost_share <= energy * (1 + 1e-3)
+    return [
+        Check(
+            f"ghosts in the window have {ghost_share:.3g} of the spot's energy; {energy:.3g} is"
+            " reflected",
+            bounded,
+        )
+    ]

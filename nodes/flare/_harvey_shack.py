@@ -1,9 +1,11 @@
-"""The three-parameter Harvey-Shack model of scatter by a surface, and its light on the pixels of a sensor.
+"""The three-parameter Harvey-Shack model of scatter by a surface, and its light on the pixels of a
+sensor.
 
-Lengths are in pixels. With the direction cosine beta of a scattered ray, measured from the ray that is not scattered,
-the surface scatters the share BSDF(beta) d2beta into d2beta, BSDF = b0 (1 + (beta / l)**2)**(s / 2). A beam of radius a
-on the surface has the marginal ray NA at the image, and the optical invariant gives r NA = a beta: the pixel at
-the distance r receives (NA / a)**2 BSDF(NA r / a) per area, and r ends at a / NA, where beta is 1.
+Lengths are in pixels. With the direction cosine beta of a scattered ray, measured from the ray that
+is not scattered, the surface scatters the share BSDF(beta) d2beta into d2beta, BSDF = b0 (1 + (beta
+/ l)**2)**(s / 2). A beam of radius a on the surface has the marginal ray NA at the image, and the
+optical invariant gives r NA = a beta: the pixel at the distance r receives (NA / a)**2 BSDF(NA r /
+a) per area, and r ends at a / NA, where beta is 1.
 """
 
 from __future__ import annotations
@@ -14,14 +16,20 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-NEAR = 16  #: pixels about the source, along each axis and direction, over which the light is integrated exactly
+#: pixels about the source, along each axis and direction, over which the light is integrated
+#: exactly
+NEAR = 16
 _NODES = 96  #: Gauss-Legendre nodes of one edge: 1e-13 for any width of the scatter
-_CLOSEST = 1e-6  #: pixels between an edge of a pixel and the source; a smaller distance is replaced by this one
-_SERIES = 1e-3  #: argument below which a series replaces (exp(z) - 1) / z, whose derivatives would cancel
+#: pixels between an edge of a pixel and the source; a smaller distance is replaced by this one
+_CLOSEST = 1e-6
+#: argument below which a series replaces (exp(z) - 1) / z, whose derivatives would cancel
+_SERIES = 1e-3
 
 
 class Lobe(NamedTuple):
-    """The scattered light of a surface on the sensor: peak (1 + (r / width)**2)**(s / 2) up to ``end``; scalars."""
+    """The scattered light of a surface on the sensor: peak (1 + (r / width)**2)**(s / 2) up to
+    ``end``; scalars.
+    """
 
     peak: Tensor  #: share of the light per pixel
     width: Tensor  #: pixels
@@ -30,27 +38,33 @@ class Lobe(NamedTuple):
 
 
 def lobe(b0: Tensor, l: Tensor, s: Tensor, scale: Tensor) -> Lobe:  # noqa: E741 (the symbol of the literature)
-    """Return the scattered light of a surface on the sensor; ``scale`` is the direction cosine per pixel, NA p / a."""
+    """Return the scattered light of a surface on the sensor; ``scale`` is the direction cosine
+    per pixel, NA p / a.
+    """
     return Lobe(b0 * scale.square(), l / scale, s, 1 / scale)
 
 
 def scattered_share(b0: Tensor, l: Tensor, s: Tensor) -> Tensor:  # noqa: E741
     """Return the total integrated scatter (TIS) of a surface.
 
-    TIS = 2 pi b0 ((l**2 + 1)**((s + 2) / 2) - l**(s + 2)) / (l**s (s + 2)), and its limit pi b0 l**2 ln(1 + l**-2) for
-    s = -2; near s = -2 nothing cancels.
+    TIS = 2 pi b0 ((l**2 + 1)**((s + 2) / 2) - l**(s + 2)) / (l**s (s + 2)), and its limit pi b0
+    l**2 ln(1 + l**-2) for s = -2; near s = -2 nothing cancels.
     """
     return 2 * torch.pi * b0 * _enclosed(l, s, torch.ones_like(l))
 
 
 def surface_of(share: float, l: float = 0.01, s: float = -1.5) -> dict[str, float]:  # noqa: E741
-    """Return b0, l and s of a surface that scatters a share of the light; the share is proportional to b0."""
+    """Return b0, l and s of a surface that scatters a share of the light; the share is
+    proportional to b0.
+    """
     unit = scattered_share(*(torch.tensor(x, dtype=torch.float64) for x in (1.0, l, s)))
     return {"b0": share / float(unit), "l": l, "s": s}
 
 
 def light_within(light: Lobe, radius: Tensor) -> Tensor:
-    """Return the share of the light that a surface scatters to less than ``radius`` pixels from the source."""
+    """Return the share of the light that a surface scatters to less than ``radius`` pixels from
+    the source.
+    """
     inside = torch.minimum(radius, light.end)
     return 2 * torch.pi * light.peak * _enclosed(light.width, light.slope, inside)
 
@@ -58,10 +72,11 @@ def light_within(light: Lobe, radius: Tensor) -> Tensor:
 def on_pixels(light: Lobe, centre: tuple[float, float], shape: tuple[int, int]) -> Tensor:
     """Return the share of the light that a surface scatters into each pixel (y, x), float64.
 
-    ``centre`` is the position (y, x) of the source, counted from the middle of the first pixel. Pixels up to 16 from
-    the source are integrated exactly: the boundary of each pixel, by the divergence theorem, so that a peak far
-    narrower than a pixel loses nothing. Farther away the value in the middle of the pixel and its second derivatives
-    give the integral, to 3e-6 of the pixel.
+    ``centre`` is the position (y, x) of the source, counted from the middle of the first pixel.
+    Pixels up to 16 from the source are integrated exactly: the boundary of each pixel, by the
+    divergence theorem, so that a peak far narrower than a pixel loses nothing. Farther away the
+    value in the middle of the pixel and its second derivatives give the integral, to 3e-6 of the
+    pixel.
     """
     y, x = (torch.arange(n, dtype=torch.float64) - c for n, c in zip(shape, centre, strict=True))
     window = _far(light, y[:, None], x[None])
@@ -79,14 +94,18 @@ def _near(centre: float, size: int) -> slice:
 
 
 def _edges(pixels: slice, centre: float) -> Tensor:
-    """Return the positions of the edges of a row of pixels along one axis, counted from the source."""
+    """Return the positions of the edges of a row of pixels along one axis, counted from the
+    source.
+    """
     return torch.arange(pixels.start, pixels.stop + 1, dtype=torch.float64) - 0.5 - centre
 
 
 def on_far_pixels(light: Lobe, square: Tensor) -> Tensor:
-    """Return the light of pixels at squared distances from the source: value in the middle, and Laplacian / 24.
+    """Return the light of pixels at squared distances from the source: value in the middle, and
+    Laplacian / 24.
 
-    The error is below 3e-6 of a pixel at 16 pixels from the source, and does not include the end of the light.
+    The error is below 3e-6 of a pixel at 16 pixels from the source, and does not include the end of
+    the light.
     """
     q = square / light.width.square()
     bend = light.slope / (light.width.square() * (1 + q)) * (2 + (light.slope - 2) * q / (1 + q))
@@ -102,7 +121,9 @@ def _far(light: Lobe, y: Tensor, x: Tensor) -> Tensor:
 
 
 def _exact(light: Lobe, y: Tensor, x: Tensor) -> Tensor:
-    """Return the light of each pixel between the edges ``y`` and ``x``, as second differences of corner integrals."""
+    """Return the light of each pixel between the edges ``y`` and ``x``, as second differences of
+    corner integrals.
+    """
     distance_y, distance_x = (edge.abs().clamp_min(_CLOSEST) for edge in (y, x))
     down, along = torch.meshgrid(distance_y, distance_x, indexing="ij")
     quarter = _triangle(light, down, along) + _triangle(light, along, down)
@@ -111,9 +132,11 @@ def _exact(light: Lobe, y: Tensor, x: Tensor) -> Tensor:
 
 
 def _triangle(light: Lobe, near: Tensor, across: Tensor) -> Tensor:
-    """Return the light in the right triangle source, foot, corner, with the legs ``near`` and ``across``.
+    """Return the light in the right triangle source, foot, corner, with the legs ``near`` and
+    ``across``.
 
-    With the angle tan(phi) = sinh(u) the integrand is smooth on the scale of 1, however narrow the scatter is.
+    With the angle tan(phi) = sinh(u) the integrand is smooth on the scale of 1, however narrow the
+    scatter is.
     """
     nodes, weights = _gauss()
     end = torch.asinh(across / near)[..., None]

@@ -9,7 +9,8 @@ from neusee.nodes.flare._stray_light import StrayShares, stray_light, stray_shar
 from neusee.nodes.shape_rules import at_least_single, blank, double, like_first
 from neusee.nodes.values import Dirt, Psf, Pupil, Stop
 
-_LOBE, _ADD = 60.0, 3.0  #: operations for the scatter of a surface in a pixel, and for its addition to a band
+#: operations for the scatter of a surface in a pixel, and for its addition to a band
+_LOBE, _ADD = 60.0, 3.0
 
 ghosts.shape(like_first)
 
@@ -32,7 +33,9 @@ def _(
 ) -> tuple[float, float]:
     bands, y, x = result.intensity.shape
     veils = bands if params.get("scaling", "none") != "none" else 1
-    return result.intensity.nbytes + 64.0 * y * x, (_LOBE * len(surfaces) * veils + _ADD * bands) * y * x
+    return result.intensity.nbytes + 64.0 * y * x, (
+        _LOBE * len(surfaces) * veils + _ADD * bands
+    ) * y * x
 
 
 @stray_shares.shape

@@ -1,4 +1,6 @@
-"""Stray light of a lens: what its surfaces scatter becomes a veil around every source, in every PSF."""
+"""Stray light of a lens: what its surfaces scatter becomes a veil around every source, in every
+PSF.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +14,16 @@ from torch import Tensor
 from typing_extensions import TypedDict
 
 from neusee.nodes import Check, ParameterError, TensorStats, node
-from neusee.nodes._half_precision import refuse_not_finite, single
-from neusee.nodes.flare._harvey_shack import NEAR, Lobe, lobe, on_far_pixels, on_pixels, scattered_share
-from neusee.nodes.optics._f_number import refuse_impossible_f_number
+from neusee.nodes.flare._harvey_shack import (
+    NEAR,
+    Lobe,
+    lobe,
+    on_far_pixels,
+    on_pixels,
+    scattered_share,
+)
+from neusee.nodes.optics._lens import refuse_impossible_f_number
+from neusee.nodes.precision import refuse_not_finite, single
 from neusee.nodes.units import Angle, BeamRadius, Diameter, FocalLength, PixelPitch, Wavelength
 from neusee.nodes.values import Psf, Pupil
 
@@ -23,7 +32,9 @@ Scaling = Literal["none", "roughness"]
 
 
 class Surface(TypedDict):
-    """A scattering surface: Harvey and Shack's b0 (1/sr), l and s, and the radius of the beam on the surface."""
+    """A scattering surface: Harvey and Shack's b0 (1/sr), l and s, and the radius of the beam on
+    the surface.
+    """
 
     __pydantic_config__ = ConfigDict(extra="forbid")  # type: ignore[misc]
     b0: Annotated[float, Field(ge=0, le=1e9)]
@@ -37,7 +48,9 @@ Surfaces = Annotated[dict[str, Surface], Field(min_length=1)]
 
 
 class StrayShares(NamedTuple):
-    """The light of a point source behind a lens that scatters, as shares of the light through the clear pupil."""
+    """The light of a point source behind a lens that scatters, as shares of the light through
+    the clear pupil.
+    """
 
     core: Tensor  #: (band,) float64, not scattered, inside and outside the window
     inside: Tensor  #: (band,) float64, scattered into the window
@@ -70,42 +83,56 @@ def stray_light(
     scaling: Scaling = "none",
     strength: Brightness | None = None,
 ) -> Psf:
-    """Add the light that the surfaces of the lens scatter to a PSF, and take it from the light that is not scattered.
+    """Add the light that the surfaces of the lens scatter to a PSF, and take it from the light that
+    is not scattered.
 
-    ``surfaces`` stand in the order in which the light meets them. Each has b0 (1/sr), l and s of Harvey and Shack,
-    BSDF = b0 (1 + (beta / l)**2)**(s / 2), at ``wavelength``, and the ``radius`` a of the beam on it, by default that
-    of the entrance pupil, ``diameter`` / 2. The surface scatters the share TIS of the light that reaches it, and
-    (NA / a)**2 BSDF(NA r / a) of this light arrives at the distance r from the source, with NA = diameter / (2 f).
-    ``scaling``: `none`, the same at every wavelength; `roughness`, a smooth polished surface, whose b0 goes as
-    wavelength**-4 and whose l as wavelength; TIS then goes as wavelength**-2 where s is below -2 and l small.
-    ``strength``: the brightest source that this PSF shows, in multiples of saturation; a tolerance may then omit the
-    step. Without a value the step is always computed.
+    ``surfaces`` stand in the order in which the light meets them. Each has b0 (1/sr), l and s of
+    Harvey and Shack, BSDF = b0 (1 + (beta / l)**2)**(s / 2), at ``wavelength``, and the ``radius``
+    a of the beam on it, by default that of the entrance pupil, ``diameter`` / 2. The surface
+    scatters the share TIS of the light that reaches it, and (NA / a)**2 BSDF(NA r / a) of this
+    light arrives at the distance r from the source, with NA = diameter / (2 f). ``scaling``:
+    `none`, the same at every wavelength; `roughness`, a smooth polished surface, whose b0 goes as
+    wavelength**-4 and whose l as wavelength; TIS then goes as wavelength**-2 where s is below -2
+    and l small. ``strength``: the brightest source that this PSF shows, in multiples of saturation;
+    a tolerance may then omit the step. Without a value the step is always computed.
 
     Heights and paths of the pupil have no effect, not even where they are NaN.
 
     Shapes: psf.intensity (band, y, x), pupil (v, u), direction (2,) rad -> as psf.
     Units:  as psf, share of the clear pupil's light per pixel; b0 1/sr, radius m.
-    Error:  energy in the window 1e-8 of the captured light, before the precision of the PSF; each pixel is integrated,
-            also where the PSF samples points. Light that scatters twice is where its first scatter sends it. The veil
-            has its centre at the source and is not blurred by mask or aberrations: exact at distances from the source
-            that exceed the width of the core, and too sharp nearer, where l f is below that width.
-            Scatter is taken as shift invariant, incidence as normal.
-    Raises: ParameterError before the run for surfaces that scatter all light, and for a beam that is only some pixels
-            wide on the sensor; ValueError for these at any other wavelength, for a PSF of other bands, and for
-            an aperture that is not finite.
-    Source: Peterson, Proc. SPIE 5178 (2004), 184 (in-field scatter of each surface by its beam); Harvey, thesis,
-            Univ. of Arizona (1976); roughness: Stover, Optical Scattering, 3rd ed., ch. 4.
+    Error:  energy in the window 1e-8 of the captured light, before the precision of the PSF; each
+            pixel is integrated, also where the PSF samples points. Light that scatters twice is
+            where its first scatter sends it. The veil has its centre at the source and is not
+            blurred by mask or aberrations: exact at distances from the source that exceed the width
+            of the core, and too sharp nearer, where l f is below that width. Scatter is taken as
+            shift invariant, incidence as normal.
+    Raises: ParameterError before the run for surfaces that scatter all light, and for a beam that
+            is only some pixels wide on the sensor; ValueError for these at any other wavelength,
+            for a PSF of other bands, and for an aperture that is not finite.
+    Source: Peterson, Proc. SPIE 5178 (2004), 184 (in-field scatter of each surface by its beam);
+            Harvey, thesis, Univ. of Arizona (1976); roughness: Stover, Optical Scattering, 3rd ed.,
+            ch. 4.
     """
     _same_bands(psf, pupil)
     lens = _Lens(surfaces, focal_length, pixel_pitch, diameter, wavelength, scaling)
-    y, x = (a + float(d) for a, d in zip(angle, (0.0, 0.0) if direction is None else direction, strict=True))
+    y, x = (
+        a + float(d)
+        for a, d in zip(angle, (0.0, 0.0) if direction is None else direction, strict=True)
+    )
     size = (psf.intensity.shape[-2], psf.intensity.shape[-1])
-    centre = (size[0] // 2 + focal_length * y / pixel_pitch, size[1] // 2 + focal_length * x / pixel_pitch)
+    centre = (
+        size[0] // 2 + focal_length * y / pixel_pitch,
+        size[1] // 2 + focal_length * x / pixel_pitch,
+    )
     share, intensity, peaks, veil = _transmitted(pupil), [], [], None
     for band, colour in enumerate(pupil.wavelengths.tolist()):
         if veil is None or scaling != "none":
             lobes = _lobes(lens, colour)
-            veil, axis, scattered = _veil(lobes, centre, size), _veil(lobes, (0.0, 0.0), (1, 1)), _total(lobes)
+            veil, axis, scattered = (
+                _veil(lobes, centre, size),
+                _veil(lobes, (0.0, 0.0), (1, 1)),
+                _total(lobes),
+            )
         core = single(psf.intensity[band])
         intensity.append(core * (1 - scattered).to(core) + (share * veil).to(core))
         peaks.append(psf.clear_peak[band] * (1 - scattered) + axis[0, 0])
@@ -125,16 +152,18 @@ def stray_shares(
     wavelength: Wavelength = 550e-9,
     scaling: Scaling = "none",
 ) -> StrayShares:
-    """Account for the light of a point source: not scattered, scattered into the window, and scattered elsewhere.
+    """Account for the light of a point source: not scattered, scattered into the window, and
+    scattered elsewhere.
 
-    ``psf`` has stray light and ``core`` is the same PSF without; the parameters are those of `stray_light`. Heights and
-    paths of the pupil have no effect, not even where they are NaN.
+    ``psf`` has stray light and ``core`` is the same PSF without; the parameters are those of
+    `stray_light`. Heights and paths of the pupil have no effect, not even where they are NaN.
 
     Shapes: psf, core (band, y, x), pupil (v, u) -> three of (band,).
-    Units:  shares of the light through the clear pupil; their sum is the share that the pupil transmits.
+    Units:  shares of the light through the clear pupil; their sum is the share that the pupil
+            transmits.
     Error:  2e-7 of the captured light, from float32 PSFs.
-    Raises: ValueError for a PSF of other bands, for surfaces that scatter all light, and for an aperture that is not
-            finite.
+    Raises: ValueError for a PSF of other bands, for surfaces that scatter all light, and for an
+            aperture that is not finite.
     Source: energy conservation; total integrated scatter as in `stray_light`.
     """
     _same_bands(psf, pupil)
@@ -164,18 +193,27 @@ def _(
         total = float(_total(_lobes(lens, wavelength)))
     except ValueError as error:
         raise ParameterError("surfaces", str(error)) from None
-    notes = [f"the lens scatters {total:.2%} of the light at {wavelength * 1e9:.4g} nm"] if total > 0.1 else []
+    notes = (
+        [f"the lens scatters {total:.2%} of the light at {wavelength * 1e9:.4g} nm"]
+        if total > 0.1
+        else []
+    )
     return [*notes, *_narrowed(pupil, diameter)]
 
 
 def _narrowed(pupil: Pupil | None, diameter: float) -> list[str]:
-    """Return a note on a lens that scatters as a wider one than its pupil, which a reading of the aperture narrowed."""
+    """Return a note on a lens that scatters as a wider one than its pupil, which a reading of
+    the aperture narrowed.
+    """
     if pupil is None or pupil.pitch.is_meta:
         return []
     span = float(pupil.pitch) * pupil.aperture.shape[-1]
     if diameter <= span * (1 + _ROUNDED):
         return []
-    text = f"the lens scatters as one of {diameter * 1e3:.4g} mm, and its pupil has {span * 1e3:.4g} mm"
+    text = (
+        f"the lens scatters as one of {diameter * 1e3:.4g} mm, and its pupil has"
+        f" {span * 1e3:.4g} mm"
+    )
     return [f"{text}: see reading.aperture"]
 
 
@@ -187,13 +225,15 @@ def _(
     strength: float | None = None,
     **params: Any,
 ) -> float:
-    """Return an estimate of what a picture lacks without stray light, relative to its brightest or saturated pixel.
+    """Return an estimate of what a picture lacks without stray light, relative to its brightest or
+    saturated pixel.
 
-    It is no bound: points of light that fill a window, each dimmer than the brightest, add their veils.
-    What is not taken from the core is TIS. A scene of equal brightness lacks a veil of TIS times its mean; a source of
-    ``strength`` saturations, whose own picture is cut off, lacks a veil of ``strength`` times the pixel on the axis.
+    It is no bound: points of light that fill a window, each dimmer than the brightest, add their
+    veils. What is not taken from the core is TIS. A scene of equal brightness lacks a veil of TIS
+    times its mean; a source of ``strength`` saturations, whose own picture is cut off, lacks a veil
+    of ``strength`` times the pixel on the axis.
     """
-    if not any(each["b0"] for each in surfaces.values()):
+    if not any(surface["b0"] for surface in surfaces.values()):
         return 0.0
     if strength is None or params.get("scaling", "none") != "none" or not psf.max > 0:
         return math.inf
@@ -208,44 +248,59 @@ stray_light.hooks.skip_estimated = True
 
 
 @stray_light.check
-def _(result: Psf, psf: Psf, pupil: Pupil, *others: Any, surfaces: Mapping[str, Any], **params: Any) -> list[Check]:
+def _(
+    result: Psf, psf: Psf, pupil: Pupil, *others: Any, surfaces: Mapping[str, Any], **params: Any
+) -> list[Check]:
     names = ("focal_length", "pixel_pitch", "diameter", "wavelength", "scaling")
-    found = stray_shares(result, psf, pupil, surfaces=surfaces, **{n: params[n] for n in names if n in params})
-    core, inside, outside = (float(x.detach().mean()) for x in found)
-    text = f"light not scattered {core:.2%}, stray light inside the window {inside:.3%} and outside {outside:.3%}"
+    light_shares = stray_shares(
+        result, psf, pupil, surfaces=surfaces, **{n: params[n] for n in names if n in params}
+    )
+    core, inside, outside = (float(x.detach().mean()) for x in light_shares)
+    text = (
+        f"light not scattered {core:.2%}, stray light inside the window {inside:.3%} and outside"
+        f" {outside:.3%}"
+    )
     return [Check(text, inside >= -1e-6 and outside >= -1e-6)]
 
 
 def _lobes(lens: _Lens, colour: float) -> list[tuple[Tensor, Lobe, Tensor]]:
-    """Return for each surface the light that reaches it, its lobe on the sensor, and its TIS, at one wavelength."""
-    found, left = [], torch.ones((), dtype=torch.float64)
+    """Return for each surface the light that reaches it, its lobe on the sensor, and its TIS, at
+    one wavelength.
+    """
+    scatterers, left = [], torch.ones((), dtype=torch.float64)
     for name, (b0, l, s, radius) in _scaled(lens, colour):  # noqa: E741
         scale = lens.diameter / (2 * lens.focal_length) * lens.pixel_pitch / radius
         light, share = lobe(b0, l, s, scale), scattered_share(b0, l, s)
         _refuse(name, colour, float(share.detach()), float(light.end.detach()), lens)
-        found.append((left, light, share))
+        scatterers.append((left, light, share))
         left = left * (1 - share)
-    return found
+    return scatterers
 
 
 def _scaled(lens: _Lens, colour: float) -> Iterator[tuple[str, tuple[Tensor, ...]]]:
-    """Return b0, l, s and beam radius of each surface at the wavelength ``colour``, as float64 scalars."""
+    """Return b0, l, s and beam radius of each surface at the wavelength ``colour``, as float64
+    scalars.
+    """
     ratio = lens.wavelength / colour if lens.scaling == "roughness" else 1.0
-    for name, each in lens.surfaces.items():
-        beam = lens.diameter / 2 if each.get("radius") is None else each["radius"]
-        numbers = (each["b0"], each["l"], each["s"], beam)
+    for name, surface in lens.surfaces.items():
+        beam = lens.diameter / 2 if surface.get("radius") is None else surface["radius"]
+        numbers = (surface["b0"], surface["l"], surface["s"], beam)
         b0, l, s, radius = (torch.as_tensor(x, dtype=torch.float64) for x in numbers)  # noqa: E741
         yield name, (b0 * ratio**4, l / ratio, s, radius)
 
 
 def _refuse(name: str, colour: float, share: float, end: float, lens: _Lens) -> None:
     if not share < 1:
-        raise ValueError(f"surface {name} scatters {share:.3g} of the light at {colour * 1e9:.4g} nm, and the limit is "
-                         "below 1: choose a smaller b0, or a steeper s")  # fmt: skip
+        raise ValueError(
+            f"surface {name} scatters {share:.3g} of the light at {colour * 1e9:.4g} nm, and the"
+            " limit is below 1: choose a smaller b0, or a steeper s"
+        )
     if not end > 2 * NEAR:
         size = end * lens.pixel_pitch
-        raise ValueError(f"the light that surface {name} scatters ends {size * 1e6:.3g} um from the source, within "
-                         f"{2 * NEAR} pixels: this surface lies on the sensor; choose a larger radius")  # fmt: skip
+        raise ValueError(
+            f"the light that surface {name} scatters ends {size * 1e6:.3g} um from the source,"
+            f" within {2 * NEAR} pixels: this surface lies on the sensor; choose a larger radius"
+        )
 
 
 def _total(lobes: list[tuple[Tensor, Lobe, Tensor]]) -> Tensor:
@@ -254,7 +309,9 @@ def _total(lobes: list[tuple[Tensor, Lobe, Tensor]]) -> Tensor:
     return 1 - left * (1 - share)
 
 
-def _veil(lobes: list[tuple[Tensor, Lobe, Tensor]], centre: tuple[float, float], size: tuple[int, int]) -> Tensor:
+def _veil(
+    lobes: list[tuple[Tensor, Lobe, Tensor]], centre: tuple[float, float], size: tuple[int, int]
+) -> Tensor:
     return torch.stack([left * on_pixels(light, centre, size) for left, light, _ in lobes]).sum(0)
 
 
@@ -269,8 +326,8 @@ def _transmitted(pupil: Pupil) -> Tensor:
 def _same_bands(psf: Psf, pupil: Pupil) -> None:
     if psf.intensity.ndim != 3 or len(psf.intensity) != len(pupil.wavelengths):
         raise ValueError(
-            f"PSF {tuple(psf.intensity.shape)} and pupil of {len(pupil.wavelengths)} bands must have the same bands: "
-            "give the pupil from which the PSF was computed"
+            f"PSF {tuple(psf.intensity.shape)} and pupil of {len(pupil.wavelengths)} bands must"
+            " have the same bands: give the pupil from which the PSF was computed"
         )
 
 
@@ -282,31 +339,39 @@ def veil_at(
     pixel_pitch: float,
     diameter: float,
 ) -> tuple[Tensor, Tensor]:
-    """Return the light that the surfaces of a lens scatter into pixels at a distance from the spot, and their share.
+    """Return the light that the surfaces of a lens scatter into pixels at a distance from the spot,
+    and their share.
 
     ``surfaces`` are those of `stray_light`. The source lies in the middle of a pixel.
 
-    Shapes: radius (any) pixels -> veil of the same shape, share of the light that passes the lens per pixel, and ().
+    Shapes: radius (any) pixels -> veil of the same shape, share of the light that passes the lens
+            per pixel, and ().
     Units:  pixels; lengths m.
-    Error:  3e-6 of a pixel from 16 pixels on; nearer, the mean over the directions in which pixels lie.
-    Raises: ValueError for surfaces that scatter all light, and for a beam that is only some pixels wide on the sensor.
+    Error:  3e-6 of a pixel from 16 pixels on; nearer, the mean over the directions in which pixels
+            lie.
+    Raises: ValueError for surfaces that scatter all light, and for a beam that is only some pixels
+            wide on the sensor.
     Source: as `stray_light`.
     """
     lobes = _lobes(_Lens(surfaces, focal_length, pixel_pitch, diameter, 1.0, "none"), 1.0)
     window = _veil(lobes, (float(NEAR), float(NEAR)), (2 * NEAR + 1, 2 * NEAR + 1)).flatten()
-    at = torch.arange(-NEAR, NEAR + 1, dtype=torch.float64)
-    places = (at[:, None].square() + at.square()).flatten()
+    offset = torch.arange(-NEAR, NEAR + 1, dtype=torch.float64)
+    places = (offset[:, None].square() + offset.square()).flatten()
     square = radius.double().square()
     distances, which = torch.unique(places, return_inverse=True)
     near = torch.zeros_like(distances).scatter_reduce_(0, which, window, "mean", include_self=False)
-    index = torch.searchsorted(distances, square.flatten().contiguous()).clamp(1, len(distances) - 1)
+    index = torch.searchsorted(distances, square.flatten().contiguous()).clamp(
+        1, len(distances) - 1
+    )
     low, high = distances[index - 1], distances[index]
-    part = ((square.flatten() - low) / (high - low)).clamp(0, 1)
-    inside = (near[index - 1] * (1 - part) + near[index] * part).reshape(square.shape)
+    fraction = ((square.flatten() - low) / (high - low)).clamp(0, 1)
+    inside = (near[index - 1] * (1 - fraction) + near[index] * fraction).reshape(square.shape)
     far = torch.stack([left * _beyond(light, square) for left, light, _ in lobes]).sum(0)
     return torch.where(square <= NEAR**2, inside, far), _total(lobes)
 
 
 def _beyond(light: Lobe, square: Tensor) -> Tensor:
-    """Return the light of a lobe at squared distances, which ends where the direction cosine is 1."""
+    """Return the light of a lobe at squared distances, which ends where the direction cosine is
+    1.
+    """
     return on_far_pixels(light, square) * (light.end - square.sqrt() + 0.5).clamp(0, 1)

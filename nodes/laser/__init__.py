@@ -1,10 +1,13 @@
-"""Laser beams in absolute units, and what they do: damage and dazzle of a sensor, exposure of an eye."""
+"""Laser beams in absolute units, and what they do: damage and dazzle of a sensor, exposure of an
+eye.
+"""
 
 from neusee.nodes.laser import _result_shapes  # noqa: F401  attaches the shape rules
-from neusee.nodes.laser._air import Law, air_transmittance, size_exponent
 from neusee.nodes.laser._beam import (
     Beam,
     Convention,
+    Law,
+    air_transmittance,
     axis_density,
     axis_irradiance,
     beam,
@@ -17,24 +20,44 @@ from neusee.nodes.laser._beam import (
     scintillation,
     sensor_density,
     share_through,
+    size_exponent,
     underfilled,
 )
-from neusee.nodes.laser._bright_pixels import BrightPixels, bright_pixels, hidden_light, round_pixels, with_frame
-from neusee.nodes.laser._damage_curve import Bracket, CurveEnds, first_damage
+from neusee.nodes.laser._bright_pixels import (
+    BrightPixels,
+    bright_pixels,
+    hidden_light,
+    round_pixels,
+    summit_gain,
+    unseen_light,
+    with_frame,
+)
 from neusee.nodes.laser._damage_distances import (
     airy_diameter,
     defocus_of_source,
     distance_intervals,
     exposure_limit,
+    frame_power,
+    heated_diameter,
+    heated_in_spot,
     sensor_gain,
+    spot_in_pixels,
+    widest_heated_diameter,
 )
 from neusee.nodes.laser._damage_laws import (
     KINDS,
+    PUBLISHED_DAMAGE,
+    Bracket,
+    CurveEnds,
     Damage,
     DamageLaw,
+    absorbed_share,
+    absorption_bracket,
     damage_at,
     damage_threshold,
+    first_damage,
     matching_laws,
+    silicon_absorption,
     spot_factor,
     spot_reach,
 )
@@ -47,12 +70,14 @@ from neusee.nodes.laser._damage_parts import (
     state_of,
     worst_state,
 )
-from neusee.nodes.laser._damage_pixels import damaged_pixels
-from neusee.nodes.laser._damage_published import PUBLISHED_DAMAGE
-from neusee.nodes.laser._damage_spot import SpotDamage, damage, heated_spot
-from neusee.nodes.laser._damage_table import read_damage_laws
-from neusee.nodes.laser._dazzle_area import (
+from neusee.nodes.laser._damage_spot import SpotDamage, damage, damaged_pixels, heated_spot
+from neusee.nodes.laser._damage_table import FittedThreshold, Shots, fit_shots, read_damage_laws
+from neusee.nodes.laser._dazzle import (
+    Dazzle,
+    DazzleCurve,
     counted_pixels,
+    dazzle,
+    dazzle_curve,
     dazzle_exposure_limit,
     dazzle_strength,
     dazzled_pixels,
@@ -60,8 +85,6 @@ from neusee.nodes.laser._dazzle_area import (
     pixel_share,
     veil_limit,
 )
-from neusee.nodes.laser._dazzle_curve import DazzleCurve, dazzle_curve
-from neusee.nodes.laser._dazzle_picture import Dazzle, dazzle
 from neusee.nodes.laser._eye_dazzle import (
     LUMENS_PER_WATT,
     STEADY,
@@ -74,18 +97,21 @@ from neusee.nodes.laser._eye_dazzle import (
     unsteady,
     veil_per_lux,
 )
-from neusee.nodes.laser._eye_limits import eye_aperture, eye_mpe, eye_mpe_formula, eye_share, hazard_distance
-from neusee.nodes.laser._eye_trains import (
+from neusee.nodes.laser._eye_limits import (
     TRAIN_RULES,
     TrainLimit,
     TrainRule,
+    eye_aperture,
     eye_limit,
     eye_limit_source,
+    eye_mpe,
+    eye_mpe_formula,
     eye_mpe_train,
+    eye_share,
+    hazard_distance,
     nominal_ocular_hazard_distance,
     train_limit,
 )
-from neusee.nodes.laser._hit_and_miss import FittedThreshold, Shots, fit_shots
 from neusee.nodes.laser._light import light, pulses_within, wavefront
 from neusee.nodes.laser._protection import (
     EDGE,
@@ -101,15 +127,6 @@ from neusee.nodes.laser._protection import (
     white_share,
 )
 from neusee.nodes.laser._round_spot import defocused_peak, round_spot, spot_peak
-from neusee.nodes.laser._silicon_absorption import absorbed_share, absorption_bracket, silicon_absorption
-from neusee.nodes.laser._spot_on_sensor import (
-    frame_power,
-    heated_diameter,
-    heated_in_spot,
-    spot_in_pixels,
-    widest_heated_diameter,
-)
-from neusee.nodes.laser._summit import summit_gain, unseen_light
 
 __all__ = [
     "EDGE",

@@ -1,9 +1,4 @@
-"""The Gaussian beam of a laser: its width, its irradiance on the axis, and its power through an aperture.
-
-Every width is a radius at which the irradiance is 1/e2 of that on the axis (ISO 11146 for a Gaussian beam), and a
-divergence is the full angle between two such radii far away. Laser safety (IEC 60825-1) uses 1/e instead, which is
-smaller by the square root of 2: `beam` converts with ``convention="1/e"``. Distances are numbers or tensors in m.
-"""
+"""The Gaussian beam of a laser, and the transmittance of air on its way."""
 
 from __future__ import annotations
 
@@ -16,15 +11,29 @@ from torch import Tensor
 from neusee.nodes import ParameterError
 from neusee.nodes.laser._round_spot import spot_peak
 
+# --- beam -----------------------------------------------------------------------------------------
+
+# The Gaussian beam of a laser: its width, its irradiance on the axis, and its power through an
+# aperture.
+#
+# Every width is a radius at which the irradiance is 1/e2 of that on the axis (ISO 11146 for a
+# Gaussian beam), and a divergence is the full angle between two such radii far away. Laser safety
+# (IEC 60825-1) uses 1/e instead, which is smaller by the square root of 2: `beam` converts with
+# ``convention="1/e"``. Distances are numbers or tensors in m.
+
+
 Number = TypeVar("Number", float, Tensor)
 Convention = Literal["1/e2", "1/e"]
 
-_AGREE = 0.02  #: largest relative difference of two statements of one quantity, because data sheets round
+#: largest relative difference of two statements of one quantity, because data sheets round
+_AGREE = 0.02
 _SMALL = 1e-4  #: argument below which a series replaces a quotient of two small numbers
 
 
 class Beam(NamedTuple):
-    """A laser beam as it leaves the laser; `beam` makes and checks a beam. Quantities are in SI units."""
+    """A laser beam as it leaves the laser; `beam` makes and checks a beam. Quantities are in SI
+    units.
+    """
 
     wavelength: float  #: m
     power: float | None  #: W, mean over the pulses; None for a single pulse
@@ -62,84 +71,152 @@ def beam(
 ) -> Beam:
     """Make a beam from what a data sheet states, and derive the missing quantities.
 
-    Waist w0, full divergence theta and M2 obey theta = 2 M2 wavelength / (pi w0): two of them give the third, and one
-    alone is completed with M2 = 1. A pulse train obeys power = pulse energy x repetition rate. ``convention`` is that
-    of `waist` and `divergence`; the result always has 1/e2.
+    Waist w0, full divergence theta and M2 obey theta = 2 M2 wavelength / (pi w0): two of them give
+    the third, and one alone is completed with M2 = 1. A pulse train obeys power = pulse energy x
+    repetition rate. ``convention`` is that of `waist` and `divergence`; the result always has 1/e2.
 
-    Raises ParameterError, with the name of the quantity, for negative values and for statements that differ by more
-    than 2 %.
+    Raises ParameterError, with the name of the quantity, for negative values and for statements
+    that differ by more than 2 %.
     """
-    given = {"wavelength": wavelength, "power": power, "pulse_energy": pulse_energy, "pulse_duration": pulse_duration,
-             "repetition_rate": repetition_rate, "waist": waist, "divergence": divergence,
-             "m_squared": m_squared}  # fmt: skip
-    for name, value in given.items():
+    stated = {
+        "wavelength": wavelength,
+        "power": power,
+        "pulse_energy": pulse_energy,
+        "pulse_duration": pulse_duration,
+        "repetition_rate": repetition_rate,
+        "waist": waist,
+        "divergence": divergence,
+        "m_squared": m_squared,
+    }
+    for name, value in stated.items():
         if value is not None and not (math.isfinite(plain(value)) and value > 0):
-            raise ParameterError(name, f"{value:g} is no {name.replace('_', ' ')}: give a finite number above 0")
+            raise ParameterError(
+                name, f"{value:g} is no {name.replace('_', ' ')}: give a finite number above 0"
+            )
     wider = math.sqrt(2) if convention == "1/e" else 1.0
-    shape = _shape(wavelength, waist and waist * wider, divergence and divergence * wider, m_squared)
-    return Beam(wavelength, *_emission(power, pulse_energy, pulse_duration, repetition_rate), *shape)
+    width, angle, quality = _shape(
+        wavelength, waist and waist * wider, divergence and divergence * wider, m_squared
+    )
+    mean, energy, duration, rate = _emission(power, pulse_energy, pulse_duration, repetition_rate)
+    return Beam(
+        wavelength=wavelength,
+        power=mean,
+        pulse_energy=energy,
+        pulse_duration=duration,
+        repetition_rate=rate,
+        waist=width,
+        divergence=angle,
+        m_squared=quality,
+    )
 
 
 def _emission(
     power: float | None, energy: float | None, duration: float | None, rate: float | None
 ) -> tuple[float | None, float | None, float | None, float | None]:
-    """Return power, pulse energy, pulse duration and repetition rate, with the power or the energy of a train."""
+    """Return power, pulse energy, pulse duration and repetition rate, with the power or the
+    energy of a train.
+    """
     if power is None and energy is None:
         raise ParameterError("power", "no power: give power, or pulse_energy with pulse_duration")
     if energy is None and duration is None and rate is None:
         return power, None, None, None
     if duration is None:
-        name = "repetition_rate" if energy is None else "pulse_energy"
-        raise ParameterError(name, "a pulse needs its duration: give pulse_duration")
-    if energy is None and rate is None:
-        text = "the power of a pulse is not known: give pulse_energy, or repetition_rate with the mean power"
-        raise ParameterError("pulse_duration", text)
+        raise _no_duration(energy)
     if rate is None:
-        if power is not None:
-            text = "a single pulse has no mean power: give repetition_rate for a pulse train, or leave power out"
-            raise ParameterError("power", text)
+        _refuse_single_pulse(power, energy)
         return None, energy, duration, None
     _refuse_long_pulse(duration, rate)
-    if energy is None and power is not None:
+    if energy is None:
+        assert power is not None
         return power, power / rate, duration, rate
-    assert energy is not None
+    _refuse_other_power(power, energy, rate)
+    return energy * rate, energy, duration, rate
+
+
+def _no_duration(energy: float | None) -> ParameterError:
+    name = "repetition_rate" if energy is None else "pulse_energy"
+    return ParameterError(name, "a pulse needs its duration: give pulse_duration")
+
+
+def _refuse_single_pulse(power: float | None, energy: float | None) -> None:
+    """Raise ParameterError unless a single pulse is stated by its energy alone."""
+    if energy is None:
+        text = (
+            "the power of a pulse is not known: give pulse_energy, or repetition_rate with the mean"
+            " power"
+        )
+        raise ParameterError("pulse_duration", text)
+    if power is not None:
+        text = (
+            "a single pulse has no mean power: give repetition_rate for a pulse train, or leave"
+            " power out"
+        )
+        raise ParameterError("power", text)
+
+
+def _refuse_other_power(power: float | None, energy: float, rate: float) -> None:
+    """Raise ParameterError for a mean power that is not pulse energy times repetition rate."""
     mean = energy * rate
     if power is not None and not math.isclose(plain(power), plain(mean), rel_tol=_AGREE):
-        text = f"pulse energy {energy:.4g} J x repetition rate {rate:.4g} Hz = {mean:.4g} W, not power {power:.4g} W"
+        text = (
+            f"pulse energy {energy:.4g} J x repetition rate {rate:.4g} Hz = {mean:.4g} W, not power"
+            f" {power:.4g} W"
+        )
         raise ParameterError("power", f"{text}: leave one of the three out")
-    return mean, energy, duration, rate
 
 
 def _refuse_long_pulse(duration: float, rate: float) -> None:
     """Raise ParameterError if the pulses of a train would overlap."""
     if duration * rate >= 1:
-        text = f"a pulse of {duration:.4g} s does not fit into the period of {1 / rate:.4g} s: give a shorter pulse"
+        text = (
+            f"a pulse of {duration:.4g} s does not fit into the period of {1 / rate:.4g} s: give a"
+            " shorter pulse"
+        )
         raise ParameterError("pulse_duration", f"{text}, or a lower repetition_rate")
 
 
 def _shape(
     wavelength: float, waist: float | None, divergence: float | None, m_squared: float | None
 ) -> tuple[float, float, float]:
-    """Return waist, divergence and M2 of a beam at 1/e2 from two or three of them, or from the first or second."""
-    least = 2 * wavelength / math.pi  # waist x divergence of a perfect Gaussian beam
+    """Return waist, divergence and M2 of a beam at 1/e2 from two or three of them, or from the
+    first or second.
+    """
+    diffraction = 2 * wavelength / math.pi  # waist x divergence of a perfect Gaussian beam
     if m_squared is not None and m_squared < 1:
-        raise ParameterError("m_squared", f"M2 = {m_squared:g} is below 1, the M2 of a perfect Gaussian beam")
+        raise ParameterError(
+            "m_squared", f"M2 = {m_squared:g} is below 1, the M2 of a perfect Gaussian beam"
+        )
     quality = 1.0 if m_squared is None else m_squared
     if waist is None and divergence is None:
-        raise ParameterError("divergence", "the width of the beam is not known: give divergence, or waist")
+        raise ParameterError(
+            "divergence", "the width of the beam is not known: give divergence, or waist"
+        )
     if waist is None and divergence is not None:
-        return quality * least / divergence, divergence, quality
+        return quality * diffraction / divergence, divergence, quality
     assert waist is not None
     if divergence is None:
-        return waist, quality * least / waist, quality
-    found = waist * divergence / least
-    said = f"waist {waist:.4g} m and divergence {divergence:.4g} rad (1/e2) have M2 = {found:.4g}"
-    if found < 1 - _AGREE:
-        text = f"{said}, but no beam has less than 1: at this waist the divergence is at least {least / waist:.4g} rad"
+        return waist, quality * diffraction / waist, quality
+    implied = _implied_quality(waist, divergence, diffraction, m_squared)
+    return waist, divergence, max(implied, 1.0)
+
+
+def _implied_quality(
+    waist: float, divergence: float, diffraction: float, m_squared: float | None
+) -> float:
+    """Return the M2 of waist and divergence; raise ParameterError where no beam has it, or where
+    another M2 is stated.
+    """
+    implied = waist * divergence / diffraction
+    said = f"waist {waist:.4g} m and divergence {divergence:.4g} rad (1/e2) have M2 = {implied:.4g}"
+    if implied < 1 - _AGREE:
+        text = (
+            f"{said}, but no beam has less than 1: at this waist the divergence is at least"
+            f" {diffraction / waist:.4g} rad"
+        )
         raise ParameterError("divergence", text)
-    if m_squared is not None and not math.isclose(plain(found), plain(m_squared), rel_tol=_AGREE):
+    if m_squared is not None and not math.isclose(plain(implied), plain(m_squared), rel_tol=_AGREE):
         raise ParameterError("m_squared", f"{said}, not {m_squared:g}: leave one of the three out")
-    return waist, divergence, max(found, 1.0)
+    return implied
 
 
 def plain(value: float | Tensor) -> float:
@@ -147,11 +224,13 @@ def plain(value: float | Tensor) -> float:
     return float(value.detach()) if isinstance(value, Tensor) else value
 
 
-# --- the beam at a distance -------------------------------------------------------------------------------------------
+# --- the beam at a distance -----------------------------------------------------------------------
 
 
 def beam_radius(beam: Beam, distance: Number) -> Number:
-    """Return the 1/e2 radius in m of a beam at a distance from the laser: w^2 = w0^2 + (theta R / 2)^2."""
+    """Return the 1/e2 radius in m of a beam at a distance from the laser: w^2 = w0^2 + (theta R
+    / 2)^2.
+    """
     squared = _radius_squared(beam, distance)
     return torch.sqrt(squared) if isinstance(squared, Tensor) else math.sqrt(squared)
 
@@ -167,7 +246,8 @@ def curvature_radius(beam: Beam, distance: Number) -> Number:
 def axis_density(beam: Beam, distance: Number, transmittance: float = 1.0) -> Number:
     """Return the share of a beam's power per m2 on the axis at a distance: 2 T / (pi w^2).
 
-    Times the power it is the irradiance; times the energy of a pulse it is the radiant exposure of one pulse.
+    Times the power it is the irradiance; times the energy of a pulse it is the radiant exposure of
+    one pulse.
     """
     return 2 * transmittance / (math.pi * _radius_squared(beam, distance))
 
@@ -180,13 +260,20 @@ def axis_irradiance(beam: Beam, distance: Number, transmittance: float = 1.0) ->
     return _mean_power(beam) * axis_density(beam, distance, transmittance)
 
 
-def share_through(beam: Beam, distance: Number, diameter: float, transmittance: float = 1.0) -> Number:
-    """Return the share of a beam's power that passes a round aperture on the axis: T (1 - exp(-D^2 / (2 w^2)))."""
+def share_through(
+    beam: Beam, distance: Number, diameter: float, transmittance: float = 1.0
+) -> Number:
+    """Return the share of a beam's power that passes a round aperture on the axis: T (1 -
+    exp(-D^2 / (2 w^2))).
+    """
     return -transmittance * _expm1(-(diameter**2) / (2 * _radius_squared(beam, distance)))
 
 
-def power_through(beam: Beam, distance: Number, diameter: float, transmittance: float = 1.0) -> Number:
-    """Return the power in W that passes a round aperture on the axis of a beam, mean over the pulses.
+def power_through(
+    beam: Beam, distance: Number, diameter: float, transmittance: float = 1.0
+) -> Number:
+    """Return the power in W that passes a round aperture on the axis of a beam, mean over the
+    pulses.
 
     Raises ValueError for a single pulse, which has no mean power.
     """
@@ -201,60 +288,90 @@ def sensor_density(
     lens_transmittance: float,
     transmittance: float = 1.0,
 ) -> Number:
-    """Return the share of a beam's power per m2 at the peak behind a clear, focused, diffraction-limited lens.
+    """Return the share of a beam's power per m2 at the peak behind a clear, focused,
+    diffraction-limited lens.
 
-    P_in / P x tau (pi D^2 / 4) / (lambda f)^2 x (2 / x) tanh(x / 2), with x = D^2 / (4 w^2). The last factor is 1 for
-    a beam that overfills the aperture. Times the power it is the peak irradiance; times the energy of a pulse it is
-    the radiant exposure of one pulse.
+    P_in / P x tau (pi D^2 / 4) / (lambda f)^2 x (2 / x) tanh(x / 2), with x = D^2 / (4 w^2). The
+    last factor is 1 for a beam that overfills the aperture. Times the power it is the peak
+    irradiance; times the energy of a pulse it is the radiant exposure of one pulse.
     """
     share = share_through(beam, distance, diameter, transmittance)
     clear = math.pi * diameter**2 / 4 / (beam.wavelength * focal_length) ** 2
-    return lens_transmittance * clear * share * underfilled(diameter**2 / (4 * _radius_squared(beam, distance)))
+    return (
+        lens_transmittance
+        * clear
+        * share
+        * underfilled(diameter**2 / (4 * _radius_squared(beam, distance)))
+    )
 
 
 def defocus_at(
-    beam: Beam, distance: Number, diameter: Number, focus: float = math.inf, lens_defocus: float = 0.0
+    beam: Beam,
+    distance: Number,
+    diameter: Number,
+    focus: float = math.inf,
+    lens_defocus: float = 0.0,
 ) -> Number:
     """Return the waves of defocus at the rim of a lens for a beam from a distance.
 
-    D^2 / (8 lambda) (1 / R' - 1 / R0), with the radius R' of the wavefront (`curvature_radius`) and the distance R0 on
-    which the lens is focused, and ``lens_defocus``, in m of path at the rim.
+    D^2 / (8 lambda) (1 / R' - 1 / R0), with the radius R' of the wavefront (`curvature_radius`) and
+    the distance R0 on which the lens is focused, and ``lens_defocus``, in m of path at the rim.
     """
     bend = 1 / curvature_radius(beam, distance) - 1 / focus
     return (diameter**2 / 8 * bend + lens_defocus) / beam.wavelength
 
 
 def density_in_spot(
-    beam: Beam, distance: Tensor, diameter: Tensor, focal_length: Tensor, waves: Tensor, within: float = 0.0
+    beam: Beam,
+    distance: Tensor,
+    diameter: Tensor,
+    focal_length: Tensor,
+    waves: Tensor,
+    within: float = 0.0,
 ) -> Tensor:
-    """Return the share of a beam's power per m2 at the brightest point behind a clear round lens with defocus.
+    """Return the share of a beam's power per m2 at the brightest point behind a clear round lens
+    with defocus.
 
-    The lens and the air pass all light. 2 / (pi w^2) (pi D^2 / (4 lambda f))^2 times `spot_peak` of the fill
-    (D / (2 w))^2 and of the ``waves`` of defocus, with ``within`` as there. In focus it is `sensor_density`.
+    The lens and the air pass all light. 2 / (pi w^2) (pi D^2 / (4 lambda f))^2 times `spot_peak` of
+    the fill (D / (2 w))^2 and of the ``waves`` of defocus, with ``within`` as there. In focus it is
+    `sensor_density`.
     """
     fill = diameter**2 / (4 * _radius_squared(beam, distance))
     return even_density(beam, distance, diameter, focal_length) * spot_peak(fill, waves, within)
 
 
 def even_density(beam: Beam, distance: Tensor, diameter: Tensor, focal_length: Tensor) -> Tensor:
-    """Return the share of a beam's power per m2 at the focus if the lens were lit evenly as on its axis."""
+    """Return the share of a beam's power per m2 at the focus if the lens were lit evenly as on
+    its axis.
+    """
     gain = (math.pi * diameter**2 / (4 * beam.wavelength * focal_length)) ** 2
     return axis_density(beam, distance) * gain
 
 
-def scintillation(wavelength: float, distance: float | Tensor, cn2: float | Tensor, worst: float) -> Tensor:
-    """Return the factor on the mean irradiance that turbulent air stays below for the share ``worst`` of the time.
+def scintillation(
+    wavelength: float, distance: float | Tensor, cn2: float | Tensor, worst: float
+) -> Tensor:
+    """Return the factor on the mean irradiance that turbulent air stays below for the share
+    ``worst`` of the time.
 
-    The irradiance at a point is lognormal, with the variance of its logarithm 1.23 Cn2 k^(7/6) R^(11/6) (Rytov, plane
-    wave, weak turbulence) and the mean of still air. It is an upper bound: a lens averages over its aperture, a
-    diverging beam fluctuates less, and strong turbulence saturates.
-    Source: Tatarskii, Wave Propagation in a Turbulent Medium (1961); Andrews, Phillips, Hopen, Al-Habash, J. Opt. Soc.
+    The irradiance at a point is lognormal, with the variance of its logarithm 1.23 Cn2 k^(7/6)
+    R^(11/6) (Rytov, plane wave, weak turbulence) and the mean of still air. It is an upper bound: a
+    lens averages over its aperture, a diverging beam fluctuates less, and strong turbulence
+    saturates.
+    Source: Tatarskii, Wave Propagation in a Turbulent Medium (1961); Andrews, Phillips, Hopen,
+            Al-Habash, J. Opt. Soc.
     Am. A 16, 1417 (1999).
     """
     wavenumber = 2 * math.pi / wavelength
     quantile = float(torch.special.ndtri(torch.tensor(worst, dtype=torch.float64)))
-    variance = 1.23 * cn2 * wavenumber ** (7 / 6) * torch.as_tensor(distance, dtype=torch.float64) ** (11 / 6)
-    # a wider spread has a smaller factor again: the largest is the bound, that of still air below half of the time
+    variance = (
+        1.23
+        * cn2
+        * wavenumber ** (7 / 6)
+        * torch.as_tensor(distance, dtype=torch.float64) ** (11 / 6)
+    )
+    # a wider spread has a smaller factor again: the largest is the bound, that of still air below
+    # half of the time
     spread = variance.sqrt().clamp_max(max(quantile, 0.0))
     return torch.exp(quantile * spread - spread.square() / 2)
 
@@ -267,16 +384,22 @@ def peak_on_sensor(
     lens_transmittance: float,
     transmittance: float = 1.0,
 ) -> Number:
-    """Return the peak irradiance in W/m2 behind a clear, focused, diffraction-limited lens, mean over the pulses.
+    """Return the peak irradiance in W/m2 behind a clear, focused, diffraction-limited lens, mean
+    over the pulses.
 
-    ``transmittance`` is that of the air. Raises ValueError for a single pulse, which has no mean power.
+    ``transmittance`` is that of the air. Raises ValueError for a single pulse, which has no mean
+    power.
     """
-    share = sensor_density(beam, distance, diameter, focal_length, lens_transmittance, transmittance)
+    share = sensor_density(
+        beam, distance, diameter, focal_length, lens_transmittance, transmittance
+    )
     return _mean_power(beam) * share
 
 
 def underfilled(x: Number) -> Number:
-    """Return (2 / x) tanh(x / 2), the relative peak of a Gaussian beam behind an aperture with x = (D / (2 w))^2."""
+    """Return (2 / x) tanh(x / 2), the relative peak of a Gaussian beam behind an aperture with x
+    = (D / (2 w))^2.
+    """
     if isinstance(x, Tensor):
         safe = x.where(x > _SMALL, 1.0)
         return torch.where(x > _SMALL, 2 / safe * torch.tanh(safe / 2), 1 - x * x / 12)
@@ -289,9 +412,68 @@ def _radius_squared(beam: Beam, distance: Number) -> Number:
 
 def _mean_power(beam: Beam) -> float:
     if beam.power is None:
-        raise ValueError("a single pulse has no mean power: give repetition_rate, or use its energy with axis_density")
+        raise ValueError(
+            "a single pulse has no mean power: give repetition_rate, or use its energy with"
+            " axis_density"
+        )
     return beam.power
 
 
 def _expm1(x: Number) -> Number:
     return torch.expm1(x) if isinstance(x, Tensor) else math.expm1(x)
+
+
+# --- air ------------------------------------------------------------------------------------------
+
+# Transmittance of air on the way from a laser to a camera, from the visibility (meteorological
+# range).
+
+
+Law = Literal["kruse", "kim"]
+_KOSCHMIEDER = 3.912  #: -ln 0.02: at the visibility a black object has 2 % of its contrast left
+_AT = 550e-9  #: m, wavelength of the visibility
+
+
+def air_transmittance(
+    distance: Number, visibility: float | None, wavelength: float, law: Law = "kim"
+) -> Number | float:
+    """Return the transmittance of air of a given visibility: exp(-(3.912 / V) (lambda / 550 nm)^-q
+    R).
+
+    ``law`` names the exponent q as a function of the visibility: `kruse` has q = 0.585 V^(1/3)
+    below 6 km, `kim` lets q fall to 0 in fog of less than 500 m, where Kruse's law is known to
+    fail. Without a visibility (None) the air is clear and the transmittance is 1. Absorption by
+    gases is left out.
+
+    Raises ParameterError for a negative distance and a visibility that is not above 0.
+    Source: Koschmieder (1924); Kruse, McGlauchlin, McQuistan, Elements of Infrared Technology
+            (1962); Kim, McArthur,
+    Korevaar, Proc. SPIE 4214, 26 (2001).
+    """
+    if not (math.isfinite(plain(distance)) and distance >= 0):
+        raise ParameterError(
+            "distance", f"{distance:g} m is no distance: give a finite number from 0"
+        )
+    if visibility is None:
+        return 1.0
+    if not visibility > 0:
+        raise ParameterError(
+            "visibility", f"{visibility:g} m is no visibility: give a number above 0"
+        )
+    exponent = size_exponent(visibility, law)
+    depth = _KOSCHMIEDER / visibility * math.pow(wavelength / _AT, -exponent) * distance
+    return torch.exp(-depth) if isinstance(depth, Tensor) else math.exp(-depth)
+
+
+def size_exponent(visibility: float, law: Law) -> float:
+    """Return the exponent q of the wavelength in the extinction of haze at a visibility in m."""
+    km = visibility / 1e3
+    if km > 50:
+        return 1.6
+    if km > 6:
+        return 1.3
+    if law == "kruse":
+        return 0.585 * math.pow(km, 1 / 3)
+    if km > 1:
+        return 0.16 * km + 0.34
+    return max(0.0, km - 0.5)

@@ -1,7 +1,9 @@
-"""The parts of a laser's light that can each damage a sensor, and the threshold that each is judged by, or why not.
+"""The parts of a laser's light that can each damage a sensor, and the threshold that each is judged
+by, or why not.
 
-The parts are the single pulse, the mean over the dwell time, the accumulation of the heat of both, and the incubation
-of many pulses. Continuous light is one pulse that lasts for the dwell time: its parts are alike.
+The parts are the single pulse, the mean over the dwell time, the accumulation of the heat of both,
+and the incubation of many pulses. Continuous light is one pulse that lasts for the dwell time: its
+parts are alike.
 """
 
 from __future__ import annotations
@@ -14,30 +16,44 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from neusee.nodes.laser._damage_curve import (
+from neusee.nodes.laser._damage_laws import (
+    ABSORPTION_SOURCE,
     CONTINUOUS_FROM,
+    PUBLISHED_DAMAGE,
     PULSE_END,
     SHORTEST,
+    SILICON_RANGE,
     SPREAD,
     Bracket,
     CurveEnds,
+    DamageLaw,
+    Kind,
+    Number,
+    Quantity,
+    absorption_bracket,
+    double,
     first_damage,
+    matching_laws,
+    spot_factor,
 )
-from neusee.nodes.laser._damage_laws import DamageLaw, Kind, Number, Quantity, double, matching_laws, spot_factor
-from neusee.nodes.laser._damage_published import PUBLISHED_DAMAGE
-from neusee.nodes.laser._silicon_absorption import ABSORPTION_SOURCE, SILICON_RANGE, absorption_bracket
 
 Part = Literal["pulse", "mean", "accumulation", "incubation"]
 State = Literal["above", "within", "below", "not judged"]
 
 PARTS: tuple[Part, ...] = ("pulse", "mean", "accumulation", "incubation")
 MEASURED = 532e-9  #: m, wavelength of the published experiments
-INCUBATION = (0.8, 0.9, 1.0)  #: exponents S of F_N = F_1 N^(S - 1): least, middle, largest; an assumption
+#: exponents S of F_N = F_1 N^(S - 1): least, middle, largest; an assumption
+INCUBATION = (0.8, 0.9, 1.0)
 _QUANTILE = 1.6448536269514722  #: of the standard normal distribution at 0.95
 _MILLISECOND = 1e-3  #: s, shortest dwell of the published continuous law
 _OWN = "own law"
-_SUPERPOSED = "heat of one pulse above the mean, and of the mean, superposed: our derivation for linear heat conduction"
-_INCUBATED = "incubation F_N = F_1 N^(S - 1) with S from 0.8 to 1: an assumption, not measured on sensors"
+_SUPERPOSED = (
+    "heat of one pulse above the mean, and of the mean, superposed: our derivation for linear heat"
+    " conduction"
+)
+_INCUBATED = (
+    "incubation F_N = F_1 N^(S - 1) with S from 0.8 to 1: an assumption, not measured on sensors"
+)
 
 
 @dataclass(frozen=True)
@@ -48,37 +64,54 @@ class LightInTime:
     dwell: Number  #: s, for which the light stays on the place
     pulse_duration: Number | None = None  #: s; None for continuous light
     repetition_rate: Number | None = None  #: Hz; None for a single pulse
-    spot: Number | None = None  #: m, 1/e2 diameter of the Gaussian spot that heats as the light does
+    #: m, 1/e2 diameter of the Gaussian spot that heats as the light does
+    spot: Number | None = None
     small_spot_exponent: Number = 0.0
 
     @property
     def duration(self) -> Tensor:
         """Return the time in s for which one pulse, or continuous light, warms the place."""
         dwell = double(self.dwell)
-        return dwell if self.pulse_duration is None else torch.minimum(double(self.pulse_duration), dwell)
+        return (
+            dwell
+            if self.pulse_duration is None
+            else torch.minimum(double(self.pulse_duration), dwell)
+        )
 
     @property
     def caught(self) -> Tensor:
         """Return the share of a pulse that falls into the dwell time."""
-        return double(1.0) if self.pulse_duration is None else self.duration / double(self.pulse_duration)
+        return (
+            double(1.0)
+            if self.pulse_duration is None
+            else self.duration / double(self.pulse_duration)
+        )
 
     @property
     def rate(self) -> Tensor:
         """Return the pulses a second over the dwell time, of which at least one falls into it."""
         once = 1 / double(self.dwell)
-        return once if self.repetition_rate is None else torch.maximum(double(self.repetition_rate), once)
+        return (
+            once
+            if self.repetition_rate is None
+            else torch.maximum(double(self.repetition_rate), once)
+        )
 
     @property
     def pulses(self) -> Tensor:
         """Return the number of pulses in the dwell time, at least 1."""
         if self.repetition_rate is None:
             return double(1.0)
-        return torch.ceil(double(self.dwell) * double(self.repetition_rate) * (1 - 1e-12)).clamp_min(1.0)
+        return torch.ceil(
+            double(self.dwell) * double(self.repetition_rate) * (1 - 1e-12)
+        ).clamp_min(1.0)
 
 
 @dataclass(frozen=True)
 class DamagePart:
-    """One part of a laser's light with the threshold that judges it, or the reason why none does."""
+    """One part of a laser's light with the threshold that judges it, or the reason why none
+    does.
+    """
 
     part: Part
     kind: Kind  #: of damage
@@ -95,11 +128,13 @@ class DamagePart:
         return self.threshold is not None and bool((self.threshold.low <= 0).any())
 
 
-def state_of(least: float, largest: float, open_below: bool = False) -> State:
-    """Return where an exposure is, from its ratios to the upper and to the lower end of a threshold."""
-    if math.isnan(least) or math.isnan(largest):
+def state_of(smallest: float, largest: float, open_below: bool = False) -> State:
+    """Return where an exposure is, from its ratios to the upper and to the lower end of a
+    threshold.
+    """
+    if math.isnan(smallest) or math.isnan(largest):
         return "not judged"
-    if least >= 1:
+    if smallest >= 1:
         return "above"
     if open_below:
         return "not judged"
@@ -107,19 +142,26 @@ def state_of(least: float, largest: float, open_below: bool = False) -> State:
 
 
 def worst_state(states: Iterable[State]) -> State:
-    """Return the state of a whole laser from those of its parts; `below` only if every part is judged and below."""
+    """Return the state of a whole laser from those of its parts; `below` only if every part is
+    judged and below.
+    """
     order: tuple[State, ...] = ("above", "not judged", "within", "below")
     states = tuple(states)
     return next((state for state in order if state in states), "not judged")
 
 
 def damage_parts(
-    light: LightInTime, device: str, own: Sequence[DamageLaw] = (), published: Sequence[DamageLaw] = PUBLISHED_DAMAGE
+    light: LightInTime,
+    device: str,
+    own: Sequence[DamageLaw] = (),
+    published: Sequence[DamageLaw] = PUBLISHED_DAMAGE,
 ) -> tuple[DamagePart, ...]:
-    """Return the parts of a laser's light with their thresholds: pulse, mean, accumulation, incubation, then others.
+    """Return the parts of a laser's light with their thresholds: pulse, mean, accumulation,
+    incubation, then others.
 
-    Laws of ``own`` count where they hold; elsewhere the published curve of the first damage does, from 400 to 1100 nm.
-    The first four parts are always there; what follows are further kinds of damage by one pulse.
+    Laws of ``own`` count where they hold; elsewhere the published curve of the first damage does,
+    from 400 to 1100 nm. The first four parts are always there; what follows are further kinds of
+    damage by one pulse.
 
     Shapes: thresholds broadcast over the values of ``light``.
     Units:  J/m2 of one pulse, or W/m2.
@@ -131,18 +173,23 @@ def damage_parts(
     means = [*_own_parts(light, device, own, "mean")] or [_first_part(light, curve, "mean")]
     pulse, mean = _lowest(pulses), _lowest(means)
     sums = [_accumulation(light, pulse, mean), _incubation(light, pulse)]
-    others = [part for part in (*pulses, *means) if part is not pulse and part is not mean]
-    is_own = any(part.note.startswith(_OWN) for part in pulses)
+    others = [judged for judged in (*pulses, *means) if judged is not pulse and judged is not mean]
+    is_own = any(judged.note.startswith(_OWN) for judged in pulses)
     further = () if is_own else _further(light, device, curve, published)
     return (pulse, mean, *sums, *others, *further)
 
 
 def _lowest(parts: Sequence[DamagePart]) -> DamagePart:
     """Return the part whose middle threshold is lowest."""
-    return min(parts, key=lambda part: math.inf if part.threshold is None else float(part.threshold.middle.min()))
+    return min(
+        parts,
+        key=lambda judged: (
+            math.inf if judged.threshold is None else float(judged.threshold.middle.min())
+        ),
+    )
 
 
-# --- the published curve ----------------------------------------------------------------------------------------------
+# --- the published curve --------------------------------------------------------------------------
 
 
 def _curve_of(light: LightInTime, device: str, published: Sequence[DamageLaw]) -> CurveEnds | str:
@@ -153,7 +200,10 @@ def _curve_of(light: LightInTime, device: str, published: Sequence[DamageLaw]) -
         classes = ", ".join(sorted({law.device for law in published}))
         return f"no law of damage for the device {device}: there are published laws for {classes}"
     if not SILICON_RANGE[0] <= light.wavelength <= SILICON_RANGE[1]:
-        return f"no law of damage at {light.wavelength * 1e9:.5g} nm: published laws are used from 400 to 1100 nm"
+        return (
+            f"no law of damage at {light.wavelength * 1e9:.5g} nm: published laws are used from 400"
+            " to 1100 nm"
+        )
     return CurveEnds(pulse, continuous)
 
 
@@ -163,18 +213,20 @@ def _first_law(device: str, quantity: Quantity, published: Sequence[DamageLaw]) 
     return next((law for law in first if law.device.casefold() == device.casefold()), None)
 
 
-def _first_part(light: LightInTime, curve: CurveEnds | str, part: Part) -> DamagePart:
-    """Return one pulse, or the mean, judged by the published curve of the first damage, or the reason why not."""
-    as_pulse = part == "pulse" and light.pulse_duration is not None
+def _first_part(light: LightInTime, curve: CurveEnds | str, share_of_light: Part) -> DamagePart:
+    """Return one pulse, or the mean, judged by the published curve of the first damage, or the
+    reason why not.
+    """
+    as_pulse = share_of_light == "pulse" and light.pulse_duration is not None
     quantity: Quantity = "fluence" if as_pulse else "irradiance"
     if isinstance(curve, str):
-        return DamagePart(part, "point", quantity, None, reason=curve)
+        return DamagePart(share_of_light, "point", quantity, None, reason=curve)
     duration = light.duration if as_pulse else double(light.dwell)
     bracket = first_damage(curve, duration, light.spot, light.small_spot_exponent)
     bracket = bracket.times(1 / light.caught) if as_pulse else bracket.times(1 / duration)
     factors, named = _wavelength(light, curve.pulse)
     return DamagePart(
-        part=part,
+        part=share_of_light,
         kind="point",
         quantity=quantity,
         threshold=bracket.times(factors),
@@ -185,12 +237,14 @@ def _first_part(light: LightInTime, curve: CurveEnds | str, part: Part) -> Damag
 
 
 def _shorter(duration: Tensor) -> str:
-    """Return why light that is shorter than any published threshold is not judged from below; empty otherwise."""
+    """Return why light that is shorter than any published threshold is not judged from below;
+    empty otherwise.
+    """
     if not bool((duration < SHORTEST).any()):
         return ""
     return (
-        f"no threshold was found for pulses below {SHORTEST * 1e9:g} ns, which are reported to damage at less fluence "
-        "than pulses of nanoseconds"
+        f"no threshold was found for pulses below {SHORTEST * 1e9:g} ns, which are reported to"
+        " damage at less fluence than pulses of nanoseconds"
     )
 
 
@@ -206,22 +260,34 @@ def _duration_note(duration: Tensor) -> str:
     if bool((duration < SHORTEST).any()):
         return "upper end of the threshold of 10 ns, extrapolated to shorter pulses"
     if bool(((duration > PULSE_END) & (duration < CONTINUOUS_FROM)).any()):
-        return f"interpolated between 10 ns and continuous light, spread {SPREAD:.2g} times to each side"
+        return (
+            f"interpolated between 10 ns and continuous light, spread {SPREAD:.2g} times to each"
+            " side"
+        )
     if bool((duration <= PULSE_END).any()):
         return f"published for 10 ns, spread {SPREAD:.2g} times to each side"
     if bool((duration < _MILLISECOND).any()):
-        return "continuous law of 1 ms and longer, extrapolated to shorter light, which needs no less irradiance"
+        return (
+            "continuous law of 1 ms and longer, extrapolated to shorter light, which needs no less"
+            " irradiance"
+        )
     return ""
 
 
 def _wavelength(light: LightInTime, law: DamageLaw) -> tuple[tuple[float, float], str]:
-    """Return the least and the largest factor on a published threshold for the wavelength, and a note on both."""
+    """Return the least and the largest factor on a published threshold for the wavelength, and a
+    note on both.
+    """
     if law.wavelengths[0] <= light.wavelength <= law.wavelengths[1]:
         return (1.0, 1.0), ""
     factors = absorption_bracket(light.wavelength, MEASURED)
-    return factors, (
-        f"extrapolated from 532 to {light.wavelength * 1e9:.4g} nm: between absorption as at 532 nm and 3 um of "
-        f"silicon alone, a factor of {factors[0]:.3g} to {factors[1]:.3g} ({ABSORPTION_SOURCE})"
+    return (
+        factors,
+        (
+            f"extrapolated from 532 to {light.wavelength * 1e9:.4g} nm: between absorption as at"
+            f" 532 nm and 3 um of silicon alone, a factor of {factors[0]:.3g} to {factors[1]:.3g}"
+            f" ({ABSORPTION_SOURCE})"
+        ),
     )
 
 
@@ -239,16 +305,23 @@ def _further(
             bracket = Bracket(middle / SPREAD, middle, middle * SPREAD).times(factors)
             note = f"one figure, spread {SPREAD:.2g} times to each side"
             yield DamagePart(
-                "pulse", law.damage, "fluence", bracket, law.source, "; ".join(filter(None, (note, named)))
+                "pulse",
+                law.damage,
+                "fluence",
+                bracket,
+                law.source,
+                "; ".join(filter(None, (note, named))),
             )
 
 
-# --- laws of the user -------------------------------------------------------------------------------------------------
+# --- laws of the user -----------------------------------------------------------------------------
 
 
-def _own_parts(light: LightInTime, device: str, own: Sequence[DamageLaw], part: Part) -> Iterator[DamagePart]:
+def _own_parts(
+    light: LightInTime, device: str, own: Sequence[DamageLaw], share_of_light: Part
+) -> Iterator[DamagePart]:
     """Yield one pulse, or the mean, judged by each law of the user that holds for it."""
-    as_pulse = part == "pulse" and light.pulse_duration is not None
+    as_pulse = share_of_light == "pulse" and light.pulse_duration is not None
     duration = light.duration if as_pulse else double(light.dwell)
     nominal = float(duration.flatten()[0])
     quantities: tuple[Quantity, ...] = ("fluence", "irradiance")
@@ -258,7 +331,7 @@ def _own_parts(light: LightInTime, device: str, own: Sequence[DamageLaw], part: 
             scale = scale / light.caught if as_pulse else scale
             note = _OWN if law.spot is None else f"{_OWN}, for a spot of {law.spot * 1e6:.3g} um"
             yield DamagePart(
-                part=part,
+                part=share_of_light,
                 kind=law.damage,
                 quantity="fluence" if as_pulse else "irradiance",
                 threshold=_own_bracket(law).times(scale),
@@ -269,40 +342,57 @@ def _own_parts(light: LightInTime, device: str, own: Sequence[DamageLaw], part: 
 
 
 def _to_quantity(law: DamageLaw, as_pulse: bool, duration: Tensor) -> Tensor:
-    """Return the factor from the quantity of a law to the fluence of one pulse, or to the irradiance over a dwell."""
+    """Return the factor from the quantity of a law to the fluence of one pulse, or to the
+    irradiance over a dwell.
+    """
     if as_pulse:
         return duration if law.quantity == "irradiance" else double(1.0)
     return 1 / duration if law.quantity == "fluence" else double(1.0)
 
 
 def _own_spot(law: DamageLaw, light: LightInTime, duration: Tensor) -> Tensor:
-    """Return the factor of the spot on an irradiance; 1 for a fluence and where a spot is not known."""
+    """Return the factor of the spot on an irradiance; 1 for a fluence and where a spot is not
+    known.
+    """
     if law.quantity == "fluence" or law.spot is None or light.spot is None:
         return double(1.0)
     return spot_factor(law.spot, light.spot, duration, light.small_spot_exponent)
 
 
 def _own_bracket(law: DamageLaw) -> Bracket:
-    """Return the bracket of a law: its own, else the middle 90 % of devices and medians, else the median alone."""
+    """Return the bracket of a law: its own, else the middle 90 % of devices and medians, else
+    the median alone.
+    """
     median = double(law.median)
     if law.low is not None and law.high is not None:
         return Bracket(double(law.low), median, double(law.high))
-    deviations = [math.log(factor) for factor in (law.factor, law.median_factor) if factor is not None]
+    deviations = [
+        math.log(factor) for factor in (law.factor, law.median_factor) if factor is not None
+    ]
     away = math.exp(_QUANTILE * math.hypot(*deviations)) if deviations else 1.0
     return Bracket(median / away, median, median * away)
 
 
-# --- many pulses ------------------------------------------------------------------------------------------------------
+# --- many pulses ----------------------------------------------------------------------------------
 
 
 def _accumulation(light: LightInTime, pulse: DamagePart, mean: DamagePart) -> DamagePart:
-    """Return the sum of the heat of one pulse above the mean and of the mean; as the mean for continuous light.
+    """Return the sum of the heat of one pulse above the mean and of the mean; as the mean for
+    continuous light.
 
-    The light of a train is its mean and a part whose mean is 0, so that a pulse warms as (1 - duty) of its fluence
-    beside the mean. With a duty near 1 the sum is that of continuous light.
+    The light of a train is its mean and a part whose mean is 0, so that a pulse warms as (1 - duty)
+    of its fluence beside the mean. With a duty near 1 the sum is that of continuous light.
     """
     if light.pulse_duration is None:
-        return DamagePart("accumulation", mean.kind, mean.quantity, mean.threshold, mean.source, mean.note, mean.reason)
+        return DamagePart(
+            "accumulation",
+            mean.kind,
+            mean.quantity,
+            mean.threshold,
+            mean.source,
+            mean.note,
+            mean.reason,
+        )
     if pulse.threshold is None or mean.threshold is None:
         missing = pulse if pulse.threshold is None else mean
         return DamagePart("accumulation", pulse.kind, "fluence", None, reason=missing.reason)
@@ -331,14 +421,23 @@ def _accumulation(light: LightInTime, pulse: DamagePart, mean: DamagePart) -> Da
 def _incubation(light: LightInTime, pulse: DamagePart) -> DamagePart:
     """Return one pulse of many, each of which weakens the sensor; as the pulse for one pulse.
 
-    Only what is above the mean counts as pulses: with a duty near 1 the light is continuous and nothing incubates.
+    Only what is above the mean counts as pulses: with a duty near 1 the light is continuous and
+    nothing incubates.
     """
     if pulse.threshold is None:
         return DamagePart("incubation", pulse.kind, pulse.quantity, None, reason=pulse.reason)
     count = light.pulses
     duty = (light.duration * light.rate).clamp_max(1.0)
-    least, middle, largest = (1 / ((1 - duty) * count ** (1 - exponent) + duty) for exponent in INCUBATION)
-    bracket = Bracket(pulse.threshold.low * least, pulse.threshold.middle * middle, pulse.threshold.high * largest)
+    smallest, middle, largest = (
+        1 / ((1 - duty) * count ** (1 - exponent) + duty) for exponent in INCUBATION
+    )
+    bracket = Bracket(
+        pulse.threshold.low * smallest,
+        pulse.threshold.middle * middle,
+        pulse.threshold.high * largest,
+    )
     many = bool((count > 1).any())
     note = f"{_INCUBATED}; {float(count.max()):.3g} pulses" if many else pulse.note
-    return DamagePart("incubation", pulse.kind, pulse.quantity, bracket, pulse.source, note, pulse.reason)
+    return DamagePart(
+        "incubation", pulse.kind, pulse.quantity, bracket, pulse.source, note, pulse.reason
+    )

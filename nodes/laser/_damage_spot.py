@@ -1,7 +1,8 @@
-"""Damage of a sensor by the light of a laser on it: every part of the light is judged, or it is said why not."""
+"""Damage of a sensor by the light of a laser, and the dead pixels that it leaves."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,33 +14,63 @@ from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.input_files import once_per_version
-from neusee.nodes.laser._damage_laws import KINDS, DamageLaw, damage_at
-from neusee.nodes.laser._damage_parts import DamagePart, LightInTime, damage_parts, state_of, worst_state
+from neusee.nodes.laser._damage_laws import KINDS, DamageLaw, Kind, damage_at
+from neusee.nodes.laser._damage_parts import (
+    DamagePart,
+    LightInTime,
+    damage_parts,
+    state_of,
+    worst_state,
+)
 from neusee.nodes.laser._damage_table import read_damage_laws
+from neusee.nodes.precision import single
+from neusee.nodes.sensor._digitization import Bits, crop
+from neusee.nodes.sensor._saturation import Well, refuse_without_steps
 from neusee.nodes.spectra._bands import mean_wavelength
-from neusee.nodes.units import DataFile, Exposure, Frequency, PixelPitch, Ratio, Time
+from neusee.nodes.units import DataFile, Exposure, Frequency, Gain, PixelPitch, Ratio, Time
 from neusee.nodes.values import Bands, LaserLight
+
+# --- damage spot ----------------------------------------------------------------------------------
+
+# Damage of a sensor by the light of a laser on it: every part of the light is judged, or it is said
+# why not.
+
 
 Thresholds = Literal["published"] | DataFile
 Exponent = Annotated[float, Field(ge=0, le=1)]
 _UNITS = {"irradiance": "W/cm2", "fluence": "J/cm2"}
-_NO_PULSE = "no pulse falls into the exposure, yet every pulse hits the sensor: give the laser a pulse_delay of 0"
+_NO_PULSE = (
+    "no pulse falls into the exposure, yet every pulse hits the sensor: give the laser a"
+    " pulse_delay of 0"
+)
 _VERDICTS = {
     "above": "damage is expected",
     "not judged": "damage is not judged: a part of the light has no law",
-    "within": "damage cannot be excluded: a part of the light is within the bracket of its threshold",
-    "below": "no damage is expected: every part of the light is judged and below the bracket of its threshold",
+    "within": (
+        "damage cannot be excluded: a part of the light is within the bracket of its threshold"
+    ),
+    "below": (
+        "no damage is expected: every part of the light is judged and below the bracket of its"
+        " threshold"
+    ),
 }
 
 
 class SpotDamage(NamedTuple):
-    """How near each part of a laser's light is to damaging a sensor: pulse, mean, accumulation, incubation, others."""
+    """How near each part of a laser's light is to damaging a sensor: pulse, mean, accumulation,
+    incubation, others.
+    """
 
-    ratio: Tensor  #: (part,) float64, exposure of the worst pixel over the threshold; NaN for a part that no law judges
+    #: (part,) float64, exposure of the worst pixel over the threshold; NaN for a part that no law
+    #: judges
+    ratio: Tensor
     least: Tensor  #: (part,) float64, the same over the upper end of the threshold's bracket
-    most: Tensor  #: (part,) float64, the same over the lower end; infinite where no lower end is known
-    probability: Tensor  #: (part,) float64, share of devices that are damaged; -1 without device data behind the law
-    low: Tensor  #: (part,) float64, lower end of the 90 % interval of the probability; -1 without device data
+    #: (part,) float64, the same over the lower end; infinite where no lower end is known
+    most: Tensor
+    #: (part,) float64, share of devices that are damaged; -1 without device data behind the law
+    probability: Tensor
+    #: (part,) float64, lower end of the 90 % interval of the probability; -1 without device data
+    low: Tensor
     high: Tensor  #: (part,) float64, upper end; -1 without device data
     peak: Tensor  #: (part,) float64, W/m2, or J/m2 of one pulse, in the brightest pixel
     threshold: Tensor  #: (part,) float64, W/m2 or J/m2; NaN for a part that no law judges
@@ -71,25 +102,29 @@ def damage(
     small_spot_exponent: Exponent = 0.0,
     resilience: Ratio = 1.0,
 ) -> SpotDamage:
-    """Compare the light that a laser brings to the sensor with thresholds of damage, one part of the light after other.
+    """Compare the light that a laser brings to the sensor with thresholds of damage, one part of
+    the light after other.
 
-    The parts are one pulse, the mean over ``dwell`` (how long the laser stays on the spot), the accumulation of the
-    heat of both, the incubation of many pulses, and further kinds of damage by one pulse. A part without a law is not
-    judged and has a ratio of NaN. Laws of a CSV file in ``thresholds`` count where they hold, and elsewhere the
-    published curve does: 0.1 J/cm2 for 10 ns, interpolated to continuous light in W/cm2, from 400 to 1100 nm. Each
-    threshold has a bracket; a probability is stated for a law with data of devices alone. A spot that is wider than the
-    published one warms more at equal irradiance, by the sum of E dA / (2 pi r) over all pixels, and lowers the
-    threshold; a narrower one raises it only with ``small_spot_exponent``. Gain, full well, quantum efficiency and the
-    exposure time of a continuous laser do not enter. The pattern is that of one device, whose threshold is
-    ``resilience`` times the stated one.
+    The parts are one pulse, the mean over ``dwell`` (how long the laser stays on the spot), the
+    accumulation of the heat of both, the incubation of many pulses, and further kinds of damage by
+    one pulse. A part without a law is not judged and has a ratio of NaN. Laws of a CSV file in
+    ``thresholds`` count where they hold, and elsewhere the published curve does: 0.1 J/cm2 for 10
+    ns, interpolated to continuous light in W/cm2, from 400 to 1100 nm. Each threshold has a
+    bracket; a probability is stated for a law with data of devices alone. A spot that is wider than
+    the published one warms more at equal irradiance, by the sum of E dA / (2 pi r) over all pixels,
+    and lowers the threshold; a narrower one raises it only with ``small_spot_exponent``. Gain, full
+    well, quantum efficiency and the exposure time of a continuous laser do not enter. The pattern
+    is that of one device, whose threshold is ``resilience`` times the stated one.
 
     Shapes: spot (band, y, x), line (band,) -> eight of (part,) float64, and the pattern (y, x).
     Units:  spot W/m2, mean over the exposure; result W/m2 or J/m2.
-    Error:  of continuous light 1.4 % too little heat for a spot of 5 pixels and 0.6 % for one of 9; pixels must resolve
-            the spot, lambda N / p above 1, else the peak at a point is higher. Heat outside the window and several
-            lasers at once are left out. Thresholds are those of few devices: an estimate, no certificate.
+    Error:  of continuous light 1.4 % too little heat for a spot of 5 pixels and 0.6 % for one of 9;
+            pixels must resolve the spot, lambda N / p above 1, else the peak at a point is higher.
+            Heat outside the window and several lasers at once are left out. Thresholds are those of
+            few devices: an estimate, no certificate.
     Raises: ParameterError before the run for a mistake in the file of thresholds.
-    Source: the source of each law; Carslaw, Jaeger, Conduction of Heat in Solids, 2nd ed., ch. 10 (steady heat).
+    Source: the source of each law; Carslaw, Jaeger, Conduction of Heat in Solids, 2nd ed., ch. 10
+            (steady heat).
     """
     choice = {
         "dwell": dwell,
@@ -105,25 +140,32 @@ def damage(
     missed = exposed.fluence is not None and light is not None and _caught(light) <= 0
     pattern = torch.zeros(spot.shape[-2:], dtype=torch.uint8, device=spot.device)
     rows = []
-    for part in parts:
-        fluence = part.quantity == "fluence"
+    for damage_part in parts:
+        fluence = damage_part.quantity == "fluence"
         image = exposed.fluence if fluence and exposed.fluence is not None else exposed.irradiance
-        rows.append(_row(part, math.nan if missed else float(image.max())))
-        if part.threshold is not None and not missed:
-            above = image >= float(part.threshold.middle) * resilience
-            pattern |= above.to(torch.uint8) << KINDS.index(part.kind)
+        rows.append(_row(damage_part, math.nan if missed else float(image.max())))
+        if damage_part.threshold is not None and not missed:
+            above = image >= float(damage_part.threshold.middle) * resilience
+            pattern |= above.to(torch.uint8) << KINDS.index(damage_part.kind)
     columns = torch.tensor(rows, dtype=torch.float64).reshape(-1, 8).T.contiguous()
     return SpotDamage._make([*columns, pattern])
 
 
-def _row(part: DamagePart, peak: float) -> tuple[float, ...]:
+def _row(damage_part: DamagePart, peak: float) -> tuple[float, ...]:
     """Return ratios, probability with its ends, peak and threshold of one part of the light."""
     none = (-1.0, -1.0, -1.0)
-    if part.threshold is None or math.isnan(peak):
+    if damage_part.threshold is None or math.isnan(peak):
         return (math.nan, math.nan, math.nan, *none, peak, math.nan)
-    low, middle, high = (float(end) for end in (part.threshold.low, part.threshold.middle, part.threshold.high))
-    if part.law is not None:
-        of_law = damage_at(part.law, peak / middle * part.law.median)
+    low, middle, high = (
+        float(end)
+        for end in (
+            damage_part.threshold.low,
+            damage_part.threshold.middle,
+            damage_part.threshold.high,
+        )
+    )
+    if damage_part.law is not None:
+        of_law = damage_at(damage_part.law, peak / middle * damage_part.law.median)
         none = (of_law.probability, of_law.low, of_law.high)  # type: ignore[assignment]
     return (peak / middle, peak / high, peak / low if low > 0 else math.inf, *none, peak, middle)
 
@@ -133,8 +175,12 @@ def _caught(light: LaserLight) -> float:
     return float(light.pulses) if float(light.pulse_fluence) > 0 else 1.0
 
 
-def _exposed(spot: Tensor, line: Bands, light: LaserLight | None, exposure: float, choice: dict[str, Any]) -> _Exposed:
-    """Return the fluence of one pulse and the mean irradiance over the dwell time, in each pixel."""
+def _exposed(
+    spot: Tensor, line: Bands, light: LaserLight | None, exposure: float, choice: dict[str, Any]
+) -> _Exposed:
+    """Return the fluence of one pulse and the mean irradiance over the dwell time, in each
+    pixel.
+    """
     image = spot.detach().sum(0, dtype=torch.float64)
     time = _in_time(line, light, exposure, choice)
     if choice["pulse_duration"] is None:
@@ -144,8 +190,12 @@ def _exposed(spot: Tensor, line: Bands, light: LaserLight | None, exposure: floa
     return _Exposed(fluence, fluence * float(time.rate * time.caught), time)
 
 
-def _in_time(line: Bands, light: LaserLight | None, exposure: float, choice: dict[str, Any]) -> LightInTime:
-    """Return the light of a laser in time; a train without a rate has the pulses that fall into the exposure."""
+def _in_time(
+    line: Bands, light: LaserLight | None, exposure: float, choice: dict[str, Any]
+) -> LightInTime:
+    """Return the light of a laser in time; a train without a rate has the pulses that fall into
+    the exposure.
+    """
     rate = choice["repetition_rate"]
     if rate is None and light is not None and not light.pulses.is_meta and float(light.pulses) > 1:
         rate = float(light.pulses) / exposure
@@ -158,7 +208,9 @@ def _in_time(line: Bands, light: LaserLight | None, exposure: float, choice: dic
     )
 
 
-def _parts(time: LightInTime, choice: dict[str, Any], diameter: float | None = None) -> tuple[DamagePart, ...]:
+def _parts(
+    time: LightInTime, choice: dict[str, Any], diameter: float | None = None
+) -> tuple[DamagePart, ...]:
     """Return the parts of the light with their thresholds for a heated spot of a diameter in m."""
     return damage_parts(
         LightInTime(
@@ -188,60 +240,95 @@ def _(
         return []
     parts = parts_before(line, light, exposure=exposure, thresholds=thresholds, **params)
     continuous = params.get("pulse_duration") is None
-    return [_threshold_text(part, continuous) for part in parts if _has_sentence(part, continuous)]
+    return [
+        _threshold_text(damage_part, continuous)
+        for damage_part in parts
+        if _has_sentence(damage_part, continuous)
+    ]
 
 
-def _has_sentence(part: DamagePart, continuous: bool) -> bool:
-    """Return True for a part with a sentence of its own: of continuous light, which has equal parts, the mean alone."""
-    return part.part == "mean" or not continuous
+def _has_sentence(damage_part: DamagePart, continuous: bool) -> bool:
+    """Return True for a part with a sentence of its own: of continuous light, which has equal
+    parts, the mean alone.
+    """
+    return damage_part.part == "mean" or not continuous
 
 
-def _name(part: DamagePart, continuous: bool) -> str:
+def _name(damage_part: DamagePart, continuous: bool) -> str:
     """Return the part of the light and the kind of damage, as sentences name them."""
-    return f"{'continuous light' if continuous else part.part}, {part.kind}"
+    return f"{'continuous light' if continuous else damage_part.part}, {damage_part.kind}"
 
 
-def _threshold_text(part: DamagePart, continuous: bool) -> str:
-    """Return the threshold of a part of the light in one sentence, or why the part is not judged."""
-    name = _name(part, continuous)
-    if part.threshold is None:
-        return f"{name}: not judged: {part.reason}"
-    low, middle, high = (float(end) / 1e4 for end in (part.threshold.low, part.threshold.middle, part.threshold.high))
-    unit = _UNITS[part.quantity]
-    if part.open_below:
-        return f"{name}: at most {high:.3g} {unit}, not judged from below: {part.reason}; {part.source}"
-    note = f" ({part.note})" if part.note else ""
-    return f"{name}: {middle:.3g} ({low:.3g} to {high:.3g}) {unit}{note}, {part.source}"
+def _threshold_text(damage_part: DamagePart, continuous: bool) -> str:
+    """Return the threshold of a part of the light in one sentence, or why the part is not
+    judged.
+    """
+    name = _name(damage_part, continuous)
+    if damage_part.threshold is None:
+        return f"{name}: not judged: {damage_part.reason}"
+    low, middle, high = (
+        float(end) / 1e4
+        for end in (
+            damage_part.threshold.low,
+            damage_part.threshold.middle,
+            damage_part.threshold.high,
+        )
+    )
+    unit = _UNITS[damage_part.quantity]
+    if damage_part.open_below:
+        return (
+            f"{name}: at most {high:.3g} {unit}, not judged from below: {damage_part.reason};"
+            f" {damage_part.source}"
+        )
+    note = f" ({damage_part.note})" if damage_part.note else ""
+    return f"{name}: {middle:.3g} ({low:.3g} to {high:.3g}) {unit}{note}, {damage_part.source}"
 
 
 @damage.check
 def _(
-    result: SpotDamage, spot: Tensor, line: Bands, light: LaserLight | None = None, *, exposure: float, **params: Any
+    result: SpotDamage,
+    spot: Tensor,
+    line: Bands,
+    light: LaserLight | None = None,
+    *,
+    exposure: float,
+    **params: Any,
 ) -> list[Check]:
     parts = parts_before(line, light, exposure=exposure, **params)
     rows = list(zip(*(column.tolist() for column in result[:8]), strict=True))
-    states = [state_of(row[1], row[2], part.open_below) for part, row in zip(parts, rows, strict=True)]
+    states = [
+        state_of(row[1], row[2], damage_part.open_below)
+        for damage_part, row in zip(parts, rows, strict=True)
+    ]
     verdict = worst_state(states)
     checks = [Check(_VERDICTS[verdict], verdict == "below")]
     continuous = params.get("pulse_duration") is None
-    for part, row, state in zip(parts, rows, states, strict=True):
-        if _has_sentence(part, continuous):
-            checks.append(Check(_sentence(part, row, continuous), state == "below"))
+    for damage_part, row, state in zip(parts, rows, states, strict=True):
+        if _has_sentence(damage_part, continuous):
+            checks.append(Check(_sentence(damage_part, row, continuous), state == "below"))
     return checks
 
 
-def _sentence(part: DamagePart, row: tuple[float, ...], continuous: bool) -> str:
-    """Return what is said of one part of the light: exposure, threshold, ratio with its bracket, and probability."""
-    ratio, least, most, chance, low, high, peak, threshold = row
-    name = _name(part, continuous)
+def _sentence(damage_part: DamagePart, row: tuple[float, ...], continuous: bool) -> str:
+    """Return what is said of one part of the light: exposure, threshold, ratio with its bracket,
+    and probability.
+    """
+    ratio, lowest, highest, chance, low, high, peak, threshold = row
+    name = _name(damage_part, continuous)
     if math.isnan(ratio):
-        return f"{name}: not judged: {part.reason or _NO_PULSE}"
-    unit = _UNITS[part.quantity]
-    if part.open_below:
-        at_least = f"at least {least:.3g} times the threshold"
-        return f"{name}: {peak / 1e4:.3g} {unit}, {at_least}; not judged from below: {part.reason}"
-    bracket = f" ({least:.3g} to {most:.3g})" if most > least else ""
-    text = f"{name}: {peak / 1e4:.3g} of {threshold / 1e4:.3g} {unit}, {ratio:.3g}{bracket} times the threshold"
+        return f"{name}: not judged: {damage_part.reason or _NO_PULSE}"
+    unit = _UNITS[damage_part.quantity]
+    if damage_part.open_below:
+        at_least = f"at least {lowest:.3g} times the threshold"
+        return (
+            f"{name}: {peak / 1e4:.3g} {unit}, {at_least}; not judged from below:"
+            f" {damage_part.reason}"
+        )
+    bracket = f" ({lowest:.3g} to {highest:.3g})" if highest > lowest else ""
+    text = (
+        f"{name}: {peak / 1e4:.3g} of {threshold / 1e4:.3g} {unit}, {ratio:.3g}{bracket} times the"
+        " threshold"
+    )
     if chance < 0:
         return text
     return f"{text}; {chance:.2g} of devices damaged (90 % interval {low:.2g} to {high:.2g})"
@@ -250,7 +337,9 @@ def _sentence(part: DamagePart, row: tuple[float, ...], continuous: bool) -> str
 def parts_before(
     line: Bands, light: LaserLight | None, *, exposure: float = 1.0, **params: Any
 ) -> tuple[DamagePart, ...]:
-    """Return the parts of the light with their thresholds for the published spot, from the parameters of the step."""
+    """Return the parts of the light with their thresholds for the published spot, from the
+    parameters of the step.
+    """
     choice = {
         "dwell": params["dwell"],
         "pulse_duration": params.get("pulse_duration"),
@@ -263,9 +352,11 @@ def parts_before(
 
 
 def heated_spot(image: Tensor, pitch: float, lost: float = 0.0) -> float | None:
-    """Return the 1/e2 diameter in m of the Gaussian spot that heats as an image of equal peak; None without light.
+    """Return the 1/e2 diameter in m of the Gaussian spot that heats as an image of equal peak; None
+    without light.
 
-    ``lost`` is the light beyond the window, in the unit of the image: it counts as if it fell on the rim of the window.
+    ``lost`` is the light beyond the window, in the unit of the image: it counts as if it fell on
+    the rim of the window.
     """
     peak = float(image.max())
     if not peak > 0:
@@ -276,15 +367,21 @@ def heated_spot(image: Tensor, pitch: float, lost: float = 0.0) -> float | None:
 
 
 def steady_heat(image: Tensor, pitch: float) -> Tensor:
-    """Return the steady heat (y, x) of an irradiance on a half-space: the integral of E dA / (2 pi r), in W/m.
+    """Return the steady heat (y, x) of an irradiance on a half-space: the integral of E dA / (2 pi
+    r), in W/m.
 
     Each pixel is evenly lit; the integral of 1 / r over its square is exact.
     """
     rows, columns = image.shape
     y, x = (torch.arange(n + 1, dtype=torch.float64, device=image.device) for n in (rows, columns))
-    corners = [(y[:, None] + j, x + i, 4 * i * j) for j in (-0.5, 0.5) for i in (-0.5, 0.5)]
-    quarter = sum(sign * (u * torch.asinh(v / u.abs()) + v * torch.asinh(u / v.abs())) for u, v, sign in corners)
-    down, across = (torch.cat([n[:-1], n[1:].flip(0)]).long() for n in (y, x))  # distances of a plane that wraps around
+    halves = itertools.product((-0.5, 0.5), repeat=2)
+    corners = [(y[:, None] + j, x + i, 4 * i * j) for j, i in halves]
+    quarter = sum(
+        sign * (u * torch.asinh(v / u.abs()) + v * torch.asinh(u / v.abs()))
+        for u, v, sign in corners
+    )
+    # distances of a plane that wraps around
+    down, across = (torch.cat([n[:-1], n[1:].flip(0)]).long() for n in (y, x))
     kernel = torch.as_tensor(quarter)[down][:, across]
     size = (2 * rows, 2 * columns)
     heat: Tensor = torch.fft.irfft2(torch.fft.rfft2(image, size) * torch.fft.rfft2(kernel), size)
@@ -304,3 +401,72 @@ def own_laws(thresholds: Thresholds) -> tuple[DamageLaw, ...]:
 @once_per_version
 def _from_file(file: Path) -> tuple[DamageLaw, ...]:
     return read_damage_laws(file)
+
+
+# --- damage pixels --------------------------------------------------------------------------------
+
+# Dead pixels in the raw frame of a sensor that a laser has damaged: points, lines, crosses and
+# whole frames.
+
+
+@node(rtol=0.0)
+def damaged_pixels(
+    raw: Tensor,
+    damages: list[SpotDamage] | None = None,
+    *,
+    full_well: Well,
+    gain: Gain,
+    bits: Bits = 16,
+    device: str = "CMOS",
+) -> Tensor:
+    """Draw the pixels that lasers have destroyed in a raw frame, from the patterns of the step
+    `laser.damage`.
+
+    `point` is a white pixel, `destruction` a black pixel, `line` a black row of a CMOS or a white
+    column of a CCD, `cross` a black row and a black column, and `frame` a black frame. What stands
+    later here covers what stands before.
+
+    Shapes: raw (channel, y, x), each pattern (y, x) of at least that size -> (channel, y, x),
+            float32 for half precision, which cannot hold the white of 16 bits.
+    Units:  DN.
+    Error:  a drawing of the published kinds of damage. Which neighbours a line takes with it, how
+            bright a dead column is, and what changes later are left out.
+    Source: Schwarz et al., Opt. Eng. 56, 034108 (2017), abstract (dead pixels, columns and rows);
+            Bi et al., Opt. Express 32, 4709 (2024), abstract (point, line, cross); Photonics 12,
+            790 (2025), abstract (white points, black lines in both directions, no valid frame).
+            That lines of a CCD are white columns is ours.
+    """
+    shape = (raw.shape[-2], raw.shape[-1])
+    pattern = torch.zeros(shape, dtype=torch.uint8, device=raw.device)
+    for damage_of_laser in damages or ():
+        pattern |= crop(damage_of_laser.pattern, shape=shape).to(raw.device)
+    white = float(max(1, min(2**bits - 1, int(full_well * gain - 0.5))))
+    drawn = (
+        single(raw)
+        .masked_fill(_of(pattern, "point"), white)
+        .masked_fill(_of(pattern, "destruction"), 0.0)
+    )
+    if device.casefold() == "ccd":
+        drawn = drawn.masked_fill(_of(pattern, "line").any(-2, keepdim=True), white)
+    else:
+        drawn = drawn.masked_fill(_of(pattern, "line").any(-1, keepdim=True), 0.0)
+    cross = _of(pattern, "cross")
+    drawn = drawn.masked_fill(cross.any(-1, keepdim=True) | cross.any(-2, keepdim=True), 0.0)
+    return drawn.masked_fill(_of(pattern, "frame").any(), 0.0)
+
+
+def _of(pattern: Tensor, kind: Kind) -> Tensor:
+    """Return True for the pixels (y, x) of a pattern that have a kind of damage."""
+    return (pattern & (1 << KINDS.index(kind))) > 0
+
+
+@damaged_pixels.preflight
+def _(*, full_well: float, gain: float, bits: int = 16, **params: object) -> list[str]:
+    refuse_without_steps(full_well, gain=gain, bits=bits)
+    return []
+
+
+@damaged_pixels.check
+def _(result: Tensor, raw: Tensor, *inputs: Any, **params: Any) -> list[Check]:
+    changed = int((result != raw).any(-3).sum())
+    return [Check(f"damage changes {changed} pixels of the frame", changed == 0)]

@@ -1,18 +1,151 @@
-"""CSV files of damage thresholds of a user: one law a row, or the shots at one level a row, from which laws are fitted.
-
-The header names quantity and unit of each column.
-"""
+"""CSV files of damage thresholds of a user, and the fit of laws to own shots."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+import numpy as np
+from numpy.typing import NDArray
+
 from neusee.nodes.input_files import csv_rows
 from neusee.nodes.laser._damage_laws import KINDS, DamageLaw, Kind, Quantity
-from neusee.nodes.laser._hit_and_miss import Shots, fit_shots
 from neusee.nodes.spectra._table_files import Column, place
+
+# --- hit and miss ---------------------------------------------------------------------------------
+
+# Threshold of damage from own shots: at each level how many shots there were, and how many of them
+# damaged.
+#
+# The share of damaged shots is fitted by a lognormal law, Phi((ln level - ln median) / ln factor),
+# with the largest likelihood (probit regression). Where no level has both damaged and undamaged
+# shots between the levels, the data hold a bracket and no spread.
+
+
+_ROUNDS = 200  #: of Fisher scoring, at most
+_CLOSE = 1e-10  #: change of the parameters at which the fit ends
+_TINY = 1e-12  #: least probability of a shot in the weights
+
+Numbers = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Shots:
+    """Shots at one level."""
+
+    level: float  #: W/m2 or J/m2
+    count: int
+    damaged: int
+
+
+@dataclass(frozen=True)
+class FittedThreshold:
+    """A threshold from shots: a law with spread, or the bracket that the data leave."""
+
+    median: float  #: in the unit of the levels
+    #: geometric standard deviation of the threshold; None where the data do not show it
+    factor: float | None
+    #: geometric standard deviation of the median; None where the data do not show it
+    median_factor: float | None
+    low: float | None = None  #: highest level without any damage; None for a law with spread
+    #: lowest level at which every shot damaged; None for a law with spread
+    high: float | None = None
+
+
+def fit_shots(shots: Sequence[Shots]) -> FittedThreshold:
+    """Return the threshold that shots at several levels show, with the spread and the uncertainty
+    of its median.
+
+    The uncertainty of the median is that of the Fisher information. Where at most one level has
+    both damaged and undamaged shots and the others are in order, the threshold is between the
+    highest level without any damage and the lowest level at which every shot damaged, and no spread
+    is stated.
+
+    Raises ValueError for shots at fewer than two levels, without any or with only damage, and for
+    damage that gets rarer with the level.
+    Source: ISO 21254-2 (damage probability over level); McCullagh, Nelder, Generalized Linear
+            Models, ch. 2.5.
+    """
+    levels = np.array([shot.level for shot in shots])
+    count = np.array([shot.count for shot in shots], np.float64)
+    damaged = np.array([shot.damaged for shot in shots], np.float64)
+    if len(np.unique(levels)) < 2:
+        raise ValueError("the shots have one level: a threshold needs several levels")
+    if not damaged.any():
+        raise ValueError(
+            "no shot was damaged: the threshold is above all levels, so add higher levels"
+        )
+    if (damaged == count).all():
+        raise ValueError(
+            "every shot was damaged: the threshold is below all levels, so add lower levels"
+        )
+    if levels[damaged < count].max() <= levels[damaged > 0].min():
+        return _separated(levels, count, damaged)
+    return _probit(np.log(levels), count, damaged)
+
+
+def _separated(levels: Numbers, count: Numbers, damaged: Numbers) -> FittedThreshold:
+    """Return the bracket of shots whose levels do not overlap; raise ValueError where one of its
+    ends is missing.
+    """
+    none, every = levels[damaged == 0], levels[damaged == count]
+    if not none.size:
+        raise ValueError("no level is without damage: add lower levels")
+    if not every.size:
+        raise ValueError(
+            "no level damaged with every shot: add higher levels, or more shots at each level"
+        )
+    low, high = float(none.max()), float(every.min())
+    return FittedThreshold(math.sqrt(low * high), None, None, low, high)
+
+
+def _probit(logs: Numbers, count: Numbers, damaged: Numbers) -> FittedThreshold:
+    """Return the lognormal law of largest likelihood; raise ValueError for damage that gets
+    rarer with the level.
+    """
+    from scipy.special import ndtr, ndtri
+
+    centre = float(logs.mean())
+    design = np.stack([np.ones_like(logs), logs - centre], 1)
+    start = ndtri((damaged + 0.5) / (count + 1))
+    values, *_ = np.linalg.lstsq(
+        design * np.sqrt(count)[:, None], start * np.sqrt(count), rcond=None
+    )
+    information = np.eye(2)
+    for _ in range(_ROUNDS):
+        predicted = design @ values
+        share = np.clip(ndtr(predicted), _TINY, 1 - _TINY)
+        density = np.exp(-(predicted**2) / 2) / math.sqrt(2 * math.pi)
+        weight = count * density**2 / (share * (1 - share))
+        information = design.T @ (design * weight[:, None])
+        score = design.T @ (density * (damaged - count * share) / (share * (1 - share)))
+        step = np.linalg.solve(information, score)
+        values = values + step
+        if np.abs(step).max() < _CLOSE * (1 + np.abs(values).max()):
+            break
+    offset, slope = float(values[0]), float(values[1])
+    if not (math.isfinite(slope) and slope > 0):
+        raise ValueError(
+            "damage gets rarer with the level: no threshold can be fitted to these shots"
+        )
+    covariance = np.linalg.inv(information)
+    gradient = np.array([-1 / slope, offset / slope**2])
+    deviation = math.sqrt(float(gradient @ covariance @ gradient))
+    return FittedThreshold(
+        math.exp(centre - offset / slope), math.exp(1 / slope), math.exp(deviation)
+    )
+
+
+# --- damage table ---------------------------------------------------------------------------------
+
+# CSV files of damage thresholds of a user: one law a row, or the shots at one level a row, from
+# which laws are fitted.
+#
+# The header names quantity and unit of each column.
+
 
 _LENGTHS = {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "mm": 1e-3, "m": 1.0}
 _TIMES = {"fs": 1e-15, "ps": 1e-12, "ns": 1e-9, "us": 1e-6, "µs": 1e-6, "ms": 1e-3, "s": 1.0}
@@ -42,10 +175,9 @@ _OPTIONAL = ("low", "high", "factor", "median factor", "spot")
 _COUNTS = ("shots", "damaged")
 _SHARED = tuple(name for name in _UNITS if name not in ("threshold", "level", *_COUNTS, *_OPTIONAL))
 _FORM = (
-    "write a header such as device,damage,wavelength from (nm),wavelength to (nm),duration from (s),duration to (s),"
-    "threshold (kW/cm2),low (kW/cm2),high (kW/cm2),factor,median factor,spot (um),source, "
-    "or with level (J/cm2),shots,damaged in place of the "
-    "threshold and its factors"
+    "write a header such as device,damage,wavelength from (nm),wavelength to (nm),duration from"
+    " (s),duration to (s),threshold (kW/cm2),low (kW/cm2),high (kW/cm2),factor,median factor,spot"
+    " (um),source, or with level (J/cm2),shots,damaged in place of the threshold and its factors"
 )
 
 
@@ -60,22 +192,28 @@ class _Cell(NamedTuple):
 def read_damage_laws(file: Path) -> tuple[DamageLaw, ...]:
     """Read laws of damage from a CSV file with one law a row, or with the shots at one level a row.
 
-    Columns, in any order: device; damage (point, line, cross, destruction or frame); wavelength from and to; duration
-    from and to; threshold, in W/cm2 or kW/cm2 for continuous light and in J/cm2 or mJ/cm2 for a pulse, of the median
-    device; low and high, the ends of a bracket around a threshold without data of devices; factor, the geometric
-    standard deviation from device to device; median factor, that of the median; spot, the 1/e2 diameter with which the
-    threshold was measured; source. Low, high, the factors and the spot may be empty or left out. A file with both kinds
-    of light has two columns of thresholds, of which each row fills one.
+    Columns, in any order: device; damage (point, line, cross, destruction or frame); wavelength
+    from and to; duration from and to; threshold, in W/cm2 or kW/cm2 for continuous light and in
+    J/cm2 or mJ/cm2 for a pulse, of the median device; low and high, the ends of a bracket around a
+    threshold without data of devices; factor, the geometric standard deviation from device to
+    device; median factor, that of the median; spot, the 1/e2 diameter with which the threshold was
+    measured; source. Low, high, the factors and the spot may be empty or left out. A file with both
+    kinds of light has two columns of thresholds, of which each row fills one.
 
-    A table of shots has the columns level, shots and damaged in place of the threshold and its factors. Rows that agree
-    in all other columns are one test, and `fit_shots` makes one law of each test.
+    A table of shots has the columns level, shots and damaged in place of the threshold and its
+    factors. Rows that agree in all other columns are one test, and `fit_shots` makes one law of
+    each test.
 
-    Raises ValueError, with line and column, for a column or a unit that is missing or unknown, for a cell that is not a
-    positive number, for a range whose end is before its start, for a factor without a median factor, for a bracket that
-    does not hold its threshold, for more damage than shots, and for shots that show no threshold.
+    Raises ValueError, with line and column, for a column or a unit that is missing or unknown, for
+    a cell that is not a positive number, for a range whose end is before its start, for a factor
+    without a median factor, for a bracket that does not hold its threshold, for more damage than
+    shots, and for shots that show no threshold.
     """
     if file.suffix.lower() in (".yaml", ".yml", ".json", ".xlsx"):
-        raise ValueError(f"{file.name} is no CSV file: thresholds are read from a table with one law a row; {_FORM}")
+        raise ValueError(
+            f"{file.name} is no CSV file: thresholds are read from a table with one law a row;"
+            f" {_FORM}"
+        )
     rows = list(csv_rows(file))
     if len(rows) < 2:
         raise ValueError(f"{file.name} has no laws of damage below a header: {_FORM}")
@@ -95,16 +233,24 @@ def _refuse_columns(file: Path, names: set[str], has_shots: bool) -> None:
         raise ValueError(f"{file.name}: no column {missing[0]}: {_FORM}")
     beside = sorted(names & {"threshold", "low", "high", "factor", "median factor"})
     if has_shots and beside:
-        raise ValueError(f"{file.name}: the column {beside[0]} beside shots: the threshold is fitted to the shots")
+        raise ValueError(
+            f"{file.name}: the column {beside[0]} beside shots: the threshold is fitted to the"
+            " shots"
+        )
 
 
 def _cells(file: Path, columns: list[Column], line: int, cells: list[str]) -> list[_Cell]:
-    """Return the cells of a row with their places; raise ValueError for another number of cells than headings."""
+    """Return the cells of a row with their places; raise ValueError for another number of cells
+    than headings.
+    """
     if len(cells) != len(columns):
         text = f"{len(cells)} columns in place of {len(columns)}, the number of headings"
         raise ValueError(f"{file.name}:{line}: {text}: write one cell for each heading")
     both = enumerate(zip(columns, cells, strict=True))
-    return [_Cell(cell.strip(), place(file, line, index, column), column) for index, (column, cell) in both]
+    return [
+        _Cell(cell.strip(), place(file, line, index, column), column)
+        for index, (column, cell) in both
+    ]
 
 
 def _heading(file: Path, line: int, index: int, cell: str) -> Column:
@@ -112,12 +258,14 @@ def _heading(file: Path, line: int, index: int, cell: str) -> Column:
     quantity, _, unit = cell.strip().removesuffix(")").partition("(")
     column = Column(quantity.strip().casefold(), unit.strip())
     if column.quantity not in _UNITS:
-        raise ValueError(f"{file.name}:{line}, column {index + 1}: no quantity {quantity.strip()!r}: {_FORM}")
+        raise ValueError(
+            f"{file.name}:{line}, column {index + 1}: no quantity {quantity.strip()!r}: {_FORM}"
+        )
     units = _UNITS[column.quantity]
     if units and column.unit not in units:
-        what = f"has the unit {column.unit}" if column.unit else "has no unit"
-        known = ", ".join(f"({unit})" for unit in units if unit.isascii())
-        raise ValueError(f"{place(file, line, index, column)} {what}: write one of {known}")
+        fault = f"has the unit {column.unit}" if column.unit else "has no unit"
+        unit_names = ", ".join(f"({unit})" for unit in units if unit.isascii())
+        raise ValueError(f"{place(file, line, index, column)} {fault}: write one of {unit_names}")
     return column
 
 
@@ -128,7 +276,10 @@ def _law(cells: list[_Cell]) -> DamageLaw:
     by_name = {cell.column.quantity: cell for cell in cells}
     if (values.get("factor") is None) != (values.get("median factor") is None):
         cell = by_name.get("factor") or by_name["median factor"]
-        text = "one of factor and median factor is given: a probability needs both, so give both or neither"
+        text = (
+            "one of factor and median factor is given: a probability needs both, so give both or"
+            " neither"
+        )
         raise ValueError(f"{cell.where}: {text}")
     low, high = _bracket(by_name, values, threshold)
     return DamageLaw(
@@ -142,40 +293,64 @@ def _law(cells: list[_Cell]) -> DamageLaw:
     )
 
 
-def _bracket(cells: dict[str, _Cell], values: dict[str, Any], threshold: _Cell) -> tuple[float | None, float | None]:
-    """Return the ends of the bracket of a row, or None twice; raise ValueError for one that does not fit."""
+def _bracket(
+    cells: dict[str, _Cell], values: dict[str, Any], threshold: _Cell
+) -> tuple[float | None, float | None]:
+    """Return the ends of the bracket of a row, or None twice; raise ValueError for one that does
+    not fit.
+    """
     low, high = values.get("low"), values.get("high")
     if low is None and high is None:
         return None, None
     cell = cells["high"] if low is None else cells["low"]
     if low is None or high is None:
-        raise ValueError(f"{cell.where}: one end of a bracket is given: give low and high, or neither")
+        raise ValueError(
+            f"{cell.where}: one end of a bracket is given: give low and high, or neither"
+        )
     if values.get("factor") is not None:
-        raise ValueError(f"{cell.where}: a bracket beside a factor: give the bracket or the spread of devices")
+        raise ValueError(
+            f"{cell.where}: a bracket beside a factor: give the bracket or the spread of devices"
+        )
     if {_quantity(cells[name]) for name in ("low", "high")} != {_quantity(threshold)}:
-        raise ValueError(f"{cell.where}: the bracket has another quantity than the threshold of this row")
+        raise ValueError(
+            f"{cell.where}: the bracket has another quantity than the threshold of this row"
+        )
     if not low <= cast(float, _value(threshold)) <= high:
-        raise ValueError(f"{cell.where}: the bracket does not hold the threshold: give low <= threshold <= high")
+        raise ValueError(
+            f"{cell.where}: the bracket does not hold the threshold: give low <= threshold <= high"
+        )
     return low, high
 
 
 def _values(cells: list[_Cell], *but: str) -> dict[str, Any]:
-    """Return the values of a row by quantity, without some quantities; raise ValueError for a range that falls."""
-    values = {cell.column.quantity: _value(cell) for cell in cells if cell.column.quantity not in but}
+    """Return the values of a row by quantity, without some quantities; raise ValueError for a
+    range that falls.
+    """
+    values = {
+        cell.column.quantity: _value(cell) for cell in cells if cell.column.quantity not in but
+    }
     by_name = {cell.column.quantity: cell for cell in cells}
     for name in ("wavelength", "duration"):
         if values[f"{name} to"] < values[f"{name} from"]:
-            raise ValueError(f"{by_name[f'{name} to'].where}: the range ends before it starts: swap the two {name}s")
+            raise ValueError(
+                f"{by_name[f'{name} to'].where}: the range ends before it starts: swap the two"
+                f" {name}s"
+            )
     return values
 
 
 def _filled(cells: list[_Cell], name: str) -> _Cell:
-    """Return the only filled cell of the columns of a quantity; raise ValueError for none and for several."""
+    """Return the only filled cell of the columns of a quantity; raise ValueError for none and
+    for several.
+    """
     filled = [cell for cell in cells if cell.column.quantity == name and cell.text]
     if len(filled) != 1:
         where = next(cell.where for cell in cells if cell.column.quantity == name)
         text = f"{len(filled)} {name}s in this row"
-        raise ValueError(f"{where}: {text}: give one, an irradiance for continuous light or a fluence for a pulse")
+        raise ValueError(
+            f"{where}: {text}: give one, an irradiance for continuous light or a fluence for a"
+            " pulse"
+        )
     return filled[0]
 
 
@@ -197,7 +372,9 @@ def _described(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def _fitted_laws(table: list[list[_Cell]]) -> tuple[DamageLaw, ...]:
-    """Return the law of each test in a table of shots; raise ValueError, with the first row, for a test without one."""
+    """Return the law of each test in a table of shots; raise ValueError, with the first row, for
+    a test without one.
+    """
     tests: dict[tuple[Any, ...], list[list[_Cell]]] = {}
     for cells in table:
         described = _described(_values(cells, "level", *_COUNTS))
@@ -235,7 +412,10 @@ def _shots(cells: list[_Cell]) -> Shots:
     by_name = {cell.column.quantity: cell for cell in cells}
     count, damaged = (_count(by_name[name]) for name in _COUNTS)
     if not count > 0 or damaged > count:
-        raise _AtCell(f"{by_name['damaged'].where}: {damaged} damaged of {count} shots: give at most as many as shots")
+        raise _AtCell(
+            f"{by_name['damaged'].where}: {damaged} damaged of {count} shots: give at most as many"
+            " as shots"
+        )
     return Shots(cast(float, _value(_filled(cells, "level"))), count, damaged)
 
 
@@ -247,7 +427,9 @@ def _count(cell: _Cell) -> int:
 
 
 def _value(cell: _Cell) -> Any:
-    """Return the text of a cell, its number in SI units, or None for an empty cell of an optional column."""
+    """Return the text of a cell, its number in SI units, or None for an empty cell of an
+    optional column.
+    """
     name, units = cell.column.quantity, _UNITS[cell.column.quantity]
     if not cell.text and name in _OPTIONAL:
         return None
@@ -260,16 +442,25 @@ def _value(cell: _Cell) -> Any:
     if not (math.isfinite(number) and number > 0):
         raise ValueError(f"{cell.where}: {cell.text} is not a finite number above 0")
     if name.endswith("factor") and number <= 1:
-        text = "a factor of one standard deviation, such as 2, is above 1; leave the cell empty if it is not known"
+        text = (
+            "a factor of one standard deviation, such as 2, is above 1; leave the cell empty if it"
+            " is not known"
+        )
         raise ValueError(f"{cell.where}: {cell.text}: {text}")
     return number * units[cell.column.unit]
 
 
 def _text(cell: _Cell) -> str:
-    """Return the text of a cell; raise ValueError for an empty cell and for a kind of damage that is not known."""
+    """Return the text of a cell; raise ValueError for an empty cell and for a kind of damage
+    that is not known.
+    """
     if not cell.text:
-        fix = "say where the threshold is from" if cell.column.quantity == "source" else "fill it in"
+        fix = (
+            "say where the threshold is from" if cell.column.quantity == "source" else "fill it in"
+        )
         raise ValueError(f"{cell.where}: the cell is empty: {fix}")
     if cell.column.quantity == "damage" and cell.text not in KINDS:
-        raise ValueError(f"{cell.where}: no kind of damage {cell.text!r}: write one of {', '.join(KINDS)}")
+        raise ValueError(
+            f"{cell.where}: no kind of damage {cell.text!r}: write one of {', '.join(KINDS)}"
+        )
     return cell.text

@@ -1,17 +1,22 @@
-"""Exposure limits of the human eye for a small source, and the distance where a laser meets them.
-
-The limits are those of IEC 60825-1:2014, Table A.1 (ICNIRP 2013, ANSI Z136.1-2014): a source that the eye sees under
-less than 1.5 mrad. They are written out here from the formulas, and are an estimate, no certificate. Ultraviolet light,
-pulses below 10 ps and extended sources are refused. Trains of pulses are in `_eye_trains`.
-"""
+"""Exposure limits of the human eye, for beams and trains of pulses, and distances."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 from neusee.nodes import ParameterError
 from neusee.nodes.laser._beam import Beam
+
+# --- eye limits -----------------------------------------------------------------------------------
+
+# Exposure limits of the human eye for a small source, and the distance where a laser meets them.
+#
+# The limits are those of IEC 60825-1:2014, Table A.1 (ICNIRP 2013, ANSI Z136.1-2014): a source that
+# the eye sees under less than 1.5 mrad. They are written out here from the formulas, and are an
+# estimate, no certificate. Ultraviolet light, pulses below 10 ps and extended sources are refused.
+# Trains of pulses are in `_eye_limits`.
+
 
 BLINK = 0.25  #: s, in which the eye turns away from visible light
 _SHORTEST, _LONGEST = 1e-11, 3e4  #: s, of an exposure
@@ -19,18 +24,21 @@ _FIRST, _LAST = 400e-9, 100e-6  #: m
 
 
 def eye_mpe(wavelength: float, duration: float) -> float:
-    """Return the largest permissible radiant exposure of the eye in J/m2 for one exposure of a duration in s.
+    """Return the largest permissible radiant exposure of the eye in J/m2 for one exposure of a
+    duration in s.
 
-    Divided by the duration it is the largest permissible irradiance. It is compared with the mean over the limiting
-    aperture of `eye_aperture`.
+    Divided by the duration it is the largest permissible irradiance. It is compared with the mean
+    over the limiting aperture of `eye_aperture`.
 
-    400 to 1400 nm (retina, small source): 2e-3 C_A J/m2 up to 5 us and 18 C_A t^0.75 up to 10 s below 1050 nm;
-    2e-2 C_C up to 13 us and 90 C_C t^0.75 up to 10 s from 1050 nm; 10 C_A C_C W/m2 beyond 10 s. C_A = 10^(0.002
-    (nm - 700)) from 700 nm and 5 from 1050 nm; C_C = 10^(0.018 (nm - 1150)) from 1150 nm and 8 + 10^(0.04 (nm - 1250))
-    from 1200 nm. Below 500 nm and beyond 10 s at most 100 C_3 J/m2 up to 100 s, then C_3 W/m2, with C_3 = 10^(0.02 (nm
-    - 450)) from 450 nm (photochemical). From 700 nm at most the limit of the skin, which protects cornea and lens.
-    From 1400 nm (cornea): 1e3 J/m2 up to 1 ms (1500 to 1800 nm 1e4 J/m2 up to 10 s; from 2600 nm 100 J/m2 up to 0.1
-    us), then 5600 t^0.25 up to 10 s and 1000 W/m2.
+    400 to 1400 nm (retina, small source): 2e-3 C_A J/m2 up to 5 us and 18 C_A t^0.75 up to 10 s
+    below 1050 nm; 2e-2 C_C up to 13 us and 90 C_C t^0.75 up to 10 s from 1050 nm; 10 C_A C_C W/m2
+    beyond 10 s. C_A = 10^(0.002 (nm - 700)) from 700 nm and 5 from 1050 nm; C_C = 10^(0.018 (nm -
+    1150)) from 1150 nm and 8 + 10^(0.04 (nm - 1250)) from 1200 nm. Below 500 nm and beyond 10 s at
+    most 100 C_3 J/m2 up to 100 s, then C_3 W/m2, with C_3 = 10^(0.02 (nm
+    - 450)) from 450 nm (photochemical). From 700 nm at most the limit of the skin, which protects
+      cornea and lens.
+    From 1400 nm (cornea): 1e3 J/m2 up to 1 ms (1500 to 1800 nm 1e4 J/m2 up to 10 s; from 2600 nm
+    100 J/m2 up to 0.1 us), then 5600 t^0.25 up to 10 s and 1000 W/m2.
 
     Raises ParameterError for a wavelength or a duration beyond these formulas.
     Source: IEC 60825-1:2014, Tables A.1 and A.5; ICNIRP, Health Phys. 105, 271 (2013).
@@ -39,7 +47,8 @@ def eye_mpe(wavelength: float, duration: float) -> float:
 
 
 def eye_mpe_formula(wavelength: float, duration: float) -> str:
-    """Return the formula of `eye_mpe` that holds, in J/m2, with its numbers put in: ``18 * 1 * 0.25**0.75``.
+    """Return the formula of `eye_mpe` that holds, in J/m2, with its numbers put in: ``18 * 1 *
+    0.25**0.75``.
 
     Raises ParameterError as `eye_mpe` does.
     """
@@ -54,7 +63,9 @@ class _Law(NamedTuple):
 
 
 def _strictest(wavelength: float, duration: float) -> _Law:
-    """Return the law that limits the exposure of the eye at a wavelength in m for a duration in s."""
+    """Return the law that limits the exposure of the eye at a wavelength in m for a duration in
+    s.
+    """
     _refuse(wavelength, duration)
     nm = wavelength * 1e9
     if nm >= 1400:
@@ -73,13 +84,18 @@ def _constant(factor: float, weight: float, duration: float, full: float) -> _La
     """Return factor x weight, for durations shorter than ``full`` s less in proportion."""
     if duration >= full:
         return _Law(factor * weight, f"{factor:g} * {weight:.7g}")
-    return _Law(factor * weight * duration / full, f"{factor:g} * {weight:.7g} * {duration:.7g} / {full:g}")
+    return _Law(
+        factor * weight * duration / full, f"{factor:g} * {weight:.7g} * {duration:.7g} / {full:g}"
+    )
 
 
 def _refuse(wavelength: float, duration: float) -> None:
     """Raise ParameterError where this module has no formula."""
     if not _FIRST <= wavelength <= _LAST:
-        text = f"no exposure limit of the eye at {wavelength * 1e9:g} nm: 400 nm to 100 um are known here"
+        text = (
+            f"no exposure limit of the eye at {wavelength * 1e9:g} nm: 400 nm to 100 um are known"
+            " here"
+        )
         raise ParameterError("wavelength", f"{text}; take the limit from the standard")
     if not _SHORTEST <= duration <= _LONGEST:
         text = f"no exposure limit of the eye for {duration:g} s: 10 ps to 30 000 s are known here"
@@ -91,19 +107,31 @@ def _near_infrared(nm: float) -> tuple[float, float]:
     absorbed = 1.0 if nm < 700 else math.pow(10, 0.002 * (nm - 700)) if nm < 1050 else 5.0
     if nm < 1150:
         return absorbed, 1.0
-    return absorbed, math.pow(10, 0.018 * (nm - 1150)) if nm < 1200 else 8 + math.pow(10, 0.04 * (nm - 1250))
+    return absorbed, (
+        math.pow(10, 0.018 * (nm - 1150)) if nm < 1200 else 8 + math.pow(10, 0.04 * (nm - 1250))
+    )
 
 
 def _retina(nm: float, duration: float) -> _Law:
-    """Return the limit in J/m2 from 400 to 1400 nm for a small source: heat, and photochemistry below 500 nm."""
+    """Return the limit in J/m2 from 400 to 1400 nm for a small source: heat, and photochemistry
+    below 500 nm.
+    """
     absorbed, spread = _near_infrared(nm)
     if duration >= 10:
         heat = _power_law(10, absorbed * spread, duration, 1)
         blue = _power_law(1, math.pow(10, 0.02 * max(0.0, nm - 450)), max(100.0, duration), 1)
         return heat if nm >= 500 else min(heat, blue)
     if nm < 1050:
-        return _constant(2e-3, absorbed, 1, 0) if duration <= 5e-6 else _power_law(18, absorbed, duration, 0.75)
-    return _constant(2e-2, spread, 1, 0) if duration <= 13e-6 else _power_law(90, spread, duration, 0.75)
+        return (
+            _constant(2e-3, absorbed, 1, 0)
+            if duration <= 5e-6
+            else _power_law(18, absorbed, duration, 0.75)
+        )
+    return (
+        _constant(2e-2, spread, 1, 0)
+        if duration <= 13e-6
+        else _power_law(90, spread, duration, 0.75)
+    )
 
 
 def _skin(nm: float, duration: float) -> _Law:
@@ -129,7 +157,8 @@ def _cornea(nm: float, duration: float) -> _Law:
 def eye_aperture(wavelength: float, duration: float) -> float:
     """Return the diameter in m of the aperture over which an exposure of the eye is averaged.
 
-    7 mm, the widest pupil, from 400 to 1400 nm; beyond, 1 mm up to 0.35 s, 1.5 t^(3/8) mm up to 10 s, then 3.5 mm.
+    7 mm, the widest pupil, from 400 to 1400 nm; beyond, 1 mm up to 0.35 s, 1.5 t^(3/8) mm up to 10
+    s, then 3.5 mm.
     Source: IEC 60825-1:2014, Table A.6.
     """
     _refuse(wavelength, duration)
@@ -138,13 +167,17 @@ def eye_aperture(wavelength: float, duration: float) -> float:
     return 1e-3 if duration <= 0.35 else 1e-3 * min(3.5, 1.5 * math.pow(duration, 0.375))
 
 
-def hazard_distance(beam: Beam, limit: float, aperture: float = 0.0, transmittance: float = 1.0) -> float:
-    """Return the distance in m beyond which the exposure on the axis of a beam is below a limit, or 0 for none.
+def hazard_distance(
+    beam: Beam, limit: float, aperture: float = 0.0, transmittance: float = 1.0
+) -> float:
+    """Return the distance in m beyond which the exposure on the axis of a beam is below a limit, or
+    0 for none.
 
-    ``limit`` is in W/m2 for a continuous beam and in J/m2 for each pulse of a pulsed one. The exposure is the mean over
-    a round ``aperture`` in m, or that on the axis for 0. Both have a closed inverse: w^2 = 2 P T / (pi limit) on the
-    axis, and w^2 = -(d^2 / 2) / ln(1 - pi d^2 limit / (4 P T)) through an aperture d, then R = 2 sqrt(w^2 - w0^2) /
-    theta. ``transmittance`` is that of the optics or of air, the same at every distance.
+    ``limit`` is in W/m2 for a continuous beam and in J/m2 for each pulse of a pulsed one. The
+    exposure is the mean over a round ``aperture`` in m, or that on the axis for 0. Both have a
+    closed inverse: w^2 = 2 P T / (pi limit) on the axis, and w^2 = -(d^2 / 2) / ln(1 - pi d^2 limit
+    / (4 P T)) through an aperture d, then R = 2 sqrt(w^2 - w0^2) / theta. ``transmittance`` is that
+    of the optics or of air, the same at every distance.
     """
     emitted = beam.power if beam.pulse_energy is None else beam.pulse_energy
     assert emitted is not None  # `beam` has made the one or the other
@@ -160,8 +193,196 @@ def hazard_distance(beam: Beam, limit: float, aperture: float = 0.0, transmittan
 
 
 def eye_share(limit: float, aperture: float, emitted: float) -> float:
-    """Return the share of a power in W, or of an energy in J, that fills a round aperture in m with a limit.
+    """Return the share of a power in W, or of an energy in J, that fills a round aperture in m with
+    a limit.
 
     ``limit`` is in W/m2 or J/m2.
     """
     return math.pi * aperture**2 / 4 * limit / emitted
+
+
+# --- eye trains -----------------------------------------------------------------------------------
+
+# Exposure limits of the eye for beams and trains of pulses, by two rules that have names, and the
+# hazard distance.
+#
+# `eye_limit_source` names the rule that a limit was computed by.
+
+
+TrainRule = Literal["IEC 60825-1:2014", "N^(-1/4)"]
+TRAIN_RULES: tuple[TrainRule, ...] = get_args(TrainRule)
+
+_COUNTED = 10.0  #: s, T2 of a small source: pulses are counted within this time for C5
+_FEW = 600  #: pulses up to which C5 is 1
+_LEAST_C5 = 0.4
+_BRIEF = 0.25  #: s, an exposure up to which C5 is 1
+
+
+class TrainLimit(NamedTuple):
+    """The largest permissible radiant exposure of the eye by one pulse of a train, by each of
+    three rules.
+    """
+
+    single: float  #: J/m2, limit of one pulse alone
+    mean: float  #: J/m2, limit of the whole exposure over the number of its pulses
+    #: J/m2, limit by the rule for repeated pulses; infinite where the standard has no such rule
+    repeated: float
+    together: float  #: number of pulses that the rule for repeated pulses counts as one
+    groups: float  #: number of pulses, or of groups that count as one, that the rule counts
+    factor: float  #: C5 of the rule
+
+    @property
+    def limit(self) -> float:
+        """Return the least of the three limits in J/m2."""
+        return min(self.single, self.mean, self.repeated)
+
+    @property
+    def strictest(self) -> Literal["single pulse", "mean", "repeated pulses"]:
+        """Return the name of the rule whose limit is the least."""
+        if self.single <= min(self.mean, self.repeated):
+            return "single pulse"
+        return "mean" if self.mean <= self.repeated else "repeated pulses"
+
+
+def eye_mpe_train(
+    wavelength: float,
+    pulse_duration: float,
+    repetition_rate: float,
+    duration: float,
+    rule: TrainRule = "IEC 60825-1:2014",
+) -> float:
+    """Return the largest permissible radiant exposure of the eye in J/m2 by each pulse of a train:
+    see `train_limit`.
+
+    Raises ParameterError for a pulse that is longer than the exposure or the period.
+    """
+    return train_limit(wavelength, pulse_duration, repetition_rate, duration, rule).limit
+
+
+def train_limit(
+    wavelength: float,
+    pulse_duration: float,
+    repetition_rate: float,
+    duration: float,
+    rule: TrainRule = "IEC 60825-1:2014",
+) -> TrainLimit:
+    """Return the limits of the eye for each pulse of a train in an exposure of ``duration`` s, by
+    three rules.
+
+    A pulse has to stay below the limit of one pulse alone, below that of the whole exposure over
+    the number of pulses, and, up to 1400 nm, below that of one pulse times C5. Pulses within T_i, 5
+    us below 1050 nm and 13 us from there, count as one pulse of T_i. ``rule`` names C5:
+
+    - `IEC 60825-1:2014`, for a source below 5 mrad: 1 for pulses longer than T_i, for exposures up
+      to 0.25 s and for up to 600 pulses; else 5 N^(-1/4), and at least 0.4. N is counted within 10
+      s (T2 of a small source).
+    - `N^(-1/4)`: N^(-1/4) for every train, where N is counted within the whole exposure. The
+      edition of 2007 has this factor. Its table of single pulses is another one, which is not here.
+      This rule is never less strict than the first.
+
+    Raises ParameterError for a pulse that is longer than the exposure or the period.
+    Source: IEC 60825-1:2014, 4.3 f), A.3 and Table 9, as two public programs write them out, which
+            agree; the standard
+    itself was not read for C5. The interpretation sheet ISH1:2017 allows more for pulses below T_i;
+    it is not used.
+    """
+    if not pulse_duration < min(duration, 1 / repetition_rate):
+        text = (
+            f"a pulse of {pulse_duration:g} s, every {1 / repetition_rate:g} s, in an exposure of"
+            f" {duration:g} s"
+        )
+        raise ParameterError("pulse_duration", f"{text}: the pulse is too long")
+    single = eye_mpe(wavelength, pulse_duration)
+    mean = eye_mpe(wavelength, duration) / max(1.0, duration * repetition_rate)
+    if wavelength >= 1400e-9:
+        return TrainLimit(single, mean, math.inf, 1.0, max(1.0, duration * repetition_rate), 1.0)
+    summed = _summed_time(wavelength)
+    counted = min(duration, _COUNTED) if rule == "IEC 60825-1:2014" else duration
+    pulses = max(1.0, counted * repetition_rate)
+    together = min(pulses, max(1.0, summed * repetition_rate))
+    groups = pulses / together
+    factor = (
+        _c5(groups, pulse_duration, duration, summed)
+        if rule == "IEC 60825-1:2014"
+        else math.pow(groups, -0.25)
+    )
+    group = eye_mpe(wavelength, max(summed, pulse_duration) if together > 1 else pulse_duration)
+    return TrainLimit(single, mean, group / together * factor, together, groups, factor)
+
+
+def _summed_time(wavelength: float) -> float:
+    """Return T_i in s: pulses within this time count as one."""
+    return 5e-6 if wavelength < 1050e-9 else 13e-6
+
+
+def _c5(groups: float, pulse_duration: float, duration: float, summed: float) -> float:
+    """Return C5 of the edition of 2014 for a source below 5 mrad."""
+    if pulse_duration > summed or duration <= _BRIEF or groups <= _FEW:
+        return 1.0
+    return min(1.0, max(_LEAST_C5, 5 * math.pow(groups, -0.25)))
+
+
+def eye_limit(beam: Beam, duration: float, rule: TrainRule = "IEC 60825-1:2014") -> float:
+    """Return the limit of the eye for a beam: W/m2 if it is continuous, J/m2 for each pulse if it
+    is pulsed.
+
+    ``rule`` is that of `train_limit` for a train of pulses; the other beams do not need a rule.
+    """
+    if beam.pulse_energy is None or beam.pulse_duration is None:
+        return eye_mpe(beam.wavelength, duration) / duration
+    if _is_single(beam, duration):
+        return eye_mpe(beam.wavelength, beam.pulse_duration)
+    assert beam.repetition_rate is not None
+    return eye_mpe_train(beam.wavelength, beam.pulse_duration, beam.repetition_rate, duration, rule)
+
+
+def eye_limit_source(beam: Beam, duration: float, rule: TrainRule = "IEC 60825-1:2014") -> str:
+    """Return the name of the rule by which `eye_limit` computes the limit of a beam, with its
+    source.
+
+    Raises ParameterError as `eye_limit` does.
+    """
+    table = (
+        "IEC 60825-1:2014, Table A.1, small source, as written out in neusee (nodes.laser.eye_mpe)"
+    )
+    if beam.pulse_energy is None or beam.pulse_duration is None:
+        return f"{table}: continuous light for {duration:g} s"
+    if _is_single(beam, duration):
+        return f"{table}: one pulse"
+    assert beam.repetition_rate is not None
+    train = train_limit(beam.wavelength, beam.pulse_duration, beam.repetition_rate, duration, rule)
+    if beam.wavelength >= 1400e-9:
+        named = "one pulse, and the mean of the train"
+    elif rule == "IEC 60825-1:2014":
+        named = (
+            f"one pulse, the mean of the train, and C5 = {train.factor:.3g} of the edition of 2014"
+        )
+    else:
+        named = (
+            f"one pulse, the mean of the train, and N^(-1/4) = {train.factor:.3g}, the factor of"
+            " the edition of 2007"
+        )
+    return f"{table}: the least of {named}; {train.strictest} decides"
+
+
+def _is_single(beam: Beam, duration: float) -> bool:
+    """Return True if at most one pulse of a pulsed beam falls within an exposure."""
+    return beam.repetition_rate is None or duration * beam.repetition_rate <= 1
+
+
+def nominal_ocular_hazard_distance(
+    beam: Beam,
+    duration: float = BLINK,
+    transmittance: float = 1.0,
+    rule: TrainRule = "IEC 60825-1:2014",
+) -> float:
+    """Return the distance in m beyond which a beam does not exceed the limit of the unaided eye for
+    an exposure in s.
+
+    The exposure is averaged over the limiting aperture. Use 0.25 s for visible light that a person
+    turns away from, and 10 s or 100 s for invisible light. ``rule`` is that of `train_limit`.
+    Optical instruments such as binoculars are not part of it.
+    """
+    averaged = duration if beam.pulse_duration is None else beam.pulse_duration
+    limit = eye_limit(beam, duration, rule)
+    return hazard_distance(beam, limit, eye_aperture(beam.wavelength, averaged), transmittance)

@@ -1,4 +1,6 @@
-"""A laser in absolute units at the lens of a camera: its wavefront in the pupil, and its light in one exposure."""
+"""A laser in absolute units at the lens of a camera: its wavefront in the pupil, and its light
+in one exposure.
+"""
 
 import math
 from typing import Annotated, Any, NamedTuple
@@ -7,17 +9,19 @@ import torch
 from pydantic import Field
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.laser._air import Law, air_transmittance
 from neusee.nodes.laser._beam import (
     Beam,
     Convention,
+    Law,
+    air_transmittance,
     axis_density,
     beam,
     beam_radius,
     curvature_radius,
     plain,
 )
-from neusee.nodes.optics._f_number import refuse_impossible_f_number
+from neusee.nodes.laser._damage_laws import double
+from neusee.nodes.optics._lens import refuse_impossible_f_number
 from neusee.nodes.optics._pupil_grid import clear_area, gaussian_over
 from neusee.nodes.spectra._bands import mean_wavelength
 from neusee.nodes.units import (
@@ -39,7 +43,8 @@ from neusee.nodes.values import Bands, LaserLight, Stop, Wavefront
 Quality = Annotated[float, Field(ge=1, le=1e6)]  #: M2 of a beam
 Multiple = Annotated[float, Field(ge=0, le=1e18)]
 _NEAR = 0.25  #: waves of defocus at 550 nm from which a near laser is worth a note
-_RIM = 1.5  #: largest error of the spot by the staircase rim of the pupil, over waves of defocus / samples
+#: largest error of the spot by the staircase rim of the pupil, over waves of defocus / samples
+_RIM = 1.5
 _WAVE = 550e-9  #: m; the wavelength in which waves of defocus are counted
 
 
@@ -63,24 +68,29 @@ def wavefront(
     convention: Convention = "1/e2",
     distance: Distance | None = None,
 ) -> Wavefront:
-    """Compute the taper and the curvature of a Gaussian beam in the pupil of a lens at a distance from the laser.
+    """Compute the taper and the curvature of a Gaussian beam in the pupil of a lens at a distance
+    from the laser.
 
-    The beam has the 1/e2 radius w and the curvature radius R + (2 w0 / divergence)^2 / R at the distance R, and hits
-    the middle of the lens. Without a distance the light fills the pupil evenly as a plane wave.
+    The beam has the 1/e2 radius w and the curvature radius R + (2 w0 / divergence)^2 / R at the
+    distance R, and hits the middle of the lens. Without a distance the light fills the pupil evenly
+    as a plane wave.
 
     Shapes: -> taper, curvature ().
     Units:  taper 1/m2; curvature 1/m.
-    Error:  exact for one Gaussian beam; a beam with M2 above 1 is taken as a wider Gaussian beam of one mode. The rim
-            of the pupil grid is a staircase: the spot of a laser that is W waves out of focus is off by 1.5 W / samples
-            of its peak at most, and usually by 0.4 W / samples: 0.4 % at 2 m for 8 mm and 540 samples.
-    Raises: ParameterError for a waist, a divergence and an M2 that disagree, and for a distance without a width.
+    Error:  exact for one Gaussian beam; a beam with M2 above 1 is taken as a wider Gaussian beam of
+            one mode. The rim of the pupil grid is a staircase: the spot of a laser that is W waves
+            out of focus is off by 1.5 W / samples of its peak at most, and usually by 0.4 W /
+            samples: 0.4 % at 2 m for 8 mm and 540 samples.
+    Raises: ParameterError for a waist, a divergence and an M2 that disagree, and for a distance
+            without a width.
     Source: Siegman, Lasers (1986), chapter 17; ISO 11146-1 (beam of any M2).
     """
     if distance is None:
         return Wavefront(*torch.zeros(2, dtype=torch.float64))
-    found = _shaped(line, _Geometry(waist, divergence, m_squared, convention, distance))
-    values = beam_radius(found, distance) ** -2, 1 / curvature_radius(found, distance)
-    return Wavefront(*(torch.as_tensor(value, dtype=torch.float64) for value in values))
+    beam = _shaped(line, _Geometry(waist, divergence, m_squared, convention, distance))
+    return Wavefront(
+        double(beam_radius(beam, distance) ** -2), double(1 / curvature_radius(beam, distance))
+    )
 
 
 @wavefront.check
@@ -89,7 +99,10 @@ def _(result: Wavefront, line: Bands, *, distance: float | None, **params: Any) 
         return [Check("plane wave, even over the pupil")]
     width = float(result.taper) ** -0.5
     return [
-        Check(f"beam of 1/e2 radius {width:.4g} m at {distance:g} m, curvature radius {1 / result.curvature:.4g} m")
+        Check(
+            f"beam of 1/e2 radius {width:.4g} m at {distance:g} m, curvature radius"
+            f" {1 / result.curvature:.4g} m"
+        )
     ]
 
 
@@ -116,64 +129,94 @@ def light(
     visibility: Visibility | None = None,
     haze: Law | None = None,
 ) -> LaserLight:
-    """Compute the light that a laser in watts or joules sends through a lens, and its peak on the sensor.
+    """Compute the light that a laser in watts or joules sends through a lens, and its peak on the
+    sensor.
 
-    The beam hits the middle of the lens. All irradiances are means over one exposure. The shutter is global and opens
-    at the time 0; the pulses begin at `pulse_delay` and then every period, before the exposure too, and a pulse that
-    the shutter cuts counts in part. With the delay 0 an exposure catches as many pulses as it can.
-    `waist` and `divergence` are the 1/e2 radius and full angle, or those at 1/e by `convention`. The air is clear, or
-    has `air_transmittance`, or the `visibility` with the law `haze`. A laser that has a `strength` gives zeros.
+    The beam hits the middle of the lens. All irradiances are means over one exposure. The shutter
+    is global and opens at the time 0; the pulses begin at `pulse_delay` and then every period,
+    before the exposure too, and a pulse that the shutter cuts counts in part. With the delay 0 an
+    exposure catches as many pulses as it can. `waist` and `divergence` are the 1/e2 radius and full
+    angle, or those at 1/e by `convention`. The air is clear, or has `air_transmittance`, or the
+    `visibility` with the law `haze`. A laser that has a `strength` gives zeros.
 
     Shapes: -> LaserLight of scalars ().
     Units:  W/m2, W, J/m2; lengths m; times s.
-    Error:  peak of a diffraction-limited lens in focus at the mean wavelength of the line; the rim of the pupil grid
-            adds 2 / samples at most.
-    Raises: ParameterError before the run for a strength beside a power, a missing power, width or distance, and for
-            statements that disagree.
-    Source: Siegman, Lasers (1986), section 17.1; Goodman, Introduction to Fourier Optics, 3rd ed., section 4.4.
+    Error:  peak of a diffraction-limited lens in focus at the mean wavelength of the line; the rim
+            of the pupil grid adds 2 / samples at most.
+    Raises: ParameterError before the run for a strength beside a power, a missing power, width or
+            distance, and for statements that disagree.
+    Source: Siegman, Lasers (1986), section 17.1; Goodman, Introduction to Fourier Optics, 3rd ed.,
+            section 4.4.
     """
     if strength is not None:
         return LaserLight(*torch.zeros(7, dtype=torch.float64))
     if distance is None:
         raise ParameterError("distance", "the distance of the laser is not known: give distance")
     geometry = _Geometry(waist, divergence, m_squared, convention, distance)
-    found = _shaped(line, geometry, power, pulse_energy, pulse_duration, repetition_rate)
-    air = _air(found.wavelength, distance, air_transmittance, visibility, haze)
-    pulses = pulses_within(found, exposure, pulse_delay)
-    mean = found.power if found.pulse_energy is None else found.pulse_energy * pulses / exposure
+    beam = _shaped(line, geometry, power, pulse_energy, pulse_duration, repetition_rate)
+    air = _air(beam.wavelength, distance, air_transmittance, visibility, haze)
+    pulses = pulses_within(beam, exposure, pulse_delay)
+    mean = beam.power if beam.pulse_energy is None else beam.pulse_energy * pulses / exposure
     assert mean is not None
-    irradiance = mean * axis_density(found, distance, air)
+    irradiance = mean * axis_density(beam, distance, air)
     flux = irradiance * clear_area(stop) * lens_transmittance
-    spot, width = (found.wavelength * focal_length) ** 2, beam_radius(found, distance)
+    spot, width = (beam.wavelength * focal_length) ** 2, beam_radius(beam, distance)
     even = flux * clear_area(stop) / spot
-    through = irradiance * gaussian_over(stop, width / math.sqrt(2))  # of the irradiance of a Gaussian beam
-    peak = axis_density(found, distance, air) * lens_transmittance * gaussian_over(stop, width) ** 2 / spot  # its field
-    values = (even, flux, irradiance, through, mean * peak, pulses, (found.pulse_energy or 0.0) * peak)
-    return LaserLight(*(torch.as_tensor(value, dtype=torch.float64) for value in values))
+    # of the irradiance of a Gaussian beam
+    through = irradiance * gaussian_over(stop, width / math.sqrt(2))
+    # its field
+    peak = (
+        axis_density(beam, distance, air)
+        * lens_transmittance
+        * gaussian_over(stop, width) ** 2
+        / spot
+    )
+    return LaserLight(
+        even_peak=double(even),
+        flux=double(flux),
+        irradiance=double(irradiance),
+        power=double(through),
+        peak=double(mean * peak),
+        pulses=double(pulses),
+        pulse_fluence=double((beam.pulse_energy or 0.0) * peak),
+    )
 
 
 @light.check
-def _(result: LaserLight, line: Bands, stop: Stop, *, strength: float | None, **params: Any) -> list[Check]:
+def _(
+    result: LaserLight, line: Bands, stop: Stop, *, strength: float | None, **params: Any
+) -> list[Check]:
     if strength is not None:
         return [Check(f"given by its strength, {strength:g}")]
-    pulses = f", {float(result.pulses):.4g} pulses in the exposure" if float(result.pulse_fluence) > 0 else ""
-    text = f"{float(result.power):.4g} W into the lens ({float(result.irradiance):.4g} W/m2 on the axis of the beam)"
+    pulses = (
+        f", {float(result.pulses):.4g} pulses in the exposure"
+        if float(result.pulse_fluence) > 0
+        else ""
+    )
+    text = (
+        f"{float(result.power):.4g} W into the lens ({float(result.irradiance):.4g} W/m2 on the"
+        " axis of the beam)"
+    )
     peak = f"peak {float(result.peak):.4g} W/m2 on the sensor behind the clear lens in focus"
     return [Check(f"{text}, {peak}{pulses}", math.isfinite(float(result.peak)))]
 
 
 def pulses_within(beam: Beam, exposure: float, delay: float) -> float:
-    """Return the number of pulses that a shutter lets through, with parts of pulses; 0 for a continuous laser."""
+    """Return the number of pulses that a shutter lets through, with parts of pulses; 0 for a
+    continuous laser.
+    """
     if beam.pulse_duration is None:
         return 0.0
 
     def begun(time: float) -> float:
-        """Return the pulses from the delay to a time after the delay; a time before the delay counts back."""
+        """Return the pulses from the delay to a time after the delay; a time before the delay
+        counts back.
+        """
         assert beam.pulse_duration is not None
         if beam.repetition_rate is None:
             return min(max(time / beam.pulse_duration, 0.0), 1.0)
-        whole = math.floor(plain(time * beam.repetition_rate))
-        return whole + min(max(time - whole / beam.repetition_rate, 0.0) / beam.pulse_duration, 1.0)
+        ended = math.floor(plain(time * beam.repetition_rate))
+        return ended + min(max(time - ended / beam.repetition_rate, 0.0) / beam.pulse_duration, 1.0)
 
     return begun(exposure - delay) - begun(-delay)
 
@@ -194,22 +237,31 @@ def _shaped(line: Bands, shape: _Geometry, *emission: float | None) -> Beam:
     )
 
 
-def _air(wavelength: float, distance: float, share: float | None, visibility: float | None, haze: Law | None) -> float:
+def _air(
+    wavelength: float,
+    distance: float,
+    share: float | None,
+    visibility: float | None,
+    haze: Law | None,
+) -> float:
     """Return the transmittance of the air between a laser and a lens."""
     if share is not None or visibility is None:
         return 1.0 if share is None else share
     if haze is None:
-        text = "laws of haze differ twentyfold in fog at 1550 nm: name one, haze: kruse or haze: kim"
+        text = (
+            "laws of haze differ twentyfold in fog at 1550 nm: name one, haze: kruse or haze: kim"
+        )
         raise ParameterError("visibility", text)
     return air_transmittance(distance, visibility, wavelength, haze)
 
 
-# --- what is refused before the run -----------------------------------------------------------------------------------
+# --- what is refused before the run ---------------------------------------------------------------
 
 _BEAM = ("waist", "divergence", "m_squared")
 _PULSE = ("pulse_energy", "pulse_duration", "repetition_rate")
 _AIR = ("air_transmittance", "visibility", "haze")
-_ABSOLUTE = ("power", *_PULSE, *_BEAM, "distance", *_AIR)  #: settings that state the light in watts and metres
+#: settings that state the light in watts and metres
+_ABSOLUTE = ("power", *_PULSE, *_BEAM, "distance", *_AIR)
 
 
 @light.preflight
@@ -224,52 +276,81 @@ def _(*, line: Bands | None = None, stop: Stop | None = None, **params: Any) -> 
         return []
     refuse_impossible_f_number(params["focal_length"], float(stop.diameter), "focal_length")
     try:
-        return [*_out_of_focus(line, stop, params), *_pulse_notes(light(line, stop, **params), params)]
+        return [
+            *_out_of_focus(line, stop, params),
+            *_pulse_notes(light(line, stop, **params), params),
+        ]
     except ParameterError as error:
         name = error.parameter if error.parameter in stated else stated[0]
         raise ParameterError(name, str(error)) from None
 
 
 def _refuse_unknown_light(stated: list[str]) -> None:
-    """Raise ParameterError for a laser in absolute units without its power or energy, or without its distance."""
+    """Raise ParameterError for a laser in absolute units without its power or energy, or without
+    its distance.
+    """
     if "power" not in stated and "pulse_energy" not in stated:
-        text = "the light of this laser is not known: give strength, or power (or pulse_energy) with distance"
+        text = (
+            "the light of this laser is not known: give strength, or power (or pulse_energy) with"
+            " distance"
+        )
         raise ParameterError(stated[0] if stated else "line.wavelength", text)
     if "distance" not in stated:
-        raise ParameterError(stated[0], "a laser in watts needs its distance from the camera, such as distance: 100 m")
+        raise ParameterError(
+            stated[0],
+            "a laser in watts needs its distance from the camera, such as distance: 100 m",
+        )
 
 
 def _refuse_beside_strength(stated: list[str]) -> None:
     """Raise ParameterError for a laser that has a strength and statements in absolute units."""
     if stated:
         other = f"{', '.join(stated)} state{'s' * (len(stated) == 1)} its light in absolute units"
-        text = f"a strength states the light of the laser at the sensor, but {other}: leave strength or the rest out"
+        text = (
+            f"a strength states the light of the laser at the sensor, but {other}: leave strength"
+            " or the rest out"
+        )
         raise ParameterError("strength", text)
 
 
 def _refuse_air(stated: list[str]) -> None:
     """Raise ParameterError for air that is stated twice, or by a law without a visibility."""
     if "air_transmittance" in stated and ("visibility" in stated or "haze" in stated):
-        raise ParameterError("air_transmittance", "the air is stated twice: leave air_transmittance or visibility out")
+        raise ParameterError(
+            "air_transmittance",
+            "the air is stated twice: leave air_transmittance or visibility out",
+        )
     if "haze" in stated and "visibility" not in stated:
         raise ParameterError("haze", "a law of haze needs the visibility, such as visibility: 5 km")
 
 
 def _out_of_focus(line: Bands, stop: Stop, params: dict[str, Any]) -> list[str]:
-    """Return a note on a laser that is so near that a lens focused at infinity does not focus it."""
+    """Return a note on a laser that is so near that a lens focused at infinity does not focus
+    it.
+    """
     shape = {name: params[name] for name in (*_BEAM, "convention", "distance")}
     waves = float(wavefront(line, **shape).curvature * stop.diameter**2) / 8 / _WAVE
     if waves <= _NEAR:
         return []
     off = f"its spot is exact to {_RIM * waves / int(stop.samples):.2g} of its peak"
-    text = f"a laser at {params['distance']:g} m is {waves:.3g} waves out of focus for a lens focused at infinity"
+    text = (
+        f"a laser at {params['distance']:g} m is {waves:.3g} waves out of focus for a lens focused"
+        " at infinity"
+    )
     return [f'{text} ({off}): optics.defocus="-{waves:.3g} waves" focuses it']
 
 
-def _pulse_notes(found: LaserLight, params: dict[str, Any]) -> list[str]:
+def _pulse_notes(light_of_laser: LaserLight, params: dict[str, Any]) -> list[str]:
     """Return a note on the pulses that an exposure catches."""
     if not params["pulse_duration"]:
         return []
-    count = float(found.pulses)
-    missed = "no pulse falls into the exposure" if count == 0 else f"{count:.4g} pulses fall into the exposure"
-    return [f"{missed} of {params['exposure']:g} s, for a global shutter and pulse_delay {params['pulse_delay']:g} s"]
+    count = float(light_of_laser.pulses)
+    missed = (
+        "no pulse falls into the exposure"
+        if count == 0
+        else f"{count:.4g} pulses fall into the exposure"
+    )
+    return [
+        f"{missed} of {params['exposure']:g} s, for a global shutter and pulse_delay"
+        f" {params['pulse_delay']:g} s"
+    ]

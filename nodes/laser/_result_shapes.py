@@ -1,4 +1,6 @@
-"""Values of the results of the laser nodes before a run, which have few numbers, and shapes of the other results."""
+"""Values of the results of the laser nodes before a run, which have few numbers, and shapes of
+the other results.
+"""
 
 from typing import Any
 
@@ -6,12 +8,17 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.laser._bright_pixels import PARTS, RINGS, BrightPixels, bright_pixels
-from neusee.nodes.laser._damage_pixels import damaged_pixels
-from neusee.nodes.laser._damage_spot import SpotDamage, damage, parts_before
-from neusee.nodes.laser._dazzle_curve import DECADES, DazzleCurve, dazzle_curve
-from neusee.nodes.laser._dazzle_picture import Dazzle, dazzle
+from neusee.nodes.laser._damage_spot import SpotDamage, damage, damaged_pixels, parts_before
+from neusee.nodes.laser._dazzle import DECADES, Dazzle, DazzleCurve, dazzle, dazzle_curve
 from neusee.nodes.laser._light import light, wavefront
-from neusee.nodes.shape_rules import at_least_single, blank, double, known, scalars, transform_operations
+from neusee.nodes.shape_rules import (
+    at_least_single,
+    blank,
+    double,
+    known,
+    scalars,
+    transform_operations,
+)
 from neusee.nodes.values import Bands, LaserLight, Psf, Stop, Wavefront
 
 dazzle.shape(scalars(Dazzle))
@@ -19,14 +26,16 @@ dazzle.shape(scalars(Dazzle))
 
 @wavefront.shape
 def _(line: Bands, **params: Any) -> Wavefront:
-    found: Wavefront = wavefront(line, **params) if known(line.centres) else scalars(Wavefront)()
-    return found
+    result: Wavefront = wavefront(line, **params) if known(line.centres) else scalars(Wavefront)()
+    return result
 
 
 @light.shape
 def _(line: Bands, stop: Stop, **params: Any) -> LaserLight:
-    found: LaserLight = light(line, stop, **params) if known(line.centres) else scalars(LaserLight)()
-    return found
+    result: LaserLight = (
+        light(line, stop, **params) if known(line.centres) else scalars(LaserLight)()
+    )
+    return result
 
 
 @damage.shape
@@ -37,8 +46,11 @@ def _(spot: Tensor, line: Bands, light: LaserLight | None = None, **params: Any)
 
 @damage.work
 def _(result: SpotDamage, spot: Tensor, *inputs: Any, **params: Any) -> tuple[float, float]:
-    pixels = float(spot[0].numel())  # six planes of twice the size for the heat, and the sum of the bands
-    return 8.0 * 26 * pixels, float(spot.numel()) + 12 * transform_operations(2 * spot.shape[-2], 2 * spot.shape[-1])
+    # six planes of twice the size for the heat, and the sum of the bands
+    pixels = float(spot[0].numel())
+    return 8.0 * 26 * pixels, float(spot.numel()) + 12 * transform_operations(
+        2 * spot.shape[-2], 2 * spot.shape[-1]
+    )
 
 
 @damaged_pixels.shape
@@ -47,7 +59,9 @@ def _(raw: Tensor, *inputs: Any, **params: Any) -> Tensor:
 
 
 @dazzle_curve.shape
-def _(psf: Psf, bands: Bands, *, strengths: tuple[float, ...] = DECADES, **params: Any) -> DazzleCurve:
+def _(
+    psf: Psf, bands: Bands, *, strengths: tuple[float, ...] = DECADES, **params: Any
+) -> DazzleCurve:
     column = double(len(strengths))
     return DazzleCurve(column, column, column, column)
 
@@ -66,7 +80,12 @@ def _(psf: Psf, bands: Bands, **params: Any) -> BrightPixels:
 
 @bright_pixels.work
 def _(
-    result: BrightPixels, psf: Psf, *inputs: Any, pixel_pitch: float, sample_pitch: float | None = None, **params: Any
+    result: BrightPixels,
+    psf: Psf,
+    *inputs: Any,
+    pixel_pitch: float,
+    sample_pitch: float | None = None,
+    **params: Any,
 ) -> tuple[float, float]:
     samples = float(psf.intensity[0].numel())
     pixels = samples * min(1.0, (sample_pitch or pixel_pitch) / pixel_pitch) ** 2

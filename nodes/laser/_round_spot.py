@@ -1,10 +1,10 @@
 """The spot of a Gaussian beam behind a clear round lens: narrower than the lens, and out of focus.
 
-A beam of 1/e2 radius w has the amplitude exp(-a r^2) in the pupil, with r = 1 at the rim and the fill
-a = (D / (2 w))^2. A lens that is W waves out of focus at the rim adds the phase 2 pi W r^2. With
-kappa = a - 2 pi i W the field at the reach v = pi x / (lambda N) from the axis is U = integral of
-exp(-kappa r^2) J0(v r) r dr from 0 to 1. Its two series by repeated integration by parts are those of Lommel
-(Born and Wolf, section 8.8.1), for a complex argument.
+A beam of 1/e2 radius w has the amplitude exp(-a r^2) in the pupil, with r = 1 at the rim and the
+fill a = (D / (2 w))^2. A lens that is W waves out of focus at the rim adds the phase 2 pi W r^2.
+With kappa = a - 2 pi i W the field at the reach v = pi x / (lambda N) from the axis is U = integral
+of exp(-kappa r^2) J0(v r) r dr from 0 to 1. Its two series by repeated integration by parts are
+those of Lommel (Born and Wolf, section 8.8.1), for a complex argument.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ _RATIOS = (0.3, 0.1, 0.03)  #: of a series, at which places are parted
 _PIECE = 1 << 21  #: Bessel functions at a time in a quadrature
 _RING = 3.8317059702075125  #: first zero of J1, where J0 has its largest negative value
 _TROUGH = -0.4027593957025531  #: J0 there
-_TABLE_WAVES, _TABLE_FILL = 8.0, 8.0  #: defocus and fill up to which the bright ring is interpolated in a table
+#: defocus and fill up to which the bright ring is interpolated in a table
+_TABLE_WAVES, _TABLE_FILL = 8.0, 8.0
 _FIRST = 0.5  #: waves of defocus from which a ring may be brighter than the axis
 _WAVE_STEPS, _FILL_STEPS = 751, 33
 _STEP = 0.05  #: of the reach, between which the brightest ring is looked for
@@ -37,19 +38,22 @@ _WIDEST = 45.0  #: reach of the rings in the table; one farther out is never the
 
 
 def round_spot(reach: Tensor, fill: float, waves: float) -> Tensor:
-    """Return the irradiance in the spot of a beam, over the peak of an even and focused beam of the same axis value.
+    """Return the irradiance in the spot of a beam, over the peak of an even and focused beam of the
+    same axis value.
 
-    ``reach`` is v = pi x / (lambda N) at the distance x from the axis, ``fill`` is (D / (2 w))^2 and ``waves`` the
-    defocus at the rim of the lens.
+    ``reach`` is v = pi x / (lambda N) at the distance x from the axis, ``fill`` is (D / (2 w))^2
+    and ``waves`` the defocus at the rim of the lens.
 
     Shapes: reach (any) -> the same, float64.
     Units:  none.
     Error:  1e-7 of the local mean, wings included.
     Raises: nothing.
-    Source: Born and Wolf, Principles of Optics, 7th ed., section 8.8 (Lommel's series); quadrature in between.
+    Source: Born and Wolf, Principles of Optics, 7th ed., section 8.8 (Lommel's series); quadrature
+            in between.
     """
     v = reach.double().abs().flatten()
-    kappa = complex(fill, -2 * math.pi * abs(waves))  # the sign of the defocus turns the phase of the field alone
+    # the sign of the defocus turns the phase of the field alone
+    kappa = complex(fill, -2 * math.pi * abs(waves))
     size = 2 * abs(kappa)
     if fill > _DARK:
         return _irradiance(_geometric(v, kappa), reach)
@@ -60,12 +64,16 @@ def round_spot(reach: Tensor, fill: float, waves: float) -> Tensor:
     if bool(near.any()):
         field[near] = _within(v[near], kappa)
     between = ~(far | near)
-    field[between] = _at_the_edge(v[between], kappa) if size > _LARGE else _integrated(v[between], kappa)
+    field[between] = (
+        _at_the_edge(v[between], kappa) if size > _LARGE else _integrated(v[between], kappa)
+    )
     return _irradiance(field, reach)
 
 
 def _irradiance(field: Tensor, reach: Tensor) -> Tensor:
-    """Return the irradiance of a field over that of an even pupil in focus, whose field is 1/2 on the axis."""
+    """Return the irradiance of a field over that of an even pupil in focus, whose field is 1/2
+    on the axis.
+    """
     irradiance: Tensor = field.abs().square() * 4
     return irradiance.reshape(reach.shape)
 
@@ -82,12 +90,16 @@ def _beyond(v: Tensor, kappa: complex) -> Tensor:
     """
     field = torch.empty(len(v), dtype=torch.complex128)
     ratio = 2 * abs(kappa) / v
-    for most, least in itertools.pairwise((math.inf, *_RATIOS, -1.0)):
-        part = (ratio <= most) & (ratio > least)
-        if bool(part.any()):
-            largest = float(ratio[part].max())
-            terms = _TERMS if largest > 1 / _APART else math.ceil(_SMALLEST / math.log(max(largest, 1e-9))) + 1
-            field[part] = _far_series(v[part], kappa, min(terms, _TERMS))
+    for upper, lower in itertools.pairwise((math.inf, *_RATIOS, -1.0)):
+        in_range = (ratio <= upper) & (ratio > lower)
+        if bool(in_range.any()):
+            largest = float(ratio[in_range].max())
+            terms = (
+                _TERMS
+                if largest > 1 / _APART
+                else math.ceil(_SMALLEST / math.log(max(largest, 1e-9))) + 1
+            )
+            field[in_range] = _far_series(v[in_range], kappa, min(terms, _TERMS))
     return field
 
 
@@ -119,7 +131,9 @@ def _within(v: Tensor, kappa: complex) -> Tensor:
 
 
 def _next(n: int, v: Tensor, last: Tensor, bessel: Tensor) -> Tensor:
-    """Return J(n + 1, v); beyond the order v, where the recurrence is unstable and J falls fast, return 0."""
+    """Return J(n + 1, v); beyond the order v, where the recurrence is unstable and J falls fast,
+    return 0.
+    """
     following = 2 * n / v * bessel - last
     return torch.where((v > n + 1) | (following.abs() < bessel.abs()), following, 0.0)
 
@@ -129,20 +143,25 @@ def _integrated(v: Tensor, kappa: complex) -> Tensor:
     if not len(v):
         return torch.zeros(0, dtype=torch.complex128)
     cycles = abs(kappa) / math.pi + float(v.max()) / (2 * math.pi)
-    at, weights = (torch.from_numpy(x) for x in legendre(1 << math.ceil(math.log2(24 + 2.2 * cycles))))
-    square = (at + 1) / 2
+    nodes, weights = (
+        torch.from_numpy(x) for x in legendre(1 << math.ceil(math.log2(24 + 2.2 * cycles)))
+    )
+    square = (nodes + 1) / 2
     pupil = torch.exp(-kappa * square) * weights / 4
     root, rows = square.sqrt(), max(1, _PIECE // len(square))
     pieces = torch.split(v, rows)
-    parts = [torch.special.bessel_j0(piece[:, None] * root).to(pupil.dtype) @ pupil for piece in pieces]
+    parts = [
+        torch.special.bessel_j0(piece[:, None] * root).to(pupil.dtype) @ pupil for piece in pieces
+    ]
     return torch.cat(parts)
 
 
 def _at_the_edge(v: Tensor, kappa: complex) -> Tensor:
-    """Return the field around the geometric edge of a wide spot: a beam behind a straight edge, to first order in 1/v.
+    """Return the field around the geometric edge of a wide spot: a beam behind a straight edge, to
+    first order in 1/v.
 
-    J0 is the sum of two waves. The one that the beam brings to the place is cut off by an edge: a complementary error
-    function. The other one, and what the first misses, come from the rim.
+    J0 is the sum of two waves. The one that the beam brings to the place is cut off by an edge: a
+    complementary error function. The other one, and what the first misses, come from the rim.
     """
     from scipy.special import wofz
 
@@ -153,8 +172,8 @@ def _at_the_edge(v: Tensor, kappa: complex) -> Tensor:
     edge = torch.from_numpy(wofz(1j * side.numpy() * depth)) * side / (4 * kappa)
     turn = complex(math.cos(math.pi / 4), math.sin(math.pi / 4))
     root, wave = 1 / torch.sqrt(2 * math.pi * v), torch.exp(-1j * v)
-    one = torch.ones_like(place)
-    lack = turn * root / (-2 * kappa * (one + place.sqrt()))
+    unity = torch.ones_like(place)
+    lack = turn * root / (-2 * kappa * (unity + place.sqrt()))
     other = root / turn / (1j * v - 2 * kappa) * wave.conj()
     beam = torch.where(lit, _geometric(v, kappa), 0.0)
     return beam + _exp(-kappa) * ((edge + lack) * wave + other)
@@ -172,22 +191,26 @@ def legendre(count: int) -> tuple[Any, Any]:
     return np.polynomial.legendre.leggauss(count)
 
 
-# --- the brightest point ----------------------------------------------------------------------------------------------
+# --- the brightest point --------------------------------------------------------------------------
 
 
 def spot_peak(fill: Tensor, waves: Tensor, within: float = 0.0) -> Tensor:
-    """Return the largest irradiance at any radius of the spot of a beam, in the unit of `round_spot`, or a bit more.
+    """Return the largest irradiance at any radius of the spot of a beam, in the unit of
+    `round_spot`, or a bit more.
 
-    On the axis it is |1 - exp(-kappa)|^2 / |kappa|^2, which falls at whole waves of defocus; there a bright ring
-    counts. ``within`` makes it the largest value while the defocus changes by up to that share to either side, so that
-    a peak which comes and goes over a short distance is not missed. The result is continuous.
+    On the axis it is |1 - exp(-kappa)|^2 / |kappa|^2, which falls at whole waves of defocus; there
+    a bright ring counts. ``within`` makes it the largest value while the defocus changes by up to
+    that share to either side, so that a peak which comes and goes over a short distance is not
+    missed. The result is continuous.
 
     Shapes: fill, waves, of one shape or of shapes that broadcast -> that shape, float64.
     Units:  none.
-    Error:  an upper bound, to 1e-4: 0.5 % above up to 8 waves, 6 % above beyond 8 waves where the rings of an even
-            beam near its geometric edge are as bright as its axis. `defocused_peak` is exact.
+    Error:  an upper bound, to 1e-4: 0.5 % above up to 8 waves, 6 % above beyond 8 waves where the
+            rings of an even beam near its geometric edge are as bright as its axis.
+            `defocused_peak` is exact.
     Raises: nothing.
-    Source: Born and Wolf, Principles of Optics, 7th ed., section 8.8; our derivation for the tapered beam.
+    Source: Born and Wolf, Principles of Optics, 7th ed., section 8.8; our derivation for the
+            tapered beam.
     """
     alike = torch.zeros_like(fill.double() + waves.double())
     fill, phase = fill.double() + alike, 2 * math.pi * waves.double().abs() + alike
@@ -196,13 +219,16 @@ def spot_peak(fill: Tensor, waves: Tensor, within: float = 0.0) -> Tensor:
     largest = _on_axis(fill, rim, phase)
     if within:
         trough = math.pi * (2 * torch.ceil(low / (2 * math.pi) - 0.5) + 1)
-        before = trough - (1 + rim).square() / (rim * trough).clamp_min(1e-12)  # the maximum, as 1 / |kappa|^2 falls
-        for each in (low, high, trough, before):
-            largest = torch.maximum(largest, _on_axis(fill, rim, each.clamp(low, high)))
+        # the maximum, as 1 / |kappa|^2 falls
+        before = trough - (1 + rim).square() / (rim * trough).clamp_min(1e-12)
+        for angle in (low, high, trough, before):
+            largest = torch.maximum(largest, _on_axis(fill, rim, angle.clamp(low, high)))
     ringed = (high > 2 * math.pi * _FIRST) & (fill < _TABLE_FILL)
     if bool(ringed.any()):
         largest = largest.clone()
-        largest[ringed] = torch.maximum(largest[ringed], _brightest_ring(fill[ringed], low[ringed], high[ringed]))
+        largest[ringed] = torch.maximum(
+            largest[ringed], _brightest_ring(fill[ringed], low[ringed], high[ringed])
+        )
     return largest
 
 
@@ -214,13 +240,17 @@ def _on_axis(fill: Tensor, rim: Tensor, phase: Tensor) -> Tensor:
 
 
 def _brightest_ring(fill: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Return the irradiance of the brightest ring, the largest for phases of the rim between two."""
+    """Return the irradiance of the brightest ring, the largest for phases of the rim between
+    two.
+    """
     rim = torch.exp(-fill)
     largest = torch.zeros_like(fill)
     phases = [low] if bool((low == high).all()) else [low, high]
     if len(phases) == 2:
         turn = _RING**2 / (4 * low.clamp_min(1.0))
-        phases.append((2 * math.pi * torch.ceil((low + turn) / (2 * math.pi)) - turn).clamp(low, high))
+        phases.append(
+            (2 * math.pi * torch.ceil((low + turn) / (2 * math.pi)) - turn).clamp(low, high)
+        )
     for phase in phases:
         size = fill.square() + phase.square()
         cosine = torch.cos(phase + phase * _RING**2 / (4 * size))
@@ -239,10 +269,12 @@ def _ring_limit(rim: Tensor, fill: Tensor, phase: Tensor, cosine: Tensor) -> Ten
 
 
 def defocused_peak(waves: float, fill: float = 0.0) -> float:
-    """Return the largest irradiance behind a clear round lens with defocus, over that of the even, focused pupil.
+    """Return the largest irradiance behind a clear round lens with defocus, over that of the even,
+    focused pupil.
 
-    It is the largest value at any radius, not that on the axis, which is sinc^2(waves) for an even beam and has zeros.
-    ``fill`` is (D / (2 w))^2 of a Gaussian beam of 1/e2 radius w: 0 for an even beam. Error: 1e-4, at any defocus.
+    It is the largest value at any radius, not that on the axis, which is sinc^2(waves) for an even
+    beam and has zeros. ``fill`` is (D / (2 w))^2 of a Gaussian beam of 1/e2 radius w: 0 for an even
+    beam. Error: 1e-4, at any defocus.
     """
     waves = abs(waves)
     axis = float(round_spot(torch.zeros(1), fill, waves))
@@ -254,7 +286,9 @@ def defocused_peak(waves: float, fill: float = 0.0) -> float:
 
 
 def _ring_share(fill: Tensor, waves: Tensor) -> Tensor:
-    """Return the irradiance of the brightest ring over `_ring_limit`, which is 1 for strong defocus."""
+    """Return the irradiance of the brightest ring over `_ring_limit`, which is 1 for strong
+    defocus.
+    """
     row = ((waves - _FIRST) / (_TABLE_WAVES - _FIRST) * (_WAVE_STEPS - 1)).clamp(0, _WAVE_STEPS - 1)
     column = (fill / _TABLE_FILL * (_FILL_STEPS - 1)).clamp(0, _FILL_STEPS - 1)
     share = _SURE * bilinear(_ring_table(), row, column)
@@ -273,20 +307,22 @@ def bilinear(table: Tensor, row: Tensor, column: Tensor) -> Tensor:
 
 @functools.lru_cache(maxsize=1)
 def _ring_table() -> Tensor:
-    """Return the irradiance of the brightest ring over its limit for strong defocus, (waves, fill)."""
+    """Return the irradiance of the brightest ring over its limit for strong defocus, (waves,
+    fill).
+    """
     waves = torch.linspace(_FIRST, _TABLE_WAVES, _WAVE_STEPS, dtype=torch.float64)
     fills = torch.linspace(0, _TABLE_FILL, _FILL_STEPS, dtype=torch.float64)
     reach = torch.linspace(1.5, _WIDEST, 436, dtype=torch.float64)
-    at, weights = (torch.from_numpy(x) for x in legendre(64))
-    square = (at + 1) / 2
+    nodes, weights = (torch.from_numpy(x) for x in legendre(64))
+    square = (nodes + 1) / 2
     bessel = torch.special.bessel_j0(reach[:, None] * square.sqrt())
     taper = torch.exp(-fills[:, None] * square) * weights / 4
     rows = []
-    for each in waves.tolist():
-        turns = 2 * math.pi * each * square
+    for wave_count in waves.tolist():
+        turns = 2 * math.pi * wave_count * square
         parts = [(taper * wave) @ bessel.T for wave in (torch.cos(turns), torch.sin(turns))]
         brightest = _summit(4 * (parts[0].square() + parts[1].square()))
-        phase = torch.full_like(fills, 2 * math.pi * each)
+        phase = torch.full_like(fills, 2 * math.pi * wave_count)
         size = fills.square() + phase.square()
         cosine = torch.cos(phase + phase * _RING**2 / (4 * size))
         rows.append(brightest * size / _ring_limit(torch.exp(-fills), fills, phase, cosine))

@@ -1,8 +1,12 @@
 """Losses: the functions that a training minimises."""
 
-from neusee.nodes.losses._contrast_loss import ContrastFloor, HighestFrequency, contrast
-from neusee.nodes.losses._gradient_penalty import gradient_penalty
-from neusee.nodes.losses._mask_losses import background_loss, suppression_loss
+from neusee.nodes.losses._mask_losses import (
+    ContrastFloor,
+    HighestFrequency,
+    background_loss,
+    contrast,
+    suppression_loss,
+)
 from neusee.nodes.losses._protected_losses import (
     ContrastVariance,
     PeakLimit,
@@ -11,8 +15,13 @@ from neusee.nodes.losses._protected_losses import (
     filtered_error,
     information,
 )
-from neusee.nodes.losses._restoration_losses import charbonnier, fft_l1, log_error
-from neusee.nodes.losses._spectral_loss import mrae
+from neusee.nodes.losses._restoration_losses import (
+    charbonnier,
+    fft_l1,
+    gradient_penalty,
+    log_error,
+    mrae,
+)
 from neusee.nodes.losses._wiener_loss import NoiseVariance, OneBandShare, wiener
 
 __all__ = [

@@ -1,5 +1,6 @@
-"""Losses of a mask: the remaining peak of a laser, and the scene light that the mask scatters out of the field."""
+"""Losses of a mask: the peak of a laser, scattered scene light, and lost image contrast."""
 
+import math
 from typing import Annotated
 
 import torch
@@ -7,33 +8,45 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import node
-from neusee.nodes._half_precision import single
 from neusee.nodes.metrics import bsr
+from neusee.nodes.optics._lens import cut_off
+from neusee.nodes.precision import single
 from neusee.nodes.values import Psf
+
+# --- mask losses ----------------------------------------------------------------------------------
+
+# Losses of a mask: the remaining peak of a laser, and the scene light that the mask scatters out of
+# the field.
+
 
 _DARK = 1e-30  #: light, or ratio, below which a band counts as dark
 
 
 @node()
-def suppression_loss(psf: Psf, *, power: Annotated[float, Field(ge=8, le=64)] = 8.0, log: bool = False) -> Tensor:
-    """Sum the laser suppression ratio over the bands, with a p-norm over pixels as a smooth maximum.
+def suppression_loss(
+    psf: Psf, *, power: Annotated[float, Field(ge=8, le=64)] = 8.0, log: bool = False
+) -> Tensor:
+    """Sum the laser suppression ratio over the bands, with a p-norm over pixels as a smooth
+    maximum.
 
-    The p-norm of PSF / clear peak stands for the maximum over pixels: its gradient reaches every bright pixel, while
-    the gradient of the maximum reaches a single pixel. With ``log`` each band counts by its logarithm, so that a factor
-    counts alike at 1e-3 and at 1.
+    The p-norm of PSF / clear peak stands for the maximum over pixels: its gradient reaches every
+    bright pixel, while the gradient of the maximum reaches a single pixel. With ``log`` each band
+    counts by its logarithm, so that a factor counts alike at 1e-3 and at 1.
 
     Shapes: psf.intensity (band, y, x) -> ().
     Units:  none.
-    Error:  the p-norm of n equal pixels is n^(1/p) times their peak and never below the peak: 1 % at p = 8 and one
-            bright pixel. float32: 1e-5; with ``log`` 1e-6 per band, a larger share of a sum near 0. A band without
-            light counts as the logarithm of 1e-30, and has no gradient.
+    Error:  the p-norm of n equal pixels is n^(1/p) times their peak and never below the peak: 1 %
+            at p = 8 and one bright pixel. float32: 1e-5; with ``log`` 1e-6 per band, a larger share
+            of a sum near 0. A band without light counts as the logarithm of 1e-30, and has no
+            gradient.
     Source: NeuSee, section Two-Stage Training (L_DOE); p-norm for the maximum is ours.
     """
     ratio = single(psf.intensity) / psf.clear_peak.to(single(psf.intensity))[:, None, None]
     top = ratio.detach().amax((-2, -1), keepdim=True)
     dark = top <= _DARK  # false for NaN, so that NaN reaches the result
     scale = top.where(~dark, 1.0)
-    sums = (ratio / scale).pow(power).sum((-2, -1)).where(~dark[:, 0, 0], 1.0)  # the root has no gradient at 0
+    # the root has no gradient at 0
+    sums = (ratio / scale).pow(power).sum((-2, -1)).where(~dark[:, 0, 0], 1.0)
     norm = sums.pow(1.0 / power).where(~dark[:, 0, 0], 0.0)
     peaks = scale[:, 0, 0] * norm
     loss: Tensor = (peaks + _DARK).log().sum() if log else peaks.sum()
@@ -52,10 +65,12 @@ def _(psf: Psf, *, power: float = 8.0, log: bool = False) -> Tensor:
 
 @node()
 def background_loss(psf: Psf, radiance: Tensor | None = None) -> Tensor:
-    """Sum over the bands the inverse of the background suppression ratio, which `metrics.bsr` computes.
+    """Sum over the bands the inverse of the background suppression ratio, which `metrics.bsr`
+    computes.
 
-    Light that the mask scatters out of the field or out of the window of the PSF makes the loss larger, whatever the
-    border of the image is. Without a scene, the loss is that of a point on the axis.
+    Light that the mask scatters out of the field or out of the window of the PSF makes the loss
+    larger, whatever the border of the image is. Without a scene, the loss is that of a point on the
+    axis.
 
     Shapes: psf.intensity (band, any, any), radiance (..., band, y, x) -> ().
     Units:  none; the number of bands where no light is lost, and more where light is lost.
@@ -67,3 +82,78 @@ def background_loss(psf: Psf, radiance: Tensor | None = None) -> Tensor:
     dark = share <= _DARK  # false for NaN, so that NaN reaches the result
     ratios: Tensor = torch.where(dark, 1.0, 1.0 / share.where(~dark, 1.0))
     return ratios.sum().to(single(psf.intensity).dtype)
+
+
+# --- contrast loss --------------------------------------------------------------------------------
+
+# The contrast loss, which keeps the image contrast of a mask while another loss lowers the laser
+# peak.
+
+
+ContrastFloor = Annotated[float, Field(gt=0, le=0.1)]
+HighestFrequency = Annotated[float, Field(gt=0, le=0.5)]  #: cycles per pixel
+
+
+@node()
+def contrast(
+    psf: Psf, *, floor: ContrastFloor = 1e-4, up_to: HighestFrequency | None = None
+) -> Tensor:
+    """Sum over the bands the contrast loss -mean(ln sqrt(MTF**2 + floor**2)), with the mean over
+    frequencies.
+
+    The mean is over the frequencies that the clear aperture passes, as in `metrics.mtf`, and the
+    contrast is the modulus of the OTF over its value at frequency 0. A mean of logarithms is the
+    logarithm of the geometric mean and follows the median, whereas a mean of squares follows the
+    few frequencies near 0 with high contrast. A factor of contrast counts alike at every contrast
+    above ``floor``, as a factor of suppression does in ``losses.suppression_loss`` with ``log``, so
+    that the weights of the two losses set the exchange rate. Below ``floor`` the loss hardly
+    changes, so that nulls at single frequencies do not dominate. ``up_to`` excludes finer
+    frequencies, which a reduced picture loses.
+
+    Shapes: psf.intensity (band, y, x) -> ().
+    Units:  none; per band 0 at full contrast and -ln(floor) at none; up_to in cycles per pixel.
+    Error:  1e-5 in float32. Light outside the window is not counted; `losses.background_loss`
+            counts that light. A band without light (1e-30) counts as contrast 0, and has no
+            gradient.
+    Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (OTF, cut-off); the mean of
+            logarithms is ours.
+    """
+    bands = zip(single(psf.intensity), cut_off(psf).tolist(), strict=True)
+    return torch.stack([_lost(kernel, cut, floor, up_to) for kernel, cut in bands]).sum()
+
+
+def _lost(kernel: Tensor, passed: float, floor: float, up_to: float | None) -> Tensor:
+    y, x = kernel.shape
+    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64, device=kernel.device) for n in (y, x))
+    cut = min(passed, up_to or math.inf)  # cycles per pixel
+    inside = torch.hypot(fy[:, None], fx[None, : x // 2 + 1]) <= cut
+    light = kernel.sum()
+    dark = light.detach() <= _DARK  # false for NaN, so that NaN reaches the result
+    # in float32, the round-off of the transform turns the gradient where the contrast is near the
+    # floor
+    otf = torch.fft.rfft2(kernel.double() / light.double().where(~dark, 1.0))[inside]
+    square = (otf.real.square() + otf.imag.square()).where(~dark, 0.0)
+    lost: Tensor = -0.5 * (square + floor**2).log().mean()
+    return lost.to(kernel)
+
+
+@contrast.reference
+def _(psf: Psf, *, floor: float = 1e-4, up_to: float | None = None) -> Tensor:
+    total = torch.zeros((), dtype=torch.float64)
+    for kernel, cut in zip(psf.intensity.double(), cut_off(psf).tolist(), strict=True):
+        y, x = kernel.shape
+        otf = torch.fft.fft2(kernel)[:, : x // 2 + 1]
+        fy, fx = (
+            torch.fft.fftfreq(y, dtype=torch.float64),
+            torch.fft.rfftfreq(x, dtype=torch.float64),
+        )
+        inside = fy[:, None].square() + fx.square() <= cut**2
+        if up_to is not None:
+            inside &= fy[:, None].square() + fx.square() <= up_to**2
+        passed_light = otf[0, 0].real
+        dark = bool(passed_light.detach() <= _DARK)
+        passed = (
+            torch.zeros(int(inside.sum())) if dark else otf[inside].abs().square() / passed_light**2
+        )
+        total = total - (passed + floor**2).sqrt().log().mean()
+    return total

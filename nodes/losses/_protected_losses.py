@@ -1,31 +1,140 @@
-"""Losses of a mask with a grey filter that holds the peak of a laser at a limit: error and information of a picture."""
+"""Losses of a mask with a grey filter that holds the peak of a laser at a limit."""
+
+from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import node
-from neusee.nodes._half_precision import single
-from neusee.nodes.losses._contrast_loss import HighestFrequency
-from neusee.nodes.losses._filtered_picture import (
-    Exposure,
-    bits,
-    error_share,
-    filter_of,
-    frequencies,
-    natural_spectrum,
-    peak_share,
-    quanta,
-    round_mtf,
-)  # fmt: skip
-from neusee.nodes.optics._lens_band import averaging, cut_off, round_lens, stop_width
-from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_shares
+from neusee.nodes.losses._mask_losses import HighestFrequency
+from neusee.nodes.optics._lens import averaging, cut_off, round_lens, stop_width
+from neusee.nodes.precision import single
+from neusee.nodes.restore._inverse._masked_blur import effective_psf, grey_shares, times
 from neusee.nodes.units import Electrons, Fraction
 from neusee.nodes.values import Bands, Psf
+
+# --- filtered picture -----------------------------------------------------------------------------
+
+# What an ideal linear filter leaves of a picture: noise equivalent quanta, error and information.
+#
+# All spectra are half spectra, as `torch.fft.rfft2` returns them. A natural scene has a power
+# spectrum 1 / frequency^2.
+
+
+_DARK = 1e-30  #: ratio of light below which a band counts as dark
+_RADII = 8192  #: of a table of contrast by frequency, up to the corner of the spectrum
+
+
+class Exposure(NamedTuple):
+    """The light and the noise of a pixel behind the clear lens."""
+
+    light: float  #: e-, mean of the scene
+    read: float  #: e-, standard deviation
+    veil: float  #: e-, even light of the laser
+    passed: float  #: share of the light that the pupil of the mask lets through
+
+
+def frequencies(size: tuple[int, int], like: Tensor) -> Tensor:
+    """Return the absolute value of each frequency of half a spectrum in cycles per pixel."""
+    fy = torch.fft.fftfreq(size[0], dtype=torch.float64, device=like.device)
+    fx = torch.fft.rfftfreq(size[1], dtype=torch.float64, device=like.device)
+    return torch.hypot(fy[:, None], fx)
+
+
+def natural_spectrum(size: tuple[int, int], contrast: float, like: Tensor) -> Tensor:
+    """Return the power 1 / frequency^2 of the contrast of a scene; its mean over all frequencies
+    is ``contrast``.
+    """
+    frequency = frequencies(size, like)
+    power = torch.where(frequency > 0, frequency, torch.inf).pow(-2.0)
+    mean_power = (power.sum(0) * times(size, power)).sum() / (size[0] * size[1])
+    return power * (contrast / mean_power.where(mean_power > 0, 1.0))
+
+
+def quanta(passed: Tensor, exposure: Exposure, filtered: Tensor) -> Tensor:
+    """Return the noise equivalent quanta (T n MTF)^2 / (T n + veil + read^2) behind a filter of
+    transmittance T.
+
+    ``passed`` is the squared modulus of the OTF, 1 at frequency 0 if all light reaches the window.
+    """
+    counts = filtered * exposure.light
+    noise = counts * exposure.passed + filtered * exposure.veil + exposure.read**2
+    return counts.square() * passed / noise.clamp_min(_DARK)
+
+
+def mean_of(values: Tensor, size: tuple[int, int], counted: Tensor) -> Tensor:
+    """Return the mean of half a spectrum over the whole spectrum, at the frequencies
+    ``counted``.
+    """
+    weights = counted * times(size, values)
+    total: Tensor = (values * weights).sum((-2, -1)) / weights.sum()
+    return total
+
+
+def error_share(snr: Tensor, spectrum: Tensor, size: tuple[int, int], counted: Tensor) -> Tensor:
+    """Return the error variance after a Wiener filter, over the variance of the scene, at some
+    frequencies.
+    """
+    return mean_of(spectrum / (1 + snr), size, counted) / mean_of(spectrum, size, counted)
+
+
+def bits(snr: Tensor, size: tuple[int, int], counted: Tensor) -> Tensor:
+    """Return the mean of log2(1 + SNR) over some frequencies."""
+    return mean_of(torch.log2(1 + snr), size, counted)
+
+
+def peak_share(intensity: Tensor, clear_peak: Tensor, power: float | None) -> Tensor:
+    """Return the largest LSR of any band; a norm of exponent ``power`` over pixels and bands
+    stands for the maximum.
+    """
+    ratio = intensity.double() / clear_peak.to(intensity.device).double()[:, None, None]
+    top = ratio.detach().amax()
+    if power is None:
+        return ratio.amax()
+    scale = torch.where(top > _DARK, top, 1.0)  # without light, the peak is 0 and has no gradient
+    sums = (ratio / scale).pow(power).sum()
+    norm: Tensor = torch.where(top > _DARK, sums, 1.0).pow(1 / power) * torch.where(
+        top > _DARK, top, 0.0
+    )
+    return norm
+
+
+def filter_of(peak: Tensor, limit: float | None) -> Tensor:
+    """Return the transmittance of the grey filter that lowers a peak to ``limit``; 1 where the
+    peak is lower.
+    """
+    if limit is None:
+        return torch.ones_like(peak)
+    return (limit / peak.clamp_min(_DARK)).clamp_max(1.0)
+
+
+def round_mtf(frequency: Tensor, cuts: Tensor, shares: Tensor) -> Tensor:
+    """Return the MTF of a round aperture for each channel, at the frequencies ``frequency``, from
+    the cut-offs of its bands.
+
+    ``shares`` (channel, band) are those of the bands in the channels. Between radii of a fine table
+    it is linear.
+    """
+    radii = torch.linspace(0.0, 0.75, _RADII, dtype=torch.float64)
+    share = (radii / cuts[:, None]).clamp_max(1.0)
+    table = shares @ ((torch.acos(share) - share * (1 - share.square()).sqrt()) * (2 / math.pi))
+    place = frequency * ((_RADII - 1) / 0.75)
+    below = place.long().clamp_max(_RADII - 2)
+    return torch.lerp(
+        table[:, below], table[:, below + 1], (place - below).expand(len(shares), *frequency.shape)
+    )
+
+
+# --- protected losses -----------------------------------------------------------------------------
+
+# Losses of a mask with a grey filter that holds the peak of a laser at a limit: error and
+# information of a picture.
+
 
 PeakLimit = Annotated[float, Field(gt=0, le=1)]  #: of the LSR
 ContrastVariance = Annotated[float, Field(gt=0, le=1)]
@@ -50,28 +159,34 @@ def filtered_error(
     up_to: HighestFrequency | None = None,
     power: NormPower | None = None,
 ) -> Tensor:
-    """Average over channels the logarithm of the error of a natural picture after a Wiener filter, over its variance.
+    """Average over channels the logarithm of the error of a natural picture after a Wiener filter,
+    over its variance.
 
-    Behind a mask with a grey filter that lowers the peak of a laser to ``limit`` times that of the clear lens, in every
-    band. The scene has a power spectrum 1 / frequency^2 and a variance ``contrast`` of relative brightness; frequency 0
-    does not count. A pixel has the noise of its light, of an even ``veil`` of the laser, and of reading. The Wiener
-    filter of a channel knows the PSF of a grey scene. The transmittance of the grey filter follows from the mask: the
-    largest that keeps the limit is the best. ``power`` replaces the maximum over pixels by a norm, whose gradient
-    reaches every bright pixel. ``up_to`` excludes finer frequencies.
+    Behind a mask with a grey filter that lowers the peak of a laser to ``limit`` times that of the
+    clear lens, in every band. The scene has a power spectrum 1 / frequency^2 and a variance
+    ``contrast`` of relative brightness; frequency 0 does not count. A pixel has the noise of its
+    light, of an even ``veil`` of the laser, and of reading. The Wiener filter of a channel knows
+    the PSF of a grey scene. The transmittance of the grey filter follows from the mask: the largest
+    that keeps the limit is the best. ``power`` replaces the maximum over pixels by a norm, whose
+    gradient reaches every bright pixel. ``up_to`` excludes finer frequencies.
 
     Shapes: psf.intensity (band, y, x), responses (channel, band) -> ().
-    Units:  none; natural logarithm of a share, 0 if nothing is seen. light, veil and read_noise e- in a pixel behind
-            the clear lens without a filter; transmittance: share of the light that the pupil behind the mask lets
-            through, a tensor () if it is learnt; up_to cycles per pixel.
-    Error:  1e-6 in float32. Clipped pixels, edges and unknown glare are neglected. Light that leaves the window counts
-            as noise, because as much comes from outside. The norm is up to n^(1/power) above the maximum.
+    Units:  none; natural logarithm of a share, 0 if nothing is seen. light, veil and read_noise e-
+            in a pixel behind the clear lens without a filter; transmittance: share of the light
+            that the pupil behind the mask lets through, a tensor () if it is learnt; up_to cycles
+            per pixel.
+    Error:  1e-6 in float32. Clipped pixels, edges and unknown glare are neglected. Light that
+            leaves the window counts as noise, because as much comes from outside. The norm is up to
+            n^(1/power) above the maximum.
     Raises: ValueError where the inputs differ in the number of bands.
-    Source: Wiener filter as in Goodman, Introduction to Fourier Optics, 4th ed., ch. 8; NEQ as in Barrett and Myers,
-            Foundations of Image Science, 2004, ch. 13; spectrum of natural scenes: Field, J. Opt. Soc. Am. A 4, 2379
-            (1987). The limit by a filter is ours.
+    Source: Wiener filter as in Goodman, Introduction to Fourier Optics, 4th ed., ch. 8; NEQ as in
+            Barrett and Myers, Foundations of Image Science, 2004, ch. 13; spectrum of natural
+            scenes: Field, J. Opt. Soc. Am. A 4, 2379 (1987). The limit by a filter is ours.
     """
     exposure = Exposure(light, read_noise, veil, transmittance)
-    snr, spectrum, counted = _behind(psf, (illuminant, responses, bands), exposure, (limit, power, contrast, up_to))
+    snr, spectrum, counted = _behind(
+        psf, (illuminant, responses, bands), exposure, (limit, power, contrast, up_to)
+    )
     lost = error_share(snr, spectrum, _size(psf), counted)
     return lost.clamp_min(1e-30).log().mean().to(single(psf.intensity))
 
@@ -92,21 +207,25 @@ def information(
     up_to: HighestFrequency | None = None,
     power: NormPower | None = None,
 ) -> Tensor:
-    """Average over channels and frequencies the negative information log2(1 + NEQ S) about a natural picture.
+    """Average over channels and frequencies the negative information log2(1 + NEQ S) about a
+    natural picture.
 
-    S is the power spectrum of the scene, and NEQ = (T n MTF)^2 / (T n + veil + read^2) are the noise equivalent quanta
-    behind mask and grey filter. Scene, filter and parameters are those of `losses.filtered_error`. Fine detail counts
-    here as much as coarse detail, whereas the error is that of coarse detail.
+    S is the power spectrum of the scene, and NEQ = (T n MTF)^2 / (T n + veil + read^2) are the
+    noise equivalent quanta behind mask and grey filter. Scene, filter and parameters are those of
+    `losses.filtered_error`. Fine detail counts here as much as coarse detail, whereas the error is
+    that of coarse detail.
 
     Shapes: psf.intensity (band, y, x), responses (channel, band) -> ().
     Units:  bits per frequency, negative; the parameters as in `losses.filtered_error`.
     Error:  1e-6 in float32. Neglects what `losses.filtered_error` neglects.
     Raises: ValueError where the inputs differ in the number of bands.
-    Source: Shannon, Proc. IRE 37, 10 (1949), for Gaussian signals and noise; NEQ as in Barrett and Myers, Foundations
-            of Image Science, 2004, ch. 13.
+    Source: Shannon, Proc. IRE 37, 10 (1949), for Gaussian signals and noise; NEQ as in Barrett and
+            Myers, Foundations of Image Science, 2004, ch. 13.
     """
     exposure = Exposure(light, read_noise, veil, transmittance)
-    snr, _, counted = _behind(psf, (illuminant, responses, bands), exposure, (limit, power, contrast, up_to))
+    snr, _, counted = _behind(
+        psf, (illuminant, responses, bands), exposure, (limit, power, contrast, up_to)
+    )
     return -bits(snr, _size(psf), counted).mean().to(single(psf.intensity))
 
 
@@ -127,8 +246,8 @@ def _behind(
 
 
 def _counted(size: tuple[int, int], up_to: float | None, like: Tensor) -> Tensor:
-    at = frequencies(size, like)
-    return (at > 0) & (at <= (1.0 if up_to is None else up_to))
+    frequency = frequencies(size, like)
+    return (frequency > 0) & (frequency <= (1.0 if up_to is None else up_to))
 
 
 def _size(psf: Psf) -> tuple[int, int]:
@@ -146,8 +265,10 @@ def _(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, **settings:
 
 @information.reference
 def _(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, **settings: Any) -> Tensor:
-    each = _by_definition(psf, illuminant, responses, bands, **settings)
-    return -torch.stack([snr[counted].log1p().mean() / math.log(2) for snr, _, counted in each]).mean()
+    channels = _by_definition(psf, illuminant, responses, bands, **settings)
+    return -torch.stack(
+        [snr[counted].log1p().mean() / math.log(2) for snr, _, counted in channels]
+    ).mean()
 
 
 def _by_definition(
@@ -172,10 +293,14 @@ def _by_definition(
     spectrum = torch.where(square > 0, 1 / square, 0.0)
     spectrum = spectrum * (contrast * x * y / spectrum.sum().clamp_min(1e-300))
     lsr = (psf.intensity.double() / psf.clear_peak[:, None, None]).flatten()
-    worst = lsr.max() if power is None else (power * lsr.clamp_min(1e-300).log()).logsumexp(0).div(power).exp()
+    worst = (
+        lsr.max()
+        if power is None
+        else (power * lsr.clamp_min(1e-300).log()).logsumexp(0).div(power).exp()
+    )
     passed = torch.minimum(torch.ones(()), limit / worst) if limit is not None else torch.ones(())
-    seen = responses.double() * (illuminant.double() * bands.centres)
-    for share in seen / seen.sum(-1, keepdim=True):
+    sensitivity = responses.double() * (illuminant.double() * bands.centres)
+    for share in sensitivity / sensitivity.sum(-1, keepdim=True):
         mtf = torch.fft.fft2(torch.tensordot(share, psf.intensity.double(), 1)).abs()
         noise = passed * (light * transmittance + veil) + read_noise**2
         counted = (square > 0) & (square <= (up_to or 1.0) ** 2)
@@ -196,22 +321,31 @@ def best_stop(
     up_to: float | None = None,
     measure: Literal["filtered_error", "information"] = "filtered_error",
 ) -> tuple[float, float, float]:
-    """Return the least loss of a round stop with a grey filter at the same limit, its diameter and transmittance.
+    """Return the least loss of a round stop with a grey filter at the same limit, its diameter and
+    transmittance.
 
-    The diameter is a share of that of the clear aperture, whose cut-off is that of ``plain``. The peak of a stop falls
-    with the fourth power of its diameter, but for what pixels average away, and its light with the second power.
-    ``measure`` names the loss: ``filtered_error`` or ``information``.
+    The diameter is a share of that of the clear aperture, whose cut-off is that of ``plain``. The
+    peak of a stop falls with the fourth power of its diameter, but for what pixels average away,
+    and its light with the second power. ``measure`` names the loss: ``filtered_error`` or
+    ``information``.
     """
     size, grey = _size(plain), grey_shares(illuminant, responses, bands)
     cuts, sides = cut_off(plain).cpu(), averaging(plain).cpu()
     blur = _pixel_contrast(size, float(sides.max()))
     spectrum = natural_spectrum(size, contrast, cuts)
-    counted, at = _counted(size, up_to, cuts), frequencies(size, cuts)
+    counted, frequency = _counted(size, up_to, cuts), frequencies(size, cuts)
 
     def loss_of(width: float) -> tuple[float, float, float]:
         filtered = filter_of(_stop_peak(width, cuts, sides), limit)
         exposure = Exposure(light, read_noise, veil, width**2)
-        snr = quanta((width**2 * blur * round_mtf(at, width * cuts, grey)).square(), exposure, filtered) * spectrum
+        snr = (
+            quanta(
+                (width**2 * blur * round_mtf(frequency, width * cuts, grey)).square(),
+                exposure,
+                filtered,
+            )
+            * spectrum
+        )
         lost = error_share(snr, spectrum, size, counted).clamp_min(1e-30).log()
         loss = lost if measure == "filtered_error" else -bits(snr, size, counted)
         return float(loss.mean()), width, float(filtered)
@@ -225,7 +359,9 @@ def best_stop(
 
 
 def _stop_peak(width: float, cuts: Tensor, sides: Tensor) -> Tensor:
-    """Return the largest LSR of any band of a stop, whose pixels average less of a wider spot away."""
+    """Return the largest LSR of any band of a stop, whose pixels average less of a wider spot
+    away.
+    """
     ratios = round_lens(width * cuts, sides).peak / round_lens(cuts, sides).peak
     return width**4 * ratios.max()
 
@@ -234,5 +370,8 @@ def _pixel_contrast(size: tuple[int, int], side: float) -> Tensor | float:
     """Return the transfer function of pixels that average, at the frequencies of `frequencies`."""
     if not side:
         return 1.0
-    fy, fx = torch.fft.fftfreq(size[0], dtype=torch.float64), torch.fft.rfftfreq(size[1], dtype=torch.float64)
+    fy, fx = (
+        torch.fft.fftfreq(size[0], dtype=torch.float64),
+        torch.fft.rfftfreq(size[1], dtype=torch.float64),
+    )
     return torch.sinc(side * fy)[:, None] * torch.sinc(side * fx)

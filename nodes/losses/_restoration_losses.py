@@ -1,4 +1,4 @@
-"""Losses of a restored picture: differences from the true picture by pixel and by spatial frequency."""
+"""Losses of a restored picture, of estimated spectra, and of a critic's gradient."""
 
 from typing import Annotated, Literal
 
@@ -7,12 +7,18 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import node
-from neusee.nodes._half_precision import single
 from neusee.nodes.metrics._picture_quality import require_same_shape
+from neusee.nodes.precision import single
+
+# --- restoration losses ---------------------------------------------------------------------------
+
+# Losses of a restored picture: differences from the true picture by pixel and by spatial frequency.
+
 
 Reduction = Literal["mean", "sum"]
 _LEAST = 1e-30  #: least power, because the root has no gradient at 0
-_NEAR, _BEYOND = 1e-6, 0.1  #: least mean square of a difference, and the slope of colours that no display shows
+#: least mean square of a difference, and the slope of colours that no display shows
+_NEAR, _BEYOND = 1e-6, 0.1
 
 
 @node()
@@ -27,7 +33,8 @@ def charbonnier(
 
     ``reduction`` sum adds up the pixels instead, which is the only reduction that the paper names.
 
-    Kornia's `charbonnier_loss` has a fixed epsilon of 1, and is a square for all differences of pictures in [0, 1].
+    Kornia's `charbonnier_loss` has a fixed epsilon of 1, and is a square for all differences of
+    pictures in [0, 1].
 
     Shapes: estimate and truth alike -> ().
     Units:  those of the pictures; epsilon in their square.
@@ -41,17 +48,21 @@ def charbonnier(
 
 @node()
 def fft_l1(estimate: Tensor, truth: Tensor, *, reduction: Reduction = "mean") -> Tensor:
-    """Average the absolute difference between the spatial Fourier spectra of the estimated and the true picture.
+    """Average the absolute difference between the spatial Fourier spectra of the estimated and the
+    true picture.
 
-    ``reduction`` sum adds up the frequencies of a transform that is not normalised, as the paper prints. For n pixels,
-    the sum is n^(3/2) times the mean, so that the weight of the loss depends on the size of the picture.
+    ``reduction`` sum adds up the frequencies of a transform that is not normalised, as the paper
+    prints. For n pixels, the sum is n^(3/2) times the mean, so that the weight of the loss depends
+    on the size of the picture.
 
-    The transform is in float64: in single precision a coefficient near 0 has neither a reliable size nor a reliable
-    direction, and the gradient is that direction.
+    The transform is in float64: in single precision a coefficient near 0 has neither a reliable
+    size nor a reliable direction, and the gradient is that direction.
 
     Shapes: estimate and truth (..., y, x) -> ().
-    Units:  those of the pictures: for the mean the transform is unitary, so the size of a picture does not matter.
-    Error:  round-off of the type of the loss, 1e-7 in float32; a coefficient below 1e-15 has no gradient.
+    Units:  those of the pictures: for the mean the transform is unitary, so the size of a picture
+            does not matter.
+    Error:  round-off of the type of the loss, 1e-7 in float32; a coefficient below 1e-15 has no
+            gradient.
     Raises: ValueError for pictures of different shapes.
     Source: NeuSee, section Two-Stage Training (L_REC), with a unitary transform and the mean.
     """
@@ -66,9 +77,10 @@ def fft_l1(estimate: Tensor, truth: Tensor, *, reduction: Reduction = "mean") ->
 def log_error(estimate: Tensor, truth: Tensor) -> Tensor:
     """Average over pictures the logarithm of the mean squared difference of the encoded pictures.
 
-    It is -ln(10) / 10 of the PSNR of `metrics.quality`. A decibel counts alike in every picture, whereas in a mean of
-    errors a few pictures that cannot be restored rule. Outside of [0, 1] a tenth of the linear value counts, so that
-    the loss has a slope where a display shows black or white.
+    It is -ln(10) / 10 of the PSNR of `metrics.quality`. A decibel counts alike in every picture,
+    whereas in a mean of errors a few pictures that cannot be restored rule. Outside of [0, 1] a
+    tenth of the linear value counts, so that the loss has a slope where a display shows black or
+    white.
 
     Shapes: estimate and truth (..., 3, y, x), linear sRGB -> ().
     Units:  none; 0 for pictures that differ by 1 everywhere.
@@ -91,3 +103,70 @@ def _encoded(picture: Tensor) -> Tensor:
 
 def _reduced(errors: Tensor, reduction: Reduction) -> Tensor:
     return errors.mean() if reduction == "mean" else errors.sum()
+
+
+# --- spectral loss --------------------------------------------------------------------------------
+
+# The loss of spectra estimated from RGB: the error of every band, relative to the true value.
+
+
+@node()
+def mrae(
+    estimate: Tensor, truth: Tensor, *, floor: Annotated[float, Field(ge=1e-12, le=1)] = 0.02
+) -> Tensor:
+    """Average the absolute error of spectra, divided by the true value or by `floor`, whichever is
+    larger.
+
+    Without a floor a black of 1e-4 has ten thousand times the gradient of white, and training fits
+    the noise of the black. With a floor no gradient exceeds 1 / floor, and for a truth below the
+    floor the divisor is constant.
+
+    Shapes: estimate and truth alike -> ().
+    Units:  none; floor in the unit of the spectra.
+    Error:  equal to the published measure where the truth is above the floor, smaller elsewhere.
+    Raises: ValueError for spectra of different shapes.
+    Source: mean relative absolute error as in NTIRE 2022 and Cai et al., MST++, CVPRW 2022; the
+            floor is ours.
+    """
+    require_same_shape(estimate, truth, "lift the picture that was rendered from the truth")
+    truth = single(truth)
+    result: Tensor = ((single(estimate) - truth).abs() / truth.abs().clamp_min(floor)).mean()
+    return result
+
+
+@mrae.reference
+def _(estimate: Tensor, truth: Tensor, *, floor: float = 0.02) -> Tensor:
+    truth = truth.double()
+    share = (estimate.double() - truth).abs() / torch.maximum(
+        truth.abs(), torch.tensor(floor, dtype=torch.float64)
+    )
+    return share.sum() / share.numel()
+
+
+# --- gradient penalty -----------------------------------------------------------------------------
+
+# The gradient penalty, a loss that keeps the norm of a critic's gradient near 1.
+
+
+@node()
+def gradient_penalty(slopes: Tensor) -> Tensor:
+    """Average (n - 1)^2 over samples, where n is the norm of the gradient of a GAN critic at a
+    sample.
+
+    ``slopes`` are the gradients of the critic with respect to its inputs, made with
+    ``create_graph=True``.
+
+    Shapes: slopes (sample, ...) -> ().
+    Units:  none.
+    Error:  float32, 1e-5. A gradient of exactly 0 adds 1 and passes nothing back: the norm of 0 has
+            no direction.
+    Source: Gulrajani et al., Improved Training of Wasserstein GANs, NeurIPS 2017 (WGAN-GP).
+    """
+    flat = single(slopes).flatten(1)
+    top = flat.detach().abs().amax(1, keepdim=True)
+    still = top == 0
+    # squares of gradients below 1e-19 underflow, and sqrt has no gradient at 0
+    scale = top.where(~still, 1.0)
+    squares = (flat / scale).square().sum(1, keepdim=True)
+    norm = squares.where(~still, 1.0).sqrt().where(~still, 0.0) * scale
+    return (norm - 1).square().mean()

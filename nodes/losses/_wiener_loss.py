@@ -1,4 +1,6 @@
-"""The Wiener loss of a mask: the share of a picture that a Wiener filter cannot recover behind the mask."""
+"""The Wiener loss of a mask: the share of a picture that a Wiener filter cannot recover behind
+the mask.
+"""
 
 from typing import Annotated
 
@@ -7,11 +9,10 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import node
-from neusee.nodes._half_precision import single
-from neusee.nodes.losses._contrast_loss import HighestFrequency
-from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_shares
-from neusee.nodes.restore._inverse._masked_blur import variance
-from neusee.nodes.restore._inverse._picture_scale import fall
+from neusee.nodes.losses._mask_losses import HighestFrequency
+from neusee.nodes.precision import single
+from neusee.nodes.restore._inverse._masked_blur import effective_psf, grey_shares, variance
+from neusee.nodes.restore._inverse._wiener_prior import fall
 from neusee.nodes.values import Bands, Psf
 
 OneBandShare = Annotated[float, Field(ge=0, le=1)]
@@ -29,33 +30,37 @@ def wiener(
     colour: OneBandShare = 1.0,
     up_to: HighestFrequency | None = None,
 ) -> Tensor:
-    """Average over channels the logarithm of (error variance after a Wiener filter) / (variance of the picture).
+    """Average over channels the logarithm of (error variance after a Wiener filter) / (variance of
+    the picture).
 
-    The power of the pictures falls with frequency as in the prior of `restore.wiener`. The filter uses the PSF of a
-    channel for a grey scene. The error at a frequency has two parts: the part of the picture that noise hides, and, for
-    the share ``colour`` of the variance, which belongs to one band alone, the difference of the PSF of that band from
-    the PSF of the channel. ``up_to`` excludes finer frequencies, which a reduced picture loses.
+    The power of the pictures falls with frequency as in the prior of `restore.wiener`. The filter
+    uses the PSF of a channel for a grey scene. The error at a frequency has two parts: the part of
+    the picture that noise hides, and, for the share ``colour`` of the variance, which belongs to
+    one band alone, the difference of the PSF of that band from the PSF of the channel. ``up_to``
+    excludes finer frequencies, which a reduced picture loses.
 
     Shapes: psf.intensity (band, y, x), responses (channel, band) -> ().
-    Units:  none; ``noise``: variance of a pixel's noise over the picture's variance; up_to in cycles per pixel.
-    Error:  1e-5 in float32. Clipped pixels, the edges and the dependence of noise on light are neglected: the loss
-            compares masks and does not predict an error.
+    Units:  none; ``noise``: variance of a pixel's noise over the picture's variance; up_to in
+            cycles per pixel.
+    Error:  1e-5 in float32. Clipped pixels, the edges and the dependence of noise on light are
+            neglected: the loss compares masks and does not predict an error.
     Raises: ValueError where the inputs differ in the number of bands.
-    Source: Wiener filter as in Goodman, Introduction to Fourier Optics, 4th ed., ch. 8; the share of one band is ours.
+    Source: Wiener filter as in Goodman, Introduction to Fourier Optics, 4th ed., ch. 8; the share
+            of one band is ours.
     """
     y, x = psf.intensity.shape[-2:]
     intensity = single(psf.intensity)
     effective = effective_psf(psf, illuminant, responses, bands).to(intensity)
     shares = grey_shares(illuminant, responses, bands).to(intensity)
     signal = (fall((y, x)) / noise).to(intensity)  # signal over noise, by frequency
-    known = signal * _counted((y, x), up_to).to(signal)
-    each, lost = torch.fft.rfft2(intensity), list[Tensor]()
+    counted_signal = signal * _counted((y, x), up_to).to(signal)
+    bands_otf, lost = torch.fft.rfft2(intensity), list[Tensor]()
     for channel, share in zip(torch.fft.rfft2(effective), shares, strict=True):
         passed = signal * _square(channel)
         filtered = signal * passed / (passed + 1).square()  # signal times the square of the filter
-        apart = torch.tensordot(share, _square(each - channel), 1)
+        apart = torch.tensordot(share, _square(bands_otf - channel), 1)
         wrong = 1 / (passed + 1) + colour * filtered * apart
-        lost.append(variance(wrong * known, (y, x)) / variance(known, (y, x)))
+        lost.append(variance(wrong * counted_signal, (y, x)) / variance(counted_signal, (y, x)))
     result: Tensor = torch.stack(lost).clamp_min(1e-30).log().mean()
     return result
 
@@ -65,8 +70,13 @@ def _square(spectrum: Tensor) -> Tensor:
 
 
 def _counted(size: tuple[int, int], up_to: float | None) -> Tensor:
-    """Return True at the spatial frequencies above 0 and up to ``up_to``, in the layout of `torch.fft.rfft2`."""
-    fy, fx = torch.fft.fftfreq(size[0], dtype=torch.float64), torch.fft.rfftfreq(size[1], dtype=torch.float64)
+    """Return True at the spatial frequencies above 0 and up to ``up_to``, in the layout of
+    `torch.fft.rfft2`.
+    """
+    fy, fx = (
+        torch.fft.fftfreq(size[0], dtype=torch.float64),
+        torch.fft.rfftfreq(size[1], dtype=torch.float64),
+    )
     square = fy[:, None].square() + fx.square()
     inside: Tensor = (square > 0) & (square <= (1.0 if up_to is None else up_to**2))
     return inside
@@ -89,14 +99,14 @@ def _(
     power = (square + 1 / (x * y)) ** -1.5
     signal = power / power.mean() / noise
     counted = (square > 0) & (square <= (up_to or 1.0) ** 2)
-    each = torch.fft.fft2(psf.intensity.double())
-    seen = responses.double() * (illuminant.double() * bands.centres)
+    bands_otf = torch.fft.fft2(psf.intensity.double())
+    sensitivity = responses.double() * (illuminant.double() * bands.centres)
     logs = []
-    for share in seen / seen.sum(-1, keepdim=True):
-        channel = (share[:, None, None] * each).sum(0)
+    for share in sensitivity / sensitivity.sum(-1, keepdim=True):
+        channel = (share[:, None, None] * bands_otf).sum(0)
         filtered = signal * channel.conj() / (signal * channel.abs().square() + 1)
         wrong = signal * (1 - filtered * channel).abs().square() + filtered.abs().square()
-        for weight, band in zip(share, each, strict=True):
+        for weight, band in zip(share, bands_otf, strict=True):
             wrong = wrong + colour * weight * signal * (filtered * (band - channel)).abs().square()
         logs.append((wrong[counted].sum() / signal[counted].sum()).clamp_min(1e-30).log())
     return torch.stack(logs).mean()

@@ -20,12 +20,18 @@ TARGETS = ("tri-bar", "edge", "text")
 
 
 def detail_targets(size: float) -> dict[str, Tensor]:
-    """Return the targets (y, x) of a height of ``size`` pixels as relative contrasts with mean 0, bright 1 above dark.
+    """Return the targets (y, x) of a height of ``size`` pixels as relative contrasts with mean 0,
+    bright 1 above dark.
 
-    tri-bar: three bars in place of the grey square that holds as much light. edge: a square that is bright on one
-    half. text: the word "STOP" in letters of five by seven dots in place of an even grey line.
+    tri-bar: three bars in place of the grey square that holds as much light. edge: a square that is
+    bright on one half. text: the word "STOP" in letters of five by seven dots in place of an even
+    grey line.
     """
-    drawn: Mapping[str, Callable[[float], Tensor]] = {"tri-bar": _bars, "edge": _edge, "text": _text}
+    drawn: Mapping[str, Callable[[float], Tensor]] = {
+        "tri-bar": _bars,
+        "edge": _edge,
+        "text": _text,
+    }
     return {name: _in_pixels(drawn[name](size)) for name in TARGETS}
 
 
@@ -53,7 +59,9 @@ def _text(size: float) -> Tensor:
 
 
 def _in_pixels(fine: Tensor) -> Tensor:
-    """Return the mean of the fine samples of each pixel, with zeros around a target that ends within a pixel."""
+    """Return the mean of the fine samples of each pixel, with zeros around a target that ends
+    within a pixel.
+    """
     sides = [-(-n // _FINE) * _FINE for n in fine.shape]
     padded = torch.zeros(*sides, dtype=torch.float64)
     padded[: fine.shape[0], : fine.shape[1]] = fine
@@ -61,29 +69,39 @@ def _in_pixels(fine: Tensor) -> Tensor:
     return pixels
 
 
-def detail_energy(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, size: float) -> dict[str, Tensor]:
-    """Return the sum over pixels of the squared picture of each target, by channel: (channel,) float64.
+def detail_energy(
+    psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, size: float
+) -> dict[str, Tensor]:
+    """Return the sum over pixels of the squared picture of each target, by channel: (channel,)
+    float64.
 
-    The picture of a target is the target behind the PSF. The window of the PSF must hold the target.
+    The picture of a target is the target behind the PSF. The window of the PSF must hold the
+    target.
     """
     otf = torch.fft.fft2(channel_psf(psf, illuminant, responses, bands))
-    found = {}
+    energies = {}
     for name, target in detail_targets(size).items():
         if max(target.shape) > min(otf.shape[-2:]):
-            text = f"{name} of {tuple(target.shape)} pixels does not fit the PSF window {tuple(otf.shape[-2:])}"
+            text = (
+                f"{name} of {tuple(target.shape)} pixels does not fit the PSF window"
+                f" {tuple(otf.shape[-2:])}"
+            )
             raise ValueError(f"{text}: choose smaller targets, or a wider window")
-        seen = otf.abs() * torch.fft.fft2(target, s=otf.shape[-2:]).abs()
-        found[name] = seen.square().mean((-2, -1))  # Parseval
-    return found
+        spectrum = otf.abs() * torch.fft.fft2(target, s=otf.shape[-2:]).abs()
+        energies[name] = spectrum.square().mean((-2, -1))  # Parseval
+    return energies
 
 
 def detection_snr(energy: Tensor, amplitude: float, contrast: float, noise: Tensor) -> Tensor:
-    """Return the signal-to-noise ratio d' of the ideal observer, all channels together: the square sums over pixels.
+    """Return the signal-to-noise ratio d' of the ideal observer, all channels together: the square
+    sums over pixels.
 
-    ``amplitude`` is the scene light in e- times the transmittance of a filter; ``noise`` (noise, channel) in e-**2. The
-    observer knows target and place; d' is the distance of the two answers in standard deviations.
+    ``amplitude`` is the scene light in e- times the transmittance of a filter; ``noise`` (noise,
+    channel) in e-**2. The observer knows target and place; d' is the distance of the two answers in
+    standard deviations.
 
-    Source: Barrett and Myers, Foundations of Image Science, section 13.2.8 (ideal observer for a known signal).
+    Source: Barrett and Myers, Foundations of Image Science, section 13.2.8 (ideal observer for a
+            known signal).
     """
-    seen = (amplitude * contrast) ** 2 * energy / noise
-    return seen.sum(-1).sqrt()
+    contributions = (amplitude * contrast) ** 2 * energy / noise
+    return contributions.sum(-1).sqrt()

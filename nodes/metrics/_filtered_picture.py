@@ -1,4 +1,4 @@
-"""The error and the information of a picture after a Wiener filter, from its noise equivalent quanta (NEQ)."""
+"""The error and the information of a picture after a Wiener filter, also under attack."""
 
 import math
 from typing import Annotated, Any, NamedTuple
@@ -8,20 +8,31 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.restore._inverse._grey_psf import grey_shares
+from neusee.nodes.restore._inverse._masked_blur import grey_shares
 from neusee.nodes.units import Electrons, Fraction
 from neusee.nodes.values import Bands, Psf
 
+# --- filtered picture -----------------------------------------------------------------------------
+
+# The error and the information of a picture after a Wiener filter, from its noise equivalent quanta
+# (NEQ).
+
+
 Light = Annotated[Electrons, Field(gt=0)]  #: electrons a pixel
 _LEAST = 1e-30  #: NEQ below which a frequency counts as lost
-HighestFrequency = Annotated[float, Field(gt=0, le=0.71)]  #: cycles per pixel; 0.71 is the corner of the spectrum
-Variance = Annotated[float, Field(gt=0, le=10)]  #: of the contrast of a scene, relative to its squared mean
+#: cycles per pixel; 0.71 is the corner of the spectrum
+HighestFrequency = Annotated[float, Field(gt=0, le=0.71)]
+#: of the contrast of a scene, relative to its squared mean
+Variance = Annotated[float, Field(gt=0, le=10)]
 
 
 class Filtered(NamedTuple):
-    """What a Wiener filter makes of a noisy picture of a natural scene, by channel of the sensor."""
+    """What a Wiener filter makes of a noisy picture of a natural scene, by channel of the
+    sensor.
+    """
 
-    error: Tensor  #: (channel,) float64, error variance after the filter over the variance of the scene
+    #: (channel,) float64, error variance after the filter over the variance of the scene
+    error: Tensor
     information: Tensor  #: (channel,) float64, bits a pixel
     log_neq: Tensor  #: (channel,) float64, mean of the natural logarithm of the NEQ up to `up_to`
     light: Tensor  #: (channel,) float64, share of the scene's light that reaches the sensor
@@ -42,25 +53,32 @@ def filtered_picture(
     variance: Variance = 0.1,
     up_to: HighestFrequency = 0.12,
 ) -> Filtered:
-    """Compute the error, the information and the NEQ of a natural scene behind a lens, after the best linear filter.
+    """Compute the error, the information and the NEQ of a natural scene behind a lens, after the
+    best linear filter.
 
-    The scene has a mean of ``electrons`` behind the plain lens and a contrast whose power S falls with the square of
-    the frequency. NEQ = (electrons |OTF|)**2 / noise. The error is the mean of S / (1 + NEQ S) over that of S, the
-    information the mean of log2(1 + NEQ S) / 2, both over all sampled frequencies. The noise of a pixel is that of
-    `noise_variance`. A shade lowers the OTF at frequency 0, so that its loss of light counts.
+    The scene has a mean of ``electrons`` behind the plain lens and a contrast whose power S falls
+    with the square of the frequency. NEQ = (electrons |OTF|)**2 / noise. The error is the mean of S
+    / (1 + NEQ S) over that of S, the information the mean of log2(1 + NEQ S) / 2, both over all
+    sampled frequencies. The noise of a pixel is that of `noise_variance`. A shade lowers the OTF at
+    frequency 0, so that its loss of light counts.
 
-    Shapes: psf.intensity (band, y, x), illuminant (band,), responses (channel, band) -> four of (channel,) float64.
-    Units:  electrons, read_noise and glare e- a pixel; prnu and residual_glare shares; up_to cycles per pixel.
-    Error:  1e-6 in float32. The scene is grey: one spectrum everywhere. Edges and clipped pixels are left out.
+    Shapes: psf.intensity (band, y, x), illuminant (band,), responses (channel, band) -> four of
+            (channel,) float64.
+    Units:  electrons, read_noise and glare e- a pixel; prnu and residual_glare shares; up_to cycles
+            per pixel.
+    Error:  1e-6 in float32. The scene is grey: one spectrum everywhere. Edges and clipped pixels
+            are left out.
     Raises: ValueError where PSF, illuminant and responses differ in the number of bands.
-    Source: Barrett and Myers, Foundations of Image Science, section 13.2 (NEQ); Goodman, Introduction to Fourier
-        Optics, 4th ed., ch. 8 (Wiener filter).
+    Source: Barrett and Myers, Foundations of Image Science, section 13.2 (NEQ); Goodman,
+        Introduction to Fourier Optics, 4th ed., ch. 8 (Wiener filter).
     """
     spectra = torch.fft.fft2(channel_psf(psf, illuminant, responses, bands))
     light = spectra[:, 0, 0].real
     level = noise_variance(electrons * light, glare, read_noise, prnu, residual_glare)
     neq = (electrons * spectra.abs()).square() / level[:, None, None]
-    power, counted = _on(neq, natural_power(tuple(neq.shape[-2:]), variance), low_frequencies(neq.shape[-2:], up_to))
+    power, counted = _on(
+        neq, natural_power(tuple(neq.shape[-2:]), variance), low_frequencies(neq.shape[-2:], up_to)
+    )
     error = (power / (1 + neq * power)).sum((-2, -1)) / power.sum()
     information = 0.5 * torch.log2(1 + neq * power).mean((-2, -1))
     logs = neq[:, counted].clamp_min(_LEAST).log().mean(-1)
@@ -82,17 +100,27 @@ def _(
     variance: float = 0.1,
     up_to: float = 0.12,
 ) -> Filtered:
-    """Sum the same means over half of the spectrum in rows, with the PSF of each channel summed band by band."""
+    """Sum the same means over half of the spectrum in rows, with the PSF of each channel summed
+    band by band.
+    """
     y, x = psf.intensity.shape[-2:]
     photons = illuminant.double() * bands.centres
     rows = []
     for response in responses.double():
         share = response * photons / (response * photons).sum()
-        otf = sum(w * torch.fft.fft2(one.double()) for w, one in zip(share, psf.intensity, strict=True))
+        otf = sum(
+            w * torch.fft.fft2(band_psf.double())
+            for w, band_psf in zip(share, psf.intensity, strict=True)
+        )
         passed = float(abs(otf[0, 0]))
-        noise = electrons * passed + glare + read_noise**2 + (prnu * (electrons * passed + glare)) ** 2
+        noise = (
+            electrons * passed + glare + read_noise**2 + (prnu * (electrons * passed + glare)) ** 2
+        )
         noise += (residual_glare * glare) ** 2
-        fy, fx = torch.fft.fftfreq(y, dtype=torch.float64), torch.fft.fftfreq(x, dtype=torch.float64)
+        fy, fx = (
+            torch.fft.fftfreq(y, dtype=torch.float64),
+            torch.fft.fftfreq(x, dtype=torch.float64),
+        )
         square = fy[:, None] ** 2 + fx**2
         power = torch.where(square > 0, 1 / square, 0.0)
         power = power * (variance / power.mean())
@@ -113,7 +141,10 @@ def _(
 def _(result: Filtered, *inputs: Any, electrons: float, **params: Any) -> list[Check]:
     error, bits = float(result.error.mean()), float(result.information.mean())
     ok = bool(((result.error >= 0) & (result.error <= 1 + 1e-6)).all())
-    text = f"{electrons:.4g} e- a pixel: error after the filter {error:.3g} of the scene, {bits:.3g} bits a pixel"
+    text = (
+        f"{electrons:.4g} e- a pixel: error after the filter {error:.3g} of the scene, {bits:.3g}"
+        " bits a pixel"
+    )
     return [Check(text, ok)]
 
 
@@ -122,29 +153,39 @@ def _on(like: Tensor, *tensors: Tensor) -> list[Tensor]:
 
 
 def channel_psf(psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
-    """Return the PSF of each channel for a grey scene in float64, (channel, y, x); its sum is the light that passes."""
+    """Return the PSF of each channel for a grey scene in float64, (channel, y, x); its sum is
+    the light that passes.
+    """
     lengths = {len(psf.intensity), len(illuminant), responses.shape[-1], len(bands.centres)}
     if len(lengths) > 1:
-        raise ValueError(f"PSF, illuminant, responses and bands have {sorted(lengths)} bands: use one `bands` step")
+        raise ValueError(
+            f"PSF, illuminant, responses and bands have {sorted(lengths)} bands: use one `bands`"
+            " step"
+        )
     shares = grey_shares(illuminant, responses, bands).to(psf.intensity.device)
-    whole: Tensor = torch.tensordot(shares, psf.intensity.double(), 1)
-    return whole
+    kernels: Tensor = torch.tensordot(shares, psf.intensity.double(), 1)
+    return kernels
 
 
-def noise_variance(light: Any, glare: Any, read_noise: float, prnu: float = 0.0, residual_glare: float = 0.0) -> Any:
-    """Return the noise variance of a pixel in e-**2: shot noise, read noise, PRNU, and wrongly subtracted glare.
+def noise_variance(
+    light: Any, glare: Any, read_noise: float, prnu: float = 0.0, residual_glare: float = 0.0
+) -> Any:
+    """Return the noise variance of a pixel in e-**2: shot noise, read noise, PRNU, and wrongly
+    subtracted glare.
 
-    light + glare + read_noise**2 + (prnu (light + glare))**2 + (residual_glare glare)**2, with light and glare in e-.
+    light + glare + read_noise**2 + (prnu (light + glare))**2 + (residual_glare glare)**2, with
+    light and glare in e-.
     """
-    whole = light + glare
-    return whole + read_noise**2 + (prnu * whole) ** 2 + (residual_glare * glare) ** 2
+    signal = light + glare
+    return signal + read_noise**2 + (prnu * signal) ** 2 + (residual_glare * glare) ** 2
 
 
 def natural_power(shape: tuple[int, ...], variance: float) -> Tensor:
-    """Return the power of the contrast of natural scenes at each frequency of an FFT: (y, x) float64.
+    """Return the power of the contrast of natural scenes at each frequency of an FFT: (y, x)
+    float64.
 
-    The power falls with the square of the frequency, is 0 at frequency 0, and its mean over all frequencies is
-    ``variance``.
+    The power falls with the square of the frequency, is 0 at frequency 0, and its mean over all
+    frequencies is ``variance``.
     """
     square = _square_frequency(shape)
     power = torch.where(square > 0, 1.0 / square.where(square > 0, 1.0), 0.0)
@@ -153,7 +194,9 @@ def natural_power(shape: tuple[int, ...], variance: float) -> Tensor:
 
 
 def low_frequencies(shape: tuple[int, ...], up_to: float) -> Tensor:
-    """Return True at the frequencies above 0 and up to ``up_to`` cycles per pixel, in the layout of an FFT: (y, x)."""
+    """Return True at the frequencies above 0 and up to ``up_to`` cycles per pixel, in the layout
+    of an FFT: (y, x).
+    """
     square = _square_frequency(shape)
     inside: Tensor = (square > 0) & (square <= up_to**2)
     return inside
@@ -168,3 +211,243 @@ def _square_frequency(shape: tuple[int, ...]) -> Tensor:
 def decibels(ratio: float) -> float:
     """Return a ratio of variances or of powers in dB, 10 log10."""
     return 10.0 * math.log10(ratio)
+
+
+# --- picture spectrum -----------------------------------------------------------------------------
+
+# The spectrum of a picture as a histogram, from which errors at any light, filter and noise follow
+# in microseconds.
+#
+# A grey filter scales the whole spectrum, and the light scales the scene: no PSF is computed again
+# for another transmittance, another scene light or another glare.
+
+
+#: decades of the bins, and bins a decade, which give an error of 1e-4
+_LEAST_FREQUENCY, _MOST, _EACH = -20, 8, 40
+
+
+class PictureSpectrum(NamedTuple):
+    """Sums over the frequencies of a picture with like power p, by channel of the sensor.
+
+    The Wiener filter knows the OTF ``known``, and p is the power of the scene times |known|**2. The
+    picture has the OTF ``true``. Both OTFs are equal without mismatch.
+    """
+
+    power: Tensor  #: (channel, bin) mean of p
+    signal: Tensor  #: (channel, bin) share of the scene's variance
+    real: Tensor  #: (channel, bin) the same, times the real part of true / known
+    square: Tensor  #: (channel, bin) the same, times the square of |true / known|
+    strength: Tensor  #: (channel, bin) mean of scene power times |true OTF|**2
+    rate: Tensor  #: (channel, bin) share of the frequencies with this strength
+    contrast: Tensor  #: (channel,) mean of log(|true OTF|**2) up to a highest frequency
+    light: Tensor  #: (channel,) share of the scene's light in the picture
+
+
+def picture_spectrum(
+    true: Psf,
+    assumed: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    variance: float = 0.1,
+    up_to: float = 0.12,
+) -> PictureSpectrum:
+    """Sort the frequencies of a picture by their power; ``assumed`` is the PSF that the filter
+    takes for the true one.
+    """
+    otf, guess = (
+        torch.fft.fft2(channel_psf(psf, illuminant, responses, bands)) for psf in (true, assumed)
+    )
+    scene = natural_power(tuple(otf.shape[-2:]), variance)
+    low = low_frequencies(tuple(otf.shape[-2:]), up_to)
+    share = scene / scene.sum()
+    rows = []
+    for channel_otf, other in zip(otf, guess, strict=True):
+        square = other.abs().square()
+        ratio = torch.where(square > 0, channel_otf * other.conj() / square.clamp_min(1e-300), 0.0)
+        weights = (share, share * ratio.real, share * ratio.abs().square())
+        power, *sums = _binned(scene * square, *weights)
+        strength, count = _binned(
+            scene * channel_otf.abs().square(), torch.full_like(scene, 1.0 / scene.numel())
+        )
+        contrast = channel_otf.abs().square()[low].clamp_min(1e-30).log().mean()
+        rows.append((power, *sums, strength, count, contrast, channel_otf[0, 0].real))
+    return PictureSpectrum(*(torch.stack(column) for column in zip(*rows, strict=True)))
+
+
+def _binned(value: Tensor, *weights: Tensor) -> list[Tensor]:
+    """Return the mean of ``value`` in each bin, weighted by the first of ``weights``, and the
+    sums of all weights.
+    """
+    bin_index = (
+        ((value.clamp_min(1e-300).log10() - _LEAST_FREQUENCY) * _EACH)
+        .long()
+        .clamp(0, (_MOST - _LEAST_FREQUENCY) * _EACH - 1)
+        .flatten()
+    )
+    empty = torch.zeros((_MOST - _LEAST_FREQUENCY) * _EACH, dtype=torch.float64)
+    sums = [empty.index_add(0, bin_index, weight.flatten()) for weight in weights]
+    weighted_sum = empty.index_add(0, bin_index, (value * weights[0]).flatten())
+    return [torch.where(sums[0] > 0, weighted_sum / sums[0].clamp_min(1e-300), 0.0), *sums]
+
+
+def remaining_error(spectrum: PictureSpectrum, amplitude: float, noise: Tensor) -> Tensor:
+    """Return the error after the filter over the variance of the scene, (noise, channel).
+
+    ``amplitude`` is the scene light in e- times the transmittance of a filter; ``noise`` (noise,
+    channel) the variance of a pixel in e-**2. With u = a**2 p / (a**2 p + noise) at amplitude a,
+    the filter passes u ratio of the scene; the ratio is true / known. The error is the sum of
+    signal |1 - u ratio|**2 and of the filtered noise, signal u (1 - u).
+    """
+    strength = amplitude**2 * spectrum.power
+    u = strength / (strength + noise[:, :, None])
+    error = (
+        spectrum.signal
+        - 2 * u * spectrum.real
+        + u.square() * spectrum.square
+        + u * (1 - u) * spectrum.signal
+    )
+    return error.sum(-1)
+
+
+def information_bits(spectrum: PictureSpectrum, amplitude: float, noise: Tensor) -> Tensor:
+    """Return the bits a pixel, mean of log2(1 + NEQ S) / 2 over all frequencies, (noise,
+    channel).
+    """
+    ratio = amplitude**2 * spectrum.strength / noise[:, :, None]
+    return (spectrum.rate * torch.log2(1 + ratio)).sum(-1) / 2
+
+
+def mean_log_neq(spectrum: PictureSpectrum, amplitude: float, noise: Tensor) -> Tensor:
+    """Return the mean of log(NEQ) over low frequencies, (noise, channel)."""
+    return spectrum.contrast + torch.log(amplitude**2 / noise)
+
+
+def radial_contrast(
+    psf: Psf, illuminant: Tensor, responses: Tensor, bands: Bands, rings: int = 40
+) -> tuple[Tensor, Tensor]:
+    """Return frequencies up to 1/2 cycle per pixel, and the mean of |OTF|**2 in a ring about each:
+    (ring,) each.
+
+    The mean is over directions and channels, and the square of the light that passes is included.
+    """
+    square = torch.fft.fft2(channel_psf(psf, illuminant, responses, bands)).abs().square().mean(0)
+    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in square.shape)
+    radius = torch.hypot(fy[:, None], fx)
+    inside = (radius > 0) & (radius < 0.5)
+    ring = (radius[inside] * 2 * rings).long()
+    empty = torch.zeros(rings, dtype=torch.float64)
+    count = empty.index_add(0, ring, torch.ones_like(radius[inside])).clamp_min(1)
+    middle = (torch.arange(rings, dtype=torch.float64) + 0.5) / (2 * rings)
+    return middle, empty.index_add(0, ring, square[inside]) / count
+
+
+# --- attacked picture -----------------------------------------------------------------------------
+
+# A picture under attack: the glare of a laser by its level, and what a filter recovers of the
+# pixels that are left.
+
+
+_LEAST_ATTACK, _MOST_ATTACK, _ATTACKS_EACH = (
+    -16,
+    1,
+    20,
+)  #: decades of the glare, and bins a decade
+_NOISES = 48  #: noises for which the error is computed; others are interpolated, to 1e-4
+
+
+class GlareLevels(NamedTuple):
+    """The light of a laser over the pixels of a field as a histogram, relative to the peak of
+    the clear lens.
+    """
+
+    level: Tensor  #: (bin,) mean of the light in a bin
+    share: Tensor  #: (bin,) share of the pixels
+
+
+class PixelNoise(NamedTuple):
+    """The noise of a pixel and its well."""
+
+    read_noise: float  #: e-
+    full_well: float  #: e-
+    prnu: float  #: relative spread of the sensitivity of pixels
+    residual_glare: float  #: share of the glare that is subtracted wrongly
+
+
+class Attacked(NamedTuple):
+    """What is left of a picture under attack, averaged over pixels and channels."""
+
+    #: () error after the filter over the variance of the scene; a full pixel counts as 1
+    error: Tensor
+    information: Tensor  #: () bits a pixel; a full pixel counts as 0
+    seen: Tensor  #: () share of the pixels that are not full
+
+
+def glare_levels(light: Tensor, clear_peak: float) -> GlareLevels:
+    """Sort the pixels of a field by the light (y, x) that a laser sends to each pixel."""
+    relative = light.double().flatten() / clear_peak
+    bin_index = (
+        ((relative.clamp_min(1e-300).log10() - _LEAST_ATTACK) * _ATTACKS_EACH)
+        .long()
+        .clamp(0, (_MOST_ATTACK - _LEAST_ATTACK) * _ATTACKS_EACH - 1)
+    )
+    empty = torch.zeros(
+        (_MOST_ATTACK - _LEAST_ATTACK) * _ATTACKS_EACH,
+        dtype=torch.float64,
+    )
+    count = empty.index_add(0, bin_index, torch.ones_like(relative))
+    mean = empty.index_add(0, bin_index, relative) / count.clamp_min(1)
+    held = count > 0
+    return GlareLevels(mean[held], count[held] / len(relative))
+
+
+def attacked_picture(
+    spectrum: PictureSpectrum,
+    glare: GlareLevels,
+    noise: PixelNoise,
+    *,
+    electrons: float,
+    transmittance: float,
+    strengths: Tensor,
+    colour: Tensor,
+) -> Attacked:
+    """Return error, information and share of seen pixels at each strength of a laser: (strength,)
+    each.
+
+    A strength of 1 fills one pixel behind the clear lens in the channel that responds most;
+    ``colour`` (channel,) is the response of each channel relative to that one. A grey filter of
+    ``transmittance`` dims scene and laser alike. The Wiener filter knows the noise of each pixel,
+    and a pixel is lost where scene and glare fill it.
+    """
+    amplitude = electrons * transmittance
+    light = amplitude * spectrum.light
+    full = noise.full_well * strengths[:, None, None] * transmittance
+    laser_light = full * glare.level[:, None] * colour  # (strength, bin, channel)
+    free = (laser_light + light) < noise.full_well
+    quiet = noise_variance(light, 0.0, noise.read_noise, noise.prnu, noise.residual_glare)
+    loudest = noise_variance(
+        light, noise.full_well, noise.read_noise, noise.prnu, noise.residual_glare
+    )
+    steps = torch.linspace(0, 1, _NOISES, dtype=torch.float64)[:, None]
+    table = quiet.log() + steps * (loudest / quiet).log()  # (noise, channel)
+    here = noise_variance(
+        light, laser_light, noise.read_noise, noise.prnu, noise.residual_glare
+    ).log()
+    place = ((here - quiet.log()) / (loudest / quiet).log() * (_NOISES - 1)).clamp(
+        0, _NOISES - 1 - 1e-9
+    )
+    error, bits = (
+        _between(f(spectrum, amplitude, table.exp()), place)
+        for f in (remaining_error, information_bits)
+    )
+    weights = glare.share[:, None]
+    means = (torch.where(free, error, 1.0), torch.where(free, bits, 0.0), free.double())
+    return Attacked(*((weights * mean).sum(1).mean(-1) for mean in means))
+
+
+def _between(table: Tensor, place: Tensor) -> Tensor:
+    """Interpolate a table (noise, channel) at real rows ``place`` (strength, bin, channel)."""
+    low = place.floor().long()
+    channel = torch.arange(table.shape[1])
+    below, above = table[low, channel], table[low + 1, channel]
+    return below + (place - low) * (above - below)

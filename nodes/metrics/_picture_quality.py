@@ -8,8 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes._half_precision import single
-from neusee.nodes.exact_convolution import exact_convolutions
+from neusee.nodes.precision import exact_convolutions, single
 
 _WINDOW = 11  #: width in pixels of the Gaussian window of SSIM
 _STRIPE = 118  #: rows that are compared at a time: 128 with the margin of the window
@@ -33,18 +32,21 @@ def quality(
 ) -> Quality:
     """Compare a picture with the true picture by mean absolute difference, PSNR and SSIM.
 
-    Both pictures are clipped to [0, 1], the range of a display. `encoded` compares sRGB-encoded values, as is usual for
-    published photographs; `linear` compares light. SSIM is that of kornia (Gaussian window, 11 x 11, sigma 1.5),
-    averaged over the RGB channels and over the pixels whose window lies inside the picture. The term 1e-12 of kornia's
-    denominator is left out: with this term two black pictures have an SSIM of 0.99999. Kornia's PSNR of two equal
-    pictures is infinite, and 200 dB here, so that a mean over pictures stays finite.
+    Both pictures are clipped to [0, 1], the range of a display. `encoded` compares sRGB-encoded
+    values, as is usual for published photographs; `linear` compares light. SSIM is that of kornia
+    (Gaussian window, 11 x 11, sigma 1.5), averaged over the RGB channels and over the pixels whose
+    window lies inside the picture. The term 1e-12 of kornia's denominator is left out: with this
+    term two black pictures have an SSIM of 0.99999. Kornia's PSNR of two equal pictures is
+    infinite, and 200 dB here, so that a mean over pictures stays finite.
 
     Shapes: estimate and truth (3, y, x), linear sRGB -> three scalars, float64.
     Units:  none; PSNR dB. ``border`` pixels at each side do not count.
-    Error:  PSNR 2e-5 dB and SSIM 1e-5 against scikit-image. Round-off of SSIM is 1e-7, also where an SSIM near 0 is the
-            small sum of positive and negative terms, but up to 3e-4 of an SSIM of flat, bright pictures: a variance is
-            the difference of two squares near 1, four roundings of 6e-8, beside the constant 9e-4.
-    Raises: ValueError for pictures of different shapes, and for pictures smaller than the window of SSIM.
+    Error:  PSNR 2e-5 dB and SSIM 1e-5 against scikit-image. Round-off of SSIM is 1e-7, also where
+            an SSIM near 0 is the small sum of positive and negative terms, but up to 3e-4 of an
+            SSIM of flat, bright pictures: a variance is the difference of two squares near 1, four
+            roundings of 6e-8, beside the constant 9e-4.
+    Raises: ValueError for pictures of different shapes, and for pictures smaller than the window of
+            SSIM.
     Source: Wang et al., IEEE Trans. Image Process. 13, 600 (2004); sRGB as IEC 61966-2-1.
     """
     require_same_shape(estimate, truth)
@@ -52,12 +54,13 @@ def quality(
     if min(a.shape[-2:]) < _WINDOW:
         size = f"{_WINDOW} x {_WINDOW}"
         raise ValueError(
-            f"SSIM needs {size} pixels, not {tuple(a.shape[-2:])} inside the border: give a larger picture"
+            f"SSIM needs {size} pixels, not {tuple(a.shape[-2:])} inside the border: give a larger"
+            " picture"
         )
     absolute, square, alike = _sums(a, b, domain)
     psnr = -10.0 * (square / a.numel()).clamp_min(1e-20).log10()
-    seen = a[..., _WINDOW - 1 :, _WINDOW - 1 :].numel()
-    return Quality(absolute / a.numel(), psnr, alike / seen)
+    windows = a[..., _WINDOW - 1 :, _WINDOW - 1 :].numel()
+    return Quality(absolute / a.numel(), psnr, alike / windows)
 
 
 @quality.check
@@ -66,10 +69,15 @@ def _(result: Quality, *inputs: Tensor, **params: object) -> list[Check]:
     return [Check(f"L1 {l1:.4f}, PSNR {psnr:.2f} dB, SSIM {ssim:.3f}", math.isfinite(psnr))]
 
 
-def require_same_shape(estimate: Tensor, truth: Tensor, fix: str = "crop the truth to the estimate") -> None:
+def require_same_shape(
+    estimate: Tensor, truth: Tensor, fix: str = "crop the truth to the estimate"
+) -> None:
     """Raise ValueError unless the estimate and the true values have the same shape."""
     if estimate.shape != truth.shape:
-        raise ValueError(f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ in shape: {fix}")
+        raise ValueError(
+            f"estimate {tuple(estimate.shape)} and truth {tuple(truth.shape)} differ in shape:"
+            f" {fix}"
+        )
 
 
 def _inside(picture: Tensor, border: int) -> Tensor:
@@ -84,12 +92,17 @@ def _shown(picture: Tensor, domain: str) -> Tensor:
     if domain == "linear":
         return inside
     encoded: Tensor = linear_rgb_to_rgb(inside)
-    return encoded.where(inside < 1, encoded - encoded.detach() + 1)  # float32 rounds 1.055 - 0.055 to less than 1
+    # float32 rounds 1.055 - 0.055 to less than 1
+    return encoded.where(inside < 1, encoded - encoded.detach() + 1)
 
 
 def _sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor, Tensor]:
-    """Sum the absolute difference, squared difference and SSIM over all pixels, in stripes that fit the CPU cache."""
-    absolute, square, alike = (torch.zeros((), dtype=torch.float64, device=a.device) for _ in range(3))
+    """Sum the absolute difference, squared difference and SSIM over all pixels, in stripes that
+    fit the CPU cache.
+    """
+    absolute, square, alike = (
+        torch.zeros((), dtype=torch.float64, device=a.device) for _ in range(3)
+    )
     rows = a.shape[-2] - _WINDOW + 1
     for first in range(0, rows, _STRIPE):
         last = min(first + _STRIPE, rows)
@@ -103,7 +116,9 @@ def _sums(a: Tensor, b: Tensor, domain: str) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _ssim(p: Tensor, q: Tensor) -> Tensor:
-    """Return the structural similarity (SSIM) at each pixel whose window lies inside the picture."""
+    """Return the structural similarity (SSIM) at each pixel whose window lies inside the
+    picture.
+    """
     from kornia.metrics import ssim
 
     pictures = (x.reshape(1, -1, *x.shape[-2:]) for x in (p, q))

@@ -5,15 +5,24 @@ from typing import Any
 from torch import Tensor
 
 from neusee.nodes.metrics._filtered_picture import Filtered, filtered_picture
-from neusee.nodes.metrics._heat_ratio import heat_ratio
-from neusee.nodes.metrics._mask_limits import Limits, limits
-from neusee.nodes.metrics._peak_irradiance import Peak, peak_irradiance
 from neusee.nodes.metrics._picture_quality import Quality, quality
 from neusee.nodes.metrics._protection_bounds import ProtectionBounds, protection_bounds
-from neusee.nodes.metrics._psf_contrast import Mtf, encircled, mtf
-from neusee.nodes.metrics._saturated_pixels import Saturated, saturated
-from neusee.nodes.metrics._spectral_error import _SAMPLES, _SIDE, spectral_error
-from neusee.nodes.metrics._suppression_ratios import bsr, light_outside, lsr, peak_bsr
+from neusee.nodes.metrics._psf_quality import _SAMPLES, _SIDE, Mtf, encircled, mtf, spectral_error
+from neusee.nodes.metrics._sensor_load import (
+    Peak,
+    Saturated,
+    heat_ratio,
+    peak_irradiance,
+    saturated,
+)
+from neusee.nodes.metrics._suppression_ratios import (
+    Limits,
+    bsr,
+    light_outside,
+    limits,
+    lsr,
+    peak_bsr,
+)
 from neusee.nodes.shape_rules import double, scalars
 from neusee.nodes.values import Bands, Psf, Pupil
 
@@ -70,12 +79,20 @@ light_outside.shape(_each_band)
 
 
 @spectral_error.shape
-def _(pupil: Pupil, bands: Bands, illuminant: Any = None, responses: Tensor | None = None, **params: Any) -> Tensor:
+def _(
+    pupil: Pupil,
+    bands: Bands,
+    illuminant: Any = None,
+    responses: Tensor | None = None,
+    **params: Any,
+) -> Tensor:
     return double(1 if responses is None else len(responses))
 
 
 @spectral_error.work
-def _(result: Tensor, pupil: Pupil, bands: Bands, *others: Any, **params: Any) -> tuple[float, float]:
+def _(
+    result: Tensor, pupil: Pupil, bands: Bands, *others: Any, **params: Any
+) -> tuple[float, float]:
     count, across = len(bands.centres), max(pupil.height.shape)
     values = 2.0 * count * _SIDE**2
     thinned = -(-across // max(1, across // _SAMPLES))

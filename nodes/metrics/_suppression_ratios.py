@@ -1,29 +1,149 @@
-"""Suppression ratios of a mask: laser suppression ratio (LSR) and background suppression ratio (BSR)."""
+"""Suppression ratios of a mask (LSR, BSR), and their physical limits for any mask."""
 
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, pad
 
 from neusee.nodes import Check, node
-from neusee.nodes._half_precision import single
-from neusee.nodes.metrics._mask_limits import least_lsr
-from neusee.nodes.optics._imaging._light_in_field import light_in_field
-from neusee.nodes.optics._notch import passed_by_notches
+from neusee.nodes.optics._band_image import light_in_field
+from neusee.nodes.optics._lens import cut_off, passed_by_notches
+from neusee.nodes.precision import single
 from neusee.nodes.values import Psf, Pupil
 
-_DARK = 1e-30  #: light below which a band counts as dark
+# --- mask limits ----------------------------------------------------------------------------------
+
+# Physical limits of any mask: the lowest laser suppression ratio, and the highest contrast for a
+# given peak.
+
+
+_DARK = 1e-30  #: share of the light below which a band counts as dark
+
+
+class Limits(NamedTuple):
+    """Bounds of laser suppression and contrast for a PSF, and the root mean square contrast of
+    this PSF.
+    """
+
+    #: (band,) float64, LSR if the light in the window is spread evenly over the window
+    floor: Tensor
+    #: (band,) float64, root mean square contrast over all frequencies that the pixels sample
+    rms: Tensor
+    bound: Tensor  #: (band,) float64, upper bound of `rms`: sqrt(LSR p0 / light)
+    #: (band,) float64, upper bound of the root mean square over the frequencies of the clear
+    #: aperture
+    passed: Tensor
+    median: Tensor  #: (band,) float64, upper bound of the median over the same frequencies
+
+
+@node(rtol=1e-6)
+def limits(psf: Psf) -> Limits:
+    """Compute a bound of laser suppression for evenly spread light, and bounds of contrast by
+    Parseval's theorem.
+
+    Light E in N pixels has a peak of at least E / N, and LSR = peak / p0. The mean of |OTF|**2 over
+    all frequencies is the sum of PSF**2, which is at most peak times light. Over a share s of the
+    frequencies the mean is at most 1 / s times as large. Half of these frequencies lie above the
+    median: median <= sqrt(2 LSR p0 / (E s)).
+
+    Shapes: psf.intensity (band, y, x) -> five of (band,) float64.
+    Units:  none.
+    Error:  1e-6 in float32. The floor holds for the window: a wider field has a lower floor.
+            Without light (1e-30) all five bounds are 0.
+    Source: Parseval's theorem; the cut-off of the clear aperture as in `metrics.mtf`.
+    """
+    rows = [_contrast_bound(kernel.double()) for kernel in psf.intensity]
+    light, rms, bound = (torch.stack(column) for column in zip(*rows, strict=True))
+    passed = bound / shares(psf).to(bound).sqrt()
+    return Limits(light * least_lsr(psf).to(light), rms, bound, passed, math.sqrt(2.0) * passed)
+
+
+def _contrast_bound(kernel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the light in the PSF of one band, the rms contrast of this PSF, and an upper bound
+    of the contrast.
+    """
+    dark = kernel.sum() <= _DARK  # false for NaN, so that NaN reaches the result
+    kernel = kernel.where(~dark, 1.0)  # a root has no gradient at 0
+    light, peak = kernel.sum(), kernel.amax()
+    rms, bound = kernel.square().sum().sqrt() / light, (peak / light).sqrt()
+    return light.where(~dark, 0.0), rms.where(~dark, 0.0), bound.where(~dark, 0.0)
+
+
+@limits.check
+def _(result: Limits, psf: Psf) -> list[Check]:
+    low, high = float(result.floor.min()), float(result.floor.max())
+    bounded = bool((result.rms <= result.bound * (1 + 1e-6)).all())
+    return [
+        Check(
+            f"LSR {low:.3g} to {high:.3g} for even light; rms contrast"
+            f" {float(result.rms.mean()):.3g}, upper bound {float(result.bound.mean()):.3g}",
+            bounded,
+        )
+    ]
+
+
+# --- limits of any mask on this lens --------------------------------------------------------------
+
+
+def least_lsr(psf: Psf) -> Tensor:
+    """Return the laser suppression ratio of light that is spread evenly over the field: (band,)
+    float64.
+
+    The field has N pixels, and the clear lens puts a share p0 of the light into the brightest
+    pixel. With a mask that keeps all light in the field, the brightest pixel has at least 1/N of
+    the light, so that LSR >= 1 / (N p0). A mask that scatters light out of the field lowers this
+    bound by the share of the light that the mask keeps.
+    """
+    pixels = psf.intensity.shape[-2] * psf.intensity.shape[-1]
+    return 1.0 / (pixels * psf.clear_peak.double())
+
+
+def most_unsuppressed(psf: Psf) -> Tensor:
+    """Return the upper bound (band,) of the rms contrast of a lossless mask that does not suppress
+    the laser.
+
+    The laser suppression ratio (LSR) of this mask is 1. For another ratio, the bound scales with
+    sqrt(LSR).
+    """
+    clear_peak = psf.clear_peak.double()
+    return (clear_peak / shares(psf).to(clear_peak)).sqrt()
+
+
+def shares(psf: Psf) -> Tensor:
+    """Return the share of the sampled spatial frequencies below the cut-off of the lens: (band,)
+    float64.
+    """
+    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in psf.intensity.shape[-2:])
+    radius = torch.hypot(fy[:, None], fx)
+    return torch.stack([(radius <= cut).double().mean() for cut in cut_off(psf).tolist()])
+
+
+def most_contrast(unsuppressed: float, lsr: Tensor) -> Tensor:
+    """Return the upper bound of the rms contrast of a mask for each laser suppression ratio in
+    ``lsr``.
+    """
+    return (unsuppressed * lsr.sqrt()).clamp_max(1.0)
+
+
+# --- suppression ratios ---------------------------------------------------------------------------
+
+# Suppression ratios of a mask: laser suppression ratio (LSR) and background suppression ratio
+# (BSR).
+
 _ROUNDED = 1e-4  #: excess of light that sampling and round-off explain
 
 
 @node(rtol=1e-6)
 def lsr(psf: Psf) -> Tensor:
-    """Compute the laser suppression ratio: the peak of the PSF divided by the peak of the PSF of the clear lens.
+    """Compute the laser suppression ratio: the peak of the PSF divided by the peak of the PSF of
+    the clear lens.
 
     Shapes: psf.intensity (band, y, x) -> (band,) float64.
     Units:  none; 1 for the clear lens.
-    Error:  of the sampling: a spot between two pixels reads up to 20 % low, so that the PSF convention matters.
+    Error:  of the sampling: a spot between two pixels reads up to 20 % low, so that the PSF
+            convention matters.
     Source: NeuSee, section Sensor Image (LSR).
     """
     return psf.intensity.amax((-2, -1)).double() / psf.clear_peak.to(psf.intensity.device)
@@ -37,39 +157,46 @@ def _(result: Tensor, *inputs: Psf) -> list[Check]:
             f"laser suppression ratio {float(result.min()):.3g} to {float(result.max()):.3g}",
             bool((result <= 1.05).all()),
         ),
-        Check(f"light spread evenly over the field would give a laser suppression ratio of {floor:.2g}"),
+        Check(
+            "light spread evenly over the field would give a laser suppression ratio of"
+            f" {floor:.2g}"
+        ),
     ]
 
 
 @node(rtol=1e-6, bands={"psf": 0, "radiance": -3, "return": -1})
 def bsr(psf: Psf, radiance: Tensor | None = None) -> Tensor:
-    """Compute the background suppression ratio: the share of the scene's light that a mask leaves in the field.
+    """Compute the background suppression ratio: the share of the scene's light that a mask leaves
+    in the field.
 
-    The scene's light is all light that the clear pupil takes from the scene inside the field, which an unbounded sensor
-    would collect behind the clear lens. Light counts as lost if it falls outside the field, outside the window of the
-    PSF, or is absorbed by dirt. No light enters from outside the field, so the border of `optics.image` has no effect,
-    and the ratio of a passive mask is at most 1. The ratio of the clear lens is a little below 1, for its own
-    diffraction. Without a scene, the ratio is that of a point on the axis: the share of the light in the window.
+    The scene's light is all light that the clear pupil takes from the scene inside the field, which
+    an unbounded sensor would collect behind the clear lens. Light counts as lost if it falls
+    outside the field, outside the window of the PSF, or is absorbed by dirt. No light enters from
+    outside the field, so the border of `optics.image` has no effect, and the ratio of a passive
+    mask is at most 1. The ratio of the clear lens is a little below 1, for its own diffraction.
+    Without a scene, the ratio is that of a point on the axis: the share of the light in the window.
 
     Shapes: psf.intensity (band, any, any), radiance (..., band, y, x) -> (..., band) float64.
     Units:  none; 1 where all light stays in the field.
-    Error:  1e-6 in float32. A band without light (1e-30) has ratio 1. A PSF sampled at points holds more than all light
-            where pixels are wider than lambda f / D, or where the light reaches the edge of the alias-free field.
-            Sharpness is not measured.
+    Error:  1e-6 in float32. A band without light (1e-30) has ratio 1. A PSF sampled at points holds
+            more than all light where pixels are wider than lambda f / D, or where the light reaches
+            the edge of the alias-free field. Sharpness is not measured.
     Raises: ValueError where scene and PSF have different bands.
     Source: NeuSee, section Sensor Image (BSR), as a ratio of energies; the border is left out.
     """
     if radiance is None:
         return single(psf.intensity).sum(-1).sum(-1, dtype=torch.float64)
-    kept, whole = light_in_field(psf.intensity, radiance)
-    dark = whole <= _DARK  # false for NaN, so that NaN reaches the result
-    ratio: Tensor = torch.where(dark, 1.0, kept / whole.where(~dark, 1.0))
+    passed, scene_light = light_in_field(psf.intensity, radiance)
+    dark = scene_light <= _DARK  # false for NaN, so that NaN reaches the result
+    ratio: Tensor = torch.where(dark, 1.0, passed / scene_light.where(~dark, 1.0))
     return ratio
 
 
 @bsr.reference
 def _(psf: Psf, radiance: Tensor | None = None) -> Tensor:
-    """Form the image without border, with a margin that catches all light of the PSF, and compare sums of pixels."""
+    """Form the image without border, with a margin that catches all light of the PSF, and
+    compare sums of pixels.
+    """
     kernel = psf.intensity.double()
     if radiance is None:
         return kernel.sum((-2, -1))
@@ -78,23 +205,33 @@ def _(psf: Psf, radiance: Tensor | None = None) -> Tensor:
     (m, n), (y, x) = kernel.shape[-2:], scene.shape[-2:]
     around = (n - 1, n - 1, m - 1, m - 1)
     full = conv2d(pad(scene, around), kernel.flip(-1, -2)[:, None], groups=len(kernel))
-    kept, whole = full[..., m // 2 : m // 2 + y, n // 2 : n // 2 + x].sum((-2, -1)), scene.sum((-2, -1))
-    dark = whole <= _DARK
-    return torch.where(dark, 1.0, kept / whole.where(~dark, 1.0)).reshape(cube.shape[:-2])
+    passed, scene_light = (
+        full[..., m // 2 : m // 2 + y, n // 2 : n // 2 + x].sum((-2, -1)),
+        scene.sum((-2, -1)),
+    )
+    dark = scene_light <= _DARK
+    return torch.where(dark, 1.0, passed / scene_light.where(~dark, 1.0)).reshape(cube.shape[:-2])
 
 
 @bsr.check
 def _(result: Tensor, *inputs: Any) -> list[Check]:
     low, high = float(result.min()), float(result.max())
-    return [Check(f"background suppression ratio {low:.3f} to {high:.3f}", bool((result <= 1 + _ROUNDED).all()))]
+    return [
+        Check(
+            f"background suppression ratio {low:.3f} to {high:.3f}",
+            bool((result <= 1 + _ROUNDED).all()),
+        )
+    ]
 
 
 @node(rtol=1e-6)
 def peak_bsr(image: Tensor, plain_image: Tensor) -> Tensor:
-    """Compute the ratio of the brightest pixel of the scene with the mask to the brightest pixel without the mask.
+    """Compute the ratio of the brightest pixel of the scene with the mask to the brightest pixel
+    without the mask.
 
-    The paper scales the peak irradiance of a scene by its background suppression ratio, so that a mask that blurs has a
-    low ratio although no light is lost. `metrics.bsr` is the ratio of energies.
+    The paper scales the peak irradiance of a scene by its background suppression ratio, so that a
+    mask that blurs has a low ratio although no light is lost. `metrics.bsr` is the ratio of
+    energies.
 
     Shapes: image and plain_image (..., band, y, x) -> (..., band) float64.
     Units:  none; about 1 for a mask that neither absorbs nor blurs.
@@ -105,9 +242,9 @@ def peak_bsr(image: Tensor, plain_image: Tensor) -> Tensor:
     if image.shape != plain_image.shape:
         shapes = f"{tuple(image.shape)} with and {tuple(plain_image.shape)} without mask"
         raise ValueError(f"image {shapes} differ in shape: use one scene for both")
-    kept, plain = (single(x).amax((-2, -1)).double() for x in (image, plain_image))
+    masked, plain = (single(x).amax((-2, -1)).double() for x in (image, plain_image))
     dark = plain <= _DARK  # false for NaN, so that NaN reaches the result
-    ratio: Tensor = torch.where(dark, 1.0, kept / plain.where(~dark, 1.0))
+    ratio: Tensor = torch.where(dark, 1.0, masked / plain.where(~dark, 1.0))
     return ratio
 
 
@@ -115,19 +252,22 @@ def peak_bsr(image: Tensor, plain_image: Tensor) -> Tensor:
 def light_outside(psf: Psf, pupil: Pupil) -> Tensor:
     """Compute the share of the light of a point that falls outside the window of its PSF, by band.
 
-    The light is what the pupil passes, so that light that dirt absorbs does not count. No later step knows of the light
-    outside the window: it is lost to the picture of the scene, and to the glare of a laser.
+    The light is what the pupil passes, so that light that dirt absorbs does not count. No later
+    step knows of the light outside the window: it is lost to the picture of the scene, and to the
+    glare of a laser.
 
     Shapes: psf.intensity (band, y, x), pupil (v, u) -> (band,) float64.
     Units:  none; 0 where the window holds all light.
-    Error:  1e-6 of the light. The light of a PSF sampled at points is that of the window only if no pixel is wider than
-            lambda f / D. A pupil without light has no light outside: 0. The height and the path of the pupil have no
-            effect, not even where they are NaN.
-    Source: conservation of energy: Goodman, Introduction to Fourier Optics, 3rd ed., section 2.1.5 (Parseval).
+    Error:  1e-6 of the light. The light of a PSF sampled at points is that of the window only if no
+            pixel is wider than lambda f / D. A pupil without light has no light outside: 0. The
+            height and the path of the pupil have no effect, not even where they are NaN.
+    Source: conservation of energy: Goodman, Introduction to Fourier Optics, 3rd ed., section 2.1.5
+            (Parseval).
     """
     passed, clear = (x.double().square().sum() for x in (pupil.amplitude, pupil.aperture))
     through = passed / clear * passed_by_notches(pupil).to(passed.device)
-    inside = torch.stack([band.sum(dtype=torch.float64) for band in single(psf.intensity)])  # a copy of one band
+    # a copy of one band
+    inside = torch.stack([band.sum(dtype=torch.float64) for band in single(psf.intensity)])
     dark = through <= _DARK  # false for NaN, so that NaN reaches the result
     outside: Tensor = torch.where(dark, 0.0, 1.0 - inside / through.where(~dark, 1.0))
     return outside
@@ -136,4 +276,6 @@ def light_outside(psf: Psf, pupil: Pupil) -> Tensor:
 @light_outside.check
 def _(result: Tensor, *inputs: Any) -> list[Check]:
     low, high = float(result.min()), float(result.max())
-    return [Check(f"{low:.2%} to {high:.2%} of the light falls outside the window", low >= -_ROUNDED)]
+    return [
+        Check(f"{low:.2%} to {high:.2%} of the light falls outside the window", low >= -_ROUNDED)
+    ]

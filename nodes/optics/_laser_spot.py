@@ -1,21 +1,145 @@
-"""The laser spot on the sensor: a PSF scaled by the strength of a laser, or by its light in watts."""
+"""The direction of a laser, and its spot on the sensor as irradiance."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
-from torch import Tensor
+from torch import Generator, Tensor
 
 from neusee.nodes import Check, ParameterError, TensorStats, node
-from neusee.nodes._half_precision import single
-from neusee.nodes.sensor._saturation import Efficiency, Well, photons_that_fill, saturation
-from neusee.nodes.units import Exposure, PixelPitch
+from neusee.nodes.precision import single
+from neusee.nodes.sensor._saturation import Well, photons_that_fill, saturation
+from neusee.nodes.units import Angle, Efficiency, Exposure, FocalLength, Fraction, PixelPitch, Shape
 from neusee.nodes.values import Bands, LaserLight, Psf
+
+# --- laser direction ------------------------------------------------------------------------------
+
+# The direction of a laser, given in the recipe or sampled at random as in the paper.
+
+
+_WIDEST = 1.0  #: rad; an angle counts as its direction cosine, which is below 1
+#: relative difference of an angle and its sine, above which a note says the difference
+_SMALL = 0.01
+Rule = Literal["width_over_focal_length", "focal_length_over_width"]
+
+
+@node()
+def direction(
+    *,
+    angle: tuple[Angle, Angle] | None = None,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
+    shape: Shape,
+    share: Fraction = 0.36,
+    rule: Rule = "width_over_focal_length",
+    rng: Generator,
+) -> Tensor:
+    """Return the direction of a laser: ``angle``, or a normally distributed angle with 3 sigma =
+    share x W / f per axis.
+
+    W is the side of the sensor. A draw beyond the edge of the sensor is repeated, so the spot lies
+    on the sensor. The paper prints f / W instead: 6.7 rad for its camera, which no lens images. A
+    draw by f / W is refused.
+
+    Shapes: -> (2,), (n_y, n_x) float64.
+    Units:  rad (direction cosines; sine and angle agree to 1e-6 at 2 mrad, and to 1 % at 14
+            degrees).
+    Error:  exact.
+    Raises: ParameterError before the run where ``rule`` asks for a draw by f / W, and for an angle
+            of 1 rad or more, which is no direction cosine.
+    Source: NeuSee, section Experiment Setup; by definition.
+    """
+    if angle is not None:
+        return torch.tensor(angle, dtype=torch.float64)
+    edges = field_of_view(focal_length, pixel_pitch, shape)
+    return torch.stack([_inside(share * edge / 3, edge / 2, rng) for edge in edges])
+
+
+def field_of_view(
+    focal_length: float, pixel_pitch: float, shape: tuple[int, int]
+) -> tuple[float, float]:
+    """Return the direction cosines (n_y, n_x) between opposite edges of the sensor: side x pitch
+    / f.
+    """
+    height, width = (side * pixel_pitch / focal_length for side in shape)
+    return height, width
+
+
+def _inside(sigma: float, edge: float, rng: Generator) -> Tensor:
+    """Sample a normal distribution of standard deviation ``sigma``, limited to absolute values
+    of at most ``edge``.
+    """
+    while True:
+        drawn = sigma * torch.randn((), generator=rng, device=rng.device, dtype=torch.float64)
+        if float(drawn.abs()) <= edge:
+            return drawn.cpu()
+
+
+@direction.preflight
+def _(
+    *,
+    angle: tuple[float, float] | None,
+    focal_length: float,
+    pixel_pitch: float,
+    shape: tuple[int, int],
+    share: float,
+    rule: Rule,
+) -> list[str]:
+    if angle is not None:
+        return angle_notes(angle)
+    if rule == "focal_length_over_width":
+        wide = share * focal_length / (shape[1] * pixel_pitch)
+        raise ParameterError(
+            "rule",
+            f"{share:g} f / W = {wide:.3g} rad would put the spot {wide * focal_length:.2g} m off"
+            " the axis: set `angle`, or set rule: width_over_focal_length",
+        )
+    return []
+
+
+def angle_notes(angle: tuple[float, float]) -> list[str]:
+    """Return a note for an angle that differs by more than 1 % from its sine.
+
+    Raises ParameterError for an angle of 1 rad or more, because the model takes an angle as its
+    direction cosine.
+    """
+    size = math.hypot(*angle)
+    degrees = f"{math.degrees(size):.4g} deg"
+    if size >= _WIDEST:
+        raise ParameterError(
+            "angle",
+            f"{degrees} off the axis is {size:.4g} rad, but the model takes an angle in rad as its"
+            " direction cosine, which is below 1: give less than 57.3 deg",
+        )
+    off = 1 - math.sin(size) / size if size else 0.0
+    text = (
+        f"{degrees} off the axis: the model takes an angle as its direction cosine, and the two"
+        f" differ by {off:.1%}"
+    )
+    return [text] if off > _SMALL else []
+
+
+@direction.check
+def _(
+    result: Tensor, *, focal_length: float, pixel_pitch: float, shape: tuple[int, int], **_: Any
+) -> list[Check]:
+    y, x = (float(n) * focal_length / pixel_pitch for n in result)
+    inside = abs(y) <= shape[0] / 2 and abs(x) <= shape[1] / 2
+    off = math.degrees(math.hypot(*(float(n) for n in result)))
+    beyond = "" if inside else ": beyond the sensor, where only glare reaches the picture"
+    return [Check(f"spot {y:+.1f}, {x:+.1f} px (y, x) off the axis, {off:.3g} deg{beyond}")]
+
+
+# --- laser spot -----------------------------------------------------------------------------------
+
+# The laser spot on the sensor: a PSF scaled by the strength of a laser, or by its light in watts.
+
 
 Meaning = Literal["first_channel", "irradiance"]
 
-_LSR = 2.2  #: largest laser suppression ratio of a pupil that only absorbs and delays; derived in the bound
+#: largest laser suppression ratio of a pupil that only absorbs and delays; derived in the bound
+_LSR = 2.2
 _SQUARE = 4 / math.pi  #: largest area of the samples of a coarse pupil grid, relative to their disc
 _UNSEEN = 1e-3  #: relative response below which a channel does not see a line
 
@@ -34,20 +158,23 @@ def laser_irradiance(
     pixel_pitch: PixelPitch,
     exposure: Exposure,
 ) -> Tensor:
-    """Scale the PSF of a laser so that its peak behind the clear lens, on axis, is ``strength`` times saturation.
+    """Scale the PSF of a laser so that its peak behind the clear lens, on axis, is ``strength``
+    times saturation.
 
-    By the meaning `first_channel` a laser of strength 1 fills the pixel at that peak in the channel that it fills
-    first, at the nominal exposure. By the meaning `irradiance` of the paper that peak is the sum of I / I_sat over the
-    wavelengths of the line, before the channels. The nominal exposure is ``exposure``, at which a strength is defined;
-    a sensor that exposes longer collects more of the same light. Without a strength the irradiance is that of the
-    `light` in watts. Each wavelength sends its share of the energy (``bands.weights``) through the pupil. The spot is
+    By the meaning `first_channel` a laser of strength 1 fills the pixel at that peak in the channel
+    that it fills first, at the nominal exposure. By the meaning `irradiance` of the paper that peak
+    is the sum of I / I_sat over the wavelengths of the line, before the channels. The nominal
+    exposure is ``exposure``, at which a strength is defined; a sensor that exposes longer collects
+    more of the same light. Without a strength the irradiance is that of the `light` in watts. Each
+    wavelength sends its share of the energy (``bands.weights``) through the pupil. The spot is
     added to the image of the scene and is not convolved.
 
     Shapes: psf.intensity (band, y, x), bands (band,), responses (channel, band) -> (band, y, x).
     Units:  result W/m2 of each sub-band, mean over the exposure; strength is a plain multiple.
     Error:  float32 of the PSF, 1e-6 of its peak; the scale is exact.
-    Raises: ParameterError before the run for a strength at a wavelength that no channel sees; ValueError where PSF,
-            line and responses have different bands, and without strength and light.
+    Raises: ParameterError before the run for a strength at a wavelength that no channel sees;
+            ValueError where PSF, line and responses have different bands, and without strength and
+            light.
     Source: NeuSee, Eq. (peak_irrad_laser_coded); in watts by definition of the PSF.
     """
     if psf.intensity.shape[0] != len(bands.centres):
@@ -56,31 +183,43 @@ def laser_irradiance(
             "the numbers of bands differ, so compute both from one `line` step"
         )
     if strength is not None:
-        sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency, "pixel_pitch": pixel_pitch}
+        sensor = {
+            "full_well": full_well,
+            "quantum_efficiency": quantum_efficiency,
+            "pixel_pitch": pixel_pitch,
+        }
         wells = 1.0 / saturation(bands, **sensor, exposure=exposure)
         energy = strength * bands.weights / unit(psf.clear_peak, bands, wells, responses, meaning)
     elif light is not None:
         energy = light.flux / pixel_pitch**2 * bands.weights
     else:
-        raise ValueError("a laser needs a strength, or its light in watts: give strength, or the input light")
+        raise ValueError(
+            "a laser needs a strength, or its light in watts: give strength, or the input light"
+        )
     intensity = single(psf.intensity)
     return intensity * energy.to(intensity)[:, None, None]
 
 
-def unit(clear_peak: Tensor, bands: Bands, wells: Tensor, responses: Tensor | None, meaning: Meaning) -> Tensor:
-    """Return the saturated pixels of one W/m2 per unit of the PSF at the peak of the clear lens: () float64.
+def unit(
+    clear_peak: Tensor, bands: Bands, wells: Tensor, responses: Tensor | None, meaning: Meaning
+) -> Tensor:
+    """Return the saturated pixels of one W/m2 per unit of the PSF at the peak of the clear lens: ()
+    float64.
 
     ``wells`` are the full wells of one W/m2 in each band.
     """
-    each = bands.weights * clear_peak * wells
+    by_band = bands.weights * clear_peak * wells
     if meaning == "irradiance":
-        return each.sum()
-    if responses is None or responses.shape[-1] != len(each):
-        raise ValueError("strength counts the channel that saturates first: give `responses` for the bands of the line")
-    most = (responses.to(each) * each).sum(-1).amax()
-    if not bool(most > 0):
+        return by_band.sum()
+    if responses is None or responses.shape[-1] != len(by_band):
+        raise ValueError(
+            "strength counts the channel that saturates first: give `responses` for the bands of"
+            " the line"
+        )
+    largest = (responses.to(by_band) * by_band).sum(-1).amax()
+    if not bool(largest > 0):
         raise ValueError(_no_channel(bands))
-    return most
+    return largest
 
 
 @laser_irradiance.preflight
@@ -92,7 +231,13 @@ def _(
     meaning: Meaning = "irradiance",
     **sensor: float,
 ) -> list[str]:
-    if not strength or meaning == "irradiance" or bands is None or responses is None or responses.is_meta:
+    if (
+        not strength
+        or meaning == "irradiance"
+        or bands is None
+        or responses is None
+        or responses.is_meta
+    ):
         return []
     if float((responses * bands.weights).sum(-1).amax() / bands.weights.sum()) < _UNSEEN:
         raise ParameterError("strength", _no_channel(bands))
@@ -116,24 +261,29 @@ def _(
     meaning: Meaning = "irradiance",
     **sensor: float,
 ) -> float:
-    """Return an upper bound of the spot's irradiance: saturation x strength x largest laser suppression ratio (LSR).
+    """Return an upper bound of the spot's irradiance: saturation x strength x largest laser
+    suppression ratio (LSR).
 
-    The bound needs no PSF, so no PSF is computed for it. A pixel that samples a point is at most as bright as the clear
-    peak, where all of the pupil is in phase. The same holds for a pixel that averages over a width up to lambda f / D,
-    because within that width all pairs of pupil points still add up. A wider pixel within the alias-free field holds at
-    least 1 / 2.2 of the clear pupil's light on axis, and no other pixel holds more than all of that light.
-    A channel of small response needs more irradiance to saturate; light in watts has its peak at the mean wavelength.
+    The bound needs no PSF, so no PSF is computed for it. A pixel that samples a point is at most as
+    bright as the clear peak, where all of the pupil is in phase. The same holds for a pixel that
+    averages over a width up to lambda f / D, because within that width all pairs of pupil points
+    still add up. A wider pixel within the alias-free field holds at least 1 / 2.2 of the clear
+    pupil's light on axis, and no other pixel holds more than all of that light. A channel of small
+    response needs more irradiance to saturate; light in watts has its peak at the mean wavelength.
     """
     if strength is None:
-        return math.inf if light is None else _LSR * _SQUARE * light.max * (bands.max / bands.min) ** 2
+        return (
+            math.inf if light is None else _LSR * _SQUARE * light.max * (bands.max / bands.min) ** 2
+        )
     if strength == 0:
         return 0.0
-    least = 1.0
+    response = 1.0
     if meaning == "first_channel":
-        least = responses.min if responses else 0.0
-    ends = torch.tensor([bands.min], dtype=torch.float64)  # the saturation irradiance falls with wavelength
+        response = responses.min if responses else 0.0
+    # the saturation irradiance falls with wavelength
+    ends = torch.tensor([bands.min], dtype=torch.float64)
     saturating: Tensor = saturation(Bands(ends, ends, ends), **sensor)
-    return _LSR * strength * float(saturating) / least if least > 0 else math.inf
+    return _LSR * strength * float(saturating) / response if response > 0 else math.inf
 
 
 @laser_irradiance.expected_range
@@ -146,10 +296,14 @@ def _(
     exposure: float,
     **params: object,
 ) -> tuple[float, float]:
-    """Return the peak behind the clear lens, in photons of the brightest channel per second and square metre."""
+    """Return the peak behind the clear lens, in photons of the brightest channel per second and
+    square metre.
+    """
     if strength is None:
         raise LookupError("the light of a laser in watts is known in the run only")
-    return 0.0, strength * photons_that_fill(full_well, quantum_efficiency) / (exposure * pixel_pitch**2)
+    return 0.0, strength * photons_that_fill(full_well, quantum_efficiency) / (
+        exposure * pixel_pitch**2
+    )
 
 
 @laser_irradiance.check
@@ -166,11 +320,16 @@ def _(
 ) -> list[Check]:
     wells = 1.0 / saturation(bands, **sensor)
     peak = float(result.sum(0).max())
-    watts, at = f"peak of the spot {peak:.4g} W/m2", f"at the nominal exposure of {sensor['exposure']:g} s"
+    watts, when = (
+        f"peak of the spot {peak:.4g} W/m2",
+        f"at the nominal exposure of {sensor['exposure']:g} s",
+    )
     if strength is not None:
-        return [Check(f"{watts}, strength {strength:g} {at}", math.isfinite(peak))]
-    if light is None or (meaning == "first_channel" and (responses is None or not float(responses.max()) > 0)):
+        return [Check(f"{watts}, strength {strength:g} {when}", math.isfinite(peak))]
+    if light is None or (
+        meaning == "first_channel" and (responses is None or not float(responses.max()) > 0)
+    ):
         return [Check(watts, math.isfinite(peak))]
     clear = light.peak / light.even_peak.clamp_min(1e-300) * light.flux / sensor["pixel_pitch"] ** 2
     strength = float(clear * unit(psf.clear_peak, bands, wells, responses, meaning))
-    return [Check(f"{watts}, which is a strength of {strength:.4g} {at}", math.isfinite(peak))]
+    return [Check(f"{watts}, which is a strength of {strength:.4g} {when}", math.isfinite(peak))]

@@ -1,35 +1,262 @@
-"""The PSF averaged over each square pixel: its intensity on a finer grid, and a short filter behind.
-
-The intensity |U|^2 of a pupil that is N samples wide has a bandwidth of B = N alpha cycles a pixel, with alpha the
-pitch of the pupil times that of the pixel over wavelength and focal length. More than 2 B samples a pixel hold all of
-the intensity, and `_pixel_filter` averages them over each pixel. A window within the alias-free field has at most N / B
-pixels, so that the fine grid has a little over 2 N samples a side in the worst case, whatever the f-number.
-
-Rule: along each axis the grid has more than 2 B samples a pixel, the multiple of a quarter (a whole number above 8)
-that needs the fewest samples, where a tap of the filter counts as one more sample. It is the same on every machine.
-Memory: strips of pixel rows with at most `FINE_SAMPLES` samples of the fine grid, 64 MiB in float32.
-"""
+"""The PSF averaged over square pixels: a finer grid, and a short filter behind."""
 
 from __future__ import annotations
 
+import functools
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._pixel_filter import FineAxis, averaged, fine_axis, unit_nodes
 from neusee.nodes.optics._psf_definition import Geometry
 from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
 from neusee.nodes.optics._transform._pupil_field import View
 from neusee.nodes.optics._transform._sample_axis import Axis, centred
 from neusee.nodes.optics._transform._scaled_transform import Method
-from neusee.nodes.torch_func import plain
+from neusee.nodes.torch_func import one_by_one, plain
 from neusee.nodes.values import Pupil
 
-#: nominal error of the filter by the type of the PSF; a fringe errs by up to 1e-8 and 1e-12 of the clear peak
+# --- pixel filter ---------------------------------------------------------------------------------
+
+# The filter that averages an intensity over square pixels, given the intensity on a finer grid.
+#
+# The intensity of a pupil of finite width is band-limited. On a grid of more than twice its
+# bandwidth the intensity between the samples is known, so that its average over a pixel is a short
+# sum of samples. The weights of this sum are the average over a pixel of a low-pass filter, which
+# passes the band of the intensity and stops its repetitions.
+
+
+_STEP = 0.25  #: samples a pixel are a multiple of this, and whole numbers from `_WHOLE` on
+_WHOLE = 8
+_PERIOD = 4  #: pixels after which the places of the pixels between the samples repeat
+_ROWS = 16  #: pixels whose weights form one dense matrix
+
+
+@dataclass(frozen=True, slots=True)
+class FineAxis:
+    """A grid along one axis of a window, fine enough for the intensity, and the length of the
+    filter on this grid.
+
+    The middle of the grid is the middle of the window.
+    """
+
+    pixels: int
+    bandwidth: float  #: of the intensity, in cycles a pixel
+    per_pixel: float  #: samples a pixel
+    error: float  #: of the filter, relative to the brightest sample that it reaches
+    taps: int
+
+    @property
+    def samples(self) -> int:
+        """Return the number of samples, which reach beyond the window by half a filter on each
+        side.
+        """
+        return math.ceil(self.per_pixel * (self.pixels - 1)) + self.taps
+
+    def part(self, pixels: int) -> FineAxis:
+        """Return the grid of a part of the window."""
+        return FineAxis(pixels, self.bandwidth, self.per_pixel, self.error, self.taps)
+
+
+def fine_axis(pixels: int, bandwidth: float, error: float) -> FineAxis:
+    """Return the grid with the fewest samples, each tap of the filter counted twice, for its
+    products.
+
+    The grid has more than ``2 bandwidth`` samples a pixel, and at least one.
+    """
+    grids = (_grid(pixels, bandwidth, m, error) for m in _samples_per_pixel(2 * bandwidth))
+    return min(grids, key=lambda grid: grid.samples + grid.taps)
+
+
+def _samples_per_pixel(lowest: float) -> list[float]:
+    step = _STEP if lowest < _WHOLE else 1.0
+    first = max(math.floor(lowest / step) + 1, math.ceil(1 / step))
+    count = 8 + math.ceil(0.5 * lowest / step)
+    return [step * (first + i) for i in range(count)]
+
+
+def _grid(pixels: int, bandwidth: float, per_pixel: float, error: float) -> FineAxis:
+    taps = math.ceil(per_pixel * (1 + _width(per_pixel - 2 * bandwidth, error))) + 1
+    return FineAxis(pixels, bandwidth, per_pixel, error, taps)
+
+
+def _decibels(error: float) -> float:
+    return -20 * math.log10(error)
+
+
+def _width(gap: float, error: float) -> float:
+    """Return the width in pixels of a low-pass filter whose pass and stop band are ``gap`` cycles a
+    pixel apart.
+
+    Source: Kaiser, Proc. IEEE Int. Symp. Circuits and Systems (1974), the length of a filter by its
+            window.
+    """
+    return (_decibels(error) - 7.95) / (14.36 * gap)
+
+
+def _weights(grid: FineAxis, away: Tensor) -> Tensor:
+    """Return the weights of samples at distances ``away`` in pixels from the middle of a pixel."""
+    nodes, shares = unit_nodes(12 + math.ceil(2 * grid.per_pixel))
+    width = _width(grid.per_pixel - 2 * grid.bandwidth, grid.error)
+    beta = 0.1102 * (_decibels(grid.error) - 8.7)
+    distance = away[..., None] + nodes
+    window = torch.special.i0(beta * (1 - (2 * distance / width).square()).clamp_min(0).sqrt())
+    low_pass = torch.sinc(grid.per_pixel * distance) * window.where(
+        distance.abs() <= width / 2, 0.0
+    )
+    weights: Tensor = (
+        low_pass @ shares / float(torch.special.i0(torch.tensor(beta, dtype=torch.float64)))
+    )
+    return weights
+
+
+def unit_nodes(count: int) -> tuple[Tensor, Tensor]:
+    """Return Gauss-Legendre nodes between -1/2 and 1/2, and their weights, which sum to one."""
+    # kept as numbers, because a transform of `torch.func` wraps new tensors
+    nodes, weights = _nodes(count)
+    return torch.tensor(nodes, dtype=torch.float64), torch.tensor(weights, dtype=torch.float64)
+
+
+@functools.lru_cache(maxsize=64)
+def _nodes(count: int) -> tuple[list[float], list[float]]:
+    import numpy as np
+
+    x, w = np.polynomial.legendre.leggauss(count)
+    return (x / 2).tolist(), (w / 2).tolist()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _AxisFilter:
+    """The weights of a block of pixels, the same for every block, and the first sample of each
+    block.
+    """
+
+    block: Tensor  #: (pixel, sample)
+    first: int  #: sample of the first block
+    stride: int  #: samples between blocks
+    pixels: int
+    samples: int
+
+    def spans(self) -> list[tuple[slice, slice, Tensor]]:
+        """Return the pixels and the samples of each block, and the weights between them."""
+        rows = len(self.block)
+        spans = []
+        for index in range(-(-self.pixels // rows)):
+            pixels = slice(index * rows, min((index + 1) * rows, self.pixels))
+            start = self.first + index * self.stride
+            samples = slice(start, min(start + self.block.shape[1], self.samples))
+            weights = self.block[: pixels.stop - pixels.start, : samples.stop - samples.start]
+            spans.append((pixels, samples, weights))
+        return spans
+
+
+@functools.lru_cache(maxsize=256)
+def _axis_filter(grid: FineAxis, dtype: torch.dtype, device: torch.device) -> _AxisFilter:
+    pixels = torch.arange(_ROWS, dtype=torch.float64) - (grid.pixels - 1) / 2
+    middles = (grid.samples - 1) / 2 + grid.per_pixel * pixels
+    firsts = (middles - grid.taps / 2).ceil()
+    samples = firsts[:, None] + torch.arange(grid.taps, dtype=torch.float64)
+    weights = _weights(grid, (samples[:_PERIOD] - middles[:_PERIOD, None]) / grid.per_pixel)
+    first = int(firsts[0])
+    block = torch.zeros(_ROWS, int(firsts[-1]) - first + grid.taps, dtype=torch.float64)
+    for row, start in enumerate(firsts.int().tolist()):
+        block[row, start - first : start - first + grid.taps] = weights[row % _PERIOD]
+    stride = round(_ROWS * grid.per_pixel)
+    return _AxisFilter(block.to(device, dtype), first, stride, grid.pixels, grid.samples)
+
+
+class PixelFilter:
+    """The average over pixels of an intensity on a fine grid, along y and then along x, and its
+    adjoint.
+    """
+
+    def __init__(self, rows: FineAxis, columns: FineAxis, like: Tensor) -> None:
+        """Take the weights in the type and on the device of ``like``, which no transform of
+        `torch.func` wraps.
+        """
+        self.rows, self.columns = (
+            _axis_filter(grid, like.dtype, like.device) for grid in (rows, columns)
+        )
+
+    def average(self, fine: Tensor) -> Tensor:
+        """Return the average (y, x) over each pixel of an intensity on the fine grid."""
+        y, x = self.rows, self.columns
+        half, out = fine.new_empty(y.pixels, x.samples), fine.new_empty(y.pixels, x.pixels)
+        for pixels, samples, weights in y.spans():
+            torch.mm(weights, fine[samples], out=half[pixels])
+        for pixels, samples, weights in x.spans():
+            torch.mm(half[:, samples], weights.T, out=out[:, pixels])
+        return out
+
+    def spread(self, light: Tensor) -> Tensor:
+        """Return the adjoint of `average`, on the fine grid."""
+        y, x = self.rows, self.columns
+        half, out = light.new_zeros(y.pixels, x.samples), light.new_zeros(y.samples, x.samples)
+        for pixels, samples, weights in x.spans():
+            half[:, samples].addmm_(light[:, pixels], weights)
+        for pixels, samples, weights in y.spans():
+            out[samples].addmm_(weights.T, half[pixels])
+        return out
+
+
+def averaged(fine: Tensor, rows: FineAxis, columns: FineAxis) -> Tensor:
+    """Return the average over pixels of an intensity on the fine grid, with derivatives of any
+    order.
+    """
+    result: Tensor = _Averaged.apply(fine, rows, columns, False)  # type: ignore[no-untyped-call]
+    return result
+
+
+class _Averaged(torch.autograd.Function):
+    """The average over pixels or its adjoint, both linear, so that each is the derivative of the
+    other.
+    """
+
+    @staticmethod
+    def forward(light: Tensor, rows: FineAxis, columns: FineAxis, adjoint: bool) -> Tensor:
+        over = PixelFilter(rows, columns, light)
+        return over.spread(light) if adjoint else over.average(light)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.grids, ctx.adjoint = inputs[1:3], inputs[3]
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
+        return _Averaged.apply(grad.contiguous(), *ctx.grids, not ctx.adjoint), None, None, None  # type: ignore[no-untyped-call]
+
+    @staticmethod
+    def jvp(ctx: Any, tangent: Tensor, *_: Any) -> Any:
+        return _Averaged.apply(tangent, *ctx.grids, ctx.adjoint)  # type: ignore[no-untyped-call]
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> Any:
+        return one_by_one(_Averaged.apply, info.batch_size, in_dims, inputs)
+
+
+# --- pixel average --------------------------------------------------------------------------------
+
+# The PSF averaged over each square pixel: its intensity on a finer grid, and a short filter behind.
+#
+# The intensity |U|^2 of a pupil that is N samples wide has a bandwidth of B = N alpha cycles a
+# pixel, with alpha the pitch of the pupil times that of the pixel over wavelength and focal length.
+# More than 2 B samples a pixel hold all of the intensity, and `_pixel_average` averages them over
+# each pixel. A window within the alias-free field has at most N / B pixels, so that the fine grid
+# has a little over 2 N samples a side in the worst case, whatever the f-number.
+#
+# Rule: along each axis the grid has more than 2 B samples a pixel, the multiple of a quarter (a
+# whole number above 8) that needs the fewest samples, where a tap of the filter counts as one more
+# sample. It is the same
+# on every machine.
+# Memory: strips of pixel rows with at most `FINE_SAMPLES` samples of the fine grid, 64 MiB in
+#         float32.
+
+
+#: nominal error of the filter by the type of the PSF; a fringe errs by up to 1e-8 and 1e-12 of the
+#: clear peak
 FILTER_ERROR = {torch.float32: 5e-10, torch.float64: 5e-15}
 FINE_SAMPLES = 1 << 24  #: of the fine grid at a time, unless one row of pixels needs more
 _STRIPE = 1 << 17  #: samples of the aperture that are converted to float64 at a time
@@ -44,27 +271,44 @@ class GridAxis(NamedTuple):
 
 
 def turns_per_pixel(pupil: Pupil, camera: Geometry, band: int) -> float:
-    """Return alpha, the turns of phase between neighbouring pupil samples for each pixel off the axis."""
-    return float(pupil.pitch) * camera.pixel_pitch / (float(pupil.wavelengths[band]) * camera.focal_length)
+    """Return alpha, the turns of phase between neighbouring pupil samples for each pixel off the
+    axis.
+    """
+    return (
+        float(pupil.pitch)
+        * camera.pixel_pitch
+        / (float(pupil.wavelengths[band]) * camera.focal_length)
+    )
 
 
 def spot(camera: Geometry) -> list[float]:
     """Return the position (y, x) of the spot on the sensor, in pixels."""
     return [
-        n // 2 + camera.focal_length * a / camera.pixel_pitch for n, a in zip(camera.shape, camera.angle, strict=True)
+        n // 2 + camera.focal_length * a / camera.pixel_pitch
+        for n, a in zip(camera.shape, camera.angle, strict=True)
     ]
 
 
 def view_of(
-    pupil: Pupil, camera: Geometry, band: int, grid: tuple[GridAxis, GridAxis], light: float, dtype: torch.dtype
+    pupil: Pupil,
+    camera: Geometry,
+    band: int,
+    grid: tuple[GridAxis, GridAxis],
+    light: float,
+    dtype: torch.dtype,
 ) -> View:
-    """Return the intensity on a grid, as the share of the light in a pixel; ``light`` divides by the clear pupil."""
+    """Return the intensity on a grid, as the share of the light in a pixel; ``light`` divides by
+    the clear pupil.
+    """
     alpha, wavelength = turns_per_pixel(pupil, camera, band), float(pupil.wavelengths[band])
     rows, columns = (
-        Axis(n, axis.samples, alpha / axis.per_pixel) for n, axis in zip(pupil.height.shape, grid, strict=True)
+        Axis(n, axis.samples, alpha / axis.per_pixel)
+        for n, axis in zip(pupil.height.shape, grid, strict=True)
     )
     tilt = (-alpha * grid[0].middle, -alpha * grid[1].middle)
-    envelope = _envelopes(grid, alpha, dtype, pupil.height.device) if camera.pixel == "zoh" else None
+    envelope = (
+        _envelopes(grid, alpha, dtype, pupil.height.device) if camera.pixel == "zoh" else None
+    )
     turns_height = float(pupil.index[band]) / wavelength
     return View(band, rows, columns, turns_height, 1 / wavelength, tilt, light * alpha**2, envelope)
 
@@ -74,14 +318,22 @@ def _envelopes(
 ) -> tuple[Tensor, Tensor]:
     """Return the diffraction envelope of square pupil samples along both axes."""
     y, x = (
-        plain(torch.sinc((centred(axis.samples, device) / axis.per_pixel + axis.middle) * alpha).square().to(dtype))
+        plain(
+            torch.sinc((centred(axis.samples, device) / axis.per_pixel + axis.middle) * alpha)
+            .square()
+            .to(dtype)
+        )
         for axis in grid
     )
     return y, x
 
 
-def fine_grid(pupil: Pupil, camera: Geometry, band: int, dtype: torch.dtype) -> tuple[FineAxis, FineAxis]:
-    """Return the grid along each axis on which the intensity of a band is computed before it is averaged."""
+def fine_grid(
+    pupil: Pupil, camera: Geometry, band: int, dtype: torch.dtype
+) -> tuple[FineAxis, FineAxis]:
+    """Return the grid along each axis on which the intensity of a band is computed before it is
+    averaged.
+    """
     alpha = turns_per_pixel(pupil, camera, band)
     return fine_axes((pupil.height.shape[0], pupil.height.shape[1]), camera.shape, alpha, dtype)
 
@@ -90,41 +342,49 @@ def fine_axes(
     samples: tuple[int, int], shape: tuple[int, int], alpha: float, dtype: torch.dtype
 ) -> tuple[FineAxis, FineAxis]:
     """Return the fine grid of a window of ``shape`` pixels for a pupil of ``samples``."""
-    y, x = (fine_axis(k, n * alpha, FILTER_ERROR[dtype]) for n, k in zip(samples, shape, strict=True))
+    y, x = (
+        fine_axis(k, n * alpha, FILTER_ERROR[dtype]) for n, k in zip(samples, shape, strict=True)
+    )
     return y, x
 
 
 def strips(rows: FineAxis, columns: FineAxis) -> list[tuple[int, int]]:
-    """Return the first and the last row, exclusive, of each strip of pixels whose fine grid is computed at a time."""
-    most = FINE_SAMPLES // columns.samples - rows.taps
-    height = max(1, math.floor(most / rows.per_pixel))
+    """Return the first and the last row, exclusive, of each strip of pixels whose fine grid is
+    computed at a time.
+    """
+    room = FINE_SAMPLES // columns.samples - rows.taps
+    height = max(1, math.floor(room / rows.per_pixel))
     count = -(-rows.pixels // height)
     ends = [rows.pixels * i // count for i in range(count + 1)]
     return list(pairwise(ends))
 
 
 class Optics(NamedTuple):
-    """How the intensity is computed: type, method of the transform, and whether focal fields are stored."""
+    """How the intensity is computed: type, method of the transform, and whether focal fields are
+    stored.
+    """
 
     dtype: torch.dtype
     method: Method
     keep: bool
 
 
-def band_average(pupil: Pupil, camera: Geometry, band: int, light: float, optics: Optics) -> list[Tensor]:
+def band_average(
+    pupil: Pupil, camera: Geometry, band: int, light: float, optics: Optics
+) -> list[Tensor]:
     """Return the share of the light in each pixel of one band, in strips of rows (y, x)."""
     rows, columns = fine_grid(pupil, camera, band, optics.dtype)
-    middles = [(n - 1) / 2 - at for n, at in zip(camera.shape, spot(camera), strict=True)]
+    middles = [(n - 1) / 2 - place for n, place in zip(camera.shape, spot(camera), strict=True)]
     across = GridAxis(columns.samples, columns.per_pixel, middles[1])
     averages = []
     for start, stop in strips(rows, columns):
-        part = rows.part(stop - start)
+        strip = rows.part(stop - start)
         below = (start + stop - camera.shape[0]) / 2
-        along = GridAxis(part.samples, part.per_pixel, middles[0] + below)
+        along = GridAxis(strip.samples, strip.per_pixel, middles[0] + below)
         view = view_of(pupil, camera, band, (along, across), light, optics.dtype)
         sampling = Sampling((replace(view, band=0),), optics.dtype, optics.method, optics.keep)
         fine = intensity_of(pupil.amplitude, pupil.height, pupil.path, sampling)[0]
-        averages.append(averaged(fine, part, columns))
+        averages.append(averaged(fine, strip, columns))
     return averages
 
 
@@ -138,19 +398,24 @@ def fine_samples(pupil: Pupil, camera: Geometry, dtype: torch.dtype) -> int:
 
 
 def clear_averages(aperture: Tensor, alphas: list[float], square_samples: bool) -> list[float]:
-    """Return the average of |U|^2 alpha^2 over the pixel on the axis, for a pupil without phase, at each alpha.
+    """Return the average of |U|^2 alpha^2 over the pixel on the axis, for a pupil without phase, at
+    each alpha.
 
-    Within a pixel the field is a smooth function of the pupil's coordinates. The aperture is therefore projected on
-    polynomials in these coordinates, and then summed over Gauss-Legendre nodes of the pixel. Bands share a projection
-    where their own numbers of polynomials are equal, so that no result depends on the other bands.
-    With ``square_samples`` the field has the envelope of square pupil samples.
+    Within a pixel the field is a smooth function of the pupil's coordinates. The aperture is
+    therefore projected on polynomials in these coordinates, and then summed over Gauss-Legendre
+    nodes of the pixel. Bands share a projection where their own numbers of polynomials are equal,
+    so that no result depends on the other bands. With ``square_samples`` the field has the envelope
+    of square pupil samples.
     """
     projections: dict[tuple[int, ...], tuple[list[Tensor], Tensor]] = {}
     averages = []
     for alpha in alphas:
         degrees = tuple(_degrees(n, alpha) for n in aperture.shape)
         if degrees not in projections:
-            bases = [_polynomials(n, d, aperture.device) for n, d in zip(aperture.shape, degrees, strict=True)]
+            bases = [
+                _polynomials(n, d, aperture.device)
+                for n, d in zip(aperture.shape, degrees, strict=True)
+            ]
             projections[degrees] = bases, _projected(aperture, *bases)
         bases, moments = projections[degrees]
         averages.append(_axis_average(moments, bases, alpha, square_samples))
@@ -158,8 +423,11 @@ def clear_averages(aperture: Tensor, alphas: list[float], square_samples: bool) 
 
 
 def _degrees(samples: int, alpha: float) -> int:
-    """Return the number of polynomials that hold all phases across a pixel to 1e-13, a multiple of 8."""
-    radians = math.pi * alpha * samples / 2  # of phase, from the middle of pupil and pixel to their edges
+    """Return the number of polynomials that hold all phases across a pixel to 1e-13, a multiple
+    of 8.
+    """
+    # of phase, from the middle of pupil and pixel to their edges
+    radians = math.pi * alpha * samples / 2
     return min(samples, 8 * math.ceil((radians + 5 * math.cbrt(radians) + 10) / 8))
 
 
@@ -167,8 +435,10 @@ def _polynomials(samples: int, degrees: int, device: torch.device) -> Tensor:
     """Return orthonormal polynomials (sample, degree) on the samples of the pupil."""
     import numpy as np
 
-    at = (np.arange(samples) - (samples - 1) / 2) * (2 / samples)
-    polynomials: Tensor = torch.from_numpy(np.polynomial.legendre.legvander(at, degrees - 1)).to(device)
+    place = (np.arange(samples) - (samples - 1) / 2) * (2 / samples)
+    polynomials: Tensor = torch.from_numpy(np.polynomial.legendre.legvander(place, degrees - 1)).to(
+        device
+    )
     orthonormal: Tensor = torch.linalg.qr(polynomials).Q
     return orthonormal
 
@@ -177,12 +447,14 @@ def _projected(aperture: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     step = max(1, _STRIPE // aperture.shape[1])
     moments = rows.new_zeros(rows.shape[1], columns.shape[1])
     for start in range(0, len(aperture), step):
-        part = slice(start, start + step)
-        moments += rows[part].T @ (aperture[part].detach().double() @ columns)
+        stripe = slice(start, start + step)
+        moments += rows[stripe].T @ (aperture[stripe].detach().double() @ columns)
     return moments
 
 
-def _axis_average(moments: Tensor, bases: list[Tensor], alpha: float, square_samples: bool) -> float:
+def _axis_average(
+    moments: Tensor, bases: list[Tensor], alpha: float, square_samples: bool
+) -> float:
     waves, weights = [], []
     for basis in bases:
         nodes, shares = unit_nodes(10 + math.ceil(2 * alpha * len(basis)))

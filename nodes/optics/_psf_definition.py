@@ -1,7 +1,8 @@
-"""The PSF from its definition: every pupil sample and every pixel in float64, without any line of the fast transforms.
+"""The PSF from its definition: every pupil sample and every pixel in float64, without any line of
+the fast transforms.
 
-Phases are counted in turns and reduced to half a turn. Autograd differentiates the sums, so that the reference of the
-gradient is independent too.
+Phases are counted in turns and reduced to half a turn. Autograd differentiates the sums, so that
+the reference of the gradient is independent too.
 """
 
 import math
@@ -36,21 +37,34 @@ def by_definition(pupil: Pupil, camera: Geometry) -> Psf:
     points = [_intensity(clear, centre._replace(sensor="point"), band)[0, 0] for band in count]
     cut_off = (torch.stack(points) * (4 / math.pi)).sqrt()
     sides = torch.full_like(cut_off, 1.0 if camera.sensor == "integrated" else 0.0)
-    return Psf(torch.stack([_intensity(pupil, camera, band) for band in count]), torch.stack(peaks), cut_off, sides)
+    return Psf(
+        torch.stack([_intensity(pupil, camera, band) for band in count]),
+        torch.stack(peaks),
+        cut_off,
+        sides,
+    )
 
 
 def _intensity(pupil: Pupil, camera: Geometry, band: int) -> Tensor:
-    """Return the share of the clear pupil's light in each pixel (y, x), averaged over points within the pixel."""
+    """Return the share of the clear pupil's light in each pixel (y, x), averaged over points
+    within the pixel.
+    """
     wavelength, index = float(pupil.wavelengths[band]), float(pupil.index[band])
     amplitude = pupil.amplitude.double()
-    turns = _reduced(pupil.height.double() * (index / wavelength)) + _reduced(pupil.path.double() / wavelength)
+    turns = _reduced(pupil.height.double() * (index / wavelength)) + _reduced(
+        pupil.path.double() / wavelength
+    )
     field = amplitude * torch.exp(2j * math.pi * _reduced(turns))
-    reach = float(pupil.pitch) * camera.pixel_pitch / (wavelength * camera.focal_length)  # turns per sample and pixel
+    # turns per sample and pixel
+    reach = float(pupil.pitch) * camera.pixel_pitch / (wavelength * camera.focal_length)
     total = amplitude.new_zeros(camera.shape)
     points = _points(reach * max(field.shape)) if camera.sensor == "integrated" else [(0.0, 1.0)]
     for y, weight_y in points:
         for x, weight_x in points:
-            rows, columns = (_axis(camera, axis, shift, field.shape[axis], reach) for axis, shift in ((0, y), (1, x)))
+            rows, columns = (
+                _axis(camera, axis, shift, field.shape[axis], reach)
+                for axis, shift in ((0, y), (1, x))
+            )
             total = total + weight_y * weight_x * (rows @ field @ columns.T).abs().square()
     light: Tensor = total * (reach**2 / pupil.aperture.detach().double().square().sum())
     for centre, width, depth in pupil.notches.tolist():
@@ -59,11 +73,17 @@ def _intensity(pupil: Pupil, camera: Geometry, band: int) -> Tensor:
 
 
 def _axis(camera: Geometry, axis: int, shift: float, samples: int, reach: float) -> Tensor:
-    """Return the phasors (pixel, sample) along one axis, with the sinc envelope of square pupil pixels."""
+    """Return the phasors (pixel, sample) along one axis, with the sinc envelope of square pupil
+    pixels.
+    """
     spot = camera.focal_length * camera.angle[axis] / camera.pixel_pitch
-    pixels = torch.arange(camera.shape[axis], dtype=torch.float64) - camera.shape[axis] // 2 + (shift - spot)
-    at = torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2
-    phasors = torch.exp(-2j * math.pi * _reduced(reach * pixels[:, None] * at))
+    pixels = (
+        torch.arange(camera.shape[axis], dtype=torch.float64)
+        - camera.shape[axis] // 2
+        + (shift - spot)
+    )
+    sample = torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2
+    phasors = torch.exp(-2j * math.pi * _reduced(reach * pixels[:, None] * sample))
     return phasors * torch.sinc(reach * pixels)[:, None] if camera.pixel == "zoh" else phasors
 
 
@@ -73,7 +93,9 @@ def _reduced(turns: Tensor) -> Tensor:
 
 
 def _points(fringes: float) -> list[tuple[float, float]]:
-    """Return Gauss-Legendre points across a pixel and weights, exact to 1e-9 for ``fringes`` turns per pixel."""
+    """Return Gauss-Legendre points across a pixel and weights, exact to 1e-9 for ``fringes``
+    turns per pixel.
+    """
     import numpy as np
 
     x, w = np.polynomial.legendre.leggauss(10 + math.ceil(4 * fringes))

@@ -1,14 +1,22 @@
-"""The grid on which the pupil is sampled: the coordinates of the samples, and the samples inside the stop."""
+"""The stop of the lens, and the grid on which the pupil is sampled."""
 
 import math
 from collections.abc import Iterator
-from typing import Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from neusee.nodes import ParameterError
+from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.units import Diameter, PupilPitch
 from neusee.nodes.values import Stop
+
+# --- pupil grid -----------------------------------------------------------------------------------
+
+# The grid on which the pupil is sampled: the coordinates of the samples, and the samples inside the
+# stop.
+
 
 _ALL = slice(None)
 _STRIPE = 1 << 16  #: samples of the pupil worked on at a time
@@ -18,7 +26,9 @@ Number = TypeVar("Number", float, Tensor)
 
 
 class PupilGrid(NamedTuple):
-    """The pupil grid of a `Stop` as Python numbers instead of tensors: samples, pitch and diameter."""
+    """The pupil grid of a `Stop` as Python numbers instead of tensors: samples, pitch and
+    diameter.
+    """
 
     samples: int  #: number of samples along each axis
     pitch: float  #: m between samples
@@ -30,28 +40,42 @@ def grid_of(stop: Stop) -> PupilGrid:
     return PupilGrid(int(stop.samples), float(stop.pitch), float(stop.diameter))
 
 
-def pupil_grid(samples: int, pitch: float | None, diameter: float, aperture: Aperture = "held") -> PupilGrid:
-    """Return the pupil grid of an aperture; without a ``pitch`` the grid is as wide as the aperture.
+def pupil_grid(
+    samples: int, pitch: float | None, diameter: float, aperture: Aperture = "held"
+) -> PupilGrid:
+    """Return the pupil grid of an aperture; without a ``pitch`` the grid is as wide as the
+    aperture.
 
-    ``aperture`` says what happens where grid and aperture differ in width. `held`: a wider aperture is refused.
-    `stretched`: the pitch is changed so that the grid is as wide as the aperture. `inscribed`: a wider aperture is
-    narrowed to the grid. `clipped`: the square grid cuts a wider aperture.
+    ``aperture`` says what happens where grid and aperture differ in width. `held`: a wider aperture
+    is refused. `stretched`: the pitch is changed so that the grid is as wide as the aperture.
+    `inscribed`: a wider aperture is narrowed to the grid. `clipped`: the square grid cuts a wider
+    aperture.
 
-    Raises: ParameterError where no sample lies inside the aperture, and for `held` where the aperture is wider than
-            the grid.
+    Raises: ParameterError where no sample lies inside the aperture, and for `held` where the
+            aperture is wider than the grid.
     """
-    if pitch is None or (aperture == "stretched" and not math.isclose(samples * pitch, diameter, rel_tol=_SAME)):
+    if pitch is None or (
+        aperture == "stretched" and not math.isclose(samples * pitch, diameter, rel_tol=_SAME)
+    ):
         return PupilGrid(samples, diameter / samples, diameter)
     span = samples * pitch
     nearest = 0.0 if samples % 2 else pitch * math.sqrt(0.5)
     if diameter < 2 * nearest:
         needed = f"{2 * nearest * 1e6:.3g} um"
         raise ParameterError(
-            "diameter", f"{diameter * 1e6:.3g} um holds no pupil sample: give {needed} or more, or a finer pitch"
+            "diameter",
+            f"{diameter * 1e6:.3g} um holds no pupil sample: give {needed} or more, or a finer"
+            " pitch",
         )
     if aperture == "held" and is_wider(diameter, span):
-        text = f"{millimetres(diameter)} is wider than the pupil grid of {samples} x {pitch * 1e6:.4g} um"
-        fix = f"give samples: {math.ceil(diameter / pitch * (1 - _SAME))}, leave the pitch out, or choose"
+        text = (
+            f"{millimetres(diameter)} is wider than the pupil grid of {samples} x"
+            f" {pitch * 1e6:.4g} um"
+        )
+        fix = (
+            f"give samples: {math.ceil(diameter / pitch * (1 - _SAME))}, leave the pitch out, or"
+            " choose"
+        )
         raise ParameterError("diameter", f"{text} = {millimetres(span)}: {fix} aperture: stretched")
     return PupilGrid(samples, pitch, diameter if aperture == "clipped" else min(diameter, span))
 
@@ -67,12 +91,16 @@ def millimetres(length: float) -> str:
 
 
 def clear_diameter(stop: Stop) -> Tensor:
-    """Return the diameter of the clear aperture along the axes, which the grid may cut: () float64, m."""
+    """Return the diameter of the clear aperture along the axes, which the grid may cut: ()
+    float64, m.
+    """
     return torch.minimum(stop.diameter.double(), stop.samples * stop.pitch.double())
 
 
 def clear_area(stop: Stop) -> float:
-    """Return the area of the clear pupil in m2: a disc, cut by the square of the grid where the disc is wider."""
+    """Return the area of the clear pupil in m2: a disc, cut by the square of the grid where the
+    disc is wider.
+    """
     radius, half = float(stop.diameter) / 2, float(stop.samples * stop.pitch) / 2
     if half >= radius:
         return math.pi * radius**2
@@ -85,17 +113,22 @@ def clear_area(stop: Stop) -> float:
 def gaussian_over(stop: Stop, width: Number) -> Number:
     """Return the integral of exp(-(r / width)^2) over the clear pupil in m2, with r from the axis.
 
-    The pupil is the disc of the stop, cut by the square of the grid where the disc is wider. Integrated over r in
-    closed form, and over one eighth of the azimuth by Gauss and Legendre, to 1e-13. A tensor receives its gradient.
+    The pupil is the disc of the stop, cut by the square of the grid where the disc is wider.
+    Integrated over r in closed form, and over one eighth of the azimuth by Gauss and Legendre, to
+    1e-13. A tensor receives its gradient.
     """
     radius, half = float(stop.diameter) / 2, float(stop.samples * stop.pitch) / 2
     if half >= radius:
         return math.pi * width**2 * _share_within(radius, width)
     corner = min(math.acos(half / radius), math.pi / 4)
-    straight = corner / 2 * sum(weight * _share_within(edge, width) for edge, weight in _edges(half, corner))
+    straight = (
+        corner
+        / 2
+        * sum(weight * _share_within(edge, width) for edge, weight in _edges(half, corner))
+    )
     curved = (math.pi / 4 - corner) * _share_within(radius, width)
-    whole: Number = 4 * width**2 * (straight + curved)
-    return whole
+    integral: Number = 4 * width**2 * (straight + curved)
+    return integral
 
 
 def _share_within(radius: float, width: Number) -> Number:
@@ -106,28 +139,38 @@ def _share_within(radius: float, width: Number) -> Number:
 
 
 def _edges(half: float, corner: float) -> list[tuple[float, float]]:
-    """Return the distances of a straight edge of the grid from the axis, up to a corner angle, with their weights."""
+    """Return the distances of a straight edge of the grid from the axis, up to a corner angle,
+    with their weights.
+    """
     import numpy as np
 
     nodes, weights = np.polynomial.legendre.leggauss(40)
-    return list(zip((half / np.cos(corner * (nodes + 1) / 2)).tolist(), weights.tolist(), strict=True))
+    return list(
+        zip((half / np.cos(corner * (nodes + 1) / 2)).tolist(), weights.tolist(), strict=True)
+    )
 
 
 def axes(grid: PupilGrid, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
-    """Return the coordinates v (samples, 1) and u (1, samples) in units of the stop's radius, float64."""
+    """Return the coordinates v (samples, 1) and u (1, samples) in units of the stop's radius,
+    float64.
+    """
     steps = torch.arange(grid.samples, dtype=torch.float64, device=device) - (grid.samples - 1) / 2
     line = steps * (2 * grid.pitch / grid.diameter)
     return line[:, None], line[None, :]
 
 
 def polar(grid: PupilGrid, device: torch.device | None = None) -> tuple[Tensor, Tensor]:
-    """Return the radius in units of the stop's radius, and the azimuth from +u towards +v, both float64 (v, u)."""
+    """Return the radius in units of the stop's radius, and the azimuth from +u towards +v, both
+    float64 (v, u).
+    """
     v, u = axes(grid, device)
     return torch.hypot(v, u), torch.atan2(v.expand(grid.samples, -1), u.expand(grid.samples, -1))
 
 
 def inside(grid: PupilGrid, device: torch.device | None = None, rows: slice = _ALL) -> Tensor:
-    """Return True for each sample whose centre lies inside the stop, bool (v, u); ``rows`` selects some rows."""
+    """Return True for each sample whose centre lies inside the stop, bool (v, u); ``rows``
+    selects some rows.
+    """
     v, u = axes(grid, device)
     return v[rows].square() + u.square() <= 1
 
@@ -142,16 +185,109 @@ def opening(grid: PupilGrid, dtype: torch.dtype, device: torch.device | None = N
 
 
 def stripes(grid: PupilGrid) -> Iterator[slice]:
-    """Yield slices of a few pupil rows, short enough that float64 temporaries fit in the CPU's cache."""
+    """Yield slices of a few pupil rows, short enough that float64 temporaries fit in the CPU's
+    cache.
+    """
     step = max(1, _STRIPE // grid.samples)
     return (slice(first, first + step) for first in range(0, grid.samples, step))
 
 
 def refuse_other_grid(height: Tensor, grid: PupilGrid) -> None:
     """Raise ValueError unless the height map has the shape of the pupil grid."""
-    wanted = (grid.samples, grid.samples)
-    if tuple(height.shape) != wanted:
+    grid_shape = (grid.samples, grid.samples)
+    if tuple(height.shape) != grid_shape:
         raise ValueError(
-            f"height is {tuple(height.shape)}, not the square pupil grid {wanted} of `stop`: resample the height, "
-            "or compute the height from the same `stop` step"
+            f"height is {tuple(height.shape)}, not the square pupil grid {grid_shape} of `stop`:"
+            " resample the height, or compute the height from the same `stop` step"
         )
+
+
+# --- stop -----------------------------------------------------------------------------------------
+
+# The stop of the lens and the grid on which the pupil is sampled.
+
+
+#: relative difference of grid and aperture that is not worth a word: a pitch written with four
+#: digits
+_ROUNDED = 1e-3
+
+
+#: samples of the pupil along an axis; fewer than four are no round aperture
+Samples = Annotated[int, Field(ge=4, le=100_000)]
+
+
+@node(rtol=1e-12, before_run=True)
+def stop(
+    *,
+    samples: Samples,
+    pitch: PupilPitch | None = None,
+    diameter: Diameter,
+    aperture: Aperture = "held",
+) -> Stop:
+    """Place the round stop of the lens on the square grid of the pupil.
+
+    Without a ``pitch`` the grid is as wide as the aperture. ``aperture`` says what happens where
+    the two differ:
+
+    - `held`: an aperture that is wider than the grid is refused;
+    - `stretched`: the pitch is changed so that the grid is as wide as the aperture;
+    - `inscribed`: a wider aperture is narrowed to the grid;
+    - `clipped`: the square grid cuts a wider aperture.
+
+    Shapes: -> samples, pitch, diameter, each ().
+    Units:  pitch and diameter m; samples along each axis.
+    Error:  exact.
+    Raises: ParameterError before the run where no sample lies inside the aperture, and for `held`
+            where the aperture is wider than the grid.
+    Source: by definition.
+    """
+    grid = pupil_grid(samples, pitch, diameter, aperture)
+    pitch_and_diameter = (torch.tensor(length, dtype=torch.float64) for length in grid[1:])
+    return Stop(torch.tensor(grid.samples), *pitch_and_diameter)
+
+
+@stop.preflight
+def _(
+    *,
+    samples: int,
+    pitch: float | None = None,
+    diameter: float,
+    aperture: Aperture = "held",
+    **_: Any,
+) -> list[str]:
+    grid = pupil_grid(samples, pitch, diameter, aperture)
+    if pitch is None or math.isclose(samples * pitch, diameter, rel_tol=_ROUNDED):
+        return []
+    span = samples * pitch
+    written = f"{samples} x {pitch * 1e6:.4g} um = {millimetres(span)}"
+    if aperture == "stretched":
+        fit = (
+            f"the pitch becomes {grid.pitch * 1e6:.4g} um, so that {samples} samples span the"
+            " aperture"
+        )
+        return [f"aperture {millimetres(diameter)}, pupil grid {written}: {fit}"]
+    if is_wider(diameter, span):
+        left = (
+            f"a disc of {millimetres(span)}"
+            if aperture == "inscribed"
+            else "a disc cut by the square grid"
+        )
+        return [
+            f"aperture {millimetres(diameter)} > pupil grid {written}: {aperture}, {left}; see"
+            " reading.aperture"
+        ]
+    return []
+
+
+@stop.check
+def _(result: Stop, *, diameter: float, aperture: Aperture = "held", **_: Any) -> list[Check]:
+    samples, pitch, clear = grid_of(result)
+    span = samples * pitch
+    narrowed = (
+        f", {aperture} instead of the requested {millimetres(diameter)}"
+        if is_wider(diameter, span)
+        else ""
+    )
+    return [
+        Check(f"clear pupil {millimetres(min(span, clear))}{narrowed}, {samples} samples across")
+    ]

@@ -5,16 +5,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neusee.nodes.optics._imaging._band_image import image
-from neusee.nodes.optics._imaging._channel_image import image_channels
-from neusee.nodes.optics._imaging._few_bands import few_bands, few_bands_checked, pupil_of_bands
-from neusee.nodes.optics._laser_direction import direction
-from neusee.nodes.optics._laser_spot import laser_irradiance
+from neusee.nodes.optics._band_image import image
+from neusee.nodes.optics._channel_image import image_channels
+from neusee.nodes.optics._few_bands import few_bands, few_bands_checked, pupil_of_bands
+from neusee.nodes.optics._laser_spot import direction, laser_irradiance
 from neusee.nodes.optics._pixel_average import FINE_SAMPLES, fine_axes
 from neusee.nodes.optics._psf import psf
 from neusee.nodes.optics._pupil import pupil
 from neusee.nodes.optics._pupil_grid import clear_diameter
-from neusee.nodes.optics._transform._fused_plan import expected_seconds
+from neusee.nodes.optics._transform._fused import expected_seconds
 from neusee.nodes.optics._transform._sample_axis import Axis
 from neusee.nodes.optics._white_irradiance import white_irradiance
 from neusee.nodes.shape_rules import at_least_single, blank, double, known, transform_operations
@@ -41,19 +40,32 @@ def _(
     even = wavefront is None or (known(wavefront.taper) and not float(wavefront.taper))
     open_ = clear if dirt is None and shade is None and even else amplitude
     notches = double(0, 3) if shade is None else shade.notches
-    return Pupil(clear, open_, relief, path, wave, bands.centres, stop.pitch, notches, clear_diameter(stop))
+    return Pupil(
+        clear, open_, relief, path, wave, bands.centres, stop.pitch, notches, clear_diameter(stop)
+    )
 
 
 @psf.shape
-def _(pupil: Pupil, *direction: Any, shape: tuple[int, int], precision: str = "single", **params: Any) -> Psf:
+def _(
+    pupil: Pupil, *direction: Any, shape: tuple[int, int], precision: str = "single", **params: Any
+) -> Psf:
     dtype = torch.float64 if precision == "double" else torch.float32
     bands = len(pupil.wavelengths)
     return Psf(blank(bands, *shape, dtype=dtype), double(bands), double(bands), double(bands))
 
 
 @psf.work
-def _(result: Psf, pupil: Pupil, *direction: Any, focal_length: float, pixel_pitch: float, **params: Any) -> Any:
-    """Return the operations of the C++; where there is no compiler, torch takes about three times as long."""
+def _(
+    result: Psf,
+    pupil: Pupil,
+    *direction: Any,
+    focal_length: float,
+    pixel_pitch: float,
+    **params: Any,
+) -> Any:
+    """Return the operations of the C++; where there is no compiler, torch takes about three
+    times as long.
+    """
     wavelength = float(pupil.wavelengths.min()) if known(pupil.wavelengths) else _SHORT
     pitch = float(pupil.pitch) if known(pupil.pitch) else _FINE
     alpha = pitch * pixel_pitch / (wavelength * focal_length)
@@ -63,7 +75,9 @@ def _(result: Psf, pupil: Pupil, *direction: Any, focal_length: float, pixel_pit
     if params.get("sensor") != "integrated":
         return _field_bytes(points), bands * 1e9 * expected_seconds(*points)
     fine = fine_axes(samples, (size[0], size[1]), alpha, result.intensity.dtype)
-    axes = [Axis(n, grid.samples, alpha / grid.per_pixel) for n, grid in zip(samples, fine, strict=True)]
+    axes = [
+        Axis(n, grid.samples, alpha / grid.per_pixel) for n, grid in zip(samples, fine, strict=True)
+    ]
     average = _FILTER_SECONDS * axes[0].n_out * axes[1].n_out
     strip = 8.0 * min(FINE_SAMPLES, axes[0].n_out * axes[1].n_out)
     return _field_bytes(axes) + strip, bands * 1e9 * (expected_seconds(*axes) + average)
@@ -81,13 +95,19 @@ def _(radiance: Tensor, psf: Psf, **params: Any) -> Tensor:
 @image.work
 def _(result: Tensor, radiance: Tensor, psf: Psf, *, border: str = "zero", **params: Any) -> Any:
     size = _padded(radiance, psf, border)
-    around = result.nbytes if border == "zero" else result[..., 0, 0].numel() * 4.0 * size[0] * size[1]
-    return 8.0 * size[0] * size[1] + around, result[..., 0, 0].numel() * 3 * transform_operations(*size)
+    around = (
+        result.nbytes if border == "zero" else result[..., 0, 0].numel() * 4.0 * size[0] * size[1]
+    )
+    return 8.0 * size[0] * size[1] + around, result[..., 0, 0].numel() * 3 * transform_operations(
+        *size
+    )
 
 
 @few_bands.shape
 def _(pupil: Pupil, *others: Any, **params: Any) -> FewBands:
-    """Return the choice of all bands, because the number of bands in use is not known before the run."""
+    """Return the choice of all bands, because the number of bands in use is not known before the
+    run.
+    """
     count = len(pupil.wavelengths)
     return FewBands(double(count, count), blank(count, dtype=torch.int64), double(), double())
 
@@ -99,14 +119,18 @@ def _(few: FewBands, *others: Any, **params: Any) -> FewBands:
 
 @pupil_of_bands.shape
 def _(pupil: Pupil, few: FewBands) -> Pupil:
-    """Return the pupil of all bands: the number of bands in use is not known before the run, nor are they."""
+    """Return the pupil of all bands: the number of bands in use is not known before the run, nor
+    are they.
+    """
     return pupil
 
 
 @few_bands.work
 @few_bands_checked.work
 def _(result: FewBands, *inputs: Any, **params: Any) -> tuple[float, float]:
-    """Return the work of PSFs of all bands in 480 x 480 pixels, which is that of a mask that spreads the light."""
+    """Return the work of PSFs of all bands in 480 x 480 pixels, which is that of a mask that
+    spreads the light.
+    """
     pixels = len(result.share) * 480.0**2
     return 16.0 * pixels, 100.0 * pixels
 
@@ -115,15 +139,25 @@ def _(result: FewBands, *inputs: Any, **params: Any) -> tuple[float, float]:
 def _(radiance: LowRankCube, psf: Psf, rows: Tensor, *few: Any, **params: Any) -> Channels:
     dtype = at_least_single(radiance.planes, psf.intensity)
     planes = blank(len(rows), *radiance.planes.shape[1:], dtype=dtype)
-    kept = blank(5, dtype=torch.int64)
-    return Channels(planes, double(*rows.shape), double(), kept, double(), double(2))
+    sizes = blank(5, dtype=torch.int64)
+    return Channels(planes, double(*rows.shape), double(), sizes, double(), double(2))
 
 
 @image_channels.work
 def _(
-    result: Channels, radiance: LowRankCube, psf: Psf, rows: Tensor, *few: Any, border: str = "zero", **params: Any
+    result: Channels,
+    radiance: LowRankCube,
+    psf: Psf,
+    rows: Tensor,
+    *few: Any,
+    border: str = "zero",
+    **params: Any,
 ) -> tuple[float, float]:
-    (high, wide), (k, y, x), r = _padded(radiance.planes, psf, border), radiance.planes.shape, len(rows)
+    (high, wide), (k, y, x), r = (
+        _padded(radiance.planes, psf, border),
+        radiance.planes.shape,
+        len(rows),
+    )
     m, n = (min(a, 2 * b - 1) for a, b in zip(psf.intensity.shape[-2:], (y, x), strict=True))
     tall = y if border == "zero" else y + m
     rows_of_spectra = 4.0 * wide * (k * tall + r * k * m + r * y)
@@ -139,9 +173,17 @@ def _(psf: Psf, bands: Bands, *others: Any, **params: Any) -> Tensor:
 
 
 @white_irradiance.shape
-def _(bands: Bands, stop: Stop, *, illuminance: Any = None, luminance: Any = None, **params: Any) -> Tensor:
-    """Return 0 for a scene without a brightness in lux or cd/m2, because this needs no table of an illuminant."""
-    return torch.zeros((), dtype=torch.float64) if illuminance is None and luminance is None else double()
+def _(
+    bands: Bands, stop: Stop, *, illuminance: Any = None, luminance: Any = None, **params: Any
+) -> Tensor:
+    """Return 0 for a scene without a brightness in lux or cd/m2, because this needs no table of
+    an illuminant.
+    """
+    return (
+        torch.zeros((), dtype=torch.float64)
+        if illuminance is None and luminance is None
+        else double()
+    )
 
 
 @direction.shape
@@ -150,7 +192,9 @@ def _(*, angle: tuple[float, float] | None = None, **params: Any) -> Tensor:
 
 
 def _padded(scene: Tensor, psf: Psf, border: str) -> tuple[int, int]:
-    """Return the size of the transforms that convolve a scene with a PSF; a reflected border makes the scene wider."""
+    """Return the size of the transforms that convolve a scene with a PSF; a reflected border
+    makes the scene wider.
+    """
     sides = zip(scene.shape[-2:], psf.intensity.shape[-2:], strict=True)
     y, x = (n + (2 if border == "reflect" else 1) * min(k, 2 * n - 1) for n, k in sides)
     return y, x

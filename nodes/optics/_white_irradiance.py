@@ -34,31 +34,40 @@ def white_irradiance(
     focal_length: FocalLength,
     lens_transmittance: Transmittance = 1.0,
 ) -> Tensor:
-    """Compute the irradiance of one band on the sensor, for a scene of relative radiance 1 without a mask.
+    """Compute the irradiance of one band on the sensor, for a scene of relative radiance 1 without
+    a mask.
 
-    A white surface (reflectance 1, Lambertian) has the luminance illuminance / pi, and the spectrum of the illuminant.
-    The lens images its radiance as the area of the clear pupil / focal length^2 x transmittance.
+    A white surface (reflectance 1, Lambertian) has the luminance illuminance / pi, and the spectrum
+    of the illuminant. The lens images its radiance as the area of the clear pupil / focal length^2
+    x transmittance.
 
     Shapes: -> () float64.
-    Units:  result W/m2 in a band per unit of the image, whose white has mean 1 over the bands; 0 if neither illuminance
-            nor luminance is given.
+    Units:  result W/m2 in a band per unit of the image, whose white has mean 1 over the bands; 0 if
+            neither illuminance nor luminance is given.
     Error:  a distant scene, on the axis: the falling off to the corners (cos^4) is left out.
-    Raises: ParameterError before the run for an illuminance beside a luminance, for bands of different widths, and for
-            a table of light that does not reach over the visible wavelengths.
-    Source: CIE 18:2019 (683 lm/W); Goodman, Introduction to Fourier Optics, 3rd ed., section 5.3; by definition.
+    Raises: ParameterError before the run for an illuminance beside a luminance, for bands of
+            different widths, and for a table of light that does not reach over the visible
+            wavelengths.
+    Source: CIE 18:2019 (683 lm/W); Goodman, Introduction to Fourier Optics, 3rd ed., section 5.3;
+            by definition.
     """
     if illuminance is None and luminance is None:
         return torch.zeros((), dtype=torch.float64)
-    candela = (0.0 if luminance is None else luminance) if illuminance is None else illuminance / math.pi
+    candela = (
+        (0.0 if luminance is None else luminance) if illuminance is None else illuminance / math.pi
+    )
     widths = bands.widths.detach().cpu().double()
     radiance = candela * luminous_share(bands, kind, temperature)
     if float(widths.max() / widths.min()) > 1 + _EQUAL:
         raise ParameterError("illuminance", _WIDTHS)
-    return torch.as_tensor(radiance * clear_area(stop) / focal_length**2 * lens_transmittance, dtype=torch.float64)
+    return torch.as_tensor(
+        radiance * clear_area(stop) / focal_length**2 * lens_transmittance, dtype=torch.float64
+    )
 
 
 _WIDTHS = (
-    "the bands differ in width, so that one unit of the image is another power in each: use the node spectra.bands"
+    "the bands differ in width, so that one unit of the image is another power in each: use the"
+    " node spectra.bands"
 )
 
 
@@ -75,19 +84,28 @@ def _(
 ) -> list[str]:
     if illuminance is None and luminance is None:
         return []
-    given = "illuminance" if illuminance is not None else "luminance"
+    stated = "illuminance" if illuminance is not None else "luminance"
     if illuminance is not None and luminance is not None:
-        text = "the brightness of white is stated twice: leave scene.illuminance or scene.luminance out"
+        text = (
+            "the brightness of white is stated twice: leave scene.illuminance or"
+            " scene.luminance out"
+        )
         raise ParameterError("luminance", text)
-    if bands is not None and not bands.widths.is_meta and float(bands.widths.max() / bands.widths.min()) > 1 + _EQUAL:
-        raise ParameterError(given, _WIDTHS)
+    if (
+        bands is not None
+        and not bands.widths.is_meta
+        and float(bands.widths.max() / bands.widths.min()) > 1 + _EQUAL
+    ):
+        raise ParameterError(stated, _WIDTHS)
     if isinstance(kind, Path):
         luminous_share(bands, kind, temperature)
     return []
 
 
 @white_irradiance.check
-def _(result: Tensor, bands: Bands, stop: Stop, *, focal_length: float, **params: object) -> list[Check]:
+def _(
+    result: Tensor, bands: Bands, stop: Stop, *, focal_length: float, **params: object
+) -> list[Check]:
     if not float(result) > 0:
         return [Check("no brightness in lux or cd/m2")]
     number = focal_length / (2 * math.sqrt(clear_area(stop) / math.pi))

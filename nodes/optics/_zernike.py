@@ -1,4 +1,4 @@
-"""Zernike polynomials over the stop, of unit root mean square, in Noll's numbering."""
+"""Zernike polynomials and smooth random phase screens over the stop."""
 
 import math
 from collections.abc import Mapping
@@ -8,11 +8,18 @@ from torch import Tensor
 
 from neusee.nodes.optics._pupil_grid import PupilGrid, axes, inside
 
+# --- zernike --------------------------------------------------------------------------------------
+
+# Zernike polynomials over the stop, of unit root mean square, in Noll's numbering.
+
+
 _ALL = slice(None)
 
 
 def noll(index: int) -> tuple[int, int]:
-    """Return the radial order n and the signed azimuthal order m (positive: cosine) of a Noll number."""
+    """Return the radial order n and the signed azimuthal order m (positive: cosine) of a Noll
+    number.
+    """
     if index < 1:
         raise ValueError(f"Zernike index {index}: Noll numbers begin at 1 (piston)")
     n = (math.isqrt(8 * index - 7) - 1) // 2
@@ -22,17 +29,25 @@ def noll(index: int) -> tuple[int, int]:
 
 
 def _radial(n: int, m: int) -> list[float]:
-    """Return the coefficients of the orthonormal radial polynomial R(n, m)(r) / r**m in rising powers of r squared."""
+    """Return the coefficients of the orthonormal radial polynomial R(n, m)(r) / r**m in rising
+    powers of r squared.
+    """
     low, high, factorial = (n - m) // 2, (n + m) // 2, math.factorial
     norm = math.sqrt((n + 1) * (1 if m == 0 else 2))
     terms = reversed(range(low + 1))
     return [
-        norm * (-1) ** k * factorial(n - k) / (factorial(k) * factorial(high - k) * factorial(low - k)) for k in terms
+        norm
+        * (-1) ** k
+        * factorial(n - k)
+        / (factorial(k) * factorial(high - k) * factorial(low - k))
+        for k in terms
     ]
 
 
 def _by_azimuth(coefficients: Mapping[int, float]) -> dict[int, list[float]]:
-    """Return one radial polynomial for each signed azimuthal order, summed over the terms of that order."""
+    """Return one radial polynomial for each signed azimuthal order, summed over the terms of
+    that order.
+    """
     sums: dict[int, list[float]] = {}
     for index, rms in coefficients.items():
         n, m = noll(index)
@@ -51,9 +66,11 @@ def _horner(coefficients: list[float], x: Tensor) -> Tensor:
 
 
 def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
-    """Return the weighted sum of Zernike polynomials at (v, u), in units of the radius; the weights are by Noll number.
+    """Return the weighted sum of Zernike polynomials at (v, u), in units of the radius; the weights
+    are by Noll number.
 
-    The sum is written in powers of u + iv, so neither the centre nor the cut of the azimuth needs special treatment.
+    The sum is written in powers of u + iv, so neither the centre nor the cut of the azimuth needs
+    special treatment.
     Source: Noll, J. Opt. Soc. Am. 66, 207 (1976), Eqs. 1 and 2.
     """
     sums = _by_azimuth(coefficients)
@@ -68,8 +85,49 @@ def combine(coefficients: Mapping[int, float], v: Tensor, u: Tensor) -> Tensor:
 
 
 def surface(
-    coefficients: Mapping[int, float], grid: PupilGrid, device: torch.device | None = None, rows: slice = _ALL
+    coefficients: Mapping[int, float],
+    grid: PupilGrid,
+    device: torch.device | None = None,
+    rows: slice = _ALL,
 ) -> Tensor:
-    """Return a weighted sum of Zernike polynomials on the pupil grid (v, u), float64, 0 outside the stop."""
+    """Return a weighted sum of Zernike polynomials on the pupil grid (v, u), float64, 0 outside
+    the stop.
+    """
     v, u = axes(grid, device)
     return torch.where(inside(grid, device, rows), combine(coefficients, v[rows], u), 0.0)
+
+
+# --- phase screen ---------------------------------------------------------------------------------
+
+# Smooth random phase screens over the pupil, the same at every sampling of the pupil.
+
+
+def screen(
+    grid: PupilGrid, scale: float, rng: torch.Generator, device: torch.device | None = None
+) -> Tensor:
+    """Return a random phase screen (v, u), float64: Gaussian noise with variance 1 and correlation
+    exp(-(d / scale)**2).
+    """
+    rows, columns = factors(grid, scale, rng, device)
+    return rows @ columns
+
+
+def factors(
+    grid: PupilGrid, scale: float, rng: torch.Generator, device: torch.device | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return matrices (v, n) and (n, u) whose product is a random phase screen, so that single rows
+    can be computed.
+
+    ``scale`` is in units of the diameter. Gaussians of width scale / 2 smooth white noise on a
+    lattice. The lattice does not depend on the sampling of the pupil, so the screen does not depend
+    on the sampling either.
+    """
+    width = scale / 2
+    half = max(0.5, grid.samples * grid.pitch / (2 * grid.diameter)) + 4 * width
+    count = 2 * math.ceil(half / width) + 1
+    white = torch.randn(count, count, generator=rng, device=rng.device, dtype=torch.float64)
+    line = axes(grid, device)[0] / 2
+    centres = (torch.arange(count, dtype=torch.float64, device=line.device) - count // 2) * width
+    spread = torch.exp(-((line - centres) ** 2) / (2 * width**2))
+    spread = spread / spread.square().sum(1, keepdim=True).sqrt()
+    return spread @ white.to(line.device), spread.T

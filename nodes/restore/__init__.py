@@ -1,33 +1,34 @@
 """Restoration nodes, which compute a colour picture of the scene from raw digital numbers."""
 
 from neusee.nodes.restore import _result_shapes  # noqa: F401  attaches the shape rules
-from neusee.nodes.restore._colour_matrix import colour_matrix
-from neusee.nodes.restore._electrons_and_colour import clipped, colour, electrons
-from neusee.nodes.restore._inverse._filter_facts import filter_facts
-from neusee.nodes.restore._inverse._frame_blur import FrameBlur, frame_blur
-from neusee.nodes.restore._inverse._nearby_glare import nearby_glare
+from neusee.nodes.restore._electrons_and_colour import (
+    clipped,
+    colour,
+    colour_matrix,
+    electrons,
+    white_level,
+)
+from neusee.nodes.restore._inverse._glare import nearby_glare
+from neusee.nodes.restore._inverse._masked_blur import FrameBlur, frame_blur
 from neusee.nodes.restore._inverse._posterior_spread import wiener_spread
 from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
-from neusee.nodes.restore._inverse._wiener import wiener
-from neusee.nodes.restore._inverse._wiener_problem import wiener_problem
-from neusee.nodes.restore._lasers._find_lasers import find_lasers
-from neusee.nodes.restore._lasers._found_glare import found_glare, found_nearby
+from neusee.nodes.restore._inverse._wiener import filter_facts, wiener, wiener_problem
+from neusee.nodes.restore._lasers._find_lasers import find_lasers, found_glare, found_nearby
+from neusee.nodes.restore._measured_psf import measured_psf
 from neusee.nodes.restore._networks._critic import critic_slopes, critics, skip_critic_draws
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba, fft_mamba
-from neusee.nodes.restore._networks._informed import Informed, informed
-from neusee.nodes.restore._networks._nafnet import NAFNet, nafnet
-from neusee.nodes.restore._networks._network_export import export_network, require_exportable
-from neusee.nodes.restore._networks._network_node import network
+from neusee.nodes.restore._networks._network_files import (
+    export_network,
+    network,
+    require_exportable,
+)
 from neusee.nodes.restore._networks._own_network import OwnNetwork, own_network, try_network
 from neusee.nodes.restore._networks._restorer import Restorer, parameter_groups, start_network
-from neusee.nodes.restore._networks._unet import UNet, unet
-from neusee.nodes.restore._networks._unrolled import Unrolled, unrolled
-from neusee.nodes.restore._points import _result_shapes as _point_shapes  # noqa: F401  attaches the rules of shape and work
-from neusee.nodes.restore._points._by_field import spread_by_field, wiener_by_field
-from neusee.nodes.restore._points._measured_psf import measured_psf
+from neusee.nodes.restore._networks._unet_and_nafnet import NAFNet, UNet, nafnet, unet
+from neusee.nodes.restore._networks._wiener_networks import Informed, Unrolled, informed, unrolled
 from neusee.nodes.restore._sensor_likelihood import MeasuringSensor, measuring_sensor
-from neusee.nodes.restore._shading._shading_node import shading
-from neusee.nodes.restore._white_level import white_level
+from neusee.nodes.restore._shading_field import shading
+from neusee.nodes.restore._wiener_by_field import spread_by_field, wiener_by_field
 
 __all__ = [
     "FFTMamba",

@@ -1,56 +1,104 @@
-"""Shapes of the results of the restoring nodes, and the work of the deconvolution and of the networks."""
+"""Shapes of the results of the restoring nodes, and the work of those that take long."""
+
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from neusee.nodes.network_classes import Architecture
-from neusee.nodes.restore._colour_matrix import colour_matrix
-from neusee.nodes.restore._electrons_and_colour import clipped, colour, electrons
-from neusee.nodes.restore._inverse._conjugate_gradients import LOWEST
-from neusee.nodes.restore._inverse._fft_grid import halvings, torus
-from neusee.nodes.restore._inverse._filter_facts import EACH, MAPS, filter_facts
+from neusee.nodes.own_modules import Architecture
+from neusee.nodes.restore._electrons_and_colour import (
+    clipped,
+    colour,
+    colour_matrix,
+    electrons,
+    white_level,
+)
+from neusee.nodes.restore._inverse._conjugate_gradients import LOWEST, MODES, SHARE
+from neusee.nodes.restore._inverse._glare import nearby_glare
 from neusee.nodes.restore._inverse._hidden_pixels import MOST, STEPS
-from neusee.nodes.restore._inverse._lowest_frequencies import MODES, SHARE
-from neusee.nodes.restore._inverse._nearby_glare import nearby_glare
+from neusee.nodes.restore._inverse._masked_blur import bordered, halvings, torus
 from neusee.nodes.restore._inverse._posterior_spread import wiener_spread
-from neusee.nodes.restore._inverse._psf_on_grid import bordered
 from neusee.nodes.restore._inverse._richardson_lucy import richardson_lucy
-from neusee.nodes.restore._inverse._wiener import PRECISE, wiener
-from neusee.nodes.restore._inverse._wiener_problem import wiener_problem
-from neusee.nodes.restore._lasers._find_lasers import find_lasers
-from neusee.nodes.restore._lasers._found_glare import found_glare, found_nearby
+from neusee.nodes.restore._inverse._wiener import (
+    EACH,
+    MAPS,
+    PRECISE,
+    filter_facts,
+    wiener,
+    wiener_problem,
+)
+from neusee.nodes.restore._lasers._find_lasers import find_lasers, found_glare, found_nearby
+from neusee.nodes.restore._measured_psf import measured_psf
 from neusee.nodes.restore._networks._fft_mamba import fft_mamba
-from neusee.nodes.restore._networks._informed import informed
-from neusee.nodes.restore._networks._nafnet import nafnet
-from neusee.nodes.restore._networks._network_node import network
+from neusee.nodes.restore._networks._network_files import network
 from neusee.nodes.restore._networks._own_network import tried
-from neusee.nodes.restore._networks._unet import unet
-from neusee.nodes.restore._networks._unrolled import unrolled
-from neusee.nodes.restore._points._by_field import spread_by_field, wiener_by_field
-from neusee.nodes.restore._shading._frame_cells import grid
-from neusee.nodes.restore._shading._shading_node import shading
-from neusee.nodes.restore._white_level import white_level
-from neusee.nodes.shape_rules import at_least_single, blank, double, like_first, transform_operations
-from neusee.nodes.values import Bands, FilterFacts, FoundLasers, Psf, Pupil, Shading, WienerProblem
+from neusee.nodes.restore._networks._unet_and_nafnet import nafnet, unet
+from neusee.nodes.restore._networks._wiener_networks import informed, unrolled
+from neusee.nodes.restore._point_frames import points_in
+from neusee.nodes.restore._shading_field import grid, shading
+from neusee.nodes.restore._wiener_by_field import spread_by_field, wiener_by_field
+from neusee.nodes.shape_rules import (
+    at_least_single,
+    blank,
+    double,
+    like_first,
+    transform_operations,
+)
+from neusee.nodes.values import (
+    Bands,
+    FilterFacts,
+    FoundLasers,
+    MeasuredPsf,
+    Psf,
+    Pupil,
+    Shading,
+    WienerProblem,
+)
+
+# --- result shapes --------------------------------------------------------------------------------
+
+# Shapes of the results of the restoring nodes, and the work of the deconvolution and of the
+# networks.
+
 
 _SYSTEM = 35.0  #: bytes for each element of a dense system: the matrix, its factors and copies
-_INVERTED = 0.30  #: operations of a transform that take as long as one of the cube of the side of an inverted matrix
-_WHITENED = 0.94  #: side of a dense system that needs as much memory as an inverted matrix of side 1
-_FILLED = 790.0  #: operations of a transform that take as long as an element of a matrix of covariances
-_FOCUS = 2.0  #: transforms, of the size of pupil and window together, that take as long as a band of a PSF
-_MODE = 24.0  #: bytes for each pixel of a pattern that the glare may have: its copies, scaled and weighted
-_SEARCHED = 150.0  #: bytes for each pixel of a frame in which lasers are searched: patterns, and slopes of a fit
+#: operations of a transform that take as long as one of the cube of the side of an inverted matrix
+_INVERTED = 0.30
+#: side of a dense system that needs as much memory as an inverted matrix of side 1
+_WHITENED = 0.94
+#: operations of a transform that take as long as an element of a matrix of covariances
+_FILLED = 790.0
+#: transforms, of the size of pupil and window together, that take as long as a band of a PSF
+_FOCUS = 2.0
+#: bytes for each pixel of a pattern that the glare may have: its copies, scaled and weighted
+_MODE = 24.0
+#: bytes for each pixel of a frame in which lasers are searched: patterns, and slopes of a fit
+_SEARCHED = 150.0
 _LINES = 61  #: spectral lines that a search tries, each with five transforms
-_KEPT = 1 / 8  #: bytes of inner results of a network that need as much memory as a byte of the usual work of a node
+#: bytes of inner results of a network that need as much memory as a byte of the usual work of a
+#: node
+_KEPT = 1 / 8
 _LAWS = 400.0  #: bytes, and operations, of the laws of a scene for each element of their matrices
 _FIELD = 60.0  #: products of matrices of the knots
 _LAYER = 1e-3  #: operations of a transform that take as long as one of a layer
 
-for node in (electrons, wiener, wiener_by_field, richardson_lucy, fft_mamba, informed, nafnet, network, unet, unrolled):
+for node in (
+    electrons,
+    wiener,
+    wiener_by_field,
+    richardson_lucy,
+    fft_mamba,
+    informed,
+    nafnet,
+    network,
+    unet,
+    unrolled,
+):
     node.shape(like_first)
 
 
@@ -72,16 +120,22 @@ def _(bands: Any, illuminant: Any, responses: Tensor, *inputs: Any, **params: An
 @shading.shape
 def _(responses: Any, *, shape: Sequence[int], **params: Any) -> Shading:
     y, x = shape
-    knots, one = grid((y, x)), double()
+    knots, scalar = grid((y, x)), double()
     counts = blank(dtype=torch.bool), blank(dtype=torch.int64)
-    return Shading(blank(y, x), blank(y, x), double(*knots), double(*knots), one, one, *counts, one)
+    return Shading(
+        blank(y, x), blank(y, x), double(*knots), double(*knots), scalar, scalar, *counts, scalar
+    )
 
 
 @shading.work
-def _(result: Shading, *inputs: Any, files: Sequence[Any] = (), **params: Any) -> tuple[float, float]:
+def _(
+    result: Shading, *inputs: Any, files: Sequence[Any] = (), **params: Any
+) -> tuple[float, float]:
     y, x = result.transmission.shape
     knots = result.estimate.numel()
-    return 100.0 * y * x + _LAWS * knots**2, _FIELD * knots**3 + 10.0 * len(files) * (y * x + _LAWS * knots**2)
+    return 100.0 * y * x + _LAWS * knots**2, _FIELD * knots**3 + 10.0 * len(files) * (
+        y * x + _LAWS * knots**2
+    )
 
 
 @nearby_glare.shape
@@ -90,7 +144,9 @@ def _(glare: Tensor, *inputs: Any, patterns: int = 12, **params: Any) -> Tensor:
 
 
 @nearby_glare.work
-def _(result: Tensor, glare: Tensor, pupil: Pupil, *others: Any, **params: Any) -> tuple[float, float]:
+def _(
+    result: Tensor, glare: Tensor, pupil: Pupil, *others: Any, **params: Any
+) -> tuple[float, float]:
     y, x = (n + k for n, k in zip(glare.shape[-2:], pupil.height.shape, strict=True))
     times = (len(result) + 1) * len(pupil.wavelengths)
     return 16.0 * (pupil.height.numel() + y * x), _FOCUS * times * transform_operations(y, x)
@@ -105,7 +161,20 @@ def _(electrons: Tensor, *inputs: Any, most: int = 3, **params: Any) -> FoundLas
     places, wave, width, size, ends, wave_ends, size_ends = values
     number, gain = blank(dtype=torch.int64), double(most, 2)
     straight = (double(most, channels), double(most, channels))
-    return FoundLasers(number, places, wave, width, size, ends, wave_ends, size_ends, certain, gain, spread, *straight)
+    return FoundLasers(
+        number,
+        places,
+        wave,
+        width,
+        size,
+        ends,
+        wave_ends,
+        size_ends,
+        certain,
+        gain,
+        spread,
+        *straight,
+    )
 
 
 @find_lasers.work
@@ -125,7 +194,9 @@ def _(found: Any, pupil: Any, electrons: Tensor, *, patterns: int = 12, **params
     return blank(patterns, *electrons.shape, dtype=at_least_single(electrons))
 
 
-def _summed(result: Tensor, found: Any, pupil: Pupil, electrons: Tensor, **params: Any) -> tuple[float, float]:
+def _summed(
+    result: Tensor, lasers: Any, pupil: Pupil, electrons: Tensor, **params: Any
+) -> tuple[float, float]:
     """Return the work of sums over all samples of the pupil, for each row and column of pixels."""
     side, (y, x) = max(pupil.height.shape), electrons.shape[-2:]
     count = len(result) if result.ndim > electrons.ndim else 1
@@ -137,7 +208,9 @@ for node in (found_glare, found_nearby):
 
 
 @wiener.work
-def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, **params: Any) -> tuple[float, float]:
+def _(
+    result: Tensor, electrons: Tensor, psf: Psf, *others: Any, **params: Any
+) -> tuple[float, float]:
     border = params.get("border", 1.0)
     y, x = _torus(electrons, psf, border)
     coarse = max(electrons.shape[-2:]) / 2 ** halvings((electrons.shape[-2], electrons.shape[-1]))
@@ -145,41 +218,66 @@ def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, **params: Any) 
     steps, side = _descent(electrons, psf, border)
     operations = steps + _FILLED * unknowns**2
     largest = max(unknowns, _WHITENED * side)
-    nearby = _MODE * sum(len(each) for each in (others[5] if len(others) > 5 else None) or ()) * electrons.numel()
+    nearby = (
+        _MODE
+        * sum(
+            len(patterns_drawn) for patterns_drawn in (others[5] if len(others) > 5 else None) or ()
+        )
+        * electrons.numel()
+    )
     return max(31.0 * len(electrons) * y * x, _SYSTEM * largest**2) + nearby, operations
 
 
 @wiener_spread.shape
 def _(
-    electrons: Tensor, psf: Any, illuminant: Any, responses: Any, bands: Any, clipped: Any, matrix: Tensor,
-    *glare: Any, **params: Any,
-) -> Tensor:  # fmt: skip
+    electrons: Tensor,
+    psf: Any,
+    illuminant: Any,
+    responses: Any,
+    bands: Any,
+    clipped: Any,
+    matrix: Tensor,
+    *glare: Any,
+    **params: Any,
+) -> Tensor:
     return blank(len(matrix), *electrons.shape[-2:], dtype=at_least_single(electrons))
 
 
 @spread_by_field.shape
-def _(electrons: Tensor, measured: Any, clipped: Any, matrix: Tensor, *others: Any, **params: Any) -> Tensor:
+def _(
+    electrons: Tensor, measured: Any, clipped: Any, matrix: Tensor, *others: Any, **params: Any
+) -> Tensor:
     return blank(len(matrix), *electrons.shape[-2:], dtype=at_least_single(electrons))
 
 
 @wiener_spread.work
-def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, draws: int = 8, **params: Any) -> tuple[float, float]:
-    told = (*others[:4], *others[5:])  # without the matrix
-    memory, operations = wiener.hooks.work(result, electrons, psf, *told, **params)  # type: ignore[misc]
+def _(
+    result: Tensor, electrons: Tensor, psf: Psf, *others: Any, draws: int = 8, **params: Any
+) -> tuple[float, float]:
+    inputs_of_filter = (*others[:4], *others[5:])  # without the matrix
+    memory, operations = wiener.hooks.work(result, electrons, psf, *inputs_of_filter, **params)  # type: ignore[misc]
     return 1.5 * memory, draws * operations
 
 
 @wiener_problem.shape
 def _(
-    electrons: Tensor, psf: Psf, illuminant: Any, responses: Any, bands: Any, clipped: Any, glare: Any = None,
-    nearby: Any = None, ghosts: Any = None, **params: Any,
-) -> WienerProblem:  # fmt: skip
+    electrons: Tensor,
+    psf: Psf,
+    illuminant: Any,
+    responses: Any,
+    bands: Any,
+    clipped: Any,
+    glare: Any = None,
+    nearby: Any = None,
+    ghosts: Any = None,
+    **params: Any,
+) -> WienerProblem:
     fine = torch.float64 if max(electrons.shape[-2:]) <= PRECISE else at_least_single(electrons)
     doubts = sum(len(other) for other in nearby or ())
-    count, frame, one = len(electrons), tuple(electrons.shape), (len(electrons), 1, 1)
+    count, frame, by_channel = len(electrons), tuple(electrons.shape), (len(electrons), 1, 1)
     kernels = (count, *psf.intensity.shape[-2:])
     patterns = [(number, *frame) for number in (len(glare or ()) + len(ghosts or ()), doubts)]
-    shapes = (frame, frame, kernels, *patterns, frame, frame, one, one)
+    shapes = (frame, frame, kernels, *patterns, frame, frame, by_channel, by_channel)
     return WienerProblem._make(blank(*shape, dtype=fine) for shape in shapes)
 
 
@@ -192,9 +290,11 @@ def _(result: WienerProblem, *inputs: Any, **params: Any) -> tuple[float, float]
 @filter_facts.shape
 def _(electrons: Tensor, *inputs: Any, **params: Any) -> FilterFacts:
     fine = torch.float64 if max(electrons.shape[-2:]) <= PRECISE else at_least_single(electrons)
-    frame, one = tuple(electrons.shape), (len(electrons), 1, 1)
+    frame, by_channel = tuple(electrons.shape), (len(electrons), 1, 1)
     maps = (MAPS + EACH * (len(electrons) - 3), *frame[1:])
-    return FilterFacts._make(blank(*shape, dtype=fine) for shape in (frame, frame, maps, one, one))
+    return FilterFacts._make(
+        blank(*shape, dtype=fine) for shape in (frame, frame, maps, by_channel, by_channel)
+    )
 
 
 @filter_facts.work
@@ -204,7 +304,9 @@ def _(result: FilterFacts, *inputs: Any, **params: Any) -> tuple[float, float]:
 
 
 @informed.work
-def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, width: int = 16, **params: Any) -> tuple[float, float]:
+def _(
+    result: Tensor, electrons: Tensor, psf: Psf, *others: Any, width: int = 16, **params: Any
+) -> tuple[float, float]:
     memory, operations = wiener.hooks.work(result, electrons, psf, *others)  # type: ignore[misc]
     of_layers, layers = _layers(result, width=width)
     return memory + of_layers, operations + layers
@@ -212,7 +314,13 @@ def _(result: Tensor, electrons: Tensor, psf: Psf, *others: Any, width: int = 16
 
 @unrolled.work
 def _(
-    result: Tensor, electrons: Tensor, psf: Psf, *others: Any, width: int = 16, steps: int = 2, **params: Any
+    result: Tensor,
+    electrons: Tensor,
+    psf: Psf,
+    *others: Any,
+    width: int = 16,
+    steps: int = 2,
+    **params: Any,
 ) -> tuple[float, float]:
     memory, operations = wiener.hooks.work(result, electrons, psf, *others)  # type: ignore[misc]
     of_layers, layers = _layers(result, width=width)
@@ -225,9 +333,14 @@ def _(signal: Any, clipped: Any, psf: Any, bands: Bands, *others: Any, **params:
 
 
 def _descent(electrons: Tensor, psf: Psf, border: float) -> tuple[float, float]:
-    """Return the operations of the steps on all grids but the coarsest, and the largest matrix that speeds them up."""
+    """Return the operations of the steps on all grids but the coarsest, and the largest matrix
+    that speeds them up.
+    """
     channels, *picture = electrons.shape
-    rims = [min(k // 2, max(256, n // 2), n) for n, k in zip(picture, psf.intensity.shape[-2:], strict=True)]
+    rims = [
+        min(k // 2, max(256, n // 2), n)
+        for n, k in zip(picture, psf.intensity.shape[-2:], strict=True)
+    ]
     size = torus((picture[0], picture[1]), bordered((rims[0], rims[1]), border))
     total, largest, steps = 0.0, 0.0, STEPS
     for level in range(halvings((picture[0], picture[1]))):
@@ -245,11 +358,15 @@ def _(
     result: Tensor, electrons: Tensor, psf: Psf, *others: Any, iterations: int = 40, **params: Any
 ) -> tuple[float, float]:
     y, x = _torus(electrons, psf)
-    return 4.0 * len(electrons) * y * x, 4.0 * (iterations + 1) * len(electrons) * transform_operations(y, x)
+    return 4.0 * len(electrons) * y * x, 4.0 * (iterations + 1) * len(
+        electrons
+    ) * transform_operations(y, x)
 
 
 def _torus(picture: Tensor, psf: Psf, border: float = 1.0) -> tuple[int, int]:
-    """Return the size of the transforms that deconvolve a picture, whose border they extend by the PSF."""
+    """Return the size of the transforms that deconvolve a picture, whose border they extend by
+    the PSF.
+    """
     sides = zip(picture.shape[-2:], psf.intensity.shape[-2:], strict=True)
     y, x = (n + math.ceil(border * min(k, 2 * n)) for n, k in sides)
     return y, x
@@ -279,4 +396,127 @@ def _(
     if architecture is None:
         return _layers(result)
     trial, pixels = tried(architecture, parameters, multiple), result[0].numel() / reduce**2
-    return _KEPT * trial.memory * min(pixels, tile**2 if tile else math.inf), _LAYER * trial.operations * pixels
+    return _KEPT * trial.memory * min(
+        pixels, tile**2 if tile else math.inf
+    ), _LAYER * trial.operations * pixels
+
+
+# --- result shapes --------------------------------------------------------------------------------
+
+# The shape of a measured PSF, and the work of measuring it and of restoring with it.
+
+
+_FITS = 6  #: steps of Gauss and Newton that a fit usually takes, each of as much work as a draw
+#: bytes for each pixel of each window: the points, their slopes and the arrays of a step
+_HELD = 80.0
+_SEEN = 40.0  #: bytes for each pixel of a frame while it is searched for points
+
+
+@measured_psf.shape
+def _(
+    responses: Tensor,
+    *,
+    files: Sequence[Path],
+    window: Sequence[int],
+    zones: Sequence[int],
+    draws: int = 24,
+    gain: float,
+    offset: float,
+    full_well: float,
+    read_noise: float,
+    bits: int = 16,
+    **params: Any,
+) -> MeasuredPsf:
+    channels, (y, x), (rows, columns) = len(responses), window, zones
+    kernels = rows, columns, channels, y, x
+    points = points_in(files, (y, x), (gain, offset, full_well, bits, read_noise))
+    per_zone = [double(rows, columns) for _ in range(2)]
+    return MeasuredPsf(
+        double(*kernels),
+        double(*kernels),
+        blank(draws, *kernels),
+        double(points, 4),
+        double(channels),
+        double(channels),
+        *per_zone,
+    )
+
+
+@measured_psf.work
+def _(
+    result: MeasuredPsf,
+    *inputs: Any,
+    files: Sequence[Path] = (),
+    shape: Sequence[int],
+    **params: Any,
+) -> tuple[float, float]:
+    """Return the bytes of the windows and a frame, and the products of the shifts of all draws and
+    fits.
+
+    Each node slows the iteration down, because points tell several PSFs at once.
+    """
+    rows, columns, channels, y, x = result.kernels.shape
+    windows = float(len(result.places) * channels * y * x)
+    pixels = float(channels * math.prod(shape))
+    steps = rows * columns * (_FITS + len(result.draws))
+    return _HELD * windows + _SEEN * pixels, steps * windows * (y + x) + len(files) * pixels
+
+
+@wiener_by_field.work
+def _(
+    result: Tensor,
+    electrons: Tensor,
+    measured: MeasuredPsf,
+    clipped: Any = None,
+    glare: Any = None,
+    nearby: Sequence[Tensor] | None = None,
+    **params: Any,
+) -> tuple[float, float]:
+    """Return the work of the filter on the largest part, and on all parts."""
+    rows, columns = (
+        _sides(n, count, size)
+        for n, count, size in zip(
+            electrons.shape[-2:],
+            measured.kernels.shape[:2],
+            measured.kernels.shape[-2:],
+            strict=True,
+        )
+    )
+    psf, memory, operations = Psf(measured.kernels[0, 0], measured.fit), 0.0, 0.0
+    for y in rows:
+        for x in columns:
+            window = blank(len(electrons), y, x)
+            doubts = [blank(len(patterns_drawn), *window.shape) for patterns_drawn in nearby or ()]
+            held, taken = wiener.hooks.work(
+                window, window, psf, None, None, None, None, None, doubts
+            )  # type: ignore[misc]
+            memory, operations = max(memory, held), operations + taken
+    return memory, operations
+
+
+@spread_by_field.work
+def _(
+    result: Tensor,
+    electrons: Tensor,
+    measured: MeasuredPsf,
+    clipped: Any,
+    matrix: Any,
+    *others: Any,
+    draws: int = 8,
+    **params: Any,
+) -> tuple[float, float]:
+    memory, operations = wiener_by_field.hooks.work(  # type: ignore[misc]
+        result, electrons, measured, clipped, *others[:2]
+    )
+    return memory, draws * operations
+
+
+def _sides(size: int, count: int, window: int) -> list[int]:
+    """Return the pixels that the parts around each of ``count`` nodes have along one axis, at
+    most.
+    """
+    if count == 1:
+        return [size]
+    ends = math.ceil(1.5 * size / count) + window // 2
+    inner = math.ceil(2.0 * size / count) + 2 * (window // 2)
+    return [min(side, size) for side in (ends, *[inner] * (count - 2), ends)]

@@ -1,4 +1,6 @@
-"""The likelihood of electrons that a sensor measured: noise of photons and amplifier, and pixels that clipped."""
+"""The likelihood of electrons that a sensor measured: noise of photons and amplifier, and pixels
+that clipped.
+"""
 
 from __future__ import annotations
 
@@ -14,19 +16,24 @@ from neusee.nodes.restore._electrons_and_colour import electrons
 from neusee.nodes.sensor._digitization import digitize, full_well
 from neusee.nodes.sensor._noise import dark_current, dark_electrons, photon_noise, read_noise
 
-_SURE = -12.0  #: standard deviations; further below the expectation, the clip level costs nothing in any precision
+#: standard deviations; further below the expectation, the clip level costs nothing in any precision
+_SURE = -12.0
 
 
 @dataclass(frozen=True)
 class MeasuringSensor:
-    """A sensor that measures expected electrons: Poisson-Gaussian noise, offset, full well and converter.
+    """A sensor that measures expected electrons: Poisson-Gaussian noise, offset, full well and
+    converter.
 
-    The measured electrons of a pixel that is not clipped have a normal distribution with the expectation as mean and
-    the variance of all noise. Of a clipped pixel it is only known that it reached the clip level.
+    The measured electrons of a pixel that is not clipped have a normal distribution with the
+    expectation as mean and the variance of all noise. Of a clipped pixel it is only known that it
+    reached the clip level.
 
-    Error:  a normal distribution in place of the Poisson distribution: right above about 20 e-. Rounding of the
-            converter counts as noise of variance 1/12 DN2. Numbers below 0 DN are not counted as clipped.
-    Source: EMVA Standard 1288, release 4.0 (variances); Tobin, Econometrica 26, 24 (1958) (censored measurements).
+    Error:  a normal distribution in place of the Poisson distribution: right above about 20 e-.
+            Rounding of the converter counts as noise of variance 1/12 DN2. Numbers below 0 DN are
+            not counted as clipped.
+    Source: EMVA Standard 1288, release 4.0 (variances); Tobin, Econometrica 26, 24 (1958) (censored
+            measurements).
     """
 
     well: float  #: e-
@@ -40,39 +47,62 @@ class MeasuringSensor:
 
     @property
     def level(self) -> float:
-        """Return the clip level, the least number of electrons without offset that `restore.clipped` marks, in e-."""
+        """Return the clip level, the least number of electrons without offset that
+        `restore.clipped` marks, in e-.
+        """
         top: int = max(1, min(2**self.bits - 1, int(self.well * self.gain - 0.5)))
         return (top - 0.5) / self.gain - self.offset
 
     def variance(self, expected: Tensor, floor: float = 0.0) -> Tensor:
-        """Return the variance of the measured electrons; expectations below ``floor`` count as ``floor``."""
+        """Return the variance of the measured electrons; expectations below ``floor`` count as
+        ``floor``.
+        """
         still = self.read_noise**2 + 1.0 / (12.0 * self.gain**2)
         return self.spread**2 * expected.clamp_min(floor) + still
 
-    def surprise(self, expected: Tensor, measured: Tensor, known: Tensor, floor: float = 0.0) -> Tensor:
+    def surprise(
+        self, expected: Tensor, measured: Tensor, unsaturated: Tensor, floor: float = 0.0
+    ) -> Tensor:
         """Return the negative log-likelihood of each pixel.
 
-        Shapes: expected, measured and known broadcast against one another; the result has the common shape.
-        Units:  e-, with the dark electrons and without the offset; known 0 where a pixel clipped; result nats.
+        Shapes: expected, measured and known broadcast against one another; the result has the
+                common shape.
+        Units:  e-, with the dark electrons and without the offset; known 0 where a pixel clipped;
+                result nats.
         """
         variance = self.variance(expected, floor)
         normal = (measured - expected).square() / variance + (2.0 * math.pi * variance).log()
-        return torch.where(known > 0, 0.5 * normal, -torch.special.log_ndtr(-self._distance(expected, variance)))
+        return torch.where(
+            unsaturated > 0,
+            0.5 * normal,
+            -torch.special.log_ndtr(-self._distance(expected, variance)),
+        )
 
-    def surprise_slope(self, expected: Tensor, measured: Tensor, known: Tensor, floor: float = 0.0) -> Tensor:
-        """Return the derivative of `surprise` with respect to the expected electrons, in nats/e-."""
+    def surprise_slope(
+        self, expected: Tensor, measured: Tensor, unsaturated: Tensor, floor: float = 0.0
+    ) -> Tensor:
+        """Return the derivative of `surprise` with respect to the expected electrons, in
+        nats/e-.
+        """
         variance = self.variance(expected, floor)
-        growth = self.spread**2 * (expected > floor).to(expected) / variance  # of the variance, relative
-        rest = measured - expected
-        normal = -rest / variance + 0.5 * growth * (1.0 - rest.square() / variance)
+        # of the variance, relative
+        growth = self.spread**2 * (expected > floor).to(expected) / variance
+        error = measured - expected
+        normal = -error / variance + 0.5 * growth * (1.0 - error.square() / variance)
         distance = self._distance(expected, variance)
         approach = -variance.rsqrt() - 0.5 * distance * growth
-        return torch.where(known > 0, normal, _hazard(distance) * approach)
+        return torch.where(unsaturated > 0, normal, _hazard(distance) * approach)
 
     def measured(self, expected: Tensor, rng: Generator) -> Tensor:
-        """Return one measurement of expected electrons without dark electrons, in e- without the offset."""
+        """Return one measurement of expected electrons without dark electrons, in e- without the
+        offset.
+        """
         charge = photon_noise(
-            expected, quantum_efficiency=1.0, distribution=self.distribution, spread=self.spread, rng=rng
+            expected,
+            quantum_efficiency=1.0,
+            distribution=self.distribution,
+            spread=self.spread,
+            rng=rng,
         )
         warm = dark_current(charge, mean=self.dark, rng=rng)
         noisy = read_noise(warm, offset=self.offset, read_noise=self.read_noise, rng=rng)
@@ -87,7 +117,9 @@ class MeasuringSensor:
 
 def _hazard(z: Tensor) -> Tensor:
     """Return the density of the normal distribution at z over its upper tail beyond z."""
-    hazard: Tensor = math.sqrt(2.0 / math.pi) / torch.special.erfcx(z.clamp_min(_SURE) * math.sqrt(0.5))
+    hazard: Tensor = math.sqrt(2.0 / math.pi) / torch.special.erfcx(
+        z.clamp_min(_SURE) * math.sqrt(0.5)
+    )
     return hazard
 
 
@@ -99,21 +131,29 @@ def measuring_sensor(
     digital: Mapping[str, Any],
     signal: Mapping[str, Any],
 ) -> MeasuringSensor:
-    """Return the sensor with the parameters of `photon_noise`, `dark_current`, `read_noise`, `full_well`, `digitize`
-    and `electrons`.
+    """Return the sensor with the parameters of `photon_noise`, `dark_current`, `read_noise`,
+    `full_well`, `digitize` and `electrons`.
 
-    Raises ValueError for readings of the paper in which the mean of a measurement is not the expected electrons.
+    Raises ValueError for readings of the paper in which the mean of a measurement is not the
+    expected electrons.
     """
-    wanted = {
+    settings = {
         "mean": (charge["mean"], "additive"),
         "mean_shift": (charge["mean_shift"], 0.0),
         "drawn_in": (charge["drawn_in"], "electrons"),
         "rounding": (digital["rounding"], "nearest"),
         "offset_subtracted": (signal["offset_subtracted"], True),
     }
-    wrong = [f"{name} {found!r} (must be {right!r})" for name, (found, right) in wanted.items() if found != right]
+    wrong = [
+        f"{name} {setting!r} (must be {right!r})"
+        for name, (setting, right) in settings.items()
+        if setting != right
+    ]
     if wrong:
-        raise ValueError(f"the likelihood is not that of a sensor with {', '.join(wrong)}: use `reading: coherent`")
+        raise ValueError(
+            f"the likelihood is not that of a sensor with {', '.join(wrong)}: use `reading:"
+            " coherent`"
+        )
     return MeasuringSensor(
         well=well["capacity"],
         gain=digital["gain"],

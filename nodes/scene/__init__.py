@@ -5,8 +5,13 @@ from neusee.nodes.scene._augmentation import Change, symmetry
 from neusee.nodes.scene._exr_picture import exr
 from neusee.nodes.scene._grey import grey
 from neusee.nodes.scene._hyperspectral import hyperspectral
-from neusee.nodes.scene._photograph import photograph
-from neusee.nodes.scene._photograph_folder import Photographs, choose_photograph, crop_photograph, list_photographs
+from neusee.nodes.scene._photograph import (
+    Photographs,
+    choose_photograph,
+    crop_photograph,
+    list_photographs,
+    photograph,
+)
 from neusee.nodes.scene._spectral_exr import write_spectral
 from neusee.nodes.scene._test_targets import targets
 

@@ -1,4 +1,6 @@
-"""Changes of photographs that give a training more scenes: symmetries of the square, sharpness, exposure and colour."""
+"""Changes of photographs that give a training more scenes: symmetries of the square, sharpness,
+exposure and colour.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from neusee.nodes.bicubic_resize import resize
+from neusee.nodes.resampling import resize
 
 
 @dataclass(frozen=True)
@@ -17,32 +19,49 @@ class Change:
     quarters: int = 0  #: quarter turns, counter-clockwise
     stops: float = 0.0  #: a scene of 2**stops times the light
     saturation: float = 1.0  #: of the colours; 0 is grey
-    enlarged: float = 1.0  #: factor by which a part of the photograph becomes larger, and so less sharp
+    #: factor by which a part of the photograph becomes larger, and so less sharp
+    enlarged: float = 1.0
 
     @classmethod
-    def drawn(cls, seed: tuple[int, ...], turned: bool, darker: float, colour: float, enlarged: float = 1.0) -> Change:
-        """Return the change that a seed draws, at most ``darker`` stops darker and with a saturation of 1 ± ``colour``.
+    def drawn(
+        cls,
+        seed: tuple[int, ...],
+        turned: bool,
+        darker: float,
+        colour: float,
+        enlarged: float = 1.0,
+    ) -> Change:
+        """Return the change that a seed draws, at most ``darker`` stops darker and with a
+        saturation of 1 ± ``colour``.
 
-        The factor of size is drawn by its logarithm from 1 to ``enlarged``. If ``turned``, the number of quarter turns
-        is drawn from 0 to 3; with a mirror these are the eight symmetries.
+        The factor of size is drawn by its logarithm from 1 to ``enlarged``. If ``turned``, the
+        number of quarter turns is drawn from 0 to 3; with a mirror these are the eight symmetries.
         """
         rng = np.random.default_rng(seed)
-        quarters, stops, saturation = int(rng.integers(4)), -float(rng.random()), 2.0 * float(rng.random()) - 1.0
+        quarters, stops, saturation = (
+            int(rng.integers(4)),
+            -float(rng.random()),
+            2.0 * float(rng.random()) - 1.0,
+        )
         factor = enlarged ** float(rng.random())
         return cls(quarters if turned else 0, darker * stops, 1.0 + colour * saturation, factor)
 
     def frame(self, shape: tuple[int, int]) -> tuple[int, int]:
-        """Return the rows and columns of a photograph that this change turns into a picture of ``shape``."""
+        """Return the rows and columns of a photograph that this change turns into a picture of
+        ``shape``.
+        """
         rows, columns = (max(1, round(side / self.enlarged)) for side in shape)
         return (columns, rows) if self.quarters % 2 else (rows, columns)
 
     def of(self, picture: Tensor, shape: tuple[int, int]) -> Tensor:
-        """Change a picture (3, y, x) in linear sRGB from 0 to 1 of the size of `frame`: colours, light, place and size.
+        """Change a picture (3, y, x) in linear sRGB from 0 to 1 of the size of `frame`: colours,
+        light, place and size.
 
-        The result has the rows and columns ``shape``; bicubic interpolation of a part enlarges it, without negatives.
-        The saturation is that of kornia: each encoded colour moves along the line to the grey of its luma (ITU-R
-        BT.601), and is clipped to the range from 0 to 1. The random augmentations of kornia draw from the
-        one random stream of torch, whereas these values are given.
+        The result has the rows and columns ``shape``; bicubic interpolation of a part enlarges it,
+        without negatives. The saturation is that of kornia: each encoded colour moves along the
+        line to the grey of its luma (ITU-R BT.601), and is clipped to the range from 0 to 1. The
+        random augmentations of kornia draw from the one random stream of torch, whereas these
+        values are given.
         """
         if self.saturation != 1.0:
             picture = _saturated(picture, self.saturation)
@@ -56,12 +75,16 @@ def _saturated(picture: Tensor, factor: float) -> Tensor:
     from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
     from kornia.enhance import adjust_saturation_with_gray_subtraction
 
-    changed: Tensor = rgb_to_linear_rgb(adjust_saturation_with_gray_subtraction(linear_rgb_to_rgb(picture), factor))
+    changed: Tensor = rgb_to_linear_rgb(
+        adjust_saturation_with_gray_subtraction(linear_rgb_to_rgb(picture), factor)
+    )
     return changed
 
 
 def symmetry(pictures: Tensor, seed: tuple[int, ...]) -> Tensor:
-    """Turn and mirror pictures (..., y, x) by a symmetry that a seed draws: one of eight, or of four if y is not x."""
+    """Turn and mirror pictures (..., y, x) by a symmetry that a seed draws: one of eight, or of
+    four if y is not x.
+    """
     rng = np.random.default_rng(seed)
     quarters, mirrored = int(rng.integers(4)), bool(rng.integers(2))
     if pictures.shape[-1] != pictures.shape[-2]:

@@ -1,6 +1,7 @@
 """Scene-linear OpenEXR pictures, converted to linear sRGB."""
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,13 +15,13 @@ from torch import Tensor
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes._colour_science import colour_science
 from neusee.nodes.input_files import not_finite, once_per_version, refuse_large_picture
-from neusee.nodes.scene._crop_to_frame import enlarged
-from neusee.nodes.scene._large_picture import Linear, bands_of, linear_light
+from neusee.nodes.scene._picture_scaling import Linear, bands_of, enlarged, linear_light
 from neusee.nodes.scene._spectral_exr import PartHeader, exr_parts, part_headers
 from neusee.nodes.units import DataFile, Shape
 
 White = Annotated[float, Field(ge=1e-30, le=1e30)]
-_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  #: of a file whose header has no primaries
+#: of a file whose header has no primaries
+_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 
 
 @node(rtol=1e-5)
@@ -34,97 +35,153 @@ def exr(
 ) -> Tensor:
     """Read a scene-linear OpenEXR picture and convert it to linear sRGB.
 
-    The channels are R, G and B with the primaries in the header, or CIE X, Y and Z, or Y alone for a grey picture.
-    Bradford adaptation is used where the white points differ; X, Y and Z without `adoptedNeutral` and without
-    `chromaticities` have the white point D65. ``part`` names the part to read if several parts hold a picture.
+    The channels are R, G and B with the primaries in the header, or CIE X, Y and Z, or Y alone for
+    a grey picture. Bradford adaptation is used where the white points differ; X, Y and Z without
+    `adoptedNeutral` and without `chromaticities` have the white point D65. ``part`` names the part
+    to read if several parts hold a picture.
 
-    Shapes: -> (3, y, x) float32, the size of the file or `shape` (scaled to cover `shape`, cropped at the centre).
-    Units:  linear sRGB, 1 = `white` in the values of the file (with null the values stay unscaled); no upper limit.
-    Error:  half floats resolve 5e-4. Negative light, from noise or colours outside sRGB, is clipped unless kept.
-    Raises: ParameterError before the run for other channels, for a part that does not exist or is not named, for a
-            damaged file, for values that are not finite, and for more than 64 million pixels.
-    Source: OpenEXR technical introduction (chromaticities, adoptedNeutral); matrices of colour-science.
+    Shapes: -> (3, y, x) float32, the size of the file or `shape` (scaled to cover `shape`, cropped
+            at the centre).
+    Units:  linear sRGB, 1 = `white` in the values of the file (with null the values stay unscaled);
+            no upper limit.
+    Error:  half floats resolve 5e-4. Negative light, from noise or colours outside sRGB, is clipped
+            unless kept.
+    Raises: ParameterError before the run for other channels, for a part that does not exist or is
+            not named, for a damaged file, for values that are not finite, and for more than 64
+            million pixels.
+    Source: OpenEXR technical introduction (chromaticities, adoptedNeutral); matrices of
+            colour-science.
     """
     scene = linear_light(*_linear_pixels(file, part), shape) / (white or 1.0)
     return scene.clamp_min(0) if negatives == "clip" else scene
 
 
 @exr.preflight
-def _(*, file: Path, shape: Shape | None = None, part: str | None = None, **params: Any) -> list[str]:
-    _, found, channels = _chosen(file, part)
-    refuse_large_picture(file, *found.size)
+def _(
+    *, file: Path, shape: Shape | None = None, part: str | None = None, **params: Any
+) -> list[str]:
+    _, header, channels = _chosen(file, part)
+    refuse_large_picture(file, *header.size)
     if problem := _damage(file, part):
         raise ParameterError("file", problem)
     notes = [f"{file.name}: only luminance; the picture is grey"] if channels == ["Y"] else []
-    ratio = float(found.header.get("pixelAspectRatio", 1.0))
+    ratio = float(header.header.get("pixelAspectRatio", 1.0))
     if abs(ratio - 1) > 1e-3:
         notes += [f"{file.name}: pixels are not square ({ratio:.3f}), but are read as square"]
-    return notes + enlarged(found.size, shape)
+    return notes + enlarged(header.size, shape)
 
 
 @exr.check
 def _(result: Tensor, *, file: Path, part: str | None = None, **params: Any) -> list[Check]:
     pixels, linear = _linear_pixels(file, part)
-    below, least = 0, math.inf
+    below, lowest = 0, math.inf
     for rows in bands_of(pixels.shape[:2]):
         light = linear(pixels[rows])
-        below, least = below + int((light < 0).sum()), min(least, float(light.min()))
+        below, lowest = below + int((light < 0).sum()), min(lowest, float(light.min()))
     text = f"peak {float(result.max()):.4g}, mean {float(result.mean()):.3g}"
     values = 3 * pixels.shape[0] * pixels.shape[1]
-    return [Check(text + (f"; {below} of {values} values were negative, down to {least:.2g}" if below else ""))]
+    return [
+        Check(
+            text
+            + (f"; {below} of {values} values were negative, down to {lowest:.2g}" if below else "")
+        )
+    ]
 
 
-def picture_size(file: Path, part: str | None) -> tuple[int, int]:
-    """Return the numbers of rows and columns of the picture in an OpenEXR file, from the header of its part."""
-    return _chosen(file, part)[1].size
+def picture_size(file: Path, part_name: str | None) -> tuple[int, int]:
+    """Return the numbers of rows and columns of the picture in an OpenEXR file, from the header
+    of its part.
+    """
+    return _chosen(file, part_name)[1].size
 
 
-def _chosen(file: Path, part: str | None) -> tuple[int, PartHeader, list[str]]:
-    """Return the number and the header of the part with the picture, and the names of the channels to read."""
+def _chosen(file: Path, part_name: str | None) -> tuple[int, PartHeader, list[str]]:
+    """Return the number and the header of the part with the picture, and the names of the
+    channels to read.
+    """
     parts = part_headers(file)
-    names = ", ".join(each.name or "unnamed" for each in parts)
-    if part is not None and part not in [each.name for each in parts]:
-        raise ParameterError("part", f"{file.name} has no part {part!r}: name one of {names}")
-    named = [(i, each) for i, each in enumerate(parts) if part in (None, each.name)]
-    found = [(i, each, channels) for i, each in named if (channels := _colour_channels(each.channels))]
-    if len(found) > 1:
-        several = ", ".join(each.name or "unnamed" for _, each, _ in found)
-        raise ParameterError("file", f"{file.name} has a picture in the parts {several}: set part to one of them")
-    if not found:
-        there = "; ".join(", ".join(each.channels) for _, each in named)
+    named = [(i, header) for i, header in enumerate(parts) if part_name in (None, header.name)]
+    if part_name is not None and not named:
+        names = _joined_names(parts)
+        raise ParameterError("part", f"{file.name} has no part {part_name!r}: name one of {names}")
+    pictures = _with_picture(named)
+    if len(pictures) > 1:
+        several = _joined_names([header for _, header, _ in pictures])
+        raise ParameterError(
+            "file", f"{file.name} has a picture in the parts {several}: set part to one of them"
+        )
+    if not pictures:
+        channel_names = "; ".join(", ".join(header.channels) for _, header in named)
         fix = "but R, G and B, or X, Y and Z, or Y alone, are needed: save the picture as RGB"
-        raise ParameterError("file", f"{file} has the channels {there}, {fix}")
-    return found[0]
+        raise ParameterError("file", f"{file} has the channels {channel_names}, {fix}")
+    return pictures[0]
+
+
+def _with_picture(
+    parts: Sequence[tuple[int, PartHeader]],
+) -> list[tuple[int, PartHeader, list[str]]]:
+    """Return the numbered parts that have a picture, and the names of its channels."""
+    pictures = []
+    for number, header in parts:
+        channels = _colour_channels(header.channels)
+        if channels:
+            pictures.append((number, header, channels))
+    return pictures
+
+
+def _joined_names(parts: Sequence[PartHeader]) -> str:
+    return ", ".join(header.name or "unnamed" for header in parts)
 
 
 def _colour_channels(names: list[str]) -> list[str]:
-    """Return the channels of a picture: R, G and B, or X, Y and Z, or Y alone; an empty list if there is no picture."""
+    """Return the channels of a picture: R, G and B, or X, Y and Z, or Y alone; an empty list if
+    there is no picture.
+    """
     if {"RY", "BY"} & set(names):
         return []
-    return next((wanted for wanted in (["R", "G", "B"], ["X", "Y", "Z"], ["Y"]) if set(wanted) <= set(names)), [])
+    return next(
+        (
+            colours
+            for colours in (["R", "G", "B"], ["X", "Y", "Z"], ["Y"])
+            if set(colours) <= set(names)
+        ),
+        [],
+    )
 
 
 @once_per_version
-def _damage(file: Path, part: str | None) -> str:
-    """Return a message for a file that cannot be read to its end or has values that are not finite, or nothing."""
+def _damage(file: Path, part_name: str | None) -> str:
+    """Return a message for a file that cannot be read to its end or has values that are not
+    finite, or nothing.
+    """
     try:
-        pixels = _pixels(file, part)[2]
+        pixels = _pixels(file, part_name)[2]
     except (RuntimeError, OSError, ValueError) as error:
         return f"{file.name} is damaged ({error}): copy or save the file again"
     return not_finite(file, int((~np.isfinite(pixels)).sum()))
 
 
-def _pixels(file: Path, part: str | None) -> tuple[dict[str, Any], list[str], NDArray[np.float32]]:
-    """Read the header, the names of the channels and the values (channel, y, x) of a picture in an OpenEXR file."""
-    number, _, names = _chosen(file, part)
+def _pixels(
+    file: Path, part_name: str | None
+) -> tuple[dict[str, Any], list[str], NDArray[np.float32]]:
+    """Read the header, the names of the channels and the values (channel, y, x) of a picture in
+    an OpenEXR file.
+    """
+    number, _, names = _chosen(file, part_name)
     with exr_parts(file) as opened:
         header, channels = dict(opened.header(number)), opened.channels(number)
-        return header, names, np.stack([np.asarray(channels[name].pixels, dtype=np.float32) for name in names])
+        return (
+            header,
+            names,
+            np.stack([np.asarray(channels[name].pixels, dtype=np.float32) for name in names]),
+        )
 
 
-def _linear_pixels(file: Path, part: str | None) -> tuple[NDArray[np.float32], Linear]:
-    """Read the values (y, x, channel) of an OpenEXR file; return them and their conversion to linear sRGB (3, y, x)."""
-    header, names, pixels = _pixels(file, part)
+def _linear_pixels(file: Path, part_name: str | None) -> tuple[NDArray[np.float32], Linear]:
+    """Read the values (y, x, channel) of an OpenEXR file; return them and their conversion to
+    linear sRGB (3, y, x).
+    """
+    header, names, pixels = _pixels(file, part_name)
     if problem := not_finite(file, int((~np.isfinite(pixels)).sum())):
         raise ValueError(problem)
     if names == ["Y"]:
@@ -136,7 +193,9 @@ def _linear_pixels(file: Path, part: str | None) -> tuple[NDArray[np.float32], L
 
 
 def _converted(matrix: Tensor | None, values: NDArray[Any]) -> Tensor:
-    """Return linear sRGB (3, y, x) of the values (y, x, channel) of a picture, or of its one channel for no matrix."""
+    """Return linear sRGB (3, y, x) of the values (y, x, channel) of a picture, or of its one
+    channel for no matrix.
+    """
     planes = torch.from_numpy(np.ascontiguousarray(values.transpose(2, 0, 1)))
     if matrix is None:
         return planes.expand(3, -1, -1).clone()
@@ -144,7 +203,9 @@ def _converted(matrix: Tensor | None, values: NDArray[Any]) -> Tensor:
 
 
 def _xyz_to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
-    """Return the matrix from CIE X, Y and Z to linear sRGB, with Bradford adaptation of the header's white to D65."""
+    """Return the matrix from CIE X, Y and Z to linear sRGB, with Bradford adaptation of the
+    header's white to D65.
+    """
     colour = colour_science()
 
     srgb = colour.RGB_COLOURSPACES["sRGB"]
@@ -154,7 +215,9 @@ def _xyz_to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
         plain: NDArray[np.float64] = srgb.matrix_XYZ_to_RGB
         return plain
     whites = colour.xy_to_XYZ(white), colour.xy_to_XYZ(srgb.whitepoint)
-    adapted: NDArray[np.float64] = colour.adaptation.matrix_chromatic_adaptation_VonKries(*whites, "Bradford")
+    adapted: NDArray[np.float64] = colour.adaptation.matrix_chromatic_adaptation_VonKries(
+        *whites, "Bradford"
+    )
     return np.asarray(srgb.matrix_XYZ_to_RGB @ adapted, dtype=np.float64)
 
 
@@ -172,5 +235,7 @@ def _to_srgb(header: dict[str, Any]) -> NDArray[np.float64]:
     neutral = np.asarray(header.get("adoptedNeutral", white), dtype=np.float64)
     own = colour.models.normalised_primary_matrix(values[:6].reshape(3, 2), white)
     space = colour.RGB_Colourspace("file", values[:6], neutral, matrix_RGB_to_XYZ=own)
-    matrix: NDArray[np.float64] = colour.matrix_RGB_to_RGB(space, colour.RGB_COLOURSPACES["sRGB"], "Bradford")
+    matrix: NDArray[np.float64] = colour.matrix_RGB_to_RGB(
+        space, colour.RGB_COLOURSPACES["sRGB"], "Bradford"
+    )
     return matrix

@@ -1,16 +1,20 @@
-"""The luminance of a colour picture, as the grey picture that a mono camera can be compared with."""
+"""The luminance of a colour picture, as the grey picture that a mono camera can be compared
+with.
+"""
 
 import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes._half_precision import single
+from neusee.nodes.precision import single
 
 _LUMINANCE = (0.2126, 0.7152, 0.0722)  #: of linear red, green and blue with the primaries of sRGB
 
 
 def luminance(rgb: Tensor, axis: int) -> Tensor:
-    """Return the luminance of linear sRGB, whose three channels lie along ``axis`` of ``rgb`` and have size 1 then."""
+    """Return the luminance of linear sRGB, whose three channels lie along ``axis`` of ``rgb``
+    and have size 1 then.
+    """
     red, green, blue = (share * rgb.narrow(axis, i, 1) for i, share in enumerate(_LUMINANCE))
     return red + green + blue
 
@@ -26,7 +30,9 @@ def grey(picture: Tensor) -> Tensor:
     Source: IEC 61966-2-1:1999 (sRGB), luminance of the primaries of ITU-R BT.709.
     """
     if picture.ndim < 3 or picture.shape[-3] != 3:
-        raise ValueError(f"a picture {tuple(picture.shape)} is not a colour picture: give (3, y, x)")
+        raise ValueError(
+            f"a picture {tuple(picture.shape)} is not a colour picture: give (3, y, x)"
+        )
     light = single(picture)
     return luminance(light, light.ndim - 3).expand_as(light).clone()
 
@@ -34,7 +40,9 @@ def grey(picture: Tensor) -> Tensor:
 @grey.reference
 def _(picture: Tensor) -> Tensor:
     shares = torch.tensor(_LUMINANCE, dtype=torch.float64, device=picture.device)
-    return torch.einsum("c,...cyx->...yx", shares, picture.double())[..., None, :, :].expand_as(picture)
+    return torch.einsum("c,...cyx->...yx", shares, picture.double())[..., None, :, :].expand_as(
+        picture
+    )
 
 
 @grey.check

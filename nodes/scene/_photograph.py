@@ -1,5 +1,10 @@
-"""Photographs as scenes: linear light from sRGB files."""
+"""Photographs as scenes: linear light from sRGB files, and crops from a folder."""
 
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -9,15 +14,36 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.input_files import once_per_version, refuse_large_picture
-from neusee.nodes.input_size import head_of, needs, refuse_other_than_file
-from neusee.nodes.picture_bytes import picture_needs
-from neusee.nodes.scene._crop_to_frame import DrawnCrop, drawn_crop, enlarged, framed
-from neusee.nodes.scene._large_picture import Codes, linear_light
+from neusee.nodes.file_headers import picture_needs
+from neusee.nodes.input_files import (
+    file_version,
+    head_of,
+    needs,
+    once_per_version,
+    opened,
+    refuse_large_picture,
+    refuse_other_than_file,
+)
+from neusee.nodes.scene._picture_scaling import (
+    Codes,
+    DrawnCrop,
+    drawn_crop,
+    enlarged,
+    framed,
+    linear_light,
+)
 from neusee.nodes.units import DataFile, Shape
 
+# --- photograph -----------------------------------------------------------------------------------
+
+# Photographs as scenes: linear light from sRGB files.
+
+
 _MODES = ("RGB", "L", "P", "1", "I", "I;16", "I;16B")
-_FIX = "convert the file to 8- or 16-bit sRGB: magick {name} -alpha off -colorspace sRGB -depth 16 {stem}.png"
+_FIX = (
+    "convert the file to 8- or 16-bit sRGB: magick {name} -alpha off -colorspace sRGB -depth 16"
+    " {stem}.png"
+)
 _DAMAGED = "{name} is damaged ({error}): copy the file again, or give another picture"
 _ORIENTATION = 0x0112  #: EXIF tag
 _ROTATED = range(5, 9)  #: EXIF orientations that exchange width and height
@@ -25,18 +51,23 @@ _LIGHT = 12  #: bytes of a pixel in linear light
 
 
 @node(rtol=1e-5)
-def photograph(*, file: DataFile, shape: Shape | None = None, crop: DrawnCrop | None = None) -> Tensor:
-    """Read a photograph as linear light: decode the sRGB curve, turn the picture upright, then scale and crop.
+def photograph(
+    *, file: DataFile, shape: Shape | None = None, crop: DrawnCrop | None = None
+) -> Tensor:
+    """Read a photograph as linear light: decode the sRGB curve, turn the picture upright, then
+    scale and crop.
 
-    ``crop`` has a seed and the number of a scene: the part of the photograph that an evaluation with this seed shows in
-    this scene, at full size, in place of the scaled centre.
+    ``crop`` has a seed and the number of a scene: the part of the photograph that an evaluation
+    with this seed shows in this scene, at full size, in place of the scaled centre.
 
-    Shapes: -> (3, y, x) float32, the size of the file or `shape` (scaled to cover `shape`, cropped at the centre).
+    Shapes: -> (3, y, x) float32, the size of the file or `shape` (scaled to cover `shape`, cropped
+            at the centre).
     Units:  linear sRGB, 1 = the white of the file.
-    Error:  half a code value (8 bit: 1.8e-3 near white); the tone curve of the camera is not inverted. Every file is
-            read as sRGB: a note names an embedded colour profile, which is ignored.
-    Raises: ParameterError before the run for another format, for another depth, for transparency, for a damaged file,
-            and for more than 64 million pixels.
+    Error:  half a code value (8 bit: 1.8e-3 near white); the tone curve of the camera is not
+            inverted. Every file is read as sRGB: a note names an embedded colour profile, which is
+            ignored.
+    Raises: ParameterError before the run for another format, for another depth, for transparency,
+            for a damaged file, and for more than 64 million pixels.
     Source: IEC 61966-2-1:1999 (sRGB); EXIF 2.3, tag Orientation.
     """
     if crop is None or shape is None:
@@ -56,17 +87,27 @@ def _(*, file: Path, shape: Shape | None = None, crop: DrawnCrop | None = None) 
 @photograph.preflight
 def _(*, file: Path, shape: Shape | None = None, crop: DrawnCrop | None = None) -> list[str]:
     if crop is not None and shape is None:
-        raise ParameterError("crop", "the part of a photograph has no size: give shape, such as [768, 768]")
+        raise ParameterError(
+            "crop", "the part of a photograph has no size: give shape, such as [768, 768]"
+        )
     profile, turned, size = read_header(file)
     if problem := _damage(file):
         raise ParameterError("file", problem)
-    notes = [f"{file.name}: colour profile {profile!r} is ignored, and the file read as sRGB"] if profile else []
-    notes += [f"{file.name}: picture turned upright by EXIF orientation {turned}"] if turned != 1 else []
+    notes = (
+        [f"{file.name}: colour profile {profile!r} is ignored, and the file read as sRGB"]
+        if profile
+        else []
+    )
+    notes += (
+        [f"{file.name}: picture turned upright by EXIF orientation {turned}"] if turned != 1 else []
+    )
     return notes + enlarged(size, shape)
 
 
 def read_header(file: Path) -> tuple[str, int, tuple[int, int]]:
-    """Return the colour profile, the EXIF orientation, and the numbers of rows and columns of the upright picture."""
+    """Return the colour profile, the EXIF orientation, and the numbers of rows and columns of
+    the upright picture.
+    """
     from PIL import Image, UnidentifiedImageError
 
     refuse_large_picture(file, *_png_size(file))
@@ -78,15 +119,21 @@ def read_header(file: Path) -> tuple[str, int, tuple[int, int]]:
             turned = image.getexif().get(_ORIENTATION, 1)
             return _profile(image), turned, image.size if turned in _ROTATED else image.size[::-1]
     except UnidentifiedImageError:
-        raise ParameterError("file", f"{file} is not a readable picture: give a PNG or JPEG file") from None
+        raise ParameterError(
+            "file", f"{file} is not a readable picture: give a PNG or JPEG file"
+        ) from None
     except Image.DecompressionBombError:
-        raise ParameterError("file", f"{file.name} states more pixels than can be read: reduce the picture") from None
+        raise ParameterError(
+            "file", f"{file.name} states more pixels than can be read: reduce the picture"
+        ) from None
     except (OSError, SyntaxError) as error:
         raise ParameterError("file", _DAMAGED.format(name=file.name, error=error)) from None
 
 
 def _png_size(file: Path) -> tuple[int, int]:
-    """Return the numbers of rows and columns in the first 24 bytes of a PNG file, or (0, 0) for another file."""
+    """Return the numbers of rows and columns in the first 24 bytes of a PNG file, or (0, 0) for
+    another file.
+    """
     head = head_of(file, 24)
     png = head.startswith(b"\x89PNG") and len(head) == 24
     return (int.from_bytes(head[20:24]), int.from_bytes(head[16:20])) if png else (0, 0)
@@ -96,7 +143,8 @@ def _png_size(file: Path) -> tuple[int, int]:
 def _damage(file: Path) -> str:
     """Return a message for a picture that is truncated or damaged, else an empty text.
 
-    The checksums of a PNG are compared. A JPEG is decoded at an eighth of its size, which reads all its data.
+    The checksums of a PNG are compared. A JPEG is decoded at an eighth of its size, which reads all
+    its data.
     """
     from PIL import Image
 
@@ -119,22 +167,32 @@ def _damage(file: Path) -> str:
 def _(result: Tensor, **params: Any) -> list[Check]:
     clipped = float((result >= 1).any(0).float().mean())
     return [
-        Check(f"mean value {float(result.mean()):.3f}, {clipped:.1%} of pixels are saturated", float(result.max()) > 0)
+        Check(
+            f"mean value {float(result.mean()):.3f}, {clipped:.1%} of pixels are saturated",
+            float(result.max()) > 0,
+        )
     ]
 
 
 def _refuse(file: Path, image: Any) -> None:
     fix = _FIX.format(name=file.name, stem=file.stem)
     if image.format not in ("PNG", "JPEG", "MPO"):
-        raise ParameterError("file", f"{file} has the format {image.format}, not PNG or JPEG: {fix}, or use scene.exr")
+        raise ParameterError(
+            "file",
+            f"{file} has the format {image.format}, not PNG or JPEG: {fix}, or use scene.exr",
+        )
     if "transparency" in image.info or image.mode.endswith("A"):
         raise ParameterError("file", f"{file} has transparency, which a scene cannot use: {fix}")
     if image.mode not in _MODES:
-        raise ParameterError("file", f"{file} has pixels of type {image.mode}, not grey or RGB: {fix}")
+        raise ParameterError(
+            "file", f"{file} has pixels of type {image.mode}, not grey or RGB: {fix}"
+        )
 
 
 def _profile(image: Any) -> str:
-    """Return the name of the colour profile embedded in a photograph, or an empty text for sRGB or no profile."""
+    """Return the name of the colour profile embedded in a photograph, or an empty text for sRGB
+    or no profile.
+    """
     from io import BytesIO
 
     from PIL import ImageCms
@@ -142,7 +200,9 @@ def _profile(image: Any) -> str:
     if not image.info.get("icc_profile"):
         return ""
     try:
-        name = ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(BytesIO(image.info["icc_profile"]))).strip()
+        name = ImageCms.getProfileDescription(
+            ImageCms.ImageCmsProfile(BytesIO(image.info["icc_profile"]))
+        ).strip()
     except (OSError, ImageCms.PyCMSError):
         name = "unreadable"
     return "" if "srgb" in name.lower() else name
@@ -159,8 +219,9 @@ def _linear(codes: NDArray[Any]) -> Tensor:
 class _Rows:
     """Code values (y, x, 3) of a decoded picture, copied when rows are asked for.
 
-    A whole copy beside the result adds up to 0.5 GB to the peak of 64 million pixels: the copy itself, and the memory
-    of the decoded picture, which the C library keeps or gives back as it likes.
+    A whole copy beside the result adds up to 0.5 GB to the peak of 64 million pixels: the copy
+    itself, and the memory of the decoded picture, which the C library keeps or gives back as it
+    likes.
     """
 
     def __init__(self, image: Any) -> None:
@@ -180,7 +241,9 @@ def _scaled(codes: Codes) -> Tensor:
     """Return code values (y, x, 3) as (3, y, x) float32 in [0, 1]."""
     codes = codes[:]
     scale = 255.0 if codes.dtype == np.uint8 else 65535.0
-    return torch.from_numpy(np.ascontiguousarray(codes.transpose(2, 0, 1), dtype=np.float32)) / scale
+    return (
+        torch.from_numpy(np.ascontiguousarray(codes.transpose(2, 0, 1), dtype=np.float32)) / scale
+    )
 
 
 def _codes(file: Path) -> Codes:
@@ -207,7 +270,9 @@ def _depth(file: Path) -> int:
 
 
 def _words(file: Path, turned: int) -> NDArray[Any]:
-    """Read a 16-bit RGB PNG file, and turn the picture upright by the EXIF orientation ``turned``."""
+    """Read a 16-bit RGB PNG file, and turn the picture upright by the EXIF orientation
+    ``turned``.
+    """
     from kornia_rs.io import read_image_png_u16
 
     rows, columns = _png_size(file)
@@ -216,3 +281,159 @@ def _words(file: Path, turned: int) -> NDArray[Any]:
     values = values.transpose(1, 0, 2) if turned in _ROTATED else values
     flip_y, flip_x = turned in (3, 4, 7, 8), turned in (2, 3, 6, 7)
     return values[:: -1 if flip_y else 1, :: -1 if flip_x else 1]
+
+
+# --- photograph folder ----------------------------------------------------------------------------
+
+# Search of a folder for readable photographs, and random crops of the photographs from a given
+# seed.
+
+
+__depends__ = ["unaffected:_pictures"]  #: what is in memory changes no result
+_PICTURES = frozenset({".png", ".jpg", ".jpeg", ".jpe", ".webp", ".tif", ".tiff", ".bmp", ".gif"})
+#: first bytes of a format -> end mark of a file of this format
+_ENDS = {b"\xff\xd8": b"\xff\xd9", b"\x89P": b"IEND"}
+#: bytes at the end of a file that must contain the end mark: some cameras write more after it
+_TAIL = 1 << 16
+_ORDER, _DRAW = 0, 2  #: random streams of one seed; the position of a part is another
+_KEPT = 1 << 30  #: bytes of decoded photographs that a process keeps
+_TRIES = 100  #: broken photographs in a row, after which drawing stops with an error
+
+Index = int | Sequence[int]  #: the number of a scene, or (stage, number) of a picture for training
+
+
+def list_photographs(root: Path) -> tuple[list[Path], list[tuple[Path, str]]]:
+    """List the readable photographs below a folder, sorted by path, and the unreadable files with a
+    reason for each.
+
+    Only the header and the end of each file are read; no picture is decoded. Hidden files, hidden
+    folders and files without the suffix of a picture are ignored.
+    """
+    reasons = {path: _problem(path) for path in _files(root)}
+    broken = [(path, reason) for path, reason in reasons.items() if reason]
+    return [path for path, reason in reasons.items() if not reason], broken
+
+
+def _files(root: Path) -> list[Path]:
+    pictures, above = list[Path](), dict[str, frozenset[tuple[int, int]]]()
+    for folder, below, names in os.walk(root, followlinks=True):
+        about, around = os.stat(folder), above.get(os.path.dirname(folder), frozenset())
+        if (place := (about.st_dev, about.st_ino)) in around:  # a link that leads back
+            below.clear()
+            continue
+        above[folder] = around | {place}
+        below[:] = sorted(name for name in below if not name.startswith("."))
+        pictures += [
+            Path(folder, n)
+            for n in names
+            if not n.startswith(".") and Path(n).suffix.lower() in _PICTURES
+        ]
+    return sorted(pictures, key=lambda path: path.relative_to(root).parts)
+
+
+def _problem(path: Path) -> str:
+    """Return the reason why a file cannot be read as a photograph, or an empty text."""
+    try:
+        read_header(path)
+        with opened(path) as file:
+            end = _ENDS[file.read(2)]
+            file.seek(max(0, path.stat().st_size - _TAIL))
+            return "" if end in file.read(_TAIL) else f"{path.name} stops before its end"
+    except (ParameterError, OSError, KeyError, ValueError, SyntaxError) as error:
+        return str(error)
+
+
+def choose_photograph(paths: Sequence[Path], seed: int, index: int) -> Path:
+    """Return the photograph for scene ``index``, so that every photograph is used once before any
+    is repeated.
+
+    The order of the photographs is drawn from the seed.
+    """
+    order: list[int] = np.random.default_rng([seed, _ORDER]).permutation(len(paths)).tolist()
+    return paths[order[index % len(paths)]]
+
+
+def crop_photograph(path: Path, shape: tuple[int, int], seed: int, index: Index) -> Tensor:
+    """Crop a photograph, linear sRGB (3, y, x), at a position that depends only on the seed and the
+    index.
+
+    A smaller photograph is enlarged first, as `drawn_crop` does. ``scene.photograph`` with ``crop``
+    gives the same.
+    """
+    return drawn_crop(_decoded(path), shape, seed, index)
+
+
+#: the decoded photographs by version, the last used one last
+_pictures: dict[tuple[int, ...], Tensor] = {}
+
+
+def _decoded(path: Path) -> Tensor:
+    """Return a photograph as linear sRGB (3, y, x), from memory if it is one of the last that were
+    used.
+
+    A photograph that has changed since is decoded again, whatever its name.
+    """
+    version = file_version(path)
+    if version is None:
+        just_changed: Tensor = photograph(file=path)
+        return just_changed
+    picture: Tensor = _pictures.pop(version) if version in _pictures else photograph(file=path)
+    _pictures[version] = picture
+    while len(_pictures) > 1 and sum(map(_size, _pictures.values())) > _KEPT:
+        del _pictures[next(iter(_pictures))]
+    return picture
+
+
+def _size(picture: Tensor) -> int:
+    return picture.numel() * picture.element_size()
+
+
+def _indices(index: Index) -> list[int]:
+    return [index] if isinstance(index, int) else list(index)
+
+
+@dataclass
+class Photographs:
+    """The photographs of a folder for training, and the files that cannot be read as
+    photographs.
+    """
+
+    paths: tuple[Path, ...]  #: in the order of their names
+    #: the reason why each other file cannot be read
+    broken: dict[Path, str] = field(default_factory=dict)
+
+    @classmethod
+    def under(cls, root: Path) -> Photographs:
+        """Find all photographs below a folder at any depth; raise ValueError for a folder
+        without photographs.
+        """
+        paths, broken = list_photographs(root)
+        if not paths:
+            why = (
+                f"; {len(broken)} cannot be read, such as {broken[0][0]}: {broken[0][1]}"
+                if broken
+                else ""
+            )
+            raise ValueError(f"the folder {root} holds no readable photograph{why}")
+        return cls(tuple(paths), dict(broken))
+
+    def crop(self, shape: tuple[int, int], seed: int, index: Index) -> Tensor:
+        """Return a random crop of a random photograph, mirrored with probability 1/2.
+
+        A broken photograph is replaced by another draw. The same ``seed`` and ``index`` give the
+        same crop in any order and in any number of processes, whereas the random crops and flips of
+        kornia draw from the one random stream of torch.
+        """
+        rng = np.random.default_rng([seed, _DRAW, *_indices(index)])
+        for _ in range(_TRIES):
+            path = self.paths[int(rng.integers(len(self.paths)))]
+            try:
+                picture = crop_photograph(path, shape, seed, index)
+            except (OSError, ValueError, SyntaxError) as error:
+                self.broken[path] = str(error)
+                continue
+            return (picture.flip(-1) if rng.random() < 0.5 else picture).contiguous()
+        path = next(iter(self.broken))
+        raise ValueError(
+            f"{_TRIES} photographs in a row cannot be read, such as {path}: {self.broken[path]}"
+        )

@@ -5,12 +5,11 @@ from typing import Any
 
 from torch import Tensor
 
-from neusee.nodes.scene._cube_files import Layout
 from neusee.nodes.scene._exr_picture import exr, picture_size
 from neusee.nodes.scene._grey import grey
-from neusee.nodes.scene._hyperspectral import hyperspectral, rows_and_columns
-from neusee.nodes.scene._large_picture import is_large
+from neusee.nodes.scene._hyperspectral import Layout, hyperspectral, rows_and_columns
 from neusee.nodes.scene._photograph import photograph, read_header
+from neusee.nodes.scene._picture_scaling import is_large
 from neusee.nodes.scene._test_targets import targets
 from neusee.nodes.shape_rules import blank, like_first
 from neusee.nodes.values import Bands
@@ -52,7 +51,11 @@ def _picture(result: Tensor, *inputs: Any, file: Path, **params: Any) -> tuple[f
     """Return the work of reading a picture, which is held in whole before it is cropped."""
     size = float(file.stat().st_size)
     try:
-        y, x = picture_size(file, params.get("part")) if file.suffix.lower() == ".exr" else read_header(file)[2]
+        y, x = (
+            picture_size(file, params.get("part"))
+            if file.suffix.lower() == ".exr"
+            else read_header(file)[2]
+        )
     except (OSError, RuntimeError, ValueError):
         return 4 * size, 4 * size + result.numel()
     return 12.0 * y * x, float(3 * y * x + 3 * result.numel())
@@ -60,7 +63,9 @@ def _picture(result: Tensor, *inputs: Any, file: Path, **params: Any) -> tuple[f
 
 @photograph.work
 def _(result: Tensor, *inputs: Any, file: Path, **params: Any) -> tuple[float, float]:
-    """Return the memory of the decoded picture, which is less for each pixel of a large one, and the operations."""
+    """Return the memory of the decoded picture, which is less for each pixel of a large one, and
+    the operations.
+    """
     held, operations = _picture(result, *inputs, file=file, **params)
     pixels = held / 12
     if result.numel() == 3 * pixels:  # not scaled: the law counts the result 2.76 times

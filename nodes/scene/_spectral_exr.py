@@ -1,15 +1,13 @@
-"""Spectral OpenEXR files: one channel per wavelength, named as in Fichet et al. (JCGT 10(3), 2021).
-
-Emitted light is ``S0.550,0nm``, reflectance is ``T.550,0nm``. The decimal mark is a comma because a point separates
-layers. Colour-science reads and writes such files only with OpenImageIO, and its import alone takes a second.
-"""
+"""Spectral OpenEXR files, one channel a wavelength, read and written."""
 
 import re
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout
 from io import StringIO
+from itertools import accumulate, repeat
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import IO, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -17,8 +15,117 @@ from torch import Tensor
 
 from neusee.nodes import ParameterError
 from neusee.nodes.constants import SPEED_OF_LIGHT
-from neusee.nodes.picture_bytes import exr_needs
-from neusee.nodes.scene._plain_exr import write_lines
+from neusee.nodes.file_headers import exr_needs
+
+# --- plain exr ------------------------------------------------------------------------------------
+
+# Uncompressed OpenEXR files of one part, written line by line in a few megabytes of memory beside
+# the planes.
+#
+# Noise and the tails of a PSF do not compress: ZIP saves 0.7 % of a stack of PSFs, and takes ten
+# times as long as a copy. The layout is that of OpenEXR 2 (OpenEXR file layout, 2013, scan line
+# images): a header, the table of the offsets of the lines, and for each line its number, its size,
+# and the pixels of one channel after another.
+
+
+_MAGIC, _VERSION, _LONG_NAMES = 20000630, 2, 0x400
+_HALF, _FLOAT = 1, 2  #: numbers of the types of a channel
+_LARGEST_HALF = 65504.0
+_AT_ONCE = 1 << 23  #: bytes of lines that are written together
+
+
+def write_lines(
+    path: Path | str, names: Sequence[str], cube: Tensor, header: Mapping[str, Any], half: bool
+) -> None:
+    """Write planes (channel, y, x) as float32, or with ``half`` as float16, under the channel names
+    ``names``.
+
+    ``header`` has texts and numbers. Raises: ValueError for ``half`` and a value beyond the range
+    of float16.
+    """
+    order = sorted(range(len(names)), key=lambda i: names[i].encode())
+    planes = [cube[i].detach().cpu().float().numpy() for i in order]
+    if half and any(
+        np.abs(plane).max(initial=0.0, where=np.isfinite(plane)) > _LARGEST_HALF for plane in planes
+    ):
+        raise ValueError(
+            f"values beyond {_LARGEST_HALF:.0f} cannot be written as half floats: write float32"
+        )
+    height, width = cube.shape[-2:]
+    kind = np.dtype("<f2" if half else "<f4")
+    size = len(names) * width * kind.itemsize
+    start = _head([names[i] for i in order], (height, width), header, half)
+    offsets = accumulate(repeat(8 + size, height - 1), initial=len(start) + 8 * height)
+    with open(path, "wb") as file:
+        file.write(start + np.fromiter(offsets, "<u8", height).tobytes())
+        _write_pixels(file, planes, size, kind)
+
+
+def _write_pixels(file: IO[bytes], planes: Sequence[Any], size: int, kind: Any) -> None:
+    """Write the lines of the planes, each after its number and its size in bytes."""
+    height, width = planes[0].shape
+    rows = max(1, min(height, _AT_ONCE // (8 + size)))
+    lines = np.empty((rows, 8 + size), np.uint8)
+    numbers, pixels = (
+        lines[:, :8].view("<i4"),
+        lines[:, 8:].view(kind).reshape(rows, len(planes), width),
+    )
+    numbers[:, 1] = size
+    for top in range(0, height, rows):
+        count = min(rows, height - top)
+        numbers[:count, 0] = np.arange(top, top + count)
+        for i, plane in enumerate(planes):
+            pixels[:count, i] = plane[top : top + count]
+        file.write(lines[:count].data)
+
+
+def _head(
+    names: Sequence[str], shape: tuple[int, int], header: Mapping[str, Any], half: bool
+) -> bytes:
+    """Return the bytes of an OpenEXR file before its table of offsets."""
+    kind, (height, width) = _HALF if half else _FLOAT, shape
+    listed = (
+        b"".join(name.encode() + b"\0" + struct.pack("<i4xii", kind, 1, 1) for name in names)
+        + b"\0"
+    )
+    window = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    parts = {
+        "channels": ("chlist", listed),
+        "compression": ("compression", b"\0"),
+        "dataWindow": ("box2i", window),
+        "displayWindow": ("box2i", window),
+        "lineOrder": ("lineOrder", b"\0"),
+        "pixelAspectRatio": ("float", struct.pack("<f", 1.0)),
+        "screenWindowCenter": ("v2f", struct.pack("<2f", 0.0, 0.0)),
+        "screenWindowWidth": ("float", struct.pack("<f", 1.0)),
+        **{name: _attribute(value) for name, value in header.items()},
+    }
+    longest = max(len(name.encode()) for name in (*names, *parts))
+    flags = _VERSION | (_LONG_NAMES if longest > 31 else 0)
+    texts = (
+        f"{name}\0{form}\0".encode() + struct.pack("<i", len(raw)) + raw
+        for name, (form, raw) in parts.items()
+    )
+    return struct.pack("<2i", _MAGIC, flags) + b"".join(texts) + b"\0"
+
+
+def _attribute(value: Any) -> tuple[str, bytes]:
+    """Return the type and the bytes of an attribute of the header."""
+    return (
+        ("float", struct.pack("<f", value))
+        if isinstance(value, float)
+        else ("string", str(value).encode())
+    )
+
+
+# --- spectral exr ---------------------------------------------------------------------------------
+
+# Spectral OpenEXR files: one channel per wavelength, named as in Fichet et al. (JCGT 10(3), 2021).
+#
+# Emitted light is ``S0.550,0nm``, reflectance is ``T.550,0nm``. The decimal mark is a comma because
+# a point separates layers. Colour-science reads and writes such files only with OpenImageIO, and
+# its import alone takes a second.
+
 
 _NAME = re.compile(r"(S0|T)\.(\d*,?\d*(?:[eE][-+]?\d+)?)(Y|Z|E|P|T|G|M|k|h|da|d|c|m|u|n|p)?(m|Hz)")
 _PREFIX = {
@@ -31,8 +138,8 @@ _PREFIX = {
 def exr_parts(file: Path | str) -> Iterator[Any]:
     """Open an OpenEXR file with its pixels; raise ValueError if a part cannot be read to its end.
 
-    For a truncated file, OpenEXR prints a warning to stdout, which would mix with the output of a command, and leaves
-    the part out.
+    For a truncated file, OpenEXR prints a warning to stdout, which would mix with the output of a
+    command, and leaves the part out.
     """
     import OpenEXR
 
@@ -63,7 +170,7 @@ def part_headers(file: Path) -> list[PartHeader]:
     exr_needs(file)
     try:
         with OpenEXR.File(str(file), header_only=True) as opened:
-            headers = [dict(part.header) for part in opened.parts]
+            headers = [dict(exr_part.header) for exr_part in opened.parts]
     except (RuntimeError, OSError, ValueError) as why:
         text = f"{file} cannot be read as OpenEXR ({str(why).strip()}): give an .exr file"
         raise ParameterError("file", text) from None
@@ -73,15 +180,21 @@ def part_headers(file: Path) -> list[PartHeader]:
 def _part(header: dict[str, Any]) -> PartHeader:
     low, high = ([int(edge) for edge in corner] for corner in header["dataWindow"])
     names = [channel.name for channel in header["channels"]]
-    return PartHeader(str(header.get("name", "")), header, names, (high[1] - low[1] + 1, high[0] - low[0] + 1))
+    return PartHeader(
+        str(header.get("name", "")), header, names, (high[1] - low[1] + 1, high[0] - low[0] + 1)
+    )
 
 
 def exr_header(file: Path) -> tuple[dict[str, Any], list[str], tuple[int, int]]:
-    """Read the header, the channel names, and the numbers of rows and columns of an OpenEXR file with one part."""
+    """Read the header, the channel names, and the numbers of rows and columns of an OpenEXR file
+    with one part.
+    """
     parts = part_headers(file)
     if len(parts) > 1:
-        names = ", ".join(part.name for part in parts)
-        raise ParameterError("file", f"{file.name} has {len(parts)} parts ({names}): save one part alone")
+        names = ", ".join(exr_part.name for exr_part in parts)
+        raise ParameterError(
+            "file", f"{file.name} has {len(parts)} parts ({names}): save one part alone"
+        )
     return parts[0].header, parts[0].channels, parts[0].size
 
 
@@ -94,10 +207,12 @@ def write_spectral(
     header: Mapping[str, Any] | None = None,
     half: bool = False,
 ) -> None:
-    """Write a spectral cube (band, y, x) with its wavelengths in m to an uncompressed OpenEXR file, as float32.
+    """Write a spectral cube (band, y, x) with its wavelengths in m to an uncompressed OpenEXR file,
+    as float32.
 
     With ``half`` the file has float16, half as many bytes, in which values below 6e-8 become zero.
-    Raises: ValueError where cube and wavelengths differ in number, where two bands would get the same name, and where a
+    Raises: ValueError where cube and wavelengths differ in number, where two bands would get the
+            same name, and where a
     value is beyond the range of float16.
     """
     wavelengths = [float(w) for w in centres]
@@ -110,15 +225,19 @@ def write_spectral(
     names = [quantity + "." + f"{w * 1e9:.6f}nm".replace(".", ",") for w in wavelengths]
     if len(set(names)) < len(names):
         raise ValueError(f"bands closer than 1e-6 nm would have equal channel names: {names}")
-    about = {"spectralLayoutVersion": "1.0", **({"emissiveUnits": "W.m^-2"} if kind == "emissive" else {})}
+    about = {
+        "spectralLayoutVersion": "1.0",
+        **({"emissiveUnits": "W.m^-2"} if kind == "emissive" else {}),
+    }
     write_lines(path, names, cube, {**about, **(header or {})}, half)
 
 
 def read_spectral(path: Path | str) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Read a spectral OpenEXR file: the cube (band, y, x), the rising wavelengths (band,) in m, and the header.
+    """Read a spectral OpenEXR file: the cube (band, y, x), the rising wavelengths (band,) in m, and
+    the header.
 
-    The cube is float32, the wavelengths float64. Only the emission is read from a file with both emission and
-    reflectance.
+    The cube is float32, the wavelengths float64. Only the emission is read from a file with both
+    emission and reflectance.
     Raises: ValueError, which lists the channels of the file, where no channel is spectral.
     """
     with exr_parts(path) as opened:
@@ -126,19 +245,27 @@ def read_spectral(path: Path | str) -> tuple[Tensor, Tensor, dict[str, Any]]:
         spectral = spectral_channels(list(channels))
         if not spectral:
             raise ValueError(
-                f"{path} has the channels {', '.join(channels)}: none has a name such as S0.550,0nm or T.550,0nm"
+                f"{path} has the channels {', '.join(channels)}: none has a name such as S0.550,0nm"
+                " or T.550,0nm"
             )
         planes = [np.asarray(channels[name].pixels, dtype=np.float32) for name in spectral.values()]
-    return torch.from_numpy(np.stack(planes)), torch.tensor(list(spectral), dtype=torch.float64), header
+    return (
+        torch.from_numpy(np.stack(planes)),
+        torch.tensor(list(spectral), dtype=torch.float64),
+        header,
+    )
 
 
 def spectral_channels(names: Sequence[str]) -> dict[float, str]:
-    """Return the channel name for each wavelength in m of a spectral OpenEXR file, in rising order of wavelength.
+    """Return the channel name for each wavelength in m of a spectral OpenEXR file, in rising order
+    of wavelength.
 
     Reflectance channels are used only if the file has no emission channels.
     """
     for kind in ("S0", "T"):
-        matches = [m for m in map(_NAME.fullmatch, names) if m and m[1] == kind and m[2] not in ("", ",")]
+        matches = [
+            m for m in map(_NAME.fullmatch, names) if m and m[1] == kind and m[2] not in ("", ",")
+        ]
         if matches:
             return dict(sorted((_wavelength(m), m[0]) for m in matches))
     return {}

@@ -20,14 +20,14 @@ _SPACING = 64  #: pixels between points
 def targets(*, kind: Kind, shape: Shape, low: Fraction = 0.0, high: Fraction = 1.0) -> Tensor:
     """Draw a grey test target: a flat field, a straight or slanted edge, a Siemens star, or points.
 
-    `flat` is `high` everywhere; `edge` is vertical through the axis, bright towards +x; `slanted_edge` is an edge
-    tilted by 5 degrees; `siemens` is a sinusoidal star of 36 cycles; `points` are single pixels, 64 apart, with one on
-    the axis.
+    `flat` is `high` everywhere; `edge` is vertical through the axis, bright towards +x;
+    `slanted_edge` is an edge tilted by 5 degrees; `siemens` is a sinusoidal star of 36 cycles;
+    `points` are single pixels, 64 apart, with one on the axis.
 
     Shapes: -> (3, y, x) float32, the axis at sample N//2.
     Units:  linear sRGB, grey between `low` and `high`.
-    Error:  edges are exact averages over the area of a pixel; the star is sampled at the centre of a pixel, and grey
-            where a cycle is shorter than two pixels.
+    Error:  edges are exact averages over the area of a pixel; the star is sampled at the centre of
+            a pixel, and grey where a cycle is shorter than two pixels.
     Raises: ParameterError before the run where low exceeds high.
     Source: slanted edge and sinusoidal star as in ISO 12233:2017.
     """
@@ -45,12 +45,19 @@ def _(*, low: float = 0.0, high: float = 1.0, **params: Any) -> list[str]:
 
 @targets.check
 def _(result: Tensor, *, low: float = 0.0, high: float = 1.0, **params: Any) -> list[Check]:
-    least, most = float(result.min()), float(result.max())
-    return [Check(f"light of the target from {least:.3g} to {most:.3g}", least >= low - 1e-6 and most <= high + 1e-6)]
+    lowest, highest = float(result.min()), float(result.max())
+    return [
+        Check(
+            f"light of the target from {lowest:.3g} to {highest:.3g}",
+            lowest >= low - 1e-6 and highest <= high + 1e-6,
+        )
+    ]
 
 
 def _slanted(y: Tensor, x: Tensor) -> Tensor:
-    """Return the exact fraction of the area of each pixel on the bright side of a slanted edge through the axis."""
+    """Return the exact fraction of the area of each pixel on the bright side of a slanted edge
+    through the axis.
+    """
     c, s = math.cos(_TILT), math.sin(_TILT)
     distance = x * c + y * s
     wide, narrow = (c + s) / 2, (c - s) / 2

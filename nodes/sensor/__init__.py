@@ -1,15 +1,20 @@
 """Sensor: conversion of photons to electrons, and of electrons to digital numbers."""
 
 from neusee.nodes.sensor import _expected_ranges, _result_shapes  # noqa: F401  attach ranges and shape rules
-from neusee.nodes.sensor._channel_sums import channel_sums
 from neusee.nodes.sensor._digitization import Bits, crop, digitize, electrons_to_clip, full_well
-from neusee.nodes.sensor._exposure import add_photons, expose, level
+from neusee.nodes.sensor._exposure import add_photons, channel_sums, expose, level
 from neusee.nodes.sensor._frame_file import FRAME_SUFFIXES, frame
 from neusee.nodes.sensor._noise import dark_current, photon_noise, read_noise
 from neusee.nodes.sensor._photon_transfer import photon_transfer
-from neusee.nodes.sensor._room_for_light import refuse_without_room, refuse_without_steps
-from neusee.nodes.sensor._saturation import line_saturation, photons_that_fill, saturation
-from neusee.nodes.sensor._sensor_limits import Limits, limits
+from neusee.nodes.sensor._saturation import (
+    Limits,
+    limits,
+    line_saturation,
+    photons_that_fill,
+    refuse_without_room,
+    refuse_without_steps,
+    saturation,
+)
 
 __all__ = [
     "FRAME_SUFFIXES",

@@ -1,4 +1,6 @@
-"""Conversion of electrons to digital numbers: full well, analogue-to-digital converter, and sensor window."""
+"""Conversion of electrons to digital numbers: full well, analogue-to-digital converter, and
+sensor window.
+"""
 
 import math
 from fractions import Fraction
@@ -9,27 +11,32 @@ from pydantic import Field
 from torch import Generator, Tensor
 
 from neusee.nodes import Check, ErrorBound, ParameterError, TensorStats, node
-from neusee.nodes._half_precision import single
-from neusee.nodes.sensor._draw_limits import rare_events
-from neusee.nodes.sensor._room_for_light import refuse_below_one_electron
-from neusee.nodes.sensor._saturation import Well
+from neusee.nodes.precision import single
+from neusee.nodes.sensor._noise import rare_events
+from neusee.nodes.sensor._saturation import Well, refuse_below_one_electron
 from neusee.nodes.torch_func import transformed
 from neusee.nodes.units import Gain, Shape
 
 Rounding = Literal["nearest", "dithered_floor", "truncation"]
-_BLOCK = 2**18  #: pixels that are converted at a time, so that their float64 numbers stay in the cache of the processor
+#: pixels that are converted at a time, so that their float64 numbers stay in the cache of the
+#: processor
+_BLOCK = 2**18
 Bits = Annotated[int, Field(ge=1, le=16)]
 
 
 def clipping_number(full_well: float, gain: float, bits: int) -> int:
-    """Return the smallest digital number that counts as clipped: of a full well, or the largest of the converter."""
+    """Return the smallest digital number that counts as clipped: of a full well, or the largest
+    of the converter.
+    """
     return max(1, min((1 << bits) - 1, int(full_well * gain - 0.5)))
 
 
 def electrons_to_clip(full_well: float, gain: float, bits: int, offset: float = 0.0) -> float:
-    """Return the electrons of light that fill a pixel: its digital number, rounded to the nearest, counts as clipped.
+    """Return the electrons of light that fill a pixel: its digital number, rounded to the nearest,
+    counts as clipped.
 
-    The converter may end below the full well, and an ``offset`` that is added before uses a part of it.
+    The converter may end below the full well, and an ``offset`` that is added before uses a part of
+    it.
 
     Shapes: scalars.
     Units:  full_well, offset and result e-; gain DN/e-.
@@ -45,8 +52,8 @@ def full_well(electrons: Tensor, *, capacity: Well) -> Tensor:
 
     Shapes: electrons (..., y, x) -> (..., y, x).
     Units:  e-.
-    Error:  a hard edge: neither blooming into neighbours nor a soft knee. An offset that is added before uses a
-            part of the well, as the paper prints.
+    Error:  a hard edge: neither blooming into neighbours nor a soft knee. An offset that is added
+            before uses a part of the well, as the paper prints.
     Source: NeuSee, Eq. (SensorImage).
     """
     return single(electrons).clamp_max(capacity)
@@ -56,8 +63,8 @@ def full_well(electrons: Tensor, *, capacity: Well) -> Tensor:
 def _(electrons: TensorStats, *, capacity: float) -> float:
     """Return the relative change of the brightest pixel if the step `sensor.full_well` is omitted.
 
-    The change is relative to the largest result. The well is rounded to the dtype, and so differs from ``capacity`` by
-    up to half a step of the dtype.
+    The change is relative to the largest result. The well is rounded to the dtype, and so differs
+    from ``capacity`` by up to half a step of the dtype.
     """
     dtype = torch.promote_types(getattr(torch, electrons.dtype), torch.float32)
     well = float(torch.tensor(capacity, dtype=dtype))
@@ -74,7 +81,12 @@ def _(electrons: ErrorBound, **params: Any) -> float:
 
 @full_well.check
 def _(result: Tensor, electrons: Tensor, *, capacity: float) -> list[Check]:
-    return [Check(f"{int(torch.count_nonzero(result >= capacity))} of {result.numel()} pixels reach the full well")]
+    return [
+        Check(
+            f"{int(torch.count_nonzero(result >= capacity))} of {result.numel()} pixels reach the"
+            " full well"
+        )
+    ]
 
 
 @node(rtol=0.0)
@@ -86,46 +98,55 @@ def digitize(
     bits: Bits = 16,
     rng: Generator | None = None,
 ) -> Tensor:
-    """Convert electrons to whole digital numbers, clipped to the range of the analogue-to-digital converter.
+    """Convert electrons to whole digital numbers, clipped to the range of the analogue-to-digital
+    converter.
 
-    Shapes: electrons (..., y, x) -> (..., y, x), whole numbers in the dtype of the input (float32 for half precision).
-    Units:  electrons e-; gain K of EMVA 1288, DN/e-, which a recipe may also write as e-/DN; result DN in
-            [0, 2**bits - 1].
-    Error:  `nearest` rounds the float64 product of electrons and gain half to even: every number is exact unless the
-            product is within 1e-11 DN of the middle of two numbers. Variance 1/12 DN2. `truncation`, floor(x), as many
-            converters cut, is 1/2 DN too low with the same variance. `dithered_floor`, floor(x + U(-1/2, 1/2)) as
-            printed, is 1/2 DN too low with up to 1/6 DN2 more variance. Integral
-            nonlinearity is left out. The gradient is that of the numbers before rounding, and 0 where the converter
-            clips.
+    Shapes: electrons (..., y, x) -> (..., y, x), whole numbers in the dtype of the input (float32
+            for half precision).
+    Units:  electrons e-; gain K of EMVA 1288, DN/e-, which a recipe may also write as e-/DN; result
+            DN in [0, 2**bits - 1].
+    Error:  `nearest` rounds the float64 product of electrons and gain half to even: every number is
+            exact unless the product is within 1e-11 DN of the middle of two numbers. Variance 1/12
+            DN2. `truncation`, floor(x), as many converters cut, is 1/2 DN too low with the same
+            variance. `dithered_floor`, floor(x + U(-1/2, 1/2)) as printed, is 1/2 DN too low with
+            up to 1/6 DN2 more variance. Integral nonlinearity is left out. The gradient is that of
+            the numbers before rounding, and 0 where the converter clips.
     Raises: ValueError for `dithered_floor` without rng.
-    Source: NeuSee, Eq. (SensorImage); EMVA Standard 1288, release 4.0 (quantization variance 1/12 DN2).
+    Source: NeuSee, Eq. (SensorImage); EMVA Standard 1288, release 4.0 (quantization variance 1/12
+            DN2).
     """
     if rounding == "dithered_floor" and rng is None:
         raise ValueError("rounding dithered_floor needs random numbers: give rng=torch.Generator()")
     electrons = single(electrons)
-    whole = _whole_numbers(electrons.detach(), gain, 2**bits - 1, rounding, rng)
+    numbers = _whole_numbers(electrons.detach(), gain, 2**bits - 1, rounding, rng)
     if not (electrons.requires_grad or transformed()):
-        return whole
+        return numbers
     ideal = (electrons * gain).clamp(0, 2**bits - 1)
-    return ideal + (whole - ideal).detach()  # the sum is exact: the difference is a multiple of the last bit of `ideal`
+    # the sum is exact: the difference is a multiple of the last bit of `ideal`
+    return ideal + (numbers - ideal).detach()
 
 
-def _whole_numbers(electrons: Tensor, gain: float, top: int, rounding: Rounding, rng: Generator | None) -> Tensor:
-    """Return the digital numbers from 0 to ``top``, rounded half to even, cut, or cut with a dither from ``rng``.
+def _whole_numbers(
+    electrons: Tensor, gain: float, top: int, rounding: Rounding, rng: Generator | None
+) -> Tensor:
+    """Return the digital numbers from 0 to ``top``, rounded half to even, cut, or cut with a dither
+    from ``rng``.
 
     The product is float64: in float32, one number in a thousand would be off by one.
     """
     result = torch.empty_like(electrons, memory_format=torch.contiguous_format)
-    flat, whole, dither = electrons.reshape(-1), result.view(-1), None
+    flat, numbers, dither = electrons.reshape(-1), result.view(-1), None
     if rounding == "dithered_floor" and rng is not None:
-        dither = torch.rand(electrons.shape, generator=rng, device=rng.device, dtype=torch.float32) - 0.5
+        dither = (
+            torch.rand(electrons.shape, generator=rng, device=rng.device, dtype=torch.float32) - 0.5
+        )
         dither = dither.to(electrons.device).reshape(-1)
-    for at in range(0, flat.numel(), _BLOCK):
-        part = slice(at, at + _BLOCK)
-        line = flat[part].double() * gain
-        line = line if dither is None else line.add_(dither[part])
+    for start in range(0, flat.numel(), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        line = flat[block].double() * gain
+        line = line if dither is None else line.add_(dither[block])
         line = line.round_() if rounding == "nearest" else line.floor_()
-        whole[part] = line.clamp_(0, top)
+        numbers[block] = line.clamp_(0, top)
     return result
 
 
@@ -141,18 +162,22 @@ def _(
     top, electrons = 2**bits - 1, single(electrons)
     line = [float(Fraction(x) * Fraction(gain)) for x in electrons.flatten().tolist()]
     if rounding == "nearest":
-        whole = [round(min(max(x, 0.0), float(top))) for x in line]
+        numbers = [round(min(max(x, 0.0), float(top))) for x in line]
     elif rounding == "truncation":
-        whole = [min(max(math.floor(x), 0), top) for x in line]
+        numbers = [min(max(math.floor(x), 0), top) for x in line]
     else:
         dither = torch.rand(electrons.shape, generator=rng, dtype=torch.float32).flatten().tolist()
-        whole = [min(max(math.floor(x + (d - 0.5)), 0), top) for x, d in zip(line, dither, strict=True)]
-    return torch.tensor(whole, dtype=electrons.dtype).reshape(electrons.shape)
+        numbers = [
+            min(max(math.floor(x + (d - 0.5)), 0), top) for x, d in zip(line, dither, strict=True)
+        ]
+    return torch.tensor(numbers, dtype=electrons.dtype).reshape(electrons.shape)
 
 
 @digitize.propagate_error
 def _(electrons: ErrorBound, *, result: TensorStats, gain: float, **params: Any) -> float:
-    """Return an error bound of the digital numbers before rounding, whose effect `rounding_error` estimates."""
+    """Return an error bound of the digital numbers before rounding, whose effect
+    `rounding_error` estimates.
+    """
     return electrons.rms * gain
 
 
@@ -160,10 +185,11 @@ def _(electrons: ErrorBound, *, result: TensorStats, gain: float, **params: Any)
 def _(rms: float, *, result: TensorStats, **params: Any) -> float:
     """Return an estimate of the rms error in DN after rounding.
 
-    A small error e (DN) moves a value across the edge between two numbers with the probability e, and changes its
-    number by 1: the mean square grows by e - e^2, and by 1/4 at most. The number of such pixels is that which one of
-    10 000 pictures exceeds. This holds where noise spreads the values over at least one number. An even area without
-    noise may change as a whole, by one number more.
+    A small error e (DN) moves a value across the edge between two numbers with the probability e,
+    and changes its number by 1: the mean square grows by e - e^2, and by 1/4 at most. The number of
+    such pixels is that which one of 10 000 pictures exceeds. This holds where noise spreads the
+    values over at least one number. An even area without noise may change as a whole, by one number
+    more.
     """
     pixels = max(1, math.prod(result.shape))
     share = rms * (1.0 - rms) if rms < 0.5 else 0.25
@@ -179,15 +205,22 @@ def _(*, gain: float, bits: int = 16, **params: object) -> list[str]:
 
 @digitize.check
 def _(result: Tensor, *inputs: Tensor, bits: int = 16, **params: Any) -> list[Check]:
-    high, low = (int(torch.count_nonzero(result == end)) / max(1, result.numel()) for end in (2**bits - 1, 0))
-    return [Check(f"{high:.2%} of pixels are at the largest digital number, {low:.2%} at 0 DN", high < 0.5)]
+    high, low = (
+        int(torch.count_nonzero(result == end)) / max(1, result.numel()) for end in (2**bits - 1, 0)
+    )
+    return [
+        Check(
+            f"{high:.2%} of pixels are at the largest digital number, {low:.2%} at 0 DN", high < 0.5
+        )
+    ]
 
 
 @node(rtol=0.0)
 def crop(image: Tensor, *, shape: Shape) -> Tensor:
     """Crop an image to the window of the sensor, with the optical axis at sample N // 2.
 
-    Where image and window are not both odd or both even, kornia's `center_crop` interpolates between pixels.
+    Where image and window are not both odd or both even, kornia's `center_crop` interpolates
+    between pixels.
 
     Shapes: image (..., y, x) -> (..., *shape).
     Units:  any.
@@ -202,7 +235,9 @@ def crop(image: Tensor, *, shape: Shape) -> Tensor:
 
 
 def _too_small(image: Tensor, shape: Shape) -> str:
-    """Return a message if an image is smaller than a window of the given shape, else an empty text."""
+    """Return a message if an image is smaller than a window of the given shape, else an empty
+    text.
+    """
     if all(n <= m for n, m in zip(shape, image.shape[-2:], strict=True)):
         return ""
     window, picture = (f"{y} x {x}" for y, x in (shape, image.shape[-2:]))
@@ -221,7 +256,9 @@ def _(*, shape: tuple[int, int], image: Tensor | None = None) -> list[str]:
 
 @crop.propagate_error
 def _(image: ErrorBound, *, result: TensorStats, **params: Any) -> float:
-    """Return an error bound of the cropped image for the worst case, in which all the error is inside the window."""
+    """Return an error bound of the cropped image for the worst case, in which all the error is
+    inside the window.
+    """
     before = math.prod(image.stats.shape) if image.stats else math.inf
     return image.rms * math.sqrt(before / max(1, math.prod(result.shape)))
 

@@ -1,8 +1,9 @@
-"""Expected ranges of the results of the sensor nodes, by which a plan foresees what well and converter cut off.
+"""Expected ranges of the results of the sensor nodes, by which a plan foresees what well and
+converter cut off.
 
-Before a run no image is known. Its brightest pixel therefore counts as 1, and irradiance counts in photons of the
-brightest channel per second and square metre: what the rows of an image and the responses of a channel multiply cancels
-between `sensor.level` and `sensor.expose`.
+Before a run no image is known. Its brightest pixel therefore counts as 1, and irradiance counts in
+photons of the brightest channel per second and square metre: what the rows of an image and the
+responses of a channel multiply cancels between `sensor.level` and `sensor.expose`.
 """
 
 import math
@@ -23,12 +24,19 @@ Range = tuple[float, float]
 
 @level.expected_range
 def _(
-    *inputs: Any, strength: float | None, full_well: float, quantum_efficiency: float, pixel_pitch: float,
-    exposure: float, **params: Any,
-) -> Range:  # fmt: skip
+    *inputs: Any,
+    strength: float | None,
+    full_well: float,
+    quantum_efficiency: float,
+    pixel_pitch: float,
+    exposure: float,
+    **params: Any,
+) -> Range:
     if strength is None:
         raise LookupError("the irradiance of a white surface is known with the spectra only")
-    level = strength * photons_that_fill(full_well, quantum_efficiency) / (exposure * pixel_pitch**2)
+    level = (
+        strength * photons_that_fill(full_well, quantum_efficiency) / (exposure * pixel_pitch**2)
+    )
     return level, level
 
 
@@ -49,7 +57,7 @@ def _(
 @add_photons.expected_range
 def _(photons: TensorStats, *added: Iterable[TensorStats] | None) -> Range:
     others = list(chain.from_iterable(filter(None, added)))
-    return photons.min, math.fsum(part.max for part in (photons, *others))
+    return photons.min, math.fsum(light.max for light in (photons, *others))
 
 
 @photon_noise.expected_range
@@ -63,21 +71,28 @@ def _(
     **params: Any,
 ) -> Range:
     counts = photons.max * quantum_efficiency
-    kept = mean_shift + (mean == "additive")
-    return 0.0, max(0.0, kept * counts + _SIGMAS * spread * math.sqrt(counts))
+    mean_factor = mean_shift + (mean == "additive")
+    return 0.0, max(0.0, mean_factor * counts + _SIGMAS * spread * math.sqrt(counts))
 
 
 @dark_current.expected_range
 def _(
-    electrons: TensorStats, *, mean: float | ElectronsPerSecond, exposure: float | None, **params: Any
-) -> Range:  # fmt: skip
+    electrons: TensorStats,
+    *,
+    mean: float | ElectronsPerSecond,
+    exposure: float | None,
+    **params: Any,
+) -> Range:
     total = dark_electrons(mean, exposure)
     return electrons.min, electrons.max + total + _SIGMAS * math.sqrt(total)
 
 
 @read_noise.expected_range
 def _(electrons: TensorStats, *, offset: float, read_noise: float, **params: Any) -> Range:
-    return electrons.min + offset - _SIGMAS * read_noise, electrons.max + offset + _SIGMAS * read_noise
+    return (
+        electrons.min + offset - _SIGMAS * read_noise,
+        electrons.max + offset + _SIGMAS * read_noise,
+    )
 
 
 @full_well.expected_range

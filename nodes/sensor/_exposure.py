@@ -1,4 +1,4 @@
-"""Conversion of irradiance to photons in each colour channel, scaling of the scene, and addition of laser light."""
+"""Irradiance to photons in each channel: weighted sums of bands, level, laser light."""
 
 import math
 from collections.abc import Mapping
@@ -10,13 +10,92 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, ErrorBound, ParameterError, TensorStats, node
-from neusee.nodes._half_precision import refuse_not_finite, single
-from neusee.nodes.sensor._channel_sums import weighted
-from neusee.nodes.sensor._saturation import Efficiency, Well, photons_per_joule, photons_that_fill, saturation
-from neusee.nodes.units import Exposure, PixelPitch
+from neusee.nodes.precision import refuse_not_finite, single
+from neusee.nodes.sensor._saturation import Well, photons_per_joule, photons_that_fill, saturation
+from neusee.nodes.units import Efficiency, Exposure, PixelPitch
 from neusee.nodes.values import Bands, Channels
 
-Strength = Annotated[float, Field(ge=0, le=1e18)]  #: multiple of the exposure that saturates a pixel
+# --- channel sums ---------------------------------------------------------------------------------
+
+# Weighted sums of the spectral bands of an image, computed from the bands or from stored sums.
+
+
+_OFF = 1e-9  #: largest relative error of weights that are combined from the rows
+
+
+def weighted(image: Tensor | Channels, weights: Tensor) -> Tensor:
+    """Multiply the spectral bands of an image by ``weights`` (..., band), and return the sum over
+    the bands.
+
+    Raises ValueError if weights and image have different numbers of bands, or if no combination of
+    the channel sums gives the weights.
+    """
+    if isinstance(image, Channels):
+        mixed = _of_rows(weights, image.rows).to(image.planes)
+        summed: Tensor = torch.tensordot(mixed, image.planes, 1)
+        return summed
+    image = single(image)
+    flat = weights.to(image) @ image.flatten(-2)
+    return flat.reshape(*flat.shape[:-1], *image.shape[-2:])
+
+
+def channel_sums(image: Tensor, rows: Tensor) -> Channels:
+    """Return weighted sums of the spectral bands of an image, one sum for each row of the matrix
+    ``rows``.
+
+    Shapes: image (..., band, y, x), rows (row, band). The sums carry no approximation error. The
+            sums of a part of the
+    bands are the contribution of these bands to the whole.
+    """
+    exact = torch.zeros((), dtype=torch.float64)
+    return Channels(weighted(image, rows), rows.detach().double(), exact, largest=exact)
+
+
+def _of_rows(weights: Tensor, rows: Tensor) -> Tensor:
+    """Solve ``weights = M rows`` for the matrix M by least squares in float64.
+
+    The gradient reaches the weights.
+    """
+    image_rows = rows.detach().cpu().double()
+    scale = image_rows.abs().amax(1, keepdim=True)
+    inverse = (
+        torch.linalg.pinv(image_rows / scale.where(scale > 0, 1.0)) / scale.where(scale > 0, 1.0).T
+    )
+    exact = weights.cpu().double()
+    if exact.shape[-1] != image_rows.shape[1]:
+        counts = (
+            f"the weights have {exact.shape[-1]} bands and the sums of the image"
+            f" {image_rows.shape[1]} bands"
+        )
+        raise ValueError(f"{counts}: compute weights and image from the same `bands` step")
+    matrix: Tensor = exact @ inverse
+    _require_combination(exact.detach(), matrix.detach() @ image_rows)
+    return matrix
+
+
+def _require_combination(exact: Tensor, combined: Tensor) -> None:
+    """Raise ValueError unless the weights ``combined`` equal ``exact`` within 1e-9 of the
+    largest weight.
+    """
+    off, largest = (exact - combined).abs().flatten(0, -2), exact.abs().flatten(0, -2).amax(-1)
+    if not bool((off.amax(-1) <= _OFF * largest).all()):
+        worst = float((off.amax(-1) / largest.clamp_min(1e-300)).max())
+        raise ValueError(
+            "the image was summed over its bands with other weights: the weights of this step"
+            f" differ by {worst:.2g} (relative error; at most 1e-9) from every combination of these"
+            " weights: use the same `bands` and `responses` for both, with a level that is equal"
+            " in all bands, or keep the image of all bands"
+        )
+
+
+# --- exposure -------------------------------------------------------------------------------------
+
+# Conversion of irradiance to photons in each colour channel, scaling of the scene, and addition of
+# laser light.
+
+
+#: multiple of the exposure that saturates a pixel
+Strength = Annotated[float, Field(ge=0, le=1e18)]
 
 
 @node(accepts_channel_sums=("irradiance",), needs_band_invariant=("level",))
@@ -31,20 +110,28 @@ def expose(
 ) -> Tensor:
     """Compute the photons in each colour channel of each pixel from the irradiance in each band.
 
-    Photons are the sum over the bands of r I level lambda t dx^2 / (h c), with response r and irradiance I. If the
-    image has already been summed over its bands (`Channels`), the photons are weighted sums of its planes.
+    Photons are the sum over the bands of r I level lambda t dx^2 / (h c), with response r and
+    irradiance I. If the image has already been summed over its bands (`Channels`), the photons are
+    weighted sums of its planes.
 
-    Shapes: irradiance (..., band, y, x), responses (channel, band), level (band,) -> (..., channel, y, x).
+    Shapes: irradiance (..., band, y, x), responses (channel, band), level (band,) -> (..., channel,
+            y, x).
     Units:  irradiance W/m2 in the whole band, or any unit if `level` is given; result photons.
-    Error:  one wavelength represents its band: error below (width / wavelength)^2 / 12, 5e-5 at 10 nm.
-    Raises: ValueError if the bands of the inputs differ, or if no combination of the rows gives the weights.
-    Source: NeuSee, Eq. (photon_count); the channel sum as EMVA Standard 1288, release 4.0, for each wavelength.
+    Error:  one wavelength represents its band: error below (width / wavelength)^2 / 12, 5e-5 at 10
+            nm.
+    Raises: ValueError if the bands of the inputs differ, or if no combination of the rows gives the
+            weights.
+    Source: NeuSee, Eq. (photon_count); the channel sum as EMVA Standard 1288, release 4.0, for each
+            wavelength.
     """
     weights = channel_weights(bands, responses, level, pixel_pitch=pixel_pitch, exposure=exposure)
-    if isinstance(irradiance, Tensor) and (irradiance.ndim < 3 or irradiance.shape[-3] != weights.shape[1]):
+    if isinstance(irradiance, Tensor) and (
+        irradiance.ndim < 3 or irradiance.shape[-3] != weights.shape[1]
+    ):
         raise ValueError(
-            f"irradiance has shape {tuple(irradiance.shape)}, not (band, y, x) with {weights.shape[1]} bands: "
-            "compute irradiance, bands and responses from the same `bands` step"
+            f"irradiance has shape {tuple(irradiance.shape)}, not (band, y, x) with"
+            f" {weights.shape[1]} bands: compute irradiance, bands and responses from the same"
+            " `bands` step"
         )
     return weighted(irradiance, weights)
 
@@ -60,7 +147,9 @@ def _(
     weights = channel_weights(bands, responses, level, **sizes)
     if isinstance(irradiance, Channels):
         return weighted(irradiance._replace(planes=irradiance.planes.double()), weights)
-    channels = [(row[:, None, None] * irradiance.double()).sum(-3) for row in weights.to(irradiance.device)]
+    channels = [
+        (row[:, None, None] * irradiance.double()).sum(-3) for row in weights.to(irradiance.device)
+    ]
     return torch.stack(channels, -3)
 
 
@@ -71,12 +160,15 @@ def _(result: Tensor, *inputs: object, **params: object) -> list[Check]:
 
 
 @expose.propagate_error
-def _(irradiance: ErrorBound, *others: ErrorBound | None, result: TensorStats, **params: Any) -> float:
-    """Return an error bound of the photons from the relative errors of the irradiance and of the factor `level`.
+def _(
+    irradiance: ErrorBound, *others: ErrorBound | None, result: TensorStats, **params: Any
+) -> float:
+    """Return an error bound of the photons from the relative errors of the irradiance and of the
+    factor `level`.
 
-    No channel has a larger relative error, because the share of `Channels` holds for each of its rows. The errors of
-    the two factors multiply too. Bands of an image have no such share: a channel may see only the darker ones,
-    and the error is unknown.
+    No channel has a larger relative error, because the share of `Channels` holds for each of its
+    rows. The errors of the two factors multiply too. Bands of an image have no such share: a
+    channel may see only the darker ones, and the error is unknown.
     """
     if irradiance.rms and irradiance.peak is None:
         return math.inf
@@ -88,12 +180,15 @@ def _(irradiance: ErrorBound, *others: ErrorBound | None, result: TensorStats, *
 def channel_weights(
     bands: Bands, responses: Tensor, level: Tensor | None, *, pixel_pitch: float, exposure: float
 ) -> Tensor:
-    """Return the photons per unit of irradiance in each band for each colour channel: (channel, band) float64."""
+    """Return the photons per unit of irradiance in each band for each colour channel: (channel,
+    band) float64.
+    """
     lengths = {len(bands.centres), responses.shape[-1]} | (set() if level is None else {len(level)})
     if len(lengths) > 1:
         raise ValueError(
-            f"bands {len(bands.centres)}, responses {tuple(responses.shape)}, level "
-            f"{None if level is None else tuple(level.shape)} differ in the number of bands: use one step `bands`"
+            f"bands {len(bands.centres)}, responses {tuple(responses.shape)}, level"
+            f" {None if level is None else tuple(level.shape)} differ in the number of bands: use"
+            " one step `bands`"
         )
     photons = photons_per_joule(bands.centres) * (exposure * pixel_pitch**2)
     weights = responses.double() * photons.to(responses.device)
@@ -114,36 +209,45 @@ def level(
     exposure: Exposure,
     rule: Literal["channel_sum", "per_band"] = "channel_sum",
 ) -> Tensor:
-    """Compute the factor that scales an image to irradiance, so that the brightest pixel has ``strength`` full wells.
+    """Compute the factor that scales an image to irradiance, so that the brightest pixel has
+    ``strength`` full wells.
 
     The image is that of the plain lens, without mask.
 
-    `channel_sum`: the brightest pixel of the brightest channel holds strength x full well, summed over bands.
-    `per_band`: each band alone peaks at strength x I_sat, as the paper prints; the sum of 31 bands overexposes.
-    Without a strength the factor is ``white``, the irradiance of a white surface in lux or cd/m2.
+    `channel_sum`: the brightest pixel of the brightest channel holds strength x full well, summed
+    over bands. `per_band`: each band alone peaks at strength x I_sat, as the paper prints; the sum
+    of 31 bands overexposes. Without a strength the factor is ``white``, the irradiance of a white
+    surface in lux or cd/m2.
 
     Shapes: plain_image (..., band, y, x), responses (channel, band), white () -> (band,) float64.
     Units:  result W/m2 per unit of the image.
     Error:  exact; a scene without light has level 0.
-    Raises: ParameterError before the run where strength and white are both given, or neither; ValueError for `per_band`
-            if the image has been summed over its bands, and for an image that is not finite.
+    Raises: ParameterError before the run where strength and white are both given, or neither;
+            ValueError for `per_band` if the image has been summed over its bands, and for an image
+            that is not finite.
     Source: NeuSee, Eq. (peak_irrad_coded).
     """
     if strength is None:
         if white is None or not bool(white > 0):
             raise ParameterError("strength", _DARK)
         planes = plain_image.planes if isinstance(plain_image, Channels) else plain_image
-        refuse_not_finite("no level can scale this image", plain_image=planes.amin() + planes.amax())
+        refuse_not_finite(
+            "no level can scale this image", plain_image=planes.amin() + planes.amax()
+        )
         return white.double().expand(len(bands.centres)).clone()
     if rule == "per_band":
         if isinstance(plain_image, Channels):
-            raise ValueError("rule per_band needs the peak of each band, but this image is summed over its bands: "
-                             "use rule channel_sum, or keep the image of all bands")  # fmt: skip
+            raise ValueError(
+                "rule per_band needs the peak of each band, but this image is summed over its"
+                " bands: use rule channel_sum, or keep the image of all bands"
+            )
         peaks = plain_image.amax((-2, -1)).reshape(-1, len(bands.centres)).amax(0).double()
         sensor = {"full_well": full_well, "quantum_efficiency": quantum_efficiency}
         top = saturation(bands, **sensor, pixel_pitch=pixel_pitch, exposure=exposure)
     else:
-        photons: Tensor = expose(plain_image, bands, responses, pixel_pitch=pixel_pitch, exposure=exposure)
+        photons: Tensor = expose(
+            plain_image, bands, responses, pixel_pitch=pixel_pitch, exposure=exposure
+        )
         peaks = photons.amax().double().expand(len(bands.centres))
         top = torch.tensor(photons_that_fill(full_well, quantum_efficiency), dtype=torch.float64)
     refuse_not_finite("no level can scale this image", plain_image=peaks)
@@ -151,7 +255,10 @@ def level(
     return torch.where(lit, strength * top.to(peaks) / peaks.where(lit, 1.0), 0.0)
 
 
-_DARK = "the brightness of the scene is not known: give sensor.background, scene.illuminance or scene.luminance"
+_DARK = (
+    "the brightness of the scene is not known: give sensor.background, scene.illuminance or"
+    " scene.luminance"
+)
 
 
 @level.band_invariant
@@ -161,7 +268,8 @@ def _(params: Mapping[str, Any]) -> bool:
 
 @level.propagate_error
 def _(plain_image: ErrorBound, *others: object, result: TensorStats, **params: Any) -> float:
-    """Return an error bound of the scale factor `level` from the error of the brightest pixel of the image.
+    """Return an error bound of the scale factor `level` from the error of the brightest pixel of
+    the image.
 
     The brightest pixels of single bands may be off by more.
     """
@@ -175,32 +283,48 @@ def _(plain_image: ErrorBound, *others: object, result: TensorStats, **params: A
 
 @level.preflight
 def _(
-    *, white: Tensor | None = None, strength: float | None = None, rule: str = "channel_sum", **params: object
+    *,
+    white: Tensor | None = None,
+    strength: float | None = None,
+    rule: str = "channel_sum",
+    **params: object,
 ) -> list[str]:
     absolute = white is not None and (white.is_meta or float(white) > 0)
     if strength is None:
         if not absolute:
             raise ParameterError("strength", _DARK)
         if rule == "per_band":
-            raise ParameterError("rule", "lux and cd/m2 are sums over the bands: use rule channel_sum")
+            raise ParameterError(
+                "rule", "lux and cd/m2 are sums over the bands: use rule channel_sum"
+            )
         return []
     if absolute:
-        text = "the brightness of the scene is stated twice, here and in lux or cd/m2: write sensor.background=null"
-        raise ParameterError("strength", f"{text}, or leave scene.illuminance and scene.luminance out")
+        text = (
+            "the brightness of the scene is stated twice, here and in lux or cd/m2: write"
+            " sensor.background=null"
+        )
+        raise ParameterError(
+            "strength", f"{text}, or leave scene.illuminance and scene.luminance out"
+        )
     notes = (
-        [f"background of {strength:g} full wells saturates the plain lens without any laser"] if strength > 1 else []
+        [f"background of {strength:g} full wells saturates the plain lens without any laser"]
+        if strength > 1
+        else []
     )
     return notes + (["rule per_band: each band alone fills the well"] if rule == "per_band" else [])
 
 
 @node(rtol=1e-6, additive_inputs=[("lasers",), ("ghosts",)])
-def add_photons(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: list[Tensor] | None = None) -> Tensor:
-    """Add the photons of the scene, of every laser and of every ghost image, which are mutually incoherent.
+def add_photons(
+    photons: Tensor, lasers: list[Tensor] | None = None, ghosts: list[Tensor] | None = None
+) -> Tensor:
+    """Add the photons of the scene, of every laser and of every ghost image, which are mutually
+    incoherent.
 
     Shapes: photons (..., channel, y, x), each laser and ghost the same -> (..., channel, y, x).
     Units:  photons.
-    Error:  float32: 6e-8 of the sum. Half precision ends at 65504, so photons in half precision are added in
-            float32.
+    Error:  float32: 6e-8 of the sum. Half precision ends at 65504, so photons in half precision are
+            added in float32.
     Raises: ValueError if a shape differs.
     Source: NeuSee, Eq. (photon_count).
     """
@@ -208,8 +332,8 @@ def add_photons(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: lis
     for added in chain(lasers or (), ghosts or ()):
         if added.shape[-3:] != photons.shape[-3:]:
             raise ValueError(
-                f"laser light of shape {tuple(added.shape)} cannot be added to a scene of {tuple(photons.shape)}: "
-                "give laser and scene the same `shape`"
+                f"laser light of shape {tuple(added.shape)} cannot be added to a scene of"
+                f" {tuple(photons.shape)}: give laser and scene the same `shape`"
             )
         total = total + added
     return total
@@ -217,13 +341,19 @@ def add_photons(photons: Tensor, lasers: list[Tensor] | None = None, ghosts: lis
 
 @add_photons.propagate_error
 def _(photons: ErrorBound, *added: list[ErrorBound] | None, **params: Any) -> float:
-    return math.fsum(part.rms for part in (photons, *chain.from_iterable(filter(None, added))))
+    return math.fsum(error.rms for error in (photons, *chain.from_iterable(filter(None, added))))
 
 
 @add_photons.check
 def _(result: Tensor, photons: Tensor, *others: object, **params: object) -> list[Check]:
     scene, high = float(photons.max()), float(result.max())
-    return [Check(f"the brightest pixel receives {high:.4g} photons, and {scene:.4g} from the scene alone", high >= 0)]
+    return [
+        Check(
+            f"the brightest pixel receives {high:.4g} photons, and {scene:.4g} from the scene"
+            " alone",
+            high >= 0,
+        )
+    ]
 
 
 @expose.zero_bound
@@ -236,12 +366,19 @@ def _(
     pixel_pitch: float,
     exposure: float,
 ) -> float:
-    """Return an upper bound of the photons in a pixel, from the largest irradiance and the largest response.
+    """Return an upper bound of the photons in a pixel, from the largest irradiance and the largest
+    response.
 
     The bound is exact for a single band.
     """
     brightest = max(irradiance.max, -irradiance.min)
     if brightest == 0:
         return 0.0
-    photons = float(photons_per_joule(torch.tensor(bands.max, dtype=torch.float64))) * exposure * pixel_pitch**2
-    return photons * bands.shape[0] * responses.max * brightest * (1.0 if level is None else level.max)
+    photons = (
+        float(photons_per_joule(torch.tensor(bands.max, dtype=torch.float64)))
+        * exposure
+        * pixel_pitch**2
+    )
+    return (
+        photons * bands.shape[0] * responses.max * brightest * (1.0 if level is None else level.max)
+    )

@@ -1,6 +1,8 @@
-"""A frame that somebody took, read from a file as the digital numbers of the camera."""
+"""A frame that somebody took, from a file, and signs that a tone curve was applied."""
 
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -10,15 +12,104 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.array_bytes import npy_needs
-from neusee.nodes.input_files import once_per_version, refuse_large_array, refuse_large_picture
-from neusee.nodes.input_size import head_of, needs, refuse_other_than_file
-from neusee.nodes.picture_bytes import exr_needs, tiff_needs
+from neusee.nodes.file_headers import exr_needs, npy_needs, tiff_needs
+from neusee.nodes.input_files import (
+    bytes_of,
+    head_of,
+    needs,
+    once_per_version,
+    refuse_large_array,
+    refuse_large_picture,
+    refuse_other_than_file,
+)
 from neusee.nodes.sensor._digitization import Bits
-from neusee.nodes.sensor._tone_curve import tone_curve_sign
 from neusee.nodes.units import DataFile, Shape
 
-Curve = Literal["linear"]  #: what a user states of the tone curve of numbers that have a sign of one
+# --- tone curve -----------------------------------------------------------------------------------
+
+# Signs in a file that a tone curve was applied: 8 bits, a stated gamma or colour profile, stretched
+# numbers.
+
+
+_BYTE = 8  #: bits of the pictures of displays, whose numbers have a tone curve
+_LINEAR_GAMMA = 100_000  #: value of the chunk gAMA of a PNG that is proportional to the light
+#: code point of a linear transfer characteristic in the chunk cICP (ITU-T H.273)
+_LINEAR_TRANSFER = 8
+#: factor by which numbers of 8 bits become numbers of 16
+_TO_SIXTEEN = {257: "stretched", 256: "shifted"}
+_ICC_PROFILE = 34675  #: tag of a TIFF file
+_FIRST_DIRECTORY = 4096  #: entries of a TIFF directory that are looked at, at most
+
+
+def tone_curve_sign(file: Path, values: NDArray[Any], depth: int | None, bits: int) -> str:
+    """Return the sign of a tone curve in a picture file as the end of a sentence, or an empty text
+    for none.
+
+    ``depth`` are the bits of the numbers in the file, or None if it does not state them; ``bits``
+    those of the sensor.
+    """
+    if _BYTE in (depth, bits) or values.dtype.itemsize == 1:
+        return "has 8 bits, as pictures with a tone curve (sRGB, gamma 2.2) have"
+    if values.dtype.kind in "ui" and values.any():
+        for factor, done in _TO_SIXTEEN.items():
+            if not (values % factor).any():
+                return f"has only multiples of {factor}: numbers of 8 bits that were {done} to 16"
+    with suppress(OSError, struct.error):
+        if file.suffix.lower() == ".png":
+            return _png_sign(bytes_of(file))
+        if file.suffix.lower() in (".tif", ".tiff"):
+            return _tiff_sign(bytes_of(file))
+    return ""
+
+
+def _png_sign(content: bytes) -> str:
+    for kind, data in _chunks(content):
+        if kind == b"sRGB":
+            return "says of itself that it is sRGB encoded, which is a tone curve"
+        if kind == b"gAMA" and (gamma := struct.unpack(">I", data[:4])[0]) != _LINEAR_GAMMA:
+            return f"states a tone curve with the gamma {_LINEAR_GAMMA / max(gamma, 1):.3g}"
+        if kind == b"cICP" and data[1] != _LINEAR_TRANSFER:
+            return (
+                f"states the transfer characteristic {data[1]} of ITU-T H.273, which is a tone"
+                " curve"
+            )
+        if kind == b"iCCP" and b"linear" not in (name := data.split(b"\0")[0]).lower():
+            return f"has the colour profile {name.decode('latin-1')}, which has a tone curve"
+    return ""
+
+
+def _chunks(content: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Yield the kind and the data of each chunk of a PNG before its pixels."""
+    place = 8
+    while place + 8 <= len(content):
+        length, kind = struct.unpack(">I4s", content[place : place + 8])
+        if kind == b"IDAT":
+            return
+        yield kind, content[place + 8 : place + 8 + length]
+        place += length + 12
+
+
+def _tiff_sign(content: bytes) -> str:
+    order = {b"II": "<", b"MM": ">"}.get(content[:2])
+    if order is None or struct.unpack(f"{order}H", content[2:4])[0] != 42:
+        return ""
+    (first,) = struct.unpack(f"{order}I", content[4:8])
+    (count,) = struct.unpack(f"{order}H", content[first : first + 2])
+    for number in range(min(count, _FIRST_DIRECTORY)):
+        entry = content[first + 2 + 12 * number : first + 14 + 12 * number]
+        tag, _, length, place = struct.unpack(f"{order}HHII", entry)
+        if tag == _ICC_PROFILE and b"linear" not in content[place : place + length].lower():
+            return "has a colour profile, which has a tone curve"
+    return ""
+
+
+# --- frame file -----------------------------------------------------------------------------------
+
+# A frame that somebody took, read from a file as the digital numbers of the camera.
+
+
+#: what a user states of the tone curve of numbers that have a sign of one
+Curve = Literal["linear"]
 _DAMAGED = "{name} is damaged or no picture ({error}): copy the file again"
 _STATE = "frame.curve=linear"
 _COLOURS = {0: 1, 2: 3}  #: channels of a PNG by its colour type
@@ -27,19 +118,25 @@ _ARRAY = "(y, x), (y, x, 3) or (3, y, x)"
 
 
 @node(rtol=0.0)
-def frame(responses: Tensor, *, file: DataFile, shape: Shape, bits: Bits = 16, curve: Curve | None = None) -> Tensor:
+def frame(
+    responses: Tensor, *, file: DataFile, shape: Shape, bits: Bits = 16, curve: Curve | None = None
+) -> Tensor:
     """Read a frame that a camera took: the digital numbers of each channel, unchanged.
 
-    The file is a PNG or TIFF of 8 or 16 bits, an OpenEXR picture, or a NumPy array. No tone curve is undone: the
-    numbers must be those of the converter, from 0 to 2**bits - 1, so that `restore.electrons` can divide them by the
-    gain and subtract the offset of the sensor. A file with a sign of a tone curve (8 bits, a stated gamma, a colour
-    profile, 8 bits stretched to 16) is refused, unless ``curve`` states that its numbers are linear in the light.
+    The file is a PNG or TIFF of 8 or 16 bits, an OpenEXR picture, or a NumPy array. No tone curve
+    is undone: the numbers must be those of the converter, from 0 to 2**bits - 1, so that
+    `restore.electrons` can divide them by the gain and subtract the offset of the sensor. A file
+    with a sign of a tone curve (8 bits, a stated gamma, a colour profile, 8 bits stretched to 16)
+    is refused, unless ``curve`` states that its numbers are linear in the light.
 
-    Shapes: responses (channel, band), of which only the number of channels counts -> (channel, y, x) float32.
+    Shapes: responses (channel, band), of which only the number of channels counts -> (channel, y,
+            x) float32.
     Units:  DN.
-    Error:  none: whole numbers are exact. An orientation in EXIF is ignored, as the sensor does not turn.
-    Raises: ParameterError before the run for a file that is damaged or of another format, and for a size, channels,
-            depth or numbers that do not fit the sensor, and for a sign of a tone curve without a statement.
+    Error:  none: whole numbers are exact. An orientation in EXIF is ignored, as the sensor does not
+            turn.
+    Raises: ParameterError before the run for a file that is damaged or of another format, and for a
+            size, channels, depth or numbers that do not fit the sensor, and for a sign of a tone
+            curve without a statement.
     Source: EMVA Standard 1288, release 4.0 (digital numbers of a camera).
     """
     if problem := frame_problem(file, len(responses), tuple(shape), bits, curve):
@@ -49,7 +146,12 @@ def frame(responses: Tensor, *, file: DataFile, shape: Shape, bits: Bits = 16, c
 
 @frame.preflight
 def _(
-    *, responses: Tensor | None = None, file: Path, shape: Shape, bits: int = 16, curve: Curve | None = None
+    *,
+    responses: Tensor | None = None,
+    file: Path,
+    shape: Shape,
+    bits: int = 16,
+    curve: Curve | None = None,
 ) -> list[str]:
     channels = None if responses is None else len(responses)
     if problem := frame_problem(file, channels, tuple(shape), bits, curve):
@@ -60,7 +162,12 @@ def _(
 @frame.check
 def _(result: Tensor, *inputs: Any, bits: int = 16, **params: Any) -> list[Check]:
     low, high, top = float(result.min()), float(result.max()), 2**bits - 1
-    return [Check(f"numbers from {low:.0f} to {high:.0f} of {top} DN, mean {float(result.mean()):.4g}", high > low)]
+    return [
+        Check(
+            f"numbers from {low:.0f} to {high:.0f} of {top} DN, mean {float(result.mean()):.4g}",
+            high > low,
+        )
+    ]
 
 
 class FrameNumbers(NamedTuple):
@@ -77,14 +184,16 @@ def frame_problem(
         values, depth = read_frame(file)
     except ParameterError as error:
         return str(error)
-    name, found = file.name, values.shape[1:]
+    name, size_of_frame = file.name, values.shape[1:]
     if channels is not None and len(values) != channels:
         return _other_channels(name, len(values), channels)
-    if found != shape:
-        size = f"[{found[0]}, {found[1]}]"
+    if size_of_frame != shape:
+        size = f"[{size_of_frame[0]}, {size_of_frame[1]}]"
         return (
-            f"{name} has {found[0]} x {found[1]} pixels (y, x), but sensor.shape is {list(shape)}: give the whole "
-            f'frame of this sensor, or "sensor.shape={size}" if this window around its centre was read out'
+            f"{name} has {size_of_frame[0]} x {size_of_frame[1]} pixels (y, x), but sensor.shape"
+            f" is {list(shape)}: give the whole "
+            f'frame of this sensor, or "sensor.shape={size}" if this window around its centre was'
+            " read out"
         )
     return (
         _other_depth(name, depth, bits, curve)
@@ -93,21 +202,27 @@ def frame_problem(
     )
 
 
-def _other_channels(name: str, found: int, channels: int) -> str:
-    if found == 1:
+def _other_channels(name: str, frame_channels: int, channels: int) -> str:
+    if frame_channels == 1:
         return (
-            f"{name} has one channel, but the camera has {channels}: it may be a raw colour filter array, which is not "
-            "handled yet; develop it to three channels without a tone curve, or name a sensor.camera of one channel"
+            f"{name} has one channel, but the camera has {channels}: it may be a raw colour filter"
+            " array, which is not handled yet; develop it to three channels without a tone curve,"
+            " or name a sensor.camera of one channel"
         )
-    return f"{name} has {found} channels, but the camera has {channels}: give a frame of the channels of sensor.camera"
+    return (
+        f"{name} has {frame_channels} channels, but the camera has {channels}: give a frame of the"
+        " channels of sensor.camera"
+    )
 
 
 def _other_depth(name: str, depth: int | None, bits: int, curve: Curve | None) -> str:
     if depth is not None and depth < bits and depth == 8:
-        linear = "" if curve == "linear" else f" and {_STATE}, if they have no tone curve (sRGB, gamma)"
+        linear = (
+            "" if curve == "linear" else f" and {_STATE}, if they have no tone curve (sRGB, gamma)"
+        )
         return (
-            f"{name} has 8 bits, but sensor.bits is {bits}: save the raw numbers of the camera in 16 bits, or give "
-            f"sensor.bits=8 with the gain of these numbers{linear}"
+            f"{name} has 8 bits, but sensor.bits is {bits}: save the raw numbers of the camera in"
+            f" 16 bits, or give sensor.bits=8 with the gain of these numbers{linear}"
         )
     return ""
 
@@ -116,8 +231,9 @@ def _curved(name: str, sign: str) -> str:
     if not sign:
         return ""
     return (
-        f"{name} {sign}, but a restoration needs numbers in proportion to the light: save the raw numbers of the "
-        f"camera, without tone curve and white balance; or state {_STATE}, if these numbers are linear in the light"
+        f"{name} {sign}, but a restoration needs numbers in proportion to the light: save the raw"
+        f" numbers of the camera, without tone curve and white balance; or state {_STATE}, if these"
+        " numbers are linear in the light"
     )
 
 
@@ -125,35 +241,44 @@ def _other_numbers(name: str, values: NDArray[Any], bits: int) -> str:
     top = 2**bits - 1
     if values.dtype.kind == "f":
         if count := int((~np.isfinite(values)).sum()):
-            return f"{name} holds {count} values that are not finite (NaN or infinity): give the numbers of the camera"
+            return (
+                f"{name} holds {count} values that are not finite (NaN or infinity): give the"
+                " numbers of the camera"
+            )
         broken = values != np.round(values)
         if broken.any():
             return (
-                f"{name} holds {values[broken][0]:g}, no whole number: give the digital numbers of the camera, from 0 "
-                f"to {top}, without a tone curve and without scaling"
+                f"{name} holds {values[broken][0]:g}, no whole number: give the digital numbers of"
+                f" the camera, from 0 to {top}, without a tone curve and without scaling"
             )
-    least, most = int(values.min()), int(values.max())
-    if least < 0:
-        return f"{name} holds {least}, below 0: give the numbers of the camera with its offset, not subtracted"
-    if most > top:
+    lowest, highest = int(values.min()), int(values.max())
+    if lowest < 0:
         return (
-            f"{name} holds {most} DN, but {bits} bits end at {top}: set sensor.bits to the depth of the converter, or "
-            "shift the numbers down if the camera moved them to the upper bits"
+            f"{name} holds {lowest}, below 0: give the numbers of the camera with its offset, not"
+            " subtracted"
         )
-    if most == least:
-        return f"{name} has the same number, {most}, in every pixel: there is no picture in it"
+    if highest > top:
+        return (
+            f"{name} holds {highest} DN, but {bits} bits end at {top}: set sensor.bits to the"
+            " depth of the converter, or shift the numbers down if the camera moved them to the"
+            " upper bits"
+        )
+    if highest == lowest:
+        return f"{name} has the same number, {highest}, in every pixel: there is no picture in it"
     return ""
 
 
-# --- files ------------------------------------------------------------------------------------------------------------
+# --- files ----------------------------------------------------------------------------------------
 
 
 def read_frame(file: Path) -> FrameNumbers:
-    """Read a frame; raise ParameterError for a file that cannot be read or has another form than a frame."""
+    """Read a frame; raise ParameterError for a file that cannot be read or has another form than
+    a frame.
+    """
     reader = _READERS.get(file.suffix.lower())
     if reader is None:
-        known = ", ".join(_READERS)
-        raise ParameterError("file", f"{file.name} is no frame that can be read: give {known}")
+        suffixes = ", ".join(_READERS)
+        raise ParameterError("file", f"{file.name} is no frame that can be read: give {suffixes}")
     refuse_other_than_file(file)
     try:
         return reader(file)
@@ -170,24 +295,39 @@ def _png(file: Path) -> FrameNumbers:
 
     head = head_of(file, 26)
     if not head.startswith(b"\x89PNG") or len(head) < 26:
-        raise ParameterError("file", f"{file.name} is no PNG file, whatever its name says: save the frame as PNG")
+        raise ParameterError(
+            "file", f"{file.name} is no PNG file, whatever its name says: save the frame as PNG"
+        )
     depth, channels = head[24], _COLOURS.get(head[25], 0)
     if not channels or depth not in (8, 16):
-        text = f"{file.name} has a palette, transparency or {depth} bits: save raw numbers of 8 or 16 bits"
+        text = (
+            f"{file.name} has a palette, transparency or {depth} bits: save raw numbers of 8 or 16"
+            " bits"
+        )
         raise ParameterError("file", text)
     rows, columns = int.from_bytes(head[20:24]), int.from_bytes(head[16:20])
     refuse_large_picture(file, rows, columns)
-    needs(rows * columns * channels * (depth // 8 + _SINGLE), file, f"{columns} x {rows} pixels in {channels} channels")
+    needs(
+        rows * columns * channels * (depth // 8 + _SINGLE),
+        file,
+        f"{columns} x {rows} pixels in {channels} channels",
+    )
     with Image.open(file) as image:
         image.verify()
     read = io.read_image_png_u16 if depth == 16 else io.read_image_png_u8
-    return FrameNumbers(_first(np.asarray(read(str(file), "rgb" if channels == 3 else "mono"))), depth)
+    return FrameNumbers(
+        _first(np.asarray(read(str(file), "rgb" if channels == 3 else "mono"))), depth
+    )
 
 
 def _tiff(file: Path) -> FrameNumbers:
     from kornia_rs import io
 
-    kinds = ((io.read_image_tiff_u16, 16), (io.read_image_tiff_u8, 8), (io.read_image_tiff_f32, None))
+    kinds = (
+        (io.read_image_tiff_u16, 16),
+        (io.read_image_tiff_u8, 8),
+        (io.read_image_tiff_f32, None),
+    )
     tiff_needs(file, 1.0, 3 * _SINGLE, first=True)
     said = ""
     for read, depth in kinds:
@@ -196,7 +336,10 @@ def _tiff(file: Path) -> FrameNumbers:
                 return FrameNumbers(_first(np.asarray(read(str(file), mode))), depth)
             except Exception as error:  # another kind of pixels, or a damaged file
                 said = str(error).partition("\n")[0]
-    text = f"{file.name} cannot be read as grey or RGB of 8 or 16 bits ({said}): save it so, without compression"
+    text = (
+        f"{file.name} cannot be read as grey or RGB of 8 or 16 bits ({said}): save it so, without"
+        " compression"
+    )
     raise ParameterError("file", text)
 
 
@@ -208,7 +351,10 @@ def _exr(file: Path) -> FrameNumbers:
         channels = {name: np.array(channel.pixels) for name, channel in opened.channels().items()}
     names = ["R", "G", "B"] if {"R", "G", "B"} <= channels.keys() else list(channels)
     if len(names) not in (1, 3):
-        text = f"{file.name} has the channels {', '.join(channels)}: save R, G and B, or one channel alone"
+        text = (
+            f"{file.name} has the channels {', '.join(channels)}: save R, G and B, or one channel"
+            " alone"
+        )
         raise ParameterError("file", text)
     return FrameNumbers(np.stack([channels[name].astype(np.float64) for name in names]), None)
 
@@ -218,7 +364,9 @@ def _npy(file: Path) -> FrameNumbers:
     array = np.load(file, mmap_mode="r", allow_pickle=False)
     refuse_large_array(file, array.shape)
     if array.dtype.kind not in "uif" or array.ndim not in (2, 3) or not array.size:
-        text = f"{file.name} is {array.dtype} of shape {array.shape}: give numbers of shape {_ARRAY}"
+        text = (
+            f"{file.name} is {array.dtype} of shape {array.shape}: give numbers of shape {_ARRAY}"
+        )
         raise ParameterError("file", text)
     if array.ndim == 3 and array.shape[0] in (1, 3):
         return FrameNumbers(np.array(array), None)

@@ -1,4 +1,4 @@
-"""Noise of the sensor: photon noise, dark current and read noise."""
+"""Noise of the sensor: photon noise, dark current, read noise, and limits of a draw."""
 
 import functools
 import math
@@ -11,17 +11,116 @@ from pydantic import Field
 from torch import Generator, Tensor
 
 from neusee.nodes import Check, ErrorBound, ParameterError, TensorStats, node
-from neusee.nodes._half_precision import single
-from neusee.nodes.sensor._draw_limits import SURE, amplitude_error, amplitude_error_drawn, chi_square_limit, poisson_rms
-from neusee.nodes.sensor._room_for_light import refuse_without_room
-from neusee.nodes.sensor._saturation import Efficiency, Well
+from neusee.nodes.precision import single
+from neusee.nodes.sensor._saturation import Well, refuse_without_room
 from neusee.nodes.torch_func import transformed
-from neusee.nodes.units import DarkCurrent, Electrons, ElectronsPerSecond, Exposure, Fraction
+from neusee.nodes.units import (
+    DarkCurrent,
+    Efficiency,
+    Electrons,
+    ElectronsPerSecond,
+    Exposure,
+    Fraction,
+)
+
+# --- draw limits ----------------------------------------------------------------------------------
+
+# Limits that one draw of noise exceeds in one of 10 000 draws: counts of rare events, sums of
+# squares of noise.
+
+
+SURE = math.log(1e4)  #: negative logarithm of the probability that a draw exceeds its limit
+
+
+def rare_events(mean: float, sure: float = SURE) -> int:
+    """Return the count that a Poisson number of this mean exceeds with a probability of at most
+    exp(-``sure``).
+
+    The count is exact: the smallest with this property. A sum of independent events of unequal
+    probabilities exceeds it no more often if the count is at least the mean + 1.
+
+    Source: quantile of the Poisson distribution, whose sum of probabilities is the incomplete gamma
+            function; sums of
+    unequal events: Anderson and Samuels, Proc. 5th Berkeley Symp. 1, 1 (1967).
+    """
+    low, high = -1, max(8, math.ceil(mean + sure + 2.0 * math.sqrt(mean * sure)))
+    while high - low > 1:
+        middle = (low + high) // 2
+        above = torch.special.gammainc(
+            torch.tensor(middle + 1.0, dtype=torch.float64), torch.tensor(mean, dtype=torch.float64)
+        )
+        low, high = (middle, high) if float(above) > math.exp(-sure) else (low, middle)
+    return high
+
+
+def poisson_rms(mean: float, pixels: int) -> float:
+    """Return what the rms of Poisson numbers in ``pixels`` exceeds in one of 10 000 draws at most.
+
+    Half of the probability is for a pixel above ``rare_number``, half for the sum of squares of the
+    others, whose variance is at most the fourth moment of the distribution.
+
+    Source: Bernstein's inequality: Boucheron, Lugosi and Massart, Concentration Inequalities,
+            section 2.8 (2013).
+    """
+    if mean == 0:
+        return 0.0
+    sure = SURE + math.log(2.0)
+    rare_number = rare_events(mean, sure + math.log(pixels))
+    fourth = mean + 7 * mean**2 + 6 * mean**3 + mean**4
+    third = rare_number**2 * sure / 3
+    excess = third + math.sqrt(third**2 + 2 * pixels * fourth * sure)
+    return min(float(rare_number), math.sqrt((pixels * (mean + mean**2) + excess) / pixels))
+
+
+def chi_square_limit(weights: float, largest: float, sure: float = SURE) -> float:
+    """Return the limit that a weighted sum of squared normal numbers exceeds with a probability of
+    exp(-``sure``).
+
+    ``weights`` is the sum of the weights, ``largest`` the largest weight.
+
+    Source: Laurent and Massart, Ann. Stat. 28, 1302 (2000), lemma 1, with the sum of squared
+            weights at most
+    ``weights`` x ``largest``.
+    """
+    return weights + 2.0 * math.sqrt(weights * largest * sure) + 2.0 * largest * sure
+
+
+def amplitude_error_drawn(drawn: float, darkest: float, pixels: int) -> float:
+    """Return a bound of the rms change of one draw of the noise, if its mean changes by the rms
+    ``drawn``.
+
+    The change of a pixel is a normal number times the root of a weight w, which is at most the
+    change of the mean e, and e**2 / ``darkest``. The weights are summed for the worst distribution
+    of the error over the pixels.
+    """
+    squares = pixels * drawn**2
+    largest = math.sqrt(squares)
+    weights = math.sqrt(pixels) * largest
+    if darkest > 0:
+        largest, weights = min(largest, squares / darkest), min(weights, squares / darkest)
+    return math.sqrt(chi_square_limit(weights, largest) / pixels)
+
+
+def amplitude_error(drawn: float, darkest: float) -> float:
+    """Return a bound of the rms change of all draws of the noise, if its mean changes by the rms
+    ``drawn``.
+    """
+    return math.sqrt(drawn) if darkest <= drawn else drawn / math.sqrt(darkest)
+
+
+# --- noise ----------------------------------------------------------------------------------------
+
+# Noise of the sensor: photon noise, dark current and read noise.
+
 
 Distribution = Literal["gaussian", "poisson"]
-_PART = 1 << 15  #: elements; torch splits larger arrays among threads, which is slow on a busy machine
-_DARK = 1e-30  #: e-; smaller numbers count as 0, because the gradient of the square root is unbounded near 0
-_MOST = 5.0  #: largest ratio of a sampled mean of the dark current to the given mean, 8 standard deviations above
+#: elements; torch splits larger arrays among threads, which is slow on a busy machine
+_PART = 1 << 15
+#: e-; smaller numbers count as 0, because the gradient of the square root is unbounded near 0
+_DARK = 1e-30
+#: largest ratio of a sampled mean of the dark current to the given mean, 8 standard deviations
+#: above
+_MOST = 5.0
 Spread = Annotated[float, Field(ge=0, le=100)]
 
 
@@ -39,23 +138,26 @@ def photon_noise(
 ) -> Tensor:
     """Convert photons to electrons and add photon noise.
 
-    With the mean count n in the unit in which the noise is drawn, `additive` gives n + N(c1 n, c2 sqrt(n)), and
-    `literal` gives N(c1 n, c2 sqrt(n)), as the paper prints, with c1 = mean_shift and c2 = spread. `poisson` draws the
-    fluctuation from the Poisson distribution. If the noise is drawn in photons and then multiplied by the efficiency,
-    the noise is too small by a factor of sqrt(efficiency).
+    With the mean count n in the unit in which the noise is drawn, `additive` gives n + N(c1 n, c2
+    sqrt(n)), and `literal` gives N(c1 n, c2 sqrt(n)), as the paper prints, with c1 = mean_shift and
+    c2 = spread. `poisson` draws the fluctuation from the Poisson distribution. If the noise is
+    drawn in photons and then multiplied by the efficiency, the noise is too small by a factor of
+    sqrt(efficiency).
 
     Shapes: photons (..., y, x) -> (..., y, x).
     Units:  photons per exposure; result e-.
-    Error:  the result is clipped at 0, which raises the Gaussian mean by at most 0.1 e-, near 0.4 e-, and by less
-            than 1e-3 e- above 10 e-. Negative photons (round-off of a convolution) count as 0.
-    Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 (variance = mean, in electrons).
+    Error:  the result is clipped at 0, which raises the Gaussian mean by at most 0.1 e-, near 0.4
+            e-, and by less than 1e-3 e- above 10 e-. Negative photons (round-off of a convolution)
+            count as 0.
+    Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0 (variance = mean, in
+            electrons).
     """
-    kept = mean_shift if mean == "literal" else 1.0 + mean_shift
+    mean_factor = mean_shift if mean == "literal" else 1.0 + mean_shift
 
-    def detected(part: Tensor) -> Tensor:
-        counts = part.clamp_min(0) * (quantum_efficiency if drawn_in == "electrons" else 1.0)
+    def detected(piece: Tensor) -> Tensor:
+        counts = piece.clamp_min(0) * (quantum_efficiency if drawn_in == "electrons" else 1.0)
         fluctuation = _poisson(counts, rng) if distribution == "poisson" else _gaussian(counts, rng)
-        drawn = (kept * counts).add_(spread * fluctuation).clamp_min(0)
+        drawn = (mean_factor * counts).add_(spread * fluctuation).clamp_min(0)
         return drawn if drawn_in == "electrons" else drawn * quantum_efficiency
 
     return _by_parts(detected, single(photons), rng)
@@ -77,10 +179,11 @@ def _(result: Tensor, photons: Tensor, **params: Any) -> list[Check]:
 
 @photon_noise.propagate_error
 def _(photons: ErrorBound, *, result: TensorStats, **params: Any) -> float:
-    """Return the error bound of the electrons: the error of the mean plus the error of the noise amplitude.
+    """Return the error bound of the electrons: the error of the mean plus the error of the noise
+    amplitude.
 
-    The noise amplitude is the square root of the mean: |sqrt(a) - sqrt(b)| <= sqrt|a - b| and <= |a - b| / sqrt(a).
-    Poisson numbers are drawn anew for another mean, so their error has no bound.
+    The noise amplitude is the square root of the mean: |sqrt(a) - sqrt(b)| <= sqrt|a - b| and <= |a
+    - b| / sqrt(a). Poisson numbers are drawn anew for another mean, so their error has no bound.
     """
     return _electrons_error(photons, amplitude_error, **params)
 
@@ -89,7 +192,9 @@ def _(photons: ErrorBound, *, result: TensorStats, **params: Any) -> float:
 def _(photons: ErrorBound, *, result: TensorStats, **params: Any) -> float:
     """Return the error bound of the electrons of one draw, which one of 10 000 draws exceeds."""
     pixels = max(1, math.prod(result.shape))
-    return _electrons_error(photons, functools.partial(amplitude_error_drawn, pixels=pixels), **params)
+    return _electrons_error(
+        photons, functools.partial(amplitude_error_drawn, pixels=pixels), **params
+    )
 
 
 def _electrons_error(
@@ -103,10 +208,10 @@ def _electrons_error(
     if params["distribution"] == "poisson" and photons.rms > 0:
         return math.inf
     drawn = photons.rms * (quantum_efficiency if params["drawn_in"] == "electrons" else 1.0)
-    kept = params["mean_shift"] + (params["mean"] == "additive")
+    mean_factor = params["mean_shift"] + (params["mean"] == "additive")
     electrons: float = 1.0 if params["drawn_in"] == "electrons" else quantum_efficiency
     darkest = photons.stats.min * drawn / photons.rms if photons.stats and photons.rms > 0 else 0.0
-    total: float = electrons * (abs(kept) * drawn + spread * amplitude(drawn, darkest))
+    total: float = electrons * (abs(mean_factor) * drawn + spread * amplitude(drawn, darkest))
     return total
 
 
@@ -114,7 +219,8 @@ def _gaussian(counts: Tensor, rng: Generator) -> Tensor:
     lit = ~(counts <= _DARK)  # True for NaN, so that NaN reaches the result
     if not (counts.requires_grad or transformed()):
         return normal(counts, rng).mul_(counts.where(lit, 0.0).sqrt_())
-    sigma = counts.where(lit, 1.0).sqrt().where(lit, 0.0)  # at 0, the square root has no finite gradient
+    # at 0, the square root has no finite gradient
+    sigma = counts.where(lit, 1.0).sqrt().where(lit, 0.0)
     return sigma * normal(counts, rng)
 
 
@@ -123,16 +229,21 @@ def _poisson(counts: Tensor, rng: Generator) -> Tensor:
     return torch.poisson(still.to(rng.device), generator=rng).to(counts) - still
 
 
-def _by_parts(compute: Callable[[Tensor], Tensor], whole: Tensor, rng: Generator) -> Tensor:
-    """Apply ``compute`` to parts of a tensor that fit into the CPU cache, with the same result as for the whole.
+def _by_parts(compute: Callable[[Tensor], Tensor], numbers: Tensor, rng: Generator) -> Tensor:
+    """Apply ``compute`` to parts of a tensor that fit into the CPU cache, with the same result as
+    for the whole.
 
-    The random numbers must not depend on the parts. Torch draws fewer than 16 normal numbers by another method, so no
-    part is that short.
+    The random numbers must not depend on the parts. Torch draws fewer than 16 normal numbers by
+    another method, so no part is that short.
     """
-    count = whole.numel()
-    if torch.is_grad_enabled() or {whole.device.type, rng.device.type} != {"cpu"} or count < 2 * _PART:
-        return compute(whole)
-    result, flat = torch.empty(whole.shape, dtype=whole.dtype), whole.reshape(-1)
+    count = numbers.numel()
+    if (
+        torch.is_grad_enabled()
+        or {numbers.device.type, rng.device.type} != {"cpu"}
+        or count < 2 * _PART
+    ):
+        return compute(numbers)
+    result, flat = torch.empty(numbers.shape, dtype=numbers.dtype), numbers.reshape(-1)
     ends = [*range(_PART, count - _PART, _PART), count]
     for first, last in pairwise([0, *ends]):
         result.view(-1)[first:last] = compute(flat[first:last])
@@ -140,7 +251,9 @@ def _by_parts(compute: Callable[[Tensor], Tensor], whole: Tensor, rng: Generator
 
 
 def normal(like: Tensor, rng: Generator) -> Tensor:
-    """Sample standard normal numbers in the shape of ``like``, with equal numbers in every precision."""
+    """Sample standard normal numbers in the shape of ``like``, with equal numbers in every
+    precision.
+    """
     return torch.randn(like.shape, generator=rng, device=rng.device, dtype=torch.float32).to(like)
 
 
@@ -158,12 +271,13 @@ def dark_current(
 
     A mean in e-/s is multiplied by ``exposure``.
 
-    The mean of the distribution is ``mean``, for ``mean_of`` sensor. For ``mean_of`` exposure the mean is sampled once
-    for each exposure from a normal distribution with mean ``mean`` and half of it as standard deviation, as the paper
-    prints of the training; a negative sample counts as 0.
+    The mean of the distribution is ``mean``, for ``mean_of`` sensor. For ``mean_of`` exposure the
+    mean is sampled once for each exposure from a normal distribution with mean ``mean`` and half of
+    it as standard deviation, as the paper prints of the training; a negative sample counts as 0.
 
-    ``full_well`` is used only to decide if the dark current is small enough to leave out: the electrons are compared
-    with the signal up to the well, because a later step cuts off the signal of a laser above the well.
+    ``full_well`` is used only to decide if the dark current is small enough to leave out: the
+    electrons are compared with the signal up to the well, because a later step cuts off the signal
+    of a laser above the well.
 
     Shapes: electrons (..., y, x) -> (..., y, x).
     Units:  e-; mean e- per exposure, or e-/s; exposure s.
@@ -175,30 +289,39 @@ def dark_current(
     total = dark_electrons(mean, exposure)
     expected = total if mean_of == "sensor" else _sampled_mean(total, rng)
 
-    def with_dark_current(part: Tensor) -> Tensor:
-        rate = torch.full(part.shape, expected, dtype=part.dtype, device=rng.device)
-        return part + torch.poisson(rate, generator=rng).to(part)
+    def with_dark_current(piece: Tensor) -> Tensor:
+        rate = torch.full(piece.shape, expected, dtype=piece.dtype, device=rng.device)
+        return piece + torch.poisson(rate, generator=rng).to(piece)
 
     return _by_parts(with_dark_current, single(electrons), rng)
 
 
 def dark_electrons(mean: float | ElectronsPerSecond, exposure: float | None) -> float:
-    """Return the mean dark electrons of one exposure, from electrons of an exposure or electrons per second.
+    """Return the mean dark electrons of one exposure, from electrons of an exposure or electrons
+    per second.
 
     Raises ParameterError for electrons per second without an exposure.
     """
     if not isinstance(mean, ElectronsPerSecond):
         return mean
     if exposure is None:
-        raise ParameterError("mean", f"{mean.rate:g} e-/s needs the exposure: give `exposure` to the step, or use e-")
+        raise ParameterError(
+            "mean", f"{mean.rate:g} e-/s needs the exposure: give `exposure` to the step, or use e-"
+        )
     return mean.rate * exposure
 
 
 @dark_current.preflight
 def _(
-    *, mean: float | ElectronsPerSecond, exposure: float | None, full_well: float | None = None, **params: object
+    *,
+    mean: float | ElectronsPerSecond,
+    exposure: float | None,
+    full_well: float | None = None,
+    **params: object,
 ) -> list[str]:
-    refuse_without_room(math.inf if full_well is None else full_well, dark=dark_electrons(mean, exposure))
+    refuse_without_room(
+        math.inf if full_well is None else full_well, dark=dark_electrons(mean, exposure)
+    )
     return []
 
 
@@ -217,8 +340,8 @@ def _(
     mean_of: str = "sensor",
 ) -> float:
     total = dark_electrons(mean, exposure)
-    most = total if mean_of == "sensor" else _MOST * total
-    return _share(most, math.sqrt(most), electrons, full_well)
+    largest_mean = total if mean_of == "sensor" else _MOST * total
+    return _share(largest_mean, math.sqrt(largest_mean), electrons, full_well)
 
 
 @dark_current.skip_draw
@@ -231,49 +354,64 @@ def _(
     **params: Any,
 ) -> float:
     total = dark_electrons(mean, exposure)
-    most = total if mean_of == "sensor" else _MOST * total
-    usual = math.sqrt(most + most**2)
-    return poisson_rms(most, max(1, math.prod(electrons.shape))) / usual if usual > 0 else 1.0
+    largest_mean = total if mean_of == "sensor" else _MOST * total
+    usual = math.sqrt(largest_mean + largest_mean**2)
+    return (
+        poisson_rms(largest_mean, max(1, math.prod(electrons.shape))) / usual if usual > 0 else 1.0
+    )
 
 
 @node()
 def read_noise(
-    electrons: Tensor, *, offset: Electrons, read_noise: Electrons, full_well: Well | None = None, rng: Generator
+    electrons: Tensor,
+    *,
+    offset: Electrons,
+    read_noise: Electrons,
+    full_well: Well | None = None,
+    rng: Generator,
 ) -> Tensor:
     """Add the offset and the Gaussian noise of the sensor amplifier to the electrons of each pixel.
 
     The temporal dark noise of EMVA 1288 includes read noise and dark current:
-    sigma_d**2 = read_noise**2 + mean of the dark current. The dark signal mu_d of EMVA 1288 is offset + mean of the
-    dark current. ``full_well`` has the same meaning as in `sensor.dark_current`.
+    sigma_d**2 = read_noise**2 + mean of the dark current. The dark signal mu_d of EMVA 1288 is
+    offset + mean of the dark current. ``full_well`` has the same meaning as in
+    `sensor.dark_current`.
 
     Shapes: electrons (..., y, x) -> (..., y, x).
     Units:  e-; offset e-, the paper's "mean read noise"; read_noise e- rms.
     Error:  white: row noise and telegraph noise are left out.
-    Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0; Janesick, Photon Transfer, SPIE
-            PM170 (2007).
+    Source: NeuSee, section Sensor Image; EMVA Standard 1288, release 4.0; Janesick, Photon
+            Transfer, SPIE PM170 (2007).
     """
 
-    def with_read_noise(part: Tensor) -> Tensor:
-        return part + normal(part, rng).mul_(read_noise).add_(offset)
+    def with_read_noise(piece: Tensor) -> Tensor:
+        return piece + normal(piece, rng).mul_(read_noise).add_(offset)
 
     return _by_parts(with_read_noise, single(electrons), rng)
 
 
 @read_noise.preflight
-def _(*, offset: float, read_noise: float, full_well: float | None = None, **params: object) -> list[str]:
-    refuse_without_room(math.inf if full_well is None else full_well, offset=offset, read_noise=read_noise)
+def _(
+    *, offset: float, read_noise: float, full_well: float | None = None, **params: object
+) -> list[str]:
+    refuse_without_room(
+        math.inf if full_well is None else full_well, offset=offset, read_noise=read_noise
+    )
     return []
 
 
 @read_noise.skip_bound
-def _(electrons: TensorStats, *, offset: float, read_noise: float, full_well: float | None) -> float:
+def _(
+    electrons: TensorStats, *, offset: float, read_noise: float, full_well: float | None
+) -> float:
     return _share(offset, read_noise, electrons, full_well)
 
 
 @read_noise.skip_draw
 def _(electrons: TensorStats, *, offset: float, read_noise: float, **params: Any) -> float:
     pixels, variance = max(1, math.prod(electrons.shape)), read_noise**2
-    sure = SURE + math.log(2.0)  # half of the probability is for the mean of the noise, half for its square
+    # half of the probability is for the mean of the noise, half for its square
+    sure = SURE + math.log(2.0)
     mean = abs(offset) * read_noise * math.sqrt(2.0 * sure / pixels)
     square = chi_square_limit(pixels * variance, variance, sure) / pixels
     usual = math.hypot(offset, read_noise)
@@ -295,14 +433,18 @@ def _(electrons: ErrorBound, **params: Any) -> float:
 
 
 def _share(shift: float, spread: float, electrons: TensorStats, full_well: float | None) -> float:
-    """Return the rms of the added electrons, divided by the largest signal or the full well, whichever is smaller.
+    """Return the rms of the added electrons, divided by the largest signal or the full well,
+    whichever is smaller.
 
-    The largest signal is that of the brightest pixel, or that of the darkest pixel if the counts are below 0. The well
-    alone is not enough, because a dark frame is only noise. The bound is exact for one mean and spread everywhere.
+    The largest signal is that of the brightest pixel, or that of the darkest pixel if the counts
+    are below 0. The well alone is not enough, because a dark frame is only noise. The bound is
+    exact for one mean and spread everywhere.
     """
     added = math.hypot(shift, spread)
     if added == 0:
         return 0.0
-    largest = max(math.hypot(electrons.max + shift, spread), math.hypot(electrons.min + shift, spread))
+    largest = max(
+        math.hypot(electrons.max + shift, spread), math.hypot(electrons.min + shift, spread)
+    )
     weighed = largest if full_well is None else min(largest, full_well)
     return added / weighed if weighed > 0 else math.inf

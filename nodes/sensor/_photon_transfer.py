@@ -7,10 +7,23 @@ from torch import Generator, Tensor
 
 from neusee.nodes import Check, ParameterError, node
 from neusee.nodes.sensor._digitization import Bits, Rounding, digitize, full_well
-from neusee.nodes.sensor._noise import Distribution, dark_current, dark_electrons, photon_noise, read_noise
-from neusee.nodes.sensor._room_for_light import refuse_without_room, refuse_without_steps
-from neusee.nodes.sensor._saturation import Efficiency, Well
-from neusee.nodes.units import Count, DarkCurrent, Electrons, ElectronsPerSecond, Exposure, Gain
+from neusee.nodes.sensor._noise import (
+    Distribution,
+    dark_current,
+    dark_electrons,
+    photon_noise,
+    read_noise,
+)
+from neusee.nodes.sensor._saturation import Well, refuse_without_room, refuse_without_steps
+from neusee.nodes.units import (
+    Count,
+    DarkCurrent,
+    Efficiency,
+    Electrons,
+    ElectronsPerSecond,
+    Exposure,
+    Gain,
+)
 
 well_of, read_of = full_well, read_noise  # parameters below have the same names
 
@@ -34,23 +47,30 @@ def photon_transfer(
 ) -> Tensor:
     """Simulate the photon-transfer curve: measured and predicted variance against the mean signal.
 
-    Each level of illumination has two flat fields. The first level is dark. The other levels rise geometrically from
-    one electron to 1.2 full wells. The frames are computed by the same nodes as a picture. The signal is the mean minus
-    the dark mean. The prediction is K^2 sigma_d^2 + sigma_q^2 + K (mean - dark mean).
+    Each level of illumination has two flat fields. The first level is dark. The other levels rise
+    geometrically from one electron to 1.2 full wells. The frames are computed by the same nodes as
+    a picture. The signal is the mean minus the dark mean. The prediction is K^2 sigma_d^2 +
+    sigma_q^2 + K (mean - dark mean).
 
     Shapes: -> (level, 3) float64.
     Units:  gain K, DN/e-; dark e- of one exposure, or e-/s times exposure; result DN, DN2, DN2.
-    Error:  sampling: the variance of a pair has a relative deviation of sqrt(2 / pixels), 1.1 % at 16384. The
-            prediction includes neither the full well nor the end of the converter, so the variances differ there.
-    Source: EMVA Standard 1288, release 4.0 Linear (photon transfer method, difference of two frames).
+    Error:  sampling: the variance of a pair has a relative deviation of sqrt(2 / pixels), 1.1 % at
+            16384. The prediction includes neither the full well nor the end of the converter, so
+            the variances differ there.
+    Source: EMVA Standard 1288, release 4.0 Linear (photon transfer method, difference of two
+            frames).
     """
 
     expected = dark_electrons(dark, exposure)
 
     def frame(photons: float) -> Tensor:
         flat = torch.full((pixels,), photons, dtype=torch.float64, device=rng.device)
-        e = photon_noise(flat, quantum_efficiency=quantum_efficiency, distribution=distribution, rng=rng)
-        e = read_of(dark_current(e, mean=expected, rng=rng), offset=offset, read_noise=read_noise, rng=rng)
+        e = photon_noise(
+            flat, quantum_efficiency=quantum_efficiency, distribution=distribution, rng=rng
+        )
+        e = read_of(
+            dark_current(e, mean=expected, rng=rng), offset=offset, read_noise=read_noise, rng=rng
+        )
         e = well_of(e, capacity=full_well)
         dn: Tensor = digitize(e, gain=gain, rounding=rounding, bits=bits, rng=rng)
         return dn
@@ -58,7 +78,9 @@ def photon_transfer(
     light = _rise(full_well / quantum_efficiency, 1.0 / quantum_efficiency, levels)
     measured = torch.tensor([_pair(frame(p), frame(p)) for p in light], dtype=torch.float64)
     signal = measured[:, 0] - measured[0, 0]
-    floor = gain**2 * (read_noise**2 + expected) + (1.0 / 6.0 if rounding == "dithered_floor" else 1.0 / 12.0)
+    floor = gain**2 * (read_noise**2 + expected) + (
+        1.0 / 6.0 if rounding == "dithered_floor" else 1.0 / 12.0
+    )
     return torch.stack([signal, measured[:, 1], floor + gain * signal], 1)
 
 
@@ -68,9 +90,11 @@ def _rise(top: float, first: float, levels: int) -> list[float]:
     return [0.0, *(first * ratio ** (i / steps) for i in range(levels - 1))]
 
 
-def _pair(one: Tensor, two: Tensor) -> tuple[float, float]:
-    """Return the mean of two frames, and the temporal variance from the difference of the frames."""
-    return float((one + two).mean() / 2), float((one - two).square().mean() / 2)
+def _pair(first: Tensor, second: Tensor) -> tuple[float, float]:
+    """Return the mean of two frames, and the temporal variance from the difference of the
+    frames.
+    """
+    return float((first + second).mean() / 2), float((first - second).square().mean() / 2)
 
 
 @photon_transfer.preflight
@@ -98,6 +122,16 @@ def _(
 def _(result: Tensor, *, full_well: float, gain: float, **params: Any) -> list[Check]:
     middle = (result[:, 0] > 0.02 * full_well * gain) & (result[:, 0] < 0.7 * full_well * gain)
     if not bool(middle.any()):
-        return [Check("no flat field lies between 2 and 70 % of the full well, so the variance is not checked")]
+        return [
+            Check(
+                "no flat field lies between 2 and 70 % of the full well, so the variance is not"
+                " checked"
+            )
+        ]
     ratio = float((result[middle, 1] / result[middle, 2]).mean())
-    return [Check(f"the measured variance is {ratio:.3f} times the predicted variance", abs(ratio - 1) < 0.1)]
+    return [
+        Check(
+            f"the measured variance is {ratio:.3f} times the predicted variance",
+            abs(ratio - 1) < 0.1,
+        )
+    ]

@@ -9,8 +9,7 @@ from neusee.nodes.sensor._exposure import add_photons, expose, level
 from neusee.nodes.sensor._frame_file import frame
 from neusee.nodes.sensor._noise import dark_current, photon_noise, read_noise
 from neusee.nodes.sensor._photon_transfer import photon_transfer
-from neusee.nodes.sensor._saturation import saturation
-from neusee.nodes.sensor._sensor_limits import Limits, limits
+from neusee.nodes.sensor._saturation import Limits, limits, saturation
 from neusee.nodes.shape_rules import at_least_single, blank, double, like_first, scalars
 from neusee.nodes.values import Bands, Channels
 
@@ -20,7 +19,9 @@ limits.shape(scalars(Limits))
 
 
 @expose.shape
-def _(irradiance: Tensor | Channels, bands: Bands, responses: Tensor, *level: Any, **params: Any) -> Tensor:
+def _(
+    irradiance: Tensor | Channels, bands: Bands, responses: Tensor, *level: Any, **params: Any
+) -> Tensor:
     image = irradiance.planes if isinstance(irradiance, Channels) else irradiance
     return blank(*image.shape[:-3], len(responses), *image.shape[-2:], dtype=at_least_single(image))
 

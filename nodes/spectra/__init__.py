@@ -1,13 +1,20 @@
-"""Nodes for spectra: spectral bands, illuminants, channel responses, and estimates of spectra from RGB."""
+"""Nodes for spectra: spectral bands, illuminants, channel responses, and estimates of spectra
+from RGB.
+"""
 
 from neusee.nodes.spectra import _result_shapes  # noqa: F401  attaches the shape rules
-from neusee.nodes.spectra._bands import bands, filters, line, mean_wavelength
+from neusee.nodes.spectra._bands import (
+    bands,
+    filters,
+    laser_table,
+    line,
+    line_table,
+    mean_wavelength,
+)
 from neusee.nodes.spectra._camera_colour import grain, render
-from neusee.nodes.spectra._channel_responses import camera_curves, responses
+from neusee.nodes.spectra._channel_responses import camera_curves, responses, rows
 from neusee.nodes.spectra._dead_leaves import leaves
-from neusee.nodes.spectra._distinct_band_sums import rows
 from neusee.nodes.spectra._illuminant import illuminant, illuminate, light_curve
-from neusee.nodes.spectra._laser_table import laser_table, line_table
 from neusee.nodes.spectra._linear_lift import (
     lift_lmmse,
     lift_lmmse_mixture,
@@ -18,7 +25,7 @@ from neusee.nodes.spectra._linear_lift import (
 from neusee.nodes.spectra._low_rank_cube import compress
 from neusee.nodes.spectra._measured_reflectances import reflectances
 from neusee.nodes.spectra._metamers import metamers
-from neusee.nodes.spectra._mst_lift_node import (
+from neusee.nodes.spectra._mst_plus_plus import (
     lift_mst_plus_plus,
     lift_pictures,
     need_mst_plus_plus_bands,

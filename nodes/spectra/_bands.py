@@ -1,15 +1,27 @@
-"""Spectral bands of a scene, and spectral sampling of a laser line."""
+"""Spectral bands of a scene, and the spectrum of a laser as lines or from a table."""
 
 import math
-from typing import Annotated, Any, Literal
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple
 
+import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.units import Count, Fraction, Linewidth, Wavelength
+from neusee.nodes.input_files import once_per_version
+from neusee.nodes.spectra._cie_tables import Table
+from neusee.nodes.spectra._table_files import LENGTHS, Curves, Numbers, curves, refused
+from neusee.nodes.units import Count, DataFile, Fraction, Linewidth, Wavelength
+from neusee.nodes.values import Bands
 from neusee.nodes.values import Bands as Samples
+
+# --- bands ----------------------------------------------------------------------------------------
+
+# Spectral bands of a scene, and spectral sampling of a laser line.
+
 
 _MOST = 100_000  #: bands, at most; 0.003 nm each from 400 to 700 nm
 _GRID = 10e-9  #: m, spacing of the bands of a scene; the paper samples laser lines on the same grid
@@ -24,13 +36,17 @@ def bands(*, start: Wavelength, stop: Wavelength, count: Count) -> Samples:
     Shapes: -> centres, widths, weights (band,) float64.
     Units:  centres and widths m; weights 1.
     Error:  the first and last bands reach half a width beyond the ends.
-    Raises: ParameterError before the run unless start is below stop, and for more than 100 000 bands.
+    Raises: ParameterError before the run unless start is below stop, and for more than 100 000
+            bands.
     Source: NeuSee: 400 to 700 nm by 10 nm.
     """
     if count == 1:
         centres, width = torch.tensor([(start + stop) / 2], dtype=torch.float64), stop - start
     else:
-        centres, width = torch.linspace(start, stop, count, dtype=torch.float64), (stop - start) / (count - 1)
+        centres, width = (
+            torch.linspace(start, stop, count, dtype=torch.float64),
+            (stop - start) / (count - 1),
+        )
     return Samples(centres, torch.full_like(centres, width), torch.ones_like(centres))
 
 
@@ -39,7 +55,9 @@ def _(*, start: float, stop: float, count: int = 1) -> list[str]:
     _refuse_many(count)
     if not start < stop:
         raise ParameterError(
-            "start", f"start {start * 1e9:g} nm must be below stop {stop * 1e9:g} nm: exchange start and stop"
+            "start",
+            f"start {start * 1e9:g} nm must be below stop {stop * 1e9:g} nm: exchange start and"
+            " stop",
         )
     return []
 
@@ -47,14 +65,19 @@ def _(*, start: float, stop: float, count: int = 1) -> list[str]:
 def _refuse_many(count: int) -> None:
     """Raise ParameterError for more bands than any computation here can use."""
     if count > _MOST:
-        raise ParameterError("count", f"{count} bands exceed the limit of {_MOST}: choose fewer bands")
+        raise ParameterError(
+            "count", f"{count} bands exceed the limit of {_MOST}: choose fewer bands"
+        )
 
 
 @bands.check
 def _(result: Samples, **params: Any) -> list[Check]:
     ends = f"{float(result.centres[0]) * 1e9:.4g} to {float(result.centres[-1]) * 1e9:.4g} nm"
     return [
-        Check(f"{len(result.centres)} bands with centres from {ends}, each {float(result.widths[0]) * 1e9:.3g} nm wide")
+        Check(
+            f"{len(result.centres)} bands with centres from {ends}, each"
+            f" {float(result.widths[0]) * 1e9:.3g} nm wide"
+        )
     ]
 
 
@@ -64,24 +87,32 @@ def filters(
     centres: Annotated[tuple[Wavelength, ...], Field(min_length=1)],
     widths: Annotated[tuple[Linewidth, ...], Field(min_length=1)],
 ) -> Samples:
-    """Return spectral bands with individual centres and widths, such as the passbands of a filter set.
+    """Return spectral bands with individual centres and widths, such as the passbands of a filter
+    set.
 
-    A single width applies to all bands. A change of one band leaves the other bands unchanged to the last bit.
+    A single width applies to all bands. A change of one band leaves the other bands unchanged to
+    the last bit.
 
     Shapes: -> centres, widths, weights (band,) float64.
     Units:  centres and widths m; weights 1.
-    Error:  each filter passes all light inside its width and none outside; real filters have edges of some nm.
+    Error:  each filter passes all light inside its width and none outside; real filters have edges
+            of some nm.
     Raises: ParameterError before the run unless one width, or one width for each centre, is given.
     Source: the filters' data sheets: central wavelength and full width at half maximum.
     """
     centre = torch.tensor(centres, dtype=torch.float64)
-    return Samples(centre, torch.tensor(widths, dtype=torch.float64).expand_as(centre), torch.ones_like(centre))
+    return Samples(
+        centre, torch.tensor(widths, dtype=torch.float64).expand_as(centre), torch.ones_like(centre)
+    )
 
 
 @filters.preflight
 def _(*, centres: tuple[float, ...], widths: tuple[float, ...]) -> list[str]:
     if len(widths) not in (1, len(centres)):
-        text = f"{len(widths)} widths for {len(centres)} centres: give one width, or one width for each centre"
+        text = (
+            f"{len(widths)} widths for {len(centres)} centres: give one width, or one width for"
+            " each centre"
+        )
         raise ParameterError("widths", text)
     return []
 
@@ -102,19 +133,22 @@ def line(
     floor: Fraction = 1e-3,
     sampling: Literal["integrated", "point"] = "integrated",
 ) -> Samples:
-    """Sample a Gaussian laser line in a few spectral bands, weighted by the energy of the line in each band.
+    """Sample a Gaussian laser line in a few spectral bands, weighted by the energy of the line in
+    each band.
 
     `floor` is a constant background of the line, relative to the peak.
 
-    `integrated`: `count` equal bands cover `span` (3 fwhm). A weight is the exact energy in a band; the weights sum
-    to 1. `point`: the bands are the `count` nearest multiples of 10 nm. A weight is the value of the line at the
-    centre, as printed in the paper; the weights do not sum to 1.
+    `integrated`: `count` equal bands cover `span` (3 fwhm). A weight is the exact energy in a band;
+    the weights sum to 1. `point`: the bands are the `count` nearest multiples of 10 nm. A weight is
+    the value of the line at the centre, as printed in the paper; the weights do not sum to 1.
 
     Shapes: -> centres, widths, weights (band,) float64.
     Units:  centres and widths m; weights relative to the energy of the line.
-    Error:  integrated: the 4e-4 of the line beyond 3 fwhm is redistributed over the bands; the floor beyond `span`
-            (3 % over 400-700 nm) is neglected. point: the sum is off by up to 5.7 % at fwhm 10 nm.
-    Raises: ParameterError before the run where the bands would reach below 100 nm, and for more than 100 000 bands.
+    Error:  integrated: the 4e-4 of the line beyond 3 fwhm is redistributed over the bands; the
+            floor beyond `span` (3 % over 400-700 nm) is neglected. point: the sum is off by up to
+            5.7 % at fwhm 10 nm.
+    Raises: ParameterError before the run where the bands would reach below 100 nm, and for more
+            than 100 000 bands.
     Source: NeuSee, laser of 10 nm FWHM with 0.1 % floor; bin integrals by the error function.
     """
     sigma = fwhm / (2 * math.sqrt(2 * math.log(2)))
@@ -129,16 +163,28 @@ def line(
 
 
 @line.preflight
-def _(*, wavelength: float, fwhm: float = 10e-9, count: int = 5, span: float | None = None, **params: Any) -> list[str]:
+def _(
+    *,
+    wavelength: float,
+    fwhm: float = 10e-9,
+    count: int = 5,
+    span: float | None = None,
+    **params: Any,
+) -> list[str]:
     _refuse_many(count)
     points = params.get("sampling") == "point"
     reach = _GRID * count / 2 if points else (3 * fwhm if span is None else span) / 2
     if wavelength - reach < 100e-9:
         name = "count" if points else "fwhm" if span is None else "span"
-        text = f"the bands of the laser reach down to {(wavelength - reach) * 1e9:.3g} nm: keep all bands above 100 nm"
+        text = (
+            f"the bands of the laser reach down to {(wavelength - reach) * 1e9:.3g} nm: keep all"
+            " bands above 100 nm"
+        )
         raise ParameterError(name, text)
     return (
-        ["laser sampled at points of the 10 nm grid: the energy of the laser is off by up to 5.7 %"] if points else []
+        ["laser sampled at points of the 10 nm grid: the energy of the laser is off by up to 5.7 %"]
+        if points
+        else []
     )
 
 
@@ -146,7 +192,10 @@ def _(*, wavelength: float, fwhm: float = 10e-9, count: int = 5, span: float | N
 def _(result: Samples, *, wavelength: float, **params: Any) -> list[Check]:
     total = float(result.weights.sum())
     mean = float((result.weights * result.centres).sum()) / total
-    text = f"{wavelength * 1e9:.5g} nm in {len(result.centres)} bands: energy {total:.4f}, mean {mean * 1e9:.5g} nm"
+    text = (
+        f"{wavelength * 1e9:.5g} nm in {len(result.centres)} bands: energy {total:.4f}, mean"
+        f" {mean * 1e9:.5g} nm"
+    )
     return [Check(text, abs(total - 1) < 0.01)]
 
 
@@ -161,3 +210,157 @@ def _points(wavelength: float, sigma: float, count: int, floor: float) -> Sample
 def mean_wavelength(line: Samples) -> float:
     """Return the mean wavelength of a laser line in m, weighted by the energy in each band."""
     return float((line.centres * line.weights).sum() / line.weights.sum())
+
+
+# --- laser table ----------------------------------------------------------------------------------
+
+# Spectrum of a laser from a table of separate lines or of spectral power.
+
+
+_COLUMNS = (
+    "write a header such as wavelength (nm),power (mW) for separate lines, or wavelength (nm),power"
+    " (mW/nm) for a spectrum, then two columns"
+)
+_PER_LENGTH = re.compile(r"(?:/|per )\s*(?:nm|um|µm|μm|m)\)?$")  #: end of a unit of spectral power
+_LEFT = 1e-3  #: share of the energy of a spectrum that its bands leave out, half of it on each side
+_MANY = 50  #: lines; each of them takes a PSF of its own
+
+
+@node(rtol=1e-9, before_run=True)
+def line_table(*, file: DataFile, count: Count = 5) -> Bands:
+    """Read the spectrum of a laser from a CSV file: the power of separate lines, or the spectral
+    power.
+
+    The unit in the header decides. A power, such as ``power (mW)`` or ``share (%)``, belongs to one
+    line, and each row becomes one band; a third column, such as ``fwhm (nm)``, may give the width
+    of each line. A power for each nm, such as ``power (mW/nm)``, is a spectrum, which ``count``
+    equal bands divide. Only the ratio of the powers counts.
+
+    Shapes: -> centres, widths, weights (band,) float64.
+    Units:  centres and widths m; weights are shares of the energy of the laser, with the sum 1.
+    Error:  lines: exact; the shape within the width of a line is left out. spectrum: linear between
+            the rows, each band holds its exact energy; the 1e-3 of the energy furthest out is
+            redistributed over the bands.
+    Raises: ParameterError before the run for a file without such a table, and for a power that is
+            negative or 0 everywhere.
+    Source: by definition.
+    """
+    laser = laser_table(file)
+    table = laser.power.table()
+    if laser.widths is None:
+        return _divided(table, count)
+    widths = torch.from_numpy(laser.widths.copy())
+    return Bands(table.wavelengths, widths, table.values[0] / table.values[0].sum())
+
+
+@line_table.preflight
+def _(*, file: Path, count: int = 5) -> list[str]:
+    laser = laser_table(file)
+    rows = len(laser.power.wavelengths)
+    if laser.widths is not None and rows > _MANY:
+        return [
+            f"{file.name}: each of the {rows} lines takes a PSF of its own: keep the strongest"
+            " lines to save time"
+        ]
+    return []
+
+
+@line_table.check
+def _(result: Bands, *, file: Path, count: int = 5) -> list[Check]:
+    laser = laser_table(file)
+    table = laser.power.table()
+    lines = Bands(table.wavelengths, table.wavelengths, table.values[0])
+    own = _mean(table) if laser.widths is None else mean_wavelength(lines)
+    mean, range_ = mean_wavelength(result), float(result.centres.max() - result.centres.min())
+    text = (
+        f"{file.name} in {len(result.centres)} bands: mean {mean * 1e9:.6g} nm, {own * 1e9:.6g} nm"
+        " in the table"
+    )
+    return [Check(text, abs(mean - own) <= 0.1 * range_ + 1e-13)]
+
+
+class LaserTable(NamedTuple):
+    """The spectrum of a laser from a file."""
+
+    power: Curves  #: one curve
+    widths: Numbers | None  #: m, of each separate line; None for a spectrum
+
+
+def laser_table(file: Path) -> LaserTable:
+    """Read the power of a laser over the wavelength from a CSV file."""
+    try:
+        return _laser_table(file)
+    except (OSError, ValueError) as error:
+        raise refused("file", _COLUMNS, error) from None
+
+
+@once_per_version
+def _laser_table(file: Path) -> LaserTable:
+    table = curves(file, None, fewest=1)
+    power, *others = table.columns
+    if not power.unit:
+        raise ValueError(f"{file.name}: column 2, {power.quantity}, has no unit")
+    spectrum = _PER_LENGTH.search(power.unit) is not None
+    if len(others) > (0 if spectrum else 1):
+        raise ValueError(
+            f"{file.name} has {len(table.columns) + 1} columns in place of"
+            f" {'2' if spectrum else '2 or 3'}"
+        )
+    table.refuse(table.values < 0, lambda value: f"a laser has no power or width of {value:g}")
+    if not table.values[0].any():
+        raise ValueError(f"{file.name} has no power at any wavelength")
+    if spectrum and len(table.wavelengths) < 2:
+        raise ValueError(f"{file.name} holds one wavelength: a spectrum needs at least two")
+    alone = table._replace(columns=(power,), values=table.values[:1])
+    return LaserTable(alone, None if spectrum else _widths(table))
+
+
+def _widths(table: Curves) -> Numbers:
+    """Return the widths of separate lines in m; lines without widths are 0 wide."""
+    if len(table.columns) == 1:
+        return np.zeros(len(table.wavelengths))
+    unit = table.columns[1].unit
+    if unit not in LENGTHS:
+        heading = table.columns[1].heading
+        raise ValueError(f"{table.file.name}: column 3, {heading}, has no widths: write fwhm (nm)")
+    widths: Numbers = table.values[1] * LENGTHS[unit]
+    return widths
+
+
+def _divided(table: Table, count: int) -> Bands:
+    """Divide a spectrum into equal bands that hold all but `_LEFT` of its energy."""
+    low, high = _reached(table, _LEFT / 2), _reached(table, 1 - _LEFT / 2)
+    edges = torch.linspace(low, high, count + 1, dtype=torch.float64)
+    centres, width = (edges[1:] + edges[:-1]) / 2, (high - low) / count
+    widths = torch.full_like(centres, width)
+    energy = table.over(Bands(centres, widths, torch.ones_like(centres)))[0]
+    return Bands(centres, widths, energy / energy.sum())
+
+
+def _reached(table: Table, share: float) -> float:
+    """Return the wavelength up to which a spectrum has a share of its energy, by bisection."""
+    first, low, high = (float(table.wavelengths[i]) for i in (0, 0, -1))
+    total = _energy(table, first, high)
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (
+            (middle, high) if _energy(table, first, middle) < share * total else (low, middle)
+        )
+    return (low + high) / 2
+
+
+def _energy(table: Table, low: float, high: float) -> float:
+    """Return the integral of a spectrum between two wavelengths."""
+    centre, width = torch.tensor([[(low + high) / 2], [high - low]], dtype=torch.float64)
+    return float(table.over(Bands(centre, width, centre))[0]) * (high - low) if high > low else 0.0
+
+
+def _mean(table: Table) -> float:
+    """Return the mean wavelength of a spectrum that is linear between its samples, weighted by
+    energy.
+    """
+    x, y = table.wavelengths, table.values[0]
+    steps = x.diff()
+    areas = (y[1:] + y[:-1]) / 2 * steps
+    moments = steps * (x[1:] * (2 * y[1:] + y[:-1]) + x[:-1] * (2 * y[:-1] + y[1:])) / 6
+    return float(moments.sum() / areas.sum())

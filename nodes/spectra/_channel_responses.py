@@ -1,56 +1,73 @@
-"""Spectral responses of the colour channels of a sensor."""
+"""Spectral responses of the channels of a sensor, and weights of the bands in them."""
 
 import re
 from pathlib import Path
 from typing import Literal
 
+import torch
 from torch import Tensor
 
 from neusee.nodes import Check, node
 from neusee.nodes.constants import ELEMENTARY_CHARGE, PLANCK, SPEED_OF_LIGHT
 from neusee.nodes.input_files import once_per_version
-from neusee.nodes.spectra._spectral_tables import Table, measured_camera, observer
+from neusee.nodes.spectra._cie_tables import Table, measured_camera, observer
 from neusee.nodes.spectra._table_files import Curves, curves, refused
 from neusee.nodes.units import DataFile, Efficiency
 from neusee.nodes.values import Bands
 
+# --- channel responses ----------------------------------------------------------------------------
+
+# Spectral responses of the colour channels of a sensor.
+
+
 Camera = Literal["CIE 1931", "Nikon 5100", "Sigma SDMerill"]
 _UNSEEN = 1e-3  #: of the largest sensitivity; a band that every channel sees less counts as unseen
-#: nm, ends of the range in which some channel has more than `_UNSEEN`, with a margin; found without the table
+#: nm, ends of the range in which some channel has more than `_UNSEEN`, with a margin; found without
+#: the table
 _SEEN: dict[str, tuple[float, float]] = {
     "CIE 1931": (375.0, 720.0),
     "Nikon 5100": (405.0, 690.0),
     "Sigma SDMerill": (405.0, 675.0),
 }
 _COLUMNS = (
-    "write a header, then wavelength in nm, red, green and blue, separated by commas, or one column for a mono camera"
+    "write a header, then wavelength in nm, red, green and blue, separated by commas, or one column"
+    " for a mono camera"
 )
-_ELECTRON_VOLT_METRES = PLANCK * SPEED_OF_LIGHT / ELEMENTARY_CHARGE  #: V m; responsivity in A/W is QE times m over this
+#: V m; responsivity in A/W is QE times m over this
+_ELECTRON_VOLT_METRES = PLANCK * SPEED_OF_LIGHT / ELEMENTARY_CHARGE
 
 
 @node(rtol=1e-9)
 def responses(
-    bands: Bands, *, camera: Camera | DataFile = "CIE 1931", quantum_efficiency: Efficiency | None = None
+    bands: Bands,
+    *,
+    camera: Camera | DataFile = "CIE 1931",
+    quantum_efficiency: Efficiency | None = None,
 ) -> Tensor:
-    """Average the sensitivity of each colour channel over each band, for the CIE observer or a measured camera.
+    """Average the sensitivity of each colour channel over each band, for the CIE observer or a
+    measured camera.
 
-    ``camera`` is one of three names, or a CSV file of your own camera: a header such as ``wavelength (nm),QE (%)``,
-    then the wavelength and either the sensitivity of one channel (a mono camera) or of red, green and blue. A column
-    is a quantum efficiency (QE, in 1 or %), a responsivity in A/W, or a relative sensitivity in any unit common to the
-    channels. A header without units means nm and relative sensitivities.
+    ``camera`` is one of three names, or a CSV file of your own camera: a header such as
+    ``wavelength (nm),QE (%)``, then the wavelength and either the sensitivity of one channel (a
+    mono camera) or of red, green and blue. A column is a quantum efficiency (QE, in 1 or %), a
+    responsivity in A/W, or a relative sensitivity in any unit common to the channels. A header
+    without units means nm and relative sensitivities.
 
-    An absolute table, of a quantum efficiency or a responsivity, is relative to ``quantum_efficiency`` if that is
-    given, so that a sensor that multiplies by ``quantum_efficiency`` later has the electrons of the table.
+    An absolute table, of a quantum efficiency or a responsivity, is relative to
+    ``quantum_efficiency`` if that is given, so that a sensor that multiplies by
+    ``quantum_efficiency`` later has the electrons of the table.
 
     Shapes: -> (channel, band) float64, with 3 channels or 1.
-    Units:  relative to the largest sensitivity of any channel at any wavelength, or, of an absolute table, to
-            ``quantum_efficiency``; no response is negative.
-    Error:  linear interpolation between the samples of the table (1, 5 and 10 nm); 0 beyond the table, whose ends are
-            below 6e-3 of the peak (CIE 360-830 nm, Nikon 380-780 nm, Sigma 400-680 nm; except that the blue of Sigma
-            is still 0.16 at 400 nm).
-    Raises: ParameterError before the run for a file without two or four columns of finite numbers, wavelengths in
-            rising order, a channel without sensitivity, sensitivities below -1 % of the largest, or a QE above 1.
-    Source: CIE 1931 2 degree observer; NPL measurements of the Nikon 5100 and Sigma SD Merrill in colour-science.
+    Units:  relative to the largest sensitivity of any channel at any wavelength, or, of an absolute
+            table, to ``quantum_efficiency``; no response is negative.
+    Error:  linear interpolation between the samples of the table (1, 5 and 10 nm); 0 beyond the
+            table, whose ends are below 6e-3 of the peak (CIE 360-830 nm, Nikon 380-780 nm, Sigma
+            400-680 nm; except that the blue of Sigma is still 0.16 at 400 nm).
+    Raises: ParameterError before the run for a file without two or four columns of finite numbers,
+            wavelengths in rising order, a channel without sensitivity, sensitivities below -1 % of
+            the largest, or a QE above 1.
+    Source: CIE 1931 2 degree observer; NPL measurements of the Nikon 5100 and Sigma SD Merrill in
+            colour-science.
     """
     table = _table(camera)
     largest = table.values.max()
@@ -61,7 +78,10 @@ def responses(
 
 @responses.preflight
 def _(
-    *, bands: Bands | None = None, camera: Camera | Path = "CIE 1931", quantum_efficiency: float | None = None
+    *,
+    bands: Bands | None = None,
+    camera: Camera | Path = "CIE 1931",
+    quantum_efficiency: float | None = None,
 ) -> list[str]:
     low, high = seen_range(camera)
     notes = _peak_note(camera, quantum_efficiency) if isinstance(camera, Path) else []
@@ -70,25 +90,34 @@ def _(
     centres = bands.centres * 1e9
     if low <= float(centres.min()) and float(centres.max()) <= high:
         return notes  # most recipes: colour-science, whose import takes a second, is not needed
-    most = responses(bands, camera=camera).amax(0)
-    unseen = centres[most < _UNSEEN]
+    strongest = responses(bands, camera=camera).amax(0)
+    unseen = centres[strongest < _UNSEEN]
     if not len(unseen):
         return notes
-    which = f"{float(unseen.min()):.5g} nm" + (f" to {float(unseen.max()):.5g} nm" if len(unseen) > 1 else "")
-    largest = float(most[most < _UNSEEN].max())
+    which = f"{float(unseen.min()):.5g} nm" + (
+        f" to {float(unseen.max()):.5g} nm" if len(unseen) > 1 else ""
+    )
+    largest = float(strongest[strongest < _UNSEEN].max())
     return [
         *notes,
-        f"no channel of {_name(camera)} sees {len(unseen)} of {len(centres)} bands, {which}: the largest relative "
-        f"response is {largest:.2g}, below {_UNSEEN:g}, so their light is missing from the picture; choose "
-        f"{low:g} to {high:g} nm",
+        (
+            f"no channel of {_name(camera)} sees {len(unseen)} of {len(centres)} bands, {which}:"
+            f" the largest relative response is {largest:.2g}, below {_UNSEEN:g}, so their light is"
+            f" missing from the picture; choose {low:g} to {high:g} nm"
+        ),
     ]
 
 
 @responses.check
-def _(result: Tensor, bands: Bands, *, camera: Camera | Path = "CIE 1931", **params: object) -> list[Check]:
+def _(
+    result: Tensor, bands: Bands, *, camera: Camera | Path = "CIE 1931", **params: object
+) -> list[Check]:
     peaks = [float(bands.centres[int(row.argmax())]) * 1e9 for row in result]
     lit = bool((result.amax(1) > 0).all())
-    text = f"{_name(camera)}: peak{'s' * (len(peaks) > 1)} at {', '.join(f'{peak:.4g}' for peak in peaks)} nm"
+    text = (
+        f"{_name(camera)}: peak{'s' * (len(peaks) > 1)} at"
+        f" {', '.join(f'{peak:.4g}' for peak in peaks)} nm"
+    )
     return [Check(text, lit or len(bands.centres) < 10)]
 
 
@@ -98,7 +127,8 @@ def channel_count(camera: str | Path) -> int:
 
 
 def camera_curves(file: Path) -> tuple[Curves, bool]:
-    """Read the curves of a camera from a CSV file; return them, and True if they are absolute quantum efficiencies.
+    """Read the curves of a camera from a CSV file; return them, and True if they are absolute
+    quantum efficiencies.
 
     A quantum efficiency in percent and a responsivity in A/W become fractions.
     """
@@ -109,28 +139,48 @@ def camera_curves(file: Path) -> tuple[Curves, bool]:
 
 
 def _camera_curves(file: Path) -> tuple[Curves, bool]:
-    found = curves(file, None, assumed="nm")
-    if len(found.values) not in (1, 3):
-        count = f"{len(found.values) + 1} columns in place of 4"
-        raise ValueError(f"{file.name}: the file has {count} for red, green and blue, or 2 for one channel")
-    units = {column.unit for column in found.columns}
-    if len(units) > 1:
-        raise ValueError(f"{file.name}: the channels have the units {', '.join(sorted(units))}: give all the same unit")
-    (unit,) = units
-    absolute = unit == "A/W" or any(_is_efficiency(column.quantity) for column in found.columns)
-    dark = found.values.max(1) <= 0
-    if dark.any():
-        name = found.columns[int(dark.argmax())].heading
-        raise ValueError(f"{file.name}: a channel has no sensitivity at any wavelength, {name}")
-    least = found.values.min()
-    if least < -0.01 * found.values.max():
-        found.refuse(found.values == least, _negative)
+    table = curves(file, None, assumed="nm")
+    if len(table.values) not in (1, 3):
+        count = f"{len(table.values) + 1} columns in place of 4"
+        raise ValueError(
+            f"{file.name}: the file has {count} for red, green and blue, or 2 for one channel"
+        )
+    unit = _only_unit(table)
+    absolute = unit == "A/W" or any(_is_efficiency(column.quantity) for column in table.columns)
+    _refuse_no_sensitivity(table)
     if absolute and unit not in ("1", "%", "A/W"):
-        raise ValueError(f"{file.name}: {found.columns[0].heading} needs the unit (1), (%) or (A/W)")
-    shares = found.values * (_ELECTRON_VOLT_METRES / found.wavelengths if unit == "A/W" else 0.01 if unit == "%" else 1)
+        raise ValueError(
+            f"{file.name}: {table.columns[0].heading} needs the unit (1), (%) or (A/W)"
+        )
+    factor = 0.01 if unit == "%" else 1
+    shares = table.values * (_ELECTRON_VOLT_METRES / table.wavelengths if unit == "A/W" else factor)
     if absolute:
-        found.refuse(shares > 1, lambda value: _above_one(value, unit))
-    return found._replace(values=shares), absolute
+        table.refuse(shares > 1, lambda value: _above_one(value, unit))
+    return table._replace(values=shares), absolute
+
+
+def _only_unit(table: Curves) -> str:
+    """Return the unit of all channels; raise ValueError if they have several."""
+    units = {column.unit for column in table.columns}
+    if len(units) > 1:
+        raise ValueError(
+            f"{table.file.name}: the channels have the units {', '.join(sorted(units))}: give all"
+            " the same unit"
+        )
+    return units.pop()
+
+
+def _refuse_no_sensitivity(table: Curves) -> None:
+    """Raise ValueError for a channel without sensitivity, or with a negative one."""
+    dark = table.values.max(1) <= 0
+    if dark.any():
+        name = table.columns[int(dark.argmax())].heading
+        raise ValueError(
+            f"{table.file.name}: a channel has no sensitivity at any wavelength, {name}"
+        )
+    lowest = table.values.min()
+    if lowest < -0.01 * table.values.max():
+        table.refuse(table.values == lowest, _negative)
 
 
 def _is_efficiency(quantity: str) -> bool:
@@ -147,22 +197,28 @@ def _above_one(value: float, unit: str) -> str:
 
 
 def _peak_note(file: Path, quantum_efficiency: float | None) -> list[str]:
-    """Return a note on the largest QE of a file: responses are relative to it, or the QE of the sensor does not count.
+    """Return a note on the largest QE of a file: responses are relative to it, or the QE of the
+    sensor does not count.
 
     Without a quantum efficiency of the sensor, responses are relative.
     """
-    found, absolute = camera_curves(file)
+    table, absolute = camera_curves(file)
     if not absolute:
         return []
-    largest = found.values.max()
-    at = found.wavelengths[found.values.max(0).argmax()] * 1e9
-    peak = f"{file.name}: the largest QE is {largest:.4g}, at {at:g} nm"
+    largest = table.values.max()
+    peak_nm = table.wavelengths[table.values.max(0).argmax()] * 1e9
+    peak = f"{file.name}: the largest QE is {largest:.4g}, at {peak_nm:g} nm"
     if quantum_efficiency is not None:
-        told = f"sensor.quantum_efficiency={quantum_efficiency:.4g}"
+        stated = f"sensor.quantum_efficiency={quantum_efficiency:.4g}"
         same = abs(quantum_efficiency / largest - 1) < 1e-3
-        return [f"{peak}, as {told}"] if same else [f"{peak}, and the QE of the table counts for electrons, not {told}"]
+        return (
+            [f"{peak}, as {stated}"]
+            if same
+            else [f"{peak}, and the QE of the table counts for electrons, not {stated}"]
+        )
     return [
-        f"{peak}, and responses are relative to it: electrons are right with sensor.quantum_efficiency={largest:.4g}"
+        f"{peak}, and responses are relative to it: electrons are right with"
+        f" sensor.quantum_efficiency={largest:.4g}"
     ]
 
 
@@ -177,14 +233,61 @@ def _table(camera: str | Path) -> Table:
 
 
 def seen_range(camera: str | Path) -> tuple[float, float]:
-    """Return the wavelengths in nm between which some channel sees more than a thousandth of the largest value."""
+    """Return the wavelengths in nm between which some channel sees more than a thousandth of the
+    largest value.
+    """
     if not isinstance(camera, Path):
         return _SEEN[camera]
     table = _from_file(camera)
-    seen = table.wavelengths[table.values.amax(0) >= _UNSEEN * table.values.max()] * 1e9
-    return float(seen[0]), float(seen[-1])
+    sensitive = table.wavelengths[table.values.amax(0) >= _UNSEEN * table.values.max()] * 1e9
+    return float(sensitive[0]), float(sensitive[-1])
 
 
 @once_per_version
 def _from_file(file: Path) -> Table:
     return camera_curves(file)[0].table()
+
+
+# --- distinct band sums ---------------------------------------------------------------------------
+
+# Weights of the spectral bands in each colour channel, and in the electrons that fill a pixel.
+
+
+@node(rtol=1e-12)
+def rows(bands: Bands, responses: Tensor, *, well: bool = True) -> Tensor:
+    """Return the weight of each spectral band in each colour channel, and in the electrons that
+    fill a pixel.
+
+    The first rows are for the colour channels. The last row is for the electrons that fill the
+    well. A channel counts photons, so that the weights are response times wavelength. The weights
+    of the last row are the wavelengths alone, because a photon of any wavelength frees one
+    electron. With `well` false, the last row is omitted.
+
+    Shapes: bands (band,), responses (channel, band) -> (channel + 1, band) float64, or (channel,
+            band).
+    Units:  m; the node that counts photons applies the common factor.
+    Error:  exact.
+    Raises: ValueError where responses and bands differ in the number of bands.
+    Source: NeuSee, Eq. (photon_count) and Eq. (ThresSat).
+    """
+    if responses.ndim != 2 or responses.shape[1] != len(bands.centres):
+        raise ValueError(
+            f"responses have shape {tuple(responses.shape)}, not (channel, band) with"
+            f" {len(bands.centres)} bands: compute responses and bands from the same `bands` step"
+        )
+    centres = bands.centres.double().to(responses.device)
+    channels = responses.double() * centres
+    return torch.cat([channels, centres[None]]) if well else channels
+
+
+@rows.check
+def _(result: Tensor, *inputs: object, **params: object) -> list[Check]:
+    rank = int(
+        torch.linalg.matrix_rank(result / result.abs().amax(1, keepdim=True).clamp_min(1e-300))
+    )
+    return [
+        Check(
+            f"{len(result)} weighted sums over {result.shape[1]} bands; the matrix of weights has"
+            f" rank {rank}"
+        )
+    ]

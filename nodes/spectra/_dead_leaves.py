@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from neusee.nodes import Check, node
-from neusee.nodes.spectra._spectral_tables import daylight, light
+from neusee.nodes.spectra._cie_tables import daylight, light
 from neusee.nodes.units import Fraction, Shape
 from neusee.nodes.values import Bands
 
@@ -30,24 +30,26 @@ def leaves(
     daylights: Fraction = 0.2,
     rng: torch.Generator,
 ) -> Tensor:
-    """Draw a "dead leaves" picture: overlapping ellipses (leaves) of random size, each with one spectrum.
+    """Draw a "dead leaves" picture: overlapping ellipses (leaves) of random size, each with one
+    spectrum.
 
-    The picture has statistics similar to those of photographs. Radii range from `smallest` to half the picture, with
-    a density that falls with the inverse cube of the radius. The brightness of a leaf is log-uniform from `darkest` to
-    1. Up to a share `texture` of another spectrum is mixed in, and up to a share `shade` of the light is removed; both
-    shares vary smoothly. A share `daylights` of the pictures is lit by another daylight but keeps the white balance of
-    D65.
+    The picture has statistics similar to those of photographs. Radii range from `smallest` to half
+    the picture, with a density that falls with the inverse cube of the radius. The brightness of a
+    leaf is log-uniform from `darkest` to 1. Up to a share `texture` of another spectrum is mixed
+    in, and up to a share `shade` of the light is removed; both shares vary smoothly. A share
+    `daylights` of the pictures is lit by another daylight but keeps the white balance of D65.
 
     Shapes: spectra (leaf, band), the first leaf behind all others -> (band, y, x) float32.
-    Units:  `smallest` pixels; reflectance under D65, in [0, 1]: another daylight is scaled to exceed D65 in no band.
+    Units:  `smallest` pixels; reflectance under D65, in [0, 1]: another daylight is scaled to
+            exceed D65 in no band.
     Error:  edges from four samples per pixel; daylights at 24 temperatures from 4000 to 15 000 K.
     Raises: ValueError where spectra and bands differ in the number of bands.
     Source: Lee, Mumford and Huang, Int. J. Comput. Vis. 41, 35 (2001).
     """
     if spectra.ndim != 2 or spectra.shape[1] != len(bands.centres):
         raise ValueError(
-            f"spectra have shape {tuple(spectra.shape)}, not (leaf, band) with {len(bands.centres)} bands: "
-            "compute spectra and bands from the same `bands` step"
+            f"spectra have shape {tuple(spectra.shape)}, not (leaf, band) with {len(bands.centres)}"
+            " bands: compute spectra and bands from the same `bands` step"
         )
     fine = (_FINE * shape[0], _FINE * shape[1])
     top = _topmost(len(spectra), fine, _FINE * smallest, rng)
@@ -63,11 +65,15 @@ def leaves(
 @leaves.check
 def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
     low, high = float(result.min()), float(result.max())
-    return [Check(f"reflectance of the picture from {low:.3g} to {high:.3g}", 0 <= low <= high <= 1)]
+    return [
+        Check(f"reflectance of the picture from {low:.3g} to {high:.3g}", 0 <= low <= high <= 1)
+    ]
 
 
 def _topmost(count: int, size: tuple[int, int], smallest: float, rng: torch.Generator) -> Tensor:
-    """Draw random overlapping ellipses, and return the index of the topmost ellipse at each sample (y, x)."""
+    """Draw random overlapping ellipses, and return the index of the topmost ellipse at each
+    sample (y, x).
+    """
     largest = max(min(size) / 2, smallest)
     share = _even(rng, count)
     radius = (smallest**-2 * (1 - share) + largest**-2 * share) ** -0.5
@@ -88,7 +94,9 @@ def _smooth(size: tuple[int, int], rng: torch.Generator) -> Tensor:
 
 
 def _lights(bands: Bands, share: float, rng: torch.Generator) -> Tensor:
-    """Return the ratio of a random daylight spectrum to D65 in each band, scaled to a maximum of 1."""
+    """Return the ratio of a random daylight spectrum to D65 in each band, scaled to a maximum of
+    1.
+    """
     chance, which = torch.rand(2, generator=rng, device=rng.device).tolist()
     centres = bands.centres
     if chance >= share:

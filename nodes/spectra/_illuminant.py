@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes._half_precision import single
 from neusee.nodes.input_files import once_per_version
-from neusee.nodes.spectra._spectral_tables import Table, daylight, light, observer, require_range
+from neusee.nodes.precision import single
+from neusee.nodes.spectra._cie_tables import Table, daylight, light, observer, require_range
 from neusee.nodes.spectra._table_files import Curves, curves, refused
 from neusee.nodes.units import DataFile, Temperature
 from neusee.nodes.values import Bands, LowRankCube
@@ -26,18 +26,22 @@ _LONGER = "give a longer table, or choose bands inside that range"
 
 
 @node(rtol=1e-9)
-def illuminant(bands: Bands, *, kind: Kind | DataFile = "daylight", temperature: Temperature = 6504.0) -> Tensor:
-    """Average the relative spectral power of an illuminant over each band: a CIE illuminant, or a table of your own.
+def illuminant(
+    bands: Bands, *, kind: Kind | DataFile = "daylight", temperature: Temperature = 6504.0
+) -> Tensor:
+    """Average the relative spectral power of an illuminant over each band: a CIE illuminant, or a
+    table of your own.
 
     Only the kind `daylight` uses `temperature`. A table is a CSV file with a header such as
     ``wavelength (nm),power (W/nm)`` and two columns; only the ratio of its powers counts.
 
     Shapes: -> (band,) float64.
     Units:  relative, mean 1 over the bands.
-    Error:  linear interpolation between samples 1 to 10 nm apart; 31 bands shift the white of D65 by 0.2 %. A table is
-            not extrapolated.
-    Raises: ParameterError before the run for daylight outside 4000 to 25 000 K, and for a file without such a table or
-            with a table that does not reach over all bands; ValueError where bands leave the table.
+    Error:  linear interpolation between samples 1 to 10 nm apart; 31 bands shift the white of D65
+            by 0.2 %. A table is not extrapolated.
+    Raises: ParameterError before the run for daylight outside 4000 to 25 000 K, and for a file
+            without such a table or with a table that does not reach over all bands; ValueError
+            where bands leave the table.
     Source: CIE 15:2004 (D series, A, E, FL, HP), CIE 15:2018 (LED), by way of colour-science.
     """
     table = _light(kind, temperature)
@@ -47,34 +51,44 @@ def illuminant(bands: Bands, *, kind: Kind | DataFile = "daylight", temperature:
     power = table.over(bands)[0]
     if not float(power.mean()) > 0:
         low, high = float(edges.min()) * 1e9, float(edges.max()) * 1e9
-        raise ValueError(f"illuminant {name} gives no light from {low:.4g} to {high:.4g} nm: choose other bands")
+        raise ValueError(
+            f"illuminant {name} gives no light from {low:.4g} to {high:.4g} nm: choose other bands"
+        )
     return (power / power.mean()).to(bands.centres.device)
 
 
 @illuminant.preflight
-def _(*, bands: Bands | None = None, kind: str | Path = "daylight", temperature: float = 6504.0) -> list[str]:
+def _(
+    *, bands: Bands | None = None, kind: str | Path = "daylight", temperature: float = 6504.0
+) -> list[str]:
     if kind == "daylight" and not 4000 <= temperature <= 25000:
         raise ParameterError(
             "temperature",
-            f"CIE daylight is defined from 4000 K to 25000 K, not at {temperature:g} K: choose kind A or an LED",
+            f"CIE daylight is defined from 4000 K to 25000 K, not at {temperature:g} K: choose kind"
+            " A or an LED",
         )
     if isinstance(kind, Path):
         table = light_curve(kind).table()
         if bands is not None and not bands.centres.is_meta:
             try:
-                require_range(_edges(bands), table.wavelengths, f"{kind.name} is tabulated from", _LONGER)
+                require_range(
+                    _edges(bands), table.wavelengths, f"{kind.name} is tabulated from", _LONGER
+                )
             except ValueError as error:
                 raise ParameterError("kind", str(error)) from None
     return []
 
 
 @illuminant.check
-def _(result: Tensor, bands: Bands, *, kind: str | Path = "daylight", temperature: float = 6504.0) -> list[Check]:
+def _(
+    result: Tensor, bands: Bands, *, kind: str | Path = "daylight", temperature: float = 6504.0
+) -> list[Check]:
     name = f"{kind} {temperature:g} K" if kind == "daylight" else _name(kind)
     peak = float(bands.centres[int(result.argmax())]) * 1e9
     return [
         Check(
-            f"{name}: relative power {float(result.min()):.2f} to {float(result.max()):.2f}, largest at {peak:.4g} nm"
+            f"{name}: relative power {float(result.min()):.2f} to {float(result.max()):.2f},"
+            f" largest at {peak:.4g} nm"
         )
     ]
 
@@ -82,20 +96,32 @@ def _(result: Tensor, bands: Bands, *, kind: str | Path = "daylight", temperatur
 def luminous_share(bands: Bands | None, kind: str | Path, temperature: float) -> float:
     """Return the mean radiance in one band of a light of 1 cd/m2, in W/(m2 sr).
 
-    Raises ParameterError for a table of light that does not hold 99 % of the luminous efficiency, and 0 for no bands.
+    Raises ParameterError for a table of light that does not hold 99 % of the luminous efficiency,
+    and 0 for no bands.
     """
     table, eye = _light(kind, temperature), observer()
-    seen = (eye.wavelengths >= table.wavelengths[0]) & (eye.wavelengths <= table.wavelengths[-1])
-    curve = eye.values[1] * seen
+    in_table = (eye.wavelengths >= table.wavelengths[0]) & (
+        eye.wavelengths <= table.wavelengths[-1]
+    )
+    curve = eye.values[1] * in_table
     if float(curve.sum() / eye.values[1].sum()) < _VISIBLE:
         low, high = float(table.wavelengths[0]) * 1e9, float(table.wavelengths[-1]) * 1e9
-        text = f"{_name(kind)} is tabulated from {low:.4g} to {high:.4g} nm, which does not reach over the visible"
-        raise ParameterError("kind", f"{text} wavelengths: lux and cd/m2 need light from 430 to 680 nm")
-    lumens = _LUMENS_PER_WATT * float(torch.trapezoid(curve * table.at(eye.wavelengths)[0], eye.wavelengths))
+        text = (
+            f"{_name(kind)} is tabulated from {low:.4g} to {high:.4g} nm, which does not reach over"
+            " the visible"
+        )
+        raise ParameterError(
+            "kind", f"{text} wavelengths: lux and cd/m2 need light from 430 to 680 nm"
+        )
+    lumens = _LUMENS_PER_WATT * float(
+        torch.trapezoid(curve * table.at(eye.wavelengths)[0], eye.wavelengths)
+    )
     if bands is None or bands.centres.is_meta:
         return 0.0
     if not lumens > 0:
-        raise ParameterError("kind", f"{_name(kind)} gives no visible light: state sensor.background in place of lux")
+        raise ParameterError(
+            "kind", f"{_name(kind)} gives no visible light: state sensor.background in place of lux"
+        )
     return float((table.over(bands)[0] * bands.widths.cpu()).mean()) / lumens
 
 
@@ -109,19 +135,22 @@ def light_curve(file: Path) -> Curves:
 
 @once_per_version
 def _light_curve(file: Path) -> Curves:
-    found = curves(file, None)
-    if len(found.values) != 1:
-        raise ValueError(f"{file.name} has {len(found.values) + 1} columns in place of 2")
-    heading = found.columns[0].heading
+    table = curves(file, None)
+    if len(table.values) != 1:
+        raise ValueError(f"{file.name} has {len(table.values) + 1} columns in place of 2")
+    heading = table.columns[0].heading
     if re.search(r"photon|mol|%", heading):
         fix = "divide photons by the wavelength, and write a unit of power, such as W/nm or 1"
         raise ValueError(f"{file.name}: {heading} is no spectral power: {fix}")
-    if not found.columns[0].unit:
-        raise ValueError(f"{file.name}: column 2, {heading}, has no unit: write power (W/nm), or power (1) if relative")
-    found.refuse(found.values < 0, lambda value: f"a light cannot have the power {value:g}")
-    if not found.values.any():
+    if not table.columns[0].unit:
+        raise ValueError(
+            f"{file.name}: column 2, {heading}, has no unit: write power (W/nm), or power (1) if"
+            " relative"
+        )
+    table.refuse(table.values < 0, lambda value: f"a light cannot have the power {value:g}")
+    if not table.values.any():
         raise ValueError(f"{file.name} has no power at any wavelength")
-    return found
+    return table
 
 
 def _light(kind: str | Path, temperature: float) -> Table:
@@ -140,26 +169,33 @@ def _edges(bands: Bands) -> Tensor:
 
 @node(bands={"reflectance": -3, "illuminant": 0, "return": -3}, accepts_low_rank=("reflectance",))
 def illuminate(
-    reflectance: Tensor | LowRankCube, illuminant: Tensor, *, times: Literal["once", "twice"] = "once"
+    reflectance: Tensor | LowRankCube,
+    illuminant: Tensor,
+    *,
+    times: Literal["once", "twice"] = "once",
 ) -> Tensor | LowRankCube:
     """Compute the radiance of a scene: reflectance times illuminant.
 
-    `once` is physical; `twice` multiplies by the square of the illuminant, as the paper prints. In a `LowRankCube`,
-    only the basis spectra are multiplied, and the basis images stay unchanged.
+    `once` is physical; `twice` multiplies by the square of the illuminant, as the paper prints. In
+    a `LowRankCube`, only the basis spectra are multiplied, and the basis images stay unchanged.
 
     Shapes: reflectance (..., band, y, x), illuminant (band,) -> (..., band, y, x).
     Units:  relative spectral radiance; the radiance of a white scene has mean 1 over the bands.
     Error:  float32: 6e-8.
     Raises: ValueError where reflectance and illuminant differ in the number of bands.
-    Source: NeuSee, T_b and the CIE formula after T_b; `twice` is contradiction C5 in the list of ambiguous statements
-            of the paper.
+    Source: NeuSee, T_b and the CIE formula after T_b; `twice` is contradiction C5 in the list of
+            ambiguous statements of the paper.
     """
     _same_bands(reflectance, illuminant)
     power = illuminant if times == "once" else illuminant.square()
     if isinstance(reflectance, LowRankCube):
         basis = reflectance.basis * power.to(reflectance.basis)[:, None]
         by = power.detach().abs().to(reflectance.residual_max)
-        rms = reflectance.residual_rms * by if reflectance.residual_rms.numel() else reflectance.residual_rms
+        rms = (
+            reflectance.residual_rms * by
+            if reflectance.residual_rms.numel()
+            else reflectance.residual_rms
+        )
         largest = reflectance.residual_map * float(by.max())
         return LowRankCube(reflectance.planes, basis, reflectance.residual_max * by, rms, largest)
     reflectance = single(reflectance)
@@ -173,27 +209,38 @@ def _same_bands(reflectance: Tensor | LowRankCube, illuminant: Tensor) -> None:
         shape = tuple(reflectance.shape)
     if len(shape) < 3 or illuminant.ndim != 1 or shape[-3] != len(illuminant):
         raise ValueError(
-            f"reflectance {shape} and illuminant {tuple(illuminant.shape)} must have the shapes (band, y, x) and "
-            "(band,): compute reflectance and illuminant from the same `bands` step"
+            f"reflectance {shape} and illuminant {tuple(illuminant.shape)} must have the shapes"
+            " (band, y, x) and (band,): compute reflectance and illuminant from the same `bands`"
+            " step"
         )
 
 
 @illuminate.reference
-def _(reflectance: Tensor | LowRankCube, illuminant: Tensor, *, times: str = "once") -> Tensor | LowRankCube:
+def _(
+    reflectance: Tensor | LowRankCube, illuminant: Tensor, *, times: str = "once"
+) -> Tensor | LowRankCube:
     power = [float(p) ** (1 if times == "once" else 2) for p in illuminant]
     if isinstance(reflectance, LowRankCube):
-        basis = torch.stack([row.double() * p for row, p in zip(reflectance.basis, power, strict=True)])
-        most = torch.stack([column * p for column, p in zip(reflectance.residual_max.T, power, strict=True)], 1)
+        basis = torch.stack(
+            [row.double() * p for row, p in zip(reflectance.basis, power, strict=True)]
+        )
+        residual = torch.stack(
+            [column * p for column, p in zip(reflectance.residual_max.T, power, strict=True)], 1
+        )
         columns = [column * p for column, p in zip(reflectance.residual_rms.T, power, strict=False)]
-        rms = torch.stack(columns, 1) if columns else most[:0, :0]
+        rms = torch.stack(columns, 1) if columns else residual[:0, :0]
         largest = reflectance.residual_map.double() * max(power)
-        return LowRankCube(reflectance.planes.double(), basis, most, rms, largest)
+        return LowRankCube(reflectance.planes.double(), basis, residual, rms, largest)
     return torch.stack([reflectance[..., b, :, :].double() * p for b, p in enumerate(power)], -3)
 
 
 @illuminate.preflight
 def _(*, times: str = "once") -> list[str]:
-    return ["the illuminant is applied twice, as the paper prints: its spectrum is squared"] if times == "twice" else []
+    return (
+        ["the illuminant is applied twice, as the paper prints: its spectrum is squared"]
+        if times == "twice"
+        else []
+    )
 
 
 @illuminate.check

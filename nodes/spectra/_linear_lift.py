@@ -7,11 +7,17 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import Check, Node, node
-from neusee.nodes._half_precision import single
-from neusee.nodes.spectra._linear_planes import linear_planes
-from neusee.nodes.spectra._low_rank_cube import Share, as_low_rank_cube, compress, plane_checks
-from neusee.nodes.spectra._principal_planes import Source, few_planes
-from neusee.nodes.spectra._spectral_tables import mallett, paints, require_range, to_srgb
+from neusee.nodes.precision import single
+from neusee.nodes.spectra._cie_tables import mallett, paints, require_range, to_srgb
+from neusee.nodes.spectra._low_rank_cube import (
+    Share,
+    Source,
+    as_low_rank_cube,
+    compress,
+    few_planes,
+    linear_planes,
+    plane_checks,
+)
 from neusee.nodes.values import Bands, LowRankCube
 
 _FIRST, _LAST = 380e-9, 780e-9  #: m, range of the measured reflectances and of the basis
@@ -21,29 +27,32 @@ _FIRST, _LAST = 380e-9, 780e-9  #: m, range of the measured reflectances and of 
 def lift_mallett(rgb: Tensor, bands: Bands) -> Tensor:
     """Reconstruct the reflectance of each pixel from RGB as a weighted sum of three basis spectra.
 
-    The basis spectra sum to 1 at every wavelength. `RGB_to_sd_Mallett2019` of colour-science gives the same numbers for
-    a single pixel, without a gradient.
+    The basis spectra sum to 1 at every wavelength. `RGB_to_sd_Mallett2019` of colour-science gives
+    the same numbers for a single pixel, without a gradient.
 
     Shapes: rgb (3, y, x) -> (band, y, x).
     Units:  linear sRGB to reflectance; the estimate is linear and keeps HDR values above 1.
-    Error:  real paints: PSNR 31 dB (CAVE balloons); the result, rendered to sRGB under D65, is within 5e-3 of rgb.
-            Negative results are clipped.
+    Error:  real paints: PSNR 31 dB (CAVE balloons); the result, rendered to sRGB under D65, is
+            within 5e-3 of rgb. Negative results are clipped.
     Raises: ValueError where rgb is not (3, y, x) or bands leave 380 to 780 nm.
-    Source: Mallett and Yuksel, Spectral primary decomposition, EGSR 2019; basis from colour-science.
+    Source: Mallett and Yuksel, Spectral primary decomposition, EGSR 2019; basis from
+            colour-science.
     """
     return _lifted(rgb, _basis(bands))
 
 
 @node(rtol=1e-6)
 def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> LowRankCube:
-    """Compute the result of `spectra.lift_mallett` as a low-rank cube: a sum of a few basis images times spectra.
+    """Compute the result of `spectra.lift_mallett` as a low-rank cube: a sum of a few basis images
+    times spectra.
 
     Pixels are computed block by block, so that the full cube is never in memory.
 
-    Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
-            float64.
+    Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k +
+            1, band) float64.
     Units:  planes and residuals are reflectances; the basis has no unit.
-    Error:  as `spectra.compress`, relative to `lift_mallett` in float64; float32 differs by round-off.
+    Error:  as `spectra.compress`, relative to `lift_mallett` in float64; float32 differs by
+            round-off.
     Raises: ValueError where `lift_mallett` or `spectra.compress` raises ValueError.
     Source: as `lift_mallett`.
     """
@@ -52,43 +61,50 @@ def lift_mallett_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> 
 
 @node(rtol=1e-5)
 def lift_lmmse(rgb: Tensor, bands: Bands) -> Tensor:
-    """Estimate reflectance from RGB by the linear minimum-mean-square-error estimator fitted to measured colour charts.
+    """Estimate reflectance from RGB by the linear minimum-mean-square-error estimator fitted to
+    measured colour charts.
 
-    W = C T^t (T C T^t)^-1 with C = E[s s^t] over the paints and the matrix T from reflectance under D65 to linear sRGB.
+    W = C T^t (T C T^t)^-1 with C = E[s s^t] over the paints and the matrix T from reflectance under
+    D65 to linear sRGB.
 
     Shapes: rgb (3, y, x) -> (band, y, x).
     Units:  linear sRGB to reflectance; the estimate is linear and keeps HDR values above 1.
-    Error:  real paints: PSNR 33.3 dB, mean relative error 0.15 (CAVE balloons); the result, rendered to sRGB, is rgb
-            exactly, except where a negative result is clipped. White gets the reflectance of white paint:
-            0.62 at 400 nm, 0.94 to 1.12 from 420 nm.
-    Raises: ValueError where rgb is not (3, y, x), and where bands leave 380 to 780 nm or are too few or too close to
-            distinguish colours.
-    Source: Wiener estimation as in Pratt and Mancill, Appl. Opt. 15, 73 (1976); charts of colour-science.
+    Error:  real paints: PSNR 33.3 dB, mean relative error 0.15 (CAVE balloons); the result,
+            rendered to sRGB, is rgb exactly, except where a negative result is clipped. White gets
+            the reflectance of white paint: 0.62 at 400 nm, 0.94 to 1.12 from 420 nm.
+    Raises: ValueError where rgb is not (3, y, x), and where bands leave 380 to 780 nm or are too
+            few or too close to distinguish colours.
+    Source: Wiener estimation as in Pratt and Mancill, Appl. Opt. 15, 73 (1976); charts of
+            colour-science.
     """
     return _lifted(rgb, _estimator(bands))
 
 
 @node(rtol=1e-6)
 def lift_lmmse_mixture(rgb: Tensor, bands: Bands, *, within: Share = 1e-6) -> LowRankCube:
-    """Compute the result of `spectra.lift_lmmse` as a low-rank cube: a sum of a few basis images times spectra.
+    """Compute the result of `spectra.lift_lmmse` as a low-rank cube: a sum of a few basis images
+    times spectra.
 
     Pixels are computed block by block, so that the full cube is never in memory.
 
-    Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
-            float64.
+    Shapes: rgb (3, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k +
+            1, band) float64.
     Units:  planes and residuals are reflectances; the basis has no unit.
-    Error:  as `spectra.compress`, relative to `lift_lmmse` in float64; float32 differs by round-off.
+    Error:  as `spectra.compress`, relative to `lift_lmmse` in float64; float32 differs by
+            round-off.
     Raises: ValueError where `lift_lmmse` or `spectra.compress` raises ValueError.
     Source: as `lift_lmmse`.
     """
     return _mixed(rgb, _estimator(bands), within)
 
 
-# --- hooks of both lifts ----------------------------------------------------------------------------------------------
+# --- hooks of both lifts --------------------------------------------------------------------------
 
 
 def _attach(lift: Node, low_rank: Node, matrix: Callable[[Bands], Tensor]) -> None:
-    """Attach a float64 reference, a check and a low-rank variant to a node that multiplies RGB by a matrix."""
+    """Attach a float64 reference, a check and a low-rank variant to a node that multiplies RGB
+    by a matrix.
+    """
 
     @lift.reference
     def lifted(rgb: Tensor, bands: Bands) -> Tensor:
@@ -108,8 +124,11 @@ def _attach(lift: Node, low_rank: Node, matrix: Callable[[Bands], Tensor]) -> No
     lift.low_rank_form = low_rank
 
 
-def lift_checks(result: Tensor, rgb: Tensor, bands: Bands, matrix: Tensor | None = None) -> list[Check]:
-    """Report the colour error of spectra estimated from RGB, and the share of negative light that was clipped to 0.
+def lift_checks(
+    result: Tensor, rgb: Tensor, bands: Bands, matrix: Tensor | None = None
+) -> list[Check]:
+    """Report the colour error of spectra estimated from RGB, and the share of negative light that
+    was clipped to 0.
 
     A large picture is sampled at some 100 000 pixels.
     """
@@ -119,42 +138,61 @@ def lift_checks(result: Tensor, rgb: Tensor, bands: Bands, matrix: Tensor | None
     off = float((to_srgb(bands.centres) @ spectra - colours).abs().max()) / scale
     checks = [
         Check(
-            f"colours of the estimated spectra differ from the RGB input by {off:.2g} of the largest RGB value",
+            f"colours of the estimated spectra differ from the RGB input by {off:.2g} of the"
+            " largest RGB value",
             float(result.min()) >= 0,
         )
     ]
     if matrix is not None:
         raw = matrix.cpu() @ colours
         below = float(raw.clamp_max(0).abs().sum()) / max(float(raw.abs().sum()), 1e-30)
-        checks.append(Check(f"{below:.2%} of the reconstructed light was negative and is clipped to 0", below < 0.05))
+        checks.append(
+            Check(
+                f"{below:.2%} of the reconstructed light was negative and is clipped to 0",
+                below < 0.05,
+            )
+        )
     return checks
 
 
 def needs_rgb(rgb: Tensor) -> None:
     """Raise ValueError unless ``rgb`` is a picture of three channels (3, y, x)."""
     if rgb.ndim != 3 or rgb.shape[0] != 3:
-        raise ValueError(f"rgb has shape {tuple(rgb.shape)}, not (3, y, x): connect a scene of three channels")
+        raise ValueError(
+            f"rgb has shape {tuple(rgb.shape)}, not (3, y, x): connect a scene of three channels"
+        )
 
 
 def _lifted(rgb: Tensor, matrix: Tensor) -> Tensor:
-    """Multiply an RGB picture by a matrix (band, 3), and set negative results to 0 in place to save memory."""
+    """Multiply an RGB picture by a matrix (band, 3), and set negative results to 0 in place to
+    save memory.
+    """
     needs_rgb(rgb)
     rgb = single(rgb)
     return torch.relu_(matrix.to(rgb) @ rgb.flatten(1)).reshape(-1, *rgb.shape[1:])
 
 
 def _mixed(rgb: Tensor, matrix: Tensor, within: float) -> LowRankCube:
-    """Estimate spectra from an RGB picture by a matrix (band, 3), and return the spectra as a low-rank cube.
+    """Estimate spectra from an RGB picture by a matrix (band, 3), and return the spectra as a
+    low-rank cube.
 
-    For a picture that requires a gradient, the full cube is computed, so that the gradient reaches the picture.
+    For a picture that requires a gradient, the full cube is computed, so that the gradient reaches
+    the picture.
     """
     needs_rgb(rgb)
     flat, exact = rgb.detach().flatten(1), matrix.to(rgb.device)
-    if (found := linear_planes(flat, exact, within)) is not None:
-        return as_low_rank_cube(found, _lifted(rgb, matrix) if rgb.requires_grad else rgb)
+    if (cube := linear_planes(flat, exact, within)) is not None:
+        return as_low_rank_cube(cube, _lifted(rgb, matrix) if rgb.requires_grad else rgb)
     dtype = rgb.dtype if rgb.dtype == torch.float64 else torch.float32
-    source = Source(lambda part: (exact @ flat[:, part].double()).clamp_min_(0), len(exact), flat.shape[1], dtype)
-    return as_low_rank_cube(few_planes(source, within), _lifted(rgb, matrix) if rgb.requires_grad else rgb)
+    source = Source(
+        lambda pixels: (exact @ flat[:, pixels].double()).clamp_min_(0),
+        len(exact),
+        flat.shape[1],
+        dtype,
+    )
+    return as_low_rank_cube(
+        few_planes(source, within), _lifted(rgb, matrix) if rgb.requires_grad else rgb
+    )
 
 
 def _basis(bands: Bands) -> Tensor:
@@ -169,22 +207,31 @@ def _estimator(bands: Bands) -> Tensor:
 
 @functools.lru_cache(maxsize=16)
 def _solved(centres: tuple[float, ...]) -> Tensor:
-    """Return the matrix (band, 3) float64 of `lift_lmmse` for bands with the given centre wavelengths in m."""
-    at = torch.tensor(centres, dtype=torch.float64)
-    return lift_matrix(torch.cat([paint.at(at) for paint in paints()]), at)
+    """Return the matrix (band, 3) float64 of `lift_lmmse` for bands with the given centre
+    wavelengths in m.
+    """
+    wavelengths = torch.tensor(centres, dtype=torch.float64)
+    return lift_matrix(torch.cat([paint.at(wavelengths) for paint in paints()]), wavelengths)
 
 
-def lift_matrix(known: Tensor, centres: Tensor) -> Tensor:
-    """Return the matrix that estimates reflectance from linear sRGB, fitted to the measured spectra ``known``.
+def lift_matrix(measured: Tensor, centres: Tensor) -> Tensor:
+    """Return the matrix that estimates reflectance from linear sRGB, fitted to the measured spectra
+    ``measured``.
 
     Shapes: known (spectrum, band) -> (band, 3) float64.
     """
-    second, rgb = known.T @ known / len(known), to_srgb(centres)
-    seen = rgb @ second @ rgb.T
-    if len(centres) < 3 or not float(torch.linalg.cond(seen)) < 1e10:
-        ends = f"{len(centres)} bands from {float(centres[0]) * 1e9:.4g} to {float(centres[-1]) * 1e9:.4g} nm"
-        raise ValueError(f"{ends} cannot distinguish three colours: use more bands, such as 31 from 400 to 700 nm")
-    weights: Tensor = torch.linalg.solve(seen, rgb @ second).T
+    second, rgb = measured.T @ measured / len(measured), to_srgb(centres)
+    second_of_rgb = rgb @ second @ rgb.T
+    if len(centres) < 3 or not float(torch.linalg.cond(second_of_rgb)) < 1e10:
+        ends = (
+            f"{len(centres)} bands from {float(centres[0]) * 1e9:.4g} to"
+            f" {float(centres[-1]) * 1e9:.4g} nm"
+        )
+        raise ValueError(
+            f"{ends} cannot distinguish three colours: use more bands, such as 31 from 400 to"
+            " 700 nm"
+        )
+    weights: Tensor = torch.linalg.solve(second_of_rgb, rgb @ second).T
     return weights
 
 

@@ -1,39 +1,175 @@
-"""Low-rank approximation of a spectral cube: a sum of a few basis images times spectra, with an error bound."""
+"""Low-rank approximations of a spectral cube, with an error bound."""
 
-from typing import Annotated
+from collections.abc import Callable
+from typing import Annotated, NamedTuple
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.spectra._principal_planes import Source, few_planes
 from neusee.nodes.values import LowRankCube
+
+# --- principal planes -----------------------------------------------------------------------------
+
+# Principal components of a spectral cube, computed and verified in blocks of pixels.
+
+
+_PIECE = 4096  #: pixels of a block: 31 bands in float64 take 1 MB and stay in the cache
+_FLOOR = 8  #: round-off units of the planes; no smaller error can be guaranteed
+_ROOT = 2e-7  #: relative resolution of a root mean square that is computed from products in float64
+
+
+class Source(NamedTuple):
+    """A spectral cube that is read in blocks of pixels, so that the whole cube is never in
+    memory.
+    """
+
+    #: a block of pixels, (band, pixel) float64, as a copy that may be changed
+    part: Callable[[slice], Tensor]
+    bands: int
+    pixels: int
+    dtype: torch.dtype  #: of the planes
+
+    def pieces(self) -> list[slice]:
+        return [slice(i, min(i + _PIECE, self.pixels)) for i in range(0, self.pixels, _PIECE)]
+
+
+def few_planes(source: Source, within: float) -> LowRankCube:
+    """Approximate a spectral cube by the fewest principal components that keep the rms error within
+    a bound.
+
+    The bound ``within`` is relative to the largest element. The planes and the map of errors are
+    flat, with all pixels in one row. Raises ValueError for NaN.
+    """
+    largest, gram = _largest_and_products(source)
+    scale = float(largest.max())
+    scaled = scale > 0 and not 1e-280 < float(gram.amax()) < 1e280
+    if scaled:
+        gram = _largest_and_products(source, scale)[1]
+    axes = torch.linalg.eigh(gram).eigenvectors.flip(1)
+    eps = torch.finfo(source.dtype).eps
+    target = max(within, _FLOOR * eps, _ROOT) * scale
+    spread = _spread(gram / source.pixels, axes, source.bands, eps) * (scale if scaled else 1.0)
+    count = max(
+        1, next((k for k, left in enumerate(spread) if float(left.max()) <= target), source.bands)
+    )
+    planes, last, off = _projected(source, axes[:, :count])
+    residual = bound_by_planes(largest, planes, axes[:, :count], last)
+    # no more than was measured
+    spread = torch.cat([spread[:count], torch.minimum(spread[count], residual[count])[None]])
+    return LowRankCube(planes, axes[:, :count], residual, spread, off)
+
+
+def _largest_and_products(source: Source, scale: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Return the largest absolute element of each band of a cube, and the Gram matrix of the bands.
+
+    The Gram matrix is that of the cube divided by ``scale``.
+    """
+    if not source.pixels or not source.bands:
+        raise ValueError("the cube has no pixels: give a scene with pixels")
+    tops, gram = [], None
+    for piece in source.pieces():
+        x = source.part(piece).div_(scale) if scale != 1.0 else source.part(piece)
+        gram = x @ x.T if gram is None else gram.addmm_(x, x.T)
+        tops.append(x.abs_().amax(1))
+    largest = torch.stack(tops).amax(0) * scale
+    if gram is None or not bool(torch.isfinite(largest).all()):
+        raise ValueError(
+            "the cube holds NaN or infinite values: replace these values, or do not compress the"
+            " cube"
+        )
+    return largest, gram
+
+
+def _projected(source: Source, axes: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Project a spectral cube on the axes of principal components, and return the largest error by
+    band and by pixel.
+
+    The first returned value holds the basis images, in the precision of the source.
+    """
+    planes = torch.empty(axes.shape[1], source.pixels, dtype=source.dtype, device=axes.device)
+    last, off = axes.new_zeros(source.bands), planes.new_empty(source.pixels)
+    for piece in source.pieces():
+        x = source.part(piece)
+        planes[:, piece] = axes.T @ x
+        left = x.sub_(axes @ planes[:, piece].double()).abs_()
+        last = torch.maximum(last, left.amax(1))
+        off[piece] = left.amax(0)
+    return planes, last, off.mul_(1 + 2 * torch.finfo(source.dtype).eps)
+
+
+def _spread(power: Tensor, axes: Tensor, count: int, eps: float) -> Tensor:
+    """Return the rms error of each band if a spectral cube is approximated by its first k principal
+    components.
+
+    The rows of the result are for k = 0, 1, 2 and so on. The error is that of the omitted
+    components plus the round-off of the basis images. ``power`` holds the mean products of the
+    bands. The round-off of these products counts as part of the error.
+    """
+    powers = axes.square() * ((power @ axes) * axes).sum(0).clamp_min(0)
+    after = torch.cat([powers.flip(1).cumsum(1).flip(1), torch.zeros_like(powers[:, :1])], 1)[
+        :, : count + 1
+    ].T
+    total = power.diagonal()
+    double = 64 * torch.finfo(torch.float64).eps * total.sum()
+    planes = torch.arange(count + 1, dtype=total.dtype, device=total.device)[:, None]
+    return (after + double).sqrt() + eps * (planes * total).sqrt()
+
+
+def bound_by_planes(largest: Tensor, planes: Tensor, basis: Tensor, last: Tensor) -> Tensor:
+    """Return a bound of the largest error of each band if a cube is approximated by its first k
+    principal components.
+
+    The rows of the result are for k = 0, 1, 2 and so on. The errors with no component and with all
+    components are measured. In between, the bound adds the omitted components to the error with all
+    components.
+    """
+    by_plane = basis.abs() * torch.maximum(planes.amax(1), -planes.amin(1)).double()
+    # round-off of the measurement
+    last = last + 4 * torch.finfo(torch.float64).eps * (largest + by_plane.sum(1))
+    after = by_plane.flip(1).cumsum(1).flip(1).T
+    return torch.cat([largest[None], last + after[1:], last[None]])
+
+
+# --- low rank cube --------------------------------------------------------------------------------
+
+# Low-rank approximation of a spectral cube: a sum of a few basis images times spectra, with an
+# error bound.
+
 
 Share = Annotated[float, Field(ge=0, le=1)]  #: relative to the largest element
 
 
 @node(rtol=1e-6)
 def compress(cube: Tensor, *, within: Share = 1e-6) -> LowRankCube:
-    """Approximate a spectral cube by the fewest principal components that keep the error within a bound.
+    """Approximate a spectral cube by the fewest principal components that keep the error within a
+    bound.
 
-    A grey scene needs one basis image. A linear estimate from RGB needs three, or a few more if pixels are clipped.
+    A grey scene needs one basis image. A linear estimate from RGB needs three, or a few more if
+    pixels are clipped.
 
-    Shapes: cube (band, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k + 1, band)
-            float64, residual_map (y, x).
+    Shapes: cube (band, y, x) -> planes (k, y, x), basis (band, k), residual_max and residual_rms (k
+            + 1, band) float64, residual_map (y, x).
     Units:  planes and residuals as the cube; the basis has no unit.
-    Error:  `residual_rms[k]` is at most the largest of `within`, 2e-7 and eight round-off units of the planes, times
-            the largest element. `residual_max[k]` and `residual_map` are the largest errors of a band and of a pixel,
-            measured on every pixel in float64. `residual_max[r]` for 0 < r < k is as a rule at most five times too
-            large. The gradient treats the basis as constant.
+    Error:  `residual_rms[k]` is at most the largest of `within`, 2e-7 and eight round-off units of
+            the planes, times the largest element. `residual_max[k]` and `residual_map` are the
+            largest errors of a band and of a pixel, measured on every pixel in float64.
+            `residual_max[r]` for 0 < r < k is as a rule at most five times too large. The gradient
+            treats the basis as constant.
     Raises: ValueError where the cube is not (band, y, x), has no pixels or holds NaN.
-    Source: principal components, Pearson 1901; Maloney, J. Opt. Soc. Am. A 3, 1673 (1986) for spectra.
+    Source: principal components, Pearson 1901; Maloney, J. Opt. Soc. Am. A 3, 1673 (1986) for
+            spectra.
     """
     if cube.ndim != 3:
-        raise ValueError(f"cube has shape {tuple(cube.shape)}, not (band, y, x): compress one scene at a time")
+        raise ValueError(
+            f"cube has shape {tuple(cube.shape)}, not (band, y, x): compress one scene at a time"
+        )
     flat = cube.detach().flatten(1)
     dtype = cube.dtype if cube.dtype == torch.float64 else torch.float32
-    source = Source(lambda pixels: flat[:, pixels].to(torch.float64, copy=True), len(flat), flat.shape[1], dtype)
+    source = Source(
+        lambda pixels: flat[:, pixels].to(torch.float64, copy=True), len(flat), flat.shape[1], dtype
+    )
     return as_low_rank_cube(few_planes(source, within), cube)
 
 
@@ -55,20 +191,156 @@ def _(cube: Tensor, *, within: float = 1e-6) -> LowRankCube:
     axes = torch.linalg.svd(flat, full_matrices=False)[0]
     errors = [flat - axes[:, :r] @ (axes[:, :r].T @ flat) for r in range(axes.shape[1] + 1)]
     spread = torch.stack([error.square().mean(1).sqrt() for error in errors])
-    most = within * float(flat.abs().max())
-    count = max(1, next((r for r, x in enumerate(spread) if float(x.max()) <= most), axes.shape[1]))
+    limit = within * float(flat.abs().max())
+    count = max(
+        1, next((r for r, x in enumerate(spread) if float(x.max()) <= limit), axes.shape[1])
+    )
     planes = (axes[:, :count].T @ flat).reshape(-1, *cube.shape[1:])
-    rest = torch.stack([error.abs().amax(1) for error in errors])
+    residual = torch.stack([error.abs().amax(1) for error in errors])
     off = errors[count].abs().amax(0).reshape(cube.shape[1:])
-    return LowRankCube(planes, axes[:, :count], rest[: count + 1], spread[: count + 1], off)
+    return LowRankCube(planes, axes[:, :count], residual[: count + 1], spread[: count + 1], off)
 
 
 @compress.check
 def plane_checks(result: LowRankCube, *inputs: object, **params: object) -> list[Check]:
-    """Report the number of basis images of a low-rank cube, and the error relative to the full spectral cube."""
-    rms, most = (
+    """Report the number of basis images of a low-rank cube, and the error relative to the full
+    spectral cube.
+    """
+    rms, largest = (
         float(x[-1].max()) / max(float(result.residual_max[0].max()), 1e-300)
         for x in (result.residual_rms, result.residual_max)
     )
     count = f"{len(result.planes)} basis images for {len(result.basis)} bands"
-    return [Check(f"{count}: error {rms:.2g} rms, {most:.2g} at most, relative to the largest element of the cube")]
+    return [
+        Check(
+            f"{count}: error {rms:.2g} rms, {largest:.2g} at most, relative to the largest element"
+            " of the cube"
+        )
+    ]
+
+
+# --- linear planes --------------------------------------------------------------------------------
+
+# Low-rank form of a spectral cube that is a matrix times a picture, with negative light clipped to
+# 0.
+#
+# Without the clipping, such a cube has as many principal components as the picture has channels,
+# and these follow from the products of the channels: the cube itself need not be analysed. The
+# clipped light is measured on every pixel.
+
+
+_PLANES_PIECE = 1 << 14  #: pixels of a block: 31 bands in float32 take 2 MB and stay in the cache
+_SAMPLE = 1 << 14  #: pixels that tell beforehand whether the clipped light is within the error
+_LEAST = 1e-5  #: least error that is tried: float32 alone leaves a few 1e-7
+
+
+class _Axes(NamedTuple):
+    """Orthonormal spectra of the unclipped cube, the strongest first, and what makes the planes
+    from the picture.
+    """
+
+    basis: Tensor  #: (band, k) float64
+    weights: Tensor  #: (k, channel) float64
+    power: Tensor  #: (k,) mean square of each plane
+
+
+def linear_planes(picture: Tensor, matrix: Tensor, within: float) -> LowRankCube | None:
+    """Return the cube ``matrix @ picture``, clipped at 0, as its fewest components with an rms
+    error of ``within``.
+
+    Shapes: picture (channel, pixel) float32, matrix (band, channel) float64. The error is relative
+            to the largest
+    element. Return None where more components are needed than the picture has channels, or
+    ``within`` is below 1e-5.
+    """
+    if (
+        picture.dtype != torch.float32
+        or within < _LEAST
+        or not bool(torch.isfinite(picture.sum(1)).all())
+    ):
+        return None
+    axes = _axes(picture, matrix)
+    some = matrix @ picture[:, :: max(1, picture.shape[1] // _SAMPLE)].double()
+    target = within * float(some.amax())
+    count = next(
+        (k for k in range(1, len(axes.power) + 1) if float(_omitted(axes, k).max()) <= target), 0
+    )
+    if not count or float(some.clamp_max(0).square().mean(1).max()) >= target**2:
+        return None
+    cube = _measured(picture, matrix, axes, count)
+    return (
+        cube
+        if float(cube.residual_rms[-1].max()) <= within * float(cube.residual_max[0].max())
+        else None
+    )
+
+
+def _axes(picture: Tensor, matrix: Tensor) -> _Axes:
+    gram = matrix.new_zeros(len(picture), len(picture))
+    for start in range(0, picture.shape[1], _PLANES_PIECE):
+        x = picture[:, start : start + _PLANES_PIECE].double()
+        gram.addmm_(x, x.T)
+    values, vectors = torch.linalg.eigh(gram / picture.shape[1])
+    root = vectors * values.clamp_min(0).sqrt()  # root @ root.T is the mean product of the channels
+    basis, strength, _ = torch.linalg.svd(matrix @ root, full_matrices=False)
+    return _Axes(basis, basis.T @ matrix, strength.square())
+
+
+def _omitted(axes: _Axes, count: int) -> Tensor:
+    """Return the rms of each band of the unclipped cube that is not in its first ``count``
+    components.
+    """
+    return (axes.basis[:, count:].square() @ axes.power[count:]).sqrt()
+
+
+def _measured(picture: Tensor, matrix: Tensor, axes: _Axes, count: int) -> LowRankCube:
+    """Return the first components of a cube, and the errors that omitted components and clipping
+    leave.
+    """
+    basis, weights = axes.basis[:, :count], axes.weights[:count]
+    light, reduced = (
+        matrix.to(picture),
+        None if count == len(axes.power) else (basis @ weights).to(picture),
+    )
+    planes, off = picture.new_empty(count, picture.shape[1]), picture.new_empty(picture.shape[1])
+    tops, lasts, squares = [], [], matrix.new_zeros(len(matrix))
+    for start in range(0, picture.shape[1], _PLANES_PIECE):
+        columns = slice(start, start + _PLANES_PIECE)
+        x = picture[:, columns]
+        planes[:, columns] = weights @ x.double()
+        bands = light @ x
+        tops.append(bands.amax(1))
+        if reduced is None:  # what is clipped is all that is lost
+            lost = bands.amin(0).neg_().clamp_min_(0)
+            off[columns], at_loss = lost, lost.nonzero()[:, 0]
+            left = bands[:, at_loss].clamp_max_(0)
+        else:
+            left = bands.clamp_min_(0).sub_(reduced @ x)
+            off[columns] = left.abs().amax(0)
+        if left.shape[1]:
+            lasts.append(left.abs().amax(1))
+            squares += left.square().sum(1)
+    rms = (squares / picture.shape[1]).sqrt()
+    return _bounded(planes, basis, axes, off, (torch.stack(tops), lasts, rms))
+
+
+def _bounded(
+    planes: Tensor,
+    basis: Tensor,
+    axes: _Axes,
+    off: Tensor,
+    measured: tuple[Tensor, list[Tensor], Tensor],
+) -> LowRankCube:
+    """Return the low-rank cube with the bounds of its errors, to which the rounding of float32
+    is added.
+    """
+    tops, lasts, rms = measured
+    largest = tops.amax(0).double().clamp_min(0)
+    sizes = torch.maximum(planes.amax(1), -planes.amin(1)).double()
+    rounding = 4 * torch.finfo(planes.dtype).eps * float((basis.abs() @ sizes).max())
+    last = (torch.stack(lasts).amax(0).double() if lasts else torch.zeros_like(largest)) + rounding
+    before = [_omitted(axes, k) + rms for k in range(planes.shape[0])]
+    spread = torch.stack([*before, rms]) + rounding
+    return LowRankCube(
+        planes, basis, bound_by_planes(largest, planes, basis, last), spread, off.add_(rounding)
+    )

@@ -1,4 +1,4 @@
-"""Measured reflectances from colour-science and from the user's files."""
+"""Measured reflectances from colour-science and from the files of a user."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,48 +7,108 @@ from zipfile import BadZipFile
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes.array_bytes import mat_needs, npz_needs
-from neusee.nodes.input_files import once_per_version
+from neusee.nodes.file_headers import mat_needs, npz_needs
+from neusee.nodes.input_files import csv_rows, once_per_version
+from neusee.nodes.spectra._cie_tables import Table, gamut_samples, paints, require_range
 from neusee.nodes.spectra._linear_lift import inside_charts
-from neusee.nodes.spectra._spectral_tables import Table, gamut_samples, paints, require_range
-from neusee.nodes.spectra._spectrum_tables import Numbers, csv_spectra, wrong_wavelengths
 from neusee.nodes.units import DataFiles
 from neusee.nodes.values import Bands
 
+# --- spectrum tables ------------------------------------------------------------------------------
+
+# CSV files of spectra: a header, wavelengths in nm in the first column, and one further column for
+# each spectrum.
+
+
+Numbers = NDArray[np.float64]
+
+
+def csv_spectra(file: Path) -> tuple[Numbers, Numbers]:
+    """Read the wavelengths of a CSV file, in nm, and its spectra (spectrum, wavelength).
+
+    Raises ValueError for lines of different length, for a cell that is not a number, and for a file
+    without columns.
+    """
+    rows = [[_number(cell, file, line) for cell in row] for line, row in list(csv_rows(file))[1:]]
+    if len({len(row) for row in rows}) > 1:
+        raise ValueError("the lines have different numbers of cells")
+    numbers = np.array(rows, np.float64)
+    if numbers.ndim != 2 or numbers.shape[1] < 2:
+        raise ValueError("the file has no columns of numbers below a header")
+    return numbers[:, 0].copy(), numbers[:, 1:].T
+
+
+def wrong_wavelengths(wavelengths: Numbers, values: Numbers) -> str:
+    """Return the reason why numbers from a file cannot be wavelengths in nm and their spectra,
+    or an empty text.
+    """
+    if not (np.isfinite(wavelengths).all() and np.isfinite(values).all()):
+        return "some of its numbers are NaN or infinite"
+    if len(wavelengths) < 2 or not (np.diff(wavelengths) > 0).all() or wavelengths[0] < 100:
+        return "the file needs at least two wavelengths in nm, in rising order"
+    return ""
+
+
+def _number(cell: str, file: Path, line: int) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        raise ValueError(f"{file.name}:{line}: {cell!r} is not a number") from None
+
+
+# --- measured reflectances ------------------------------------------------------------------------
+
+# Measured reflectances from colour-science and from the user's files.
+
+
 Set = Literal["charts", "CIE 2017", "CQS"]
 _MOST = 1.5  #: largest reflectance; a file with larger values is probably in percent
-_FILES = "give .csv (first column wavelength in nm), .npz (wavelengths, reflectances) or .mat (S_name, sur_name)"
+_FILES = (
+    "give .csv (first column wavelength in nm), .npz (wavelengths, reflectances) or .mat (S_name,"
+    " sur_name)"
+)
 
 
 @node(rtol=1e-12)
 def reflectances(
-    bands: Bands, *, sets: tuple[Set, ...] = ("charts", "CIE 2017", "CQS"), files: DataFiles | None = None
+    bands: Bands,
+    *,
+    sets: tuple[Set, ...] = ("charts", "CIE 2017", "CQS"),
+    files: DataFiles | None = None,
 ) -> Tensor:
-    """Return measured reflectances from colour-science and from the user's files, one spectrum in each row.
+    """Return measured reflectances from colour-science and from the user's files, one spectrum in
+    each row.
 
-    `charts` are the 102 patches of `spectra.lift_lmmse`, `CIE 2017` the 99 objects of the colour fidelity index, `CQS`
-    15 saturated paints. A file is .csv (a header; first column nm, then one column for each spectrum), .npz
-    (`wavelengths` in nm and `reflectances`, (spectrum, wavelength)), or a .mat of the Psychtoolbox (`S_name`: start,
-    step, count; `sur_name`).
+    `charts` are the 102 patches of `spectra.lift_lmmse`, `CIE 2017` the 99 objects of the colour
+    fidelity index, `CQS` 15 saturated paints. A file is .csv (a header; first column nm, then one
+    column for each spectrum), .npz (`wavelengths` in nm and `reflectances`, (spectrum,
+    wavelength)), or a .mat of the Psychtoolbox (`S_name`: start, step, count; `sur_name`).
 
     Shapes: -> (spectrum, band) float64.
     Units:  reflectance, 1 = white; values outside [0, 1] are clipped.
     Error:  linear interpolation between the samples: some 1e-3 for paints at 10 nm.
-    Raises: ParameterError before the run for a file that holds no reflectances; ValueError where bands leave 380 to
-            780 nm, or the range of a file.
+    Raises: ParameterError before the run for a file that holds no reflectances; ValueError where
+            bands leave 380 to 780 nm, or the range of a file.
     Source: charts and NIST CQS 9.0 (Davis and Ohno 2010) by colour-science; CIE 224:2017.
     """
     if sets:
         inside_charts(bands)
-    tables = [table for name in sets for table in _SETS[name]()]
+    tables: list[Table] = []
+    for name in sets:
+        tables += _SETS[name]()
     for file in files or ():
         tables.append(_read(file))
         fix = "leave the file out, or choose bands inside that range"
         require_range(bands.centres, tables[-1].wavelengths, f"{file.name} holds", fix)
-    return torch.cat([table.at(bands.centres) for table in tables]).clamp(0.0, 1.0).to(bands.centres.device)
+    return (
+        torch.cat([table.at(bands.centres) for table in tables])
+        .clamp(0.0, 1.0)
+        .to(bands.centres.device)
+    )
 
 
 @reflectances.preflight
@@ -64,7 +124,8 @@ def _(*, sets: tuple[Set, ...] = ("charts",), files: tuple[Path, ...] | None = N
 def _(result: Tensor, bands: Bands, **params: Any) -> list[Check]:
     return [
         Check(
-            f"{len(result)} spectra, reflectance {float(result.min()):.3g} to {float(result.max()):.3g}",
+            f"{len(result)} spectra, reflectance {float(result.min()):.3g} to"
+            f" {float(result.max()):.3g}",
             len(result) > 3,
         )
     ]
@@ -77,7 +138,7 @@ _SETS: dict[str, Callable[[], tuple[Table, ...]]] = {
 }
 
 
-# --- files ----------------------------------------------------------------------------------------------------------
+# --- files ----------------------------------------------------------------------------------------
 
 
 @once_per_version
@@ -91,21 +152,38 @@ def _read(file: Path) -> Table:
     except ParameterError:
         raise
     except (OSError, KeyError, ValueError, TypeError, BadZipFile, UnicodeDecodeError) as error:
-        raise ParameterError("files", f"{file.name} cannot be read as reflectances ({error}): {_FILES}") from None
+        raise ParameterError(
+            "files", f"{file.name} cannot be read as reflectances ({error}): {_FILES}"
+        ) from None
     wrong = _wrong(wavelengths, values)
     if wrong:
         raise ParameterError("files", f"{file.name}: {wrong}")
-    return Table(torch.from_numpy(wavelengths) * 1e-9, torch.from_numpy(np.ascontiguousarray(values)))
+    return Table(
+        torch.from_numpy(wavelengths) * 1e-9, torch.from_numpy(np.ascontiguousarray(values))
+    )
 
 
 def _wrong(wavelengths: Numbers, values: Numbers) -> str:
-    """Return the reason why arrays from a file cannot be wavelengths and reflectances, or an empty text if they can."""
-    if wavelengths.ndim != 1 or values.ndim != 2 or values.shape[1] != len(wavelengths) or values.size == 0:
-        return f"{wavelengths.shape} wavelengths and {values.shape} reflectances: write (spectrum, wavelength)"
+    """Return the reason why arrays from a file cannot be wavelengths and reflectances, or an
+    empty text if they can.
+    """
+    if (
+        wavelengths.ndim != 1
+        or values.ndim != 2
+        or values.shape[1] != len(wavelengths)
+        or values.size == 0
+    ):
+        return (
+            f"{wavelengths.shape} wavelengths and {values.shape} reflectances: write (spectrum,"
+            " wavelength)"
+        )
     if wrong := wrong_wavelengths(wavelengths, values):
         return wrong
     if values.max() > _MOST or values.min() < -0.1:
-        return f"values from {values.min():.3g} to {values.max():.3g} are not reflectances: write 1 for white, not 100"
+        return (
+            f"values from {values.min():.3g} to {values.max():.3g} are not reflectances: write 1"
+            " for white, not 100"
+        )
     return ""
 
 
@@ -123,13 +201,17 @@ def _mat(file: Path) -> tuple[Numbers, Numbers]:
         variables = loadmat(file)
     except Exception as why:  # scipy raises many kinds of errors for foreign bytes
         raise ValueError(f"the file is not a .mat file of version 7 or older: {why}") from None
-    name = next(name.removeprefix("sur_") for name in [*variables, "sur_"] if name.startswith("sur_"))
+    name = next(
+        name.removeprefix("sur_") for name in [*variables, "sur_"] if name.startswith("sur_")
+    )
     start, step, count = _real(variables[f"S_{name}"]).ravel()
     return start + step * np.arange(int(count)), _real(variables[f"sur_{name}"]).T
 
 
 def _real(values: Any) -> Numbers:
-    """Return the values as float64; raise ValueError for complex values, whose imaginary part would be lost."""
+    """Return the values as float64; raise ValueError for complex values, whose imaginary part
+    would be lost.
+    """
     if np.iscomplexobj(values):
         raise ValueError("its values are complex: save real numbers")
     return np.asarray(values, np.float64)

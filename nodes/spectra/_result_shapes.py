@@ -8,14 +8,18 @@ from torch import Tensor
 
 from neusee.nodes.shape_rules import at_least_single, blank, double, known, like_first
 from neusee.nodes.spectra._camera_colour import grain, render
-from neusee.nodes.spectra._channel_responses import channel_count, responses, seen_range
+from neusee.nodes.spectra._channel_responses import channel_count, responses, rows, seen_range
 from neusee.nodes.spectra._dead_leaves import _FINE, leaves
-from neusee.nodes.spectra._distinct_band_sums import rows
 from neusee.nodes.spectra._illuminant import illuminant, illuminate
-from neusee.nodes.spectra._linear_lift import lift_lmmse, lift_lmmse_mixture, lift_mallett, lift_mallett_mixture
+from neusee.nodes.spectra._linear_lift import (
+    lift_lmmse,
+    lift_lmmse_mixture,
+    lift_mallett,
+    lift_mallett_mixture,
+)
 from neusee.nodes.spectra._low_rank_cube import compress
 from neusee.nodes.spectra._metamers import metamers
-from neusee.nodes.spectra._mst_lift_node import lift_mst_plus_plus
+from neusee.nodes.spectra._mst_plus_plus import lift_mst_plus_plus
 from neusee.nodes.values import Bands, LowRankCube
 
 _FEW = 20  #: bands of a laser line, at most
@@ -28,15 +32,19 @@ def _(bands: Bands, **params: Any) -> Tensor:
 
 @responses.shape
 def _(bands: Bands, *, camera: str | Path = "CIE 1931", **params: Any) -> Tensor:
-    """Return the responses to bands that no channel sees, which a laser must know before the run, or their shape."""
+    """Return the responses to bands that no channel sees, which a laser must know before the
+    run, or their shape.
+    """
     if known(bands.centres) and _beyond(bands, camera):
-        found: Tensor = responses(bands, camera=camera, **params)
-        return found
+        channels: Tensor = responses(bands, camera=camera, **params)
+        return channels
     return double(channel_count(camera), len(bands.centres))
 
 
 def _beyond(bands: Bands, camera: str | Path) -> bool:
-    """Return True for the few bands of a laser if some channel may not see them; no table is read for others."""
+    """Return True for the few bands of a laser if some channel may not see them; no table is
+    read for others.
+    """
     low, high = seen_range(camera)
     return len(bands.centres) < _FEW and not low <= float(bands.centres.mean()) * 1e9 <= high
 
@@ -56,15 +64,19 @@ def _cube(rgb: Tensor, bands: Bands, **params: Any) -> Tensor:
 
 
 def _mixture(rgb: Tensor, bands: Bands, **params: Any) -> LowRankCube:
-    """Return the shape of the low-rank form of a linear lift, which has as many planes as the picture has colours."""
+    """Return the shape of the low-rank form of a linear lift, which has as many planes as the
+    picture has colours.
+    """
     return _low_rank(min(len(rgb), len(bands.centres)), len(bands.centres), rgb)
 
 
 def _low_rank(planes: int, bands: int, like: Tensor) -> LowRankCube:
     dtype = torch.float64 if like.dtype == torch.float64 else torch.float32
-    whole, off = (blank(*shape, *like.shape[-2:], dtype=dtype) for shape in ((planes,), ()))
-    most, spread = (double(planes + 1, bands) for _ in range(2))
-    return LowRankCube(whole, double(bands, planes), most, spread, off)
+    planes_of_cube, off = (
+        blank(*shape, *like.shape[-2:], dtype=dtype) for shape in ((planes,), ())
+    )
+    largest, spread = (double(planes + 1, bands) for _ in range(2))
+    return LowRankCube(planes_of_cube, double(bands, planes), largest, spread, off)
 
 
 for node in (lift_lmmse, lift_mallett, lift_mst_plus_plus):
@@ -75,7 +87,9 @@ lift_mallett_mixture.shape(_mixture)
 
 @compress.shape
 def _(cube: Tensor, **params: Any) -> LowRankCube:
-    """Return the shape for as many planes as a cube can need, because only the values tell how many it needs."""
+    """Return the shape for as many planes as a cube can need, because only the values tell how
+    many it needs.
+    """
     return _low_rank(len(cube), len(cube), cube)
 
 
@@ -103,7 +117,9 @@ def _(result: Tensor, *inputs: Any, **params: Any) -> tuple[float, float]:
 
 @render.shape
 def _(reflectance: Tensor, bands: Bands) -> Tensor:
-    return blank(*reflectance.shape[:-3], 3, *reflectance.shape[-2:], dtype=at_least_single(reflectance))
+    return blank(
+        *reflectance.shape[:-3], 3, *reflectance.shape[-2:], dtype=at_least_single(reflectance)
+    )
 
 
 grain.shape(like_first)

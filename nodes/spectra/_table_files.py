@@ -1,6 +1,8 @@
-"""CSV tables of a user: wavelengths in the first column, and a header that names quantity and unit of each column.
+"""CSV tables of a user: wavelengths in the first column, and a header that names quantity and unit
+of each column.
 
-A header is such as ``wavelength (nm),QE (%)``. Lines that begin with ``#`` are comments, such as the source.
+A header is such as ``wavelength (nm),QE (%)``. Lines that begin with ``#`` are comments, such as
+the source.
 """
 
 import math
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 
 from neusee.nodes import ParameterError
 from neusee.nodes.input_files import csv_rows
-from neusee.nodes.spectra._spectral_tables import Table
+from neusee.nodes.spectra._cie_tables import Table
 
 Numbers = NDArray[np.float64]
 
@@ -55,57 +57,81 @@ class Curves(NamedTuple):
 
     def table(self) -> Table:
         """Return the curves as a table that can be interpolated."""
-        return Table(torch.from_numpy(self.wavelengths.copy()), torch.from_numpy(self.values.copy()))
+        return Table(
+            torch.from_numpy(self.wavelengths.copy()), torch.from_numpy(self.values.copy())
+        )
 
     def place(self, curve: int, row: int) -> str:
         """Return the line and the column of a value, as messages name them."""
         return place(self.file, self.lines[row], curve + 1, self.columns[curve])
 
     def refuse(self, wrong: NDArray[np.bool_], why: Callable[[float], str]) -> None:
-        """Raise ValueError for the first value (curve, row) that is ``wrong``; ``why`` is the message for a value."""
+        """Raise ValueError for the first value (curve, row) that is ``wrong``; ``why`` is the
+        message for a value.
+        """
         if wrong.any():
             row, curve = (int(i) for i in np.argwhere(wrong.T)[0])
             raise ValueError(f"{self.place(curve, row)}: {why(float(self.values[curve, row]))}")
 
 
 def place(file: Path, line: int, column: int, heading: Column) -> str:
-    """Return a place in a table as text, such as ``qe.csv:5, column 2, QE (%)``; columns count from 0."""
+    """Return a place in a table as text, such as ``qe.csv:5, column 2, QE (%)``; columns count
+    from 0.
+    """
     return f"{file.name}:{line}, column {column + 1}, {heading.heading}"
 
 
 def table_rows(file: Path) -> Rows:
     """Read the headings and the numbers of a CSV file.
 
-    Raises ValueError, with line and column, for a file without header, for lines of different length, and for a cell
-    that is not a finite number.
+    Raises ValueError, with line and column, for a file without header, for lines of different
+    length, and for a cell that is not a finite number.
     """
     rows = list(csv_rows(file))
     if not rows:
         raise ValueError(f"{file.name} has no columns of numbers below a header")
     (first, header), body = rows[0], rows[1:]
-    if all(_is_number(cell) for cell in header):
-        raise ValueError(
-            f"{file.name}:{first}: the first row holds numbers: begin with a header, such as wavelength (nm),QE (%)"
-        )
+    _refuse_only_numbers(file, first, header)
     columns = tuple(_column(cell) for cell in header)
     if not body or len(columns) < 2:
         raise ValueError(f"{file.name} has no columns of numbers below a header")
     for line, row in body:
-        if len(row) != len(columns):
-            count = f"{len(row)} column{'s' * (len(row) != 1)} in place of {len(columns)}"
-            raise ValueError(f"{file.name}:{line}: {count}, the number of headings: write one number for each heading")
-    numbers = [[_number(file, line, i, columns[i], cell) for i, cell in enumerate(row)] for line, row in body]
+        _refuse_other_length(file, line, row, len(columns))
+    numbers = [
+        [_number(file, line, i, columns[i], cell) for i, cell in enumerate(row)]
+        for line, row in body
+    ]
     return Rows(columns, tuple(line for line, _ in body), np.array(numbers, np.float64))
 
 
-def curves(file: Path, units: Sequence[str] | None, assumed: str = "", least: int = 2) -> Curves:
+def _refuse_only_numbers(file: Path, line: int, header: Sequence[str]) -> None:
+    """Raise ValueError for a first row of numbers in place of a header."""
+    if all(_is_number(cell) for cell in header):
+        raise ValueError(
+            f"{file.name}:{line}: the first row holds numbers: begin with a header, such as"
+            " wavelength (nm),QE (%)"
+        )
+
+
+def _refuse_other_length(file: Path, line: int, row: Sequence[str], length: int) -> None:
+    """Raise ValueError for a row that has not one number for each heading."""
+    if len(row) != length:
+        count = f"{len(row)} column{'s' * (len(row) != 1)} in place of {length}"
+        raise ValueError(
+            f"{file.name}:{line}: {count}, the number of headings: write one number for each"
+            " heading"
+        )
+
+
+def curves(file: Path, units: Sequence[str] | None, assumed: str = "", fewest: int = 2) -> Curves:
     """Read the curves of a CSV file over the wavelength, whose unit is in the first heading.
 
-    ``units`` are the units that the other columns may have, None for any. A file without any unit has wavelengths in
-    the unit ``assumed``; without such a unit, units are necessary. ``least`` is the least number of rows.
+    ``units`` are the units that the other columns may have, None for any. A file without any unit
+    has wavelengths in the unit ``assumed``; without such a unit, units are necessary. ``fewest`` is
+    the least number of rows.
 
-    Raises ValueError where `table_rows` does, for a unit that is missing or unknown, and for wavelengths that do not
-    rise or lie outside 100 nm to 20 um.
+    Raises ValueError where `table_rows` does, for a unit that is missing or unknown, and for
+    wavelengths that do not rise or lie outside 100 nm to 20 um.
     """
     rows = table_rows(file)
     first, *others = rows.columns
@@ -117,15 +143,23 @@ def curves(file: Path, units: Sequence[str] | None, assumed: str = "", least: in
         for number, column in enumerate(others, 1):
             _refuse_unit(file, number, column, units)
     nm = rows.values[:, 0] * (LENGTHS[unit] / 1e-9)
-    if len(nm) < least:
+    if len(nm) < fewest:
         raise ValueError(f"{file.name} holds one wavelength: at least two wavelengths are needed")
     for problem in _wrong_order(file, rows.lines, nm):
         raise ValueError(problem)
-    return Curves(file, tuple(others), rows.lines, rows.values[:, 0] * LENGTHS[unit], rows.values[:, 1:].T.copy())
+    return Curves(
+        file,
+        tuple(others),
+        rows.lines,
+        rows.values[:, 0] * LENGTHS[unit],
+        rows.values[:, 1:].T.copy(),
+    )
 
 
 def refused(parameter: str, form: str, error: Exception) -> ParameterError:
-    """Return the error of a parameter whose file is no table of the needed form, which ``form`` says."""
+    """Return the error of a parameter whose file is no table of the needed form, which ``form``
+    says.
+    """
     return ParameterError(parameter, f"{error}; {form}")
 
 
@@ -155,29 +189,38 @@ def _number(file: Path, line: int, index: int, column: Column, cell: str) -> flo
 
 def _refuse_first(file: Path, first: Column) -> None:
     """Raise ValueError for a first column without wavelengths in a known unit."""
-    known = ", ".join(unit for unit in LENGTHS if unit.isascii())
+    unit_names = ", ".join(unit for unit in LENGTHS if unit.isascii())
     if not first.unit:
         fix = f"write the unit in brackets, such as {first.quantity or 'wavelength'} (nm)"
         raise ValueError(f"{file.name}: the first column, {first.quantity}, has no unit: {fix}")
-    fix = f"write wavelength (nm) there, or another of {known}"
+    fix = f"write wavelength (nm) there, or another of {unit_names}"
     raise ValueError(f"{file.name}: the first column, {first.heading}, has no wavelengths: {fix}")
 
 
 def _refuse_unit(file: Path, number: int, column: Column, units: Sequence[str]) -> None:
     if column.unit not in units:
-        what = f"has the unit {column.unit}" if column.unit else "has no unit"
+        fault = f"has the unit {column.unit}" if column.unit else "has no unit"
         fix = f"write one of {', '.join(f'({unit})' for unit in units)}"
-        raise ValueError(f"{file.name}: column {number + 1}, {column.quantity}, {what}: {fix}")
+        raise ValueError(f"{file.name}: column {number + 1}, {column.quantity}, {fault}: {fix}")
 
 
 def _wrong_order(file: Path, lines: Sequence[int], nm: Numbers) -> Iterator[str]:
     """Yield what is wrong with the wavelengths of a file, in nm."""
     for line, before, here in zip(lines[1:], nm, nm[1:], strict=False):
         if here == before:
-            yield f"{file.name}:{line}: {here:g} nm stands there again: keep one row for each wavelength"
+            yield (
+                f"{file.name}:{line}: {here:g} nm stands there again: keep one row for each"
+                " wavelength"
+            )
         elif here < before:
-            yield f"{file.name}:{line}: {here:g} nm follows {before:g} nm: list the wavelengths in rising order"
+            yield (
+                f"{file.name}:{line}: {here:g} nm follows {before:g} nm: list the wavelengths in"
+                " rising order"
+            )
     for line, here in zip(lines, nm, strict=True):
         if not _LEAST <= here * 1e-9 <= _MOST:
-            fix = "check the unit in the header, such as wavelength (um), and give wavelengths from 100 nm to 20 um"
+            fix = (
+                "check the unit in the header, such as wavelength (um), and give wavelengths from"
+                " 100 nm to 20 um"
+            )
             yield f"{file.name}:{line}: the wavelength {here:g} is no light when read in nm: {fix}"

@@ -1,14 +1,18 @@
-"""The claims of speed, each beside its peers in one run: `python tests/benchmarks/all.py [NAME ...] [--turns 10]`.
+"""The claims of speed, each beside its peers in one run: `python tests/benchmarks/all.py [NAME ...]
+[--turns 10]`.
 
-Writes the page `recipes/guide/benchmarks.md` of the handbook, and the same tables in `RESULTS.md`. With names, such as
-`scan`, only these claims are measured again, and the other parts stay; `--page` measures none, and writes both files
-from the page. One thread; processor seconds, so that other work on the machine changes little; the load is recorded.
+Writes the page `recipes/guide/benchmarks.md` of the handbook, and the same tables in `RESULTS.md`.
+With names, such as `scan`, only these claims are measured again, and the other parts stay; `--page`
+measures none, and writes both files from the page. One thread; processor seconds, so that other
+work on the machine changes little; the load is recorded.
 """
 
 import argparse
 import os
 
-os.environ.update({name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")})
+os.environ.update(
+    {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+)
 
 import platform
 import re
@@ -42,26 +46,44 @@ has an error, it is that from a reference in double precision. A table without p
 
 Peers: {peers}.
 """
-_PEERS = ("joblib", "apache-hamilton", "hcipy", "prysm", "scipy", "finufft", "poppy", "mambapy", "torch")
+_PEERS = (
+    "joblib",
+    "apache-hamilton",
+    "hcipy",
+    "prysm",
+    "scipy",
+    "finufft",
+    "poppy",
+    "mambapy",
+    "torch",
+)
 _SECTION = re.compile(r"<!-- claim (\w+) -->\n(.*?)<!-- end -->\n", re.S)
 
 
 def table(found: Comparison | Figures) -> str:
     """Return one claim as a table in Markdown."""
     if isinstance(found, Figures):
-        head = [f"| {found.what} | {' | '.join(found.columns)} |", f"|---{'|---' * len(found.columns)}|"]
+        head = [
+            f"| {found.what} | {' | '.join(found.columns)} |",
+            f"|---{'|---' * len(found.columns)}|",
+        ]
         return "\n".join([*head, *(f"| {' | '.join(row)} |" for row in found.rows)]) + _load(found)
     ours, turns = found.seconds[OURS], len(found.seconds[OURS])
     remarks = any(found.remarks.values())
     last = (" |", "---|") if remarks else ("", "")
-    lines = [f"| {found.what} | ms | ratio |{' error' + last[0] if remarks else ''}", f"|---|---|---|{last[1]}"]
+    lines = [
+        f"| {found.what} | ms | ratio |{' error' + last[0] if remarks else ''}",
+        f"|---|---|---|{last[1]}",
+    ]
     note = f" {found.remarks.get(OURS, '').removeprefix('error ')} |" if remarks else ""
     lines.append(f"| neusee | {1e3 * statistics.median(ours):.4g} | |{note}")
     for peer in found.peers():
         middle, low, high = found.ratio(peer)
         note = f" {found.remarks.get(peer, '').removeprefix('error ')} |" if remarks else ""
         milliseconds = 1e3 * statistics.median(found.seconds[peer])
-        lines.append(f"| {peer} | {milliseconds:.4g} | {middle:.2f} ({low:.2f} to {high:.2f}) |{note}")
+        lines.append(
+            f"| {peer} | {milliseconds:.4g} | {middle:.2f} ({low:.2f} to {high:.2f}) |{note}"
+        )
     return "\n".join(lines) + _load(found, f"{turns} turns; ")
 
 
@@ -72,7 +94,10 @@ def _load(found: Comparison | Figures, turns: str = "") -> str:
 
 def section(name: str, found: Iterable[Comparison | Figures]) -> str:
     """Return the part of the page that one claim fills."""
-    where = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, torch {torch.__version__}"
+    where = (
+        f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, torch"
+        f" {torch.__version__}"
+    )
     head = f"Measured on {date.today().isoformat()}; {where}.\n\n"
     return f"<!-- claim {name} -->\n{head}{''.join(map(table, found))}<!-- end -->\n"
 
@@ -82,7 +107,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*", choices=[*CLAIMS, []])
     parser.add_argument("--turns", type=int, default=10)
-    parser.add_argument("--page", action="store_true", help="Measure nothing, and write both files from the page.")
+    parser.add_argument(
+        "--page", action="store_true", help="Measure nothing, and write both files from the page."
+    )
     args = parser.parse_args()
     if args.page:
         return write({})
@@ -94,7 +121,9 @@ def main() -> None:
 
 
 def write(new: Mapping[str, str]) -> None:
-    """Write the parts ``new`` of the page anew and keep the others, and write the same parts in `RESULTS.md`."""
+    """Write the parts ``new`` of the page anew and keep the others, and write the same parts in
+    `RESULTS.md`.
+    """
     old = PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""
     parts = {found[1]: found[0] for found in _SECTION.finditer(old)} | new
     peers = ", ".join(f"{peer} {version(peer)}" for peer in _PEERS)

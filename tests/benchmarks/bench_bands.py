@@ -1,10 +1,11 @@
-"""Results by band: `python tests/benchmarks/bench_bands.py [SIZE ...]`, 31 bands of SIZE x SIZE pixels (1024 2048).
+"""Results by band: `python tests/benchmarks/bench_bands.py [SIZE ...]`, 31 bands of SIZE x SIZE
+pixels (1024 2048).
 
-Three tables in Markdown. Time: a step computed whole and written in one piece, as a store without bands has it, beside
-the same step in which one band of 31 has changed: hashed, computed, written and read by band. Memory: what a step takes
-beside its inputs, whole and in parts, each in a process of its own; pages of files that are mapped can be dropped when
-memory is short and are not counted. Reading: a payload in one file beside 31 blobs, mapped and summed, with pages in
-the cache.
+Three tables in Markdown. Time: a step computed whole and written in one piece, as a store without
+bands has it, beside the same step in which one band of 31 has changed: hashed, computed, written
+and read by band. Memory: what a step takes beside its inputs, whole and in parts, each in a process
+of its own; pages of files that are mapped can be dropped when memory is short and are not counted.
+Reading: a payload in one file beside 31 blobs, mapped and summed, with pages in the cache.
 """
 
 import os
@@ -21,8 +22,7 @@ import torch
 from neusee.nodes.optics import image, psf
 from neusee.nodes.spectra import illuminate
 from neusee.nodes.values import Psf, Pupil
-from neusee.workflows.engine.band_results import call_by_band, plain_of
-from neusee.workflows.engine.node_call import call
+from neusee.workflows.engine.node_call import call, call_by_band, plain_of
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Step
 from neusee.workflows.store import serialization
@@ -71,7 +71,9 @@ def one_changed(inputs):
 
 def by_band(step, inputs, blobs, parts=1):
     """Compute what is missing, and keep it."""
-    value = call_by_band(step, inputs, lambda given: call(step, given, step.params, 0, "cpu"), "code", blobs, parts)
+    value = call_by_band(
+        step, inputs, lambda given: call(step, given, step.params, 0, "cpu"), "code", blobs, parts
+    )
     serialization.pack(value, blobs)
     return plain_of(value)
 
@@ -99,18 +101,25 @@ def seconds(work):
 
 def times(size):
     print(
-        f"\n| step, 31 x {size} x {size} | whole, s | by band, all new, s | 1 of 31 changed, s | ratio | MB written |"
+        f"\n| step, 31 x {size} x {size} | whole, s | by band, all new, s | 1 of 31 changed, s |"
+        " ratio | MB written |"
     )
     print("|---|---|---|---|---|---|")
     for name in STEPS[:3]:
         step, inputs = step_of(name, size)
         with tempfile.TemporaryDirectory() as folder:
             first, cold, again, written = _times(step, inputs, Path(folder))
-        print(f"| {name} | {first:.2f} | {cold:.2f} | {again:.3f} | {first / again:.1f} | {written:.1f} |", flush=True)
+        print(
+            f"| {name} | {first:.2f} | {cold:.2f} | {again:.3f} | {first / again:.1f} |"
+            f" {written:.1f} |",
+            flush=True,
+        )
 
 
 def _times(step, inputs, root):
-    """Seconds: in one file, by band, by band with one changed (each the least of three); and MB written for it."""
+    """Seconds: in one file, by band, by band with one changed (each the least of three); and MB
+    written for it.
+    """
     call(step, inputs, step.params, 0, "cpu")  # tables and buffers
     found, before = [], 0
     for i in range(3):
@@ -171,7 +180,9 @@ def reads(size):
         names = tuple(f"{i:032x}.0" for i in range(BANDS))
         in_file = min(seconds(lambda: write_file(root / "payload", [x])) for _ in range(3))
         fresh = [Blobs(root / str(i) / "bands") for i in range(3)]
-        by_blob = min(seconds(partial(serialization.pack, Stacked(x, names), blobs)) for blobs in fresh)
+        by_blob = min(
+            seconds(partial(serialization.pack, Stacked(x, names), blobs)) for blobs in fresh
+        )
         blobs, xxh3 = fresh[0], write_file(root / "payload", [x])
         print(f"\n| 31 x {size} x {size} | one file, s | 31 blobs, s |\n|---|---|---|")
         print(f"| write and sync | {in_file:.3f} | {by_blob:.3f} |")
@@ -179,13 +190,18 @@ def reads(size):
             expected = xxh3 if verify else None
             pairs = [
                 (
-                    seconds(lambda e=expected: serialization.read(str(root / "payload"), e)[0].sum()),
+                    seconds(
+                        lambda e=expected: serialization.read(str(root / "payload"), e)[0].sum()
+                    ),
                     seconds(lambda v=verify: blobs.read(names, x.shape, x.dtype, v).sum()),
                 )
                 for _ in range(5)
             ]
             plain, stacked = (min(column) for column in zip(*pairs, strict=True))
-            print(f"| read{', verified,' if verify else ''} and sum | {plain:.3f} | {stacked:.3f} |", flush=True)
+            print(
+                f"| read{', verified,' if verify else ''} and sum | {plain:.3f} | {stacked:.3f} |",
+                flush=True,
+            )
 
 
 def main(sizes):

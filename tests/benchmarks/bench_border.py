@@ -3,9 +3,10 @@
     python tests/benchmarks/bench_border.py results.jsonl --pictures photographs/ --seeds 1100 3
     python tests/benchmarks/bench_border.py results.jsonl --report
 
-Frames of `bench_restored_frames.py`: crops of photographs behind each mask, and crops of the sample behind the designed
-mask whose scene is an even sky. Each is restored by the filter with an unknown border as wide as the reach of the PSF,
-1.5, 2 and 3 times as wide. The gains are those over the frame as developed, in dB, the seconds of one processor.
+Frames of `bench_restored_frames.py`: crops of photographs behind each mask, and crops of the sample
+behind the designed mask whose scene is an even sky. Each is restored by the filter with an unknown
+border as wide as the reach of the PSF, 1.5, 2 and 3 times as wide. The gains are those over the
+frame as developed, in dB, the seconds of one processor.
 """
 
 import argparse
@@ -50,7 +51,14 @@ def gains(given, truth):
     """The gain of each filter over the frame as developed, and the PSNR of that, in dB."""
     psf = Psf(given["psf[mask].intensity"], given["psf[mask].clear_peak"])
     bands = Bands(*(given[f"bands.{name}"] for name in ("centres", "widths", "weights")))
-    light = (given["signal[mask]"], psf, given["illuminant"], given["responses"], bands, given["clipped[mask]"].bool())
+    light = (
+        given["signal[mask]"],
+        psf,
+        given["illuminant"],
+        given["responses"],
+        bands,
+        given["clipped[mask]"].bool(),
+    )
     nothing = frames.score(given["developed[mask]"].double().numpy(), truth)
     found = {"developed": nothing}
     for border in BORDERS:
@@ -63,7 +71,9 @@ def gains(given, truth):
 
 
 def scenes(first, count, pictures):
-    """Kind of scene, mask, seed, kind of picture and its function; skies are looked for in later seeds."""
+    """Kind of scene, mask, seed, kind of picture and its function; skies are looked for in later
+    seeds.
+    """
     for seed in range(first, first + count):
         for mask in frames.MASKS:
             yield "photograph", mask, seed, seed, pictures
@@ -84,7 +94,12 @@ def run(path, first, count, folder):
                 continue
             skies += scene == "sky"
             numbers, truth, _ = frames.taken(mask, 0.0, seed, kind, picture)
-            each = {"scene": scene, "mask": mask, "seed": seed, **gains(inputs(numbers, mask, Path(place)), truth)}
+            each = {
+                "scene": scene,
+                "mask": mask,
+                "seed": seed,
+                **gains(inputs(numbers, mask, Path(place)), truth),
+            }
             with path.open("a") as file:
                 file.write(json.dumps(each) + "\n")
 
@@ -100,7 +115,10 @@ def is_even(mask, seed):
 def report(rows):
     """Print the mean gain, the least, and the median time of each border, by scene and mask."""
     names = [f"{border:g}" for border in BORDERS]
-    print(f"scene, mask: frames, PSNR as developed; mean gain (least), median time with borders {', '.join(names)}")
+    print(
+        "scene, mask: frames, PSNR as developed; mean gain (least), median time with borders"
+        f" {', '.join(names)}"
+    )
     for scene, mask in sorted({(r["scene"], r["mask"]) for r in rows}):
         some = [r for r in rows if (r["scene"], r["mask"]) == (scene, mask)]
         shown = [
@@ -108,7 +126,10 @@ def report(rows):
             f"{np.median([r[f'{k} s'] for r in some]):.2f} s"
             for k in names
         ]
-        print(f"{scene:10} {mask:9} {len(some):3}  {np.mean([r['developed'] for r in some]):.2f}  {'  '.join(shown)}")
+        print(
+            f"{scene:10} {mask:9} {len(some):3}  {np.mean([r['developed'] for r in some]):.2f} "
+            f" {'  '.join(shown)}"
+        )
 
 
 if __name__ == "__main__":

@@ -1,11 +1,13 @@
-"""Record what each command does on a cache that fails, with exit code, seconds and message, in RESULTS.md.
+"""Record what each command does on a cache that fails, with exit code, seconds and message, in
+RESULTS.md.
 
     python tests/benchmarks/bench_cache_faults.py [COMMAND=FAULT,FAULT...]
 
-Each row is a process of its own, in an empty folder, with a cache that fails as `cache_faults.py` says (mounts need
-root). `run` computes the recipe first_light as shipped, the other commands the small recipes of
-`test_cache_faults.py`. Without arguments, `run` meets every fault and each other command those in `SOME`. The
-section of RESULTS.md is written anew, with the rows of the commands that were not asked for as they were.
+Each row is a process of its own, in an empty folder, with a cache that fails as `cache_faults.py`
+says (mounts need root). `run` computes the recipe first_light as shipped, the other commands the
+small recipes of `test_cache_faults.py`. Without arguments, `run` meets every fault and each other
+command those in `SOME`. The section of RESULTS.md is written anew, with the rows of the commands
+that were not asked for as they were.
 """
 
 from __future__ import annotations
@@ -53,7 +55,11 @@ def module(file: Path) -> Any:
 def failing(fault: str, folder: Path) -> Iterator[Path]:
     """Yield a cache that fails as a fault says."""
     faults = module(CLI / "cache_faults.py")
-    made = faults.mounted(folder, "size=100m") if fault == MIDDLE else faults.failing_cache(fault, folder)
+    made = (
+        faults.mounted(folder, "size=100m")
+        if fault == MIDDLE
+        else faults.failing_cache(fault, folder)
+    )
     with made as cache:
         yield cache
 
@@ -73,13 +79,24 @@ def row(command: str, fault: str, words: Sequence[str], recipe: str) -> str:
         (Path(folder) / "mine.yaml").write_text(recipe, encoding="utf-8")
         start = time.perf_counter()
         done = subprocess.run(
-            [sys.executable, HERE, "child", fault, *words], cwd=folder, capture_output=True, text=True
+            [sys.executable, HERE, "child", fault, *words],
+            cwd=folder,
+            capture_output=True,
+            text=True,
         )
         seconds = time.perf_counter() - start
-        messages = [line for line in (done.stderr + done.stdout).splitlines() if line.startswith("warning")]
-        told = messages[0].removeprefix("warning").strip(": ") if messages else done.stderr.strip()[-200:] or "none"
+        messages = [
+            line for line in (done.stderr + done.stdout).splitlines() if line.startswith("warning")
+        ]
+        told = (
+            messages[0].removeprefix("warning").strip(": ")
+            if messages
+            else done.stderr.strip()[-200:] or "none"
+        )
         told = told.replace(f"{folder}/cache", "CACHE").replace("|", "/")
-    verdict = json.loads(done.stdout)["verdict"] if "--json" in words and done.returncode == 0 else ""
+    verdict = (
+        json.loads(done.stdout)["verdict"] if "--json" in words and done.returncode == 0 else ""
+    )
     return f"| {command} | {fault} | {done.returncode} | {seconds:.0f} | {verdict} | {told} |\n"
 
 
@@ -101,10 +118,14 @@ def write(made: dict[str, str]) -> None:
 
 
 def main(words: Sequence[str]) -> None:
-    """Run the commands with the faults that are asked for, and record each as soon as it has ended."""
+    """Run the commands with the faults that are asked for, and record each as soon as it has
+    ended.
+    """
     small, faults = module(CLI / "test_cache_faults.py"), module(CLI / "cache_faults.py")
     plan = {name: SOME for name in small.COMMANDS} | {"run": (*faults.FAULTS, MIDDLE)}
-    asked = dict(word.split("=") for word in words) or {name: ",".join(each) for name, each in plan.items()}
+    asked = dict(word.split("=") for word in words) or {
+        name: ",".join(each) for name, each in plan.items()
+    }
     for command, names in asked.items():
         for fault in names.split(",") if names else plan[command]:
             given = FULL if command == "run" else small.COMMANDS[command]

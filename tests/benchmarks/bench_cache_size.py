@@ -1,9 +1,10 @@
-"""`cache ls`, `cache gc` and the start of a run with a large cache: seconds and memory, as a table in RESULTS.md.
+"""`cache ls`, `cache gc` and the start of a run with a large cache: seconds and memory, as a table
+in RESULTS.md.
 
     python tests/benchmarks/bench_cache_size.py [--results N ...]
 
-Makes a cache of N results (100 000) in a temporary folder, one in four with a file of 1 kB, and runs each command in a
-process of its own. An empty cache shows what the start of the program takes.
+Makes a cache of N results (100 000) in a temporary folder, one in four with a file of 1 kB, and
+runs each command in a process of its own. An empty cache shows what the start of the program takes.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from neusee.workflows.keys.seal import seal_record
+from neusee.workflows.keys.sealed_files import seal_record
 from neusee.workflows.store.journal import row_of
 
 RESULTS = Path(__file__).with_name("RESULTS.md")
@@ -44,8 +45,19 @@ def about_of(i: int, key: str, rng: random.Random) -> dict[str, Any]:
         "key": key,
         "step": f"psf[mask,{i % 7}]",
         "recipe": "first_light",
-        "origin": {"node": "optics.psf", "code": "c" * 32, "params": {f"p{k}": 1.1 * k for k in range(10)}},
-        "facts": {"shape": [31, 64, 64], "dtype": "float32", "min": 0.0, "max": 1.0, "sum": 12.0, "finite": True},
+        "origin": {
+            "node": "optics.psf",
+            "code": "c" * 32,
+            "params": {f"p{k}": 1.1 * k for k in range(10)},
+        },
+        "facts": {
+            "shape": [31, 64, 64],
+            "dtype": "float32",
+            "min": 0.0,
+            "max": 1.0,
+            "sum": 12.0,
+            "finite": True,
+        },
         "checks": [["phase step 0.31 turn < 0.5", True]] * 3,
         "seconds": rng.random(),
         "bytes": 512,
@@ -79,10 +91,14 @@ def fill(root: Path, count: int) -> None:
 
 
 def measured(root: Path, words: list[str]) -> tuple[float, float, str]:
-    """Return the processor seconds and the peak in MB of one command, and the last line that it prints."""
+    """Return the processor seconds and the peak in MB of one command, and the last line that it
+    prints.
+    """
     command = [sys.executable, "-m", "neusee", *words]
     with tempfile.TemporaryFile() as out:
-        process = subprocess.Popen(command, env={**os.environ, "NEUSEE_CACHE": str(root)}, stdout=out, cwd=root.parent)
+        process = subprocess.Popen(
+            command, env={**os.environ, "NEUSEE_CACHE": str(root)}, stdout=out, cwd=root.parent
+        )
         _, status, used = os.wait4(process.pid, 0)
         if status:
             raise SystemExit(f"{' '.join(command)} ended with status {status}")

@@ -1,12 +1,15 @@
-"""What choosing costs, of a cold run and of a cached one: `python tests/benchmarks/bench_choosing.py [RECIPE ...]`.
+"""What choosing costs, of a cold run and of a cached one: `python
+tests/benchmarks/bench_choosing.py [RECIPE ...]`.
 
-Choosing is all that a run with `--exact` does not do: the recipe made cheaper, the account of the tolerance, the
-proof along the graph, and inside the image of few planes the search for what may be left away and the bounds. Each is
-timed where it is called; time in one that another calls counts once, and steps that it asks for do not count. Beside a
-cached run stands one with `--exact`, as long as that is in the store too. The runs are whole, engine and store
-included, and in one process, with the code of the nodes read before. While the store writes large results, its threads
-take the cores from whatever is computed, and the clock runs on: a cold run whose store takes nothing shows what
-choosing takes by itself, and is the shorter run to compare it with. Medians of 3, or of one where it takes long.
+Choosing is all that a run with `--exact` does not do: the recipe made cheaper, the account of the
+tolerance, the proof along the graph, and inside the image of few planes the search for what may be
+left away and the bounds. Each is timed where it is called; time in one that another calls counts
+once, and steps that it asks for do not count. Beside a cached run stands one with `--exact`, as
+long as that is in the store too. The runs are whole, engine and store included, and in one process,
+with the code of the nodes read before. While the store writes large results, its threads take the
+cores from whatever is computed, and the clock runs on: a cold run whose store takes nothing shows
+what choosing takes by itself, and is the shorter run to compare it with. Medians of 3, or of one
+where it takes long.
 """
 
 import statistics
@@ -19,12 +22,12 @@ from functools import wraps
 from pathlib import Path
 from unittest import mock
 
-from neusee.nodes.optics._imaging import _channel_image
+from neusee.nodes.optics import _channel_image
 from neusee.workflows import load
 from neusee.workflows.engine import execution, resolve_keys, runner
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.cold_run import cold
-from neusee.workflows.tolerance.error_budget import ErrorBudget
+from neusee.workflows.tolerance.skip_decision import ErrorBudget
 
 ENGINE = (
     (runner, "economised"),
@@ -33,7 +36,10 @@ ENGINE = (
     (ErrorBudget, "verdict"),
     (ErrorBudget, "pass_on"),
 )
-NODE = tuple((_channel_image, name) for name in ("passed", "with_windows", "choose", "guessed", "rounding", "_top"))
+NODE = tuple(
+    (_channel_image, name)
+    for name in ("passed", "with_windows", "choose", "guessed", "rounding", "_top")
+)
 LONG = 20.0  #: s, beyond which one run is enough
 
 
@@ -116,13 +122,24 @@ def line(name):
         memo = Store(Path(folder))
         for each in (recipe, full):
             once(each, memo)
-        cached, whole = ([once(each, Store(Path(folder))) for _ in range(9)] for each in (recipe, full))
+        cached, whole = (
+            [once(each, Store(Path(folder))) for _ in range(9)] for each in (recipe, full)
+        )
         colds, unwritten = (fresh(recipe, memo, kind) for kind in (Store, Unwritten))
-    rows = {"cold": colds, "cold, nothing written": unwritten, "cached": cached, "cached, `--exact`": whole}
+    rows = {
+        "cold": colds,
+        "cold, nothing written": unwritten,
+        "cached": cached,
+        "cached, `--exact`": whole,
+    }
     for what, runs in rows.items():
         seconds, engine, node = (statistics.median(column) for column in zip(*runs, strict=True))
         share = (engine + node) / seconds
-        print(f"| {name} | {what} | {seconds:.4f} | {1e3 * engine:.1f} | {1e3 * node:.1f} | {share:.1%} |", flush=True)
+        print(
+            f"| {name} | {what} | {seconds:.4f} | {1e3 * engine:.1f} | {1e3 * node:.1f} |"
+            f" {share:.1%} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

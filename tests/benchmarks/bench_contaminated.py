@@ -13,10 +13,11 @@
     --quick          importance samples about the mode in place of chains, with all checks of frames and levels
     --table          only print the table of FILE
 
-The frames come from a camera in NumPy that shares no code with the nodes; they are written to files and calibrated
-with the search, the chains and all checks of the command. Where a check fails, or the frames are refused, the command
-ends with 3. Only values that a calibration with exit code 0 states are judged: by their distance from the truth in
-stated standard deviations, and by the interval between the 0.5 % and the 99.5 % quantile of the draws.
+The frames come from a camera in NumPy that shares no code with the nodes; they are written to files
+and calibrated with the search, the chains and all checks of the command. Where a check fails, or
+the frames are refused, the command ends with 3. Only values that a calibration with exit code 0
+states are judged: by their distance from the truth in stated standard deviations, and by the
+interval between the 0.5 % and the 99.5 % quantile of the draws.
 """
 
 import argparse
@@ -36,10 +37,18 @@ from neusee.workflows.calibration.calibration_page import CalibrationResult
 from neusee.workflows.calibration.emcee_sampler import Chains
 from neusee.workflows.calibration.frame_validity import frame_checks, inspect_recipe, widened
 from neusee.workflows.calibration.identifiability import identify
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_checks import Check, _of_data, count_failures, importance_samples
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
-from neusee.workflows.calibration.run_calibration import CalibrationRefused, FramesRefused, find_posterior
+from neusee.workflows.calibration.log_posterior import SensorPosterior, find_mode, initial_theta
+from neusee.workflows.calibration.posterior_checks import (
+    Check,
+    _of_data,
+    count_failures,
+    importance_samples,
+)
+from neusee.workflows.calibration.run_calibration import (
+    CalibrationRefused,
+    FramesRefused,
+    find_posterior,
+)
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 
@@ -85,7 +94,8 @@ steps:
   levels: {node: calibrate.levels, from: level}
 """
 LIKELIHOOD = {
-    "density": """\
+    "density": (
+        """\
   sufficient: {node: calibrate.sufficient, from: levels}
   prior:
     node: calibrate.prior
@@ -109,8 +119,10 @@ LIKELIHOOD = {
       arrivals: poisson
       bits: 12
 outputs: [density]
-""",
-    "camera": """\
+"""
+    ),
+    "camera": (
+        """\
   prior:
     node: calibrate.camera_prior
     with:
@@ -137,12 +149,15 @@ outputs: [density]
       lamp: 0.01
       drift: 0.03
 outputs: [camera]
-""",
+"""
+    ),
 }
 
 
 def camera(mode, row, seed):
-    """A camera of 20 levels; of a real one the lamp scatters from level to level, and so does that of a clean one."""
+    """A camera of 20 levels; of a real one the lamp scatters from level to level, and so does
+    that of a clean one.
+    """
     faults = {**ROWS[row], **({"lamp": 0.005} if mode == "camera" else {})}
     return Camera(list(ROWS).index(row) * 10_000 + seed, size=96, lit=16, darks=4, faults=faults)
 
@@ -151,7 +166,8 @@ def truth(made, mode):
     """What a calibration of the pixels of this camera should say."""
     current = 5 + float(made._hot.mean())
     level = made.offset + made.gain * (float(made._dsnu.mean()) + 1e-3 * current)
-    level -= 0.5 * made._of("truncation")  # numbers that are cut are those of an offset lower by half a number
+    # numbers that are cut are those of an offset lower by half a number
+    level -= 0.5 * made._of("truncation")
     if "black" in made.faults:
         level -= np.rint(made.offset + made._of("black") * made.gain * made.noise)
     known = {
@@ -160,24 +176,36 @@ def truth(made, mode):
         NOISE[mode]: made.noise,
     }
     known["dark_current"] = current
-    return known | ({"dark_signal": level} if mode == "camera" else {"offset": level / made.gain - 1e-3 * current})
+    return known | (
+        {"dark_signal": level}
+        if mode == "camera"
+        else {"offset": level / made.gain - 1e-3 * current}
+    )
 
 
 def written(folder, made, mode):
-    """Write the frames and the recipe of a camera; return the truth. The light is the mean of both frames of a pair."""
+    """Write the frames and the recipe of a camera; return the truth. The light is the mean of
+    both frames of a pair.
+    """
     lines = ["# Frames of a camera in NumPy.", "measured:"]
     for name, photons, exposure, frames in made.levels():
         file = name.replace(" ", "_") + ".npy"
         np.save(folder / file, frames.astype(np.uint16))
         light = photons * (1 + made._of("drift") * (made.frames - 1) / 2)
-        lines.append(f"  {file[:-4]}: {{files: {file}, photons: {light:.6f}, exposure: {exposure:.6g} s}}")
+        lines.append(
+            f"  {file[:-4]}: {{files: {file}, photons: {light:.6f}, exposure: {exposure:.6g} s}}"
+        )
     scatter = "all" if mode == "density" else "steady"
-    (folder / "mine.yaml").write_text("\n".join([*lines, RECIPE.replace("SCATTER", scatter) + LIKELIHOOD[mode]]))
+    (folder / "mine.yaml").write_text(
+        "\n".join([*lines, RECIPE.replace("SCATTER", scatter) + LIKELIHOOD[mode]])
+    )
     return truth(made, mode)
 
 
 def sampled(recipe, store):
-    """The result of a calibration from importance samples of 4000 draws, without chains and models of the response."""
+    """The result of a calibration from importance samples of 4000 draws, without chains and
+    models of the response.
+    """
     tests = inspect_recipe(recipe, store)
     if any(test.verdict == "refused" for test in tests):
         raise FramesRefused(tests)
@@ -188,16 +216,30 @@ def sampled(recipe, store):
         raise CalibrationRefused(identifiability.refused)
     law = importance_samples(problem, mode, recipe.seed)
     chosen = np.random.default_rng(1).choice(len(law.weights), 8000, p=law.weights)
-    chains = Chains(law.samples[chosen][None, :, None], np.zeros((1, 8000, 1)), 0.3, 1.0, 8000, True)
+    chains = Chains(
+        law.samples[chosen][None, :, None], np.zeros((1, 8000, 1)), 0.3, 1.0, 8000, True
+    )
     search = Check("the search found the mode", "", "settled", "pass" if mode.settled else "fail")
     found = [*frame_checks(tests), search, *_of_data(problem, mode, identifiability, law)]
-    return CalibrationResult(problem, mode, identifiability, widened(problem, chains, tests, 2), found, (), tests)
+    return CalibrationResult(
+        problem, mode, identifiability, widened(problem, chains, tests, 2), found, (), tests
+    )
 
 
 def calibrated(mode, row, seed, quick):
-    """Return the line of one camera: exit code, failed checks, and what is stated of each parameter."""
+    """Return the line of one camera: exit code, failed checks, and what is stated of each
+    parameter.
+    """
     began = time.process_time()
-    line = {"mode": mode, "row": row, "seed": seed, "quick": quick, "exit": 0, "wrong": [], "stated": {}}
+    line = {
+        "mode": mode,
+        "row": row,
+        "seed": seed,
+        "quick": quick,
+        "exit": 0,
+        "wrong": [],
+        "stated": {},
+    }
     with TemporaryDirectory() as name:
         folder = Path(name)
         known = written(folder, camera(mode, row, seed), mode)
@@ -206,7 +248,9 @@ def calibrated(mode, row, seed, quick):
             if quick:
                 result = sampled(recipe, store)
             else:
-                result = find_posterior(recipe, store, lambda text: None, walkers=64, move="de", draws=1000)
+                result = find_posterior(
+                    recipe, store, lambda text: None, walkers=64, move="de", draws=1000
+                )
         except FramesRefused as refused:
             line |= {"exit": 3, "wrong": [t.name for t in refused.tests if t.verdict == "refused"]}
         except (CalibrationRefused, ValueError) as error:
@@ -226,7 +270,8 @@ def told(result, known):
             stated[name] = {"z": round(z, 3), "outside": bool(not low <= known[name] <= high)}
     models = {m.name: m.stated for m in result.models if m.name in stated}
     for name, interval in models.items():
-        stated[name]["spread outside"] = bool(not interval.low <= known[name] <= interval.high)  # 90 %
+        # 90 %
+        stated[name]["spread outside"] = bool(not interval.low <= known[name] <= interval.high)
     spread = result.draws["gain"].std() / result.draws["gain"].mean()
     at = result.problem.names.index("gain")  # whose coordinate is its logarithm
     alone = float(np.sqrt(result.mode.covariance[at, at]))
@@ -252,17 +297,22 @@ def lines_of(files):
 
 
 def cameras(given):
-    """The cameras (mode, row, seed, quick) of one shard, by their seeds; rows in another order for each seed.
+    """The cameras (mode, row, seed, quick) of one shard, by their seeds; rows in another order for
+    each seed.
 
     So each row gets its cameras at the same pace, and all shards take about the same time.
     """
-    counts = {row: given.clean if row in ("clean", "unequal pixels") else given.cameras for row in ROWS}
+    counts = {
+        row: given.clean if row in ("clean", "unequal pixels") else given.cameras for row in ROWS
+    }
     rows = [row for row in ROWS if row in given.only.split(",")]
     number, of = map(int, given.shard.split("/"))
     every = []
     for seed in range(max(counts.values())):
         own = [(mode, row, seed, given.quick) for row in rows for mode in given.modes.split(",")]
-        own = [one for one in own if seed < (given.cameras if one[:2] == _UNTRUE else counts[one[1]])]
+        own = [
+            one for one in own if seed < (given.cameras if one[:2] == _UNTRUE else counts[one[1]])
+        ]
         every += random.Random(seed).sample(own, len(own))
     return every[number - 1 :: of]
 
@@ -273,11 +323,14 @@ def table(lines):
     for line in lines:
         groups[line["mode"], line["row"]].append(line)
     print(
-        "| mode | fault | cameras | exit 3 | by | values stated | beyond 5 sd | outside 99 % | largest z | wider | s |"
+        "| mode | fault | cameras | exit 3 | by | values stated | beyond 5 sd | outside 99 % |"
+        " largest z | wider | s |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     every = []
-    for (mode, row), group in sorted(groups.items(), key=lambda x: (x[0][0], list(ROWS).index(x[0][1]))):
+    for (mode, row), group in sorted(
+        groups.items(), key=lambda x: (x[0][0], list(ROWS).index(x[0][1]))
+    ):
         good = [line for line in group if not line["exit"]]
         values = [value for line in good for value in line["stated"].values()]
         every += values
@@ -289,27 +342,39 @@ def table(lines):
         z = [abs(value["z"]) for value in values]
         wider = f"{np.median([line['wider'] for line in good]):.1f}" if good else ""
         print(
-            f"| {mode} | {row} | {len(group)} | {len(group) - len(good)} | {by} | {len(values)} "
-            f"| {sum(x > 5 for x in z)} | {sum(v['outside'] for v in values)} | {max(z, default=0):.1f} | {wider} "
-            f"| {np.median([line['seconds'] for line in group]):.1f} |"
+            f"| {mode} | {row} | {len(group)} | {len(group) - len(good)} | {by} | {len(values)} |"
+            f" {sum(x > 5 for x in z)} | {sum(v['outside'] for v in values)} |"
+            f" {max(z, default=0):.1f} | {wider} |"
+            f" {np.median([line['seconds'] for line in group]):.1f} |"
         )
     outside = sum(value["outside"] for value in every)
     ends = binomtest(outside, max(1, len(every))).proportion_ci(0.95, "exact")
-    print(f"\n{outside} of {len(every)} stated values outside 99 % ({ends.low:.2%} to {ends.high:.2%}).")
+    print(
+        f"\n{outside} of {len(every)} stated values outside 99 % ({ends.low:.2%} to"
+        f" {ends.high:.2%})."
+    )
     clean = [
-        line for line in lines if line["row"] in ("clean", "unequal pixels") and (line["mode"], line["row"]) != _UNTRUE
+        line
+        for line in lines
+        if line["row"] in ("clean", "unequal pixels") and (line["mode"], line["row"]) != _UNTRUE
     ]
     if clean:
         false = sum(line["exit"] > 0 for line in clean)
         ends = binomtest(false, len(clean)).proportion_ci(0.95, "exact")
-        print(f"{false} of {len(clean)} clean cameras with exit code 3 ({ends.low:.2%} to {ends.high:.2%}).")
+        print(
+            f"{false} of {len(clean)} clean cameras with exit code 3 ({ends.low:.2%} to"
+            f" {ends.high:.2%})."
+        )
 
 
-_UNTRUE = ("density", "unequal pixels")  #: pixels that differ are no clean camera where all pixels count as alike
+#: pixels that differ are no clean camera where all pixels count as alike
+_UNTRUE = ("density", "unequal pixels")
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("files", type=Path, nargs="+")
     for name, kind, default in (("cameras", int, 20), ("clean", int, 20), ("minutes", float, 1e9)):
         parser.add_argument(f"--{name}", type=kind, default=default)

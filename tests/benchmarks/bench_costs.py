@@ -1,4 +1,5 @@
-"""Seconds and peak memory of steps: laws of the nodes against measured runs, those that were held out apart.
+"""Seconds and peak memory of steps: laws of the nodes against measured runs, those that were held
+out apart.
 
 python tests/benchmarks/measured_runs.py FOLDER   # the runs
 python tests/benchmarks/bench_costs.py FOLDER
@@ -11,15 +12,17 @@ from statistics import median
 from fit_costs import LARGE, LONG, SOME, grouped, loaders, read
 from measured_runs import FIT, HELD_OUT
 
-from neusee.workflows.engine import cost_laws
+from neusee.workflows.engine import cost_model as cost_laws
 
 CLOSE = 0.2  #: relative error that counts as met
 
 
 def show(folder):
-    """Compare the laws with the steps of all runs: as measured, and relative to the pace of the other nodes of a run.
+    """Compare the laws with the steps of all runs: as measured, and relative to the pace of the
+    other nodes of a run.
 
-    The last line tells how well a time can be predicted at all: how often times of the same node and size agree.
+    The last line tells how well a time can be predicted at all: how often times of the same node
+    and size agree.
     """
     loading = loaders([run for run in read(folder, FIT | HELD_OUT) if "grown" in run])
     for title, names in (("fitted", FIT), ("held out", HELD_OUT)):
@@ -28,17 +31,24 @@ def show(folder):
             met[what, abs(ratio - 1) <= CLOSE] += 1
             within[what] += spread.least <= ratio <= spread.most
             if abs(ratio - 1) > CLOSE:
-                print(f"  {title}: {what} of {node}: {ratio:.2f} at {[f'{x:.3g}' for x in row.size]}")
+                print(
+                    f"  {title}: {what} of {node}: {ratio:.2f} at {[f'{x:.3g}' for x in row.size]}"
+                )
         for what in ("seconds", "paced seconds", "peak"):
             total = met[what, True] + met[what, False]
-            print(f"{title}: {what} within 20 %: {met[what, True]} of {total}; in the range {within[what]}")
+            print(
+                f"{title}: {what} within 20 %: {met[what, True]} of {total}; in the range"
+                f" {within[what]}"
+            )
     again = list(repeated(read(folder, FIT | HELD_OUT), loading))
     close = sum(abs(ratio - 1) <= CLOSE for ratio in again)
     print(f"the same step again: seconds within 20 %: {close} of {len(again)}")
 
 
 def repeated(runs, loading):
-    """Time of a step over the median of the other runs of the same node and size, of steps that are long."""
+    """Time of a step over the median of the other runs of the same node and size, of steps that
+    are long.
+    """
     found = {}
     for run in runs:
         for node, rows in grouped([run], loading).items():
@@ -52,12 +62,19 @@ def repeated(runs, loading):
 
 
 def ratios_of(runs, loading):
-    """Measured over predicted of the steps that are long or large, by node and size, with the range of the law."""
+    """Measured over predicted of the steps that are long or large, by node and size, with the
+    range of the law.
+    """
     laws, paces = cost_laws.shipped(), {}
     for run in runs:
         alone = grouped([run], loading)
         for left in alone:
-            rows = ((laws[n], row) for n, rows in alone.items() for row in rows if n != left and row.seconds > SOME)
+            rows = (
+                (laws[n], row)
+                for n, rows in alone.items()
+                for row in rows
+                if n != left and row.seconds > SOME
+            )
             ratios = [row.seconds / expected(law, row)[0] for law, row in rows]
             paces.setdefault(left, {})[run["name"]] = median(ratios) if len(ratios) > 2 else 1.0
     for node, rows in sorted(grouped(runs, loading).items()):
@@ -71,12 +88,21 @@ def ratios_of(runs, loading):
     for node, pace in sorted(paces.items()):
         for row in grouped(runs, loading, pace)[node]:
             if row.seconds > LONG:
-                yield "paced seconds", node, row, row.seconds / expected(laws[node], row)[0], laws[node].spread[1]
+                yield (
+                    "paced seconds",
+                    node,
+                    row,
+                    row.seconds / expected(laws[node], row)[0],
+                    laws[node].spread[1],
+                )
 
 
 def expected(law, row):
     """Seconds and peak of a step by its law."""
-    size, extra = cost_laws.Size(*row.size), law.loads if row.loads and law.loads else cost_laws.Loading((), 0.0, 0.0)
+    size, extra = (
+        cost_laws.Size(*row.size),
+        law.loads if row.loads and law.loads else cost_laws.Loading((), 0.0, 0.0),
+    )
     return law.time(size) + extra.seconds, law.peak(size) + extra.memory
 
 

@@ -1,12 +1,15 @@
-"""Masks without images: what the known ones do, what can be designed, and whether a learned one is five times better.
+"""Masks without images: what the known ones do, what can be designed, and whether a learned one is
+five times better.
 
     python tests/benchmarks/bench_design.py FOLDER PIECE [PIECE ...]
 
-Pieces: `known` (masks of a formula), the name of a design below, `designs` (all of them), `table` (of what lies in
-FOLDER), `filter` (half-rings, and the one made for a Wiener filter: what such a filter leaves wrong, and why). Each
-design is kept in FOLDER and not repeated; an interrupted one goes on. All are judged on the 540 samples, 31 bands and
-512 pixels of the recipe. Those of few numbers are learned on a pupil of half the samples and a window of 504 pixels;
-pixels are learned on what they are judged on, for a deep relief is not known between coarse samples.
+Pieces: `known` (masks of a formula), the name of a design below, `designs` (all of them), `table`
+        (of what lies in
+FOLDER), `filter` (half-rings, and the one made for a Wiener filter: what such a filter leaves
+wrong, and why). Each design is kept in FOLDER and not repeated; an interrupted one goes on. All are
+judged on the 540 samples, 31 bands and 512 pixels of the recipe. Those of few numbers are learned
+on a pupil of half the samples and a window of 504 pixels; pixels are learned on what they are
+judged on, for a deep relief is not known between coarse samples.
 """
 
 from __future__ import annotations
@@ -30,7 +33,8 @@ from neusee.workflows.training.mask_design.design_run import MaskTraining, desig
 from neusee.workflows.training.mask_design.design_terms import Terms
 
 AT = {"optics.samples": 270, "optics.pitch": "29.92 um", "optics.window": [504, 504]}
-FINER = {"optics.samples": 405, "optics.pitch": "19.94667 um"}  # at 400 nm 72 waves (of 550 nm) are its Nyquist limit
+# at 400 nm 72 waves (of 550 nm) are its Nyquist limit
+FINER = {"optics.samples": 405, "optics.pitch": "19.94667 um"}
 FIVE = (12.0, 18.0, 24.0, 30.0, 36.0)
 HALF_RINGS = (3.0, 5.0, 8.0, 12.0, 14.0, 20.0, 30.0)
 COMMON = {"at": AT, "weights": {"lsr": 1.0, "bsr": 4.0}}
@@ -44,14 +48,29 @@ DEEP = {
     "at": {},
     "bands": 5,
 }
-FROM_RINGS = DEEP | {"start": "five half-rings, evolved", "max_height": "130 um", "grid": 540, "learning_rate": 0.002,
-                     "iterations": 120}  # fmt: skip
+FROM_RINGS = DEEP | {
+    "start": "five half-rings, evolved",
+    "max_height": "130 um",
+    "grid": 540,
+    "learning_rate": 0.002,
+    "iterations": 120,
+}
 DESIGNS = {
     "five half-rings, evolved": RINGS,
-    "five half-rings, evolved, slopes to 64": RINGS
-    | {"slopes": [4.0, 64.0], "population": 50, "iterations": 12, "polish": 200},
-    "five half-rings, evolved, slopes to 68, polished": RINGS
-    | {"slopes": [4.0, 68.0], "population": 50, "iterations": 36, "bands": 11, "polish": 350, "at": FINER},
+    "five half-rings, evolved, slopes to 64": (
+        RINGS | {"slopes": [4.0, 64.0], "population": 50, "iterations": 12, "polish": 200}
+    ),
+    "five half-rings, evolved, slopes to 68, polished": (
+        RINGS
+        | {
+            "slopes": [4.0, 68.0],
+            "population": 50,
+            "iterations": 36,
+            "bands": 11,
+            "polish": 350,
+            "at": FINER,
+        }
+    ),
     "Zernike, 150 polynomials": {
         "kind": "zernike",
         "modes": 150,
@@ -62,20 +81,25 @@ DESIGNS = {
     "rings, 40 sided": {"kind": "rings", "learning_rate": 0.01, "noise": 0.5, "iterations": 80},
     "UNet": {"kind": "unet", "max_height": "20 um", "width": 16, "grid": 135, "iterations": 80},
     "pixelwise, 20 um deep": DEEP,
-    "pixelwise, 5 um deep": DEEP | {"max_height": "5 um", "scale": 0.04, "learning_rate": 0.05, "iterations": 150},
+    "pixelwise, 5 um deep": (
+        DEEP | {"max_height": "5 um", "scale": 0.04, "learning_rate": 0.05, "iterations": 150}
+    ),
     **{
-        f"pixelwise, 20 um deep, contrast {weight}": DEEP
-        | {"iterations": 120, "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": weight}}
+        f"pixelwise, 20 um deep, contrast {weight}": (
+            DEEP | {"iterations": 120, "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": weight}}
+        )
         for weight in (0.5, 1.0, 2.0, 4.0)
     },
-    "pixelwise from the polished half-rings, contrast 2.0, slowly": FROM_RINGS
-    | {
-        "start": "five half-rings, evolved, slopes to 68, polished",
-        "learning_rate": 0.001,
-        "iterations": 250,
-        "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 2.0},
-        "power": 24,
-    },
+    "pixelwise from the polished half-rings, contrast 2.0, slowly": (
+        FROM_RINGS
+        | {
+            "start": "five half-rings, evolved, slopes to 68, polished",
+            "learning_rate": 0.001,
+            "iterations": 250,
+            "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 2.0},
+            "power": 24,
+        }
+    ),
     "UNet, 5 um deep": {
         "kind": "unet",
         "max_height": "5 um",
@@ -85,30 +109,42 @@ DESIGNS = {
         "bands": 5,
         "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 1.0},
     },
-    "pixelwise, 5 um deep, contrast 1.0": DEEP
-    | {
-        "max_height": "5 um",
-        "scale": 0.04,
-        "learning_rate": 0.05,
-        "iterations": 300,
-        "power": 24,
-        "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 1.0},
-    },
-    "pixelwise, 5 um deep, contrast 1.0, then 2.5": DEEP
-    | {
-        "start": "pixelwise, 5 um deep, contrast 1.0",
-        "max_height": "5 um",
-        "grid": 540,
-        "learning_rate": 0.03,
-        "iterations": 130,
-        "power": 32,
-        "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 2.5},
-    },
-    "pixelwise from the evolved half-rings, contrast 2.0, slowly": FROM_RINGS
-    | {"weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 2.0}, "learning_rate": 0.001, "iterations": 300, "power": 24},
+    "pixelwise, 5 um deep, contrast 1.0": (
+        DEEP
+        | {
+            "max_height": "5 um",
+            "scale": 0.04,
+            "learning_rate": 0.05,
+            "iterations": 300,
+            "power": 24,
+            "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 1.0},
+        }
+    ),
+    "pixelwise, 5 um deep, contrast 1.0, then 2.5": (
+        DEEP
+        | {
+            "start": "pixelwise, 5 um deep, contrast 1.0",
+            "max_height": "5 um",
+            "grid": 540,
+            "learning_rate": 0.03,
+            "iterations": 130,
+            "power": 32,
+            "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 2.5},
+        }
+    ),
+    "pixelwise from the evolved half-rings, contrast 2.0, slowly": (
+        FROM_RINGS
+        | {
+            "weights": {"lsr": 1.0, "bsr": 4.0, "contrast": 2.0},
+            "learning_rate": 0.001,
+            "iterations": 300,
+            "power": 24,
+        }
+    ),
     **{
-        f"pixelwise from the evolved half-rings, contrast {weight}": FROM_RINGS
-        | {"weights": {"lsr": 1.0, "bsr": 4.0, "contrast": weight}}
+        f"pixelwise from the evolved half-rings, contrast {weight}": (
+            FROM_RINGS | {"weights": {"lsr": 1.0, "bsr": 4.0, "contrast": weight}}
+        )
         for weight in (0.0, 1.0, 2.0, 4.0)
     },
 }
@@ -125,7 +161,8 @@ DESIGNS[FOR_A_FILTER] = {
     "noise_share": 7e-4,
     "at": {},
 }
-OWN = {FOR_A_FILTER: ("half_ring", ["doe.waves=[14]"])}  #: the recipe whose own relief it starts from
+#: the recipe whose own relief it starts from
+OWN = {FOR_A_FILTER: ("half_ring", ["doe.waves=[14]"])}
 
 
 def known(stop: Stop) -> dict[str, torch.Tensor]:
@@ -136,8 +173,12 @@ def known(stop: Stop) -> dict[str, torch.Tensor]:
         "axicon, 20 waves": doe.axicon(stop, waves=20.0),
         "spiral axicon, 20 waves, charge 8": doe.spiral_axicon(stop, waves=20.0, charge=8),
         "half-ring, 20 waves": doe.half_rings(stop, waves=(20.0,)),
-        "five half-rings, (12, 18, 24, 30, 36)": doe.half_rings(stop, waves=(12.0, 18.0, 24.0, 30.0, 36.0)),
-        "five half-rings, (16, 28, 40, 52, 64)": doe.half_rings(stop, waves=(16.0, 28.0, 40.0, 52.0, 64.0)),
+        "five half-rings, (12, 18, 24, 30, 36)": doe.half_rings(
+            stop, waves=(12.0, 18.0, 24.0, 30.0, 36.0)
+        ),
+        "five half-rings, (16, 28, 40, 52, 64)": doe.half_rings(
+            stop, waves=(16.0, 28.0, 40.0, 52.0, 64.0)
+        ),
     }
 
 
@@ -154,26 +195,43 @@ def one(name: str, folder: Path) -> None:
         return
     values, began = {**COMMON, **DESIGNS[name]}, time.perf_counter()
     if "start" in values:  # the relief of another design
-        values["start"] = folder / "runs" / read(folder, values["start"])["folder"] / "mask.safetensors"
+        values["start"] = (
+            folder / "runs" / read(folder, values["start"])["folder"] / "mask.safetensors"
+        )
     how = MaskTraining.model_validate(values)
     recipe, words = OWN.get(name, ("first_light", []))
-    made = design(load(recipe, words), how, Store(folder / "cache"), folder / "runs", lambda s: print(f"{name}: {s}"))
+    made = design(
+        load(recipe, words),
+        how,
+        Store(folder / "cache"),
+        folder / "runs",
+        lambda s: print(f"{name}: {s}"),
+    )
     found = json.loads((made / "mask.json").read_text())
-    place.write_text(json.dumps(found | {"seconds": time.perf_counter() - began, "folder": made.name}))
+    place.write_text(
+        json.dumps(found | {"seconds": time.perf_counter() - began, "folder": made.name})
+    )
 
 
 def formulas(folder: Path) -> None:
     """Judge the masks of a formula."""
     terms = Terms(load("first_light"), MaskTraining(), Store(folder / "cache"))
     for name, height in known(terms.stop).items():
-        (folder / f"{name}.json").write_text(json.dumps(mask_figures(terms, height) | {"seconds": 0.0}))
+        (folder / f"{name}.json").write_text(
+            json.dumps(mask_figures(terms, height) | {"seconds": 0.0})
+        )
 
 
 def filtered(folder: Path) -> None:
-    """What a Wiener filter leaves wrong of a picture seen at an eighth: by noise alone, and by colour too."""
+    """What a Wiener filter leaves wrong of a picture seen at an eighth: by noise alone, and by
+    colour too.
+    """
     how = MaskTraining.model_validate(DESIGNS[FOR_A_FILTER] | {"weights": {"wiener": 1.0}})
     terms = Terms(load("half_ring"), how, Store(folder / "cache"))
-    masks = {f"half-ring, {waves} waves": doe.half_rings(terms.stop, waves=(waves,)) for waves in HALF_RINGS}
+    masks = {
+        f"half-ring, {waves} waves": doe.half_rings(terms.stop, waves=(waves,))
+        for waves in HALF_RINGS
+    }
     made = folder / "runs" / read(folder, FOR_A_FILTER)["folder"] / "mask.safetensors"
     masks |= {"five half-rings, (12, 18, 24, 30, 36)": doe.half_rings(terms.stop, waves=FIVE)}
     masks |= {FOR_A_FILTER: load_file(made)["height"]}
@@ -183,8 +241,15 @@ def filtered(folder: Path) -> None:
         with torch.no_grad():
             psf = terms.psf(height)
             kept = math.exp(-float(losses.contrast(psf, up_to=how.up_to)) / terms.count)
-            wrong = [math.exp(float(Terms.parts(_as(terms, colour), height)["wiener"])) for colour in (0.0, 1.0)]
-        cells = [f"{float(metrics.lsr(psf).mean()):.3g}", f"{kept:.3g}", *(f"{x:.2e}" for x in wrong)]
+            wrong = [
+                math.exp(float(Terms.parts(_as(terms, colour), height)["wiener"]))
+                for colour in (0.0, 1.0)
+            ]
+        cells = [
+            f"{float(metrics.lsr(psf).mean()):.3g}",
+            f"{kept:.3g}",
+            *(f"{x:.2e}" for x in wrong),
+        ]
         print(f"| {name} | {' | '.join(cells)} |")
 
 
@@ -197,7 +262,10 @@ def _as(terms: Terms, colour: float) -> Terms:
 
 def table(folder: Path) -> None:
     """Print what is known, masks of a formula first."""
-    print("| mask | mean LSR | worst LSR | BSR | median MTF | bound of it | even light | relief, µm | s |")
+    print(
+        "| mask | mean LSR | worst LSR | BSR | median MTF | bound of it | even light | relief, µm"
+        " | s |"
+    )
     print("|---|---|---|---|---|---|---|---|---|")
     for name in [*known(16, 1e-4, 1.6e-3), *DESIGNS]:
         place = folder / f"{name}.json"

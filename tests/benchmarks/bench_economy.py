@@ -1,9 +1,11 @@
-"""Sums over the bands of an image, by band and by few planes: `python tests/benchmarks/bench_economy.py [REPEATS]`.
+"""Sums over the bands of an image, by band and by few planes: `python
+tests/benchmarks/bench_economy.py [REPEATS]`.
 
-Two tables in Markdown, medians of REPEATS (3) in one process, in seconds of the wall and of the processor, for on a
-machine that others use the wall says little. First, 31 bands imaged, and few planes imaged and their light summed; the
-ratio of the two; the same with `expose`; what was kept, the largest difference and the bound. Second, what makes a
-cube few planes, and the lift that makes them at once.
+Two tables in Markdown, medians of REPEATS (3) in one process, in seconds of the wall and of the
+processor, for on a machine that others use the wall says little. First, 31 bands imaged, and few
+planes imaged and their light summed; the ratio of the two; the same with `expose`; what was kept,
+the largest difference and the bound. Second, what makes a cube few planes, and the lift that makes
+them at once.
 """
 
 import statistics
@@ -45,7 +47,9 @@ def psf(size):
 
 
 def medians(work, repeats):
-    """Median seconds of wall and processor, and what came of it; one call before that does not count."""
+    """Median seconds of wall and processor, and what came of it; one call before that does not
+    count.
+    """
     found, walls, busy = work(), [], []
     for _ in range(repeats):
         wall, cpu = time.perf_counter(), time.process_time()
@@ -57,7 +61,9 @@ def medians(work, repeats):
 
 def convolutions(repeats):
     print(
-        "| scene, PSF | rank | rows | within | bands, s (CPU) | planes, s (CPU) | ratio (CPU) | exposed (CPU) |", end=""
+        "| scene, PSF | rank | rows | within | bands, s (CPU) | planes, s (CPU) | ratio (CPU) |"
+        " exposed (CPU) |",
+        end="",
     )
     print(" kept | difference | bound |\n|---|---|---|---|---|---|---|---|---|---|---|")
     for size in SIZES:
@@ -82,24 +88,36 @@ def compared(plain, few, lit, shown, weights):
     summed, channels = torch.tensordot(weights.float(), plain[2], 1), few[2]
     error = float(((summed - channels.planes).abs().amax((1, 2)) / summed.amax((1, 2))).max())
     kept = "{} planes, {} kernels, {} bands, {} x {}".format(*channels.kept.tolist())
-    alone, whole = (plain[i] / few[i] for i in (0, 1)), ((plain[i] + lit[i]) / (few[i] + shown[i]) for i in (0, 1))
+    alone, whole = (
+        (plain[i] / few[i] for i in (0, 1)),
+        ((plain[i] + lit[i]) / (few[i] + shown[i]) for i in (0, 1)),
+    )
     return (
-        f"| {plain[0]:.2f} ({plain[1]:.2f}) | {few[0]:.3f} ({few[1]:.3f}) | {{:.1f}} ({{:.1f}}) ".format(*alone)
+        f"| {plain[0]:.2f} ({plain[1]:.2f}) | {few[0]:.3f} ({few[1]:.3f}) | {{:.1f}} ({{:.1f}}) ".format(
+            *alone
+        )
         + "| {:.1f} ({:.1f}) ".format(*whole)
         + f"| {kept} | {error:.1e} | {float(channels.bound):.1e} |"
     )
 
 
 def planes(repeats):
-    print("\n| 31 x y x x | what | s (CPU) | planes | left, of the brightest |\n|---|---|---|---|---|")
+    print(
+        "\n| 31 x y x x | what | s (CPU) | planes | left, of the brightest |\n|---|---|---|---|---|"
+    )
     for size in SIZES:
-        for name, colours in (("no clipping", 0.5 + 0.01 * rand(3, *size)), ("clipped", rand(3, *size))):
+        for name, colours in (
+            ("no clipping", 0.5 + 0.01 * rand(3, *size)),
+            ("clipped", rand(3, *size)),
+        ):
             cube = lift_lmmse(colours, SCENE)
             for within in (1e-6, 1e-4, 1e-2):
                 done = medians(partial(compress, cube, within=within), repeats)
                 tell(size, f"compress within {within:g}, {name}", done)
                 if lift_lmmse.low_rank_form is not None:
-                    done = medians(partial(lift_lmmse.low_rank_form, colours, SCENE, within=within), repeats)
+                    done = medians(
+                        partial(lift_lmmse.low_rank_form, colours, SCENE, within=within), repeats
+                    )
                     tell(size, f"lift to planes within {within:g}, {name}", done)
 
 
@@ -107,7 +125,9 @@ def tell(size, what, done):
     wall, busy, found = done
     left = float(found.residual_max[-1].max() / found.residual_max[0].max())
     print(
-        f"| {size[0]} x {size[1]} | {what} | {wall:.2f} ({busy:.2f}) | {len(found.planes)} | {left:.1e} |", flush=True
+        f"| {size[0]} x {size[1]} | {what} | {wall:.2f} ({busy:.2f}) | {len(found.planes)} |"
+        f" {left:.1e} |",
+        flush=True,
     )
 
 

@@ -1,8 +1,10 @@
-"""How far is the EMVA 1288 sheet from the reference: `python tests/benchmarks/bench_emva_sheet.py FOLDER`.
+"""How far is the EMVA 1288 sheet from the reference: `python tests/benchmarks/bench_emva_sheet.py
+FOLDER`.
 
-FOLDER holds the reference sets of the EMVA 1288 working group as they come (github.com/EMVA1288/datasets), each in a
-folder with `EMVA1288_Data.txt`. Each quantity of the sheet is compared with that of the package `emva1288` on the same
-frames, and those of set 001 with the published ones (release 3.0).
+FOLDER holds the reference sets of the EMVA 1288 working group as they come
+(github.com/EMVA1288/datasets), each in a folder with `EMVA1288_Data.txt`. Each quantity of the
+sheet is compared with that of the package `emva1288` on the same frames, and those of set 001 with
+the published ones (release 3.0).
 """
 
 import logging
@@ -29,24 +31,30 @@ THEIRS = {
     "mu_I_mean": "u_I_mean", "mu_I_var": "u_I_var",
     **{f"{kind}1288_column": f"{kind}1288_col" for kind in ("DSNU", "PRNU")},
 }  # fmt: skip
-SPATIAL = {"DSNU1288_DN": 0.154925054745, "DSNU1288": 0.551787767644, "PRNU1288": 0.432704411062}  #: published, set 001
+#: published, set 001
+SPATIAL = {"DSNU1288_DN": 0.154925054745, "DSNU1288": 0.551787767644, "PRNU1288": 0.432704411062}
 
 
 def ours(file, scatter):
     """The sheet of a descriptor."""
-    series = sorted((spatial_series(*each) for each in descriptor_series([file])), key=lambda s: s.photons)
+    series = sorted(
+        (spatial_series(*each) for each in descriptor_series([file])), key=lambda s: s.photons
+    )
     return emva_sheet(descriptor(file=file, scatter=scatter), Nonuniformity(*series))
 
 
 def theirs(file):
     """The quantities of the reference implementation."""
-    np.asfarray = lambda values: np.asarray(values, dtype=float)  # emva1288 1.0.2 was written for NumPy 1
+    # emva1288 1.0.2 was written for NumPy 1
+    np.asfarray = lambda values: np.asarray(values, dtype=float)
     from emva1288.process.data import Data1288
     from emva1288.process.loader import LoadImageData
     from emva1288.process.parser import ParseEmvaDescriptorFile
     from emva1288.process.results import Results1288
 
-    images = LoadImageData(ParseEmvaDescriptorFile(str(file), loglevel=logging.ERROR).images, loglevel=logging.ERROR)
+    images = LoadImageData(
+        ParseEmvaDescriptorFile(str(file), loglevel=logging.ERROR).images, loglevel=logging.ERROR
+    )
     return Results1288(Data1288(images.data, loglevel=logging.ERROR).data, loglevel=logging.ERROR)
 
 
@@ -71,7 +79,8 @@ def compared(file):
         (defects(without_trend(lit.total - dark.total), 1.0), reference.histogram_PRNU),
     )
     print(
-        "pixels of other classes, of DSNU and of PRNU:", *(int(np.abs(a.pixels - b["values"]).sum()) for a, b in pairs)
+        "pixels of other classes, of DSNU and of PRNU:",
+        *(int(np.abs(a.pixels - b["values"]).sum()) for a, b in pairs),
     )
 
 

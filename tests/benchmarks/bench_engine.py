@@ -47,7 +47,8 @@ def mean(x):
     return x.mean(dtype=torch.float64)
 
 
-# shapes, as a node of the package has them: without, 1000 results count as 69 MB each, and the run is refused
+# shapes, as a node of the package has them: without, 1000 results count as 69 MB each, and the run
+# is refused
 @start.shape
 def _(*, count):
     return torch.empty(count, device="meta")
@@ -68,7 +69,9 @@ def recipe(outputs: tuple[str, ...], *steps: Step) -> Recipe:
 
 
 def step(name: str, what, source: str | None = None, **params) -> Step:
-    return Step(name, what, params, {"x": source} if source else {}, Location("bench.yaml", 1, 1), {})
+    return Step(
+        name, what, params, {"x": source} if source else {}, Location("bench.yaml", 1, 1), {}
+    )
 
 
 def chain(n: int, count: int = 4, changed: int = -1) -> Recipe:
@@ -112,10 +115,18 @@ def overhead(folder: Path) -> None:
     for name, what in (("chain", chain(1000)), ("side by side", wide(1000))):
         cold = min(timed(partial(new_run, what, folder / f"{name}{i}")) for i in range(3))
         cached = timed(partial(new_run, what, folder / f"{name}0"), 3)
-        row(f"1000 trivial steps, {name}: cold", f"{cold:.3f} ms a step", f"one small file {file:.3f} ms; aim 0.5")
+        row(
+            f"1000 trivial steps, {name}: cold",
+            f"{cold:.3f} ms a step",
+            f"one small file {file:.3f} ms; aim 0.5",
+        )
         row(f"1000 trivial steps, {name}: cached", f"{cached:.3f} ms a step", "aim 0.1")
     long = partial(new_run, chain(10_000), folder / "long")
-    row("chain of 10 000 steps, cold and cached", f"{timed(long):.2f} and {timed(long):.2f} s", "no recursion")
+    row(
+        "chain of 10 000 steps, cold and cached",
+        f"{timed(long):.2f} and {timed(long):.2f} s",
+        "no recursion",
+    )
 
 
 def keys(folder: Path) -> None:
@@ -127,12 +138,20 @@ def keys(folder: Path) -> None:
             found[item.name] = key_of(item, found, 1, code)[0]
         code.save()
 
-    row("40 keys, first and later", f"{timed(forty) * 1e3:.1f} and {timed(forty, 5) * 1e3:.1f} ms", "aim 30 ms")
+    row(
+        "40 keys, first and later",
+        f"{timed(forty) * 1e3:.1f} and {timed(forty, 5) * 1e3:.1f} ms",
+        "aim 30 ms",
+    )
 
 
 def recipe_texts(_: Path) -> None:
-    """Read the twelve largest recipe files, with the place of each value; the library gives plain values."""
-    files = sorted(Path(recipes.__path__[0]).rglob("*.yaml"), key=lambda path: -path.stat().st_size)[:12]
+    """Read the twelve largest recipe files, with the place of each value; the library gives
+    plain values.
+    """
+    files = sorted(
+        Path(recipes.__path__[0]).rglob("*.yaml"), key=lambda path: -path.stat().st_size
+    )[:12]
 
     def ours() -> None:
         yaml_values._document.cache_clear()
@@ -146,7 +165,11 @@ def recipe_texts(_: Path) -> None:
     pairs = [(timed(ours), timed(theirs)) for _ in range(15)]
     ratios = sorted(a / b for a, b in pairs)
     value = f"{ratios[7]:.2f} times ruamel.yaml ({ratios[0]:.2f} to {ratios[-1]:.2f})"
-    row("12 recipe files, with places", value, f"the library alone {min(b for _, b in pairs) * 1e3:.0f} ms")
+    row(
+        "12 recipe files, with places",
+        value,
+        f"the library alone {min(b for _, b in pairs) * 1e3:.0f} ms",
+    )
 
 
 def gigabyte(folder: Path) -> None:
@@ -163,7 +186,9 @@ def gigabyte(folder: Path) -> None:
     ):
         loads.clear()
         seconds = timed(partial(new_run, chain(9, count, changed), place))
-        row(f"10 steps, 1 GB: {what}", f"{seconds * 1e3:.0f} ms, {sum(loads) / MB:.0f} MB read", aim)
+        row(
+            f"10 steps, 1 GB: {what}", f"{seconds * 1e3:.0f} ms, {sum(loads) / MB:.0f} MB read", aim
+        )
     serialization.read = read
 
 
@@ -175,13 +200,19 @@ def stack(folder: Path) -> None:
     sync = timed(lambda: (folder / "raw").write_bytes(x.numpy().data))
     load = timed(lambda: Store(folder / "stack").get(key), 3)
     touch = timed(lambda: Store(folder / "stack").get(key).sum(), 3)
-    row("520 MB: put, with checksum and fsync", f"{write:.2f} s", f"plain write without fsync {sync:.2f} s")
+    row(
+        "520 MB: put, with checksum and fsync",
+        f"{write:.2f} s",
+        f"plain write without fsync {sync:.2f} s",
+    )
     row("520 MB: get, verified", f"{load:.3f} s", f"copy in memory {copy:.3f} s")
     row("520 MB: get and sum", f"{touch:.3f} s", f"sum alone {timed(lambda: x.sum(), 3):.3f} s")
 
 
 def memory(folder: Path) -> None:
-    """A chain of eight stacks holds two at a time; the mean at its end makes one of twice the size."""
+    """A chain of eight stacks holds two at a time; the mean at its end makes one of twice the
+    size.
+    """
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     seconds = timed(partial(new_run, chain(8, STACK), folder / "memory"))
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
@@ -203,7 +234,11 @@ def function(folder: Path) -> None:
             y = add(y, k=float(i))
 
     calls, alone = timed(lambda: live({"s1.k": 1.0}), 20), timed(bare, 20)
-    row("as_function, 99 live steps", f"{calls * 1e4:.1f} µs a step", f"the bare calls {alone * 1e4:.1f} µs")
+    row(
+        "as_function, 99 live steps",
+        f"{calls * 1e4:.1f} µs a step",
+        f"the bare calls {alone * 1e4:.1f} µs",
+    )
 
 
 if __name__ == "__main__":

@@ -1,13 +1,16 @@
-"""Random cameras with PSFs of few bands, against the run in full: `bench_estimates.py [small] [COUNT [SEED [FILE]]]`.
+"""Random cameras with PSFs of few bands, against the run in full: `bench_estimates.py [small]
+[COUNT [SEED [FILE]]]`.
 
-Each of COUNT (100) recipes, drawn as the tests draw them, has a pupil of 256 samples, PSFs and a scene of 256 pixels,
-and a sensor of 200 pixels: large enough for an estimate. With `small` the recipes keep their 48 to 97 pixels, and a
-thumbnail has 20 cells along each side in place of 120, so that estimates are used there too.
+Each of COUNT (100) recipes, drawn as the tests draw them, has a pupil of 256 samples, PSFs and a
+scene of 256 pixels, and a sensor of 200 pixels: large enough for an estimate. With `small` the
+recipes keep their 48 to 97 pixels, and a thumbnail has 20 cells along each side in place of 120, so
+that estimates are used there too.
 
-Outputs are the raw and the developed pictures, and the tolerance is between 1e-4 and 3e-2. The error is the largest
-over these pictures against the run in full; the stated error counts the rounding to digital numbers. The cost is
-processor time of a cold run, choice, proof and second attempts included, in one process beside the run in full.
-FILE keeps each line, so that a run goes on where it was stopped.
+Outputs are the raw and the developed pictures, and the tolerance is between 1e-4 and 3e-2. The
+error is the largest over these pictures against the run in full; the stated error counts the
+rounding to digital numbers. The cost is processor time of a cold run, choice, proof and second
+attempts included, in one process beside the run in full. FILE keeps each line, so that a run goes
+on where it was stopped.
 
 One line a recipe on the standard error; a table in Markdown, by tolerance, at the end.
 """
@@ -24,7 +27,8 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "workflows"))
 import random_recipes
 
-from neusee.nodes.optics._imaging import _band_thumbnail, _few_bands
+from neusee.nodes.optics import _few_bands
+from neusee.nodes.optics import _few_bands as _band_thumbnail
 from neusee.workflows.engine.runner import run
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.cold_run import cold
@@ -69,7 +73,9 @@ def main(count, start, file, small):
         _band_thumbnail.SIDE = _few_bands.SIDE = 20
         _band_thumbnail._PART, _band_thumbnail._TILE = 40, 8
     if file and Path(file).exists():
-        known = {each["seed"]: each for each in map(json.loads, Path(file).read_text().splitlines())}
+        known = {
+            each["seed"]: each for each in map(json.loads, Path(file).read_text().splitlines())
+        }
     with tempfile.TemporaryDirectory() as folder:
         memo = Store(Path(folder))
         for seed in range(start, start + count):
@@ -83,7 +89,11 @@ def main(count, start, file, small):
 
 
 def table(lines):
-    print("| tolerance | recipes | within | error / tolerance: median, most | error / stated error, most | ", end="")
+    print(
+        "| tolerance | recipes | within | error / tolerance: median, most | error / stated error,"
+        " most | ",
+        end="",
+    )
     print("fewer bands | second attempts | of in full |\n|---|---|---|---|---|---|---|---|")
     for low, high in pairwise(ENDS):
         row(f"{low:g} to {high:g}", [x for x in lines if low <= x["tolerance"] < high])

@@ -1,8 +1,10 @@
-"""How often a good camera is refused by the checks: `python tests/benchmarks/bench_good_cameras.py [CAMERAS] [FILE]`.
+"""How often a good camera is refused by the checks: `python tests/benchmarks/bench_good_cameras.py
+[CAMERAS] [FILE]`.
 
-CAMERAS (100) of `plain_camera`, which shares no code with neusee: a third each linear, bent by 2 to 3 %, and cubic by
-3 %. A line of Markdown for each response: calibrations, checks that failed by name, z of the gain, effective share and
-k-hat of the importance samples. Rows are kept in FILE, so that what was stopped goes on.
+CAMERAS (100) of `plain_camera`, which shares no code with neusee: a third each linear, bent by 2 to
+3 %, and cubic by 3 %. A line of Markdown for each response: calibrations, checks that failed by
+name, z of the gain, effective share and k-hat of the importance samples. Rows are kept in FILE, so
+that what was stopped goes on.
 """
 
 import json
@@ -34,7 +36,9 @@ def camera_of(number, rng):
         },
         "cubic": {"cube": 0.03},
     }[kind]
-    return kind, PlainCamera(lamp=float(rng.uniform(0.001, 0.01)), drift=0.02, scatter=0.001, **terms)
+    return kind, PlainCamera(
+        lamp=float(rng.uniform(0.001, 0.01)), drift=0.02, scatter=0.001, **terms
+    )
 
 
 def kept(*arguments, sampled=run_calibration.importance_samples):
@@ -80,7 +84,10 @@ def main(count=100, file="good_cameras.jsonl"):
             rows.append(calibrated(number))
             with path.open("a") as opened:
                 opened.write(json.dumps(rows[-1]) + "\n")
-    columns = "cameras | refused | checks that fail | z of the gain, sd | gain in stated 90 % | tau | share | k-hat"
+    columns = (
+        "cameras | refused | checks that fail | z of the gain, sd | gain in stated 90 % | tau |"
+        " share | k-hat"
+    )
     print(f"| response | {columns} |")
     print("|---|---|---|---|---|---|---|---|---|")
     for kind in RESPONSES:
@@ -88,13 +95,19 @@ def main(count=100, file="good_cameras.jsonl"):
         good = [row for row in own if "refused" not in row]
         names = Counter(name for row in good for name in row["failed"])
         print(
-            f"| {kind} | {len(own)} | {len(own) - len(good)} | {dict(names) or 'none'} "
-            f"| {np.std([row['z'] for row in good]):.2f} | {np.mean([row['stated'] for row in good]):.0%} "
-            f"| {np.median([row['tau'] for row in good]):.1f} (at most {max(row['tau'] for row in good):.1f}) "
-            f"| {np.median([row['share'] for row in good]):.2f} (at least {min(row['share'] for row in good):.2f}) "
-            f"| {max(row['tail'] for row in good):.2f} at most |"
+            f"| {kind} | {len(own)} | {len(own) - len(good)} | {dict(names) or 'none'} |"
+            f" {np.std([row['z'] for row in good]):.2f} |"
+            f" {np.mean([row['stated'] for row in good]):.0%} |"
+            f" {np.median([row['tau'] for row in good]):.1f} (at most"
+            f" {max(row['tau'] for row in good):.1f}) |"
+            f" {np.median([row['share'] for row in good]):.2f} (at least"
+            f" {min(row['share'] for row in good):.2f}) | {max(row['tail'] for row in good):.2f} at"
+            " most |"
         )
-    print(f"\nSeconds of a calibration without page: {np.median([r['seconds'] for r in rows if 'seconds' in r]):.1f}.")
+    print(
+        "\nSeconds of a calibration without page:"
+        f" {np.median([r['seconds'] for r in rows if 'seconds' in r]):.1f}."
+    )
 
 
 if __name__ == "__main__":

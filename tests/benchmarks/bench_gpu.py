@@ -1,9 +1,12 @@
-"""What a GPU gives beside the processor of the same machine: `python tests/benchmarks/bench_gpu.py [FOLDER] [PART…]`.
+"""What a GPU gives beside the processor of the same machine: `python tests/benchmarks/bench_gpu.py
+[FOLDER] [PART…]`.
 
-Parts: `scan` (the selective scan beside mambapy and torch), `psf` (31 bands, 2160 x 2160 pupil, 2048 x 2048 pixels),
-`recipes` (whole recipes with a warm process and an empty cache, and the largest difference of their results), `train`
-(iterations of the recipe `train` in the size of the paper; FOLDER holds photographs). A part that fails says so and the
-next begins. Prints tables in Markdown. Times are medians of several turns, the GPU waited for.
+Parts: `scan` (the selective scan beside mambapy and torch), `psf` (31 bands, 2160 x 2160 pupil,
+        2048 x 2048 pixels),
+`recipes` (whole recipes with a warm process and an empty cache, and the largest difference of their
+results), `train` (iterations of the recipe `train` in the size of the paper; FOLDER holds
+photographs). A part that fails says so and the next begins. Prints tables in Markdown. Times are
+medians of several turns, the GPU waited for.
 """
 
 import os
@@ -28,7 +31,15 @@ from neusee.workflows.engine.runner import run  # noqa: E402
 
 DEVICE = "cuda:0"
 RECIPES = ("first_light", "six_lasers", "paper_table1")
-COMPARED = ("psf", "image", "lsr", "deconvolved", "restored", "developed_quality", "restored_quality")
+COMPARED = (
+    "psf",
+    "image",
+    "lsr",
+    "deconvolved",
+    "restored",
+    "developed_quality",
+    "restored_quality",
+)
 
 
 def seconds(work, repeats=5):
@@ -43,7 +54,7 @@ def seconds(work, repeats=5):
     return statistics.median(taken[1:]), (max(taken[1:]) - min(taken[1:])) / 2
 
 
-# --- the scan ---------------------------------------------------------------------------------------------------------
+# --- the scan -------------------------------------------------------------------------------------
 
 
 def mambapy(u, dt, A, B, C):
@@ -63,16 +74,23 @@ def scan():
         for name, backend in (("Triton", "triton"), ("torch", "torch"), ("mambapy", None)):
 
             def once(backend=backend, values=values):
-                y = mambapy(*values) if backend is None else selective_scan(*values, backend=backend)
+                y = (
+                    mambapy(*values)
+                    if backend is None
+                    else selective_scan(*values, backend=backend)
+                )
                 y.sum().backward()
                 return y
 
             middle, spread = seconds(once)
             error = float((once().detach() - truth).abs().max() / truth.abs().max())
-            print(f"| {length} | {name} | {1e3 * middle:.2f} ± {1e3 * spread:.2f} | {error:.0e} |", flush=True)
+            print(
+                f"| {length} | {name} | {1e3 * middle:.2f} ± {1e3 * spread:.2f} | {error:.0e} |",
+                flush=True,
+            )
 
 
-# --- point-spread functions -------------------------------------------------------------------------------------------
+# --- point-spread functions -----------------------------------------------------------------------
 
 
 def psf():
@@ -82,7 +100,9 @@ def psf():
         bands = spectra.bands(start=400e-9, stop=700e-9, count=31)
         stop = optics.stop(samples=2160, pitch=3.74e-6, diameter=8e-3)
         height = masks.half_rings(stop, waves=(60.0,))
-        pupil = optics.pupil(height, masks.material(bands, material="fused silica"), bands, stop, None)
+        pupil = optics.pupil(
+            height, masks.material(bands, material="fused silica"), bands, stop, None
+        )
         pupil = type(pupil)(*(x.to(device) if isinstance(x, torch.Tensor) else x for x in pupil))
 
         def once(pupil=pupil):
@@ -95,7 +115,7 @@ def psf():
     print(f"\nLargest difference over the peak: {float((one - other).abs().max() / one.max()):.1e}")
 
 
-# --- whole recipes ----------------------------------------------------------------------------------------------------
+# --- whole recipes --------------------------------------------------------------------------------
 
 
 def each_tensor(value):
@@ -110,7 +130,12 @@ def difference(one, other):
     """Largest difference of two results over the largest value of each tensor."""
     pairs = zip(each_tensor(one), each_tensor(other), strict=True)
     return max(
-        (float((a - b).abs().max() / b.abs().max().clamp_min(1e-30)) for a, b in pairs if a.numel()), default=0.0
+        (
+            float((a - b).abs().max() / b.abs().max().clamp_min(1e-30))
+            for a, b in pairs
+            if a.numel()
+        ),
+        default=0.0,
     )
 
 
@@ -127,23 +152,36 @@ def recipes():
                 found[device] = run(recipe, Store(Path(folder)), outputs, device=device).values
                 taken[device] = time.perf_counter() - began
         here, there = found["cpu"], found[DEVICE]
-        alike = {n: difference(there[n], here[n]) for n in outputs if n.startswith(("psf", "image", "lsr"))}
-        quality = [f"{float(x['restored_quality'].psnr):.2f}" for x in (here, there) if "restored_quality" in x]
+        alike = {
+            n: difference(there[n], here[n])
+            for n in outputs
+            if n.startswith(("psf", "image", "lsr"))
+        }
+        quality = [
+            f"{float(x['restored_quality'].psnr):.2f}"
+            for x in (here, there)
+            if "restored_quality" in x
+        ]
         worst = max(alike, key=alike.get)
         ratio = taken["cpu"] / taken[DEVICE]
         print(f"| {name} | {taken['cpu']:.1f} | {taken[DEVICE]:.1f} | {ratio:.1f} | {', '.join(quality)} | "
               f"{alike[worst]:.0e} ({worst}) |", flush=True)  # fmt: skip
 
 
-# --- a training in the size of the paper ------------------------------------------------------------------------------
+# --- a training in the size of the paper ----------------------------------------------------------
 
 
 def train():
     from neusee.workflows.api import verbs
 
     photographs = next((x for x in sys.argv[1:] if Path(x).is_dir()), None)
-    words = [f"train.photographs={photographs}", "train.held_out=null", "train.stages.1.iterations=4",
-             "train.stages.2.iterations=6", "train.pool=8"]  # fmt: skip
+    words = [
+        f"train.photographs={photographs}",
+        "train.held_out=null",
+        "train.stages.1.iterations=4",
+        "train.stages.2.iterations=6",
+        "train.pool=8",
+    ]
     recipe = load("train", words)
     marks = []
     torch.cuda.reset_peak_memory_stats()

@@ -1,8 +1,10 @@
-"""How often intervals hold the truth for few photographs: `python tests/benchmarks/bench_intervals.py 1000 5 8 20`.
+"""How often intervals hold the truth for few photographs: `python
+tests/benchmarks/bench_intervals.py 1000 5 8 20`.
 
-Samples of known mean from four laws, and differences of two methods with skewed errors on the same photographs. Beside
-`paired_intervals.less`, of `neusee evaluate`, stand the bootstrap-t alone and Student's t. The share of 1000 samples
-whose 95 % interval holds the truth has a standard error of 0.7 %; the median width stands in brackets.
+Samples of known mean from four laws, and differences of two methods with skewed errors on the same
+photographs. Beside `paired_intervals.less`, of `neusee evaluate`, stand the bootstrap-t alone and
+Student's t. The share of 1000 samples whose 95 % interval holds the truth has a standard error of
+0.7 %; the median width stands in brackets.
 """
 
 import sys
@@ -10,7 +12,7 @@ import sys
 import numpy as np
 from scipy.stats import t as student
 
-from neusee.workflows.evaluation import paired_intervals
+from neusee.workflows.evaluation import confidence_intervals as paired_intervals
 
 TIMES, *COUNTS = [int(word) for word in sys.argv[1:]] or [1000, 5, 8, 20]
 DRAWS = 2000
@@ -31,7 +33,9 @@ LAWS = {
 
 
 def measure(draw, truth, n, few):
-    """Share that holds the truth and median width, with the floor of Student's t below ``few`` photographs."""
+    """Share that holds the truth and median width, with the floor of Student's t below ``few``
+    photographs.
+    """
     rng, held, width = np.random.default_rng(n), [], []
     paired_intervals._SMALL = few
     for k in range(TIMES):
@@ -58,8 +62,15 @@ def main():
     print("| photographs | law | neusee | bootstrap-t alone | Student's t |\n|---|---|---|---|---|")
     for n in COUNTS:
         for name, (draw, truth) in LAWS.items():
-            rows = (measure(draw, truth, n, small), measure(draw, truth, n, 0), of_student(draw, truth, n))
-            print(f"| {n} | {name} | " + " | ".join(f"{h:.1%} ({w:.2f})" for h, w in rows) + " |", flush=True)
+            rows = (
+                measure(draw, truth, n, small),
+                measure(draw, truth, n, 0),
+                of_student(draw, truth, n),
+            )
+            print(
+                f"| {n} | {name} | " + " | ".join(f"{h:.1%} ({w:.2f})" for h, w in rows) + " |",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

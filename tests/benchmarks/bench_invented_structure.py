@@ -3,11 +3,12 @@
     python tests/benchmarks/bench_invented_structure.py results.jsonl --seeds 0 4
     python tests/benchmarks/bench_invented_structure.py results.jsonl --report
 
-Frames as in `bench_restored_frames.py`: a camera in NumPy that the recipe describes wrongly, restored by the command.
-The scene has eight places on a shaded wall: a word of five letters, a face 20 pixels wide, or nothing. A reader looks
-at each place for each of 24 words and 6 faces: it takes the template of the highest correlation within three pixels
-of shift, if this is at least 0.5. Counted are the words and faces that are read rightly, those read as another one,
-and the *empty* places in which something is read. Beside them stands the share of pixels of empty places, saturated
+Frames as in `bench_restored_frames.py`: a camera in NumPy that the recipe describes wrongly,
+restored by the command. The scene has eight places on a shaded wall: a word of five letters, a face
+20 pixels wide, or nothing. A reader looks at each place for each of 24 words and 6 faces: it takes
+the template of the highest correlation within three pixels of shift, if this is at least 0.5.
+Counted are the words and faces that are read rightly, those read as another one, and the *empty*
+places in which something is read. Beside them stands the share of pixels of empty places, saturated
 ones apart, whose error is larger than the 90 % interval that the program states.
 """
 
@@ -28,7 +29,7 @@ from safetensors.numpy import load_file
 from scipy.ndimage import uniform_filter
 
 from neusee.workflows.cli import app
-from neusee.workflows.report.figures.frame_and_interval import half_width
+from neusee.workflows.report.figures.camera_pictures import half_width
 from tests.benchmarks import bench_restored_frames as frames
 from tests.nodes.restore.lasers import own_camera as own
 
@@ -60,10 +61,16 @@ def templates():
 
 
 def drawn(kind, side, rng):
-    """The scene in linear colours, and in `drawn.what` the number of the template in each place, or None."""
+    """The scene in linear colours, and in `drawn.what` the number of the template in each place,
+    or None.
+    """
     y, x = np.mgrid[:side, :side] / side
-    wall = 0.3 + 0.1 * np.sin(2 * np.pi * (x * rng.uniform(0.5, 1.5) + rng.random())) * np.cos(2 * np.pi * y)
-    drawn.what = [int(rng.integers(len(templates()))) if rng.random() < 0.5 else None for _ in PLACES]
+    wall = 0.3 + 0.1 * np.sin(2 * np.pi * (x * rng.uniform(0.5, 1.5) + rng.random())) * np.cos(
+        2 * np.pi * y
+    )
+    drawn.what = [
+        int(rng.integers(len(templates()))) if rng.random() < 0.5 else None for _ in PLACES
+    ]
     rim = (side - frames.SIDE) // 2
     for (down, right), what in zip(PLACES, drawn.what, strict=True):
         if what is not None:
@@ -73,24 +80,44 @@ def drawn(kind, side, rng):
 
 
 def restored(numbers, mask, method, folder):
-    """The restored picture (3, y, x) in linear sRGB, its standard deviation, and the saturated pixels (y, x)."""
+    """The restored picture (3, y, x) in linear sRGB, its standard deviation, and the saturated
+    pixels (y, x).
+    """
     np.save(folder / "frame.npy", numbers)
     option = "search" if method == "search" else "wiener_blind"
     outputs = ["restored", "restored_spread", "developed[mask]", "clipped[mask]"]
     told = io.StringIO()
-    with tempfile.TemporaryDirectory() as out, contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+    with (
+        tempfile.TemporaryDirectory() as out,
+        contextlib.redirect_stdout(told),
+        contextlib.redirect_stderr(told),
+    ):
         try:
             app.main(
-                ["restore", str(folder / "frame.npy"), "--camera", str(folder / "camera.yaml"), "--mask",
-                 str(folder / f"{mask}.npy"), f"restore={option}", f"frame.draws={DRAWS}",
-                 f"outputs={json.dumps(outputs)}", "--out", out]
-            )  # fmt: skip
+                [
+                    "restore",
+                    str(folder / "frame.npy"),
+                    "--camera",
+                    str(folder / "camera.yaml"),
+                    "--mask",
+                    str(folder / f"{mask}.npy"),
+                    f"restore={option}",
+                    f"frame.draws={DRAWS}",
+                    f"outputs={json.dumps(outputs)}",
+                    "--out",
+                    out,
+                ]
+            )
         except SystemExit as end:
             if end.code not in (0, 3):
                 raise RuntimeError(told.getvalue()) from None
         results = load_file(str(next(Path(out).glob("*/data/outputs.safetensors"))))
     picture = results["developed[mask]" if method == "nothing" else "restored"].astype(float)
-    return picture, results["restored_spread"].astype(float), results["clipped[mask]"].astype(bool).any(0)
+    return (
+        picture,
+        results["restored_spread"].astype(float),
+        results["clipped[mask]"].astype(bool).any(0),
+    )
 
 
 def read(picture):
@@ -104,9 +131,13 @@ def read(picture):
             inner = inner - inner.mean()
             for y in range(2 * NEAR + 1):
                 for x in range(2 * NEAR + 1):
-                    part = detail[down + y : down + y + inner.shape[0], right + x : right + x + inner.shape[1]]
+                    part = detail[
+                        down + y : down + y + inner.shape[0], right + x : right + x + inner.shape[1]
+                    ]
                     part = part - part.mean()
-                    alike = abs((part * inner).sum()) / np.sqrt((part**2).sum() * (inner**2).sum() + 1e-12)
+                    alike = abs((part * inner).sum()) / np.sqrt(
+                        (part**2).sum() * (inner**2).sum() + 1e-12
+                    )
                     best = max(best, (float(alike), number), key=lambda b: b[0])
         found.append(best[1])
     return found
@@ -119,7 +150,9 @@ def one(seed, mask, strength, folder):
         picture, spread, clipped = restored(numbers, mask, method, folder)
         gains = np.median(truth, (1, 2)) / np.maximum(np.median(picture, (1, 2)), 1e-9)
         seen = read(frames.encoded(picture * gains[:, None, None]).mean(0))
-        outside = (np.abs(picture - truth / gains[:, None, None]) > half_width(spread, DRAWS)).mean(0)
+        outside = (np.abs(picture - truth / gains[:, None, None]) > half_width(spread, DRAWS)).mean(
+            0
+        )
         empty = np.zeros_like(clipped)
         for (down, right), item in zip(PLACES, what, strict=True):
             if item is None:
@@ -135,21 +168,36 @@ def one(seed, mask, strength, folder):
 
 
 def report(rows):
-    print("| mask | strength | restored by | read rightly | read as another | empty, yet read | outside its interval |")
+    print(
+        "| mask | strength | restored by | read rightly | read as another | empty, yet read |"
+        " outside its interval |"
+    )
     print("|---|---|---|---|---|---|---|")
     for mask in frames.MASKS:
         for strength in sorted({r["strength"] for r in rows}):
             for method in METHODS:
-                some = [r for r in rows if (r["mask"], r["strength"], r["method"]) == (mask, strength, method)]
+                some = [
+                    r
+                    for r in rows
+                    if (r["mask"], r["strength"], r["method"]) == (mask, strength, method)
+                ]
                 if some:
-                    total = {k: sum(r[k] for r in some) for k in ("right", "wrong", "full", "empty", "invented")}
-                    share = "-" if method == "nothing" else f"{np.mean([r['outside'] for r in some]):.0%}"
+                    total = {
+                        k: sum(r[k] for r in some)
+                        for k in ("right", "wrong", "full", "empty", "invented")
+                    }
+                    share = (
+                        "-"
+                        if method == "nothing"
+                        else f"{np.mean([r['outside'] for r in some]):.0%}"
+                    )
                     read_rightly, empty = (
                         f"{total['right']} of {total['full']}",
                         f"{total['invented']} of {total['empty']}",
                     )
                     print(
-                        f"| {mask} | {strength:g} | {method} | {read_rightly} | {total['wrong']} | {empty} | {share} |"
+                        f"| {mask} | {strength:g} | {method} | {read_rightly} | {total['wrong']} |"
+                        f" {empty} | {share} |"
                     )
 
 

@@ -1,19 +1,21 @@
 """How often lasers are found in one frame, how exactly, and how often no laser is taken for one.
 
     python tests/benchmarks/bench_laser_search.py results.jsonl --seeds 1000 40
-    python tests/benchmarks/bench_laser_search.py results.jsonl --seeds 1000 50 --only empty --side 64
-    python tests/benchmarks/bench_laser_search.py results.jsonl --seeds 1000 40 --only lasers --wrong
-    python tests/benchmarks/bench_laser_search.py results.jsonl --report
+    python tests/benchmarks/bench_laser_search.py results.jsonl --seeds 1000 50 --only empty --side
+    64 python tests/benchmarks/bench_laser_search.py results.jsonl --seeds 1000 40 --only lasers
+    --wrong python tests/benchmarks/bench_laser_search.py results.jsonl --report
 
-The frames come from `tests/nodes/restore/lasers/own_camera.py`, a camera in NumPy alone. Each seed makes, for each
-mask, two frames without a laser, one of them with lamps, one with a laser of 1000 or more, and one with a weaker laser.
-``--only`` keeps the frames without a laser, those with one, or those with one of 1000 or more. With ``--wrong`` the
-camera has the errors of `bench_restored_frames.py`, of which the search is not told: defocus, half a pixel of tilt,
-grains of dirt, another illuminant. The tilt moves the spot that counts as true, because no frame can tell it from a
-direction. The strength that counts as true is that of the light at the aperture, as in a recipe: grains of dirt absorb
-part of it, which `own_camera` makes up for, so that its light counts over the share of the pupil that is open. A frame
-that stands in the file is not computed again, so that a run that was stopped continues. The patterns on the axis, which
-depend on the mask alone, are computed once. Intervals of rates are of 90 % (Clopper and Pearson).
+The frames come from `tests/nodes/restore/lasers/own_camera.py`, a camera in NumPy alone. Each seed
+makes, for each mask, two frames without a laser, one of them with lamps, one with a laser of 1000
+or more, and one with a weaker laser. ``--only`` keeps the frames without a laser, those with one,
+or those with one of 1000 or more. With ``--wrong`` the camera has the errors of
+`bench_restored_frames.py`, of which the search is not told: defocus, half a pixel of tilt, grains
+of dirt, another illuminant. The tilt moves the spot that counts as true, because no frame can tell
+it from a direction. The strength that counts as true is that of the light at the aperture, as in a
+recipe: grains of dirt absorb part of it, which `own_camera` makes up for, so that its light counts
+over the share of the pupil that is open. A frame that stands in the file is not computed again, so
+that a run that was stopped continues. The patterns on the axis, which depend on the mask alone, are
+computed once. Intervals of rates are of 90 % (Clopper and Pearson).
 """
 
 import argparse
@@ -40,7 +42,12 @@ from tests.nodes.restore.lasers.as_inputs import found_in, kept_templates  # noq
 MASKS = ("plain", "half_ring", "cubic")
 STRONG, WEAK = (1e3, 1e4, 1e5, 1e6), (1.0, 10.0, 100.0)
 KINDS = ("sample", "leaves", "noise")
-KEPT = {None: lambda s: True, "empty": lambda s: s == 0, "lasers": lambda s: s > 0, "strong": lambda s: s >= STRONG[0]}
+KEPT = {
+    None: lambda s: True,
+    "empty": lambda s: s == 0,
+    "lasers": lambda s: s > 0,
+    "strong": lambda s: s >= STRONG[0],
+}
 
 
 def cases(seed, masks=MASKS):
@@ -53,7 +60,9 @@ def cases(seed, masks=MASKS):
 
 
 def taken(seed, name, mask, strength, lamps, side, wrong):
-    """A frame, what it shows, the spot in pixels from the middle, its wavelength, and its electrons at the aperture."""
+    """A frame, what it shows, the spot in pixels from the middle, its wavelength, and its
+    electrons at the aperture.
+    """
     rng = np.random.default_rng([seed, *name.encode()])
     kind = KINDS[int(rng.integers(len(KINDS)))]
     spot, wavelength = tuple(rng.uniform(-0.35, 0.35, 2) * side), rng.uniform(420e-9, 670e-9)
@@ -99,7 +108,9 @@ def run(path, first, count, side, only, wrong):
             for name, mask, strength, lamps in cases(seed, wrong_camera.MASKS if wrong else MASKS):
                 if (seed, name, side, camera) in done or not KEPT[only](strength):
                     continue
-                with patch.object(_find_lasers, "line_templates", lambda *_, mask=mask: keep(mask, side)):
+                with patch.object(
+                    _find_lasers, "line_templates", lambda *_, mask=mask: keep(mask, side)
+                ):
                     each = row(seed, name, mask, strength, lamps, side, wrong)
                 with path.open("a") as file:
                     file.write(json.dumps(each) + "\n")
@@ -116,7 +127,10 @@ def inside(value, ends):
 def rate(count, of):
     """A share with its interval of 90 %, in percent."""
     low, high = beta.ppf([0.05, 0.95], [count, count + 1], [of - count + 1, of - count])
-    return f"{count:3} of {of:3}, {0 if count == 0 else 100 * low:3.0f} to {100 if count == of else 100 * high:.1f} %"
+    return (
+        f"{count:3} of {of:3}, {0 if count == 0 else 100 * low:3.0f} to"
+        f" {100 if count == of else 100 * high:.1f} %"
+    )
 
 
 def report(all_rows):
@@ -128,23 +142,34 @@ def report(all_rows):
         print(f"false alarms {'with' if lamps else 'without'} lamps: {alarms}")
     print(f"false alarms: {rate(sum(r['number'] > 0 for r in free), len(free))}")
     seconds = np.array([r["seconds"] for r in all_rows])
-    print(f"seconds of a processor a frame: {np.median(seconds):.1f} in the median, {seconds.max():.1f} at most")
+    print(
+        f"seconds of a processor a frame: {np.median(seconds):.1f} in the median,"
+        f" {seconds.max():.1f} at most"
+    )
     print("strength: found where it is (0.2 px and 5 nm), with the interval of 90 % of that rate")
     for strength in (*WEAK, *STRONG):
         some = [r for r in all_rows if r["strength"] == strength]
         if some:
             print(f"  {strength:7g}: {rate(sum(map(right, some)), len(some))}")
     print(
-        "mask, strength: frames, found, identifiable, place within 0.2 px, within 5 nm, coverage of place, nm, channels"
+        "mask, strength: frames, found, identifiable, place within 0.2 px, within 5 nm, coverage of"
+        " place, nm, channels"
     )
     groups = {(r["mask"], r["strength"]) for r in all_rows if r["strength"]}
     for mask, strength in [*sorted(groups), ("all", 1e3), ("all", 0.0)]:
         some = [r for r in all_rows if (r["mask"], r["strength"]) == (mask, strength)]
         if mask == "all":
-            some = [r for r in all_rows if (r["strength"] >= 1e3 if strength else 0 < r["strength"] < 1e3)]
+            some = [
+                r
+                for r in all_rows
+                if (r["strength"] >= 1e3 if strength else 0 < r["strength"] < 1e3)
+            ]
         print(f"{mask:9} {strength:7g}: {line(some)}")
     extra = [r for r in all_rows if r["strength"] and r["number"] > 1]
-    print(f"more than one laser found where there is one: {len(extra)} of {sum(r['strength'] > 0 for r in all_rows)}")
+    print(
+        f"more than one laser found where there is one: {len(extra)} of"
+        f" {sum(r['strength'] > 0 for r in all_rows)}"
+    )
 
 
 def right(r):
@@ -161,9 +186,13 @@ def line(some):
     sure = [r for r in seen if all(r["identifiable"])]
     place = [inside(a, e) for r in sure for a, e in zip(r["spot"], r["spot_ends"], strict=True)]
     colour = [inside(r["nm"], r["nm_ends"]) for r in sure]
-    amounts = [inside(a, e) for r in sure for a, e in zip(r["channels"], r["channel_ends"], strict=True)]
+    amounts = [
+        inside(a, e) for r in sure for a, e in zip(r["channels"], r["channel_ends"], strict=True)
+    ]
     shares = [f"{np.mean(x):.2f} of {len(x)}" if x else "-" for x in (place, colour, amounts)]
-    return f"{len(some):3} {len(seen):3} {len(sure):3} {len(near):3} {len(hue):3}  {'  '.join(shares)}"
+    return (
+        f"{len(some):3} {len(seen):3} {len(sure):3} {len(near):3} {len(hue):3}  {'  '.join(shares)}"
+    )
 
 
 if __name__ == "__main__":
@@ -172,7 +201,9 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "COUNT"))
     parser.add_argument("--side", type=int, default=128, help="pixels a side")
     parser.add_argument("--only", choices=["empty", "lasers", "strong"])
-    parser.add_argument("--wrong", action="store_true", help="a camera with errors that the search is not told")
+    parser.add_argument(
+        "--wrong", action="store_true", help="a camera with errors that the search is not told"
+    )
     parser.add_argument("--report", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)

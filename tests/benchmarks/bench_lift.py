@@ -1,10 +1,12 @@
-"""Lifts from RGB to spectra, side by side: a measured scene, and drawn pictures of reflectances that none has seen.
+"""Lifts from RGB to spectra, side by side: a measured scene, and drawn pictures of reflectances
+that none has seen.
 
     python tests/benchmarks/bench_lift.py WEIGHTS CUBE.mat [REFLECTANCES ...]
 
-WEIGHTS is what `neusee train train_lift` leaves (mst_plus_plus.safetensors, or state.pt on the way); CUBE a scene of 31
-bands from 400 to 700 nm, such as CAVE's; REFLECTANCES files that `spectra.reflectances` reads, of which 32 pictures of
-64 x 64 are drawn, each leaf one measured spectrum. All see the noiseless picture that `spectra.render` gives.
+WEIGHTS is what `neusee train train_lift` leaves (mst_plus_plus.safetensors, or state.pt on the
+way); CUBE a scene of 31 bands from 400 to 700 nm, such as CAVE's; REFLECTANCES files that
+`spectra.reflectances` reads, of which 32 pictures of 64 x 64 are drawn, each leaf one measured
+spectrum. All see the noiseless picture that `spectra.render` gives.
 """
 
 from __future__ import annotations
@@ -36,7 +38,9 @@ Lift = Callable[[Tensor], Tensor]
 
 
 def lifts(weights: Path) -> dict[str, Lift]:
-    """The three lifts of a recipe, MST++ with these weights, and the estimate that its training starts at."""
+    """The three lifts of a recipe, MST++ with these weights, and the estimate that its training
+    starts at.
+    """
     rng, linear = torch.Generator(), lift_matrix(reflectances(SCENE), SCENE.centres)
     return {
         "lmmse": lambda rgb: lift_lmmse(rgb, SCENE),
@@ -58,7 +62,9 @@ def weights_in(path: Path) -> Path:
 
 
 def drawn(files: tuple[Path, ...]) -> list[Tensor]:
-    """Pictures of these reflectances as they were measured: no mixtures, no blacks, no other light."""
+    """Pictures of these reflectances as they were measured: no mixtures, no blacks, no other
+    light.
+    """
     known = reflectances(SCENE, sets=(), files=files)
     cubes = []
     for number in range(PICTURES):
@@ -78,14 +84,20 @@ def row(lift: Lift, cubes: list[Tensor]) -> str:
         found = lift(rgb).double()
         off, lit = found - truth, truth >= LEAST
         square, count = square + float(off.square().sum()), count + truth.numel()
-        relative, lit_count = relative + float((off.abs()[lit] / truth[lit]).sum()), lit_count + int(lit.sum())
+        relative, lit_count = (
+            relative + float((off.abs()[lit] / truth[lit]).sum()),
+            lit_count + int(lit.sum()),
+        )
         cosine = (found * truth).sum(0) / (found.norm(dim=0) * truth.norm(dim=0)).clamp_min(1e-12)
         angle += float(cosine.clamp(-1, 1).acos().rad2deg().mean()) / len(cubes)
         colour += float((render(found, SCENE) - rgb).square().mean().sqrt()) / len(cubes)
     rms = (square / count) ** 0.5
     psnr = -20 * torch.tensor(rms).log10().item()
     seconds = time.perf_counter() - began
-    return f"{psnr:.2f} | {rms:.4f} | {relative / lit_count:.4f} | {angle:.2f} | {colour:.1e} | {seconds:.2f} |"
+    return (
+        f"{psnr:.2f} | {rms:.4f} | {relative / lit_count:.4f} | {angle:.2f} | {colour:.1e} |"
+        f" {seconds:.2f} |"
+    )
 
 
 def main(weights: Path, cube: Path, files: tuple[Path, ...]) -> None:

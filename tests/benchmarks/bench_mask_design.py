@@ -1,13 +1,16 @@
-"""Masks designed at equal peak of the laser, against the best stop with a filter: `bench_mask_design.py FILE`.
+"""Masks designed at equal peak of the laser, against the best stop with a filter:
+`bench_mask_design.py FILE`.
 
     nice -n 10 python tests/benchmarks/bench_mask_design.py front.json 200 40    # steps, and minutes at most
 
-Designs for each peak limit L, light of the scene and start: the shipped masks (each as free pixels, from that of twelve
-strengths of the shape with the least loss), five random maps, a sum of Legendre products, and a polynomial along one
-line. Each is designed with a grey filter, with a learnt stop and a filter, and alone (its own peak is held at L by a
-penalty). Adam on `losses.filtered_error`; defocus, wavelength and direction are drawn at each step. Each finished mask
-is judged by `judged_masks.py`, which shares nothing with the loss, in 16 states that no step has seen. FILE keeps each
-finished design, so that a stopped run goes on; tables in Markdown are printed from what it holds.
+Designs for each peak limit L, light of the scene and start: the shipped masks (each as free pixels,
+from that of twelve strengths of the shape with the least loss), five random maps, a sum of Legendre
+products, and a polynomial along one line. Each is designed with a grey filter, with a learnt stop
+and a filter, and alone (its own peak is held at L by a penalty). Adam on `losses.filtered_error`;
+defocus, wavelength and direction are drawn at each step. Each finished mask is judged by
+`judged_masks.py`, which shares nothing with the loss, in 16 states that no step has seen. FILE
+keeps each finished design, so that a stopped run goes on; tables in Markdown are printed from what
+it holds.
 """
 
 import json
@@ -31,8 +34,11 @@ STRENGTHS = (0.15, 0.25, 0.4, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0, 2.5, 3.2, 4.0)
 DIAMETERS = (0.95, 0.7, 0.5, 0.35)
 DECIBELS = 10 / math.log(10)
 ONE = torch.ones(1, dtype=torch.float64)
-STOP = Stop(torch.tensor(judge.SAMPLES), torch.tensor(judge.DIAMETER / judge.SAMPLES, dtype=torch.float64),
-            torch.tensor(judge.DIAMETER, dtype=torch.float64))  # fmt: skip
+STOP = Stop(
+    torch.tensor(judge.SAMPLES),
+    torch.tensor(judge.DIAMETER / judge.SAMPLES, dtype=torch.float64),
+    torch.tensor(judge.DIAMETER, dtype=torch.float64),
+)
 CLEAR = torch.from_numpy(judge.CLEAR).float()
 AT = (torch.arange(judge.SAMPLES) - (judge.SAMPLES - 1) / 2) / (judge.SAMPLES / 2)
 V, U = AT[:, None].expand(judge.SAMPLES, -1), AT[None].expand(judge.SAMPLES, -1)
@@ -85,7 +91,9 @@ def strongest(name, strength):
     rng = torch.Generator().manual_seed(int(seed or 0))
     if kind == "chance":
         rough = torch.randn(1, 1, 14, 14, generator=rng)
-        return Free(strength * nn.functional.interpolate(rough, judge.SAMPLES, mode="bicubic")[0, 0])
+        return Free(
+            strength * nn.functional.interpolate(rough, judge.SAMPLES, mode="bicubic")[0, 0]
+        )
     how = (strength, judge.CENTRE, "fused silica", rng)
     return Family(Polynomials(8, *how) if kind == "polynomial" else Streak(12, *how))
 
@@ -121,7 +129,9 @@ def loss_of(turns, amplitude, state, limit, light, way):
     if way != "alone":
         return losses.filtered_error(psf, ONE, ONE[None], bands, **how, limit=limit, power=64)
     peak = losses.suppression_loss(psf, power=64.0, log=True)
-    return losses.filtered_error(psf, ONE, ONE[None], bands, **how) + 3 * (peak - math.log(0.9 * limit)).clamp_min(0)
+    return losses.filtered_error(psf, ONE, ONE[None], bands, **how) + 3 * (
+        peak - math.log(0.9 * limit)
+    ).clamp_min(0)
 
 
 def designed(limit, light, name, way, steps):
@@ -131,8 +141,14 @@ def designed(limit, light, name, way, steps):
         masks, rounds = [strongest(name, strength) for strength in STRENGTHS], [None]
         if way == "stop":
             rounds = [LearntStop(width) for width in DIAMETERS]
-        choices = [(mask, one, CLEAR if one is None else CLEAR * one(STOP)) for mask in masks for one in rounds]
-        mask, round_one, _ = min(choices, key=lambda c: float(loss_of(c[0](), c[2], nominal, limit, light, way)))
+        choices = [
+            (mask, one, CLEAR if one is None else CLEAR * one(STOP))
+            for mask in masks
+            for one in rounds
+        ]
+        mask, round_one, _ = min(
+            choices, key=lambda c: float(loss_of(c[0](), c[2], nominal, limit, light, way))
+        )
     groups = [{"params": mask.parameters(), "lr": mask.rate}]
     groups += [{"params": round_one.parameters(), "lr": 0.1}] if round_one else []
     adam = torch.optim.Adam(groups)
@@ -146,7 +162,11 @@ def designed(limit, light, name, way, steps):
     with torch.no_grad():
         amplitude = CLEAR if round_one is None else CLEAR * round_one(STOP)
         loss = float(loss_of(mask(), amplitude, nominal, limit, light, way))
-        return mask().double().numpy(), 1.0 if round_one is None else float(round_one.diameter()), loss
+        return (
+            mask().double().numpy(),
+            1.0 if round_one is None else float(round_one.diameter()),
+            loss,
+        )
 
 
 def point(limit, light, name, way, steps, known):
@@ -159,9 +179,19 @@ def point(limit, light, name, way, steps, known):
     if (limit, light) not in known:
         known[limit, light] = judge.rival(limit, light)
     best, stop, passed = known[limit, light]
-    return {"gain": DECIBELS * math.log(best / error), "error": error, "rival": best, "rival stop": stop,
-            "rival filter": passed, "lsr": front.lsr, "filter": filtered, "stop": width, "loss": loss,
-            "loss as judged": loss_as_judged(turns, width, limit, light, front.lsr), "seconds": spent}  # fmt: skip
+    return {
+        "gain": DECIBELS * math.log(best / error),
+        "error": error,
+        "rival": best,
+        "rival stop": stop,
+        "rival filter": passed,
+        "lsr": front.lsr,
+        "filter": filtered,
+        "stop": width,
+        "loss": loss,
+        "loss as judged": loss_as_judged(turns, width, limit, light, front.lsr),
+        "seconds": spent,
+    }
 
 
 def loss_as_judged(turns, width, limit, light, worst):
@@ -173,23 +203,47 @@ def loss_as_judged(turns, width, limit, light, worst):
         how = {"read_noise": judge.READ, "limit": min(1.0, min(1.0, limit / worst) * own)}
         passed = float(amplitude.square().sum() / CLEAR.square().sum())
         each.append(
-            math.exp(losses.filtered_error(psf, ONE, ONE[None], bands, light=light, transmittance=passed, **how))
+            math.exp(
+                losses.filtered_error(
+                    psf, ONE, ONE[None], bands, light=light, transmittance=passed, **how
+                )
+            )
         )
     return sum(each) / len(each)
 
 
 def order():
-    """The designs, the more telling ones first: those with a filter, then some of the other ways, then the rest."""
-    each = [(way, name, limit, light) for way in WAYS for name in STARTS for limit in LIMITS for light in LIGHTS]
-    first = [key for key in each if key[0] == "filter" and (key[1] not in CHANCE[2:] or key[3] in TELLING_LIGHTS)]
-    telling = [(way, name, limit, light) for limit in (1e-2, 3e-2, 1e-3) for name in TELLING for way in WAYS[1:]
-               for light in TELLING_LIGHTS]  # fmt: skip
+    """The designs, the more telling ones first: those with a filter, then some of the other
+    ways, then the rest.
+    """
+    each = [
+        (way, name, limit, light)
+        for way in WAYS
+        for name in STARTS
+        for limit in LIMITS
+        for light in LIGHTS
+    ]
+    first = [
+        key
+        for key in each
+        if key[0] == "filter" and (key[1] not in CHANCE[2:] or key[3] in TELLING_LIGHTS)
+    ]
+    telling = [
+        (way, name, limit, light)
+        for limit in (1e-2, 3e-2, 1e-3)
+        for name in TELLING
+        for way in WAYS[1:]
+        for light in TELLING_LIGHTS
+    ]
     return list(dict.fromkeys([*first, *telling, *each]))
 
 
 def main(file, steps, minutes):
     found, begun = json.loads(file.read_text()) if file.exists() else {}, time.time()
-    known = {key[2:]: (one["rival"], one["rival stop"], one["rival filter"]) for key, one in points(found).items()}
+    known = {
+        key[2:]: (one["rival"], one["rival stop"], one["rival filter"])
+        for key, one in points(found).items()
+    }
     for way, name, limit, light in order():
         key = f"{way}, {name}, {limit:g}, {light:g}, {steps}"
         if key in found:

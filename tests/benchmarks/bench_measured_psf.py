@@ -1,11 +1,13 @@
-"""What a measured PSF adds to the search for lasers, where the lens is not in the focus that the recipe says.
+"""What a measured PSF adds to the search for lasers, where the lens is not in the focus that the
+recipe says.
 
     python tests/benchmarks/bench_measured_psf.py --waves 0.4 --seeds 10 3
 
-The camera is that of `bench_restored_frames.py` behind a plain lens, with grains of dirt, half a pixel of tilt and
-``waves`` of defocus at the rim, of which the recipe knows nothing. Its PSF comes from six frames of a white point, half
-of them thirty times as long, and four dark ones. Each frame is restored by the filter that knows of no laser and by
-the search, each with the PSF of the recipe and with the measured one. The score is that of `bench_restored_frames.py`.
+The camera is that of `bench_restored_frames.py` behind a plain lens, with grains of dirt, half a
+pixel of tilt and ``waves`` of defocus at the rim, of which the recipe knows nothing. Its PSF comes
+from six frames of a white point, half of them thirty times as long, and four dark ones. Each frame
+is restored by the filter that knows of no laser and by the search, each with the PSF of the recipe
+and with the measured one. The score is that of `bench_restored_frames.py`.
 """
 
 import argparse
@@ -28,9 +30,11 @@ from tests.nodes.restore.lasers import own_camera as own
 MASK, WINDOW = "plain", 33
 KINDS = ("sample", "leaves", "noise")
 METHODS = {
-    "blind": ["restore=wiener_blind"], "search": ["restore=search"], "psf": ["--psf"],
+    "blind": ["restore=wiener_blind"],
+    "search": ["restore=search"],
+    "psf": ["--psf"],
     "psf, search": ["--psf", "restore=search"],
-}  # fmt: skip
+}
 
 
 def smaller(side, waves):
@@ -47,7 +51,9 @@ def smaller(side, waves):
 
 
 def write_points(folder, seed, count=6, dark=4):
-    """Write frames of a white point through the true pupil, at parts of a pixel, and dark frames."""
+    """Write frames of a white point through the true pupil, at parts of a pixel, and dark
+    frames.
+    """
     folder.mkdir()
     rng, shape = np.random.default_rng([seed, 5]), (frames.SIDE, frames.SIDE)
     weight = own.band_response() * own.daylight(own.BANDS) * own.BANDS
@@ -56,7 +62,11 @@ def write_points(folder, seed, count=6, dark=4):
             spot = rng.uniform(-0.5, 0.5, 2)
             psf = np.stack([own.pattern(f"{MASK}~{seed}", w, spot, shape) for w in own.BANDS])
             light = np.tensordot(weight, psf, 1)
-            save(folder / f"p{number}.npy", 0.6 * own.WELL * light / light.max() * (30 if number % 2 else 1), rng)
+            save(
+                folder / f"p{number}.npy",
+                0.6 * own.WELL * light / light.max() * (30 if number % 2 else 1),
+                rng,
+            )
     for number in range(dark):
         save(folder / f"dark{number}.npy", np.zeros((3, *shape)), rng)
 
@@ -69,12 +79,26 @@ def save(file, light, rng):
 def restored(folder, words, outputs):
     """The outputs of `neusee restore` for the frame of a folder."""
     told = io.StringIO()
-    with tempfile.TemporaryDirectory() as out, contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+    with (
+        tempfile.TemporaryDirectory() as out,
+        contextlib.redirect_stdout(told),
+        contextlib.redirect_stderr(told),
+    ):
         try:
             app.main(
-                ["restore", str(folder / "frame.npy"), "--camera", str(folder / "camera.yaml"), "--mask",
-                 str(folder / f"{MASK}.npy"), *words, f"outputs={json.dumps(outputs)}", "--out", out]
-            )  # fmt: skip
+                [
+                    "restore",
+                    str(folder / "frame.npy"),
+                    "--camera",
+                    str(folder / "camera.yaml"),
+                    "--mask",
+                    str(folder / f"{MASK}.npy"),
+                    *words,
+                    f"outputs={json.dumps(outputs)}",
+                    "--out",
+                    out,
+                ]
+            )
         except SystemExit as end:
             if end.code not in (0, 3):
                 raise RuntimeError(told.getvalue()) from None
@@ -114,9 +138,17 @@ def main():
             for strength in given.strengths:
                 one = scores(folder, seed, strength)
                 found.setdefault(strength, []).append(one)
-                print(seed, strength, {name: round(value, 2) for name, value in one.items()}, flush=True)
+                print(
+                    seed,
+                    strength,
+                    {name: round(value, 2) for name, value in one.items()},
+                    flush=True,
+                )
     for strength, each in found.items():
-        print(strength, {name: round(float(np.mean([one[name] for one in each])), 2) for name in each[0]})
+        print(
+            strength,
+            {name: round(float(np.mean([one[name] for one in each])), 2) for name in each[0]},
+        )
 
 
 if __name__ == "__main__":

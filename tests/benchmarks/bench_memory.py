@@ -4,11 +4,13 @@
     python tests/benchmarks/bench_memory.py FOLDER      # predicted against measured, as a table for RESULTS.md
     python tests/benchmarks/bench_memory.py limits small    # runs with limits whose name holds this word, up to 5 GB
 
-A prediction starts from the memory that the program of that run held before its first step, as ``neusee run`` does
-itself. The numbers of `workflows.explain.report_memory` are fitted to the runs that are not held out.
+A prediction starts from the memory that the program of that run held before its first step, as
+``neusee run`` does itself. The numbers of `workflows.explain.report_memory` are fitted to the runs
+that are not held out.
 
-With limits, each run has an empty cache and its own process, whose resident memory is read every 5 ms. The limit is a
-tenth above the prediction. The last column is the outcome of the same run with a limit of 9/10 of the prediction.
+With limits, each run has an empty cache and its own process, whose resident memory is read every 5
+ms. The limit is a tenth above the prediction. The last column is the outcome of the same run with a
+limit of 9/10 of the prediction.
 """
 
 import json
@@ -28,7 +30,7 @@ from fit_costs import read
 from measured_runs import FIT, HELD_OUT, at
 from scipy.optimize import nnls
 
-from neusee.workflows.explain import report_memory
+from neusee.workflows.explain import run_forecast as report_memory
 from neusee.workflows.explain.run_forecast import lanes_for, planned
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
@@ -47,7 +49,9 @@ def neusee(place, *words):
     """Start the program with an empty cache below ``place``."""
     env = {**os.environ, "NEUSEE_CACHE": f"{place}/cache", "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "neusee", *words]
-    return subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        command, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
 
 
 def watched(process):
@@ -65,7 +69,9 @@ def watched(process):
 
 
 def predicted(words):
-    """The predicted peak memory of a run with an empty cache in bytes: of its steps, and of its report."""
+    """The predicted peak memory of a run with an empty cache in bytes: of its steps, and of its
+    report.
+    """
     with tempfile.TemporaryDirectory() as place:
         out, err = neusee(place, "plan", *words, "--json").communicate()
     assert out, err
@@ -74,7 +80,9 @@ def predicted(words):
 
 
 def forecast(run):
-    """Predicted memory of a measured run in bytes: the program, with its steps, its report, and what it shows."""
+    """Predicted memory of a measured run in bytes: the program, with its steps, its report, and
+    what it shows.
+    """
     name, *changes = [word for word in run["words"] if word != "--exact"]
     recipe, shown = replace(load(name, changes), exact="--exact" in run["words"]), []
 
@@ -97,7 +105,9 @@ def forecast(run):
 
 
 def compare(folder):
-    """Print predicted and measured memory of all runs, and the numbers of the report that fit best."""
+    """Print predicted and measured memory of all runs, and the numbers of the report that fit
+    best.
+    """
     head = "run", "", "predicted: steps, report", "measured: steps, report", "measured / predicted"
     print(f"| {' | '.join(head)} |\n|{'---|' * len(head)}")
     ratios, rows = {}, []
@@ -108,11 +118,17 @@ def compare(folder):
             ratios.setdefault(kind, []).append(ratio)
             if kind == "fitted":
                 rows.append((1e6, running - held, shown, run["reporting"] - held, run["reporting"]))
-            both = (f"{one / 1e6:.0f}, {two / 1e6:.0f}" for one, two in ((running, reporting), _ends(run)))
+            both = (
+                f"{one / 1e6:.0f}, {two / 1e6:.0f}"
+                for one, two in ((running, reporting), _ends(run))
+            )
             print(f"| {' | '.join((run['name'], kind, *both, f'{ratio:.2f}'))} |")
     for kind, found in ratios.items():
         close = sum(abs(ratio - 1) <= 0.2 for ratio in found)
-        print(f"{kind}: peak of the process within 20 %: {close} of {len(found)}, {min(found):.2f} to {max(found):.2f}")
+        print(
+            f"{kind}: peak of the process within 20 %: {close} of {len(found)}, {min(found):.2f} to"
+            f" {max(found):.2f}"
+        )
     table = np.array(rows)
     best = nnls(table[:, :3] / table[:, 4:], table[:, 3] / table[:, 4])[0]
     print("report: MB for drawing, share held back, copies:", ", ".join(f"{x:.3g}" for x in best))
@@ -126,7 +142,15 @@ def _ends(run):
 
 def limits(word, *_):
     """Print one line of a table for each run with limits whose name holds the word."""
-    head = "run", "predicted: steps, report", "limit", "measured", "measured / predicted", "worst step", "limit of 9/10"
+    head = (
+        "run",
+        "predicted: steps, report",
+        "limit",
+        "measured",
+        "measured / predicted",
+        "worst step",
+        "limit of 9/10",
+    )
     print(f"| {' | '.join(head)} |\n|{'---|' * len(head)}")
     for name, words in ROWS.items():
         if word not in name:
@@ -140,17 +164,31 @@ def limits(word, *_):
             page = next(iter(Path(place, "runs").glob("*/provenance.json")), None)
             steps = json.loads(page.read_text())["steps"] if page else []
         with tempfile.TemporaryDirectory() as place:
-            less = neusee(place, *common[:-3], "--out", f"{place}/runs", "--memory", f"{int(0.9 * most)} B")
+            less = neusee(
+                place, *common[:-3], "--out", f"{place}/runs", "--memory", f"{int(0.9 * most)} B"
+            )
             again, seen = watched(less)
-        outcome = {0: "ran", 2: "refused", 1: "stopped"}[again] + ("" if again == 2 else f", {seen / 1e6:.0f} MB")
+        outcome = {0: "ran", 2: "refused", 1: "stopped"}[again] + (
+            "" if again == 2 else f", {seen / 1e6:.0f} MB"
+        )
         ran = f"{found / 1e6:.0f} MB" + ("" if code == 0 else f" (exit {code})")
         both = ", ".join(f"{part / 1e6:.0f}" for part in parts)
-        row = name, f"{both} MB", f"{limit / 1e6:.0f} MB", ran, f"{found / most:.2f}", worst(steps), outcome
+        row = (
+            name,
+            f"{both} MB",
+            f"{limit / 1e6:.0f} MB",
+            ran,
+            f"{found / most:.2f}",
+            worst(steps),
+            outcome,
+        )
         print(f"| {' | '.join(row)} |", flush=True)
 
 
 def worst(steps):
-    """Largest deviation of the predicted peak of a step from the measured peak, of steps above 64 MB."""
+    """Largest deviation of the predicted peak of a step from the measured peak, of steps above
+    64 MB.
+    """
     large = [s for s in steps if s.get("peak") and s.get("predicted_peak") and s["peak"] > 64e6]
     if not large:
         return "-"

@@ -1,10 +1,13 @@
-"""Learning in several processes: how far their gradients are from those of one, and seconds an iteration.
+"""Learning in several processes: how far their gradients are from those of one, and seconds an
+iteration.
 
     python tests/benchmarks/bench_mesh.py [1x1 2x1 1x2 2x2 ...]
 
-Errors: one iteration in float64, of each part |difference| / |gradient|. Seconds: `train_small` with pictures of all
-31 bands (`tolerance=0`) and as it stands, batch 4, float32, median of four iterations after the first, of the first
-process. All processes run on this machine with one thread each: with fewer cores than processes nothing is gained.
+Errors: one iteration in float64, of each part |difference| / |gradient|. Seconds: `train_small`
+        with pictures of all
+31 bands (`tolerance=0`) and as it stands, batch 4, float32, median of four iterations after the
+first, of the first process. All processes run on this machine with one thread each: with fewer
+cores than processes nothing is gained.
 """
 
 from __future__ import annotations
@@ -23,11 +26,15 @@ import mesh_processes
 from mesh_processes import DO, _photographs, start
 
 from neusee.workflows import Store, load
-from neusee.workflows.training.parallel.process_mesh import Mesh
+from neusee.workflows.training.process_mesh import Mesh
 from neusee.workflows.training.training_iteration import Learner
 from neusee.workflows.training.training_pictures import TrainingStream
 
-DOUBLE = ["train.precision=float64", "steps.psf.with.precision=double", "steps.laser_psf.with.precision=double"]
+DOUBLE = [
+    "train.precision=float64",
+    "steps.psf.with.precision=double",
+    "steps.laser_psf.with.precision=double",
+]
 PLAIN = ["train.network.kind=unet", "train.stages.1.batch=4"]
 CASES = {"each band": ["tolerance=0"], "few planes": []}
 TIMES = 4
@@ -39,7 +46,9 @@ def timed(job: dict[str, Any], mesh: Mesh) -> None:
     how = recipe.training
     learner = Learner(recipe, how, "cpu", mesh=mesh)
     learner.begin(how.stages[1], True)
-    samples = TrainingStream(recipe, how, _photographs(recipe, how, True), Store(Path(job["store"])), "cpu", None, mesh)
+    samples = TrainingStream(
+        recipe, how, _photographs(recipe, how, True), Store(Path(job["store"])), "cpu", None, mesh
+    )
     seconds = []
     for iteration in range(1 + TIMES):
         began = time.perf_counter()
@@ -52,7 +61,15 @@ def timed(job: dict[str, Any], mesh: Mesh) -> None:
 def done(place: Path, mesh: str, case: str, do: str, words: list[str]) -> dict[str, Any]:
     """What a job in processes of its own left."""
     folder = place / f"{do} {case} {mesh}"
-    start({"folder": str(folder), "store": str(place / "store"), "mesh": mesh, "do": do, "words": words})
+    start(
+        {
+            "folder": str(folder),
+            "store": str(place / "store"),
+            "mesh": mesh,
+            "do": do,
+            "words": words,
+        }
+    )
     found: dict[str, Any] = torch.load(folder / f"{do}.pt", weights_only=True)
     return found
 
@@ -62,7 +79,10 @@ def error(found: dict[str, Any], one: dict[str, Any], part: str) -> float:
     names = [name for name in one["grads"] if name.startswith(f"{part}.")]
     off, whole = (
         torch.cat([x.flatten() for x in each]).norm()
-        for each in ([found["grads"][n] - one["grads"][n] for n in names], [one["grads"][n] for n in names])
+        for each in (
+            [found["grads"][n] - one["grads"][n] for n in names],
+            [one["grads"][n] for n in names],
+        )
     )
     return float(off / whole)
 
@@ -71,14 +91,20 @@ def main(meshes: list[str]) -> None:
     """One line for each case and mesh."""
     mesh_processes.LONGEST = 600.0
     DO["timed"] = timed
-    print("| imaged | mesh | element | network | critics | s an iteration |\n|---|---|---|---|---|---|", flush=True)
+    print(
+        "| imaged | mesh | element | network | critics | s an iteration"
+        " |\n|---|---|---|---|---|---|",
+        flush=True,
+    )
     with tempfile.TemporaryDirectory() as folder:
         for case, words in CASES.items():
             one = None
             for mesh in meshes:
                 found = done(Path(folder), mesh, case, "step", [*PLAIN, *words, *DOUBLE])
                 one = one or found
-                errors = " | ".join(f"{error(found, one, part):.1e}" for part in ("mask", "net", "critics"))
+                errors = " | ".join(
+                    f"{error(found, one, part):.1e}" for part in ("mask", "net", "critics")
+                )
                 seconds = done(Path(folder), mesh, case, "timed", [*PLAIN, *words])["seconds"]
                 print(f"| {case} | {mesh} | {errors} | {seconds:.2f} |", flush=True)
 

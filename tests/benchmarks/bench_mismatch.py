@@ -1,12 +1,14 @@
-"""What a filter makes of a picture when it is told the laser a little wrongly: `bench_mismatch.py [SIDE]` (192).
+"""What a filter makes of a picture when it is told the laser a little wrongly: `bench_mismatch.py
+[SIDE]` (192).
 
     python tests/benchmarks/bench_mismatch.py 192
 
-The camera of `first_light` behind no mask and behind five half-rings, a green laser of strength 1e3, 1e5 and 1e6. The
-picture is simulated once. The filter is told the PSF and the laser exactly, or with one error: direction (half a pixel
-on each axis), wavelength (2 nm) or defocus (0.1 waves). PSNR in dB of the restored picture; a table in Markdown, with
-one row for each kind of knowledge of the filter and its seconds of processor time. Of the grids of the filter only the
-coarsest are solved densely here, which takes a third of the time.
+The camera of `first_light` behind no mask and behind five half-rings, a green laser of strength
+1e3, 1e5 and 1e6. The picture is simulated once. The filter is told the PSF and the laser exactly,
+or with one error: direction (half a pixel on each axis), wavelength (2 nm) or defocus (0.1 waves).
+PSNR in dB of the restored picture; a table in Markdown, with one row for each kind of knowledge of
+the filter and its seconds of processor time. Of the grids of the filter only the coarsest are
+solved densely here, which takes a third of the time.
 """
 
 import sys
@@ -16,7 +18,8 @@ from pathlib import Path
 import torch
 
 from neusee.nodes import metrics, restore
-from neusee.nodes.restore._inverse import _conjugate_gradients, _fft_grid
+from neusee.nodes.restore._inverse import _conjugate_gradients
+from neusee.nodes.restore._inverse import _masked_blur as _fft_grid
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
@@ -42,14 +45,28 @@ FILTERS = {
     "24 patterns and likeliest doubt": {"patterns": 24, "doubt": None},
 }
 SEEN = ["signal[mask]", "clipped[mask]", "truth", "matrix", "illuminant", "responses", "bands"]
-TOLD = ["psf[mask]", f"laser_photons[mask,{LINE}]", f"laser_pupil[mask,{LINE}]", f"direction[{LINE}]", f"line[{LINE}]",
-        f"laser_responses[{LINE}]"]  # fmt: skip
+TOLD = [
+    "psf[mask]",
+    f"laser_photons[mask,{LINE}]",
+    f"laser_pupil[mask,{LINE}]",
+    f"direction[{LINE}]",
+    f"line[{LINE}]",
+    f"laser_responses[{LINE}]",
+]
 
 
 def values(side, mask, strength, changes, names, store):
     """The results of some steps of the camera."""
-    small = [f"scene.shape=[{side + 96},{side + 96}]", f"sensor.shape=[{side},{side}]", "optics.window=[512,512]"]
-    recipe = load("first_light", [f"doe={mask}", f"lasers.green.strength={strength:g}", *small, *changes], Path())
+    small = [
+        f"scene.shape=[{side + 96},{side + 96}]",
+        f"sensor.shape=[{side},{side}]",
+        "optics.window=[512,512]",
+    ]
+    recipe = load(
+        "first_light",
+        [f"doe={mask}", f"lasers.green.strength={strength:g}", *small, *changes],
+        Path(),
+    )
     found = run(recipe, store, names)
     return {name: found[name] for name in names}
 
@@ -59,7 +76,15 @@ def patterns_of(told, count):
     glare, pupil, towards, line, responses = (told[name] for name in TOLD[1:])
     rng = torch.Generator().manual_seed(0)
     return restore.nearby_glare(
-        glare, pupil, towards, line, responses, focal_length=FOCAL, pixel_pitch=PITCH, patterns=count, rng=rng
+        glare,
+        pupil,
+        towards,
+        line,
+        responses,
+        focal_length=FOCAL,
+        pixel_pitch=PITCH,
+        patterns=count,
+        rng=rng,
     )
 
 
@@ -69,14 +94,24 @@ def psnr(seen, told, patterns=0, doubt=0.0, alone=False):
     if alone:  # each pixel by itself: the same variance as a doubt that differs from pixel to pixel
         return _psnr(seen, _alone(seen, told, nearby))
     found = restore.wiener(
-        *_picture(seen, told), [glare], None if nearby is None else [nearby], doubt=doubt, read_noise=10.5
+        *_picture(seen, told),
+        [glare],
+        None if nearby is None else [nearby],
+        doubt=doubt,
+        read_noise=10.5,
     )
     return _psnr(seen, found)
 
 
 def _picture(seen, told):
-    return (seen["signal[mask]"], told["psf[mask]"], seen["illuminant"], seen["responses"], seen["bands"],
-            seen["clipped[mask]"])  # fmt: skip
+    return (
+        seen["signal[mask]"],
+        told["psf[mask]"],
+        seen["illuminant"],
+        seen["responses"],
+        seen["bands"],
+        seen["clipped[mask]"],
+    )
 
 
 def _alone(seen, told, nearby):
@@ -91,7 +126,9 @@ def _alone(seen, told, nearby):
 
     _glare._estimated = independent
     try:
-        return restore.wiener(*_picture(seen, told), [told[TOLD[1]]], [nearby], doubt=1e-9, read_noise=10.5)
+        return restore.wiener(
+            *_picture(seen, told), [told[TOLD[1]]], [nearby], doubt=1e-9, read_noise=10.5
+        )
     finally:
         _glare._estimated = whole
 
@@ -103,11 +140,18 @@ def _psnr(seen, found):
 def main(side):
     store = Store()
     _conjugate_gradients.LOWEST, _fft_grid.DENSE = 64, 20
-    print("| mask, strength | filter |", " | ".join(ERRORS), "| s |\n|---|---|" + "---|" * (len(ERRORS) + 1))
+    print(
+        "| mask, strength | filter |",
+        " | ".join(ERRORS),
+        "| s |\n|---|---|" + "---|" * (len(ERRORS) + 1),
+    )
     for mask in ("flat", "five_half_rings"):
         for strength in (1e3, 1e5, 1e6):
             seen = values(side, mask, strength, [], SEEN, store)
-            told = {name: values(side, mask, strength, changes, TOLD, store) for name, changes in ERRORS.items()}
+            told = {
+                name: values(side, mask, strength, changes, TOLD, store)
+                for name, changes in ERRORS.items()
+            }
             for each in told.values():
                 each["nearby"] = patterns_of(each, 24)
             for name, how in FILTERS.items():

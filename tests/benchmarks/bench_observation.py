@@ -1,10 +1,12 @@
-"""Print what it costs to observe a call of an own node, here or in a process of its own, beside plain calls in turns.
+"""Print what it costs to observe a call of an own node, here or in a process of its own, beside
+plain calls in turns.
 
     python tests/benchmarks/bench_observation.py [CALLS]
 
-Each turn is one plain call and one of each other kind, so that other work on the machine meets all. The parts say what
-an observed call that does nothing spends its time on. That the steps of a packaged recipe are not observed at all is a
-test (`tests/workflows/observation/test_shipped_nodes.py`).
+Each turn is one plain call and one of each other kind, so that other work on the machine meets all.
+The parts say what an observed call that does nothing spends its time on. That the steps of a
+packaged recipe are not observed at all is a test
+(`tests/workflows/observation/test_shipped_nodes.py`).
 """
 
 from __future__ import annotations
@@ -20,11 +22,11 @@ from functools import partial
 import numpy as np
 import torch
 
-from neusee.workflows.engine.memory_use import process_memory
+from neusee.workflows.engine.machine_resources import process_memory
 from neusee.workflows.engine.step_process import call_in_fork
 from neusee.workflows.observation import kernel_layer
 from neusee.workflows.observation.observed_call import observed
-from neusee.workflows.observation.shared_generators import SharedGenerators
+from neusee.workflows.observation.random_generators import SharedGenerators
 from neusee.workflows.observation.taints import Covered
 
 COVERED = Covered(frozenset(), lambda name: True)
@@ -85,7 +87,9 @@ def filtered() -> None:
 
 
 def processor_time() -> float:
-    """Return the processor time in s of this process and of the one that answers, which others on the machine spare."""
+    """Return the processor time in s of this process and of the one that answers, which others
+    on the machine spare.
+    """
     with open(f"/proc/{kernel_layer.client().server()}/stat", encoding="ascii") as file:
         ticks = file.read().rpartition(")")[2].split()[11:13]
     return time.process_time() + sum(map(int, ticks)) / os.sysconf("SC_CLK_TCK")
@@ -103,25 +107,38 @@ def main(calls: int) -> None:
     """Print the table of nodes of 0, 1, 10 and 100 ms, and the parts."""
     torch.set_num_threads(1)
     observed(int, COVERED)  # starts the process that answers
-    print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} processors, load {os.getloadavg()[0]:.1f}")
+    print(
+        f"{platform.processor() or platform.machine()}, {os.cpu_count()} processors, load"
+        f" {os.getloadavg()[0]:.1f}"
+    )
     print(f"this process holds {process_memory() / 1e6:.0f} MB")
     for seconds in (0.0, 1e-3, 1e-2, 1e-1, 1.0):
         compute = node(seconds) if seconds else int
-        ways = {"observed": partial(observed, compute, COVERED), "in a process of its own": partial(apart, compute)}
-        for name, way in ways.items():  # one after the other: memory that a fork has shared is slow at its next use
+        ways = {
+            "observed": partial(observed, compute, COVERED),
+            "in a process of its own": partial(apart, compute),
+        }
+        # one after the other: memory that a fork has shared is slow at its next use
+        for name, way in ways.items():
             count = calls // (1 if seconds < 0.05 else round(40 * seconds))
             plain, seen = zip(*((timed(compute), timed(way)) for _ in range(count)), strict=True)
             print(f"{seconds * 1e3:3.0f} ms: plain {quantiles(plain)} ms")
             more = [late - early for late, early in zip(seen, plain, strict=True)]
-            within = np.mean([late <= max(AIM, SHARE * early) for late, early in zip(more, plain, strict=True)])
+            within = np.mean(
+                [late <= max(AIM, SHARE * early) for late, early in zip(more, plain, strict=True)]
+            )
             ratio = np.median(seen) / max(float(np.median(plain)), 1e-9)
             print(
-                f"        {name}: more {quantiles(more)} ms; ratio of medians {ratio:.2f}; {within:.0%} within the aim"
+                f"        {name}: more {quantiles(more)} ms; ratio of medians {ratio:.2f};"
+                f" {within:.0%} within the aim"
             )
     began = processor_time()
     for _ in range(10 * calls):
         observed(int, COVERED)
-    print(f"processor time of an observed call of nothing: {(processor_time() - began) / (10 * calls) * 1e3:.2f} ms")
+    print(
+        "processor time of an observed call of nothing:"
+        f" {(processor_time() - began) / (10 * calls) * 1e3:.2f} ms"
+    )
     for name, part in PARTS.items():
         print(f"{name}: {quantiles([timed(part) for _ in range(calls)])} ms")
     print(f"load {os.getloadavg()[0]:.1f}")

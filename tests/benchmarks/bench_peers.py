@@ -2,9 +2,9 @@
 
 Prints a table in Markdown. All three take turns in one process, so that a loaded machine slows them
 alike; figures are medians. joblib and Hamilton are given floats and NumPy arrays, with which they
-are at their best; ours works on tensors. Every cached run begins with nothing in memory, as the next
-process would; building Hamilton's driver, like our recipe, is not counted. Hamilton runs with the
-recursion limit raised to 30 000, without which it fails on a chain of 1000.
+are at their best; ours works on tensors. Every cached run begins with nothing in memory, as the
+next process would; building Hamilton's driver, like our recipe, is not counted. Hamilton runs with
+the recursion limit raised to 30 000, without which it fails on a chain of 1000.
 """
 
 import importlib
@@ -111,7 +111,10 @@ def large_chain(n: int, folder: Path, changed: int = -1) -> tuple[Any, list[str]
     text = ARRAYS.format(count=COUNT)
     for i in range(1, n):
         k = float(i) + (i == changed) / 2
-        text += f"\n\ndef s{i}(s{i - 1}: np.ndarray) -> np.ndarray:\n    return s{i - 1} + np.float32({k})\n"
+        text += (
+            f"\n\ndef s{i}(s{i - 1}: np.ndarray) -> np.ndarray:\n    return s{i - 1} +"
+            f" np.float32({k})\n"
+        )
     text += f"\n\ndef mean(s{n - 1}: np.ndarray) -> float:\n    return float(np.mean(s{n - 1}))\n"
     return module(f"peer_large{changed + 1}", text, folder), ["mean"]
 
@@ -136,14 +139,24 @@ def overhead(folder: Path) -> None:
             for i in range(repeat):
                 at = folder / place.format(name=name, i=i)
                 peer = hamilton(graph, at / "hamilton")
-                works = [partial(new_run, ours, at / "ours"), partial(theirs, STEPS, at / "joblib"), peer]
+                works = [
+                    partial(new_run, ours, at / "ours"),
+                    partial(theirs, STEPS, at / "joblib"),
+                    peer,
+                ]
                 found.append([seconds(work) for work in works])
-            cells = [f"{statistics.median(c) / STEPS * 1e3:.3f} ms a step" for c in zip(*found, strict=True)]
+            cells = [
+                f"{statistics.median(c) / STEPS * 1e3:.3f} ms a step"
+                for c in zip(*found, strict=True)
+            ]
             row(f"{STEPS} trivial steps, {name}: {state}", *cells)
 
 
 def long_chain(folder: Path) -> None:
-    works = (partial(new_run, chain(LONG), folder / "long"), partial(joblib_chain, LONG, folder / "long-joblib"))
+    works = (
+        partial(new_run, chain(LONG), folder / "long"),
+        partial(joblib_chain, LONG, folder / "long-joblib"),
+    )
     cells = [f"{seconds(work):.2f} and {seconds(work):.2f} s" for work in works]
     row(f"chain of {LONG} steps, cold and cached", *cells, unraised(folder))
 
@@ -170,19 +183,31 @@ def gigabyte(folder: Path) -> None:
     """Nine arrays of 111 MB and a number."""
     loads: list[int] = []
     read = serialization.read
-    serialization.read = lambda path, *rest: loads.append(os.path.getsize(path)) or read(path, *rest)  # type: ignore
-    ours, theirs, place = folder / "gigabyte", folder / "gigabyte-joblib", folder / "gigabyte-hamilton"
+    serialization.read = lambda path, *rest: (
+        loads.append(os.path.getsize(path)) or read(path, *rest)
+    )  # type: ignore
+    ours, theirs, place = (
+        folder / "gigabyte",
+        folder / "gigabyte-joblib",
+        folder / "gigabyte-hamilton",
+    )
     for what, changed, repeat in (("cold", -1, 1), ("cached", -1, 3), ("last two changed", 8, 1)):
         graph, recipe = large_chain(9, folder, changed), chain(9, COUNT, changed)
         cells: list[list[tuple[float, float]]] = [[], [], []]
         for _ in range(repeat):
-            works = [partial(new_run, recipe, ours), partial(joblib_chain, 9, theirs, COUNT, changed)]
+            works = [
+                partial(new_run, recipe, ours),
+                partial(joblib_chain, 9, theirs, COUNT, changed),
+            ]
             for cell, work in zip(cells, [*works, hamilton(graph, place)], strict=True):
                 loads.clear()
                 before = bytes_read()
                 cell.append((seconds(work), bytes_read() - before + sum(loads)))
         texts = (tuple(statistics.median(c) for c in zip(*cell, strict=True)) for cell in cells)
-        row(f"10 steps, 1 GB: {what}", *(f"{t * 1e3:.0f} ms, {size / MB:.1f} MB read" for t, size in texts))
+        row(
+            f"10 steps, 1 GB: {what}",
+            *(f"{t * 1e3:.0f} ms, {size / MB:.1f} MB read" for t, size in texts),
+        )
     serialization.read = read
 
 
@@ -206,7 +231,10 @@ def helped({one}) -> torch.Tensor:
     return scale() * torch.ones(1)
 """
 OURS = {
-    "imports": "from pathlib import Path\nfrom neusee.nodes import node\nfrom neusee.nodes.peer_helper import scale",
+    "imports": (
+        "from pathlib import Path\nfrom neusee.nodes import node\nfrom neusee.nodes.peer_helper"
+        " import scale"
+    ),
     "x": "*, x: Path",
     "read": "torch.load(x)",
     "net": "*, net: Path",
@@ -230,7 +258,8 @@ net.weight.fill_(weight)
 given = {"tensor": {"x": torch.ones(3)}, "network": {"net": net}, "helped": {"one": 1.0}}[name]
 """
 RUNS = {
-    "ours": """
+    "ours": (
+        """
 import neusee.nodes
 from pathlib import Path
 neusee.nodes.__path__ = [*neusee.nodes.__path__, folder]
@@ -245,30 +274,39 @@ for key, value in given.items():
         given[key] = Path(f"{folder}/{key}.pt")
 step = Step("y", getattr(case, name), given, {}, Location("peer.yaml", 1, 1), {})
 found = run(Recipe("peer", "", 1, 0.0, ("y",), {"y": step}), Store(Path(folder) / "ours")).values["y"]
-""",
-    "joblib": """
+"""
+    ),
+    "joblib": (
+        """
 sys.path.insert(0, folder)
 import joblib, peer_case as case
 found = joblib.Memory(folder + "/joblib", verbose=0).cache(getattr(case, name))(**given)
-""",
-    "hamilton": """
+"""
+    ),
+    "hamilton": (
+        """
 sys.path.insert(0, folder)
 import peer_case as case
 from hamilton import driver
 built = driver.Builder().with_modules(case).with_cache(path=folder + "/hamilton").build()
 found = built.execute([name], inputs=given)[name]
-""",
+"""
+    ),
 }
 
 
 def right(folder: Path) -> None:
-    """What further processes give after the first: for the same tensor, other weights, another helper."""
+    """What further processes give after the first: for the same tensor, other weights, another
+    helper.
+    """
     hits, weights, helpers = [], [], []
     for engine, script in RUNS.items():
         place = folder / f"right-{engine}"
         place.mkdir()
         text = CASE.format(**(OURS if engine == "ours" else THEIRS))
-        (place / "peer_case.py").write_text(text.replace("def ", "@node()\ndef ") if engine == "ours" else text)
+        (place / "peer_case.py").write_text(
+            text.replace("def ", "@node()\ndef ") if engine == "ours" else text
+        )
         (place / "peer_helper.py").write_text("def scale():\n    return 2.0\n")
         told = partial(new_process, GIVEN + script + "print(f'{float(found):g}')", place)
         told("tensor", 0)
@@ -293,7 +331,12 @@ if __name__ == "__main__":
     sys.setrecursionlimit(30_000)
     with tempfile.TemporaryDirectory(dir=sys.argv[1] if len(sys.argv) > 1 else None) as place:
         sys.path.insert(0, place)
-        row("what", "neusee", f"joblib {version('joblib')}", f"Hamilton {version('apache-hamilton')}")
+        row(
+            "what",
+            "neusee",
+            f"joblib {version('joblib')}",
+            f"Hamilton {version('apache-hamilton')}",
+        )
         row("---", "---", "---", "---")
         for part in (overhead, long_chain, gigabyte, right):
             part(Path(place))

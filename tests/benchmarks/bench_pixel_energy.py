@@ -1,11 +1,11 @@
 """Energy and error of PSFs averaged over pixels, on random cameras, and their time against points.
 
-    python -m tests.benchmarks.bench_pixel_energy --cameras 300 --compared 60 --out pixel_energy.json
-    python -m tests.benchmarks.bench_pixel_energy --times
+    python -m tests.benchmarks.bench_pixel_energy --cameras 300 --compared 60 --out
+    pixel_energy.json python -m tests.benchmarks.bench_pixel_energy --times
 
-Cameras from f/1.2 to f/32, 1 to 20 um and 355 to 1600 nm, with windows inside the alias-free field; draws whose pupil
-cannot carry the window are counted apart. A run that is stopped goes on where its file ends. Times are processor times
-of one thread, points and averages in turns in one run.
+Cameras from f/1.2 to f/32, 1 to 20 um and 355 to 1600 nm, with windows inside the alias-free field;
+draws whose pupil cannot carry the window are counted apart. A run that is stopped goes on where its
+file ends. Times are processor times of one thread, points and averages in turns in one run.
 """
 
 import argparse
@@ -53,8 +53,14 @@ def report(rows):
     cameras = [row for row in rows.values() if row is not None]
     errors = [row["error"] for row in cameras if "error" in row]
     highest = max(row["energy"] for row in cameras)
-    print(f"{len(cameras)} cameras, {len(rows) - len(cameras)} draws refused: energy at most 1 {highest - 1:+.2e}")
-    print(f"{len(errors)} compared with separate code: error at most {max(errors):.2e} of the clear peak")
+    print(
+        f"{len(cameras)} cameras, {len(rows) - len(cameras)} draws refused: energy at most 1"
+        f" {highest - 1:+.2e}"
+    )
+    print(
+        f"{len(errors)} compared with separate code: error at most {max(errors):.2e} of the clear"
+        " peak"
+    )
 
 
 def timed(samples, side, number, focal, pixel, repeats=3):
@@ -80,7 +86,9 @@ def timed(samples, side, number, focal, pixel, repeats=3):
 
 
 def main():
-    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    words = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     words.add_argument("--cameras", type=int, default=300)
     words.add_argument("--compared", type=int, default=60)
     words.add_argument("--out", type=Path, default=Path("pixel_energy.json"))
@@ -93,7 +101,8 @@ def main():
     for case in TIMED:
         points, averages = timed(*case)
         print(
-            f"{case[0]} -> {case[1]}, f/{case[2]}: {1e3 * points:.1f} ms at points, {averages / points:.2f} times that"
+            f"{case[0]} -> {case[1]}, f/{case[2]}: {1e3 * points:.1f} ms at points,"
+            f" {averages / points:.2f} times that"
         )
 
 

@@ -2,9 +2,10 @@
 
     python tests/benchmarks/bench_presets.py FOLDER PHOTOGRAPHS
 
-Pictures of 48 x 48, 9 bands, an FFT-Mamba of width 8. Iterations are a fiftieth of the presets' (200 and 400) and so is
-what their schedules count; the first rates are ten times as large, for a small network in few steps. A run that is
-there is not repeated. Writes `presets.png` and prints a table.
+Pictures of 48 x 48, 9 bands, an FFT-Mamba of width 8. Iterations are a fiftieth of the presets'
+(200 and 400) and so is what their schedules count; the first rates are ten times as large, for a
+small network in few steps. A run that is there is not repeated. Writes `presets.png` and prints a
+table.
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ WINDOW = 20  #: iterations that are averaged
 def rows(name: str, words: list[str], folder: Path, photographs: str) -> list[dict[str, str]]:
     """The losses of a preset, learned now or found."""
     recipe = load("train_small", [*words, *SMALL, f"train.photographs={photographs}"])
-    made = train(recipe, Store(folder / "cache"), folder / name.replace(" ", "_"), ["bench_presets"], print)
+    made = train(
+        recipe, Store(folder / "cache"), folder / name.replace(" ", "_"), ["bench_presets"], print
+    )
     with (made / "losses.csv").open(newline="") as file:
         return list(csv.DictReader(file))
 
@@ -62,7 +65,9 @@ def figure(found: dict[str, list[dict[str, str]]]) -> Any:
             axis.plot([mean(each, name, at + 1) for at in range(len(each))], label=preset)
         axis.axvline(200, color="0.7", lw=0.8)
         axis.set(
-            title=name, xlabel="iteration; stage 2 from the line on", yscale="linear" if name == "critics" else "log"
+            title=name,
+            xlabel="iteration; stage 2 from the line on",
+            yscale="linear" if name == "critics" else "log",
         )
     axes[0].legend(frameon=False)
     return figure

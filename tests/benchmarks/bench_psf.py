@@ -1,16 +1,19 @@
-"""The PSF beside prysm, hcipy, poppy, scipy and finufft: `python tests/benchmarks/bench_psf.py [REPEATS] [OPTIONS]`.
+"""The PSF beside prysm, hcipy, poppy, scipy and finufft: `python tests/benchmarks/bench_psf.py
+[REPEATS] [OPTIONS]`.
 
-`--one-thread` takes the least processor time of one thread instead of the median of the time on two threads, for a
-machine on which others compute. `--size 2160 64` takes one size. `--part forward` takes one table (forward, methods,
-backward, spectra). `--fast` leaves out plain matrices: those of the peers for windows of 1024 and more, where they
-take six to thirty times as long as ours, and those with torch's own gradient.
-Everybody gets the same number of threads and the same clear or defocused disc at 550 nm, and returns the intensity.
-The peers are handed the complex pupil and keep their operators; ours keeps its own, starts from the height map and
-makes the phase each time. What making the complex64 pupil costs in NumPy is a row of its own, and a column adds it to
-the peers; the other way round, `neusee, ready pupil` is handed it as they are, and computes in torch.
-Calls are interleaved, so that a loaded machine slows all alike, and each is preceded by a pause and by a call that
-does not count, because the threads of one library spin for a while and would slow the next. The error is against the
-double sum in complex128 on a subset of rows and columns, relative to the peak. Prints tables in Markdown.
+`--one-thread` takes the least processor time of one thread instead of the median of the time on two
+threads, for a machine on which others compute. `--size 2160 64` takes one size. `--part forward`
+takes one table (forward, methods, backward, spectra). `--fast` leaves out plain matrices: those of
+the peers for windows of 1024 and more, where they take six to thirty times as long as ours, and
+those with torch's own gradient. Everybody gets the same number of threads and the same clear or
+defocused disc at 550 nm, and returns the intensity. The peers are handed the complex pupil and keep
+their operators; ours keeps its own, starts from the height map and makes the phase each time. What
+making the complex64 pupil costs in NumPy is a row of its own, and a column adds it to the peers;
+the other way round, `neusee, ready pupil` is handed it as they are, and computes in torch. Calls
+are interleaved, so that a loaded machine slows all alike, and each is preceded by a pause and by a
+call that does not count, because the threads of one library spin for a while and would slow the
+next. The error is against the double sum in complex128 on a subset of rows and columns, relative to
+the peak. Prints tables in Markdown.
 """
 
 # ruff: noqa: E402 (threads are set before anybody starts theirs)
@@ -19,7 +22,9 @@ import sys
 
 ONE = "--one-thread" in sys.argv
 THREADS = 1 if ONE else 2
-os.environ.update({name: str(THREADS) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")})
+os.environ.update(
+    {name: str(THREADS) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+)
 
 import math
 import statistics
@@ -72,7 +77,10 @@ def pupil_call(p):
     height, amplitude = p.height.numpy(), p.amplitude.numpy()
 
     def call():
-        angle, made = np.float32(2 * np.pi * INDEX / WAVELENGTH) * height, np.empty(height.shape, np.complex64)
+        angle, made = (
+            np.float32(2 * np.pi * INDEX / WAVELENGTH) * height,
+            np.empty(height.shape, np.complex64),
+        )
         np.cos(angle, out=made.real)
         np.sin(angle, out=made.imag)
         return np.multiply(made, amplitude, out=made)
@@ -125,7 +133,9 @@ def hcipy_call(f, k, kind):
 
 def poppy_call(f, k):
     n_lam_d = k * PIXEL * DIAMETER / (WAVELENGTH * FOCAL)
-    return lambda: power(poppy.matrixDFT.matrix_dft(f, n_lam_d, k, offset=(0.5, 0.5), centering="ADJUSTABLE"))
+    return lambda: power(
+        poppy.matrixDFT.matrix_dft(f, n_lam_d, k, offset=(0.5, 0.5), centering="ADJUSTABLE")
+    )
 
 
 def scipy_call(f, k):
@@ -136,7 +146,9 @@ def scipy_call(f, k):
 
 def finufft_call(f, k, eps, kind):
     n, step = len(f), 2 * np.pi * DIAMETER / len(f) * PIXEL / (WAVELENGTH * FOCAL)
-    points = (step * (np.arange(k) - k // 2)).astype("float32" if kind == "complex64" else "float64")
+    points = (step * (np.arange(k) - k // 2)).astype(
+        "float32" if kind == "complex64" else "float64"
+    )
     plans = [finufft.Plan(2, (n,), m, eps, -1, kind, nthreads=THREADS) for m in (n, k)]
     for plan in plans:
         plan.setpts(points)
@@ -164,26 +176,38 @@ def contenders(n, k, p):
         "poppy MFT": poppy_call(exact, k),
     }
     fast = "--fast" in sys.argv and k >= 1024
-    return {name: call for name, call in every.items() if not (fast and {"MFT", "mdft"} & set(name.split()))}
+    return {
+        name: call
+        for name, call in every.items()
+        if not (fast and {"MFT", "mdft"} & set(name.split()))
+    }
 
 
 def subset(p, k):
     """Rows and columns, and |U|^2 there, by the double sum in complex128."""
     n = len(p.height)
-    pick = np.unique(np.r_[np.linspace(0, k - 1, 48).astype(int), np.clip(k // 2 + np.arange(-8, 9), 0, k - 1)])
+    pick = np.unique(
+        np.r_[np.linspace(0, k - 1, 48).astype(int), np.clip(k // 2 + np.arange(-8, 9), 0, k - 1)]
+    )
     j = np.arange(n) - (n - 1) / 2
-    kernel = np.exp(-2j * np.pi * DIAMETER / n * PIXEL / (WAVELENGTH * FOCAL) * np.outer(pick - k // 2, j))
+    kernel = np.exp(
+        -2j * np.pi * DIAMETER / n * PIXEL / (WAVELENGTH * FOCAL) * np.outer(pick - k // 2, j)
+    )
     return np.ix_(pick, pick), power(kernel @ field(p, np.complex128) @ kernel.T)
 
 
 def error(image, where, truth):
     """Largest error over the peak, after the best common scale: normalisations differ."""
     part = image[where].astype(np.float64)
-    return float(np.abs(part * ((part * truth).sum() / (part**2).sum()) - truth).max() / truth.max())
+    return float(
+        np.abs(part * ((part * truth).sum() / (part**2).sum()) - truth).max() / truth.max()
+    )
 
 
 def seconds(call):
-    """Time of a second call in a row, after the threads of whoever ran before have stopped spinning."""
+    """Time of a second call in a row, after the threads of whoever ran before have stopped
+    spinning.
+    """
     clock = time.process_time if ONE else time.perf_counter
     if not ONE:
         time.sleep(0.15)
@@ -194,7 +218,9 @@ def seconds(call):
 
 
 def interleaved(calls, repeats):
-    """Median seconds of each call (on one thread the least), taken in turns; what is slow is taken twice."""
+    """Median seconds of each call (on one thread the least), taken in turns; what is slow is
+    taken twice.
+    """
     times = {name: [] for name in calls}
     first = {name: seconds(call) for name, call in calls.items()}
     for turn in range(repeats):
@@ -205,7 +231,10 @@ def interleaved(calls, repeats):
 
 
 def forward(repeats):
-    print("| pupil -> window | who | ms | of ours | with the pupil made | error, clear | error, 10 waves |")
+    print(
+        "| pupil -> window | who | ms | of ours | with the pupil made | error, clear | error, 10"
+        " waves |"
+    )
     print("|---|---|---|---|---|---|---|")
     for n, k in SIZES:
         clear, bent = pupil(n), pupil(n, 10.0)
@@ -215,7 +244,8 @@ def forward(repeats):
         made, mine = times.pop("made"), times["neusee"]
         print(f"| {n} -> {k} | *the complex pupil alone, NumPy* | {1e3 * made:.1f} | | | | |")
         for name, t in sorted(times.items(), key=lambda item: item[1]):
-            whole = 1.0 if name == "neusee" else (t + made) / mine  # ours with a ready pupil, too: as a peer
+            # ours with a ready pupil, too: as a peer
+            whole = 1.0 if name == "neusee" else (t + made) / mine
             errors = error(calls[name](), *truths[0]), error(others[name](), *truths[1])
             print(f"| {n} -> {k} | {name} | {1e3 * t:.1f} | {t / mine:.2f} | {whole:.2f} | "
                   f"{errors[0]:.0e} | {errors[1]:.0e} |", flush=True)  # fmt: skip
@@ -226,7 +256,10 @@ def methods(repeats):
     print("\n| pupil -> window | " + " | ".join(names) + " |\n|---|---|---|---|---|---|")
     for n, k in SIZES:
         times = interleaved({m: ours(pupil(n), k, m) for m in names}, repeats)
-        print(f"| {n} -> {k} | " + " | ".join(f"{1e3 * times[m]:.1f}" for m in names) + " |", flush=True)
+        print(
+            f"| {n} -> {k} | " + " | ".join(f"{1e3 * times[m]:.1f}" for m in names) + " |",
+            flush=True,
+        )
 
 
 def plain_autograd(p, k):
@@ -237,15 +270,21 @@ def plain_autograd(p, k):
     kernel = torch.exp(-2j * torch.pi * turns).to(torch.complex64)
 
     def image(height):
-        u = kernel @ (p.amplitude * torch.exp(2j * torch.pi * INDEX / WAVELENGTH * height)) @ kernel.T
+        u = (
+            kernel
+            @ (p.amplitude * torch.exp(2j * torch.pi * INDEX / WAVELENGTH * height))
+            @ kernel.T
+        )
         return u.abs().square()
 
     return image
 
 
 def backward(repeats):
-    print("\n| pupil -> window | forward ms | forward + backward ms | ratio | the same without C++ | ratio of both | "
-          "torch autograd, matrices: f + b ms |\n|---|---|---|---|---|---|---|")  # fmt: skip
+    print(
+        "\n| pupil -> window | forward ms | forward + backward ms | ratio | the same without C++ |"
+        " ratio of both | torch autograd, matrices: f + b ms |\n|---|---|---|---|---|---|---|"
+    )
     for n, k in SIZES:
         p = pupil(n, 3.0)
         camera = dict(focal_length=FOCAL, pixel_pitch=PIXEL, shape=(k, k))
@@ -266,27 +305,35 @@ def backward(repeats):
             calls["torch"] = partial(learn, plain_autograd(p, k))
         t = interleaved(calls, repeats)
         print(f"| {n} -> {k} | {1e3 * t['f']:.1f} | {1e3 * t['fb']:.1f} | {t['fb'] / t['f']:.2f} | "
-              f"{1e3 * t['grids']:.1f} | {t['fb'] / t['grids']:.2f} | {1e3 * t.get('torch', math.nan):.0f} |",
+              f"{1e3 * t['grids']:.1f} | {t['fb'] / t['grids']:.2f} | "
+              f"{1e3 * t.get('torch', math.nan):.0f} |",
               flush=True)  # fmt: skip
 
 
 def peak_gigabytes():
     """Largest resident size of this process since its peak was last cleared."""
-    (line,) = (x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("VmHWM"))
+    (line,) = (
+        x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("VmHWM")
+    )
     return int(line.split()[1]) / 2**20
 
 
 def all_bands(who, learn=False):
-    """31 bands from one rough height map, at full size; prints seconds and peak GB. Runs in its own process."""
+    """31 bands from one rough height map, at full size; prints seconds and peak GB. Runs in its
+    own process.
+    """
     torch.manual_seed(1)
     bands = [400e-9 + 10e-9 * i for i in range(31)]
     p = pupil(2160, wavelengths=bands, height=1e-6 * torch.rand(2160, 2160))
-    Path("/proc/self/clear_refs").write_text("5")  # the peak so far, the parent's too, no longer counts
+    # the peak so far, the parent's too, no longer counts
+    Path("/proc/self/clear_refs").write_text("5")
     before = peak_gigabytes()
     start, worked = time.perf_counter(), time.process_time()
     if who == "neusee":
         height = p.height.requires_grad_(learn)
-        out = psf(p._replace(height=height), focal_length=FOCAL, pixel_pitch=PIXEL, shape=(2048, 2048)).intensity
+        out = psf(
+            p._replace(height=height), focal_length=FOCAL, pixel_pitch=PIXEL, shape=(2048, 2048)
+        ).intensity
         if learn:
             out.backward(torch.ones(()).expand_as(out))
     else:
@@ -294,19 +341,34 @@ def all_bands(who, learn=False):
         for band, wavelength in enumerate(bands):
             globals()["WAVELENGTH"] = wavelength
             out[band] = hcipy_call(field(p), 2048, hcipy.ZoomFastFourierTransform)()
-    took, worked, after = time.perf_counter() - start, time.process_time() - worked, peak_gigabytes()
+    took, worked, after = (
+        time.perf_counter() - start,
+        time.process_time() - worked,
+        peak_gigabytes(),
+    )
     print(f"{took:.2f} {worked:.2f} {after:.2f} {before:.2f}")
 
 
 def spectra():
-    print("\n| 31 bands, height -> 2048^2 PSFs, a process of its own, cold | s (three runs) | processor s | peak GB | "
-          "before the call |\n|---|---|---|---|---|")  # fmt: skip
-    for who, title in (("neusee", "neusee"), ("learn", "neusee, forward + backward"), ("hcipy", "hcipy ZoomFFT c64")):
+    print(
+        "\n| 31 bands, height -> 2048^2 PSFs, a process of its own, cold | s (three runs) |"
+        " processor s | peak GB | before the call |\n|---|---|---|---|---|"
+    )
+    for who, title in (
+        ("neusee", "neusee"),
+        ("learn", "neusee, forward + backward"),
+        ("hcipy", "hcipy ZoomFFT c64"),
+    ):
         command = [sys.executable, __file__, "--bands", who, *["--one-thread"] * ONE]
-        runs = [subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-4:]
-                for _ in range(3)]  # fmt: skip
+        runs = [
+            subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-4:]
+            for _ in range(3)
+        ]
         took, worked, peak, before = zip(*runs, strict=True)
-        print(f"| {title} | {', '.join(took)} | {', '.join(worked)} | {max(peak)} | {before[0]} |", flush=True)
+        print(
+            f"| {title} | {', '.join(took)} | {', '.join(worked)} | {max(peak)} | {before[0]} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":
@@ -320,7 +382,10 @@ if __name__ == "__main__":
             if "--size" in sys.argv:
                 SIZES[:] = [tuple(int(n) for n in sys.argv[sys.argv.index("--size") + 1 :][:2])]
             part = sys.argv[sys.argv.index("--part") + 1] if "--part" in sys.argv else ""
-            print(f"load {os.getloadavg()[0]:.1f} at the start, torch {torch.__version__}, {repeats} repeats\n")
+            print(
+                f"load {os.getloadavg()[0]:.1f} at the start, torch {torch.__version__}, {repeats}"
+                " repeats\n"
+            )
             for table in (forward, methods, backward):
                 if part in ("", table.__name__):
                     table(repeats)

@@ -1,4 +1,5 @@
-"""What `neusee calibrate` says of real cameras, clean and faulty, by a simulator that shares no line with it.
+"""What `neusee calibrate` says of real cameras, clean and faulty, by a simulator that shares no
+line with it.
 
     python tests/benchmarks/bench_real_cameras.py FILE [options]
 
@@ -10,12 +11,14 @@
     --minutes M      begin no camera after M minutes
     --table          only print the table of FILE
 
-A clean camera is drawn by its number: gain, well, read noise, vignetting, flicker and drift of the lamp, spread of the
-pixels, hot pixels, a well below the converter's top, numbers shifted to the left. Its frames are written as PNG files,
-whose names tell exposure and photons. Wrong means: a value that is stated with exit code 0 lies more than 3 combined
-standard uncertainties of its budget from the truth. Two ratios say how wide the gain is: over all that scatters from
-level to level (sampling, lamp, dark signal, variances), and over sampling alone. A lamp that flickers makes the second
-one large although nothing was added: the means of the levels tell the bend of the response, on which the gain depends.
+A clean camera is drawn by its number: gain, well, read noise, vignetting, flicker and drift of the
+lamp, spread of the pixels, hot pixels, a well below the converter's top, numbers shifted to the
+left. Its frames are written as PNG files, whose names tell exposure and photons. Wrong means: a
+value that is stated with exit code 0 lies more than 3 combined standard uncertainties of its budget
+from the truth. Two ratios say how wide the gain is: over all that scatters from level to level
+(sampling, lamp, dark signal, variances), and over sampling alone. A lamp that flickers makes the
+second one large although nothing was added: the means of the levels tell the bend of the response,
+on which the gain depends.
 """
 
 import argparse
@@ -38,7 +41,7 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
 from neusee.nodes.calibrate import CLEAN_PAIRS, STATISTICS  # noqa: E402
-from neusee.nodes.calibrate._budget._camera_sources import SOURCES  # noqa: E402
+from neusee.nodes.calibrate._sheet_budget import SOURCES  # noqa: E402
 from neusee.workflows.calibration import emcee_sampler  # noqa: E402
 from neusee.workflows.calibration.run_calibration import CalibrationRefused, find_posterior  # noqa: E402
 from neusee.workflows.frames.folder_recipe import recipe_of_folder  # noqa: E402
@@ -98,7 +101,9 @@ def camera_of(number, side, **faults):
 
 
 def written(camera, folder):
-    """Write the frames as PNG files whose names tell exposure and photons; return the truth of the camera."""
+    """Write the frames as PNG files whose names tell exposure and photons; return the truth of
+    the camera.
+    """
     folder.mkdir()
     for shot in camera.shots():
         kind = f"lit_{1e3 * shot.exposure:g}ms_{shot.photons:.7g}ph" if shot.photons else shot.name
@@ -119,12 +124,16 @@ def in_process(camera):
         store = Store(folder / "store")
         try:
             recipe = recipe_of_folder(folder / "lab", store)
-            result = find_posterior(recipe, store, lambda _: None, walkers=64, move="de", draws=1000)
+            result = find_posterior(
+                recipe, store, lambda _: None, walkers=64, move="de", draws=1000
+            )
         except (CalibrationRefused, ValueError) as error:
             return {"exit": 3, "failed": [str(error)[:160]]}
     failed = [check.name for check in result.checks if check.mark == "fail"]
     budgets = {budget.key: budget for budget in result.budgets}
-    widths = {name: (budgets[name].value, budgets[name].combined) for name in truth if name in budgets}
+    widths = {
+        name: (budgets[name].value, budgets[name].combined) for name in truth if name in budgets
+    }
     shares = {c.source: c.share for c in budgets["gain"].contributions if c.share}
     return judged(truth, widths, shares, failed)
 
@@ -136,7 +145,9 @@ def by_command(camera):
         truth = written(camera, folder / "lab")
         command = [sys.executable, "-m", "neusee", "calibrate", "lab", "--quiet", "--out", "runs"]
         environment = {**os.environ, "NEUSEE_CACHE": str(folder / "cache")}
-        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            command, cwd=folder, env=environment, capture_output=True, text=True, check=False
+        )
         if done.returncode not in (0, 3):
             return {"exit": done.returncode, "failed": [done.stderr[-160:]]}
         (run,) = (path for path in (folder / "runs").iterdir() if not path.is_symlink())
@@ -156,7 +167,9 @@ def by_command(camera):
 
 
 def judged(truth, widths, shares, failed):
-    """The line of a camera; ``shares`` are the contributions of the sources to the width of the gain."""
+    """The line of a camera; ``shares`` are the contributions of the sources to the width of the
+    gain.
+    """
     z = {name: (value - truth[name]) / width for name, (value, width) in widths.items()}
     value, width = widths["gain"]
     return {
@@ -171,8 +184,13 @@ def judged(truth, widths, shares, failed):
 
 
 def jobs(given):
-    """The cameras (row, number, function) that are asked for, in an order that brings each row forward."""
-    rows = [("clean, in process", given.cameras, 0, in_process), ("clean, by command", given.commands, 0, by_command)]
+    """The cameras (row, number, function) that are asked for, in an order that brings each row
+    forward.
+    """
+    rows = [
+        ("clean, in process", given.cameras, 0, in_process),
+        ("clean, by command", given.commands, 0, by_command),
+    ]
     rows += [(fault, given.faulty, 10_000, in_process) for fault in FAULTS]
     most = max(count for _, count, _, _ in rows)
     for number in range(most):
@@ -182,15 +200,29 @@ def jobs(given):
 
 
 def table(lines):
-    columns = ("row", "cameras", "exit 3", "by", "values stated", "beyond 3 sd", "largest z", "width of the gain")
+    columns = (
+        "row",
+        "cameras",
+        "exit 3",
+        "by",
+        "values stated",
+        "beyond 3 sd",
+        "largest z",
+        "width of the gain",
+    )
     print(f"| {' | '.join(columns)} | over all that scatters | over sampling |")
     print("|---|---|---|---|---|---|---|---|---|---|")
     for row in dict.fromkeys(line["row"] for line in lines):
         own = [line for line in lines if line["row"] == row]
         good = [line for line in own if line["exit"] == 0]
-        names = Counter(name.split(":")[0] for line in own if line["exit"] for name in line["failed"])
+        names = Counter(
+            name.split(":")[0] for line in own if line["exit"] for name in line["failed"]
+        )
         z = [abs(x) for line in good for x in line["z"].values()]
-        text = f"| {row} | {len(own)} | {len(own) - len(good)} | {', '.join(f'{n} {c}' for n, c in names.items())} "
+        text = (
+            f"| {row} | {len(own)} | {len(own) - len(good)} |"
+            f" {', '.join(f'{n} {c}' for n, c in names.items())} "
+        )
         text += f"| {len(z)} | {sum(x > 3 for x in z)} | {max(z, default=0):.1f} "
         if good:
             width = 100 * np.median([line["width"] for line in good])
@@ -215,7 +247,9 @@ def kept(file):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("file", type=Path)
     parser.add_argument("--cameras", type=int, default=300)
     parser.add_argument("--commands", type=int, default=100)

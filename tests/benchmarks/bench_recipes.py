@@ -1,8 +1,10 @@
-"""Whole runs as a user starts them: time, memory, and the second run against a bare import of torch.
+"""Whole runs as a user starts them: time, memory, and the second run against a bare import of
+torch.
 
     python tests/benchmarks/bench_recipes.py [RECIPE ...]
 
-Without a name: first_light, cold and again; paper_table1, cold and after one change; each in a fresh cache.
+Without a name: first_light, cold and again; paper_table1, cold and after one change; each in a
+fresh cache.
 """
 
 from __future__ import annotations
@@ -18,13 +20,19 @@ import time
 from collections import defaultdict
 from pathlib import Path
 
-NEUSEE = [sys.executable, "-c", "from neusee.workflows.cli.app import main; raise SystemExit(main())"]
+NEUSEE = [
+    sys.executable,
+    "-c",
+    "from neusee.workflows.cli.app import main; raise SystemExit(main())",
+]
 
 
 def process(command: list[str], cache: Path) -> tuple[float, float]:
     """Wall seconds and peak memory (GB) of a command, both of that process alone."""
     began = time.perf_counter()
-    child = subprocess.Popen(command, env=os.environ | {"NEUSEE_CACHE": str(cache)}, stdout=subprocess.DEVNULL)
+    child = subprocess.Popen(
+        command, env=os.environ | {"NEUSEE_CACHE": str(cache)}, stdout=subprocess.DEVNULL
+    )
     _, status, usage = os.wait4(child.pid, 0)
     if os.waitstatus_to_exitcode(status):
         raise SystemExit(f"failed: {' '.join(command)}")
@@ -53,7 +61,10 @@ def cold(recipe: str, place: Path) -> None:
     for node, count, spent, size in found[:14]:
         print(f"| {node} | {count} | {spent:.2f} | {size:.0f} |")
     rest = found[14:]
-    print(f"| all others | {sum(r[1] for r in rest)} | {sum(r[2] for r in rest):.2f} | {sum(r[3] for r in rest):.0f} |")
+    print(
+        f"| all others | {sum(r[1] for r in rest)} | {sum(r[2] for r in rest):.2f} |"
+        f" {sum(r[3] for r in rest):.0f} |"
+    )
     total = sum(r[2] for r in found)
     print(f"| pictures, page, files, store | | {seconds - total:.1f} | |")
 
@@ -66,7 +77,10 @@ def again(recipe: str, place: Path, repeats: int = 7) -> None:
         torch.append(process([sys.executable, "-c", "import torch"], place / "cache")[0])
     ratio = statistics.median(a / b for a, b in zip(ours, torch, strict=True))
     medians = f"{statistics.median(ours):.2f} s against {statistics.median(torch):.2f} s"
-    print(f"\n`{recipe}`, again: {medians} for `import torch`, ratio {ratio:.2f} (median of {repeats} pairs)")
+    print(
+        f"\n`{recipe}`, again: {medians} for `import torch`, ratio {ratio:.2f} (median of {repeats}"
+        " pairs)"
+    )
 
 
 ENGINE = """
@@ -82,19 +96,32 @@ print(f"{time.perf_counter() - began:.2f} {ran} {len(done)}")
 
 
 def engine(cache: Path, *changes: str) -> tuple[float, int, int]:
-    """Seconds of the engine alone, from light to developed picture, without restoration; steps that ran; all steps."""
+    """Seconds of the engine alone, from light to developed picture, without restoration; steps
+    that ran; all steps.
+    """
     command = [sys.executable, "-c", ENGINE, *changes]
-    out = subprocess.run(command, env=os.environ | {"NEUSEE_CACHE": str(cache)}, capture_output=True, check=True)
+    out = subprocess.run(
+        command, env=os.environ | {"NEUSEE_CACHE": str(cache)}, capture_output=True, check=True
+    )
     seconds, ran, steps = out.stdout.split()
     return float(seconds), int(ran), int(steps)
 
 
 def changed(place: Path) -> None:
-    """paper_table1 after one change: the whole command, and the engine up to the developed pictures."""
-    print("\n| paper_table1, up to the developed pictures | seconds | steps that ran | of cold |\n|---|---|---|---|")
+    """paper_table1 after one change: the whole command, and the engine up to the developed
+    pictures.
+    """
+    print(
+        "\n| paper_table1, up to the developed pictures | seconds | steps that ran | of cold"
+        " |\n|---|---|---|---|"
+    )
     cold_seconds, ran, count = engine(place / "engine")
     print(f"| cold | {cold_seconds:.1f} | {ran} of {count} | 1 |")
-    for change in ("sensor.read_noise=20 e-", "lasers.green.wavelength=550 nm", "sensor.read_noise=10.5 e-"):
+    for change in (
+        "sensor.read_noise=20 e-",
+        "lasers.green.wavelength=550 nm",
+        "sensor.read_noise=10.5 e-",
+    ):
         seconds, ran, count = engine(place / "engine", change)
         print(f"| `{change}` | {seconds:.2f} | {ran} of {count} | 1/{cold_seconds / seconds:.0f} |")
     for change in ("sensor.read_noise=20 e-", "lasers.green.wavelength=550 nm"):

@@ -1,10 +1,12 @@
-"""Repeated commands, with and without the stored answer of each: processor and wall seconds, as a table in RESULTS.md.
+"""Repeated commands, with and without the stored answer of each: processor and wall seconds, as a
+table in RESULTS.md.
 
     python tests/benchmarks/bench_repeated_command.py [--times 9]
 
-Each command is a process of its own with one thread. Without the answer: the folder of answers is removed first, so
-that the command reads the recipe, takes results from the store and keeps its answer. The two take turns in one
-run, beside `neusee --help` and a bare `import torch`, and the load of the machine is recorded.
+Each command is a process of its own with one thread. Without the answer: the folder of answers is
+removed first, so that the command reads the recipe, takes results from the store and keeps its
+answer. The two take turns in one run, beside `neusee --help` and a bare `import torch`, and the
+load of the machine is recorded.
 """
 
 import argparse
@@ -47,7 +49,9 @@ def measured(words: list[str], place: Path) -> tuple[float, float]:
     """Return the processor and the wall seconds of one process."""
     env = {**os.environ, "NEUSEE_CACHE": str(place / "cache"), "OMP_NUM_THREADS": "1"}
     began = time.perf_counter()
-    process = subprocess.Popen([sys.executable, *words], env=env, cwd=place, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [sys.executable, *words], env=env, cwd=place, stdout=subprocess.DEVNULL
+    )
     _, status, used = os.wait4(process.pid, 0)
     if status:
         raise SystemExit(f"{' '.join(words)} ended with status {status}")
@@ -60,9 +64,14 @@ def shown(seconds: list[float]) -> str:
 
 
 def line(name: str, rows: list[tuple[float, float]], alone: float) -> str:
-    """Return the row of a command in the table; ``alone``: processor seconds of an import of torch, the median."""
+    """Return the row of a command in the table; ``alone``: processor seconds of an import of
+    torch, the median.
+    """
     processor, wall = map(list, zip(*rows, strict=True))
-    return f"| {name} | {shown(processor)} | {shown(wall)} | {statistics.median(processor) / alone:.2f} |\n"
+    return (
+        f"| {name} | {shown(processor)} | {shown(wall)} |"
+        f" {statistics.median(processor) / alone:.2f} |\n"
+    )
 
 
 def write(lines: list[str], about: str) -> None:
@@ -93,7 +102,9 @@ def main() -> None:
     alone = statistics.median(processor for processor, _ in found[TORCH])
     lines = [line(name, rows, alone) for name, rows in found.items()]
     load = f"load of the machine {min(loads):.1f} to {max(loads):.1f} with {os.cpu_count()} cores"
-    write(lines, f"Whole processes of one thread, {times} of each in turns: least (median); {load}.")
+    write(
+        lines, f"Whole processes of one thread, {times} of each in turns: least (median); {load}."
+    )
     print("".join(lines), load)
 
 

@@ -1,15 +1,17 @@
-"""How near the restored picture is to the scene, for frames of a camera that the recipe describes wrongly.
+"""How near the restored picture is to the scene, for frames of a camera that the recipe describes
+wrongly.
 
-    python tests/benchmarks/bench_restored_frames.py results.jsonl --seeds 0 4 --pictures photographs/
-    python tests/benchmarks/bench_restored_frames.py results.jsonl --report
+    python tests/benchmarks/bench_restored_frames.py results.jsonl --seeds 0 4 --pictures
+    photographs/ python tests/benchmarks/bench_restored_frames.py results.jsonl --report
 
-The frames come from `tests/nodes/restore/lasers/own_camera.py`, a camera in NumPy alone, with an error that nobody is
-told of: 0.1 wave of defocus at the rim, half a pixel of tilt, grains of dirt in the pupil, and another illuminant. Each
-frame is restored by `neusee restore` with the recipe of the clean camera: by the filter that knows of no laser, by the
-filter that is told direction and wavelength, by the search, and by the network of this package after the search. Beside
-them stands the frame as developed, without a
-restoration. A picture is scored after a shift and one gain for each channel, which no frame can tell, as PSNR of the
-encoded picture away from its border. A frame that stands in the file is not computed again.
+The frames come from `tests/nodes/restore/lasers/own_camera.py`, a camera in NumPy alone, with an
+error that nobody is told of: 0.1 wave of defocus at the rim, half a pixel of tilt, grains of dirt
+in the pupil, and another illuminant. Each frame is restored by `neusee restore` with the recipe of
+the clean camera: by the filter that knows of no laser, by the filter that is told direction and
+wavelength, by the search, and by the network of this package after the search. Beside them stands
+the frame as developed, without a restoration. A picture is scored after a shift and one gain for
+each channel, which no frame can tell, as PSNR of the encoded picture away from its border. A frame
+that stands in the file is not computed again.
 """
 
 import argparse
@@ -42,7 +44,8 @@ MASKS = ("plain", "half_ring", "designed")
 STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
 WEIGHTS = ROOT / "recipes" / "samples" / "neusee_network.safetensors"
 METHODS = ("nothing", "blind", "told", "search", "network")
-DESIGNED, DEPTH = ROOT / "recipes" / "samples" / "demonstration_mask.png", 33.9189e-6  #: of recipes/doe/demonstration
+#: of recipes/doe/demonstration
+DESIGNED, DEPTH = ROOT / "recipes" / "samples" / "demonstration_mask.png", 33.9189e-6
 
 CAMERA = """\
 defaults:
@@ -59,12 +62,16 @@ defaults:
   - reading: coherent
 seed: 7
 """
-#: the network of this package after the search, which is no option that ships, for it gains nothing there
+#: the network of this package after the search, which is no option that ships, for it gains nothing
+#: there
 NETWORK = (
     (ROOT / "recipes" / "restore" / "search.yaml")
     .read_text()
     .replace("node: restore.wiener\n", "node: restore.informed\n")
-    .replace("    with:\n      balance:", f"    with:\n      weights: {WEIGHTS}\n      width: 12\n      balance:")
+    .replace(
+        "    with:\n      balance:",
+        f"    with:\n      weights: {WEIGHTS}\n      width: 12\n      balance:",
+    )
 )
 OPTICS = f"""\
 defaults: [small]
@@ -90,10 +97,13 @@ sensor:
 """
 
 FILES = {
-    "camera.yaml": CAMERA, "optics/own.yaml": OPTICS, "sensor/own.yaml": SENSOR, "restore/network.yaml": NETWORK,
-}  # fmt: skip
+    "camera.yaml": CAMERA,
+    "optics/own.yaml": OPTICS,
+    "sensor/own.yaml": SENSOR,
+    "restore/network.yaml": NETWORK,
+}
 
-# --- the true camera --------------------------------------------------------------------------------------------------
+# --- the true camera ------------------------------------------------------------------------------
 
 own_pupil = own.pupil
 
@@ -113,7 +123,10 @@ def true_pupil(name):
         with Image.open(DESIGNED) as file:
             white = 65535.0 if file.mode.startswith("I") else 255.0
             grey = Image.fromarray(np.asarray(file, np.float32) / white)
-        height = np.asarray(grey.resize((own.SAMPLES, own.SAMPLES), Image.Resampling.BILINEAR), float) * DEPTH
+        height = (
+            np.asarray(grey.resize((own.SAMPLES, own.SAMPLES), Image.Resampling.BILINEAR), float)
+            * DEPTH
+        )
     else:
         inside, height = own_pupil(mask)
     if not seed:
@@ -138,12 +151,16 @@ def observer():
     seen = functions[own.BANDS * 1e9].T * own.daylight(own.BANDS)
     seen = seen / seen[1].sum()
     white = colour.xy_to_XYZ(colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]["D65"])
-    adapted = colour.adaptation.matrix_chromatic_adaptation_VonKries(seen.sum(1), white, transform="Bradford")
+    adapted = colour.adaptation.matrix_chromatic_adaptation_VonKries(
+        seen.sum(1), white, transform="Bradford"
+    )
     return colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB @ adapted @ seen
 
 
 def photographs(folder):
-    """Let the camera take crops of the photographs of a folder; returns the function in place of `own.picture`."""
+    """Let the camera take crops of the photographs of a folder; returns the function in place of
+    `own.picture`.
+    """
     files = sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".png"))
 
     def picture(kind, side, rng):
@@ -156,7 +173,9 @@ def photographs(folder):
 
 
 def taken(mask, strength, seed, kind, picture):
-    """A frame in digital numbers (y, x, 3), the linear sRGB of its scene (3, y, x), and the laser."""
+    """A frame in digital numbers (y, x, 3), the linear sRGB of its scene (3, y, x), and the
+    laser.
+    """
     rng = np.random.default_rng([seed, *mask.encode(), int(strength)])
     kept = []
 
@@ -174,12 +193,14 @@ def taken(mask, strength, seed, kind, picture):
     numbers = np.rint((electrons + own.OFFSET) * own.GAIN).astype(np.uint16)
     rim = SIDE // 2
     inner = kept[0][rim : rim + SIDE, rim : rim + SIDE]
-    basis = np.stack([np.exp(-0.5 * ((own.BANDS - c) / 45e-9) ** 2) for c in (610e-9, 545e-9, 460e-9)])
+    basis = np.stack(
+        [np.exp(-0.5 * ((own.BANDS - c) / 45e-9) ** 2) for c in (610e-9, 545e-9, 460e-9)]
+    )
     basis /= basis.sum(0) + 0.05
     return numbers.transpose(1, 2, 0), np.einsum("cb,kb,yxk->cyx", observer(), basis, inner), laser
 
 
-# --- the program ------------------------------------------------------------------------------------------------------
+# --- the program ----------------------------------------------------------------------------------
 
 
 def written_camera(folder):
@@ -190,23 +211,42 @@ def written_camera(folder):
         path.write_text("# The clean camera.\n" + text)
     fine = np.arange(390e-9, 711e-9, 1e-9)
     rows = [f"{w * 1e9:.0f}," + ",".join(f"{v:.8f}" for v in own.response(w)) for w in fine]
-    (folder / "sensor" / "own.csv").write_text("\n".join(["wavelength (nm),red (1),green (1),blue (1)", *rows]) + "\n")
+    (folder / "sensor" / "own.csv").write_text(
+        "\n".join(["wavelength (nm),red (1),green (1),blue (1)", *rows]) + "\n"
+    )
     for mask in MASKS:
         inside, height = true_pupil(mask)
-        np.save(folder / f"{mask}.npy", (height - height.min()) * inside)  # a glass has no height below 0
+        # a glass has no height below 0
+        np.save(folder / f"{mask}.npy", (height - height.min()) * inside)
     return folder / "camera.yaml"
 
 
 def outputs_of(numbers, mask, words, outputs, folder, load=load_file):
-    """The named outputs of `neusee restore` for a frame and a mask, with further words of the command."""
+    """The named outputs of `neusee restore` for a frame and a mask, with further words of the
+    command.
+    """
     np.save(folder / "frame.npy", numbers)
     told = io.StringIO()
-    with tempfile.TemporaryDirectory() as out, contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+    with (
+        tempfile.TemporaryDirectory() as out,
+        contextlib.redirect_stdout(told),
+        contextlib.redirect_stderr(told),
+    ):
         try:
             app.main(
-                ["restore", str(folder / "frame.npy"), "--camera", str(folder / "camera.yaml"),
-                 "--mask", str(folder / f"{mask}.npy"), *words, f"outputs={json.dumps(outputs)}", "--out", out]
-            )  # fmt: skip
+                [
+                    "restore",
+                    str(folder / "frame.npy"),
+                    "--camera",
+                    str(folder / "camera.yaml"),
+                    "--mask",
+                    str(folder / f"{mask}.npy"),
+                    *words,
+                    f"outputs={json.dumps(outputs)}",
+                    "--out",
+                    out,
+                ]
+            )
         except SystemExit as end:
             if end.code not in (0, 3):
                 raise RuntimeError(told.getvalue()) from None
@@ -214,7 +254,9 @@ def outputs_of(numbers, mask, words, outputs, folder, load=load_file):
 
 
 def restored(numbers, mask, method, laser, folder):
-    """What `neusee restore` returns for a frame, linear sRGB (3, y, x), its numbers of lasers, and processor time."""
+    """What `neusee restore` returns for a frame, linear sRGB (3, y, x), its numbers of lasers,
+    and processor time.
+    """
     options = {"blind": "wiener_blind", "nothing": "wiener_blind"}
     words = [f"restore={options.get(method, method)}"]
     if method == "told":
@@ -222,15 +264,22 @@ def restored(numbers, mask, method, laser, folder):
         line = f"wavelength: {laser.wavelength * 1e9} nm, fwhm: {laser.fwhm * 1e9} nm, strength: 1"
         words = ["restore=wiener", f"lasers={{it: {{{line}, angle: [{y} mrad, {x} mrad]}}}}"]
         words = words if laser.strength else ["restore=wiener"]
-    outputs = ["restored", "developed[mask]", *(["search"] if method in ("search", "network") else [])]
+    outputs = [
+        "restored",
+        "developed[mask]",
+        *(["search"] if method in ("search", "network") else []),
+    ]
     start = time.process_time()
     results = outputs_of(numbers, mask, words, outputs, folder)
-    number = next((int(v) for k, v in results.items() if k.startswith("search") and k.endswith("number")), None)
+    number = next(
+        (int(v) for k, v in results.items() if k.startswith("search") and k.endswith("number")),
+        None,
+    )
     picture = results["developed[mask]" if method == "nothing" else "restored"]
     return picture.astype(float), number, time.process_time() - start
 
 
-# --- the score --------------------------------------------------------------------------------------------------------
+# --- the score ------------------------------------------------------------------------------------
 
 
 def encoded(x):
@@ -239,7 +288,9 @@ def encoded(x):
 
 
 def score(picture, truth):
-    """PSNR in dB after the best shift within two pixels and the gains that bring the medians together."""
+    """PSNR in dB after the best shift within two pixels and the gains that bring the medians
+    together.
+    """
     scale = np.percentile(truth, 99.5)
     truth = truth / scale
     gains = np.median(truth, (1, 2)) / np.maximum(np.median(picture, (1, 2)), 1e-9)
@@ -252,11 +303,17 @@ def score(picture, truth):
         return float(np.mean((np.clip(moved[:, RIM:-RIM, RIM:-RIM], 0, 1) - aim) ** 2))
 
     starts = [(y, x) for y in (-0.5, 0, 0.5) for x in (-0.5, 0, 0.5)]
-    best = minimize(error, min(starts, key=error), method="Nelder-Mead", bounds=[(-2, 2)] * 2, options={"xatol": 0.02})
+    best = minimize(
+        error,
+        min(starts, key=error),
+        method="Nelder-Mead",
+        bounds=[(-2, 2)] * 2,
+        options={"xatol": 0.02},
+    )
     return -10 * np.log10(best.fun)
 
 
-# --- runs and tables --------------------------------------------------------------------------------------------------
+# --- runs and tables ------------------------------------------------------------------------------
 
 
 def run(path, first, count, picture, kinds, masks, strengths, methods=METHODS):
@@ -276,9 +333,15 @@ def run(path, first, count, picture, kinds, masks, strengths, methods=METHODS):
                     for method in todo:
                         shown, number, seconds = restored(numbers, mask, method, laser, folder)
                         each = {
-                            "seed": seed, "mask": mask, "strength": strength, "method": method, "kind": str(kind),
-                            "psnr": round(score(shown, truth), 3), "number": number, "seconds": round(seconds, 1),
-                        }  # fmt: skip
+                            "seed": seed,
+                            "mask": mask,
+                            "strength": strength,
+                            "method": method,
+                            "kind": str(kind),
+                            "psnr": round(score(shown, truth), 3),
+                            "number": number,
+                            "seconds": round(seconds, 1),
+                        }
                         with path.open("a") as file:
                             file.write(json.dumps(each) + "\n")
 
@@ -288,7 +351,9 @@ def rows(path):
 
 
 def report(found):
-    """Print the means of the methods that were run, and the paired gains of the search with their 95 % intervals."""
+    """Print the means of the methods that were run, and the paired gains of the search with
+    their 95 % intervals.
+    """
     methods = [m for m in METHODS if any(r["method"] == m for r in found)]
     by = {(r["seed"], r["mask"], r["strength"], r["method"]): r["psnr"] for r in found}
     whole = {key[:3] for key in by if all((*key[:3], m) in by for m in methods)}
@@ -298,22 +363,33 @@ def report(found):
             frames = sorted(k for k in whole if k[2] == strength and mask in (k[1], "all"))
             if frames:
                 table = {m: np.array([by[(*k, m)] for k in frames]) for m in methods}
-                gains = [f"{m} {interval(table['search'] - table[m])}" for m in methods if m != "search"]
+                gains = [
+                    f"{m} {interval(table['search'] - table[m])}" for m in methods if m != "search"
+                ]
                 means = " ".join(f"{v.mean():6.2f}" for v in table.values())
                 print(f"{mask:9} {strength:7g}: {len(frames):3}  {means}   {'  '.join(gains)}")
 
 
 def interval(gain):
     """Mean, 95 % interval and least value of paired gains."""
-    half = student.ppf(0.975, len(gain) - 1) * gain.std(ddof=1) / len(gain) ** 0.5 if len(gain) > 1 else np.inf
-    return f"{gain.mean():+.2f} ({gain.mean() - half:+.2f} to {gain.mean() + half:+.2f}, least {gain.min():+.2f})"
+    half = (
+        student.ppf(0.975, len(gain) - 1) * gain.std(ddof=1) / len(gain) ** 0.5
+        if len(gain) > 1
+        else np.inf
+    )
+    return (
+        f"{gain.mean():+.2f} ({gain.mean() - half:+.2f} to {gain.mean() + half:+.2f}, least"
+        f" {gain.min():+.2f})"
+    )
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("file", type=Path)
     parser.add_argument("--seeds", type=int, nargs=2, metavar=("FIRST", "COUNT"))
-    parser.add_argument("--pictures", type=Path, help="folder of photographs in place of the three made kinds")
+    parser.add_argument(
+        "--pictures", type=Path, help="folder of photographs in place of the three made kinds"
+    )
     parser.add_argument("--masks", nargs="+", default=MASKS)
     parser.add_argument("--strengths", type=float, nargs="+", default=STRENGTHS)
     parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS)

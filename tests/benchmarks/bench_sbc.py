@@ -1,10 +1,12 @@
-"""Simulation-based calibration: `python tests/benchmarks/bench_sbc.py MODE [SIMULATIONS] [MOVE] [FILE]`.
+"""Simulation-based calibration: `python tests/benchmarks/bench_sbc.py MODE [SIMULATIONS] [MOVE]
+[FILE]`.
 
-MODE is density (pixels alike) or camera (a drifting lamp, a bent response). SIMULATIONS (200) cameras are drawn from
-the priors below; `plain_camera`, which shares no code with neusee, takes their frames; `neusee calibrate` searches the
-mode and draws as ever. A table in Markdown: p of the ranks, coverage and z of each parameter, with the bars that a
-right posterior misses in 1 of 1000 studies. MOVE is de, stretch, or snooker: the snooker of emcee 3.1.6, which must
-fail, walks without the density that guides the other moves. Rows are kept in FILE, so that what was stopped goes on.
+MODE is density (pixels alike) or camera (a drifting lamp, a bent response). SIMULATIONS (200)
+cameras are drawn from the priors below; `plain_camera`, which shares no code with neusee, takes
+their frames; `neusee calibrate` searches the mode and draws as ever. A table in Markdown: p of the
+ranks, coverage and z of each parameter, with the bars that a right posterior misses in 1 of 1000
+studies. MOVE is de, stretch, or snooker: the snooker of emcee 3.1.6, which must fail, walks without
+the density that guides the other moves. Rows are kept in FILE, so that what was stopped goes on.
 """
 
 import json
@@ -21,13 +23,16 @@ from plain_camera import PlainCamera, frames_recipe, table
 
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.importance_sampling import draw_guide
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import search_mode
+from neusee.workflows.calibration.log_posterior import SensorPosterior, search_mode
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.calibration.independent_draws import DRAWS, walk_draws
-from neusee.workflows.studies.calibration.rank_uniformity import rank_tests
-from neusee.workflows.studies.calibration.simulated_sensors import PosteriorDraws, rank_truth
+from neusee.workflows.studies.calibration.posterior_tests import (
+    DRAWS,
+    PosteriorDraws,
+    rank_tests,
+    rank_truth,
+    walk_draws,
+)
 
 #: by mode and parameter: median and factor; mean and standard deviation of those in `LINEAR`
 PRIORS = {
@@ -58,7 +63,8 @@ def drawn_from(mode, rng):
 def measured(mode, truth, number, folder):
     """The recipe of a measurement of the camera ``truth``."""
     prior = [
-        f"steps.prior.with.{name}=[{a!r} {UNITS.get(name, '')}, {b!r}{' e-' if name == 'offset' else ''}]"
+        f"steps.prior.with.{name}=[{a!r} {UNITS.get(name, '')},"
+        f" {b!r}{' e-' if name == 'offset' else ''}]"
         for name, (a, b) in PRIORS[mode].items()
     ]
     if mode == "camera":
@@ -66,15 +72,21 @@ def measured(mode, truth, number, folder):
         file = table(camera, [number, 2], folder / "levels.csv", size=64, lit=15, beyond=1.5)
         return load("calibrate_camera", [f"table.file={file}", *prior])
     camera = PlainCamera(
-        gain=truth["gain"], quantum_efficiency=truth["quantum_efficiency"], temporal_dark_noise=truth["read_noise"],
-        dark_current=truth["dark_current"], dark_signal=truth["gain"] * truth["offset"],
-        full=truth["full_well"] - truth["offset"], first=0.0,
-    )  # fmt: skip
+        gain=truth["gain"],
+        quantum_efficiency=truth["quantum_efficiency"],
+        temporal_dark_noise=truth["read_noise"],
+        dark_current=truth["dark_current"],
+        dark_signal=truth["gain"] * truth["offset"],
+        full=truth["full_well"] - truth["offset"],
+        first=0.0,
+    )
     return load(str(frames_recipe(camera, [number, 2], folder, size=48, lit=10, darks=4)), prior)
 
 
 def at_the_top(problem, truth):
-    """Return the truth with bend and twist at the brightest level that the calibration uses, and not at TOP."""
+    """Return the truth with bend and twist at the brightest level that the calibration uses, and
+    not at TOP.
+    """
     lit, mean, variance = (
         problem.levels.photons.numpy() > 0,
         problem.levels.mean.numpy(),
@@ -96,12 +108,16 @@ def simulated(mode, number, move):
         if GUIDED[move]:
             guide = draw_guide(problem, best, np.random.default_rng(number))
             emcee_sampler._FIRST = emcee_sampler._LONGEST = STEPS
-            chains = emcee_sampler.sample(problem, best, folder / "c.h5", seed=number, how=move, guide=guide)
+            chains = emcee_sampler.sample(
+                problem, best, folder / "c.h5", seed=number, move_name=move, guide=guide
+            )
             rng = np.random.default_rng([number, 3])
             flat = chains.flat[rng.choice(len(chains.flat), DRAWS, replace=False)]
-            found = PosteriorDraws(flat, chains.tau, chains.steps > 10 * chains.tau, emcee_sampler.stranded(chains.log))
+            found = PosteriorDraws(
+                flat, chains.tau, chains.steps > 10 * chains.tau, emcee_sampler.stranded(chains.log)
+            )
         else:
-            found = walk_draws(problem, best, number, how=move)
+            found = walk_draws(problem, best, number, move_name=move)
         row = rank_truth(problem, truth, found)
     return {"number": number, **vars(row), "seconds": time.process_time() - began}
 
@@ -125,19 +141,23 @@ def main(mode="camera", count=200, move="de", file=None):
             rows.append(simulated(mode, number, move))
             with path.open("a") as opened:
                 opened.write(json.dumps(rows[-1]) + "\n")
-    print("| parameter | p | at least | coverage | bar | z mean | z sd | |\n|---|---|---|---|---|---|---|---|")
+    print(
+        "| parameter | p | at least | coverage | bar | z mean | z sd |"
+        " |\n|---|---|---|---|---|---|---|---|"
+    )
     found = [Row(row) for row in rows[: int(count)]]
     for v in rank_tests(found):
         held = "fails" if v.failed else "holds"
         print(
-            f"| {v.name} | {v.p:.3f} | {v.least_p:.4f} | {v.coverage:.3f} | {v.bar[0]:.3f} to {v.bar[1]:.3f} "
-            f"| {v.z_mean:+.2f} | {v.z_sd:.2f} | {held} |"
+            f"| {v.name} | {v.p:.3f} | {v.least_p:.4f} | {v.coverage:.3f} | {v.bar[0]:.3f} to"
+            f" {v.bar[1]:.3f} | {v.z_mean:+.2f} | {v.z_sd:.2f} | {held} |"
         )
     short = sum(not row.independent for row in found)
     print(
-        f"\n{len(found)} simulations in mode {mode}, {np.median([r.seconds for r in found]):.1f} s of processor time "
-        f"each; {short} chains too short, {sum(r.stranded > 0 for r in found)} with stranded walkers; tau "
-        f"{np.median([r.tau for r in found]):.1f}, at most {max(r.tau for r in found):.1f}."
+        f"\n{len(found)} simulations in mode {mode}, {np.median([r.seconds for r in found]):.1f} s"
+        f" of processor time each; {short} chains too short, {sum(r.stranded > 0 for r in found)}"
+        f" with stranded walkers; tau {np.median([r.tau for r in found]):.1f}, at most"
+        f" {max(r.tau for r in found):.1f}."
     )
 
 

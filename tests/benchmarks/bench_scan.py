@@ -1,10 +1,11 @@
-"""The selective scan beside mambapy's and the plain loop: `python tests/benchmarks/bench_scan.py [REPEATS]`.
+"""The selective scan beside mambapy's and the plain loop: `python tests/benchmarks/bench_scan.py
+[REPEATS]`.
 
-All get u, dt, A, B and C and return y; forward and backward, the decays and the reading by C included, batch 1, d 96,
-n 16, float32. With one thread, in turns within one process, so that a loaded machine slows all alike; with two after
-that. Beside the wall clock stands the processor's own time, which other work does not lengthen. Memory: what the peak
-of a process of its own rises by during its first call. The error is of y against a loop in float64. Prints tables in
-Markdown.
+All get u, dt, A, B and C and return y; forward and backward, the decays and the reading by C
+included, batch 1, d 96, n 16, float32. With one thread, in turns within one process, so that a
+loaded machine slows all alike; with two after that. Beside the wall clock stands the processor's
+own time, which other work does not lengthen. Memory: what the peak of a process of its own rises by
+during its first call. The error is of y against a loop in float64. Prints tables in Markdown.
 """
 
 import os
@@ -46,7 +47,9 @@ def mambapy(u, dt, A, B, C):
 def loop(u, dt, A, B, C):
     """The plain loop, in float32."""
     h, rows = torch.zeros(len(u), D, N), []
-    for push, step, into, out in zip((dt * u).unbind(1), dt.unbind(1), B.unbind(1), C.unbind(1), strict=True):
+    for push, step, into, out in zip(
+        (dt * u).unbind(1), dt.unbind(1), B.unbind(1), C.unbind(1), strict=True
+    ):
         h = torch.exp(step[..., None] * A) * h + push[..., None] * into[:, None]
         rows.append((h @ out[..., None])[..., 0])
     return torch.stack(rows, 1)
@@ -61,7 +64,9 @@ SCANS = {
 
 
 def once(scan, values):
-    """Wall and processor seconds of a forward and of a backward: (forward, backward), (forward, backward)."""
+    """Wall and processor seconds of a forward and of a backward: (forward, backward), (forward,
+    backward).
+    """
     for x in values:
         x.grad = None
     marks = [(time.perf_counter(), time.process_time())]
@@ -73,26 +78,35 @@ def once(scan, values):
 
 
 def interleaved(names, values, repeats):
-    """Median of wall and processor time of each, taken in turns after a call that does not count."""
+    """Median of wall and processor time of each, taken in turns after a call that does not
+    count.
+    """
     taken = {name: [] for name in names}
     for turn in range(repeats + 1):
         for name in names:
             time.sleep(0.05)
             found = once(SCANS[name], values)
             taken[name] += [found] if turn else []
-    return {n: [[statistics.median(x[i][j] for x in t) for j in (0, 1)] for i in (0, 1)] for n, t in taken.items()}
+    return {
+        n: [[statistics.median(x[i][j] for x in t) for j in (0, 1)] for i in (0, 1)]
+        for n, t in taken.items()
+    }
 
 
 def peak():
     """Largest resident size of this process since its peak was last cleared, in kB."""
-    (line,) = (x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("VmHWM"))
+    (line,) = (
+        x for x in Path("/proc/self/status").read_text().splitlines() if x.startswith("VmHWM")
+    )
     return int(line.split()[1])
 
 
 def megabytes(name, length):
     """Rise of the peak in a process of its own."""
     command = [sys.executable, __file__, "--memory", name, str(length)]
-    return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1])
+    return float(
+        subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1]
+    )
 
 
 def memory(name, length):
@@ -111,7 +125,10 @@ def table(length, threads, repeats):
     names = [n for n in SCANS if length <= LOOP or n != "plain loop"]
     times = interleaved(names, values, repeats)
     truth = reference(*(x.detach() for x in values))
-    errors = {n: float((SCANS[n](*values).detach() - truth).abs().max() / truth.abs().max()) for n in names}
+    errors = {
+        n: float((SCANS[n](*values).detach() - truth).abs().max() / truth.abs().max())
+        for n in names
+    }
     best = sum(times["neusee, C++"][1])
     for name in names:
         (forward, backward), cpu = times[name]
@@ -125,8 +142,14 @@ if __name__ == "__main__":
         memory(sys.argv[-2], int(sys.argv[-1]))
     else:
         repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 9
-        print(f"load {os.getloadavg()[0]:.1f} at the start, torch {torch.__version__}, {repeats} repeats\n")
-        print("| length | threads | who | forward ms | backward ms | both, processor ms | of C++ | peak MB | error |")
+        print(
+            f"load {os.getloadavg()[0]:.1f} at the start, torch {torch.__version__}, {repeats}"
+            " repeats\n"
+        )
+        print(
+            "| length | threads | who | forward ms | backward ms | both, processor ms | of C++ |"
+            " peak MB | error |"
+        )
         print("|---|---|---|---|---|---|---|---|---|")
         for length in LENGTHS:
             table(length, 1, repeats if length <= LOOP else max(1, repeats // 3))

@@ -1,10 +1,12 @@
-"""What the frames of a folder tell of a shading field: coverage of its intervals, and what dividing by it gains.
+"""What the frames of a folder tell of a shading field: coverage of its intervals, and what dividing
+by it gains.
 
     python tests/benchmarks/bench_shading.py photographs/ [side]
 
-A camera in NumPy: a field of twelve blurred grains that takes up to half of the light, 15 % of it, or nothing; scenes
-from photographs, Poisson and read noise, clipping. The gain is that of a frame with an error of 28 dB, as a restored
-one has, divided by the field or not, each at its best scale. Nothing here is shared with the estimate but its cells.
+A camera in NumPy: a field of twelve blurred grains that takes up to half of the light, 15 % of it,
+or nothing; scenes from photographs, Poisson and read noise, clipping. The gain is that of a frame
+with an error of 28 dB, as a restored one has, divided by the field or not, each at its best scale.
+Nothing here is shared with the estimate but its cells.
 """
 
 import sys
@@ -14,8 +16,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from neusee.nodes.restore._shading._frame_cells import at_pixels, cells_of, grid
-from neusee.nodes.restore._shading._shared_field import shared_field
+from neusee.nodes.restore._shading_field import at_pixels, cells_of, grid, shared_field
 
 FULL, READ, ERROR = 20000.0, 10.0, 0.04
 
@@ -25,7 +26,11 @@ def photographs(folder, side):
         with Image.open(path) as file:
             square = min(file.size)
             left, top = ((n - square) // 2 for n in file.size)
-            small = file.convert("RGB").crop((left, top, left + square, top + square)).resize((side, side))
+            small = (
+                file.convert("RGB")
+                .crop((left, top, left + square, top + square))
+                .resize((side, side))
+            )
         yield (np.asarray(small, float) / 255).transpose(2, 0, 1) ** 2.2 * 0.7 * FULL + 20
 
 
@@ -48,7 +53,12 @@ def trial(scenes, light, rng):
     knots = grid((side, side))
     found = shared_field(frames, knots)
     mean, deviation = found.mean.numpy(), found.covariance.diagonal().clamp_min(0).sqrt().numpy()
-    true = np.log(light).reshape(knots[0], side // knots[0], knots[1], side // knots[1]).mean((1, 3)).ravel()
+    true = (
+        np.log(light)
+        .reshape(knots[0], side // knots[0], knots[1], side // knots[1])
+        .mean((1, 3))
+        .ravel()
+    )
     inside = np.mean(np.abs(true - true.mean() - mean) <= 1.645 * deviation + 1e-6)
     told = np.mean(mean**2) / np.mean(mean**2 + deviation**2)
     used = bool(told >= 0.5 and found.clean < 0.05 and found.scenes >= 8)
@@ -66,7 +76,9 @@ def psnr(picture, truth):
 def main(folder, side=192):
     torch.set_num_threads(1)
     every, rng = list(photographs(Path(folder), int(side))), np.random.default_rng(5)
-    print("| field | frames | trials | knots in their 90 % interval | divided | mean gain | least |")
+    print(
+        "| field | frames | trials | knots in their 90 % interval | divided | mean gain | least |"
+    )
     print("|---|---|---|---|---|---|---|")
     for name, depth in (("strong", 0.5), ("weak", 0.15), ("clean", 0.0)):
         for count in (1, 12, 40, 80):

@@ -1,10 +1,11 @@
-"""The stability study of the shipped recipes: cells, failures, warnings and seconds, as a table for RESULTS.md.
+"""The stability study of the shipped recipes: cells, failures, warnings and seconds, as a table for
+RESULTS.md.
 
     python tests/benchmarks/bench_stability.py [--store FOLDER] [RECIPE ...]
 
-Without a name: all shipped recipes. The recipes share one store, so that a recipe counts only the seconds of cells that
-no earlier recipe had. With --store, a run that was stopped goes on where it was; the seconds are those stored with each
-cell.
+Without a name: all shipped recipes. The recipes share one store, so that a recipe counts only the
+seconds of cells that no earlier recipe had. With --store, a run that was stopped goes on where it
+was; the seconds are those stored with each cell.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ RECIPES = sorted(path.stem for path in (Path(__file__).parents[2] / "recipes").g
 
 
 def seconds(store: Store) -> dict[str, tuple[int, float]]:
-    """Return the number of cells, and the seconds, that each recipe was the first to compute; the last of each cell."""
+    """Return the number of cells, and the seconds, that each recipe was the first to compute;
+    the last of each cell.
+    """
     last: dict[tuple[str, str], Mapping[str, Any]] = {}
     for _, about in store.brief.each():
         if str(about.get("step", "")).startswith("stability of "):
@@ -43,7 +46,10 @@ def main() -> None:
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
         store = Store(given.store or Path(place) / "store")
-        print("| recipe | cells | fail | warn | first computed here | seconds of these |\n|---|---|---|---|---|---|")
+        print(
+            "| recipe | cells | fail | warn | first computed here | seconds of these"
+            " |\n|---|---|---|---|---|---|"
+        )
         for recipe in given.recipes:
             folder = study(load(recipe), store, Path(place) / "runs", ["neusee"], lambda line: None)
             found = json.loads((folder / "provenance.json").read_text())

@@ -1,10 +1,12 @@
-"""Coverage of a lens's stray light: `python tests/benchmarks/bench_stray_light.py [CAMERAS] [FILE] [PRIOR] [FIRST]`.
+"""Coverage of a lens's stray light: `python tests/benchmarks/bench_stray_light.py [CAMERAS] [FILE]
+[PRIOR] [FIRST]`.
 
-A table in Markdown of CAMERAS (200), from number FIRST (0) on, whose lens is drawn from PRIOR: `wide` (that of the
-recipe `calibrate_stray_light`) or `narrow` (that of the tests). How many 90 % intervals of b0, l and s hold the truth,
-the effective sample size, and how often a misfit is told. Pictures are those of
-tests/workflows/calibration/simulated_lenses.py, by NumPy and SciPy alone, of 128 x 128 pixels of 4 to 6.5 um in light
-of 10 to 40 nm. FILE keeps a line for each camera that is done; a second call goes on from there.
+A table in Markdown of CAMERAS (200), from number FIRST (0) on, whose lens is drawn from PRIOR:
+`wide` (that of the recipe `calibrate_stray_light`) or `narrow` (that of the tests). How many 90 %
+intervals of b0, l and s hold the truth, the effective sample size, and how often a misfit is told.
+Pictures are those of tests/workflows/calibration/simulated_lenses.py, by NumPy and SciPy alone, of
+128 x 128 pixels of 4 to 6.5 um in light of 10 to 40 nm. FILE keeps a line for each camera that is
+done; a second call goes on from there.
 """
 
 import json
@@ -17,9 +19,14 @@ import torch
 
 from neusee.workflows.calibration.identifiability import identify
 from neusee.workflows.calibration.importance_sampling import draw_samples, weights
+from neusee.workflows.calibration.log_posterior import find_mode, initial_theta
 from neusee.workflows.calibration.posterior_checks import _SMOOTH, _SURPRISE, slow_waves
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
-from tests.workflows.calibration.simulated_lenses import PRIOR, drawn_camera, problem_of, recipe_prior
+from tests.workflows.calibration.simulated_lenses import (
+    PRIOR,
+    drawn_camera,
+    problem_of,
+    recipe_prior,
+)
 
 SHAPE = ("b0", "l", "s")
 
@@ -48,7 +55,9 @@ def fitted(seed, prior):
         "kinds": identify(problem, mode).kinds,
         "effective": float(1 / (weight**2).sum()),
         "settled": bool(mode.settled),
-        "residuals": ((rings.mean - look.mean.reshape(-1)) / look.variance.reshape(-1).sqrt()).tolist(),
+        "residuals": (
+            ((rings.mean - look.mean.reshape(-1)) / look.variance.reshape(-1).sqrt()).tolist()
+        ),
         "ends": [[_quantile(column, weight, share) for column in z.T] for share in (0.05, 0.95)],
         "middle": middle.tolist(),
         "width": np.sqrt(weight @ (z - middle) ** 2).tolist(),
@@ -78,13 +87,16 @@ def main(count=200, file="stray_light_coverage.jsonl", prior="wide", first=0):
     misfits = sum(slow_waves(np.array(row["residuals"]))[1] < _SMOOTH for row in rows)
     surprises = sum(np.abs(row["middle"]).max() > _SURPRISE for row in rows)
     print(
-        "| cameras | refused | b0 | l | s | misfit told | prior said to be wrong | effective size: least, median | s |"
+        "| cameras | refused | b0 | l | s | misfit told | prior said to be wrong | effective size:"
+        " least, median | s |"
     )
     print("|---|---|---|---|---|---|---|---|---|")
     shares = " | ".join(f"{100 * share:.1f} %" for share in held)
     spent = np.median([row["seconds"] for row in rows])
     size = f"{sizes.min():.0f}, {np.median(sizes):.0f}"
-    print(f"| {len(rows)} | {refused} | {shares} | {misfits} | {surprises} | {size} | {spent:.1f} |")
+    print(
+        f"| {len(rows)} | {refused} | {shares} | {misfits} | {surprises} | {size} | {spent:.1f} |"
+    )
 
 
 if __name__ == "__main__":

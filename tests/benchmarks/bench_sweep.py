@@ -2,9 +2,10 @@
 
     python tests/benchmarks/bench_sweep.py [--points 1000]
 
-Two recipes: three trivial steps, and first_light with small pictures, of which 58 steps lead to the output. The
-overhead is the processor time of this process in planning and running, less that within nodes, per point; it is told
-for each fifth of the points. One thread; the load of the machine is recorded.
+Two recipes: three trivial steps, and first_light with small pictures, of which 58 steps lead to the
+output. The overhead is the processor time of this process in planning and running, less that within
+nodes, per point; it is told for each fifth of the points. One thread; the load of the machine is
+recorded.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ import itertools
 import os
 import shutil
 
-os.environ.update({name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")})
+os.environ.update(
+    {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+)
 
 import statistics
 import tempfile
@@ -67,20 +70,32 @@ def mean(image: Tensor) -> Tensor:
     return image.mean()
 '''
 SMALL = [
-    "optics.samples=128", "optics.pitch=63.11 um", "optics.bands=5", "optics.window=[48, 48]", "scene.shape=[28, 28]",
-    "sensor.shape=[24, 24]", "outputs=[saturated]",
-]  # fmt: skip
+    "optics.samples=128",
+    "optics.pitch=63.11 um",
+    "optics.bands=5",
+    "optics.window=[48, 48]",
+    "scene.shape=[28, 28]",
+    "sensor.shape=[24, 24]",
+    "outputs=[saturated]",
+]
 FIFTHS = 5
-RECIPES = {"three": "three trivial steps", "first_light": "first_light with small pictures, 58 steps"}
+RECIPES = {
+    "three": "three trivial steps",
+    "first_light": "first_light with small pictures, 58 steps",
+}
 LAWS = (
-    "sensor.quantum_efficiency=lognormal(0.56, 1.01)", "sensor.read_noise=lognormal(10.5 e-, 1.01)",
-    "sensor.full_well=lognormal(25500 e-, 1.01)", "outputs=[saturated, lsr, transfer]",
-)  # fmt: skip
+    "sensor.quantum_efficiency=lognormal(0.56, 1.01)",
+    "sensor.read_noise=lognormal(10.5 e-, 1.01)",
+    "sensor.full_well=lognormal(25500 e-, 1.01)",
+    "outputs=[saturated, lsr, transfer]",
+)
 
 
 @dataclass(frozen=True)
 class Overhead:
-    """Milliseconds of one point beside its nodes: planning, and running in each fifth of the points."""
+    """Milliseconds of one point beside its nodes: planning, and running in each fifth of the
+    points.
+    """
 
     plan: float
     run: list[float]
@@ -92,13 +107,17 @@ class Overhead:
         return self.plan + statistics.mean(self.run)
 
 
-def _sweeping(recipe: str, axis: str, values: str, words: list[str], folder: Path, store: Store) -> Sweeping:
+def _sweeping(
+    recipe: str, axis: str, values: str, words: list[str], folder: Path, store: Store
+) -> Sweeping:
     arguments = [*read_words(words, folder), *read_axes({axis: values}, folder)]
     return Sweeping(recipe, arguments, folder, store, False, "cpu")
 
 
 def overhead(which: str, points: int) -> Overhead:
-    """Return the overhead of the points of a sweep of ``three`` steps or of ``first_light``, in an empty store."""
+    """Return the overhead of the points of a sweep of ``three`` steps or of ``first_light``, in
+    an empty store.
+    """
     busy = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as place, _nodes_timed() as within:
         folder, store = Path(place), Store(Path(place) / "cache")
@@ -165,7 +184,9 @@ def draws(count: int = 64) -> Iterator[Callable[[int], object]]:
 
 @contextmanager
 def sweep_of(points: int) -> Iterator[Callable[[int], object]]:
-    """Yield a function that runs a sweep of first_light in an empty store with a number of workers."""
+    """Yield a function that runs a sweep of first_light in an empty store with a number of
+    workers.
+    """
     with tempfile.TemporaryDirectory() as place:
         copies, axis = itertools.count(), ("sensor.read_noise", f"linspace(5 e-, 20 e-, {points})")
 
@@ -186,6 +207,7 @@ if __name__ == "__main__":
         found = overhead(which, points)
         fifths = ", ".join(f"{each:.2f}" for each in found.run)
         print(
-            f"{what}: {found.point:.2f} ms a point; plan {found.plan:.2f}, run {fifths}; load {found.load:.1f}",
+            f"{what}: {found.point:.2f} ms a point; plan {found.plan:.2f}, run {fifths}; load"
+            f" {found.load:.1f}",
             flush=True,
         )

@@ -1,10 +1,12 @@
-"""Random recipes and tolerances, against every setting of a small grid: `bench_tolerance.py [COUNT] [FIRST SEED]`.
+"""Random recipes and tolerances, against every setting of a small grid: `bench_tolerance.py [COUNT]
+[FIRST SEED]`.
 
-Each of COUNT (100) recipes, drawn as the tests draw them, is run as it chooses and in full; then with every
-combination of its cheaper settings (a third of the bands, three quarters of the pupil's samples, of the PSF's window,
-both with and without `--exact`). The error is that of both raw pictures against the full run; the cost is the
-wall time of a whole cold run, choice, proof and second attempts included. The three cheapest settings within the
-tolerance, and the recipe as it chooses, are run three times more in turn, and their medians compared.
+Each of COUNT (100) recipes, drawn as the tests draw them, is run as it chooses and in full; then
+with every combination of its cheaper settings (a third of the bands, three quarters of the pupil's
+samples, of the PSF's window, both with and without `--exact`). The error is that of both raw
+pictures against the full run; the cost is the wall time of a whole cold run, choice, proof and
+second attempts included. The three cheapest settings within the tolerance, and the recipe as it
+chooses, are run three times more in turn, and their medians compared.
 
 One line a recipe on the standard error; a table in Markdown, by tolerance, at the end.
 """
@@ -27,7 +29,7 @@ import random_recipes
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.recipe.changed_recipe import changed
+from neusee.workflows.recipe.loading import changed
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.accuracy.recipe_knobs import knobs
 from neusee.workflows.studies.cold_run import cold
@@ -63,7 +65,9 @@ class Line:
 
 
 def settings(recipe):
-    """Every combination of settings no dearer than the recipe's own; the first is the recipe as it chooses."""
+    """Every combination of settings no dearer than the recipe's own; the first is the recipe as
+    it chooses.
+    """
     turned = [knob for knob in knobs(recipe, quick=True).found if knob.what != "precision"]
     choices = [dict.fromkeys([(), knob.changes[0].overrides]) for knob in turned]
     for whole, words in itertools.product((False, True), itertools.product(*choices)):
@@ -119,9 +123,9 @@ def main(count, start):
         for seed in range(start, start + count):
             lines.append(found := line(seed, memo))
             print(
-                f"{seed:4d}  tolerance {found.tolerance:.1e}  error {found.error:.1e}  bound {found.bound:.1e}  "
-                f"attempts {found.attempts}  {found.ours:.3f} s, in full {found.full:.3f} s, "
-                f"{found.best:.3f} s with {found.label}",
+                f"{seed:4d}  tolerance {found.tolerance:.1e}  error {found.error:.1e}  bound"
+                f" {found.bound:.1e}  attempts {found.attempts}  {found.ours:.3f} s, in full"
+                f" {found.full:.3f} s, {found.best:.3f} s with {found.label}",
                 file=sys.stderr,
                 flush=True,
             )
@@ -129,10 +133,16 @@ def main(count, start):
 
 
 def table(lines):
-    print("| tolerance | recipes | within | error / tolerance, median, most | s | of in full | ", end="")
+    print(
+        "| tolerance | recipes | within | error / tolerance, median, most | s | of in full | ",
+        end="",
+    )
     print("of the cheapest, median, most |\n|---|---|---|---|---|---|---|")
     for low in range(-5, -1):
-        row(f"1e{low} to 1e{low + 1}", [x for x in lines if 10.0**low <= x.tolerance < 10.0 ** (low + 1)])
+        row(
+            f"1e{low} to 1e{low + 1}",
+            [x for x in lines if 10.0**low <= x.tolerance < 10.0 ** (low + 1)],
+        )
     row("all", lines)
     for what, name in (("Attempts", "attempts"), ("The cheapest within the tolerance", "label")):
         counts = Counter(str(getattr(x, name)) for x in lines).most_common()
@@ -147,8 +157,9 @@ def row(name, lines):
     within = sum(x.error <= x.tolerance for x in lines)
     middle = statistics.median
     print(
-        f"| {name} | {len(lines)} | {within} | {middle(shares):.1e}, {max(shares):.2f} "
-        f"| {middle(x.ours for x in lines):.2f} | {middle(whole):.2f} | {middle(costs):.2f}, {max(costs):.2f} |"
+        f"| {name} | {len(lines)} | {within} | {middle(shares):.1e}, {max(shares):.2f} |"
+        f" {middle(x.ours for x in lines):.2f} | {middle(whole):.2f} | {middle(costs):.2f},"
+        f" {max(costs):.2f} |"
     )
 
 

@@ -1,9 +1,11 @@
-"""How much quicker a study of uncertainty is than as many runs: `python bench_uncertainty.py [RECIPE] [DRAWS]`.
+"""How much quicker a study of uncertainty is than as many runs: `python bench_uncertainty.py
+[RECIPE] [DRAWS]`.
 
-The sensor of RECIPE (paper_table1) is known as well as normal laws of 1 % say, but for the offset (1 e-). DRAWS (400)
-draws by the study, from an empty cache, with its page; against as many runs with the same outputs, from an empty cache
-each: in this process, median of three, and `neusee run` as a whole, once, which makes the page of a run too. Last, what
-the study takes when all its draws are there, and how it goes on when it is killed half way.
+The sensor of RECIPE (paper_table1) is known as well as normal laws of 1 % say, but for the offset
+(1 e-). DRAWS (400) draws by the study, from an empty cache, with its page; against as many runs
+with the same outputs, from an empty cache each: in this process, median of three, and `neusee run`
+as a whole, once, which makes the page of a run too. Last, what the study takes when all its draws
+are there, and how it goes on when it is killed half way.
 """
 
 import json
@@ -70,7 +72,10 @@ def main(name="paper_table1", draws="400"):
         doc = json.loads((cache / "runs" / "latest" / "provenance.json").read_text())
         again, _ = neusee(cache, *words)
     each = doc["seconds a draw"]
-    print(f"the study of {doc['draws']} draws: {took:.1f} s, {each:.3f} s a draw; with all draws there: {again:.1f} s")
+    print(
+        f"the study of {doc['draws']} draws: {took:.1f} s, {each:.3f} s a draw; with all draws"
+        f" there: {again:.1f} s"
+    )
     print(f"every standard deviation to {doc['error']:.1%}")
     print(f"{draws} runs in this process over the study: {int(draws) * alone / took:.0f}")
     print(f"{draws} times `neusee run` over the study: {int(draws) * whole / took:.0f}")
@@ -80,7 +85,10 @@ def main(name="paper_table1", draws="400"):
         rest, _ = neusee(cache, *words)
         other = json.loads((cache / "runs" / "latest" / "provenance.json").read_text())
     same = other["quantities"] == doc["quantities"]
-    print(f"killed after {before:.1f} s ({code}); went on for {rest:.1f} s and {other['computed']} draws: same {same}")
+    print(
+        f"killed after {before:.1f} s ({code}); went on for {rest:.1f} s and {other['computed']}"
+        f" draws: same {same}"
+    )
 
 
 if __name__ == "__main__":

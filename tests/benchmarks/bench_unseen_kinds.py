@@ -1,11 +1,14 @@
-"""Try kinds of own nodes that read what no key has: is one served stale without a word? Are honest ones still cached?
+"""Try kinds of own nodes that read what no key has: is one served stale without a word? Are honest
+ones still cached?
 
-    python tests/benchmarks/bench_unseen_kinds.py --results FILE [NAME ...] [--again] [--root CHECKOUT] [--list]
+    python tests/benchmarks/bench_unseen_kinds.py --results FILE [NAME ...] [--again] [--root
+    CHECKOUT] [--list]
 
-Each case of the folder `unseen_kinds` runs in a folder and a cache of its own: `neusee run`, a change of what the node
-reads, `neusee run` again, and, where the second run took a result from the cache, once more with an empty cache, which
-is the truth. Names, or parts of names, choose cases. FILE has one line of JSON for each case and grows as cases end, so
-that the next call goes on; `--again` tries those again that were bad.
+Each case of the folder `unseen_kinds` runs in a folder and a cache of its own: `neusee run`, a
+change of what the node reads, `neusee run` again, and, where the second run took a result from the
+cache, once more with an empty cache, which is the truth. Names, or parts of names, choose cases.
+FILE has one line of JSON for each case and grows as cases end, so that the next call goes on;
+`--again` tries those again that were bad.
 
 | verdict | meaning |
 |---|---|
@@ -14,8 +17,8 @@ that the next call goes on; `--again` tries those again that were bad.
 | stale | the second run gives another value than the truth |
 | kept | an honest node: the second run took it from the cache |
 | refused, unsaved | an honest node that is refused, or computed again |
-| unreached | the change does not reach the step, so that it changes no truth: the step has neither variables of the
-  environment that no key has, nor what other steps leave in the process |
+| unreached | the change does not reach the step, so that it changes no truth: the step has neither
+  variables of the environment that no key has, nor what other steps leave in the process |
 | no case | the node fails: mend the case |
 | skipped | this machine lacks what the case needs |
 """
@@ -41,9 +44,20 @@ import unseen_kinds
 from safetensors.numpy import load_file
 from unseen_kinds.case import Case, now
 
-VERDICTS = ("right", "told", "unreached", "stale", "kept", "refused", "unsaved", "no case", "skipped")
+VERDICTS = (
+    "right",
+    "told",
+    "unreached",
+    "stale",
+    "kept",
+    "refused",
+    "unsaved",
+    "no case",
+    "skipped",
+)
 BAD = ("stale", "refused", "unsaved", "no case")
-OF_NEUSEE = ("cache key", "not stored", "no other step")  #: in each of its own warnings, and in none of a library
+#: in each of its own warnings, and in none of a library
+OF_NEUSEE = ("cache key", "not stored", "no other step")
 _ROOT = Path(__file__).parents[2]
 _PLAIN = ("PATH", "HOME", "XDG_CACHE_HOME", "VIRTUAL_ENV", "LANG", "LC_ALL", "USER", "TMPDIR")
 _SHOWN = 400  #: of an output, this many numbers are compared and written down
@@ -112,7 +126,11 @@ def leave(case: Case, folder: Path) -> None:
 def environment(case: Case, place: Place, turn: int, cache: Path) -> dict[str, str]:
     """Return the variables of a run."""
     env = {name: os.environ[name] for name in _PLAIN if name in os.environ}
-    env |= {"NEUSEE_CACHE": str(cache), "PYTHONPATH": str(place.root / ".src"), "OMP_NUM_THREADS": "1"}
+    env |= {
+        "NEUSEE_CACHE": str(cache),
+        "PYTHONPATH": str(place.root / ".src"),
+        "OMP_NUM_THREADS": "1",
+    }
     for name, change in case.env.items():
         value = now(change, turn)
         if value is None:
@@ -128,7 +146,17 @@ def call(case: Case, place: Place, turn: int, cache: Path) -> Run:
     """Run the program once in a new process."""
     out = cache.with_suffix(f".{turn}")
     command = filled(now(case.prefix, turn), place.folder).split()
-    command += [sys.executable, "-P", "-m", "neusee", "run", str(place.folder / "r.yaml"), "--json", "--out", str(out)]
+    command += [
+        sys.executable,
+        "-P",
+        "-m",
+        "neusee",
+        "run",
+        str(place.folder / "r.yaml"),
+        "--json",
+        "--out",
+        str(out),
+    ]
     ended = subprocess.run(
         command,
         env=environment(case, place, turn, cache),
@@ -141,8 +169,12 @@ def call(case: Case, place: Place, turn: int, cache: Path) -> Run:
     if ended.returncode:
         return Run(ended.returncode, {}, {}, ended.stderr.strip() or ended.stdout.strip())
     report = json.loads(ended.stdout)
-    numbers = load_file(place.folder / Path(report["report"]).parent / "data" / "outputs.safetensors")
-    values = {name: np.asarray(value, float).ravel()[:_SHOWN].tolist() for name, value in numbers.items()}
+    numbers = load_file(
+        place.folder / Path(report["report"]).parent / "data" / "outputs.safetensors"
+    )
+    values = {
+        name: np.asarray(value, float).ravel()[:_SHOWN].tolist() for name, value in numbers.items()
+    }
     states = {step["step"]: step["state"] for step in report["steps"]}
     return Run(0, values, states, "\n".join([*report["warnings"], ended.stderr.strip()]).strip())
 
@@ -166,7 +198,11 @@ def judged(case: Case, place: Place) -> dict[str, object]:
     if case.honest:
         cached = set(second.states.values()) <= {"cached", "not needed"}
         warned = any(each in words for each in OF_NEUSEE)
-        return {"verdict": "kept" if cached and not warned else "unsaved", "words": words, "states": second.states}
+        return {
+            "verdict": "kept" if cached and not warned else "unsaved",
+            "words": words,
+            "states": second.states,
+        }
     truth = second
     if set(second.states.values()) != {"run"}:
         truth = call(case, place, 2, cache.with_suffix(".empty"))
@@ -215,13 +251,19 @@ def results(path: Path) -> dict[str, dict[str, object]]:
 
 
 def table(found: dict[str, dict[str, object]]) -> str:
-    """Return how often each verdict was reached in each family, and the bad cases with what was said."""
+    """Return how often each verdict was reached in each family, and the bad cases with what was
+    said.
+    """
     counts = Counter((name.partition(".")[0], str(line["verdict"])) for name, line in found.items())
     verdicts = [each for each in VERDICTS if any(verdict == each for _, verdict in counts)]
     lines = [f"| family | {' | '.join(verdicts)} |", f"|---{'|---' * len(verdicts)}|"]
     for family in sorted({family for family, _ in counts}):
-        lines.append(f"| {family} | {' | '.join(str(counts[family, each] or '') for each in verdicts)} |")
-    sums = [sum(count for (_, verdict), count in counts.items() if verdict == each) for each in verdicts]
+        lines.append(
+            f"| {family} | {' | '.join(str(counts[family, each] or '') for each in verdicts)} |"
+        )
+    sums = [
+        sum(count for (_, verdict), count in counts.items() if verdict == each) for each in verdicts
+    ]
     lines.append(f"| all {sum(sums)} | {' | '.join(map(str, sums))} |")
     for name, line in found.items():
         if line["verdict"] in BAD:
@@ -234,18 +276,26 @@ def selected(every: dict[str, Case], words: list[str]) -> dict[str, Case]:
     """Return the cases that a name, or a part of a name, chooses; all if there is none."""
     exact = set(words) & set(every)
     parts = set(words) - exact
-    return {n: case for n, case in every.items() if not words or n in exact or any(part in n for part in parts)}
+    return {
+        n: case
+        for n, case in every.items()
+        if not words or n in exact or any(part in n for part in parts)
+    }
 
 
 def main() -> None:
     """Try the cases that are chosen, and print what was found."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("names", nargs="*", help="parts of names of cases; all if none")
     parser.add_argument("--results", type=Path, help="file of JSON lines that grows")
     parser.add_argument("--again", action="store_true", help="try the bad ones of the file again")
     parser.add_argument("--root", type=Path, default=_ROOT, help="checkout of neusee that is tried")
     parser.add_argument("--list", action="store_true", help="print the names, and end")
-    parser.add_argument("--scratch", type=Path, default=Path.home(), help="where the folders of the cases are made")
+    parser.add_argument(
+        "--scratch", type=Path, default=Path.home(), help="where the folders of the cases are made"
+    )
     words = parser.parse_args()
     chosen = selected(dict(cases()), words.names)
     if words.list:

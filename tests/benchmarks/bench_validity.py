@@ -1,13 +1,15 @@
-"""Which faults of calibration frames are found, from which amplitude, and from which amplitude they bias the result.
+"""Which faults of calibration frames are found, from which amplitude, and from which amplitude they
+bias the result.
 
     python tests/benchmarks/bench_validity.py [cameras] [clean cameras]
 
-The frames come from a camera in NumPy that shares no code with the nodes. A fault is found where a test of the frames
-says "widened" or "refused"; the amplitude found half of the time is interpolated. The bias is that of
-the system gain and of the dark noise in electrons by the photon-transfer line of NumPy, in standard deviations of the
-same line over clean cameras; the larger one of both counts. The stated error is the error of the same line in
-single cameras that are not refused, in stated standard deviations: those of the line and of the faults that may hide.
-By chance alone its root mean square is 1 or less.
+The frames come from a camera in NumPy that shares no code with the nodes. A fault is found where a
+test of the frames says "widened" or "refused"; the amplitude found half of the time is
+interpolated. The bias is that of the system gain and of the dark noise in electrons by the
+photon-transfer line of NumPy, in standard deviations of the same line over clean cameras; the
+larger one of both counts. The stated error is the error of the same line in single cameras that are
+not refused, in stated standard deviations: those of the line and of the faults that may hide. By
+chance alone its root mean square is 1 or less.
 """
 
 import importlib.util
@@ -49,7 +51,10 @@ def levels(seed, **faults):
 
 
 def inspected(found):
-    stacks = [Stack(name, photons, time, "steady", torch.from_numpy(x)) for name, photons, time, x in found]
+    stacks = [
+        Stack(name, photons, time, "steady", torch.from_numpy(x))
+        for name, photons, time, x in found
+    ]
     return inspect_frames(stacks, False, 0.7)
 
 
@@ -64,17 +69,26 @@ def refused(tests):
 def stated_errors(found, tests, sd):
     """Return the errors of gain and dark noise in stated standard deviations."""
     hidden = open_errors([hidden for test in tests for hidden in test.hidden])
-    shifts = [np.hypot.reduce([0.0, *(t.shifts.get(name, 0.0) for t in tests)]) for name in ("gain", "noise")]
+    shifts = [
+        np.hypot.reduce([0.0, *(t.shifts.get(name, 0.0) for t in tests)])
+        for name in ("gain", "noise")
+    ]
     error = gain_and_noise(found) - np.log([0.125, 8.0])
     stated = [[sd[0], hidden["gain"], shifts[0]], [sd[1], *hidden.values(), *shifts]]
     return error / [np.hypot.reduce(x) for x in stated]
 
 
 def gain_and_noise(found):
-    """Return ln K and ln of the dark noise in electrons, from the levels below 70 % of the greatest variance."""
-    dark = [np.diff(x.astype(float), axis=0).var() / 2 for name, photons, _, x in found if not photons]
+    """Return ln K and ln of the dark noise in electrons, from the levels below 70 % of the
+    greatest variance.
+    """
+    dark = [
+        np.diff(x.astype(float), axis=0).var() / 2 for name, photons, _, x in found if not photons
+    ]
     base = np.mean([x.mean() for _, photons, _, x in found if not photons])
-    lit = [(x.mean() - base, np.diff(x.astype(float), axis=0).var() / 2) for _, p, _, x in found if p]
+    lit = [
+        (x.mean() - base, np.diff(x.astype(float), axis=0).var() / 2) for _, p, _, x in found if p
+    ]
     mean, variance = np.array(lit).T
     used = mean <= 0.7 * mean[variance.argmax()]
     gain = (mean[used] @ (variance[used] - np.mean(dark))) / (mean[used] @ mean[used])
@@ -101,8 +115,12 @@ def row(name, amplitudes, seeds, centre, sd):
         shares.append(np.mean([bool(alarms(found)) for found in tests]))
         off = (np.array([gain_and_noise(found) for found in frames]) - centre).mean(0)
         biases.append(float(np.abs(off / sd).max()))
-        kept = [stated_errors(f, t, sd) for f, t in zip(frames, tests, strict=True) if not refused(t)]
-        stated.append(f"{np.sqrt(np.square(kept).mean(0).max()):.1f} ({len(kept)})" if kept else "refused")
+        kept = [
+            stated_errors(f, t, sd) for f, t in zip(frames, tests, strict=True) if not refused(t)
+        ]
+        stated.append(
+            f"{np.sqrt(np.square(kept).mean(0).max()):.1f} ({len(kept)})" if kept else "refused"
+        )
     return (
         " ".join(f"{a:g}" for a in amplitudes),
         " ".join(f"{s:.0%}" for s in shares),
@@ -118,15 +136,23 @@ def main(cameras=8, clean=400):
     seeds = range(int(cameras))
     plain = np.array([gain_and_noise(levels(seed)) for seed in range(24)])
     sd, centre = plain.std(0), plain[: len(seeds)]
-    print("| fault | amplitudes | found | bias, sd | stated error (cameras) | found half of the time at | one sd at |")
+    print(
+        "| fault | amplitudes | found | bias, sd | stated error (cameras) | found half of the time"
+        " at | one sd at |"
+    )
     print("|---|---|---|---|---|---|---|")
     for name, amplitudes in {"clean": (0.0,), **AMPLITUDES}.items():
         print(f"| {name} | {' | '.join(row(name, amplitudes, seeds, centre, sd))} |", flush=True)
     uneven = {"prnu": 0.01, "dsnu": 3, "lamp": 0.015}
-    tests = (inspected(levels(5000 + seed, **(uneven if seed % 2 else {}))) for seed in range(int(clean)))
+    tests = (
+        inspected(levels(5000 + seed, **(uneven if seed % 2 else {}))) for seed in range(int(clean))
+    )
     wrong = sum(bool(alarms(found)) for found in tests)
     ends = binomtest(wrong, int(clean)).proportion_ci(0.95, "exact")
-    print(f"\n{wrong} of {clean} clean cameras widened or refused ({ends.low:.2%} to {ends.high:.2%}).")
+    print(
+        f"\n{wrong} of {clean} clean cameras widened or refused ({ends.low:.2%} to"
+        f" {ends.high:.2%})."
+    )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
-"""The PSF in C++ and in torch, by instruction set: `python tests/benchmarks/bench_vectors.py [REPEATS]`.
+"""The PSF in C++ and in torch, by instruction set: `python tests/benchmarks/bench_vectors.py
+[REPEATS]`.
 
-Each instruction set is a process of its own, in which the C++ is compiled for it, and torch, MKL and NumPy use no wider
-one. Least processor time of one thread, calls in turns within the process. `scipy CZT` and `hcipy ZoomFFT` get the
-ready complex pupil; ours makes it from the height map. Prints a table in Markdown, with the time of torch and of the
-peers over that of the C++: the C++ is what runs wherever there is a compiler, so that no ratio may be below 1.
+Each instruction set is a process of its own, in which the C++ is compiled for it, and torch, MKL
+and NumPy use no wider one. Least processor time of one thread, calls in turns within the process.
+`scipy CZT` and `hcipy ZoomFFT` get the ready complex pupil; ours makes it from the height map.
+Prints a table in Markdown, with the time of torch and of the peers over that of the C++: the C++ is
+what runs wherever there is a compiler, so that no ratio may be below 1.
 """
 
 import os
@@ -25,7 +27,17 @@ def one_level(level, repeats):
 
     import hcipy
     import torch
-    from bench_psf import DIAMETER, FOCAL, PIXEL, WAVELENGTH, field, hcipy_call, ours, pupil, scipy_call
+    from bench_psf import (
+        DIAMETER,
+        FOCAL,
+        PIXEL,
+        WAVELENGTH,
+        field,
+        hcipy_call,
+        ours,
+        pupil,
+        scipy_call,
+    )
 
     from neusee.nodes.optics._transform._sample_axis import Axis
     from neusee.nodes.optics._transform._scaled_transform import cheapest
@@ -50,7 +62,9 @@ def one_level(level, repeats):
                     seconds[name].append(time.process_time() - start)
         least = {name: min(times) for name, times in seconds.items()}
         ratios = " | ".join(f"{least[name] / least['C++']:.2f}" for name in PEERS)
-        print(f"| {level} | {samples} -> {window} | {1e3 * least['C++']:.3g} | {ratios} |", flush=True)
+        print(
+            f"| {level} | {samples} -> {window} | {1e3 * least['C++']:.3g} | {ratios} |", flush=True
+        )
 
 
 def main():
@@ -63,7 +77,9 @@ def main():
     threads = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
     for level, limits in LEVELS.items():
         env = {**os.environ, **threads, **limits, "CXX": f"g++ -march={level}"}
-        subprocess.run([sys.executable, __file__, str(repeats), "--level", level], env=env, check=True)
+        subprocess.run(
+            [sys.executable, __file__, str(repeats), "--level", level], env=env, check=True
+        )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
-"""Error and processor time of recipes by tolerance: `bench_work_precision.py [RECIPE ...] [--repeats N]`.
+"""Error and processor time of recipes by tolerance: `bench_work_precision.py [RECIPE ...]
+[--repeats N]`.
 
-Each recipe (first_light, six_lasers, dirty_windshield, paper_table1) gives its raw and developed pictures, in full and
-at tolerances from 1e-4 to 3e-2, in turn and N (1) times, each time with an empty store in one process. The error is the
-largest over the pictures against the run in full; the time is the least processor time of a whole cold run: choice,
-proof and second attempts included. On a machine that others use, wall time says little.
+Each recipe (first_light, six_lasers, dirty_windshield, paper_table1) gives its raw and developed
+pictures, in full and at tolerances from 1e-4 to 3e-2, in turn and N (1) times, each time with an
+empty store in one process. The error is the largest over the pictures against the run in full; the
+time is the least processor time of a whole cold run: choice, proof and second attempts included. On
+a machine that others use, wall time says little.
 
 One line in Markdown for each recipe and tolerance.
 """
@@ -38,17 +40,24 @@ def rows(name, memo, repeats):
     recipes = {t: load(name, ["outputs=[raw, developed]", f"tolerance={t}"]) for t in TOLERANCES}
     recipes = {0.0: replace(recipes[TOLERANCES[0]], exact=True), **recipes}
     least, said, truth = dict.fromkeys(recipes, float("inf")), {}, {}
-    timed(recipes[TOLERANCES[-1]], memo)  # libraries load once, and not in the time of the first line
+    # libraries load once, and not in the time of the first line
+    timed(recipes[TOLERANCES[-1]], memo)
     for _ in range(repeats):
         for tolerance, recipe in recipes.items():
             seconds, result, used = timed(recipe, memo)
             least[tolerance] = min(least[tolerance], seconds)
             truth = truth or dict(result.values)
             error = max(error_of(result[step], value) for step, value in truth.items())
-            said[tolerance] = f"{error:.1e} | {result.proof.worst:.1e} | {used or '-'} | {result.attempts}"
+            said[tolerance] = (
+                f"{error:.1e} | {result.proof.worst:.1e} | {used or '-'} | {result.attempts}"
+            )
     for tolerance, rest in said.items():
         ratio = least[0.0] / least[tolerance]
-        print(f"| {name} | {tolerance or 'in full'} | {least[tolerance]:.2f} | {ratio:.2f} | {rest} |", flush=True)
+        print(
+            f"| {name} | {tolerance or 'in full'} | {least[tolerance]:.2f} | {ratio:.2f} |"
+            f" {rest} |",
+            flush=True,
+        )
 
 
 def main():
@@ -57,7 +66,16 @@ def main():
     reading.add_argument("--repeats", type=int, default=1)
     given = reading.parse_args()
     print(f"load {os.getloadavg()[0]:.1f}\n")
-    columns = ("recipe", "tolerance", "s", "in full over this", "error", "stated", "bands in use", "attempts")
+    columns = (
+        "recipe",
+        "tolerance",
+        "s",
+        "in full over this",
+        "error",
+        "stated",
+        "bands in use",
+        "attempts",
+    )
     print(f"| {' | '.join(columns)} |")
     print("|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:

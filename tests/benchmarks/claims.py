@@ -1,7 +1,8 @@
 """What neusee claims of its speed, each beside the peers that do the same work; `all.py` runs them.
 
-Each function yields comparisons. One thread each, and processor time, so that other work on the machine changes little.
-Errors are against references in double precision that share no code with either.
+Each function yields comparisons. One thread each, and processor time, so that other work on the
+machine changes little. Errors are against references in double precision that share no code with
+either.
 """
 
 import os
@@ -24,17 +25,29 @@ _PROGRAM = [sys.executable, "-m", "neusee"]
 
 
 def point_spread(turns: int) -> Iterator[Comparison]:
-    """Yield the PSF from a height map, beside transforms whose error is at most 2e-6 of the peak."""
+    """Yield the PSF from a height map, beside transforms whose error is at most 2e-6 of the
+    peak.
+    """
     for samples, window in ((2160, 2048), (2160, 512), (1024, 1024), (256, 256), (2160, 64)):
         lens = bench_psf.pupil(samples, 10.0)
         where, truth = bench_psf.subset(lens, window)
         made, calls = bench_psf.pupil_call(lens), bench_psf.contenders(samples, window, lens)
         calls.pop("neusee, ready pupil")
         errors = {name: bench_psf.error(call(), where, truth) for name, call in calls.items()}
-        chosen = {name: call for name, call in calls.items() if name == OURS or errors[name] <= _ACCURATE}
-        works = {name: call if name == OURS else partial(_both, made, call) for name, call in chosen.items()}
+        chosen = {
+            name: call for name, call in calls.items() if name == OURS or errors[name] <= _ACCURATE
+        }
+        works = {
+            name: call if name == OURS else partial(_both, made, call)
+            for name, call in chosen.items()
+        }
         remarks = {name: f"error {errors[name]:.0e}" for name in works}
-        yield compared(f"PSF of {samples}² samples in {window}² pixels, height map and all", works, turns, remarks)
+        yield compared(
+            f"PSF of {samples}² samples in {window}² pixels, height map and all",
+            works,
+            turns,
+            remarks,
+        )
 
 
 def _both(first, second):
@@ -49,20 +62,31 @@ def bands(turns: int) -> Iterator[Comparison]:
         name: partial(process, [sys.executable, "bench_psf.py", "--bands", who], {}, folder)
         for name, who in ((OURS, "neusee"), ("hcipy ZoomFFT c64", "hcipy"))
     }
-    yield compared("31 PSFs of 2160² samples in 2048² pixels, start of the program and all", works, max(3, turns // 3))
+    yield compared(
+        "31 PSFs of 2160² samples in 2048² pixels, start of the program and all",
+        works,
+        max(3, turns // 3),
+    )
 
 
 def scan(turns: int) -> Iterator[Comparison]:
     """Yield the selective scan, forward and backward."""
     values = bench_scan.draw(4096)
     truth = bench_scan.reference(*(x.detach() for x in values))
-    scans = {OURS if name == "neusee, C++" else name: call for name, call in bench_scan.SCANS.items()}
+    scans = {
+        OURS if name == "neusee, C++" else name: call for name, call in bench_scan.SCANS.items()
+    }
     remarks = {}
     for name, call in scans.items():
         error = float((call(*values).detach() - truth).abs().max() / truth.abs().max())
         remarks[name] = f"error {error:.0e}"
     works = {name: partial(bench_scan.once, call, values) for name, call in scans.items()}
-    yield compared("selective scan of 4096 steps, 96 channels, 16 states, forward and backward", works, turns, remarks)
+    yield compared(
+        "selective scan of 4096 steps, 96 channels, 16 states, forward and backward",
+        works,
+        turns,
+        remarks,
+    )
 
 
 def cached_steps(turns: int) -> Iterator[Comparison]:
@@ -108,7 +132,9 @@ def _hamilton(graph, folder):
 
 
 def large_values(turns: int) -> Iterator[Comparison]:
-    """Yield a cached chain of nine arrays of 111 MB, beside joblib and Hamilton, which read them all."""
+    """Yield a cached chain of nine arrays of 111 MB, beside joblib and Hamilton, which read them
+    all.
+    """
     with tempfile.TemporaryDirectory() as place:
         sys.path.insert(0, place)
         folder, count = Path(place), bench_peers.COUNT
@@ -127,7 +153,11 @@ def repeated_commands(turns: int) -> Iterator[Comparison]:
     with tempfile.TemporaryDirectory() as place:
         cache = {"NEUSEE_CACHE": f"{place}/cache"}
         torch_alone = partial(process, [sys.executable, "-c", "import torch"], {}, place)
-        for words in (["run", "first_light", "--quiet"], ["plan", "first_light"], ["validate", "first_light"]):
+        for words in (
+            ["run", "first_light", "--quiet"],
+            ["plan", "first_light"],
+            ["validate", "first_light"],
+        ):
             ours = partial(process, [*_PROGRAM, *words], cache, place)
             ours()  # computed
             ours()  # the answer is kept
@@ -136,7 +166,9 @@ def repeated_commands(turns: int) -> Iterator[Comparison]:
 
 
 def long_sweeps(turns: int) -> Iterator[Figures]:
-    """Yield the overhead of a point of a sweep of 1000 points, in milliseconds of the processor beside its nodes."""
+    """Yield the overhead of a point of a sweep of 1000 points, in milliseconds of the processor
+    beside its nodes.
+    """
     points, load = 100 * turns, os.getloadavg()[0]
     rows = []
     for which, what in bench_sweep.RECIPES.items():
@@ -147,11 +179,18 @@ def long_sweeps(turns: int) -> Iterator[Figures]:
 
 
 def workers(turns: int) -> Iterator[Comparison]:
-    """Yield two worker processes beside one, by the clock: 64 draws of a study, and a sweep of 32 points."""
+    """Yield two worker processes beside one, by the clock: 64 draws of a study, and a sweep of
+    32 points.
+    """
     with bench_sweep.draws() as draw, bench_sweep.sweep_of(32) as sweep:
-        for what, work in (("64 draws of an uncertainty study", draw), ("32 points of a sweep", sweep)):
+        for what, work in (
+            ("64 draws of an uncertainty study", draw),
+            ("32 points of a sweep", sweep),
+        ):
             works = {OURS: partial(work, 2), "one worker": partial(work, 1)}
-            yield compared(f"{what}, two workers, by the clock", works, max(3, turns // 3), by_clock=True)
+            yield compared(
+                f"{what}, two workers, by the clock", works, max(3, turns // 3), by_clock=True
+            )
 
 
 CLAIMS = {

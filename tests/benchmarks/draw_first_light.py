@@ -1,4 +1,6 @@
-"""Draws the picture of the README from a real run: ``python tests/benchmarks/draw_first_light.py``."""
+"""Draws the picture of the README from a real run: ``python
+tests/benchmarks/draw_first_light.py``.
+"""
 
 import inspect
 from pathlib import Path
@@ -12,12 +14,21 @@ PICTURE = Path(__file__).parents[2] / "recipes" / "guide" / "first_light.png"
 WANTED = "developed, restored, image, bands, level, spot, line, developed_quality, restored_quality"
 COLOURS = 200  #: of the palette, so that the picture stays below 100 kB
 ARMS = {"plain": ("plain lens", "#d55e00"), "mask": ("behind the mask", "#0072b2")}
-CURVE = "irradiance, in units of saturation", "pixels from the laser\n(brightest pixel of each column)"
+CURVE = (
+    "irradiance, in units of saturation",
+    "pixels from the laser\n(brightest pixel of each column)",
+)
 
 
 def irradiance(result, step, arm):
-    """Return the irradiance on the sensor, scene and laser, as a multiple of what saturates a pixel."""
-    sensor = {name: step.params[name] for name in inspect.signature(saturation).parameters if name != "bands"}
+    """Return the irradiance on the sensor, scene and laser, as a multiple of what saturates a
+    pixel.
+    """
+    sensor = {
+        name: step.params[name]
+        for name in inspect.signature(saturation).parameters
+        if name != "bands"
+    }
     scene = saturation(result["bands"], **sensor) / result["level"]
     laser = saturation(result["line[green]"], **sensor)
     lit = (result[f"image[{arm}]"], scene), (result[f"spot[{arm},green]"], laser)
@@ -38,7 +49,9 @@ def compare(axis, total, centre):
     """Draw the irradiance of both arms across the laser."""
     for arm, (name, colour) in ARMS.items():
         peak = float(total[arm].max())
-        axis.semilogy(torch.arange(total[arm].shape[-1]) - centre, total[arm].amax(0), color=colour, lw=1.2)
+        axis.semilogy(
+            torch.arange(total[arm].shape[-1]) - centre, total[arm].amax(0), color=colour, lw=1.2
+        )
         axis.axhline(peak, color=colour, lw=0.8, ls=":")
         axis.text(-255, peak * 1.15, f"{name}: {peak:.3g}", color=colour, fontsize=8)
     axis.set(xlim=(-260, 260), ylim=(1, 3000))
@@ -51,7 +64,9 @@ def draw(result, step):
     """Draw three pictures and the irradiance across the laser."""
     from matplotlib import pyplot as plt
 
-    figure, axes = plt.subplots(1, 4, figsize=(10.4, 3.05), dpi=100, layout="constrained", width_ratios=[1, 1, 1, 1.25])
+    figure, axes = plt.subplots(
+        1, 4, figsize=(10.4, 3.05), dpi=100, layout="constrained", width_ratios=[1, 1, 1, 1.25]
+    )
     total = {arm: irradiance(result, step, arm) for arm in ARMS}
     for axis, (arm, (name, _)) in zip(axes, ARMS.items(), strict=False):
         psnr = float(result[f"developed_quality[{arm}]"].psnr)

@@ -1,12 +1,13 @@
-"""Coefficients of the cost laws: a fit of seconds and memory by node to measured runs of shipped recipes.
+"""Coefficients of the cost laws: a fit of seconds and memory by node to measured runs of shipped
+recipes.
 
     python tests/benchmarks/measured_runs.py FOLDER   # the runs
     python tests/benchmarks/fit_costs.py FOLDER       # fits to the runs in FIT and writes node_costs.json
     python tests/benchmarks/bench_costs.py FOLDER     # compares with all runs, those that were held out apart
 
-For each node and size the largest peak and the median processor time count. The fit is least squares of the relative
-error with coefficients that are not negative (Lawson and Hanson 1974, ch. 23). The range of a law is that of runs
-about laws that were fitted without their size.
+For each node and size the largest peak and the median processor time count. The fit is least
+squares of the relative error with coefficients that are not negative (Lawson and Hanson 1974, ch.
+23). The range of a law is that of runs about laws that were fitted without their size.
 """
 
 import json
@@ -23,7 +24,7 @@ from measured_runs import FIT, file_of
 from scipy.optimize import nnls
 
 from neusee.nodes import registered_nodes
-from neusee.workflows.engine import cost_laws
+from neusee.workflows.engine import cost_model as cost_laws
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.report.contents import steps_of, wanted
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -31,8 +32,10 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 TARGET = Path(__file__).parents[2] / "workflows" / "engine" / "node_costs.json"
 LIBRARIES = "colour", "kornia"  #: that take long to load
 SMALLEST = 16e6  #: B; below, memory that earlier steps freed hides what a step needs
-SMALL_PART = 1e6  #: B of the inputs, the result or the work; below, they cannot be what takes the memory
-MEMORY_FLOOR, TIME_FLOOR = 32e6, 20e-3  #: B and s to which an error is relative at least: below is noise
+#: B of the inputs, the result or the work; below, they cannot be what takes the memory
+SMALL_PART = 1e6
+#: B and s to which an error is relative at least: below is noise
+MEMORY_FLOOR, TIME_FLOOR = 32e6, 20e-3
 SOME = 50e-3  #: s from which a step tells the pace of the machine
 LARGE, LONG = 64e6, 0.1  #: B and s from which a step counts for a comparison
 
@@ -58,7 +61,11 @@ def sizes_in(*words):
     name, *changes = [word for word in words if word != "--exact"]
     recipe = replace(load(name, changes), exact="--exact" in words)
     recipe = with_substitutions(recipe, wanted(recipe))
-    return {step: size for step, size in cost_laws.sizes_of(recipe, steps_of(recipe)).items() if size.known}
+    return {
+        step: size
+        for step, size in cost_laws.sizes_of(recipe, steps_of(recipe)).items()
+        if size.known
+    }
 
 
 def loaders(runs):
@@ -75,11 +82,14 @@ def loaders(runs):
 
 
 def grouped(runs, loading, paces=None):
-    """By node: what was seen at each size, with times divided by the pace of the machine in each run."""
+    """By node: what was seen at each size, with times divided by the pace of the machine in each
+    run.
+    """
     found = {}
     for run in runs:
         sizes, there, pace = sizes_in(*run["words"]), set(), (paces or {}).get(run["name"], 1.0)
-        for row in {json.dumps(row): row for row in run["steps"]}.values():  # a journal may repeat a line
+        # a journal may repeat a line
+        for row in {json.dumps(row): row for row in run["steps"]}.values():
             libraries = set(loading.get(row["node"], ((), 0))[0])
             first = not libraries <= there
             there |= libraries
@@ -87,13 +97,20 @@ def grouped(runs, loading, paces=None):
                 size = tuple(sizes[row["step"]][:4])
                 even = row | {"seconds": row["seconds"] / pace}
                 found.setdefault(row["node"], {}).setdefault((size, first), []).append(even)
-    return {node: [seen(*key, rows) for key, rows in sizes.items()] for node, sizes in found.items()}
+    return {
+        node: [seen(*key, rows) for key, rows in sizes.items()] for node, sizes in found.items()
+    }
 
 
 def seen(size, first, rows):
     """The largest peak and the median time of the steps of one size."""
     peaks = [row["peak"] for row in rows if row["peak"] is not None]
-    return Seen(size, first, max(max(peaks), size[1]) if peaks else None, median(row["seconds"] for row in rows))
+    return Seen(
+        size,
+        first,
+        max(max(peaks), size[1]) if peaks else None,
+        median(row["seconds"] for row in rows),
+    )
 
 
 def fitted(columns, values, floor):
@@ -106,15 +123,20 @@ def fitted(columns, values, floor):
 
 
 def memory_law(rows, grown):
-    """Bytes, and the factors of inputs, result and work; the ``grown`` bytes of a library are known."""
+    """Bytes, and the factors of inputs, result and work; the ``grown`` bytes of a library are
+    known.
+    """
     known = [row for row in rows if row.peak is not None]
     known = [row for row in known if row.peak > SMALLEST] or known
     if not known:
         return np.array([0.0, 0.0, 1.0, 0.0])
     totals = [sum(row.size[:2]) for row in known]
-    constant = float(max(totals) > 3 * min(totals))  # sizes too alike cannot tell the constant from a slope
+    # sizes too alike cannot tell the constant from a slope
+    constant = float(max(totals) > 3 * min(totals))
     used = [max(row.size[i] for row in known) > SMALL_PART for i in range(3)]
-    columns = [(constant, *(x * use for x, use in zip(row.size, used, strict=False))) for row in known]
+    columns = [
+        (constant, *(x * use for x, use in zip(row.size, used, strict=False))) for row in known
+    ]
     peaks = np.array([max(row.peak - row.loads * grown, row.size[1]) for row in known])
     return fitted(columns, peaks, MEMORY_FLOOR + grown)
 
@@ -127,13 +149,20 @@ def time_law(rows):
 
 
 def paced(runs, loading):
-    """How much longer than usual the steps of each run took, as a median: a busy machine has slower caches too."""
+    """How much longer than usual the steps of each run took, as a median: a busy machine has
+    slower caches too.
+    """
     paces = {run["name"]: 1.0 for run in runs}
     alone = {run["name"]: grouped([run], loading) for run in runs}
     for _ in range(4):
         laws = {node: time_law(rows) for node, rows in grouped(runs, loading, paces).items()}
         for name, groups in alone.items():
-            ratios = [r.seconds / time_of(laws[n], r) for n, rows in groups.items() for r in rows if r.seconds > SOME]
+            ratios = [
+                r.seconds / time_of(laws[n], r)
+                for n, rows in groups.items()
+                for r in rows
+                if r.seconds > SOME
+            ]
             paces[name] = median(ratios) if len(ratios) > 2 else 1.0
         usual = median(paces.values())
         paces = {name: pace / usual for name, pace in paces.items()}
@@ -151,7 +180,9 @@ def time_of(law, row):
 
 
 def left_out(rows, grown):
-    """Measured over predicted, of peaks and of times, where the law was fitted without the size; None for few sizes."""
+    """Measured over predicted, of peaks and of times, where the law was fitted without the size;
+    None for few sizes.
+    """
     over, late = [], []
     sizes = {row.size for row in rows}
     for row in rows:
@@ -165,7 +196,8 @@ def left_out(rows, grown):
 
 
 def ranges(groups, loading, paces):
-    """Ranges of peaks and times about each law; of all laws together for a node that was measured at few sizes.
+    """Ranges of peaks and times about each law; of all laws together for a node that was measured
+    at few sizes.
 
     The range of a time is widened by the range of the pace of the machine.
     """
@@ -175,7 +207,10 @@ def ranges(groups, loading, paces):
     pace = ((1.0, 1.0), (min(paces.values()), max(paces.values())))
     return {
         node: [
-            [short(min(1.0, *(own or usual[i])) * pace[i][0]), short(max(1.0, *(own or usual[i])) * pace[i][1])]
+            [
+                short(min(1.0, *(own or usual[i])) * pace[i][0]),
+                short(max(1.0, *(own or usual[i])) * pace[i][1]),
+            ]
             for i, own in enumerate(each)
         ]
         for node, each in found.items()
@@ -191,7 +226,11 @@ def law(node, rows, loading, spread):
     """The law of one node for the file."""
     libraries, grown = loading.get(node, ((), 0.0))
     memory, seconds = memory_law(rows, grown), time_law(rows)
-    found = {"memory": [short(x) for x in memory], "seconds": [short(x) for x in seconds[:2]], "spread": spread}
+    found = {
+        "memory": [short(x) for x in memory],
+        "seconds": [short(x) for x in seconds[:2]],
+        "spread": spread,
+    }
     return found | ({"loads": [libraries, short(grown), short(seconds[2])]} if libraries else {})
 
 
@@ -199,7 +238,9 @@ def unruled(runs):
     """The largest result of each node that has no rule of the shape of its result."""
     for run in runs:
         sizes_in(*run["words"])  # imports the nodes
-    bare = {each.path for each in registered_nodes() if each.hooks.shape is None and not each.before_run}
+    bare = {
+        each.path for each in registered_nodes() if each.hooks.shape is None and not each.before_run
+    }
     found = Counter()
     for run in runs:
         for row in run["steps"]:
@@ -209,16 +250,29 @@ def unruled(runs):
 
 
 def upper(groups):
-    """The law of a node that was never measured: the most that a shipped node took for its size, by each measure."""
+    """The law of a node that was never measured: the most that a shipped node took for its size,
+    by each measure.
+    """
     works = {each.path: each.hooks.work is not None for each in registered_nodes()}
     large = [(node, row) for node, rows in groups.items() for row in rows if not row.loads]
     held = [(n, r) for n, r in large if r.peak is not None]
     ratio = max(r.peak / sum(r.size[:2]) for n, r in held if not works[n] and r.peak > LARGE / 2)
     least = max(r.peak for n, r in held if not works[n] and sum(r.size[:2]) < SMALL_PART)
-    work = max((r.peak - sum(r.size[:2])) / r.size[2] for n, r in held if works[n] and r.peak > LARGE / 2 and r.size[2])
-    slow = max(r.seconds / r.size[3] for n, r in large if not works[n] and r.seconds > LONG / 5 and r.size[3] > 1e5)
+    work = max(
+        (r.peak - sum(r.size[:2])) / r.size[2]
+        for n, r in held
+        if works[n] and r.peak > LARGE / 2 and r.size[2]
+    )
+    slow = max(
+        r.seconds / r.size[3]
+        for n, r in large
+        if not works[n] and r.seconds > LONG / 5 and r.size[3] > 1e5
+    )
     start = max(r.seconds for n, r in large if not works[n] and r.size[3] < 1e5)
-    return {"memory": [short(x) for x in (least, ratio, ratio, max(work, 0))], "seconds": [short(start), short(slow)]}
+    return {
+        "memory": [short(x) for x in (least, ratio, ratio, max(work, 0))],
+        "seconds": [short(start), short(slow)],
+    }
 
 
 def write(laws, guess):
@@ -235,7 +289,8 @@ def fit(folder):
     most, loading = unruled(runs), loaders([run for run in runs if "grown" in run])
     before = json.loads(TARGET.read_text())
     known = {
-        node: {key: value for key, value in each.items() if key != "most"} for node, each in before["nodes"].items()
+        node: {key: value for key, value in each.items() if key != "most"}
+        for node, each in before["nodes"].items()
     }
     blank = {"memory": [0.0, 0.0, 1.0, 0.0], "seconds": [0.0, 0.0]}
     told = {node: known.get(node, blank) | {"most": size} for node, size in most.items()}

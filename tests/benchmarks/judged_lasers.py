@@ -1,9 +1,11 @@
-"""A table of 36 lasers of every kind of pulse, for reading by hand: `python tests/benchmarks/judged_lasers.py`.
+"""A table of 36 lasers of every kind of pulse, for reading by hand: `python
+tests/benchmarks/judged_lasers.py`.
 
-Each laser shines from 20 m into a lens of 50 mm and 12 mm (f/4.2, transmittance 0.9) with a divergence of 1 mrad.
-Beside what `neusee safety` says, the table has the peak on the sensor and the thresholds by the formulas of a pocket
-calculator, which share no line with neusee. The exit status is 1 where both differ by more than 3 %, and where a
-verdict is safe beside a part that is above its threshold or not judged.
+Each laser shines from 20 m into a lens of 50 mm and 12 mm (f/4.2, transmittance 0.9) with a
+divergence of 1 mrad. Beside what `neusee safety` says, the table has the peak on the sensor and the
+thresholds by the formulas of a pocket calculator, which share no line with neusee. The exit status
+is 1 where both differ by more than 3 %, and where a verdict is safe beside a part that is above its
+threshold or not judged.
 """
 
 from __future__ import annotations
@@ -76,7 +78,9 @@ outputs: [laser_lsr]
 
 
 def by_hand(case: Case) -> dict[str, tuple[float, float]]:
-    """Return exposure and threshold of each part, in J/cm2 or W/cm2, by the formulas of a pocket calculator."""
+    """Return exposure and threshold of each part, in J/cm2 or W/cm2, by the formulas of a pocket
+    calculator.
+    """
     if not 400 <= case.nm <= 1100:
         return {}
     wavelength = case.nm * 1e-9
@@ -103,10 +107,14 @@ def by_hand(case: Case) -> dict[str, tuple[float, float]]:
 
 
 def fluence_by_hand(seconds: float) -> float:
-    """Return the threshold of the first damage in J/cm2: 0.1 to 10 ns, 0.316 at 10 us, then 31.6 kW/cm2."""
+    """Return the threshold of the first damage in J/cm2: 0.1 to 10 ns, 0.316 at 10 us, then 31.6
+    kW/cm2.
+    """
     if seconds >= 10e-6:
         return 10**4.5 * seconds
-    return 0.1 * 10 ** (math.log10(10**4.5 * 10e-6 / 0.1) / 3 * max(0.0, math.log10(seconds / 10e-9)))
+    return 0.1 * 10 ** (
+        math.log10(10**4.5 * 10e-6 / 0.1) / 3 * max(0.0, math.log10(seconds / 10e-9))
+    )
 
 
 def judged(case: Case, folder: Path) -> dict[str, object]:
@@ -115,7 +123,9 @@ def judged(case: Case, folder: Path) -> dict[str, object]:
     light = f"pulse_energy: {case.energy!r} J, pulse_duration: {case.duration!r} s{train}"
     if case.power:
         light = f"power: {case.power!r} W"
-    (folder / "table.yaml").write_text(RECIPE.format(nm=case.nm, light=light, dwell=repr(case.dwell)))
+    (folder / "table.yaml").write_text(
+        RECIPE.format(nm=case.nm, light=light, dwell=repr(case.dwell))
+    )
     found: dict[str, object] = document(estimate(load("table.yaml", [], folder)))["damage"][0]
     return found
 
@@ -139,7 +149,9 @@ def main() -> int:
 
 
 def _printed(row: dict[str, object], hand: dict[str, tuple[float, float]], case: Case) -> bool:
-    """Print one part of the light with the ratio by hand; return True if both differ by more than 3 %."""
+    """Print one part of the light with the ratio by hand; return True if both differ by more
+    than 3 %.
+    """
     ratio: dict[str, float] | None = row["ratio"]  # type: ignore[assignment]
     if ratio is None:
         print(f"    {row['part']:13} {row['damage']:12} not judged: {row['reason']}")

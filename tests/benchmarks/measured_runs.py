@@ -1,10 +1,12 @@
-"""Runs of shipped recipes at several sizes, with the processor time and the peak memory of each step, for cost laws.
+"""Runs of shipped recipes at several sizes, with the processor time and the peak memory of each
+step, for cost laws.
 
     python tests/benchmarks/measured_runs.py FOLDER [NAME ...]   # one file for each run that FOLDER lacks
 
-Each run has an empty cache and its own process with one thread. The time of a step is the processor time of its
-thread, so that other work on the machine counts little. The peak memory is that of the kernel, which misses nothing.
-``fit_costs.py`` fits the laws to the runs in FIT, and ``bench_memory.py`` compares with all runs.
+Each run has an empty cache and its own process with one thread. The time of a step is the processor
+time of its thread, so that other work on the machine counts little. The peak memory is that of the
+kernel, which misses nothing. ``fit_costs.py`` fits the laws to the runs in FIT, and
+``bench_memory.py`` compares with all runs.
 """
 
 import json
@@ -18,7 +20,9 @@ from types import SimpleNamespace
 
 
 def at(scene, sensor, samples, window):
-    """Changes of a recipe to a scene, sensor, pupil and window of other sizes; the pupil keeps its width."""
+    """Changes of a recipe to a scene, sensor, pupil and window of other sizes; the pupil keeps
+    its width.
+    """
     sizes = {"scene.shape": [scene] * 2, "sensor.shape": [sensor] * 2, "optics.samples": samples}
     sizes |= {"optics.pitch": f"{8.0784 / samples * 1e3:.4f} um", "optics.window": [window] * 2}
     return [f"{name}={value}" for name, value in sizes.items()]
@@ -50,7 +54,12 @@ FIT = {  # small ones first
     "first_light, pictures, 384 px": ["first_light", *B, *P],
     "dirty_windshield, pictures, 512 px": ["dirty_windshield", *C, *P, "tolerance=1e-2"],
     "first_light, pictures, 768 px (as shipped)": ["first_light", *P, "tolerance=1e-2"],
-    "paper_table1, pictures, 1024 px": ["paper_table1", *at(1024, 1024, 1080, 1024), *P, "tolerance=1e-2"],
+    "paper_table1, pictures, 1024 px": [
+        "paper_table1",
+        *at(1024, 1024, 1080, 1024),
+        *P,
+        "tolerance=1e-2",
+    ],
 }
 HELD_OUT = {
     "calibrate, 256 px (as shipped)": ["calibrate"],
@@ -106,7 +115,9 @@ def file_of(name):
 
 
 def collect(folder, names):
-    """Carry out each run of ``names`` that ``folder`` lacks, in its own process with an empty cache."""
+    """Carry out each run of ``names`` that ``folder`` lacks, in its own process with an empty
+    cache.
+    """
     for name in names:
         target = Path(folder, file_of(name))
         if target.exists():
@@ -125,27 +136,42 @@ def collect(folder, names):
             took = time.perf_counter() - began
             marks = Path(place, "marks.json")
             if not marks.exists() or done.returncode not in (0, 3):
-                print(f"{name}: exit {done.returncode}: {(done.stdout + done.stderr)[-600:]}", flush=True)
+                print(
+                    f"{name}: exit {done.returncode}: {(done.stdout + done.stderr)[-600:]}",
+                    flush=True,
+                )
                 continue
             lines = Path(place, "cache", "journal.jsonl").read_text().splitlines()[1:]
             rows = [json.loads(line) for line in lines if line]
             kept = ("step", "node", "seconds", "bytes", "peak", "device")
             found = {"name": name, "words": RUNS[name], **json.loads(marks.read_text())}
-            target.write_text(json.dumps(found | {"steps": [{key: row.get(key) for key in kept} for row in rows]}))
-        print(f"{name}: {took:.0f} s, {found['running'] / 1e6:.0f}, {found['reporting'] / 1e6:.0f} MB", flush=True)
+            target.write_text(
+                json.dumps(found | {"steps": [{key: row.get(key) for key in kept} for row in rows]})
+            )
+        print(
+            f"{name}: {took:.0f} s, {found['running'] / 1e6:.0f},"
+            f" {found['reporting'] / 1e6:.0f} MB",
+            flush=True,
+        )
 
 
 def measure(target, words):
-    """Run the program in this process, with processor time for the times of steps, and write what the process held."""
+    """Run the program in this process, with processor time for the times of steps, and write
+    what the process held.
+    """
     from neusee.workflows.cli.app import main
-    from neusee.workflows.engine import memory_use, step_job
+    from neusee.workflows.engine import machine_resources as memory_use
+    from neusee.workflows.engine import step_job
     from neusee.workflows.simulation import simulate_recipe
 
     step_job.time = SimpleNamespace(time=time.time, perf_counter=time.thread_time)
     marks, inner, computed = {"grown": []}, simulate_recipe.run, step_job._computed
 
     def watched(work, *others):
-        before, there = memory_use.process_memory(), {name.partition(".")[0] for name in sys.modules}
+        before, there = (
+            memory_use.process_memory(),
+            {name.partition(".")[0] for name in sys.modules},
+        )
         outcome = computed(work, *others)
         new = sorted({name.partition(".")[0] for name in sys.modules} - there)
         grown = memory_use.process_memory() - before - outcome.bytes
@@ -156,7 +182,9 @@ def measure(target, words):
         marks["before"] = memory_use.process_memory()
         result = inner(*args, **options)
         marks["running"], marks["after"] = memory_use.process_peak(), memory_use.process_memory()
-        marks["values"] = sum(done.bytes for name, done in result.done.items() if name in result.values)
+        marks["values"] = sum(
+            done.bytes for name, done in result.done.items() if name in result.values
+        )
         memory_use._peak_reset()
         memory_use._highest = 0
         return result

@@ -1,4 +1,6 @@
-"""Ratios of times of two programs that take turns in one run, with an interval that assumes no law of the times."""
+"""Ratios of times of two programs that take turns in one run, with an interval that assumes no
+law of the times.
+"""
 
 import math
 import os
@@ -14,7 +16,9 @@ OURS = "neusee"
 
 @dataclass(frozen=True)
 class Comparison:
-    """Processor seconds of one claim: of neusee and of each peer, one value a turn, and remarks such as errors."""
+    """Processor seconds of one claim: of neusee and of each peer, one value a turn, and remarks
+    such as errors.
+    """
 
     what: str
     seconds: Mapping[str, Sequence[float]]
@@ -27,16 +31,20 @@ class Comparison:
         return sorted(others, key=lambda name: statistics.median(self.seconds[name]))
 
     def ratio(self, peer: str) -> tuple[float, float, float]:
-        """Return the median of the peer's seconds over ours in the same turn, and the interval of this median."""
+        """Return the median of the peer's seconds over ours in the same turn, and the interval
+        of this median.
+        """
         found = sorted(b / a for a, b in zip(self.seconds[OURS], self.seconds[peer], strict=True))
         low, high = median_ranks(len(found))
         return statistics.median(found), found[low], found[high]
 
 
 def median_ranks(count: int, level: float = 0.95) -> tuple[int, int]:
-    """Return the ranks (from 0) of sorted values between which the median lies with a probability of ``level``.
+    """Return the ranks (from 0) of sorted values between which the median lies with a probability
+    of ``level``.
 
-    This is the interval of the sign test. Where there are too few values for it, it goes from the least to the largest.
+    This is the interval of the sign test. Where there are too few values for it, it goes from the
+    least to the largest.
     """
     below, rank = 0.0, 0
     for k in range(count // 2):
@@ -49,7 +57,9 @@ def median_ranks(count: int, level: float = 0.95) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Figures:
-    """A table of numbers that have no peer: its columns, its rows as text, and the load of the machine."""
+    """A table of numbers that have no peer: its columns, its rows as text, and the load of the
+    machine.
+    """
 
     what: str
     columns: Sequence[str]
@@ -64,7 +74,9 @@ def compared(
     remarks: Mapping[str, str] | None = None,
     by_clock: bool = False,
 ) -> Comparison:
-    """Time works that take turns, after a turn that does not count: processor seconds, or those of the clock."""
+    """Time works that take turns, after a turn that does not count: processor seconds, or those
+    of the clock.
+    """
     load, seconds = os.getloadavg()[0], {name: list[float]() for name in works}
     for turn in range(turns + 1):
         for name, work in works.items():
@@ -75,12 +87,20 @@ def compared(
 
 
 def _processor_seconds(work: Work) -> float:
-    """Return the processor seconds of this process and of the processes that ended during ``work``."""
+    """Return the processor seconds of this process and of the processes that ended during
+    ``work``.
+    """
     before = os.times()
     fine = time.process_time()
     work()
     fine, after = time.process_time() - fine, os.times()
-    return fine + after.children_user - before.children_user + after.children_system - before.children_system
+    return (
+        fine
+        + after.children_user
+        - before.children_user
+        + after.children_system
+        - before.children_system
+    )
 
 
 def _seconds_by_clock(work: Work) -> float:
@@ -91,4 +111,10 @@ def _seconds_by_clock(work: Work) -> float:
 
 def process(command: Sequence[str], environment: Mapping[str, str], folder: str) -> None:
     """Run one program to its end; raise `CalledProcessError` if it fails."""
-    subprocess.run(command, env={**os.environ, **environment}, cwd=folder, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        command,
+        env={**os.environ, **environment},
+        cwd=folder,
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )

@@ -1,9 +1,10 @@
-"""A camera in NumPy alone for simulation-based calibration: no code of the nodes, frames pixel by pixel.
+"""A camera in NumPy alone for simulation-based calibration: no code of the nodes, frames pixel by
+pixel.
 
-``frames`` simulates the pixels of one level; ``table`` writes means and temporal variances of pairs for the recipe
-`calibrate_camera`; ``frames_recipe`` writes the frames themselves, and a recipe of `calibrate.density`. The response
-bends by bend and twist, y = K e (1 + bend x + twist x**2), with x = y / top, or by a cube, which is none of the models
-of the response.
+``frames`` simulates the pixels of one level; ``table`` writes means and temporal variances of pairs
+for the recipe `calibrate_camera`; ``frames_recipe`` writes the frames themselves, and a recipe of
+`calibrate.density`. The response bends by bend and twist, y = K e (1 + bend x + twist x**2), with x
+= y / top, or by a cube, which is none of the models of the response.
 """
 
 import csv
@@ -43,7 +44,9 @@ class PlainCamera:
         electrons = electrons + self.temporal_dark_noise * rng.standard_normal(shape)
         electrons = np.minimum(electrons, self.full)
         centre = electrons.mean()
-        electrons = centre + (electrons - centre) * np.exp(0.5 * self.scatter * rng.standard_normal())
+        electrons = centre + (electrons - centre) * np.exp(
+            0.5 * self.scatter * rng.standard_normal()
+        )
         y = self._response(electrons) + self.dark_signal + self.drift * rng.standard_normal()
         number = np.floor(y) if self.truncates else np.rint(y)
         return np.clip(number, 0, 2**self.bits - 1).astype(np.int64)
@@ -59,17 +62,23 @@ class PlainCamera:
         return y
 
     def series(self, lit=20, darks=6, beyond=1.6):
-        """Photons and exposures of dark levels up to 0.1 s, and of lit levels up to ``beyond`` times the used range."""
+        """Photons and exposures of dark levels up to 0.1 s, and of lit levels up to ``beyond``
+        times the used range.
+        """
         dark = [(0.0, 1e-3 + 0.02 * i) for i in range(darks)]
         brightest = self.top / self.gain / self.quantum_efficiency
         return dark + [(brightest * beyond * (i + 1) / lit, 1e-3) for i in range(lit)]
 
 
 def moments(stack):
-    """Mean and temporal variance of a pair, without the difference of the means (EMVA 1288, 6.6), in integers."""
+    """Mean and temporal variance of a pair, without the difference of the means (EMVA 1288,
+    6.6), in integers.
+    """
     a, b = stack[0].astype(float), stack[1].astype(float)
     apart = a - b
-    return stack.mean(), 0.5 * ((apart**2).mean() - apart.mean() ** 2) * apart.size / (apart.size - 1)
+    return stack.mean(), 0.5 * ((apart**2).mean() - apart.mean() ** 2) * apart.size / (
+        apart.size - 1
+    )
 
 
 def table(camera, seed, file, *, size=96, **series):
@@ -81,7 +90,13 @@ def table(camera, seed, file, *, size=96, **series):
         for photons, exposure in camera.series(**series):
             mean, variance = moments(camera.frames(rng, photons, exposure, size=size))
             writer.writerow(
-                [repr(float(photons)), repr(float(exposure)), size * size, repr(float(mean)), repr(float(variance))]
+                [
+                    repr(float(photons)),
+                    repr(float(exposure)),
+                    size * size,
+                    repr(float(mean)),
+                    repr(float(variance)),
+                ]
             )
     return file
 
@@ -129,12 +144,17 @@ levels:
 
 
 def frames_recipe(camera, seed, folder, *, size=96, **series):
-    """Write the frames of one measurement as .npy and a recipe that reads them; return the path of the recipe."""
+    """Write the frames of one measurement as .npy and a recipe that reads them; return the path
+    of the recipe.
+    """
     rng, text = np.random.default_rng(seed), RECIPE
     for i, (photons, exposure) in enumerate(camera.series(**series)):
         path = folder / f"level_{i:02d}.npy"
         np.save(path, camera.frames(rng, photons, exposure, size=size))
-        text += f"  l{i:02d}: {{files: {path}, photons: {float(photons)!r}, exposure: {float(exposure)!r} s}}\n"
+        text += (
+            f"  l{i:02d}: {{files: {path}, photons: {float(photons)!r}, exposure:"
+            f" {float(exposure)!r} s}}\n"
+        )
     recipe = folder / "measurement.yaml"
     recipe.write_text(text)
     return recipe

@@ -1,4 +1,6 @@
-"""Random cameras in front of random lasers: settings, laws of what is uncertain, and the recipe of `neusee safety`."""
+"""Random cameras in front of random lasers: settings, laws of what is uncertain, and the recipe
+of `neusee safety`.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,14 @@ from tests.workflows.safety import own_camera_limits as own
 from tests.workflows.safety.own_camera_spots import spots_of
 
 DRAWS, OWN_DRAWS = 1000, 2000
-UNITS = {"power": "W", "energy": "J", "divergence": "rad", "waist": "m", "visibility": "m", "well": "e-"}
+UNITS = {
+    "power": "W",
+    "energy": "J",
+    "divergence": "rad",
+    "waist": "m",
+    "visibility": "m",
+    "well": "e-",
+}
 KEYS = {"energy": "pulse_energy", "efficiency": "quantum_efficiency", "well": "full_well"}
 ELSEWHERE = (355e-9, 1310e-9, 1550e-9)  # m, where no published law of damage holds
 
@@ -46,36 +55,63 @@ class Camera:
         if name not in self.laws:
             return f"{KEYS.get(name, name)}: {self.given[name]!r}{unit}"
         law, first, second = self.laws[name]
-        return f'{KEYS.get(name, name)}: "{law}({first!r}{unit}, {second!r}{"" if law == "lognormal" else unit})"'
+        return (
+            f'{KEYS.get(name, name)}: "{law}({first!r}{unit},'
+            f' {second!r}{"" if law == "lognormal" else unit})"'
+        )
 
     def recipe(self, draws: int = DRAWS) -> str:
         """Return the recipe; the brightest pixel is the share of the picture that dazzles."""
         given = self.given
-        beam = [self.text(n) for n in ("power", "energy", "divergence", "waist", "visibility") if n in given]
+        beam = [
+            self.text(n)
+            for n in ("power", "energy", "divergence", "waist", "visibility")
+            if n in given
+        ]
         beam += [f"pulse_duration: {given['duration']!r} s"] if "duration" in given else []
         beam += [f"repetition_rate: {given['rate']!r} Hz"] if "rate" in given else []
         focus = {0.0: "laser", math.inf: "infinity"}.get(given["focus"], f"{given['focus']!r} m")
         scatter = f"{{share: {given['scatter']!r}}}" if given["scatter"] else "null"
-        lens = f"{self.text('transmittance')}, focus: {focus}, defocus: {given['defocus']!r} waves, scatter: {scatter}"
+        lens = (
+            f"{self.text('transmittance')}, focus: {focus}, defocus: {given['defocus']!r} waves,"
+            f" scatter: {scatter}"
+        )
         sensor = f"{self.text('efficiency')}, {self.text('well')}"
         return RECIPE.format(
-            number=self.number, distance=self.distance, beam=", ".join(beam), lens=lens, sensor=sensor, draws=draws,
-            **{name: given[name] for name in ("wavelength", "focal_length", "diameter", "pixel", "exposure", "dwell")},
-        )  # fmt: skip
+            number=self.number,
+            distance=self.distance,
+            beam=", ".join(beam),
+            lens=lens,
+            sensor=sensor,
+            draws=draws,
+            **{
+                name: given[name]
+                for name in ("wavelength", "focal_length", "diameter", "pixel", "exposure", "dwell")
+            },
+        )
 
     def drawn(self) -> dict[str, Any]:
         """Return the settings with draws (draw, 1) in place of those that are uncertain."""
         draw = np.random.default_rng([33, self.number])
-        laws = {"lognormal": lambda a, b: a * b ** draw.standard_normal(OWN_DRAWS),
-                "normal": lambda a, b: draw.normal(a, b, OWN_DRAWS),
-                "uniform": lambda a, b: draw.uniform(a, b, OWN_DRAWS)}  # fmt: skip
-        return self.given | {name: laws[law](*numbers)[:, None] for name, (law, *numbers) in self.laws.items()}
+        laws = {
+            "lognormal": lambda a, b: a * b ** draw.standard_normal(OWN_DRAWS),
+            "normal": lambda a, b: draw.normal(a, b, OWN_DRAWS),
+            "uniform": lambda a, b: draw.uniform(a, b, OWN_DRAWS),
+        }
+        return self.given | {
+            name: laws[law](*numbers)[:, None] for name, (law, *numbers) in self.laws.items()
+        }
 
     @property
     def half_pixel(self) -> float:
         """Return half a pixel in the unit of the reference."""
         given = self.given
-        return math.pi * given["diameter"] * given["pixel"] / (2 * given["wavelength"] * given["focal_length"])
+        return (
+            math.pi
+            * given["diameter"]
+            * given["pixel"]
+            / (2 * given["wavelength"] * given["focal_length"])
+        )
 
     @property
     def opens_below(self) -> bool:
@@ -94,24 +130,45 @@ def rounded(value: float) -> float:
 
 
 def camera(number: int) -> Camera:
-    """Return a random camera in front of a random laser whose light is about a limit at a random distance."""
+    """Return a random camera in front of a random laser whose light is about a limit at a random
+    distance.
+    """
     draw = np.random.default_rng([32, number])
 
     def between(low: float, high: float) -> float:
         return rounded(float(np.exp(draw.uniform(math.log(low), math.log(high)))))
 
-    given = {"wavelength": float(draw.integers(400, 1101)) * 1e-9, "focal_length": between(8e-3, 0.2)}
+    given = {
+        "wavelength": float(draw.integers(400, 1101)) * 1e-9,
+        "focal_length": between(8e-3, 0.2),
+    }
     if draw.random() < 0.12:
         given["wavelength"] = float(draw.choice(ELSEWHERE))
-    given |= {"diameter": rounded(given["focal_length"] / between(1.2, 16)), "pixel": between(1e-6, 10e-6)}
-    given |= {"divergence": between(1e-4, 1e-2), "exposure": between(1e-5, 3e-2), "dwell": between(1e-3, 10)}
+    given |= {
+        "diameter": rounded(given["focal_length"] / between(1.2, 16)),
+        "pixel": between(1e-6, 10e-6),
+    }
+    given |= {
+        "divergence": between(1e-4, 1e-2),
+        "exposure": between(1e-5, 3e-2),
+        "dwell": between(1e-3, 10),
+    }
     given |= {"efficiency": rounded(draw.uniform(0.05, 0.75)), "well": between(2e3, 1e5)}
-    given |= {"transmittance": rounded(draw.uniform(0.7, 0.95)), "scatter": float(draw.choice([0, 0, 0.003, 0.01]))}
+    given |= {
+        "transmittance": rounded(draw.uniform(0.7, 0.95)),
+        "scatter": float(draw.choice([0, 0, 0.003, 0.01])),
+    }
     distance = between(1, 1e4)
-    given["focus"] = [math.inf, math.inf, 0.0, rounded(distance * between(0.3, 3))][draw.integers(4)]
-    given["defocus"] = rounded(draw.uniform(-1, 1)) if draw.random() < 0.2 and given["focus"] else 0.0
+    given["focus"] = [math.inf, math.inf, 0.0, rounded(distance * between(0.3, 3))][
+        draw.integers(4)
+    ]
+    given["defocus"] = (
+        rounded(draw.uniform(-1, 1)) if draw.random() < 0.2 and given["focus"] else 0.0
+    )
     if draw.random() < 0.5:
-        given["waist"] = rounded(2 * draw.uniform(2, 6) * given["wavelength"] / (math.pi * given["divergence"]))
+        given["waist"] = rounded(
+            2 * draw.uniform(2, 6) * given["wavelength"] / (math.pi * given["divergence"])
+        )
     if draw.random() < 0.3:
         given["visibility"] = between(3e3, 3e4)
     given |= emitted(given, int(draw.integers(4)), between(1e-14, 1e-3), between(1, 1e6))
@@ -140,7 +197,9 @@ def source_at_limit(given: dict[str, float], distance: float, damages: bool) -> 
     return rounded(float(np.clip(1 / ratio, 1e-15, 1e6)))
 
 
-def laws_of(given: dict[str, float], draw: np.random.Generator, source: str) -> dict[str, tuple[str, float, float]]:
+def laws_of(
+    given: dict[str, float], draw: np.random.Generator, source: str
+) -> dict[str, tuple[str, float, float]]:
     """Return the laws of none to three settings."""
     known = {
         source: ("lognormal", given[source], rounded(draw.uniform(1.05, 1.6))),

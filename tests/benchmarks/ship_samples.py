@@ -1,10 +1,11 @@
 """Write the designed mask and the trained network as they ship, and say what that changes.
 
     python tests/benchmarks/ship_samples.py mask mask.safetensors recipes/samples
-    python tests/benchmarks/ship_samples.py network best.safetensors later/best.safetensors recipes/samples
+    python tests/benchmarks/ship_samples.py network best.safetensors later/best.safetensors
+    recipes/samples
 
-The relief becomes a grey picture of 12 bits that states the height of white and the pitch. The weights become half
-floats, of several files their mean.
+The relief becomes a grey picture of 12 bits that states the height of white and the pitch. The
+weights become half floats, of several files their mean.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ def mask(file: Path, out: Path) -> None:
     Image.fromarray(levels).save(out / "demonstration_mask.png", optimize=True, pnginfo=stated)
     wrong = torch.from_numpy(levels.astype(np.float64)) * depth / 65535 - height
     print(
-        f"doe.depth: {depth * 1e6:.4f} um; levels change the relief by {float(wrong.abs().max()) * 1e9:.2f} nm at most"
+        f"doe.depth: {depth * 1e6:.4f} um; levels change the relief by"
+        f" {float(wrong.abs().max()) * 1e9:.2f} nm at most"
     )
 
 
@@ -47,9 +49,14 @@ def network(files: list[Path], out: Path) -> None:
     each = [load_file(file) for file in files]
     weights = {name: torch.stack([one[name] for one in each]).mean(0) for name in each[0]}
     half = {name: x.to(torch.float16) for name, x in weights.items()}
-    worst = max(float((half[n].float() - x).norm() / x.norm().clamp_min(1e-30)) for n, x in weights.items())
+    worst = max(
+        float((half[n].float() - x).norm() / x.norm().clamp_min(1e-30)) for n, x in weights.items()
+    )
     save_file(half, out / "neusee_network.safetensors", said)
-    print(f"{sum(x.numel() for x in half.values())} numbers; halving changes a tensor by {worst:.1e} at most")
+    print(
+        f"{sum(x.numel() for x in half.values())} numbers; halving changes a tensor by {worst:.1e}"
+        " at most"
+    )
 
 
 if __name__ == "__main__":

@@ -75,9 +75,13 @@ def test_wrapping_at_one_wave_costs_the_other_colours(wavelength, deep, wrapped)
     assert lsr(thin, wavelength) == pytest.approx(wrapped, rel=0.03)
 
 
-@pytest.mark.parametrize(("wavelength", "floor"), [(400e-9, 1.07e-6), (550e-9, 2.02e-6), (700e-9, 3.28e-6)])
+@pytest.mark.parametrize(
+    ("wavelength", "floor"), [(400e-9, 1.07e-6), (550e-9, 2.02e-6), (700e-9, 3.28e-6)]
+)
 def test_energy_floor_of_the_full_sensor(wavelength, floor):
-    """Spread evenly over S, light leaves 1 / (pixels * clear peak) = 4 lambda2 f2 / (pi D2 S) of the peak."""
+    """Spread evenly over S, light leaves 1 / (pixels * clear peak) = 4 lambda2 f2 / (pi D2 S) of
+    the peak.
+    """
     clear = psf(torch.zeros(2160, 2160), wavelength, window=8)
     assert 1 / (2048**2 * float(clear.clear_peak)) == pytest.approx(floor, rel=0.005)
     assert float(clear.intensity[0, 4, 4]) == pytest.approx(float(clear.clear_peak), rel=1e-4)

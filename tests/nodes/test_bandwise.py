@@ -26,7 +26,9 @@ def pupil(n, bands, height=1e-6, path=0.0):
     disc = ((x[:, None] ** 2 + x**2) <= 1).float()
     waves = torch.linspace(400e-9, 700e-9, bands, dtype=torch.float64)
     pitch = torch.tensor(DIAMETER / n, dtype=torch.float64)
-    return Pupil(disc, disc * rand(n, n), rand(n, n) * height, disc * path, 0.46 + waves * 1e4, waves, pitch)
+    return Pupil(
+        disc, disc * rand(n, n), rand(n, n) * height, disc * path, 0.46 + waves * 1e4, waves, pitch
+    )
 
 
 def as_psf(bands, *shape, dtype=torch.float32):
@@ -44,7 +46,10 @@ CASES = {
     "optics.psf": [
         ((pupil(33, 4),), {"shape": (9, 15)}),
         ((pupil(64, 7),), {"shape": (31, 64), "pixel": "zoh", "angle": (1e-4, -2e-4)}),
-        ((pupil(201, 5, path=3e-7), torch.tensor([2e-4, 1e-4], dtype=torch.float64)), {"shape": (65, 65)}),
+        (
+            (pupil(201, 5, path=3e-7), torch.tensor([2e-4, 1e-4], dtype=torch.float64)),
+            {"shape": (65, 65)},
+        ),
         ((pupil(40, 4),), {"shape": (12, 12), "sensor": "integrated"}),
         ((pupil(128, 4),), {"shape": (64, 64), "precision": "double"}),
         ((pupil(64, 4),), {"shape": (500, 500), "pixel": "zoh"}),
@@ -55,7 +60,10 @@ CASES = {
     ],
     "flare.stray_light": [
         ((as_psf(5, 21, 33), pupil(33, 5)), SCATTER),
-        ((as_psf(7, 40, 41), pupil(40, 7), torch.tensor([2e-4, 1e-4], dtype=torch.float64)), SCATTER),
+        (
+            (as_psf(7, 40, 41), pupil(40, 7), torch.tensor([2e-4, 1e-4], dtype=torch.float64)),
+            SCATTER,
+        ),
         ((as_psf(4, 64, 64), pupil(64, 4)), {**SCATTER, "scaling": "roughness"}),
     ],
     "metrics.bsr": [
@@ -89,7 +97,8 @@ def tensors(value):
     return [value] if isinstance(value, Tensor) else list(value)
 
 
-# Two threads wait for each other on a core that they share with other tests: seconds of a few milliseconds' work.
+# Two threads wait for each other on a core that they share with other tests: seconds of a few
+# milliseconds' work.
 @pytest.fixture(params=[1, pytest.param(2, marks=pytest.mark.slow)])
 def threads(request):
     before = torch.get_num_threads()

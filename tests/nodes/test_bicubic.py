@@ -5,9 +5,15 @@ import torch
 from torch.nn.functional import interpolate
 from torch.testing import assert_close
 
-from neusee.nodes.bicubic_resize import enlarge, resize
+from neusee.nodes.resampling import enlarge, resize
 
-SIZES = [((16, 16), (8, 8)), ((37, 53), (18, 26)), ((9, 5), (31, 64)), ((8, 30), (19, 7)), ((1, 6), (4, 1))]
+SIZES = [
+    ((16, 16), (8, 8)),
+    ((37, 53), (18, 26)),
+    ((9, 5), (31, 64)),
+    ((8, 30), (19, 7)),
+    ((1, 6), (4, 1)),
+]
 
 
 def drawn(*shape, dtype=torch.float64):
@@ -29,7 +35,9 @@ def test_enlarge_is_torch_bicubic():
 
 
 def test_resize_keeps_a_grey_picture_and_the_finest_stripes_go_grey():
-    assert_close(resize(torch.full((1, 11, 9), 0.3), 5, 4), torch.full((1, 5, 4), 0.3), rtol=0, atol=1e-7)
+    assert_close(
+        resize(torch.full((1, 11, 9), 0.3), 5, 4), torch.full((1, 5, 4), 0.3), rtol=0, atol=1e-7
+    )
     stripes = torch.arange(64.0).remainder(2).expand(64, 64)
     assert float((resize(stripes, 16, 16) - 0.5)[:, 2:-2].abs().max()) < 0.02
     assert float((enlarge(stripes, 21, 21) - 0.5)[:, 2:-2].abs().max()) > 0.4

@@ -1,7 +1,9 @@
-"""Every node that offers float64 against a sum in longdouble that shares no line with it: 1e-11 of the largest value.
+"""Every node that offers float64 against a sum in longdouble that shares no line with it: 1e-11 of
+the largest value.
 
-Each reference is written in NumPy from the formula in the node's docstring. A float32 anywhere on the way, such as that
-of an integer tensor times a Python number, misses the limit by four decimal places.
+Each reference is written in NumPy from the formula in the node's docstring. A float32 anywhere on
+the way, such as that of an integer tensor times a Python number, misses the limit by four decimal
+places.
 """
 
 from itertools import pairwise
@@ -30,29 +32,43 @@ def exact(x):
     return np.asarray(x.numpy() if isinstance(x, torch.Tensor) else x, L)
 
 
-# --- inputs, all float64 ----------------------------------------------------------------------------------------------
+# --- inputs, all float64 --------------------------------------------------------------------------
 
 CENTRES = torch.tensor([412.3e-9, 487.9e-9, 561.7e-9, 688.1e-9], dtype=torch.float64)
-BANDS = Bands(CENTRES, torch.full((4,), 9.7e-9, dtype=torch.float64), torch.tensor([0.1, 0.2, 0.3, 0.4]).double())
+BANDS = Bands(
+    CENTRES,
+    torch.full((4,), 9.7e-9, dtype=torch.float64),
+    torch.tensor([0.1, 0.2, 0.3, 0.4]).double(),
+)
 STOP = Stop(torch.tensor(24), torch.tensor(3.3e-4).double(), torch.tensor(7.9e-3).double())
 SCENE, IMAGE = draw(4, 11, 9), draw(4, 11, 9, seed=1)
 PSF = Psf(draw(4, 7, 8) / 60, draw(4))
 WIDE = Psf(draw(4, 12, 13) / 160, draw(4, low=0.02) / 4)
 RESPONSES, ILLUMINANT, LEVEL, ROWS = draw(3, 4), draw(4, seed=2), 1e3 * draw(4, seed=3), draw(2, 4)
 PLANES, BASIS = draw(3, 11, 9), draw(4, 3)
-LOW_RANK = LowRankCube(PLANES, BASIS, torch.tensor([9.0, 9.0, 9.0, 0.0]).double()[:, None].expand(4, 4))
+LOW_RANK = LowRankCube(
+    PLANES, BASIS, torch.tensor([9.0, 9.0, 9.0, 0.0]).double()[:, None].expand(4, 4)
+)
 PICTURE, TRUTH = draw(3, 13, 12), draw(3, 13, 12, seed=1)
 HEIGHT = 140e-6 * draw(24, 24)
 DISC = torch.tensor(np.hypot(*np.meshgrid(*[np.arange(24) - 11.5] * 2)) <= 11.5).double()
 INDEX = torch.tensor([0.4683, 0.4629, 0.4596, 0.4555], dtype=torch.float64)
-PUPIL = Pupil(DISC, DISC * draw(24, 24, low=0.0), HEIGHT, 3e-6 * draw(24, 24, seed=4), INDEX, CENTRES, STOP.pitch)
+PUPIL = Pupil(
+    DISC,
+    DISC * draw(24, 24, low=0.0),
+    HEIGHT,
+    3e-6 * draw(24, 24, seed=4),
+    INDEX,
+    CENTRES,
+    STOP.pitch,
+)
 WELL = {"full_well": 25500.0, "quantum_efficiency": 0.56, "pixel_pitch": 2.9e-6, "exposure": 0.013}
 SHUTTER = {"pixel_pitch": 2.9e-6, "exposure": 0.013}
 FILLS = L(25500.0) / L(0.56)
 AREA = L(0.013) * L(2.9e-6) ** 2
 
 
-# --- references -------------------------------------------------------------------------------------------------------
+# --- references -----------------------------------------------------------------------------------
 
 
 def photons_per_joule(centres):
@@ -60,7 +76,9 @@ def photons_per_joule(centres):
 
 
 def dft(x):
-    """Give the Fourier sum of a picture, sum x exp(-2 pi i (j k / n)), with whole turns taken away first."""
+    """Give the Fourier sum of a picture, sum x exp(-2 pi i (j k / n)), with whole turns taken
+    away first.
+    """
     for axis in (-2, -1):
         n = x.shape[axis]
         turns = np.outer(np.arange(n), np.arange(n)) % n / L(n)
@@ -82,10 +100,21 @@ def half(size):
 def psf_of(pupil, **camera):
     found = []
     for index, wavelength in zip(pupil.index, pupil.wavelengths, strict=True):
-        one = window(pupil.height.numpy(), pupil.path.numpy(), pupil.amplitude.numpy(), float(index), float(wavelength),
-                     float(pupil.pitch), camera["focal_length"], camera["pixel_pitch"], camera["shape"],
-                     camera["angle"])  # fmt: skip
-        found.append(one * float((exact(pupil.amplitude) ** 2).sum() / (exact(pupil.aperture) ** 2).sum()))
+        one = window(
+            pupil.height.numpy(),
+            pupil.path.numpy(),
+            pupil.amplitude.numpy(),
+            float(index),
+            float(wavelength),
+            float(pupil.pitch),
+            camera["focal_length"],
+            camera["pixel_pitch"],
+            camera["shape"],
+            camera["angle"],
+        )
+        found.append(
+            one * float((exact(pupil.amplitude) ** 2).sum() / (exact(pupil.aperture) ** 2).sum())
+        )
     return np.stack(found)
 
 
@@ -100,7 +129,9 @@ def pupil_path(height, index, bands, stop, **terms):
         9: np.sqrt(L(8)) * (3 * u**2 * v - v**3),
         11: np.sqrt(L(5)) * (6 * square**2 - 6 * square + 1),
     }
-    path = L(terms["defocus"]) * L(550e-9) * square + sum(L(c) * modes[j] for j, c in terms["aberrations"].items())
+    path = L(terms["defocus"]) * L(550e-9) * square + sum(
+        L(c) * modes[j] for j, c in terms["aberrations"].items()
+    )
     return np.where(square <= 1, path, 0)
 
 
@@ -152,7 +183,9 @@ def outside(psf, pupil):
 
 
 def contrasts(psf, up_to=1):
-    """Yield the contrast of each band at the half spectrum's frequencies that the clear aperture passes."""
+    """Yield the contrast of each band at the half spectrum's frequencies that the clear aperture
+    passes.
+    """
     for kernel, peak in zip(exact(psf.intensity), exact(psf.clear_peak), strict=True):
         fy, fx = (f[..., half(kernel.shape[1])] for f in frequencies(kernel.shape))
         otf = dft(kernel)[:, half(kernel.shape[1])]
@@ -170,7 +203,9 @@ def contrast_loss(psf, *, floor, up_to):
 
 def encircled(psf, *, pixel_pitch, radius):
     y, x = ((np.arange(n) - n // 2) * L(pixel_pitch) for n in psf.intensity.shape[1:])
-    return (exact(psf.intensity) * (np.sqrt(y[:, None] ** 2 + x[None, :] ** 2) <= L(radius))).sum((1, 2))
+    return (exact(psf.intensity) * (np.sqrt(y[:, None] ** 2 + x[None, :] ** 2) <= L(radius))).sum(
+        (1, 2)
+    )
 
 
 def limits(psf):
@@ -179,13 +214,20 @@ def limits(psf):
     fy, fx = frequencies(kernel.shape[1:])
     passed = [(np.sqrt(fy**2 + fx**2) <= np.sqrt(4 * p / PI)).mean(dtype=L) for p in peak]
     bound = np.sqrt(top / light)
-    rows = [light / (kernel[0].size * peak), np.sqrt((kernel**2).sum((1, 2))) / light, bound, bound / np.sqrt(passed)]
+    rows = [
+        light / (kernel[0].size * peak),
+        np.sqrt((kernel**2).sum((1, 2))) / light,
+        bound,
+        bound / np.sqrt(passed),
+    ]
     return np.stack([*rows, np.sqrt(L(2)) * rows[3]])
 
 
 def wells(image, bands, level, spots, lines, **_):
     each = [(exact(image) * (exact(level) / saturating(bands))[:, None, None]).sum(0)]
-    each += [(exact(s) / saturating(b)[:, None, None]).sum(0) for s, b in zip(spots, lines, strict=True)]
+    each += [
+        (exact(s) / saturating(b)[:, None, None]).sum(0) for s, b in zip(spots, lines, strict=True)
+    ]
     return sum(each).max()
 
 
@@ -195,8 +237,23 @@ def p_norm(psf, *, power, log):
     return np.log(peaks + L(1e-30)).sum() if log else peaks.sum()
 
 
-def seen_behind(psf, illuminant, responses, bands, *, light, read_noise, veil, limit, transmittance, contrast, up_to):
-    """Yield NEQ x S of each channel behind mask and grey filter, and S, at the frequencies that count."""
+def seen_behind(
+    psf,
+    illuminant,
+    responses,
+    bands,
+    *,
+    light,
+    read_noise,
+    veil,
+    limit,
+    transmittance,
+    contrast,
+    up_to,
+):
+    """Yield NEQ x S of each channel behind mask and grey filter, and S, at the frequencies that
+    count.
+    """
     kernel = exact(psf.intensity)
     square = sum(np.abs(f) ** 2 for f in frequencies(kernel.shape[1:]))
     power = np.divide(1, square, out=np.zeros_like(square), where=square > 0)
@@ -211,7 +268,9 @@ def seen_behind(psf, illuminant, responses, bands, *, light, read_noise, veil, l
 
 
 def filtered_error(*inputs, **how):
-    return np.mean([np.log((s / (1 + snr)).sum() / s.sum()) for snr, s in seen_behind(*inputs, **how)])
+    return np.mean(
+        [np.log((s / (1 + snr)).sum() / s.sum()) for snr, s in seen_behind(*inputs, **how)]
+    )
 
 
 def information(*inputs, **how):
@@ -237,7 +296,20 @@ def wiener_loss(psf, illuminant, responses, bands, *, noise, colour, up_to):
     return np.mean(logs)
 
 
-def filtered(psf, illuminant, responses, bands, *, electrons, read_noise, glare, prnu, residual_glare, variance, up_to):
+def filtered(
+    psf,
+    illuminant,
+    responses,
+    bands,
+    *,
+    electrons,
+    read_noise,
+    glare,
+    prnu,
+    residual_glare,
+    variance,
+    up_to,
+):
     """Error, information, mean log NEQ and light of each channel, by sums over all frequencies."""
     kernel, columns = exact(psf.intensity), []
     square = sum(f**2 for f in frequencies(kernel.shape[1:]))
@@ -247,23 +319,34 @@ def filtered(psf, illuminant, responses, bands, *, electrons, read_noise, glare,
     for part in seen / seen.sum(1, keepdims=True):
         otf = dft(np.tensordot(part, kernel, 1))
         whole = L(electrons) * otf[0, 0].real + L(glare)
-        noise = whole + L(read_noise) ** 2 + (L(prnu) * whole) ** 2 + (L(residual_glare) * L(glare)) ** 2
+        noise = (
+            whole
+            + L(read_noise) ** 2
+            + (L(prnu) * whole) ** 2
+            + (L(residual_glare) * L(glare)) ** 2
+        )
         neq = (L(electrons) * np.abs(otf)) ** 2 / noise
         low = (square > 0) & (square <= L(up_to) ** 2)
         error = (power / (1 + neq * power)).sum() / power.sum()
-        columns.append((error, np.log2(1 + neq * power).mean() / 2, np.log(neq[low]).mean(), otf[0, 0].real))
+        columns.append(
+            (error, np.log2(1 + neq * power).mean() / 2, np.log(neq[low]).mean(), otf[0, 0].real)
+        )
     return np.array(columns, L).T
 
 
 def weakest(light, lsr, bands, lines):
-    """The light times the largest of the ratios at the band that is nearest to the mean of each line."""
+    """The light times the largest of the ratios at the band that is nearest to the mean of each
+    line.
+    """
     centres = [float((x.centres * x.weights).sum() / x.weights.sum()) for x in lines]
     found = [exact(lsr)[np.abs(np.asarray(bands.centres) - c).argmin()] for c in centres]
     return exact(light) * min(max(found), L(1))
 
 
 def warmed(psf, plain, *, pixel_pitch, dwell):
-    """Heat of the hottest pixel over that of the clear lens: every pixel warms every pixel of silicon."""
+    """Heat of the hottest pixel over that of the clear lens: every pixel warms every pixel of
+    silicon.
+    """
     import mpmath
 
     y, x = psf.intensity.shape[1:]
@@ -271,17 +354,27 @@ def warmed(psf, plain, *, pixel_pitch, dwell):
     squares = ((at[:, None] - at) ** 2).sum(-1)
     with mpmath.workdps(30):
         reach, pitch = mpmath.sqrt(4 * mpmath.mpf(8.8e-5) * dwell), mpmath.mpf(pixel_pitch)
-        each = {int(n): mpmath.erfc(mpmath.sqrt(int(n)) * pitch / reach) / (mpmath.sqrt(int(n)) * pitch)
-                for n in np.unique(squares) if n}  # fmt: skip
+        each = {
+            int(n): mpmath.erfc(mpmath.sqrt(int(n)) * pitch / reach) / (mpmath.sqrt(int(n)) * pitch)
+            for n in np.unique(squares)
+            if n
+        }
         disc = pitch / mpmath.sqrt(mpmath.pi)
-        each[0] = 2 * mpmath.pi * mpmath.quad(lambda r: mpmath.erfc(r / reach), [0, disc]) / pitch**2
+        each[0] = (
+            2 * mpmath.pi * mpmath.quad(lambda r: mpmath.erfc(r / reach), [0, disc]) / pitch**2
+        )
     kernel = np.array([L(str(each[n])) for n in squares.flat], L).reshape(squares.shape)
-    hottest = [(kernel @ exact(one.intensity).reshape(len(one.intensity), -1).T).max(0) for one in (psf, plain)]
+    hottest = [
+        (kernel @ exact(one.intensity).reshape(len(one.intensity), -1).T).max(0)
+        for one in (psf, plain)
+    ]
     return hottest[0] / hottest[1]
 
 
 def bounds(psf, *, electrons, read_noise, glare):
-    """Logarithms of value and bound of each inequality, from Parseval's sum of |OTF|**2; c = 0.45962."""
+    """Logarithms of value and bound of each inequality, from Parseval's sum of |OTF|**2; c =
+    0.45962.
+    """
     c, n, rows = L(0.45962), L(electrons), []
     quiet, noise = L(read_noise) ** 2, n + L(glare) + L(read_noise) ** 2
     for kernel, p0 in zip(exact(psf.intensity), exact(psf.clear_peak), strict=True):
@@ -293,8 +386,18 @@ def bounds(psf, *, electrons, read_noise, glare):
         stop = n**2 * lsr ** L(1.5) * c / 4 / (n * np.sqrt(lsr) + quiet)
         mask, most = n**2 * inside.mean() / noise, n**2 * lsr / 4 / noise
         both = max(grey, stop)
-        pairs = (kernel**2).sum(), peak, inside.mean() / (c / 4), lsr / c, mask / grey, most / grey, mask / both
-        rows.append([*np.log([*pairs, most / both]), np.log(n**2 * inside / noise).mean(), np.log(most)])
+        pairs = (
+            (kernel**2).sum(),
+            peak,
+            inside.mean() / (c / 4),
+            lsr / c,
+            mask / grey,
+            most / grey,
+            mask / both,
+        )
+        rows.append(
+            [*np.log([*pairs, most / both]), np.log(n**2 * inside / noise).mean(), np.log(most)]
+        )
     return np.array(rows, L).T
 
 
@@ -324,9 +427,13 @@ def averaged(height, stop, *, feature):
 
 
 def pulse_over_thresholds(spot, line, exposure, **_):
-    """The fluence of one pulse over the published thresholds of a CMOS, in J/m2 from J/cm2: first traces and others."""
+    """The fluence of one pulse over the published thresholds of a CMOS, in J/m2 from J/cm2:
+    first traces and others.
+    """
     thresholds = [L("0.1"), L("100"), L("0.2419"), L("2.0054")]
-    return np.array([exact(spot).sum(0).max() * L(exposure) / (threshold * 10_000) for threshold in thresholds])
+    return np.array(
+        [exact(spot).sum(0).max() * L(exposure) / (threshold * 10_000) for threshold in thresholds]
+    )
 
 
 def photons(irradiance, bands, responses, level, **_):
@@ -353,7 +460,10 @@ def gaussian_line(*, wavelength, fwhm, count, floor, **_):
     import mpmath
 
     with mpmath.workdps(40):
-        sigma, width = mpmath.mpf(fwhm) / (2 * mpmath.sqrt(2 * mpmath.log(2))), 3 * mpmath.mpf(fwhm) / count
+        sigma, width = (
+            mpmath.mpf(fwhm) / (2 * mpmath.sqrt(2 * mpmath.log(2))),
+            3 * mpmath.mpf(fwhm) / count,
+        )
         edges = [width * (mpmath.mpf(i) - mpmath.mpf(count) / 2) for i in range(count + 1)]
         inside = [mpmath.ncdf(b / sigma) - mpmath.ncdf(a / sigma) for a, b in pairwise(edges)]
         weights = [w + floor * width / (sigma * mpmath.sqrt(2 * mpmath.pi)) for w in inside]
@@ -372,14 +482,26 @@ def spectrum_difference(a, b):
 def shown(x):
     inside = np.clip(exact(x), 0, 1)
     dark = inside <= L("0.0031308")
-    return np.where(dark, L("12.92") * inside, L("1.055") * inside ** (1 / L("2.4")) - L("0.055")) + L("0.1") * (
-        exact(x) - inside
-    )
+    return np.where(
+        dark, L("12.92") * inside, L("1.055") * inside ** (1 / L("2.4")) - L("0.055")
+    ) + L("0.1") * (exact(x) - inside)
 
 
-CAMERA = {"focal_length": 0.11, "pixel_pitch": 2.9e-6, "shape": (12, 15), "angle": (3.1e-5, -5.7e-5)}
+CAMERA = {
+    "focal_length": 0.11,
+    "pixel_pitch": 2.9e-6,
+    "shape": (12, 15),
+    "angle": (3.1e-5, -5.7e-5),
+}
 LENS = {"defocus": 37.5, "aberrations": {4: 1.1e-6, 7: -3e-7, 9: 2e-7, 11: 5e-8}}
-GHOST = {"focal_length": 0.11, "pixel_pitch": 2.9e-6, "count": 1, "energy": 0.03, "spread": 0.1, "radius": 9e-6}
+GHOST = {
+    "focal_length": 0.11,
+    "pixel_pitch": 2.9e-6,
+    "count": 1,
+    "energy": 0.03,
+    "spread": 0.1,
+    "radius": 9e-6,
+}
 
 
 def first(x):
@@ -387,8 +509,12 @@ def first(x):
 
 
 def case(node, inputs, reference, params=None, take=first, like=None):
-    """A call of a node, the reference of the tensors that ``take`` picks, and the scale if not their largest value."""
-    return SimpleNamespace(node=node, inputs=inputs, reference=reference, params=params or {}, take=take, like=like)
+    """A call of a node, the reference of the tensors that ``take`` picks, and the scale if not
+    their largest value.
+    """
+    return SimpleNamespace(
+        node=node, inputs=inputs, reference=reference, params=params or {}, take=take, like=like
+    )
 
 
 def rng():
@@ -469,7 +595,9 @@ CASES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("one", CASES, ids=lambda c: f"{c.node.path} {'' if not c.params else next(iter(c.params))}")
+@pytest.mark.parametrize(
+    "one", CASES, ids=lambda c: f"{c.node.path} {'' if not c.params else next(iter(c.params))}"
+)
 def test_the_error_in_float64(one):
     given = {**one.params, **({"rng": rng()} if one.node.random else {})}
     found = one.take(one.node(*one.inputs, **given))

@@ -1,4 +1,6 @@
-"""Convolutions in full float32 leave the settings of the process as they found them, from any number of threads."""
+"""Convolutions in full float32 leave the settings of the process as they found them, from any
+number of threads.
+"""
 
 from concurrent.futures import ThreadPoolExecutor
 from threading import Event, Thread
@@ -8,15 +10,17 @@ import pytest
 import torch
 from torch.backends import cudnn
 
-from neusee.nodes.exact_convolution import exact_convolutions, tf32_setting
 from neusee.nodes.metrics import quality
-from neusee.workflows.keys.process_settings import settings
+from neusee.nodes.precision import exact_convolutions, tf32_setting
+from neusee.workflows.keys.loaded_state import settings
 
 ON_CUDA = SimpleNamespace(is_cuda=True)
 
 
 def test_no_thread_on_the_cpu_changes_a_setting():
-    """Each of two threads restored what the other had set, so that TF32 stayed off and every later key was another."""
+    """Each of two threads restored what the other had set, so that TF32 stayed off and every
+    later key was another.
+    """
     a, b = torch.rand(2, 3, 40, 40)
     seen = []
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from neusee.nodes import doe, flare, losses, metrics, optics, restore, sensor, spectra
-from neusee.nodes._half_precision import refuse_half, refuse_not_finite, single
 from neusee.nodes.doe._refractive_index import wave_height
 from neusee.nodes.optics._transform._scaled_transform import transform
+from neusee.nodes.precision import refuse_half, refuse_not_finite, single
 from neusee.nodes.values import Bands, Psf, Pupil
 
 
@@ -21,7 +21,7 @@ def slope_of(loss, x):
     return torch.autograd.grad(loss(x), x)[0]
 
 
-# --- losses at zero ---------------------------------------------------------------------------------------------------
+# --- losses at zero -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("log", [False, True])
@@ -30,13 +30,18 @@ def test_an_opaque_mask_has_a_finite_loss_and_no_slope(log, scale):
     dark = torch.full((2, 5, 5), scale)
     loss = float(losses.suppression_loss(psf_of(dark), log=log))
     assert loss == pytest.approx(2 * math.log(1e-30) if log else 0.0, abs=1e-5 * abs(loss) + 1e-29)
-    assert float(slope_of(lambda x: losses.suppression_loss(psf_of(x), log=log), dark).abs().max()) == 0
+    assert (
+        float(slope_of(lambda x: losses.suppression_loss(psf_of(x), log=log), dark).abs().max())
+        == 0
+    )
 
 
 def test_the_log_of_the_lsr_is_the_same_in_both_precisions_when_one_band_is_dark():
     psf = torch.rand(2, 5, 5, generator=torch.Generator().manual_seed(1))
     psf[0] = 0
-    single_, double = (float(losses.suppression_loss(psf_of(x), log=True)) for x in (psf, psf.double()))
+    single_, double = (
+        float(losses.suppression_loss(psf_of(x), log=True)) for x in (psf, psf.double())
+    )
     assert single_ == pytest.approx(double, rel=1e-6)
 
 
@@ -61,12 +66,18 @@ def test_the_penalty_and_its_slope_follow_the_closed_form(size):
     slopes = torch.randn(3, 8, generator=torch.Generator().manual_seed(1)) * size
     norm = slopes.double().norm(dim=1, keepdim=True)
     expected = 2 * (norm - 1) / 3 * slopes.double() / norm
-    assert float(losses.gradient_penalty(slopes)) == pytest.approx(float((norm - 1).square().mean()), rel=1e-5)
-    torch.testing.assert_close(slope_of(losses.gradient_penalty, slopes).double(), expected, rtol=1e-5, atol=1e-7)
+    assert float(losses.gradient_penalty(slopes)) == pytest.approx(
+        float((norm - 1).square().mean()), rel=1e-5
+    )
+    torch.testing.assert_close(
+        slope_of(losses.gradient_penalty, slopes).double(), expected, rtol=1e-5, atol=1e-7
+    )
 
 
 def test_the_penalty_can_be_differentiated_twice_as_training_needs():
-    slopes = torch.randn(2, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64).requires_grad_()
+    slopes = torch.randn(
+        2, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    ).requires_grad_()
     assert torch.autograd.gradcheck(losses.gradient_penalty, slopes)
     assert torch.autograd.gradgradcheck(losses.gradient_penalty, slopes)
 
@@ -79,14 +90,18 @@ def test_equal_pictures_have_a_loss_near_zero_and_no_slope(loss):
 
 
 def test_spectra_of_smooth_differences_have_the_slope_of_float64():
-    """Nearly all of their coefficients are 0, and of 0 in single precision only the rounding is left."""
+    """Nearly all of their coefficients are 0, and of 0 in single precision only the rounding is
+    left.
+    """
     ramp = torch.linspace(0, 1e4, 32).expand(3, 32, 32)
     truth = torch.rand(3, 32, 32, generator=torch.Generator().manual_seed(1))
-    usual, exact = (slope_of(lambda x: losses.fft_l1(x, truth.to(x)), x) for x in (ramp, ramp.double()))
+    usual, exact = (
+        slope_of(lambda x: losses.fft_l1(x, truth.to(x)), x) for x in (ramp, ramp.double())
+    )
     torch.testing.assert_close(usual.double(), exact, rtol=0, atol=1e-6 * float(exact.abs().max()))
 
 
-# --- pictures without light -------------------------------------------------------------------------------------------
+# --- pictures without light -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-40])
@@ -105,21 +120,29 @@ def test_the_median_contrast_of_a_symmetric_psf_has_no_slope_by_chance():
     assert not found.low.requires_grad
 
 
-# --- precision --------------------------------------------------------------------------------------------------------
+# --- precision ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("half", [torch.float16, torch.bfloat16])
 def test_half_precision_is_computed_in_single(half):
     psf = psf_of(torch.rand(2, 16, 16, generator=torch.Generator().manual_seed(1)).to(half))
     wide = Psf(psf.intensity.float(), psf.clear_peak)
-    one, two = (torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(s)).to(half) for s in (1, 2))
+    one, two = (
+        torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(s)).to(half) for s in (1, 2)
+    )
     for loss in (losses.charbonnier, losses.fft_l1):
         assert loss(one, two).dtype == torch.float32
-        assert float(loss(one, two)) == pytest.approx(float(loss(one.float(), two.float())), rel=1e-6)
+        assert float(loss(one, two)) == pytest.approx(
+            float(loss(one.float(), two.float())), rel=1e-6
+        )
     found = losses.background_loss(psf, one[:2])
     assert found.dtype == torch.float32
-    assert float(found) == pytest.approx(float(losses.background_loss(wide, one[:2].float())), rel=1e-6)
-    assert float(losses.suppression_loss(psf)) == pytest.approx(float(losses.suppression_loss(wide)), rel=1e-6)
+    assert float(found) == pytest.approx(
+        float(losses.background_loss(wide, one[:2].float())), rel=1e-6
+    )
+    assert float(losses.suppression_loss(psf)) == pytest.approx(
+        float(losses.suppression_loss(wide)), rel=1e-6
+    )
     torch.testing.assert_close(metrics.mtf(psf).rms, metrics.mtf(wide).rms)
 
 
@@ -133,7 +156,7 @@ def test_what_half_precision_cannot_hold_is_refused_and_the_rest_widened():
         refuse_not_finite("no light", path=half, height=half / 0)
 
 
-# --- numbers that are none --------------------------------------------------------------------------------------------
+# --- numbers that are none ------------------------------------------------------------------------
 
 
 def test_a_ratio_of_what_is_no_number_is_none():
@@ -155,7 +178,15 @@ def pupil_of(height, path=None):
     flat = torch.ones_like(height)
     wavelengths = torch.tensor([550e-9], dtype=torch.float64)
     path = torch.zeros_like(height) if path is None else path
-    return Pupil(flat, flat, height, path, torch.tensor([0.46], dtype=torch.float64), wavelengths, torch.tensor(1e-4))
+    return Pupil(
+        flat,
+        flat,
+        height,
+        path,
+        torch.tensor([0.46], dtype=torch.float64),
+        wavelengths,
+        torch.tensor(1e-4),
+    )
 
 
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6, "shape": (9, 9)}
@@ -165,7 +196,9 @@ SENSOR = {"full_well": 25500.0, "quantum_efficiency": 0.56, "pixel_pitch": 2.9e-
 @pytest.mark.parametrize("part", ["height", "path"])
 @pytest.mark.parametrize("wrong", [math.nan, math.inf])
 def test_a_phase_that_is_no_number_is_refused(part, wrong):
-    """A path that was not a number was taken for no path at all, and the picture was that of a clean lens."""
+    """A path that was not a number was taken for no path at all, and the picture was that of a
+    clean lens.
+    """
     screen = torch.zeros(16, 16)
     screen[3, 4] = wrong
     pupil = pupil_of(torch.zeros(16, 16))._replace(**{part: screen})
@@ -175,9 +208,13 @@ def test_a_phase_that_is_no_number_is_refused(part, wrong):
 
 @pytest.mark.parametrize("part", ["height", "path"])
 def test_a_phase_without_digits_is_refused(part):
-    """At 1e15 m neighbouring float64 numbers are 1e5 turns apart, and the PSF was that of a random phase."""
+    """At 1e15 m neighbouring float64 numbers are 1e5 turns apart, and the PSF was that of a
+    random phase.
+    """
     pupil = pupil_of(torch.zeros(16, 16))._replace(**{part: torch.full((16, 16), 1e15)})
-    with pytest.raises(ValueError, match=r"turns of phase, more than 1e\+09.*give heights and paths in metres"):
+    with pytest.raises(
+        ValueError, match=r"turns of phase, more than 1e\+09.*give heights and paths in metres"
+    ):
         optics.psf(pupil, **LENS)
 
 
@@ -196,7 +233,7 @@ def test_the_light_of_what_is_no_number_is_not_left_out():
     assert float(metrics.saturated(raw, **well).pixels) == 1
 
 
-# --- sensor, in the dark and in half precision ------------------------------------------------------------------------
+# --- sensor, in the dark and in half precision ----------------------------------------------------
 
 
 @pytest.mark.parametrize("photons", [0.0, 1e-40])
@@ -221,7 +258,7 @@ def test_half_precision_does_not_end_the_light_at_65504():
     torch.testing.assert_close(sensor.digitize(half, gain=1 / 0.37), reference, rtol=0, atol=0)
 
 
-# --- reliefs ----------------------------------------------------------------------------------------------------------
+# --- reliefs --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("levels", [None, 2])
@@ -239,14 +276,19 @@ def test_a_relief_in_half_precision_is_refused(half):
     height = torch.full((16, 16), 1e-6).to(half)
     bands = bands_of(1)
     with pytest.raises(ValueError, match="too coarse for a phase"):
-        optics.pupil(height, torch.tensor([0.46]), bands, optics.stop(samples=16, pitch=1e-4, diameter=1.6e-3))
+        optics.pupil(
+            height,
+            torch.tensor([0.46]),
+            bands,
+            optics.stop(samples=16, pitch=1e-4, diameter=1.6e-3),
+        )
     with pytest.raises(ValueError, match="too coarse for a phase"):
         optics.psf(pupil_of(height), **LENS)
     with pytest.raises(ValueError, match="too coarse for a phase"):
         doe.fabricate(height, wrap_at=550e-9)
 
 
-# --- the image --------------------------------------------------------------------------------------------------------
+# --- the image ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("border", ["zero", "reflect"])
@@ -256,7 +298,10 @@ def test_a_lamp_a_million_times_as_bright_does_not_drown_the_dark(border):
     scene[0, 20, 20] = 1.0  # the other band has no lamp
     kernel = torch.rand(2, 7, 7, generator=rng).pow(8)
     psf = psf_of(kernel / kernel.sum((-2, -1), keepdim=True))
-    found, exact = optics.image(scene, psf, border=border), optics.image.hooks.reference(scene, psf, border=border)
+    found, exact = (
+        optics.image(scene, psf, border=border),
+        optics.image.hooks.reference(scene, psf, border=border),
+    )
     dim = exact < 1e-5
     assert bool(dim[0].any())
     assert float((found - exact)[dim].abs().max()) <= 1e-5 * float(exact[dim].max())
@@ -282,11 +327,14 @@ def test_an_image_in_half_precision_is_formed_in_single(half):
 @pytest.mark.parametrize("lift", [spectra.lift_mallett, spectra.lift_lmmse])
 def test_black_has_the_slope_of_the_reference(lift):
     black = torch.zeros(3, 4, 4, dtype=torch.float64)
-    usual, truth = (slope_of(lambda x, f=f: f(x, bands_of(5)).sum(), black) for f in (lift, lift.hooks.reference))
+    usual, truth = (
+        slope_of(lambda x, f=f: f(x, bands_of(5)).sum(), black)
+        for f in (lift, lift.hooks.reference)
+    )
     torch.testing.assert_close(usual, truth)
 
 
-# --- the scaled transform ---------------------------------------------------------------------------------------------
+# --- the scaled transform -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", ["folded", "bluestein", "kaiser_bessel"])
@@ -312,7 +360,7 @@ def test_every_method_agrees_with_the_plain_sum_at_the_extremes(method, shape, w
         assert float((found - exact).abs().max()) <= bound * top
 
 
-# --- restoration ------------------------------------------------------------------------------------------------------
+# --- restoration ----------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -332,7 +380,9 @@ def test_restoration_has_a_slope_beside_clipped_pixels(blurred):
     usual = slope_of(restored, blurred[0])
     assert bool(blurred[5].any())
     assert bool(usual.isfinite().all())
-    step = 1e-4 * torch.randn(3, 12, 12, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    step = 1e-4 * torch.randn(
+        3, 12, 12, generator=torch.Generator().manual_seed(2), dtype=torch.float64
+    )
     double = [x.double() if torch.is_tensor(x) and x.is_floating_point() else x for x in blurred]
     double[1] = Psf(double[1].intensity.double(), double[1].clear_peak)
 
@@ -361,11 +411,13 @@ def test_restoration_refuses_what_is_not_finite(wrong, blurred):
 
 def test_the_slope_of_a_psf_without_light_is_finite(blurred):
     dark = torch.full((3, 5, 5), 1e-40)
-    slope = slope_of(lambda k: restore.wiener(blurred[0], psf_of(k), *blurred[2:], read_noise=10.5).sum(), dark)
+    slope = slope_of(
+        lambda k: restore.wiener(blurred[0], psf_of(k), *blurred[2:], read_noise=10.5).sum(), dark
+    )
     assert bool(slope.isfinite().all())
 
 
-# --- ghosts -----------------------------------------------------------------------------------------------------------
+# --- ghosts ---------------------------------------------------------------------------------------
 
 
 def test_ghosts_of_no_light_have_a_finite_slope_and_those_of_no_number_are_none():

@@ -54,7 +54,9 @@ def test_every_gain_is_that_one(node):
     assert "gain_unit" not in node.params.model_fields
 
 
-@pytest.mark.parametrize("node", [calibrate.prior, calibrate.camera_prior], ids=lambda node: node.path)
+@pytest.mark.parametrize(
+    "node", [calibrate.prior, calibrate.camera_prior], ids=lambda node: node.path
+)
 def test_what_is_believed_of_a_gain_has_its_unit(node):
     (pair,) = (hint for hint in typing.get_args(node.hints["gain"]) if hint is not type(None))
     assert typing.get_args(pair)[0] == Gain

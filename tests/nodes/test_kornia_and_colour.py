@@ -1,4 +1,6 @@
-"""Where a node does what kornia or colour-science does too: the difference that matters, each with a third witness."""
+"""Where a node does what kornia or colour-science does too: the difference that matters, each
+with a third witness.
+"""
 
 import itertools
 import math
@@ -16,15 +18,15 @@ from PIL import Image
 from skimage.metrics import structural_similarity
 
 from neusee.nodes import constants
-from neusee.nodes.bicubic_resize import enlarge, resize
 from neusee.nodes.losses import charbonnier
 from neusee.nodes.metrics import quality
+from neusee.nodes.resampling import enlarge, resize
 from neusee.nodes.scene import Photographs
-from neusee.nodes.scene._crop_to_frame import framed
+from neusee.nodes.scene._picture_scaling import framed
 from neusee.nodes.scene._spectral_exr import _PREFIX, spectral_channels
 from neusee.nodes.sensor import crop
 from neusee.nodes.spectra import bands, illuminant, lift_mallett, render
-from neusee.nodes.spectra._spectral_tables import light, paints
+from neusee.nodes.spectra._cie_tables import light, paints
 
 NM = 1e-9
 SCENE = bands(start=400 * NM, stop=700 * NM, count=31)
@@ -34,15 +36,19 @@ def drawn(*shape, dtype=torch.float64):
     return torch.rand(*shape, dtype=dtype, generator=torch.Generator().manual_seed(1))
 
 
-# --- kornia -----------------------------------------------------------------------------------------------------------
+# --- kornia ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("light", [0.0, 1e-6])
 def test_dark_pictures_are_as_alike_as_scikit_image_says(light):
-    """The term 1e-12 that kornia adds to the denominator counts beside the constants of SSIM, 1e-4 times 9e-4."""
+    """The term 1e-12 that kornia adds to the denominator counts beside the constants of SSIM,
+    1e-4 times 9e-4.
+    """
     estimate, truth = light * drawn(2, 3, 16, 16)
     how = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "win_size": 11}
-    _, exact = structural_similarity(estimate.numpy(), truth.numpy(), channel_axis=0, data_range=1.0, full=True, **how)
+    _, exact = structural_similarity(
+        estimate.numpy(), truth.numpy(), channel_axis=0, data_range=1.0, full=True, **how
+    )
     exact = exact[:, 5:-5, 5:-5].mean()
     theirs = kornia.metrics.ssim(estimate[None], truth[None], 11, padding="valid").mean()
     assert float(quality(estimate, truth, domain="linear").ssim) == pytest.approx(exact, abs=1e-9)
@@ -57,8 +63,13 @@ def test_equal_pictures_have_a_psnr_that_can_be_averaged():
 
 def test_charbonnier_is_an_absolute_difference_where_that_of_kornia_is_a_square():
     small = 1e-2
-    estimate, truth = torch.full((3, 4, 4), small, dtype=torch.float64), torch.zeros(3, 4, 4, dtype=torch.float64)
-    assert float(charbonnier(estimate, truth)) == pytest.approx(math.sqrt(small**2 + 1e-6), rel=1e-12)
+    estimate, truth = (
+        torch.full((3, 4, 4), small, dtype=torch.float64),
+        torch.zeros(3, 4, 4, dtype=torch.float64),
+    )
+    assert float(charbonnier(estimate, truth)) == pytest.approx(
+        math.sqrt(small**2 + 1e-6), rel=1e-12
+    )
     theirs = kornia.losses.charbonnier_loss(estimate, truth, reduction="mean")
     assert float(theirs) == pytest.approx(small**2 / 2, rel=1e-4)
 
@@ -77,8 +88,12 @@ def test_a_window_of_the_other_parity_has_whole_pixels_and_keeps_the_axis(size, 
 
 def test_a_smaller_picture_is_that_of_pillow_where_kornia_blurs_by_a_gaussian():
     picture = drawn(1, 60, 60)
-    pillow = np.array(Image.fromarray(picture[0].float().numpy()).resize((20, 20), Image.Resampling.BICUBIC))
-    theirs = kornia.geometry.transform.resize(picture, (20, 20), interpolation="bicubic", antialias=True)
+    pillow = np.array(
+        Image.fromarray(picture[0].float().numpy()).resize((20, 20), Image.Resampling.BICUBIC)
+    )
+    theirs = kornia.geometry.transform.resize(
+        picture, (20, 20), interpolation="bicubic", antialias=True
+    )
     np.testing.assert_allclose(resize(picture, 20, 20)[0], pillow, atol=1e-6)
     assert float((theirs[0] - torch.from_numpy(pillow)).abs().max()) > 0.02
 
@@ -101,7 +116,9 @@ def test_the_gradient_of_a_larger_picture_is_deterministic_on_cuda():
 
 
 def test_crops_and_flips_of_training_leave_the_random_stream_of_torch_alone(tmp_path):
-    Image.fromarray(np.arange(20 * 30 * 3, dtype=np.uint8).reshape(20, 30, 3)).save(tmp_path / "a.png")
+    Image.fromarray(np.arange(20 * 30 * 3, dtype=np.uint8).reshape(20, 30, 3)).save(
+        tmp_path / "a.png"
+    )
     photographs, before = Photographs.under(tmp_path), torch.get_rng_state()
     cuts = [photographs.crop((8, 8), 5, index) for index in (*range(8), *range(8))]
     assert torch.equal(torch.get_rng_state(), before)
@@ -110,12 +127,14 @@ def test_crops_and_flips_of_training_leave_the_random_stream_of_torch_alone(tmp_
     assert not torch.equal(torch.get_rng_state(), before)
 
 
-# --- colour-science ---------------------------------------------------------------------------------------------------
+# --- colour-science -------------------------------------------------------------------------------
 
 
 @pytest.mark.filterwarnings("ignore:Aligning")
 def test_white_is_white_on_the_bands_of_the_scene():
-    """The definition: a reflectance of 1 is (1, 1, 1). Integration by colour-science tints white on 31 bands."""
+    """The definition: a reflectance of 1 is (1, 1, 1). Integration by colour-science tints white
+    on 31 bands.
+    """
     white = torch.ones(31, 1, 1, dtype=torch.float64)
     assert (render(white, SCENE) - 1).abs().max() < 1e-12
     shape = colour.SpectralShape(400, 700, 10)

@@ -8,12 +8,21 @@ from pydantic import Field, ValidationError
 
 from neusee.nodes import node
 from neusee.nodes.calibrate import Traceability
-from neusee.nodes.parameter_model import ParameterModel
-from neusee.nodes.units import Electrons, NumberRange, PixelPitch, Wavelength, in_words, number_ranges
-from neusee.workflows.recipe.blocks import evaluate_block, safety_block, train_block, train_lift_block
+from neusee.nodes.parameters import ParameterModel
+from neusee.nodes.units import (
+    Electrons,
+    NumberRange,
+    PixelPitch,
+    Wavelength,
+    in_words,
+    number_ranges,
+)
+from neusee.workflows.recipe.blocks import evaluate_block, safety_block, train_block
+from neusee.workflows.recipe.blocks import train_block as train_lift_block
 from neusee.workflows.recipe.node_families import all_nodes
 
-BLOCKS = (evaluate_block, safety_block, train_block, train_lift_block, Traceability)  # imported, so that models exist
+# imported, so that models exist
+BLOCKS = (evaluate_block, safety_block, train_block, train_lift_block, Traceability)
 
 
 def models(base=ParameterModel):
@@ -45,7 +54,13 @@ def test_every_number_of_a_block_has_two_bounds():
         for name, hint in get_type_hints(model, include_extras=True).items()
         if name in model.model_fields
     }
-    assert {"Laser.power", "SensorFacts.full_well", "Stage.iterations", "Rates.weights", "Lamp.drift"} <= hints.keys()
+    assert {
+        "Laser.power",
+        "SensorFacts.full_well",
+        "Stage.iterations",
+        "Rates.weights",
+        "Lamp.drift",
+    } <= hints.keys()
     assert [name for name, hint in hints.items() if any(map(is_open, number_ranges(hint)))] == []
 
 
@@ -74,13 +89,25 @@ def test_a_bound_is_told_in_the_unit_of_a_reader(number, si, words):
 
 
 @node()
-def counted(*, count: Annotated[int, Field(ge=1, le=9)], share: Annotated[float, Field(ge=0, le=1)], on: bool = True):
+def counted(
+    *,
+    count: Annotated[int, Field(ge=1, le=9)],
+    share: Annotated[float, Field(ge=0, le=1)],
+    on: bool = True,
+):
     return count * share
 
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"count": True}, {"share": False}, {"share": math.nan}, {"share": math.inf}, {"count": 10}, {"count": 1.5}],
+    [
+        {"count": True},
+        {"share": False},
+        {"share": math.nan},
+        {"share": math.inf},
+        {"count": 10},
+        {"count": 1.5},
+    ],
 )
 def test_truth_values_and_numbers_that_are_not_finite_are_refused(wrong):
     right = {"count": 1, "share": 0.5, "on": False}

@@ -1,4 +1,6 @@
-"""Statistics: what is kept beside a result is right for every type and size, whatever the parts it is read in."""
+"""Statistics: what is kept beside a result is right for every type and size, whatever the parts
+it is read in.
+"""
 
 import math
 
@@ -12,12 +14,18 @@ SIZES = [(65,), (1000, 7), (1 << 17,), (3, 1 << 17), (2, (1 << 17) + 1)]
 
 
 @pytest.mark.parametrize("shape", SIZES)
-@pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64, torch.uint8, torch.int32, torch.bool])
+@pytest.mark.parametrize(
+    "dtype", [torch.float16, torch.float32, torch.float64, torch.uint8, torch.int32, torch.bool]
+)
 def test_agrees_with_numpy(shape, dtype):
     torch.manual_seed(0)
     x = (torch.randn(shape) * torch.randint(0, 2, shape) * 5).abs().to(dtype)
     found, known = TensorStats.of(x), x.numpy().astype(np.float64)
-    assert (found.min, found.max, found.support) == (known.min(), known.max(), np.count_nonzero(known))
+    assert (found.min, found.max, found.support) == (
+        known.min(),
+        known.max(),
+        np.count_nonzero(known),
+    )
     assert found.sum == pytest.approx(known.sum(), rel=2e-7)
     assert found.finite
     assert found.shape == shape
@@ -46,4 +54,6 @@ def test_complex_numbers_count_by_their_magnitude_and_views_as_they_look():
     assert TensorStats.of(torch.full((100,), 3 + 4j)).sum == pytest.approx(500.0)
     whole = torch.arange(10_000.0).view(100, 100)
     assert TensorStats.of(whole.T[::3]) == TensorStats.of(whole.T[::3].contiguous())
-    assert TensorStats.of(torch.tensor(2.0).expand(300, 1024)).sum == pytest.approx(2.0 * 300 * 1024)
+    assert TensorStats.of(torch.tensor(2.0).expand(300, 1024)).sum == pytest.approx(
+        2.0 * 300 * 1024
+    )

@@ -1,6 +1,8 @@
-"""The C++ at each width of a vector, against float64 definitions and against the C++ at the other widths.
+"""The C++ at each width of a vector, against float64 definitions and against the C++ at the other
+widths.
 
-The PSF has the same bits everywhere. The scan has the same bits on all processors that fuse a product and a sum.
+The PSF has the same bits everywhere. The scan has the same bits on all processors that fuse a
+product and a sum.
 """
 
 import ctypes
@@ -15,9 +17,9 @@ import torch
 
 from neusee.nodes import _cpp_library
 from neusee.nodes.optics._transform import _fused
-from neusee.nodes.optics._transform._fused_plan import fused_axis
+from neusee.nodes.optics._transform._fft_transforms import last_work
+from neusee.nodes.optics._transform._fused import fused_axis
 from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
-from neusee.nodes.optics._transform._kaiser_bessel_transform import last_work
 from neusee.nodes.optics._transform._pupil_field import View
 from neusee.nodes.optics._transform._sample_axis import Axis, centred, last_type
 from neusee.nodes.restore._scan import _cpp_scan
@@ -31,11 +33,21 @@ LEVELS = {
     "x86-64-v3": (32, {"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe"}),
     "x86-64-v4": (64, {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}),
 }
-#: samples (v, u) of the pupil and pixels (y, x) of the window: every remainder of every number of lanes
+#: samples (v, u) of the pupil and pixels (y, x) of the window: every remainder of every number of
+#: lanes
 SHAPES = [((n + 2, n), (n, n + 1)) for n in range(1, 18)]
-SHAPES += [((64, 64), (64, 64)), ((301, 240), (33, 47)), ((17, 240), (250, 3)), ((48, 61), (350, 340))]
+SHAPES += [
+    ((64, 64), (64, 64)),
+    ((301, 240), (33, 47)),
+    ((17, 240), (250, 3)),
+    ((48, 61), (350, 340)),
+]
 #: types of the pupil and of the result
-TYPES = [(torch.float32, torch.float32), (torch.float64, torch.float32), (torch.float64, torch.float64)]
+TYPES = [
+    (torch.float32, torch.float32),
+    (torch.float64, torch.float32),
+    (torch.float64, torch.float64),
+]
 LIMIT = {torch.float32: 2e-6, torch.float64: 1e-12}
 DRIVER = Path(__file__).with_name("psf_driver.cpp")
 
@@ -58,7 +70,9 @@ def skip_unless_it_runs(level):
 
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory):
-    """Return a function that makes the C++ of one level the one that is used, in a folder of its own."""
+    """Return a function that makes the C++ of one level the one that is used, in a folder of its
+    own.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("libraries")))
 
@@ -70,16 +84,24 @@ def compiled(tmp_path_factory):
 
 
 def optics(samples, pixels, kind, dtype):
-    """Return random factors of a pupil (amplitude, height, path), and a view with tilt and envelope in two bands."""
+    """Return random factors of a pupil (amplitude, height, path), and a view with tilt and
+    envelope in two bands.
+    """
     draw = torch.Generator().manual_seed(sum(samples) + sum(pixels))
-    height, path, grey = (torch.rand(samples, generator=draw, dtype=torch.float64) for _ in range(3))
+    height, path, grey = (
+        torch.rand(samples, generator=draw, dtype=torch.float64) for _ in range(3)
+    )
     lit = torch.rand(samples, generator=draw) < 0.8
     lit[samples[0] // 2, samples[1] // 2] = True
     factors = [x.to(kind) for x in (lit * grey, 7 * height, path)]
-    # at most a tenth of the alias-free field, so that the window is one that the Kaiser-Bessel kernel is made for
+    # at most a tenth of the alias-free field, so that the window is one that the Kaiser-Bessel
+    # kernel is made for
     rows, columns = (Axis(n, k, 0.4 / max(n, k)) for n, k in zip(samples, pixels, strict=True))
     envelope = tuple((1 + torch.rand(k, generator=draw)).to(dtype) for k in pixels)
-    views = View(0, rows, columns, 1.5, 0.0, (0.01, -0.02), 0.7, envelope), View(1, rows, columns, 0.9, 2.1, (0, 0), 2)
+    views = (
+        View(0, rows, columns, 1.5, 0.0, (0.01, -0.02), 0.7, envelope),
+        View(1, rows, columns, 0.9, 2.1, (0, 0), 2),
+    )
     return factors, views
 
 
@@ -88,12 +110,19 @@ def intensity(factors, views, dtype):
 
 
 def definition(factors, views):
-    """Return weight * envelope * |K_y P K_x^T|^2 by matrices in complex128, with torch's own gradient."""
+    """Return weight * envelope * |K_y P K_x^T|^2 by matrices in complex128, with torch's own
+    gradient.
+    """
     amplitude, height, path = (x.double() for x in factors)
     images = []
     for view in views:
         v, u = (centred(n, torch.device("cpu")) for n in height.shape)
-        turns = view.turns_height * height + view.turns_path * path + view.tilt[0] * v[:, None] + view.tilt[1] * u
+        turns = (
+            view.turns_height * height
+            + view.turns_path * path
+            + view.tilt[0] * v[:, None]
+            + view.tilt[1] * u
+        )
         sums = [
             torch.exp(-2j * torch.pi * axis.alpha * torch.outer(centred(axis.n_out, v.device), x))
             for axis, x in ((view.rows, v), (view.columns, u))
@@ -143,7 +172,8 @@ def test_the_psf_is_its_definition_and_its_bits_are_those_of_every_width(compile
             largest = bound(*optics(samples, pixels, kind, dtype))
             assert float((ours[0] - truth[0]).abs().max()) <= LIMIT[dtype] * largest
             for found, slope in zip(ours[1:], truth[1:], strict=True):
-                size = max(float(slope.abs().max()), 1.0)  # one sample alone has slope 0: there 1, as that of two
+                # one sample alone has slope 0: there 1, as that of two
+                size = max(float(slope.abs().max()), 1.0)
                 assert float((found - slope).abs().max()) <= 3 * LIMIT[dtype] * size
     compiled("x86-64-v2")
     for case, expected in reference.items():
@@ -156,7 +186,9 @@ def test_the_cases_transform_in_all_three_pairs_of_types():
     for samples, pixels in SHAPES:
         for kind, dtype in TYPES:
             view = optics(samples, pixels, kind, dtype)[1][0]
-            pairs.add((dtype, last_type(*last_work(view.rows, view.columns), dtype, _fused._LITTLE)))
+            pairs.add(
+                (dtype, last_type(*last_work(view.rows, view.columns), dtype, _fused._LITTLE))
+            )
     assert pairs == set(_fused._NAMES)
 
 
@@ -174,7 +206,9 @@ def scan_results(d, n, dtype, evaluate):
 def scan_by_loop(u, dt, A, B, C):
     """Return y by the loop over time that defines the scan."""
     state, rows = u.new_zeros(len(u), *A.shape), []
-    for push, step, into, out in zip((dt * u).unbind(1), dt.unbind(1), B.unbind(1), C.unbind(1), strict=True):
+    for push, step, into, out in zip(
+        (dt * u).unbind(1), dt.unbind(1), B.unbind(1), C.unbind(1), strict=True
+    ):
         state = torch.exp(step[..., None] * A) * state + push[..., None] * into[:, None]
         rows.append((state @ out[..., None])[..., 0])
     return torch.stack(rows, 1)
@@ -196,10 +230,19 @@ def test_the_scan_has_the_same_bits_at_every_width_with_fma(compiled):
     both = []
     for level in ("x86-64-v3", "x86-64-v4"):
         compiled(level)
-        both.append([scan_results(d, 3, t, lambda *x: selective_scan(*x, backend="cpp"))
-                     for d in (5, 16, 45, 100) for t in (torch.float32, torch.float64)])  # fmt: skip
+        both.append(
+            [
+                scan_results(d, 3, t, lambda *x: selective_scan(*x, backend="cpp"))
+                for d in (5, 16, 45, 100)
+                for t in (torch.float32, torch.float64)
+            ]
+        )
     for narrow, wide in pairwise(both):
-        assert all(torch.equal(a, b) for x, y in zip(narrow, wide, strict=True) for a, b in zip(x, y, strict=True))
+        assert all(
+            torch.equal(a, b)
+            for x, y in zip(narrow, wide, strict=True)
+            for a, b in zip(x, y, strict=True)
+        )
 
 
 #: a compiler, and the program that runs what it compiles
@@ -224,7 +267,11 @@ def driver(tmp_path_factory):
             skip_unless_it_runs(compiler[-1].removeprefix("-march="))
         program = folder / target
         if not program.exists():
-            flags = [flag for flag in _cpp_library.FLAGS if not flag.startswith(("-march", "-fopenmp", "-shared"))]
+            flags = [
+                flag
+                for flag in _cpp_library.FLAGS
+                if not flag.startswith(("-march", "-fopenmp", "-shared"))
+            ]
             include = f"-I{_fused.SOURCES[0].parent.resolve()}"
             command = [*compiler, *flags, _cpp_library.UNFUSED, include, DRIVER, "-o", program]
             subprocess.run(command, check=True)
@@ -236,7 +283,9 @@ def driver(tmp_path_factory):
 @pytest.mark.parametrize("target", TARGETS)
 @pytest.mark.parametrize("kinds", list(_fused._NAMES))
 def test_another_target_and_compiler_give_the_same_bits(tmp_path, driver, target, kinds):
-    """A driver in C++ calls the transform as Python does, because the Python here loads no code of another target."""
+    """A driver in C++ calls the transform as Python does, because the Python here loads no code
+    of another target.
+    """
     command, dtype = driver(target), kinds[0]
     samples, pixels = ((61, 47), (90, 97)) if kinds == (torch.float32,) * 2 else ((70, 83), (9, 7))
     factors, views = optics(samples, pixels, torch.float64, dtype)

@@ -1,4 +1,6 @@
-"""Whether a node passes under a transform of `torch.func`: its result must be that of torch.autograd, or of a loop."""
+"""Whether a node passes under a transform of `torch.func`: its result must be that of
+torch.autograd, or of a loop.
+"""
 
 import torch
 from torch import Tensor
@@ -22,7 +24,9 @@ def put(value, place, x):
     if isinstance(value, dict):
         key = int(first) if first.isdecimal() else first
         return {**value, key: put(value[key], rest, x)}
-    return type(value)(put(item, rest, x) if i == int(first) else item for i, item in enumerate(value))
+    return type(value)(
+        put(item, rest, x) if i == int(first) else item for i, item in enumerate(value)
+    )
 
 
 def at(value, place):
@@ -42,7 +46,9 @@ def function_of(node, case):
 
     def function(x):
         changed = put(whole, place, x)
-        inputs, params = (changed, case.params) if whole is not case.params else (case.inputs, changed)
+        inputs, params = (
+            (changed, case.params) if whole is not case.params else (case.inputs, changed)
+        )
         drawn = {"rng": torch.Generator().manual_seed(0)} if node.random else {}
         found = [y for y in tree_leaves(node(*inputs, **params, **drawn)) if isinstance(y, Tensor)]
         return tuple(y for y in found if y.is_floating_point() or y.is_complex())
@@ -51,8 +57,12 @@ def function_of(node, case):
 
 
 def followed(function, x):
-    """Which of the results autograd follows, of those that are no NaN here; none if the node has no derivative."""
-    return [y.requires_grad and bool(y.isfinite().all()) for y in function(x.clone().requires_grad_())]
+    """Which of the results autograd follows, of those that are no NaN here; none if the node has
+    no derivative.
+    """
+    return [
+        y.requires_grad and bool(y.isfinite().all()) for y in function(x.clone().requires_grad_())
+    ]
 
 
 def _close(found, expected):
@@ -61,7 +71,10 @@ def _close(found, expected):
     scale = float(expected.detach().abs().max()) if expected.numel() else 0.0
     single = torch.float32 in (found.dtype, expected.dtype)
     if not torch.allclose(
-        found, expected.to(found), rtol=2e-4 if single else 1e-9, atol=(1e-5 if single else 1e-10) * scale
+        found,
+        expected.to(found),
+        rtol=2e-4 if single else 1e-9,
+        atol=(1e-5 if single else 1e-10) * scale,
     ):
         raise Differs(f"off by {float((found - expected).abs().max()):.3g} of {scale:.3g}")
 
@@ -89,7 +102,8 @@ def vjp(function, x):
 
 
 def jvp(function, x, to=1e-8):
-    """Compare `torch.func.jvp` with what autograd pulls back: both have the same product with a vector, within ``to``.
+    """Compare `torch.func.jvp` with what autograd pulls back: both have the same product with a
+    vector, within ``to``.
 
     Single precision is compared to 1e-3.
     """

@@ -1,4 +1,6 @@
-"""Nodes for tests of the study of accuracy: imported as ``neusee.nodes.measured``. Their errors are closed forms."""
+"""Nodes for tests of the study of accuracy: imported as ``neusee.nodes.measured``. Their errors
+are closed forms.
+"""
 
 import time
 from typing import Literal
@@ -12,7 +14,8 @@ from neusee.nodes.values import Bands, Psf
 
 CALLS: list[str] = []
 __depends__ = ("unaffected:STOP_AT",)
-STOP_AT: set[int] = set()  #: counts of bands at which `bands` behaves as if someone pressed Ctrl-C, once each
+#: counts of bands at which `bands` behaves as if someone pressed Ctrl-C, once each
+STOP_AT: set[int] = set()
 
 
 @node()
@@ -33,7 +36,9 @@ def pupil(*, samples: Count, pitch: PositiveLength) -> Tensor:
 
 
 @node()
-def spread(pupil: Tensor, bands: Bands, *, shape: Shape, precision: Literal["single", "double"] = "single") -> Psf:
+def spread(
+    pupil: Tensor, bands: Bands, *, shape: Shape, precision: Literal["single", "double"] = "single"
+) -> Psf:
     kind = torch.float64 if precision == "double" else torch.float32
     one = torch.full((len(bands.centres), *shape), 1 / 3, dtype=kind)
     return Psf(one, bands.centres)

@@ -39,13 +39,18 @@ def read(toy, write, tmp_path):
 
 @pytest.fixture
 def mistakes(read):
-    """What a recipe of toy nodes is refused with: one line each, with single spaces between the columns."""
+    """What a recipe of toy nodes is refused with: one line each, with single spaces between the
+    columns.
+    """
     from neusee.workflows.graph.diagnostics import RecipeError
 
     def mistakes(text, *arguments):
         with pytest.raises(RecipeError) as caught:
             read(text, *arguments)
-        return [" | ".join(filter(None, (str(p.mark), p.path, p.message))) for p in caught.value.diagnostics]
+        return [
+            " | ".join(filter(None, (str(p.mark), p.path, p.message)))
+            for p in caught.value.diagnostics
+        ]
 
     return mistakes
 
@@ -61,7 +66,9 @@ def one_thread():
 
 @pytest.fixture(autouse=True)
 def one_worker(monkeypatch):
-    """A test computes in its own process unless it asks for several workers, whatever the load of the machine."""
+    """A test computes in its own process unless it asks for several workers, whatever the load
+    of the machine.
+    """
     from neusee.workflows.engine import worker_processes
 
     monkeypatch.setattr(worker_processes, "free_processors", lambda: 1)
@@ -69,8 +76,10 @@ def one_worker(monkeypatch):
 
 @pytest.fixture(autouse=True)
 def no_fault_in_any_figure(monkeypatch):
-    """Every figure that the program draws in a test has panels with content, and texts that can be read."""
-    from neusee.workflows.report import drawing_process
+    """Every figure that the program draws in a test has panels with content, and texts that can
+    be read.
+    """
+    from neusee.workflows.report import files_beside as drawing_process
     from neusee.workflows.report.figures import style
     from tests.figure_faults import watched
 
@@ -81,7 +90,8 @@ def no_fault_in_any_figure(monkeypatch):
         return save(figure)
 
     monkeypatch.setattr(style, "png_of", saved)
-    monkeypatch.setattr(drawing_process, "possible", lambda: False)  # pictures of another process are not seen here
+    # pictures of another process are not seen here
+    monkeypatch.setattr(drawing_process, "possible", lambda: False)
     yield
     assert found == []
 

@@ -1,6 +1,8 @@
-"""CPOP, the other heuristic of the paper that describes HEFT: a competitor that shares no line with the scheduler.
+"""CPOP, the other heuristic of the paper that describes HEFT: a competitor that shares no line with
+the scheduler.
 
-Source: Topcuoglu, Hariri, Wu, IEEE Transactions on Parallel and Distributed Systems 13 (2002) 260, section 4.2.
+Source: Topcuoglu, Hariri, Wu, IEEE Transactions on Parallel and Distributed Systems 13 (2002) 260,
+        section 4.2.
 """
 
 from __future__ import annotations
@@ -24,7 +26,9 @@ def cpop(tasks: list[Task], cluster: Cluster) -> Slots:
     mean = {task.name: sum(task.seconds[d] for d in names) / len(names) for task in tasks}
     down: dict[str, float] = {}
     for task in tasks:  # each comes after its sources
-        down[task.name] = max((down[s] + mean[s] + sent(s, task.name, pairs) for s in task.sources), default=0.0)
+        down[task.name] = max(
+            (down[s] + mean[s] + sent(s, task.name, pairs) for s in task.sources), default=0.0
+        )
     up: dict[str, float] = {}
     for task in reversed(tasks):
         rest = ((sent(task.name, r, pairs) + up[r]) for r in readers[task.name])
@@ -43,9 +47,15 @@ def cpop(tasks: list[Task], cluster: Cluster) -> Slots:
         task = min(ready, key=lambda t: (-through[t.name], t.name))
         choices = []
         for d in [fastest] if task.name in path else names:
-            data = [slots[s][2] + (sent(s, task.name, [(slots[s][0], d)]) if slots[s][0] != d else 0.0)
-                    for s in task.sources]  # fmt: skip
-            start = _gap(sorted(s[1:] for s in slots.values() if s[0] == d), max(data, default=0.0), task.seconds[d])
+            data = [
+                slots[s][2] + (sent(s, task.name, [(slots[s][0], d)]) if slots[s][0] != d else 0.0)
+                for s in task.sources
+            ]
+            start = _gap(
+                sorted(s[1:] for s in slots.values() if s[0] == d),
+                max(data, default=0.0),
+                task.seconds[d],
+            )
             choices.append((start + task.seconds[d], d, start))
         end, d, start = min(choices, key=lambda choice: choice[0])
         slots[task.name] = (d, start, end)

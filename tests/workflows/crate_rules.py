@@ -1,4 +1,6 @@
-"""The rules of RO-Crate 1.1 and of its profile Process Run Crate 0.5, written from their texts, for a folder."""
+"""The rules of RO-Crate 1.1 and of its profile Process Run Crate 0.5, written from their texts,
+for a folder.
+"""
 
 import json
 import re
@@ -39,22 +41,35 @@ def faults(folder):
             yield from (
                 f"{entity['@id']} {key}: nothing is {target}"
                 for target in references(value)
-                if target not in graph and not (key == "conformsTo" and target.startswith("https://w3id.org/"))
+                if target not in graph
+                and not (key == "conformsTo" and target.startswith("https://w3id.org/"))
             )
     yield from _root(graph)
     yield from _files(graph, Path(folder))
     yield from _actions(graph)
-    yield from (f"nothing leads to {each}" for each in graph.keys() - _reached(graph, "ro-crate-metadata.json"))
+    yield from (
+        f"nothing leads to {each}"
+        for each in graph.keys() - _reached(graph, "ro-crate-metadata.json")
+    )
 
 
 def _terms(entity):
-    """Yield the words that the context does not define, and values that are neither text nor reference."""
+    """Yield the words that the context does not define, and values that are neither text nor
+    reference.
+    """
     kinds = entity.get("@type")
-    words = [*(key for key in entity if key[0] != "@"), *(kinds if isinstance(kinds, list) else [kinds])]
-    yield from (f"{entity['@id']}: {word} is not in the context" for word in words if word not in terms())
+    words = [
+        *(key for key in entity if key[0] != "@"),
+        *(kinds if isinstance(kinds, list) else [kinds]),
+    ]
+    yield from (
+        f"{entity['@id']}: {word} is not in the context" for word in words if word not in terms()
+    )
     for key, value in entity.items():
         for each in value if isinstance(value, list) else [value]:
-            if not (isinstance(each, str) and each) and not (isinstance(each, dict) and each.keys() == {"@id"}):
+            if not (isinstance(each, str) and each) and not (
+                isinstance(each, dict) and each.keys() == {"@id"}
+            ):
                 yield f"{entity['@id']} {key}: {each!r} is neither a text nor a reference"
 
 
@@ -67,11 +82,16 @@ def _root(graph):
     if root["@type"] != "Dataset":
         yield "the root is no data set"
     yield from (
-        f"the root has no {key}" for key in ("name", "description", "datePublished", "license") if key not in root
+        f"the root has no {key}"
+        for key in ("name", "description", "datePublished", "license")
+        if key not in root
     )
     if not DAY.fullmatch(root.get("datePublished", "")):
         yield "datePublished is no date"
-    if PROFILE not in references(root.get("conformsTo")) or graph[PROFILE]["@type"] != "CreativeWork":
+    if (
+        PROFILE not in references(root.get("conformsTo"))
+        or graph[PROFILE]["@type"] != "CreativeWork"
+    ):
         yield "the root does not name the profile"
 
 
@@ -80,7 +100,9 @@ def _files(graph, folder):
     there = {name for name in there if not any(part.startswith(".") for part in name.split("/"))}
     named = {unquote(key): e for key, e in graph.items() if e["@type"] == "File"}
     yield from (f"{name} is not in the folder" for name in named.keys() - there)
-    yield from (f"{name} is not in the crate" for name in there - named.keys() - {"ro-crate-metadata.json"})
+    yield from (
+        f"{name} is not in the crate" for name in there - named.keys() - {"ro-crate-metadata.json"}
+    )
     parts = {unquote(each) for each in references(graph["./"].get("hasPart", []))}
     yield from (f"{name} is no part of the root" for name in named.keys() ^ parts)
     for name in named.keys() & there:
@@ -98,7 +120,10 @@ def _actions(graph):
         if action["@id"] not in references(graph["./"].get("mentions")):
             yield "the root does not mention the action"
         (tool,) = references(action["instrument"])
-        if graph[tool]["@type"] != "SoftwareApplication" or not graph[tool].keys() >= {"name", "softwareVersion"}:
+        if graph[tool]["@type"] != "SoftwareApplication" or not graph[tool].keys() >= {
+            "name",
+            "softwareVersion",
+        }:
             yield "the instrument is no software with a version"
         times = [action[key] for key in ("startTime", "endTime") if key in action]
         if not all(map(DAY.fullmatch, times)) or "endTime" not in action:
@@ -106,7 +131,11 @@ def _actions(graph):
         elif sorted(times, key=datetime.fromisoformat) != times:
             yield "the command ended before it began"
         results = list(references(action.get("result", [])))
-        yield from (f"the result {each} is no file" for each in results if graph.get(each, {}).get("@type") != "File")
+        yield from (
+            f"the result {each} is no file"
+            for each in results
+            if graph.get(each, {}).get("@type") != "File"
+        )
         if "recipe.yaml" in graph and "recipe.yaml" not in references(action.get("object", [])):
             yield "the recipe is not what the command read"
 

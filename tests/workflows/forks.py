@@ -1,8 +1,10 @@
-"""Runs in processes of their own, forked from one that has torch at hand, so that a test can afford fifty.
+"""Runs in processes of their own, forked from one that has torch at hand, so that a test can afford
+fifty.
 
-`Forks` starts this file as a server. Each job is a JSON object: ``folder`` with a family of nodes, the
-``family``'s name, the ``store``, the ``steps`` as ``[name, node, parameters, wires]``, the ``outputs``, and
-``first``, Python that the child executes before it runs. The child writes what came of it to the file ``out``.
+`Forks` starts this file as a server. Each job is a JSON object: ``folder`` with a family of nodes,
+the ``family``'s name, the ``store``, the ``steps`` as ``[name, node, parameters, wires]``, the
+``outputs``, and ``first``, Python that the child executes before it runs. The child writes what
+came of it to the file ``out``.
 """
 
 from __future__ import annotations
@@ -55,7 +57,9 @@ class Forks:
         environment = {**os.environ, "PYTHONHASHSEED": hash_seed, "OMP_NUM_THREADS": "1"}
         command = [sys.executable, "-B", __file__]
         pipe = subprocess.PIPE
-        self._server = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, env=environment)
+        self._server = subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, text=True, env=environment
+        )
 
     def start(self, **job: Any) -> Child:
         """Start a job and do not wait for it."""
@@ -91,7 +95,8 @@ def serve() -> None:
     """Fork a child for each line that comes in, and tell its number."""
     import torch
 
-    from neusee.workflows.engine.cost_laws import shipped
+    import neusee.workflows.engine.runner  # noqa: F401  # that no fork imports it again
+    from neusee.workflows.engine.cost_model import shipped
 
     shipped()  # a file that another user may not read
 
@@ -110,7 +115,8 @@ def work(job: dict[str, Any]) -> None:
     import warnings
 
     sys.stdin = open(os.devnull)  # noqa: SIM115  # the server's lines are not for us
-    with warnings.catch_warnings(record=True) as said, open(job["out"], "w") as out:  # while it still may
+    # while it still may
+    with warnings.catch_warnings(record=True) as said, open(job["out"], "w") as out:
         warnings.simplefilter("always")
         try:
             found = once(job)

@@ -1,4 +1,6 @@
-"""Many runs in one process, and what it holds afterwards: started by ``test_growth`` as a program of its own."""
+"""Many runs in one process, and what it holds afterwards: started by ``test_growth`` as a
+program of its own.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ from neusee.workflows.simulation.simulate_recipe import simulate
 
 
 def several(path: Path, folder: Path, count: int) -> None:
-    """Run a recipe ``count`` times: new values and known ones, on a store that fills and on empty ones."""
+    """Run a recipe ``count`` times: new values and known ones, on a store that fills and on
+    empty ones.
+    """
     for i in range(count):
         waves = 1 + i / 100 if i % 2 else 2
         recipe = load(path, [f"mask.waves={waves}"]) if i % 3 else load(path, mask={"waves": waves})
@@ -40,13 +44,19 @@ def several(path: Path, folder: Path, count: int) -> None:
 def held() -> dict[str, int]:
     """Everything that a run might leave behind."""
     gc.collect()
-    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):  # what the allocator keeps for the next run is not held
+    # what the allocator keeps for the next run is not held
+    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
         trim(0)
-    loggers = [logging.root, *(x for x in logging.root.manager.loggerDict.values() if isinstance(x, logging.Logger))]
-    figure = getattr(sys.modules.get("matplotlib.figure"), "Figure", ())  # pyplot, which would count them, is not used
+    loggers = [
+        logging.root,
+        *(x for x in logging.root.manager.loggerDict.values() if isinstance(x, logging.Logger)),
+    ]
+    # pyplot, which would count them, is not used
+    figure = getattr(sys.modules.get("matplotlib.figure"), "Figure", ())
     return {
         "bytes": tracemalloc.get_traced_memory()[0],
-        "resident": int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE"),
+        "resident": int(Path("/proc/self/statm").read_text().split()[1])
+        * os.sysconf("SC_PAGE_SIZE"),
         "files": len(os.listdir("/proc/self/fd")),
         "maps": len(Path("/proc/self/maps").read_text().splitlines()),
         "threads": threading.active_count(),

@@ -1,10 +1,11 @@
-"""Processes that learn together, forked from one that has everything at hand, so that a test can afford many.
+"""Processes that learn together, forked from one that has everything at hand, so that a test can
+afford many.
 
     python mesh_processes.py JOBS.json
 
-A job: ``mesh`` (such as 2x1), ``words`` that change the recipe, a ``folder`` of its own, and what to ``do``:
-``step``, the gradients of one iteration; ``train``, a training; ``fail``, a training in which one process raises.
-Beside each job's folder a list of exit codes is left, one a process.
+A job: ``mesh`` (such as 2x1), ``words`` that change the recipe, a ``folder`` of its own, and what
+to ``do``: ``step``, the gradients of one iteration; ``train``, a training; ``fail``, a training in
+which one process raises. Beside each job's folder a list of exit codes is left, one a process.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from typing import Any
 import torch
 
 from neusee.workflows import Store, load
-from neusee.workflows.training.parallel.process_mesh import Mesh, joined
-from neusee.workflows.training.parallel.shared_graph import Shared
+from neusee.workflows.training.band_shards import Shared
+from neusee.workflows.training.process_mesh import Mesh, joined
 from neusee.workflows.training.run_training import _photographs, train
 from neusee.workflows.training.training_iteration import Learner
 from neusee.workflows.training.training_pictures import TrainingStream
@@ -37,25 +38,43 @@ def step(job: dict[str, Any], mesh: Mesh) -> None:
     how = recipe.training
     learner = Learner(recipe, how, "cpu", mesh=mesh)
     learner.begin(how.stages[1], True)
-    samples = TrainingStream(recipe, how, _photographs(recipe, how, True), Store(Path(job["store"])), "cpu", None, mesh)
+    samples = TrainingStream(
+        recipe, how, _photographs(recipe, how, True), Store(Path(job["store"])), "cpu", None, mesh
+    )
     losses, _ = learner.iterate(samples, 1, 0)
     if mesh.first:
         parts = {n: getattr(learner, n).named_parameters() for n in ("mask", "net", "critics")}
         grads = {f"{n}.{k}": p.grad for n, named in parts.items() for k, p in named}
-        shared = {"steps": sorted(samples.shards.steps), "sums": sorted(samples.shards.rows), "cut": samples._each._cut}
-        torch.save({"grads": grads, "losses": losses, "shared": shared}, Path(job["folder"], "step.pt"))
+        shared = {
+            "steps": sorted(samples.shards.steps),
+            "sums": sorted(samples.shards.rows),
+            "cut": samples._each._cut,
+        }
+        torch.save(
+            {"grads": grads, "losses": losses, "shared": shared}, Path(job["folder"], "step.pt")
+        )
 
 
 def pooled(job: dict[str, Any], mesh: Mesh) -> None:
-    """Two rounds of a pool behind a fixed mask: the pictures of this process, and how often it drew values."""
+    """Two rounds of a pool behind a fixed mask: the pictures of this process, and how often it
+    drew values.
+    """
     recipe = load("train_small", job["words"])
     how, store = recipe.training, Store(Path(job["store"]))
-    samples = TrainingStream(recipe, how, _photographs(recipe, how, True), store, "cpu", recipe, mesh)
+    samples = TrainingStream(
+        recipe, how, _photographs(recipe, how, True), store, "cpu", recipe, mesh
+    )
     usual, drawn = samples._drawn, []
     samples._drawn = lambda *place: drawn.append(place) or usual(*place)  # type: ignore[method-assign, func-returns-value]
-    found = [(i, sample.tensors) for first in (0, 2, 4, 6) for i, sample in samples.batch(Shared.of({}), 2, first, 2)]
-    torch.save({"pictures": found, "drawn": len(drawn), "by band": samples._each.by_band},
-               Path(job["folder"], f"pool_{mesh.rank}.pt"))  # fmt: skip
+    found = [
+        (i, sample.tensors)
+        for first in (0, 2, 4, 6)
+        for i, sample in samples.batch(Shared.of({}), 2, first, 2)
+    ]
+    torch.save(
+        {"pictures": found, "drawn": len(drawn), "by band": samples._each.by_band},
+        Path(job["folder"], f"pool_{mesh.rank}.pt"),
+    )
 
 
 def learn(job: dict[str, Any], mesh: Mesh) -> None:

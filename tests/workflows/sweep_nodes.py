@@ -1,4 +1,6 @@
-"""Nodes for tests of sweeps: imported as ``neusee.nodes.swept``. They count their calls and fail when asked to."""
+"""Nodes for tests of sweeps: imported as ``neusee.nodes.swept``. They count their calls and fail
+when asked to.
+"""
 
 from typing import NamedTuple
 
@@ -10,7 +12,8 @@ from neusee.nodes.units import Count, Electrons, Real, Wavelength
 
 CALLS: list[str] = []
 __depends__ = ("unaffected:INTERRUPT",)
-INTERRUPT: set[float] = set()  #: levels at which `noted` behaves as if someone pressed Ctrl-C, once each
+#: levels at which `noted` behaves as if someone pressed Ctrl-C, once each
+INTERRUPT: set[float] = set()
 
 
 class Quality(NamedTuple):

@@ -1,4 +1,6 @@
-"""Figures whose content is measured or drawn at random can be read for all values, also for unlucky ones."""
+"""Figures whose content is measured or drawn at random can be read for all values, also for
+unlucky ones.
+"""
 
 from __future__ import annotations
 
@@ -10,24 +12,32 @@ import torch
 from matplotlib.colors import to_hex
 
 from neusee.nodes.values import Bands
-from neusee.workflows.evaluation import evaluation_figures
+from neusee.workflows.evaluation import evaluation_page as evaluation_figures
 from neusee.workflows.evaluation.confidence_intervals import MetricTable
 from neusee.workflows.placement.heft_schedule import Schedule, Slot
-from neusee.workflows.report.figures import gantt, numerics, optics, photon_transfer, recipe_graph, scene_spectra
+from neusee.workflows.report.figures import camera_pictures as scene_spectra
+from neusee.workflows.report.figures import graph_and_timeline as gantt
+from neusee.workflows.report.figures import graph_and_timeline as recipe_graph
+from neusee.workflows.report.figures import optics
+from neusee.workflows.report.figures import verification as numerics
+from neusee.workflows.report.figures import verification as photon_transfer
 from neusee.workflows.report.figures.style import canvas
-from neusee.workflows.studies.accuracy import accuracy_figures
+from neusee.workflows.studies.accuracy import accuracy_page as accuracy_figures
 from neusee.workflows.studies.leave_out import leave_out_study
-from neusee.workflows.studies.leave_out.scene_costs import SceneCost
+from neusee.workflows.studies.leave_out.leave_out_study import SceneCost
 from neusee.workflows.studies.stability.case_result import Cell
-from neusee.workflows.studies.stability.stability_figures import grid_picture
-from neusee.workflows.studies.uncertainty import uncertainty_figures
+from neusee.workflows.studies.stability.stability_study import grid_picture
+from neusee.workflows.studies.uncertainty import uncertainty_page as uncertainty_figures
 from neusee.workflows.training.mask_design import design_page
 
 # a function that is called as it is writes the picture: the check of all figures then reads it
 
 
 def costs(*seconds):
-    names = (*(f"scene {i}" for i in range(len(seconds) - 1)), "one wavelength, no laser, clean window")
+    names = (
+        *(f"scene {i}" for i in range(len(seconds) - 1)),
+        "one wavelength, no laser, clean window",
+    )
     return [SceneCost(name, s, 0.8 * s, 3, ()) for name, s in zip(names, seconds, strict=True)]
 
 
@@ -55,7 +65,11 @@ def test_a_legend_hides_no_measured_point():
 
 def test_a_sensor_without_noise_has_no_line_of_dark_noise():
     measured = torch.tensor([[0.0, 0.0, 0.0], [10.0, 11.0, 10.0], [100.0, 98.0, 100.0]])
-    labels = photon_transfer.transfer.__wrapped__(measured=measured).axes[0].get_legend_handles_labels()[1]
+    labels = (
+        photon_transfer.transfer.__wrapped__(measured=measured)
+        .axes[0]
+        .get_legend_handles_labels()[1]
+    )
     assert not [label for label in labels if label.startswith("dark noise")]
 
 
@@ -72,11 +86,21 @@ def test_points_and_lasers_that_coincide_are_told_apart():
     )
 
 
-NAMES = ("sensor.analogue_to_digital_conversion", "the photograph of a friend", "optics.psf", "a", "x" * 40)
+NAMES = (
+    "sensor.analogue_to_digital_conversion",
+    "the photograph of a friend",
+    "optics.psf",
+    "a",
+    "x" * 40,
+)
 
 
 def test_the_name_of_a_step_stays_in_its_box():
-    sources = {name: ["first"] for name in NAMES} | {f"a[{i}]": ["first"] for i in range(120)} | {"first": []}
+    sources = (
+        {name: ["first"] for name in NAMES}
+        | {f"a[{i}]": ["first"] for i in range(120)}
+        | {"first": []}
+    )
     recipe_graph.graph(sources=sources, states=dict.fromkeys(sources, "run"))
 
 
@@ -96,7 +120,9 @@ def test_a_long_name_is_broken_and_shortened(name, copies, shown):
 
 
 def test_an_evaluation_without_a_value_has_axes():
-    table = MetricTable((0.0, 10.0), {name: np.array([[np.nan, 0.2]]) for name in ("l1", "l1 small")}, np.zeros(1))
+    table = MetricTable(
+        (0.0, 10.0), {name: np.array([[np.nan, 0.2]]) for name in ("l1", "l1 small")}, np.zeros(1)
+    )
     axes = evaluation_figures.strengths.__wrapped__({"a": table}, 64).axes
     assert axes[0].get_ylim() == pytest.approx((0.0, 0.21))
 
@@ -125,7 +151,9 @@ def test_numbers_that_differ_in_the_last_digits_are_short():
         ("well", -3.154902072e-4, -3.154901666e-4),
     ]
     middles = {"a": -3.154901258e-4, "b": 0.01237144}
-    figure = uncertainty_figures.tornado.__wrapped__({"a": swings, "b": [("gain", 0.0124, 0.0125)]}, middles)
+    figure = uncertainty_figures.tornado.__wrapped__(
+        {"a": swings, "b": [("gain", 0.0124, 0.0125)]}, middles
+    )
     figure.draw_without_rendering()
     for ax, offset in zip(figure.axes, (True, False), strict=True):
         assert bool(ax.xaxis.get_offset_text().get_text()) == offset
@@ -134,20 +162,30 @@ def test_numbers_that_differ_in_the_last_digits_are_short():
 
 def test_the_legend_of_one_step_is_no_wider_than_its_diagram():
     names = ("precision", "method", "window", "samples of the pupil")
-    lines = [accuracy_figures.Line(name, [accuracy_figures.Dot(1e-3, 1e-6, "fft")]) for name in names]
+    lines = [
+        accuracy_figures.Line(name, [accuracy_figures.Dot(1e-3, 1e-6, "fft")]) for name in names
+    ]
     accuracy_figures.steps([("optics.psf", lines, 1e-2)])
 
 
 def test_radii_of_a_small_window_are_plain_numbers():
     figure, axes = canvas(3.0, 2.8)
-    psf, bands = SimpleNamespace(intensity=torch.rand(1, 17, 17)), SimpleNamespace(centres=torch.tensor([550e-9]))
+    psf, bands = (
+        SimpleNamespace(intensity=torch.rand(1, 17, 17)),
+        SimpleNamespace(centres=torch.tensor([550e-9])),
+    )
     optics._encircled(axes[0, 0], psf, bands, 3.2e-6, "plain lens")
     figure.draw_without_rendering()
-    shown = [label.get_text() for label in axes[0, 0].get_xticklabels(which="both") if label.get_text()]
+    shown = [
+        label.get_text() for label in axes[0, 0].get_xticklabels(which="both") if label.get_text()
+    ]
     assert {float(text) for text in shown} <= {1, 2, 3, 5, 10, 20, 30, 50, 100}
 
 
 def test_a_grid_of_few_nodes_with_long_names_has_rows_of_full_height():
     cells = [Cell("warn", "", 10.0**-e, 1.0, 1e-3, 1e-3) for e in (3, 120, 7, 300)]
-    entries = [("group", f"case {i % 2}", f"optics.{'long_' * (4 + i)}name", cell) for i, cell in enumerate(cells)]
+    entries = [
+        ("group", f"case {i % 2}", f"optics.{'long_' * (4 + i)}name", cell)
+        for i, cell in enumerate(cells)
+    ]
     grid_picture(entries)

@@ -1,4 +1,6 @@
-"""A small family of nodes for tests of the recipe reader: it is imported as ``neusee.nodes.toy``."""
+"""A small family of nodes for tests of the recipe reader: it is imported as
+``neusee.nodes.toy``.
+"""
 
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -7,7 +9,17 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import ParameterError, node
-from neusee.nodes.units import Count, DataFile, Electrons, Fraction, Length, PositiveLength, Real, Shape, Wavelength
+from neusee.nodes.units import (
+    Count,
+    DataFile,
+    Electrons,
+    Fraction,
+    Length,
+    PositiveLength,
+    Real,
+    Shape,
+    Wavelength,
+)
 from neusee.nodes.values import Stop
 
 
@@ -26,7 +38,9 @@ def height(*, samples: Count = 4) -> Tensor:
 
 
 @node()
-def pupil(height: Tensor, dirt: Tensor | None = None, *, pitch: PositiveLength, diameter: Length = 1e-3) -> Lens:
+def pupil(
+    height: Tensor, dirt: Tensor | None = None, *, pitch: PositiveLength, diameter: Length = 1e-3
+) -> Lens:
     return Lens(height if dirt is None else height * dirt)
 
 
@@ -56,7 +70,9 @@ def spot(psf: Spread, *, strength: Real, at: tuple[Length, Length] = (0.0, 0.0))
 
 
 @node()
-def gather(photons: Tensor, lasers: list[Tensor], ghosts: list[Tensor], *, share: Fraction = 1.0) -> Tensor:
+def gather(
+    photons: Tensor, lasers: list[Tensor], ghosts: list[Tensor], *, share: Fraction = 1.0
+) -> Tensor:
     return photons + sum(lasers) + sum(ghosts)
 
 

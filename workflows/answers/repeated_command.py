@@ -1,60 +1,243 @@
-"""A command that may have a stored answer: the answer is looked for before the command, and kept after it.
-
-command = begin(["safety", "safety_pointer"], terminal)   # None where no answer can be right
-text = command.answer()                                   # None if there is none: run the command
-command.keep(...)                                         # after the command
-"""
+"""A command that may have a stored answer, which is looked for before the command runs."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from neusee.workflows.answers.answer_upkeep import make_room
-from neusee.workflows.answers.installed_program import ROOT, SITES, SOURCES, program_state, standard_library
-from neusee.workflows.answers.opened_files import Folders, Opened
 from neusee.workflows.answers.results_folder import kept_files, printed, write_again
-from neusee.workflows.answers.stored_answer import RUN, Answer, read_answer, used, write_answer
-from neusee.workflows.answers.stored_results import note_use, still_there, taken_from
-from neusee.workflows.answers.typed_command import command_name
-from neusee.workflows.answers.witnesses import Unsettled, Witnesses, hold, witnesses_of
+from neusee.workflows.answers.stored_answer import (
+    RUN,
+    Answer,
+    make_room,
+    read_answer,
+    used,
+    write_answer,
+)
+from neusee.workflows.answers.witnesses import (
+    Folders,
+    Opened,
+    Unsettled,
+    Witnesses,
+    hold,
+    note_use,
+    still_there,
+    taken_from,
+    witnesses_of,
+)
+from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.run_folder import writable_folder
-from neusee.workflows.store.environment import budget_bytes, default_root
+from neusee.workflows.store.cache_settings import budget_bytes, default_root
 from neusee.workflows.store.shared_folder import Disk
 
 if TYPE_CHECKING:
-    from neusee.workflows.answers.repeated_run import RunResults
+    from neusee.workflows.answers.results_folder import RunResults
     from neusee.workflows.graph.recipe_graph import Recipe
     from neusee.workflows.report.study_folder import StudyReport
     from neusee.workflows.store.result_store import Store
+
+
+# --- typed command --------------------------------------------------------------------------------
+
+# Name of a stored answer: the digest of the command as typed and of the process in which it runs.
+
+
+#: variables of a login or a terminal window that no program of this house reads; the working folder
+#: counts by itself, and the secret of the cache by the signature of each answer
+IGNORED = frozenset(
+    {
+        "NEUSEE_CACHE_SECRET",
+        "OLDPWD",
+        "PWD",
+        "SHLVL",
+        "SSH_AUTH_SOCK",
+        "SSH_CLIENT",
+        "SSH_CONNECTION",
+        "SSH_TTY",
+        "TERM_SESSION_ID",
+        "TMUX",
+        "TMUX_PANE",
+        "WINDOWID",
+        "XDG_SESSION_ID",
+        "_",
+    }
+)
+
+
+def command_name(words: Sequence[str], terminal: Sequence[object]) -> str:
+    """Return the name of the answer to a command; ``terminal`` says how wide the terminal is and
+    what it shows.
+
+    The name depends on the words, the working folder, all variables of the environment but
+    `IGNORED`, the terminal, Python with its options and search path, and the machine. Answers of
+    another form have other names.
+    """
+    python = [
+        sys.version,
+        sys.executable,
+        list(sys.flags),
+        list(sys.warnoptions),
+        dict(sys._xoptions),
+        sys.path,
+    ]
+    place = [os.getcwd(), sorted(_decisive(os.environ).items()), list(os.uname()), os.cpu_count()]
+    return digest("answer 2", list(words), list(terminal), python, place)
+
+
+def _decisive(variables: Mapping[str, str]) -> dict[str, str]:
+    return {name: value for name, value in variables.items() if name not in IGNORED}
+
+
+# --- installed program ----------------------------------------------------------------------------
+
+# Digest of the program as it is installed: its source files, the packages beside it, and the
+# graphics devices.
+
+
+ROOT = Path(__file__).parents[2]  #: of the package neusee
+SOURCES = ("nodes", "workflows")  #: folders of the package of which every file counts
+SITES = ("site-packages", "dist-packages")  #: names of folders of installed packages
+_ABOUT = (".dist-info", ".egg-info", ".egg-link", ".pth")
+_CODE = (".py", ".so", ".pyd", ".zip")
+_DRIVER = "/proc/driver/nvidia/version"
+
+
+class ProgramState(NamedTuple):
+    """Digest of the installed program, and when the newest of its source files changed."""
+
+    digest: str
+    changed: int  #: ns since 1970
+
+
+def standard_library() -> str:
+    """Return the folder of Python's own modules."""
+    return os.path.dirname(os.path.realpath(os.__file__))
+
+
+def program_state(root: Path = ROOT) -> ProgramState:
+    """Return the state of the program, with the content of each of its source files; import
+    nothing.
+
+    Raises `OSError` if the package is not a folder of files.
+    """
+    text, changed = hashlib.blake2b(digest_size=16), 0
+    for name in _source_files(root):
+        with open(root / name, "rb") as file:
+            stat, content = os.fstat(file.fileno()), file.read()
+        text.update(b"%s\0%d\0" % (os.fsencode(name), len(content)) + content)
+        changed = max(changed, stat.st_mtime_ns, stat.st_ctime_ns)
+    text.update(
+        repr([[_importable(folder) for folder in dict.fromkeys(sys.path)], _devices()]).encode(
+            errors="replace"
+        )
+    )
+    return ProgramState(text.hexdigest(), changed)
+
+
+def _source_files(root: Path) -> list[str]:
+    """Return the paths of all source files relative to the package, sorted."""
+    files = [name for name in ("__init__.py", "__main__.py") if (root / name).is_file()]
+    for folder in SOURCES:
+        inside = [os.path.join(folder, name) for name in _below(os.fspath(root / folder))]
+        if not inside:
+            raise FileNotFoundError(f"{root / folder} has no source files")
+        files += inside
+    return sorted(files)
+
+
+def _below(folder: str, above: str = "") -> Iterator[str]:
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            name = f"{above}{entry.name}"
+            if entry.name == "__pycache__":
+                continue
+            if entry.is_dir():
+                yield from _below(entry.path, f"{name}/")
+            else:
+                yield name
+
+
+def _importable(folder: str) -> list[tuple[str, int]]:
+    """Return what a folder of the search path can import: installed packages with their time, or
+    files of code.
+
+    The folders of Python itself count by the version of Python.
+    """
+    where = os.path.realpath(folder or ".")
+    installed = os.path.basename(where) in SITES
+    if not installed and f"{where}/".startswith(f"{standard_library()}/"):
+        return []
+    try:
+        with os.scandir(where) as entries:
+            code = [
+                entry
+                for entry in entries
+                if (entry.name.endswith(_ABOUT) if installed else _is_code(entry))
+            ]
+            return sorted(
+                (entry.name, entry.stat().st_mtime_ns if installed else 0) for entry in code
+            )
+    except OSError as error:
+        return [(type(error).__name__, 0)]
+
+
+def _is_code(entry: os.DirEntry[str]) -> bool:
+    return entry.name.endswith(_CODE) or os.path.isfile(f"{entry.path}/__init__.py")
+
+
+def _devices() -> list[str]:
+    """Return the names of the graphics devices and the version of their driver."""
+    names = sorted(name for name in os.listdir("/dev") if name.startswith(("nvidia", "kfd", "dri")))
+    try:
+        return [*names, Path(_DRIVER).read_text(errors="replace")]
+    except OSError:
+        return names
+
+
+# --- repeated command -----------------------------------------------------------------------------
+
+# A command that may have a stored answer: the answer is looked for before the command, and kept
+# after it.
+#
+# command = begin(["safety", "safety_pointer"], terminal)   # None where no answer can be right
+# text = command.answer()                                   # None if there is none: run the command
+# command.keep(...)                                         # after the command
+
 
 running: list[Command] = []  #: the command of this process, if its answer may be kept
 _SYSTEM = ("/proc", "/sys", "/dev")
 _OUT = "runs"  #: folder of results where the command names none
 _RECIPES = (".yaml", ".yml")
-#: files that are made of others: bytecode, compiled modules, and the list of fonts that matplotlib keeps
+#: files that are made of others: bytecode, compiled modules, and the list of fonts that matplotlib
+#: keeps
 _DERIVED = re.compile(r"\.pyc$|\.so$|/fontlist-v[^/]*$")
-#: files of a cache that decide what a forecast or an explanation says, beside the results themselves
+#: files of a cache that decide what a forecast or an explanation says, beside the results
+#: themselves
 _OF_CACHE = re.compile(r"journal\.jsonl|speeds\.json|code/.*")
 _SHARE = 0.9  #: of the free memory, which a run may use
-_PART = re.compile(r"/\.[^/]*\.part(/|$)")  #: in the path of a folder of results that is not complete
+#: in the path of a folder of results that is not complete
+_PART = re.compile(r"/\.[^/]*\.part(/|$)")
 _TICK = 20_000_000  #: ns, longer than a tick of the clock of a file system
-_IMPORTED = 2_000_000_000  #: ns before the command began in which its modules may have been imported
+#: ns before the command began in which its modules may have been imported
+_IMPORTED = 2_000_000_000
 _NAME = re.compile(r"\d{4}-\d\d-\d\d_(?P<label>.+)_(?P<key>[0-9a-f]{8})(_[1-9]\d{0,6})?")
 _MAIN = ("__main__", "__mp_main__")  #: the program that the user starts
-_NATIVE = ("h5py", "netCDF4")  #: packages whose files are opened without Python, and named by no parameter
+#: packages whose files are opened without Python, and named by no parameter
+_NATIVE = ("h5py", "netCDF4")
 
 
 def begin(words: Sequence[str], terminal: Sequence[object]) -> Command | None:
     """Return the command that may have a stored answer, or None where none is looked for or kept.
 
-    That is where the cache is at a URL or not usable, and in a process that has already imported torch.
+    That is where the cache is at a URL or not usable, and in a process that has already imported
+    torch.
     """
     if "torch" in sys.modules or "://" in os.environ.get("NEUSEE_CACHE", ""):
         return None
@@ -98,20 +281,24 @@ class Command:
         self._opened, self._doubtful = Opened(), False
 
     def _started(self) -> int:
-        """Return the time (ns) of the begin by the clock as it is set now; the program is imported by then."""
+        """Return the time (ns) of the begin by the clock as it is set now; the program is
+        imported by then.
+        """
         from neusee.nodes.import_times import Moment
 
         return Moment(*self._clocks).time()
 
     def answer(self) -> str | None:
-        """Write the folder of the stored answer again and return the text to print, or None without a right answer.
+        """Write the folder of the stored answer again and return the text to print, or None without
+        a right answer.
 
         Without one, the files that this process opens from now on are recorded.
         Raises `OSError` if the folder of results cannot be written.
         """
         answer = read_answer(self._disk, self.name)
         if answer and self._holds(answer):
-            with suppress(ValueError, KeyError, TypeError, AttributeError):  # a document that is none
+            # a document that is none
+            with suppress(ValueError, KeyError, TypeError, AttributeError):
                 text = self._given_again(answer)
                 used(self._disk, self.name)
                 return text
@@ -134,47 +321,73 @@ class Command:
         if not answer.key:
             return answer.text
         if answer.kind != RUN:
-            return printed(answer, write_again(answer, time.perf_counter() - self._began) / "report.html")
-        from neusee.workflows.answers.repeated_run import said_again, write_run_again
+            return printed(
+                answer, write_again(answer, time.perf_counter() - self._began) / "report.html"
+            )
+        from neusee.workflows.answers.results_folder import said_again, write_run_again
 
         folder, document = write_run_again(answer, self._disk, time.perf_counter() - self._began)
         note_use(self._disk, answer.stored)
         return said_again(answer, folder, document)
 
     def doubt(self) -> None:
-        """Keep no answer: the command has said something that its text does not hold, such as a warning."""
+        """Keep no answer: the command has said something that its text does not hold, such as a
+        warning.
+        """
         self._doubtful = True
 
     def keep(
-        self, text: str, as_json: bool, recipe: Recipe, results: Results | RunResults | Said | None = None
+        self,
+        text: str,
+        as_json: bool,
+        recipe: Recipe,
+        results: Results | RunResults | Said | None = None,
     ) -> None:
-        """Keep the answer of a command that has ended well; do so only if nothing that it rests on is in doubt.
+        """Keep the answer of a command that has ended well; do so only if nothing that it rests on
+        is in doubt.
 
-        Args: text: of the terminal, with `results_folder.PAGE` for the path of the page. recipe: that of the command.
-        results: what the command has written, or what it has taken from a store. A command that writes nothing makes no
-        cache either.
+        Args: text: of the terminal, with `results_folder.PAGE` for the path of the page. recipe:
+                that of the command.
+        results: what the command has written, or what it has taken from a store. A command that
+        writes nothing makes no cache either.
         """
         self._opened.end()
         with suppress(OSError, ValueError, KeyError, TypeError):
-            inputs = [*_input_files(recipe), *(self._of_cache() if isinstance(results, Said) else ())]
+            inputs = [
+                *_input_files(recipe),
+                *(self._of_cache() if isinstance(results, Said) else ()),
+            ]
             witnesses = self._witnesses(results.out if results else None, inputs)
             written = results if results and results.out else None
             if self._is_doubtful() or not (written or os.path.isdir(self._disk.folder)):
                 return
-            place = (str(written.out), *_parts(written.folder.name)) if written else ("", "", "")
+            label, key = _parts(written.folder.name) if written else ("", "")
             fields = results.fields() if results else {"files": {}}
-            answer = Answer(self._state.digest, witnesses, text, as_json, *place, **fields)
+            answer = Answer(
+                self._state.digest,
+                witnesses,
+                text,
+                as_json,
+                out=str(written.out) if written else "",
+                label=label,
+                key=key,
+                **fields,
+            )
             if write_answer(self._disk, self.name, answer):
                 make_room(self._disk, budget_bytes(None))
 
     def _fits(self, answer: Answer) -> bool:
-        """Return True if the folder of an answer is the one that the command names, and if it can be written.
+        """Return True if the folder of an answer is the one that the command names, and if it can
+        be written.
 
         If it cannot be written, the command itself says why.
         """
         if not answer.key:
             return not answer.files
-        if answer.out not in (_OUT, *(str(Path(word.removeprefix("--out="))) for word in self._words)):
+        if answer.out not in (
+            _OUT,
+            *(str(Path(word.removeprefix("--out="))) for word in self._words),
+        ):
             return False
         try:
             writable_folder(answer.out)
@@ -183,7 +396,9 @@ class Command:
         return True
 
     def _is_doubtful(self) -> bool:
-        """Return True if the program may have changed since the command began, or if the command said more."""
+        """Return True if the program may have changed since the command began, or if the command
+        said more.
+        """
         state = program_state()
         return (
             self._doubtful
@@ -196,26 +411,36 @@ class Command:
     def _witnesses(self, out: Path | None, inputs: Iterable[str]) -> Witnesses:
         """Return the witnesses of the answer; folders of results in ``out`` are no witnesses."""
         recipes = _recipe_folders(self._words)
-        ignored = Folders([*_installed(), *_SYSTEM, self._disk.folder, *(ROOT / name for name in SOURCES)])
+        ignored = Folders(
+            [*_installed(), *_SYSTEM, self._disk.folder, *(ROOT / name for name in SOURCES)]
+        )
         cache, written = Folders([self._disk.folder]), os.path.abspath(out) if out else None
         opened = [path for path in self._opened.files if not _DERIVED.search(path)]
         files = [path for path in opened if path.endswith(_RECIPES) or path not in ignored]
         if any(path in cache for path in (os.getcwd(), *files)) or written in recipes:
             raise Unsettled("a recipe is in the folder of the cache or of results")
-        folders = [path for path in self._opened.folders if path not in ignored and not _PART.search(path)]
+        folders = [
+            path for path in self._opened.folders if path not in ignored and not _PART.search(path)
+        ]
         listed = {path: self._opened.folders[path] for path in folders if path != written}
         return witnesses_of([*files, *inputs], recipes, listed, self._started() - _TICK, written)
 
     def _of_cache(self) -> list[str]:
-        """Return the files of the cache that were read and decide what a forecast or an explanation says."""
-        return [path for path in self._opened.files if _OF_CACHE.fullmatch(_inside(path, self._disk.folder))]
+        """Return the files of the cache that were read and decide what a forecast or an
+        explanation says.
+        """
+        return [
+            path
+            for path in self._opened.files
+            if _OF_CACHE.fullmatch(_inside(path, self._disk.folder))
+        ]
 
 
 def _are_free(memory: int) -> bool:
     """Return True if a run may use so many bytes of memory now."""
     if not memory:
         return True
-    from neusee.workflows.engine.memory_use import free_memory
+    from neusee.workflows.engine.machine_resources import free_memory
 
     return _SHARE * free_memory() >= memory
 
@@ -225,48 +450,67 @@ def _inside(path: str, folder: str) -> str:
 
 
 def _parts(folder: str) -> tuple[str, str]:
-    """Return the label and the key in the name of a folder of results, such as ``2026-11-23_safety_82a46a54_2``.
+    """Return the label and the key in the name of a folder of results, such as
+    ``2026-11-23_safety_82a46a54_2``.
 
     Raises `ValueError` for another name.
     """
-    found = _NAME.fullmatch(folder)
-    if not found:
+    match = _NAME.fullmatch(folder)
+    if not match:
         raise ValueError(f"{folder} is not the name of a folder of results")
-    return found["label"], found["key"]
+    return match["label"], match["key"]
 
 
 def _recipe_folders(words: Sequence[str]) -> set[str]:
     """Return the folders in which the recipe and its options are looked for."""
-    from neusee.workflows.recipe.text.option_groups import shared_folders
+    from neusee.workflows.recipe.text.composition import shared_folders
 
-    beside = (os.path.dirname(os.path.expanduser(word)) for word in words if word.endswith(_RECIPES))
-    return {os.path.abspath(folder or ".") for folder in [".", *beside, *map(str, shared_folders())]}
+    beside = (
+        os.path.dirname(os.path.expanduser(word)) for word in words if word.endswith(_RECIPES)
+    )
+    return {
+        os.path.abspath(folder or ".") for folder in [".", *beside, *map(str, shared_folders())]
+    }
 
 
 def _input_files(recipe: Recipe) -> set[str]:
-    """Return the paths of all files that the values of a recipe name; one that is a folder is refused later."""
+    """Return the paths of all files that the values of a recipe name; one that is a folder is
+    refused later.
+    """
     values: list[Any] = list(recipe.config.values.values())
-    found = set()
+    paths = set()
     while values:
         value = values.pop()
         if isinstance(value, Path):
-            found.add(os.path.abspath(value))
+            paths.add(os.path.abspath(value))
         elif isinstance(value, dict):
             values += [*value, *value.values()]
         elif isinstance(value, list | tuple | set | frozenset):
             values += value
-    return found
+    return paths
 
 
 def _installed() -> list[str]:
-    """Return the folders of Python's own modules and of installed packages, whose versions count."""
-    return [standard_library(), *(folder for folder in sys.path if os.path.basename(folder) in SITES)]
+    """Return the folders of Python's own modules and of installed packages, whose versions
+    count.
+    """
+    return [
+        standard_library(),
+        *(folder for folder in sys.path if os.path.basename(folder) in SITES),
+    ]
 
 
 def _own_code() -> Iterable[str]:
-    """Yield the modules of this process that are neither neusee nor installed: a recipe names code of its own."""
-    known = Folders([*_installed(), ROOT])
+    """Yield the modules of this process that are neither neusee nor installed: a recipe names
+    code of its own.
+    """
+    covered = Folders([*_installed(), ROOT])
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)  # of torch.ops it is a name without a folder
-        if file and name not in _MAIN and os.path.isfile(file) and os.path.abspath(file) not in known:
+        if (
+            file
+            and name not in _MAIN
+            and os.path.isfile(file)
+            and os.path.abspath(file) not in covered
+        ):
             yield name

@@ -1,16 +1,35 @@
-"""Files and folders on which an answer rests, and the comparison with what they are now."""
+"""Files, folders and results on which an answer rests, and whether they are as they were."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
+import re
 import stat
+import sys
 from collections.abc import Iterable, Iterator, Mapping
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import xxhash
+
+from neusee.workflows.keys.sealed_files import secrets
+from neusee.workflows.store import metadata
+from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept
+from neusee.workflows.store.payload import SmallResults
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.shared_folder import Disk
+
+# --- witnesses ------------------------------------------------------------------------------------
+
+# Files and folders on which an answer rests, and the comparison with what they are now.
 
 
 class Unsettled(ValueError):
-    """Error for a file or folder that may have changed while the command ran, or that cannot be compared later."""
+    """Error for a file or folder that may have changed while the command ran, or that cannot be
+    compared later.
+    """
 
 
 class Witnesses(NamedTuple):
@@ -18,12 +37,15 @@ class Witnesses(NamedTuple):
 
     files: dict[str, str]  #: by path: digest of the content
     absent: list[str]  #: paths at which a file was wanted, and where there was none
-    recipes: dict[str, str]  #: by folder in which recipes and options are looked for: digest of their names
+    #: by folder in which recipes and options are looked for: digest of their names
+    recipes: dict[str, str]
     listed: dict[str, str]  #: by another folder that was listed: digest of all names in it
 
 
 class Listing(NamedTuple):
-    """The names in a folder, and when the folder last changed (ns); 0 for a folder that is missing."""
+    """The names in a folder, and when the folder last changed (ns); 0 for a folder that is
+    missing.
+    """
 
     names: list[str]
     changed: int
@@ -39,29 +61,42 @@ def listing(folder: str) -> Listing:
 
 
 def witnesses_of(
-    files: Iterable[str], recipes: Iterable[str], listed: Mapping[str, Listing], before: int, made: str | None = None
+    files: Iterable[str],
+    recipes: Iterable[str],
+    listed: Mapping[str, Listing],
+    before: int,
+    made: str | None = None,
 ) -> Witnesses:
-    """Return witnesses for these paths as they are now; a path without a file is a witness of its absence.
+    """Return witnesses for these paths as they are now; a path without a file is a witness of its
+    absence.
 
-    ``made`` is a folder that the command itself may have made: as a new name in a listed folder it is no change.
-    Raises `Unsettled` for what changed after the time ``before`` (ns), and for a folder in place of a file.
+    ``made`` is a folder that the command itself may have made: as a new name in a listed folder it
+    is no change. Raises `Unsettled` for what changed after the time ``before`` (ns), and for a
+    folder in place of a file.
     """
     for folder, then in listed.items():
-        own = os.path.relpath(made, folder).partition(os.sep)[0] if made else ""
-        now = [name for name in all_names(folder) if name != own or name in then.names]
+        now = _names_but(folder, then, made)
         if then.changed > before or now != then.names:
             raise Unsettled(f"{folder} changed while the command ran")
-    found: dict[str, str] = {}
+    digests: dict[str, str] = {}
     absent = []
     for path in sorted(set(files)):
         try:
-            found[path] = file_digest(path, before)
+            digests[path] = file_digest(path, before)
         except FileNotFoundError:
             absent.append(path)
         except OSError as error:
             raise Unsettled(f"{path} cannot be read: {error}") from None
     names = {folder: _digest(recipe_names(folder)) for folder in sorted(set(recipes))}
-    return Witnesses(found, absent, names, {folder: _digest(all_names(folder)) for folder in sorted(listed)})
+    return Witnesses(
+        digests, absent, names, {folder: _digest(all_names(folder)) for folder in sorted(listed)}
+    )
+
+
+def _names_but(folder: str, then: Listing, made: str | None) -> list[str]:
+    """Return the names in a folder as it is now, without the folder ``made`` if it is new."""
+    own = os.path.relpath(made, folder).partition(os.sep)[0] if made else ""
+    return [name for name in all_names(folder) if name != own or name in then.names]
 
 
 def hold(witnesses: Witnesses) -> bool:
@@ -69,8 +104,13 @@ def hold(witnesses: Witnesses) -> bool:
     try:
         return (
             not any(map(os.path.lexists, witnesses.absent))
-            and all(_digest(recipe_names(folder)) == digest for folder, digest in witnesses.recipes.items())
-            and all(_digest(all_names(folder)) == digest for folder, digest in witnesses.listed.items())
+            and all(
+                _digest(recipe_names(folder)) == digest
+                for folder, digest in witnesses.recipes.items()
+            )
+            and all(
+                _digest(all_names(folder)) == digest for folder, digest in witnesses.listed.items()
+            )
             and all(file_digest(path) == digest for path, digest in witnesses.files.items())
         )
     except (OSError, Unsettled):
@@ -80,7 +120,8 @@ def hold(witnesses: Witnesses) -> bool:
 def file_digest(path: str, before: int | None = None) -> str:
     """Return the digest of the content of a file; never wait for a pipe in its place.
 
-    Raises `Unsettled` for what is no file, and for a file that changed after the time ``before`` (ns).
+    Raises `Unsettled` for what is no file, and for a file that changed after the time ``before``
+    (ns).
     """
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
         about = os.fstat(file.fileno())
@@ -94,14 +135,16 @@ def file_digest(path: str, before: int | None = None) -> str:
 
 
 def recipe_names(folder: str) -> list[str]:
-    """Return the names of the recipes in a folder, and of the options in its groups, as far as they are files."""
+    """Return the names of the recipes in a folder, and of the options in its groups, as far as
+    they are files.
+    """
     return sorted(_yaml_in(folder, groups=True))
 
 
 def _yaml_in(folder: str, groups: bool) -> Iterator[str]:
     try:
-        with os.scandir(folder) as found:
-            entries = list(found)
+        with os.scandir(folder) as scan:
+            entries = list(scan)
     except OSError:
         return
     for entry in entries:
@@ -124,4 +167,227 @@ def _blake() -> hashlib.blake2b:
 
 
 def _digest(names: list[str]) -> str:
-    return hashlib.blake2b("\0".join(names).encode(errors="surrogateescape"), digest_size=16).hexdigest()
+    return hashlib.blake2b(
+        "\0".join(names).encode(errors="surrogateescape"), digest_size=16
+    ).hexdigest()
+
+
+# --- opened files ---------------------------------------------------------------------------------
+
+# Record of the files that this process opens to read and of the folders that it lists, by an audit
+# hook of Python.
+
+
+_LISTS = ("os.listdir", "os.scandir")
+_WRITES = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+_listeners: list[Opened] = []  #: at most one; the hook of a process cannot be removed
+_hooked: list[bool] = []
+
+
+class Opened:
+    """The files that were opened to read and the folders that were listed, as absolute paths."""
+
+    def __init__(self) -> None:
+        self.files: dict[str, None] = {}
+        self.folders: dict[str, Listing] = {}  #: as each was when it was listed first
+        self._lists = False
+
+    def listen(self) -> None:
+        """Begin the record; another record of this process ends."""
+        _listeners[:] = [self]
+        if not _hooked:
+            _hooked.append(True)
+            sys.addaudithook(_hear)
+
+    def end(self) -> None:
+        """End the record."""
+        if self in _listeners:
+            _listeners.remove(self)
+
+    def hear(self, event: str, arguments: tuple[Any, ...]) -> None:
+        """Note one event of Python's audit; a file descriptor in place of a path says nothing
+        new.
+        """
+        path = os.curdir if event in _LISTS and arguments[0] is None else arguments[0]
+        if not isinstance(path, str | bytes | os.PathLike):
+            return
+        if event in _LISTS:
+            self._list(os.path.abspath(os.fsdecode(path)))
+        elif not _is_written(*arguments[1:3]):
+            self.files[os.path.abspath(os.fsdecode(path))] = None
+
+    def _list(self, folder: str) -> None:
+        if self._lists or folder in self.folders:
+            return
+        self._lists = True  # listing is an event too
+        try:
+            self.folders[folder] = listing(folder)
+        finally:
+            self._lists = False
+
+
+class Folders:
+    """Some folders with all that is below them."""
+
+    def __init__(self, roots: Iterable[str | os.PathLike[str]]) -> None:
+        named: list[str] = []
+        for root in roots:
+            named += [str(os.path.abspath(root)), str(os.path.realpath(root))]
+        self._starts = tuple(f"{path.rstrip('/')}/" for path in named)
+
+    def __contains__(self, path: object) -> bool:
+        """Return True if a path is one of the folders or below one of them, whatever links lead
+        there.
+        """
+        return any(
+            f"{form}/".startswith(self._starts) for form in (str(path), os.path.realpath(str(path)))
+        )
+
+
+def _is_written(mode: Any, flags: Any) -> bool:
+    """Return True for a file that is opened to be written anew or made."""
+    if isinstance(mode, str):
+        return mode[:1] in ("w", "x", "a")
+    return isinstance(flags, int) and bool(flags & _WRITES)
+
+
+def _hear(event: str, arguments: tuple[Any, ...]) -> None:
+    if _listeners and (event == "open" or event in _LISTS):
+        _listeners[0].hear(event, arguments)
+
+
+# --- stored results -------------------------------------------------------------------------------
+
+# Results and files of the cache on which an answer rests, and the comparison with what they are
+# now, without torch.
+#
+# A result that was loaded is compared byte by byte, as a run that loads it does; of the others the
+# metadata are compared, which hold the size and the checksum of the value, and the size of its
+# file.
+
+
+_KEY = re.compile(r"[0-9a-z-]{2,64}")
+_FILE = re.compile(r"(files|bands)/[0-9a-z]{2}/\w[\w.-]*")
+
+
+class StoredResults(NamedTuple):
+    """What of a cache an answer rests on; by default nothing."""
+
+    #: by key: digest of the metadata, or an empty text for a result that was missing
+    results: Mapping[str, str] = {}
+    loaded: tuple[str, ...] = ()  #: keys of the results whose values were loaded
+    files: Mapping[str, str] = {}  #: by path in the cache: digest of a band, a picture or an export
+    taken: Mapping[str, str] = {}  #: by name in the folder of results: the path in the cache
+
+
+NOTHING = StoredResults()
+
+
+def taken_from(store: Store, taken: Mapping[str, Path]) -> StoredResults:
+    """Return what a process has asked of a store so far, and the stored files that it took into a
+    folder of results.
+
+    Raises `Unsettled` for a file that is not in the store, and `OSError` for one that cannot be
+    read.
+    """
+    asked, loaded = store.asked(), sorted(store.loaded())
+    paths = {name: os.path.relpath(path, store.root) for name, path in taken.items()}
+    bands = (
+        f"bands/{name[:2]}/{name}" for key in loaded for name in metadata.bands(asked[key] or {})
+    )
+    read_files = sorted({*paths.values(), *bands})
+    if outside := [path for path in read_files if not _FILE.fullmatch(path)]:
+        raise Unsettled(f"{outside[0]} is not in the folders of a store")
+    files = {path: _digest_of_results(f"{store.disk.folder}/{path}") for path in read_files}
+    results = {key: _said(about) for key, about in sorted(asked.items())}
+    return StoredResults(results, tuple(loaded), files, paths)
+
+
+def still_there(disk: Disk, then: StoredResults) -> bool:
+    """Return True if every result is as it was and every file has the same content; change
+    nothing in the cache.
+    """
+    small = SmallResults(disk)
+    try:
+        abouts = {key: _about(disk, small, key) for key in then.results}
+        return (
+            all(_said(abouts[key]) == digest for key, digest in then.results.items())
+            and all(_is_whole(disk, abouts[key]) for key in then.loaded)
+            and all(
+                _digest_of_results(f"{disk.folder}/{path}") == digest
+                for path, digest in then.files.items()
+            )
+        )
+    except (*UNREADABLE, Unsettled):
+        return False
+
+
+def note_use(disk: Disk, then: StoredResults) -> None:
+    """Record that the values were used, as a run that loads them does."""
+    for key in then.loaded:
+        metadata.record_use(disk, key)
+
+
+def checked(fields: Mapping[str, Any]) -> StoredResults:
+    """Return the results that the JSON of an answer names.
+
+    Raises `ValueError` or `TypeError` for what `taken_from` never gives.
+    """
+    results = StoredResults(**{**fields, "loaded": tuple(fields.get("loaded", ()))})
+    if not all(
+        isinstance(field, dict) for field in (results.results, results.files, results.taken)
+    ):
+        raise ValueError("a field of the answer is not of its type")
+    names = [
+        (_KEY, [*results.results, *results.loaded]),
+        (_FILE, [*results.files, *results.taken.values()]),
+    ]
+    if any(not form.fullmatch(name) for form, many in names for name in many):
+        raise ValueError("the answer names what is no result and no file of a cache")
+    digests = [*results.results.values(), *results.files.values()]
+    if not all(isinstance(text, str) for text in digests) or not {*results.taken.values()} <= {
+        *results.files
+    }:
+        raise ValueError("a field of the answer is not of its type")
+    if not {*results.loaded} <= {*results.results}:
+        raise ValueError("a result was loaded and is not named")
+    return results
+
+
+def _about(disk: Disk, small: SmallResults, key: str) -> Metadata | None:
+    """Return the metadata of a result as a store finds them, without moving a damaged result
+    away.
+    """
+    about = small.find(key)
+    return about if is_kept(about) else metadata.find(disk, key) or about
+
+
+def _said(about: Metadata | None) -> str:
+    if about is None:
+        return ""
+    return hashlib.blake2b(json.dumps(about, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+
+def _is_whole(disk: Disk, about: Metadata | None) -> bool:
+    """Return True if the file of a value has the checksum in the metadata, or with a secret the
+    signed digest.
+    """
+    if not is_kept(about):
+        return False
+    payload = about.get("payload")
+    if not payload:
+        return True
+    algorithm, name = (hashlib.sha256, "sha256") if secrets() else (xxhash.xxh3_128, "xxh3")
+    return bool(_digest_by(disk.path(about["key"], "safetensors"), algorithm) == payload.get(name))
+
+
+def _digest_of_results(path: str) -> str:
+    """Return a digest of a file, of the kind that the store uses for its files."""
+    return _digest_by(path, hashlib.sha256 if secrets() else xxhash.xxh3_128)
+
+
+def _digest_by(path: str, algorithm: Any) -> str:
+    with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise Unsettled(f"{path} is not a file")
+        return hashlib.file_digest(file, algorithm).hexdigest()

@@ -1,9 +1,11 @@
-"""Functions for use from Python: `neusee.run`, `sweep`, `train`, `evaluate`, `calibrate` and `study`.
+"""Functions for use from Python: `neusee.run`, `sweep`, `train`, `evaluate`, `calibrate` and
+`study`.
 
-All functions have these options. ``changes`` change a recipe that is given by name or file: a mapping like the values
-of `load` (``{"doe": "axicon", "sensor": {"read_noise": "20 e-"}}``), or command-line arguments (``["doe=axicon"]``).
-``store`` keeps results; None means ``$NEUSEE_CACHE`` or the default folder. The folder of results is made in ``out``.
-``progress`` is called with a line for each finished part. The report shows ``command``, which repeats the call.
+All functions have these options. ``changes`` change a recipe that is given by name or file: a
+mapping like the values of `load` (``{"doe": "axicon", "sensor": {"read_noise": "20 e-"}}``), or
+command-line arguments (``["doe=axicon"]``). ``store`` keeps results; None means ``$NEUSEE_CACHE``
+or the default folder. The folder of results is made in ``out``. ``progress`` is called with a line
+for each finished part. The report shows ``command``, which repeats the call.
 """
 
 from __future__ import annotations
@@ -15,8 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.recipe.text.overrides import Override
-from neusee.workflows.recipe.text.python_overrides import overrides_of
+from neusee.workflows.recipe.text.overrides import Override, overrides_of
 from neusee.workflows.report.run_folder import writable_folder
 from neusee.workflows.report.study_folder import Progress, silent
 from neusee.workflows.store.remote_store import open_store
@@ -25,10 +26,10 @@ if TYPE_CHECKING:
     from neusee.workflows.engine.runner import Result
     from neusee.workflows.engine.step_job import Executor
     from neusee.workflows.evaluation.pipelines import Pipeline
-    from neusee.workflows.graph.step_record import Event
+    from neusee.workflows.graph.recipe_graph import Event
     from neusee.workflows.store.result_store import Store
     from neusee.workflows.sweeps.sweep_run import Sweep
-    from neusee.workflows.training.parallel.process_mesh import Mesh
+    from neusee.workflows.training.process_mesh import Mesh
 
 Named = str | os.PathLike[str]  #: the name of a packaged recipe, or the path of a file
 Changes = Mapping[str, Any] | Sequence[str]
@@ -48,11 +49,15 @@ def run(
     executor: Executor | None = None,
     memory: int | None = None,
 ) -> Result:
-    """Run a recipe and return the results of the steps ``outputs``; None means the outputs that the recipe names.
+    """Run a recipe and return the results of the steps ``outputs``; None means the outputs that the
+    recipe names.
 
-    Args: device: one or several devices, ``cuda:0,cuda:1,cpu``, the preferred one first. watch: gets every `Event`.
-    executor: computes the steps instead of this process. memory: largest number of bytes to use on each device.
-    Raises: `RecipeError` before anything runs, `RunError` if a step fails, ValueError for an unknown output.
+    Args: device: one or several devices, ``cuda:0,cuda:1,cpu``, the preferred one first. watch:
+            gets every `Event`.
+    executor: computes the steps instead of this process. memory: largest number of bytes to use on
+    each device.
+    Raises: `RecipeError` before anything runs, `RunError` if a step fails, ValueError for an
+            unknown output.
     """
     names = (outputs,) if isinstance(outputs, str) else outputs
     return _read(recipe, changes).run(store, names, watch, device, executor, memory)
@@ -68,15 +73,21 @@ def sweep(
     zip: bool = False,
     on_error: Literal["stop", "continue"] = "stop",
 ) -> Sweep:
-    """Run a recipe at every combination of the parameter values in ``axes``, and return the results of all runs.
+    """Run a recipe at every combination of the parameter values in ``axes``, and return the results
+    of all runs.
 
-    Args: axes: from a parameter or group to a list of values, or to a text such as ``"linspace(450 nm, 650 nm, 5)"``.
-    zip: pair the values of the axes instead of combining them. on_error: ``"continue"`` lists a failed point as a row.
-    Raises: `RecipeError` with all mistakes of all points before anything runs, or the error of the first failed point.
+    Args: axes: from a parameter or group to a list of values, or to a text such as ``"linspace(450
+            nm, 650 nm, 5)"``.
+    zip: pair the values of the axes instead of combining them. on_error: ``"continue"`` lists a
+    failed point as a row.
+    Raises: `RecipeError` with all mistakes of all points before anything runs, or the error of the
+            first failed point.
     """
     from neusee.workflows.sweeps.sweep_run import sweep as run_sweep
 
-    return run_sweep(_name(recipe, "sweep"), axes, _arguments(changes), zip, store, on_error, device)
+    return run_sweep(
+        _name(recipe, "sweep"), axes, _arguments(changes), zip, store, on_error, device
+    )
 
 
 def train(
@@ -92,12 +103,15 @@ def train(
     watch: Callable[[int, int, Mapping[str, float]], None] | None = None,
     mesh: Mesh | None = None,
 ) -> Path:
-    """Train the mask and the networks of a recipe, or continue a stopped training, and return the folder of results.
+    """Train the mask and the networks of a recipe, or continue a stopped training, and return the
+    folder of results.
 
-    Args: stages: 1 trains mask and network, 2 the network alone, 0 designs the mask without pictures; None means all
-    stages of the recipe. watch: is called with the stage (0 for a lift), its finished iterations and the losses. mesh:
-    the processes of `torchrun`.
-    Raises: ValueError, or its subclass `DesignError` or `MeshError`, for a recipe that cannot be trained; `NotFinite`
+    Args: stages: 1 trains mask and network, 2 the network alone, 0 designs the mask without
+            pictures; None means all
+    stages of the recipe. watch: is called with the stage (0 for a lift), its finished iterations
+    and the losses. mesh: the processes of `torchrun`.
+    Raises: ValueError, or its subclass `DesignError` or `MeshError`, for a recipe that cannot be
+            trained; `NotFinite`
     if a loss is NaN or infinite.
     """
     recipe, folder, store = _read(recipe, changes), writable_folder(out), store or open_store()
@@ -105,11 +119,13 @@ def train(
         from neusee.workflows.training.lift.lift_run import train_lift
 
         return train_lift(recipe, store, folder, command, progress, device, watch)
-    from neusee.workflows.training.parallel.process_mesh import ALONE
+    from neusee.workflows.training.process_mesh import ALONE
     from neusee.workflows.training.run_training import train as run_training
 
     numbers = stages if stages is not None else recipe.training.learnt if recipe.training else ()
-    return run_training(recipe, store, folder, command, progress, tuple(numbers), device, watch, mesh or ALONE)
+    return run_training(
+        recipe, store, folder, command, progress, tuple(numbers), device, watch, mesh or ALONE
+    )
 
 
 def evaluate(
@@ -130,16 +146,19 @@ def evaluate(
     equal_protection: float | None = None,
     by: str | None = None,
 ) -> Path:
-    """Compare masks and restorers on the same scenes and laser strengths, and return the folder of results.
+    """Compare masks and restorers on the same scenes and laser strengths, and return the folder of
+    results.
 
-    What is None is that of the recipe's block ``evaluate``, such as all photographs in ``paper_protocol``.
+    What is None is that of the recipe's block ``evaluate``, such as all photographs in
+    ``paper_protocol``.
 
-    Args: pipelines: a mask and a restorer each, ``"flat+none, five_half_rings+wiener"``. data: a folder of photographs;
-    None means the recipe's own scene. scenes: number of scenes, else 20. strengths: of the laser, in multiples of
-    saturation; None means the strengths in the paper. small: the shorter side in pixels of reduced pictures, which are
-    compared too. reference: the pipeline with which all others are compared. equal_protection: the peak of a laser as a
-    share of that of the plain lens, to which filters and stops bring every pipeline; by: ``best``, ``filter`` or
-    ``stop``.
+    Args: pipelines: a mask and a restorer each, ``"flat+none, five_half_rings+wiener"``. data: a
+            folder of photographs;
+    None means the recipe's own scene. scenes: number of scenes, else 20. strengths: of the laser,
+    in multiples of saturation; None means the strengths in the paper. small: the shorter side in
+    pixels of reduced pictures, which are compared too. reference: the pipeline with which all
+    others are compared. equal_protection: the peak of a laser as a share of that of the plain lens,
+    to which filters and stops bring every pipeline; by: ``best``, ``filter`` or ``stop``.
     Raises: `EvaluationRefused` with every mistake before anything runs, `RunError` if a step fails.
     """
     from neusee.workflows.evaluation import run_evaluation
@@ -174,18 +193,23 @@ def calibrate(
     move: str = "de",
     draws: int = 1000,
 ) -> Path:
-    """Estimate the posterior of a recipe's sensor, or continue a stopped calibration, and return the folder of results.
+    """Estimate the posterior of a recipe's sensor, or continue a stopped calibration, and return
+    the folder of results.
 
-    Args: walkers: number of walkers in each of the four ensembles. move: the move of the walkers, ``"de"`` or
+    Args: walkers: number of walkers in each of the four ensembles. move: the move of the walkers,
+            ``"de"`` or
     ``"stretch"``. draws: least number of independent draws.
-    Raises: `CalibrationRefused` if the levels constrain the sensor too little, ValueError for a recipe without a
+    Raises: `CalibrationRefused` if the levels constrain the sensor too little, ValueError for a
+            recipe without a
     likelihood.
     """
     from neusee.workflows.calibration import run_calibration
 
     recipe, store = _read(recipe, changes), store or open_store()
     options: dict[str, Any] = {"walkers": walkers, "move": move, "draws": draws}
-    return run_calibration.calibrate(recipe, store, writable_folder(out), command, progress, **options)
+    return run_calibration.calibrate(
+        recipe, store, writable_folder(out), command, progress, **options
+    )
 
 
 def study(
@@ -199,9 +223,11 @@ def study(
     command: Sequence[str] = (),
     **options: Any,
 ) -> Path:
-    """Study how accurate the numbers of a recipe are, or continue a stopped study, and return the folder of results.
+    """Study how accurate the numbers of a recipe are, or continue a stopped study, and return the
+    folder of results.
 
-    Args: kind: ``"accuracy"``, ``"stability"``, ``"leave-out"``, ``"calibration"``, ``"uncertainty"`` or
+    Args: kind: ``"accuracy"``, ``"stability"``, ``"leave-out"``, ``"calibration"``,
+            ``"uncertainty"`` or
     ``"protection"``. options: the options of this kind, as ``neusee study KIND --help`` lists them.
     Raises: ValueError for an unknown kind or an unsuitable recipe, `RunError` if a step fails.
     """
@@ -215,23 +241,37 @@ def study(
 
 
 def _read(recipe: Recipe | Named, changes: Changes) -> Recipe:
-    """Return a loaded recipe unchanged, or load the recipe that a name or file gives with ``changes``."""
+    """Return a loaded recipe unchanged, or load the recipe that a name or file gives with
+    ``changes``.
+    """
     if not isinstance(recipe, Recipe):
         return load(recipe, _arguments(changes))
     if changes:
-        raise TypeError(f"{recipe.name} is loaded already: pass the name of the recipe, or pass the changes to `load`")
+        raise TypeError(
+            f"{recipe.name} is loaded already: pass the name of the recipe, or pass the changes to"
+            " `load`"
+        )
     return recipe
 
 
 def _name(recipe: Named, verb: str) -> str:
-    """Return the name or file of a recipe for the function ``verb``; raise TypeError for a loaded recipe."""
+    """Return the name or file of a recipe for the function ``verb``; raise TypeError for a
+    loaded recipe.
+    """
     if isinstance(recipe, Recipe):
-        raise TypeError(f"{verb} loads the recipe several times: pass the name or file of the recipe, and changes")
+        raise TypeError(
+            f"{verb} loads the recipe several times: pass the name or file of the recipe, and"
+            " changes"
+        )
     return os.fspath(recipe)
 
 
 def _arguments(changes: Changes) -> list[str | Override]:
-    """Return ``changes`` of a recipe as overrides for `load`; raise TypeError if ``changes`` is a string."""
+    """Return ``changes`` of a recipe as overrides for `load`; raise TypeError if ``changes`` is
+    a string.
+    """
     if isinstance(changes, str):
-        raise TypeError(f"changes must be a mapping or a list of arguments: write changes=[{changes!r}]")
+        raise TypeError(
+            f"changes must be a mapping or a list of arguments: write changes=[{changes!r}]"
+        )
     return [*overrides_of(changes, Path.cwd())] if isinstance(changes, Mapping) else [*changes]

@@ -1,31 +1,221 @@
-"""The page of a calibration: parameters with intervals or limits, identifiability, checks and pictures."""
+"""The page of a calibration: parameters, checks, and the least squares of EMVA 1288."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from neusee.nodes.calibrate import Budget, FrameTest, Rings
-from neusee.workflows.calibration.budget_page import budget_picture, budget_sections
-from neusee.workflows.calibration.frame_validity import frame_section
+from neusee.nodes.calibrate import (
+    Budget,
+    FrameTest,
+    LeastSquares,
+    Rings,
+    expected_levels,
+    least_squares,
+)
+from neusee.workflows.calibration.calibration_figures import (
+    chains_section,
+    corner_section,
+    curve_section,
+    words,
+)
+from neusee.workflows.calibration.frame_validity import IntervalEstimate, ModelSpread, frame_section
 from neusee.workflows.calibration.identifiability import KINDS, Identifiability
 from neusee.workflows.calibration.laboratory import RELATIVE, stated
-from neusee.workflows.calibration.level_misfit import is_camera
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.model_spread import IntervalEstimate, ModelSpread
-from neusee.workflows.calibration.picture_sections import chains_section, corner_section, curve_section, words
-from neusee.workflows.calibration.posterior_checks import Check, count_failures
-from neusee.workflows.calibration.posterior_mode import LaplaceFit
-from neusee.workflows.calibration.standard_fit import Comparison, comparisons, least_squares_section
-from neusee.workflows.report.study_page import Mark, Section, with_uncertainty
+from neusee.workflows.calibration.log_posterior import LaplaceFit, SensorPosterior
+from neusee.workflows.calibration.posterior_checks import Check, Mark, count_failures, is_camera
+from neusee.workflows.calibration.uncertainty_budget import budget_picture, budget_sections
+from neusee.workflows.report.study_page import Mark as StudyPageMark
+from neusee.workflows.report.study_page import Section, with_uncertainty
 
 if TYPE_CHECKING:
+    from neusee.nodes.values import Levels
     from neusee.workflows.calibration.emcee_sampler import Chains
     from neusee.workflows.calibration.log_posterior import FloatArray
+
+
+# --- standard fit ---------------------------------------------------------------------------------
+
+# The least squares of EMVA 1288 beside the posterior: a section of the page, and a check that both
+# agree.
+
+
+#: parameter of the posterior: field of `LeastSquares`, and what the field is called in EMVA 1288
+QUANTITIES = {
+    "gain": ("gain", "overall system gain K"),
+    "quantum_efficiency": ("efficiency", "quantum efficiency \u03b7"),
+    "read_noise": ("temporal_dark_noise", "temporal dark noise \u03c3_d"),
+    "temporal_dark_noise": ("temporal_dark_noise", "temporal dark noise \u03c3_d"),
+}
+#: combined standard deviations between the posterior and its least squares, above which it is
+#: refused
+_APART = 3.0
+_TEXT = """The fit of the standard, of lines through the origin up to 70 % of saturation, on the
+    same frames. Its error is that of the noise alone. It knows neither a bent response nor the
+    uncertainty of the lamp, so that the two need not agree. The column of the posterior's own line
+    is the same fit on the levels that the posterior predicts, bend and all: these two must agree.
+    The last column is their difference over the combined standard deviation. Only quantities that
+    the frames determine are compared."""
+
+
+class Comparison(NamedTuple):
+    """A quantity by the standard's least squares, and by the same fit on the levels that the
+    posterior predicts.
+    """
+
+    name: str
+    value: float
+    error: float  #: standard error of `value` by noise alone
+    #: by the fit on the predicted levels; the value of the posterior where nothing predicts levels
+    predicted: float
+    apart: float  #: difference over the combined standard deviation
+
+
+def comparisons(
+    measured: Levels, estimates: Sequence[ParameterEstimate], camera: Mapping[str, Any] | None
+) -> list[Comparison]:
+    """Return the comparison of each quantity that the frames determine; none where the standard's
+    fit is impossible.
+
+    ``measured`` are the statistics of the frames, ``estimates`` the rows of the posterior, and
+    ``camera`` the parameters of `calibrate.camera`, or None for another likelihood.
+    """
+    rows = [row for row in estimates if row.name in QUANTITIES and row.kind == "estimate"]
+    try:
+        fit = least_squares(measured)
+    except ValueError:
+        return []
+    own = _own_fit(measured, estimates, camera)
+    return [_compared(row, fit, own) for row in rows]
+
+
+def agreement(comparisons: Sequence[Comparison]) -> list[Check]:
+    """Return if posterior and least squares agree, as a check that refuses the posterior; none
+    without a comparison.
+    """
+    if not comparisons:
+        return []
+    worst = max(comparisons, key=lambda comparison: abs(comparison.apart))
+    label = QUANTITIES[worst.name][1]
+    text = (
+        f"{label}: least squares {worst.value:.5g}, by the posterior {worst.predicted:.5g},"
+        f" {worst.apart:+.1f} sd"
+    )
+    good = abs(worst.apart) <= _APART
+    if not good:
+        text += ": refused, one of them is wrong, and the frames do not say which"
+    mark: Mark = "pass" if good else "fail"
+    return [
+        Check(
+            "the posterior agrees with its least squares",
+            text,
+            f"within {_APART:.0f} combined sd",
+            mark,
+        )
+    ]
+
+
+def least_squares_section(
+    measured: Levels, estimates: Sequence[ParameterEstimate], comparisons: Sequence[Comparison]
+) -> Section:
+    """Return the comparison of the standard's least squares with the posterior, or the reason why
+    there is none.
+
+    A parameter of which the posterior is no estimate has no row: the standard's value would rest on
+    what the frames do not tell.
+    """
+    heading = "Beside the least squares of EMVA 1288"
+    rows = {row.name: row for row in estimates if row.name in QUANTITIES and row.kind == "estimate"}
+    if not rows:
+        return Section(
+            heading, "The frames determine none of the quantities that the standard fits."
+        )
+    if not comparisons:
+        return Section(heading, f"The standard's fit is not possible: {_reason(measured)}.")
+    columns = (
+        "quantity",
+        "least squares",
+        "posterior's own line",
+        "posterior",
+        "unit",
+        "difference / sd",
+    )
+    return Section(
+        heading,
+        _TEXT,
+        columns,
+        [_row(rows[comparison.name], comparison) for comparison in comparisons],
+    )
+
+
+def compared(comparisons: Sequence[Comparison]) -> Mapping[str, Mapping[str, float]]:
+    """Return value and standard error of the standard's fit for each parameter that the section
+    compares.
+    """
+    return {
+        comparison.name: {"value": comparison.value, "error": comparison.error}
+        for comparison in comparisons
+    }
+
+
+def _own_fit(
+    measured: Levels, estimates: Sequence[ParameterEstimate], camera: Mapping[str, Any] | None
+) -> LeastSquares | None:
+    if camera is None:
+        return None
+    values = {**camera, **{row.name: row.mean for row in estimates}}
+    try:
+        fit: LeastSquares = least_squares(expected_levels(measured, values))
+    except ValueError:
+        return None
+    return fit
+
+
+def _compared(row: ParameterEstimate, fit: LeastSquares, own: LeastSquares | None) -> Comparison:
+    value, error = _value(fit, row.name)
+    predicted = row.mean if own is None else _value(own, row.name)[0]
+    width = abs(predicted) * math.hypot(row.sd / row.mean, error / value) if value else math.inf
+    return Comparison(row.name, value, error, predicted, (value - predicted) / width)
+
+
+def _reason(measured: Levels) -> str:
+    try:
+        least_squares(measured)
+    except ValueError as reason:
+        return str(reason)
+    return "it gives no value"
+
+
+def _row(row: ParameterEstimate, comparison: Comparison) -> tuple[str, str, str, str, str, float]:
+    value, posterior = (
+        with_uncertainty(comparison.value, comparison.error),
+        with_uncertainty(row.mean, row.sd),
+    )
+    return (
+        QUANTITIES[row.name][1],
+        value,
+        f"{comparison.predicted:.5g}",
+        posterior,
+        row.unit,
+        comparison.apart,
+    )
+
+
+def _value(fit: LeastSquares, name: str) -> tuple[float, float]:
+    field = QUANTITIES[name][0]
+    return float(getattr(fit, field)), float(getattr(fit, f"{field}_error"))
+
+
+# --- calibration page -----------------------------------------------------------------------------
+
+# The page of a calibration: parameters with intervals or limits, identifiability, checks and
+# pictures.
+
 
 #: by kind of a result: the numbers that the frames do not give
 NOT_TOLD = {
@@ -41,7 +231,9 @@ _PURE = ("quantum_efficiency", "spread", "scatter", "lamp", "bend", "twist", "l"
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """The posterior of one parameter: mean, standard deviation and interval, compared with the recipe's own value."""
+    """The posterior of one parameter: mean, standard deviation and interval, compared with the
+    recipe's own value.
+    """
 
     name: str
     unit: str
@@ -56,24 +248,33 @@ class ParameterEstimate:
 
     @property
     def text(self) -> str:
-        """Return the estimate or limit of a parameter as text with its unit, or say that the frames give neither."""
+        """Return the estimate or limit of a parameter as text with its unit, or say that the
+        frames give neither.
+        """
         if self.kind == "estimate":
             return f"{with_uncertainty(self.mean, self.sd)} {self.unit}".rstrip()
         if self.kind == "none":
             return KINDS["none"]
         if self.kind == "between":
-            return f"{self.low:.3g} to {self.high:.3g} {self.unit}".rstrip() + " (90 %, depends on the prior)"
+            return (
+                f"{self.low:.3g} to {self.high:.3g} {self.unit}".rstrip()
+                + " (90 %, depends on the prior)"
+            )
         limit = f"below {self.high:.3g}" if self.kind == "upper" else f"above {self.low:.3g}"
         return f"{limit} {self.unit}".rstrip() + " (95 %, depends on the prior)"
 
     def end(self, which: Literal["low", "high"]) -> str:
-        """Return the 5 % or the 95 % end of the interval as text, or a dash where only the prior gives it."""
+        """Return the 5 % or the 95 % end of the interval as text, or a dash where only the prior
+        gives it.
+        """
         return "–" if which in NOT_TOLD[self.kind] else f"{getattr(self, which):.6g}"
 
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """The results of a calibration: posterior mode, identifiability, Markov chains, checks and camera responses."""
+    """The results of a calibration: posterior mode, identifiability, Markov chains, checks and
+    camera responses.
+    """
 
     problem: SensorPosterior
     mode: LaplaceFit
@@ -82,7 +283,8 @@ class CalibrationResult:
     checks: Sequence[Check]
     models: Sequence[ModelSpread] = ()  #: of a camera of unknown response
     frames: Sequence[FrameTest] = ()  #: the tests of the frames
-    walk: Chains | None = None  #: the draws of the walkers, where `chains` also has what the frames may hide
+    #: the draws of the walkers, where `chains` also has what the frames may hide
+    walk: Chains | None = None
     budgets: Sequence[Budget] = ()  #: the uncertainty budgets of the estimates
 
     @cached_property
@@ -106,7 +308,9 @@ class CalibrationResult:
     @cached_property
     def unwidened(self) -> Mapping[str, float]:
         """Return the standard deviation of each parameter in the draws of the walkers."""
-        return {name: float(x.std()) for name, x in self.problem.parameters(self.walked.draws).items()}
+        return {
+            name: float(x.std()) for name, x in self.problem.parameters(self.walked.draws).items()
+        }
 
     @property
     def params(self) -> Mapping[str, Any]:
@@ -132,12 +336,16 @@ class CalibrationResult:
 
 
 def unit_of(name: str, params: Mapping[str, Any]) -> str:
-    """Return the unit of a parameter of the likelihood: `calibrate.density`, `.camera` or `.stray_light`."""
+    """Return the unit of a parameter of the likelihood: `calibrate.density`, `.camera` or
+    `.stray_light`.
+    """
     if name == "gain":
         return "DN/e-"
     if name == "dark_current":
         return f"e- in {params['dark_exposure']:g} s"
-    return {"dark_signal": "DN", "drift": "DN", "b0": "1/sr", **dict.fromkeys(_PURE, "")}.get(name, "e-")
+    return {"dark_signal": "DN", "drift": "DN", "b0": "1/sr", **dict.fromkeys(_PURE, "")}.get(
+        name, "e-"
+    )
 
 
 def banner(result: CalibrationResult) -> str:
@@ -150,14 +358,22 @@ def banner(result: CalibrationResult) -> str:
 
 
 def lead(result: CalibrationResult) -> str:
-    """Return the opening of a calibration's page: estimates, values to report, and undetermined parameters."""
+    """Return the opening of a calibration's page: estimates, values to report, and undetermined
+    parameters.
+    """
     values = [f"{words(row.name)} {row.text}" for row in result.rows()]
     stated = [f"{words(m.name)} {_between(m.stated)}" for m in estimated_models(result)]
     return "\n\n".join(
         f"{opening}{'; '.join(parts)}."
         for opening, parts in (
             ("", values),
-            ("To be stated, with 90 % intervals that include the difference between models of the response: ", stated),
+            (
+                (
+                    "To be stated, with 90 % intervals that include the difference between models"
+                    " of the response: "
+                ),
+                stated,
+            ),
             ("Not determined by these frames: ", result.identifiability.directions),
         )
         if parts
@@ -165,18 +381,28 @@ def lead(result: CalibrationResult) -> str:
 
 
 def estimated_models(result: CalibrationResult) -> list[ModelSpread]:
-    """Return the models of the response for each parameter that the frames determine; others have no value."""
-    return [model for model in result.models if result.identifiability.kinds[model.name] == "estimate"]
+    """Return the models of the response for each parameter that the frames determine; others
+    have no value.
+    """
+    return [
+        model for model in result.models if result.identifiability.kinds[model.name] == "estimate"
+    ]
 
 
 def sections(result: CalibrationResult) -> list[Section]:
-    """Return the sections of a calibration's page: parameters, checks, identifiability and pictures."""
+    """Return the sections of a calibration's page: parameters, checks, identifiability and
+    pictures.
+    """
     models = (_models,) if result.models else ()
     frames = (_frames,) if result.frames else ()
     standard = (_standard,) if result.problem.measured is not None else ()
     parts = (_checks, *frames, _not_determined, curve_section, corner_section, chains_section)
     budget = budget_sections(result.budgets, stated(result.problem.recipe), result.budget_picture)
-    return [*(part(result) for part in (_parameters, *standard, *models)), *budget, *(part(result) for part in parts)]
+    return [
+        *(section(result) for section in (_parameters, *standard, *models)),
+        *budget,
+        *(section(result) for section in parts),
+    ]
 
 
 def _standard(result: CalibrationResult) -> Section:
@@ -189,29 +415,53 @@ def _frames(result: CalibrationResult) -> Section:
 
 
 def _parameters(result: CalibrationResult) -> Section:
-    text = """A value is given only if the posterior is less than a third as wide as the prior. Otherwise there is a
-        limit, which depends on the prior, and a dash stands for an end that only the prior gives. The last columns
-        show the share of the draws below the recipe's own value,
-        and the width of the posterior divided by the width of the prior."""
-    columns = ("parameter", "posterior", "5 %", "95 %", "unit", "recipe", "draws below it", "width / prior")
+    text = """A value is given only if the posterior is less than a third as wide as the prior.
+        Otherwise there is a limit, which depends on the prior, and a dash stands for an end that
+        only the prior gives. The last columns show the share of the draws below the recipe's own
+        value, and the width of the posterior divided by the width of the prior."""
+    columns = (
+        "parameter",
+        "posterior",
+        "5 %",
+        "95 %",
+        "unit",
+        "recipe",
+        "draws below it",
+        "width / prior",
+    )
     estimates = result.rows()
     rows = [
-        (words(r.name), r.text, r.end("low"), r.end("high"), r.unit, f"{r.nominal:.6g}", r.share, r.narrower)
+        (
+            words(r.name),
+            r.text,
+            r.end("low"),
+            r.end("high"),
+            r.unit,
+            f"{r.nominal:.6g}",
+            r.share,
+            r.narrower,
+        )
         for r in estimates
     ]
-    marks: dict[tuple[int, int], Mark] = {
-        (i, 6): "pass" if 0.005 <= r.share <= 0.995 else "warn" for i, r in enumerate(estimates) if r.kind == "estimate"
+    marks: dict[tuple[int, int], StudyPageMark] = {
+        (i, 6): "pass" if 0.005 <= r.share <= 0.995 else "warn"
+        for i, r in enumerate(estimates)
+        if r.kind == "estimate"
     }
     return Section(
-        "The lens" if isinstance(result.problem.levels, Rings) else "The sensor", text, columns, rows, marks=marks
+        "The lens" if isinstance(result.problem.levels, Rings) else "The sensor",
+        text,
+        columns,
+        rows,
+        marks=marks,
     )
 
 
 def _models(result: CalibrationResult) -> Section:
-    text = """The posterior with a linear response, and with responses of one and of two more terms, each with its 90 %
-        interval. The stated value is the mean of the two models with the most terms. The stated standard deviation is
-        the larger one of both models and half the distance of both values, added in quadrature. The interval of a
-        single model is too narrow."""
+    text = """The posterior with a linear response, and with responses of one and of two more terms,
+        each with its 90 % interval. The stated value is the mean of the two models with the most
+        terms. The stated standard deviation is the larger one of both models and half the distance
+        of both values, added in quadrature. The interval of a single model is too narrow."""
     columns = (
         "parameter",
         *(f"{n} term{'s' * (n != 1)}" for n in range(len(result.models[0].models))),
@@ -231,17 +481,26 @@ def _between(interval: IntervalEstimate) -> str:
 
 def _checks(result: CalibrationResult) -> Section:
     rows = [(check.name, check.found, check.bar, check.mark) for check in result.checks]
-    marks: dict[tuple[int, int], Mark] = {(i, 3): check.mark for i, check in enumerate(result.checks)}
+    marks: dict[tuple[int, int], StudyPageMark] = {
+        (i, 3): check.mark for i, check in enumerate(result.checks)
+    }
     count = count_failures(result.checks)
     text = f"{count} fail: the posterior is not fit for use." if count else "No check fails."
     return Section("Checks", text, ("check", "found", "bar", "holds"), rows, marks=marks)
 
 
 def _not_determined(result: CalibrationResult) -> Section:
-    text = """Singular values of the derivatives of the levels per standard deviation of the prior, computed before any
-        sampling. In a direction below 3 the prior constrains the parameters more than the frames do."""
+    text = """Singular values of the derivatives of the levels per standard deviation of the prior,
+        computed before any sampling. In a direction below 3 the prior constrains the parameters
+        more than the frames do."""
     strengths = result.identifiability.strengths
     directions = [line for line in result.identifiability.directions if line != RELATIVE]
-    rows = list(zip(strengths, [""] * (len(strengths) - len(directions)) + [*directions], strict=True))
-    marks: dict[tuple[int, int], Mark] = {(i, 0): "warn" if text else "pass" for i, (_, text) in enumerate(rows)}
-    return Section("What the levels determine", text, ("strength", "not determined"), rows, marks=marks)
+    rows = list(
+        zip(strengths, [""] * (len(strengths) - len(directions)) + [*directions], strict=True)
+    )
+    marks: dict[tuple[int, int], StudyPageMark] = {
+        (i, 0): "warn" if text else "pass" for i, (_, text) in enumerate(rows)
+    }
+    return Section(
+        "What the levels determine", text, ("strength", "not determined"), rows, marks=marks
+    )

@@ -1,14 +1,9 @@
-"""Sampling of a sensor's posterior with emcee: four ensembles of walkers, until the chains are long enough.
-
-Only this file and `ensembles` import emcee. After each round all draws are written in emcee's HDF5 format, behind a
-seal in the first bytes, which HDF5 leaves to its users. A killed run continues from the last round and gives the same
-draws, to the last bit, as a run that never stopped. Chains whose file has no right seal start anew.
-"""
+"""Sampling of a posterior with emcee, by ensembles of walkers, until chains are long enough."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,23 +12,183 @@ from typing import TYPE_CHECKING, Any
 import emcee
 import numpy as np
 
-from neusee.nodes.array_bytes import hdf5_needs
-from neusee.nodes.input_size import bytes_of
-from neusee.workflows.calibration.ensembles import Walk, walk_until
-from neusee.workflows.calibration.guided_move import GuidedMove
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import LaplaceFit
-from neusee.workflows.keys.seal import seal_file, unseal_file
+from neusee.nodes.file_headers import hdf5_needs
+from neusee.nodes.input_files import bytes_of
+from neusee.workflows.calibration.log_posterior import LaplaceFit, SensorPosterior
+from neusee.workflows.calibration.posterior_mixture import Density
+from neusee.workflows.keys.sealed_files import seal_file, unseal_file
 from neusee.workflows.report.study_folder import Progress, silent
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.importance_sampling import Guide
     from neusee.workflows.calibration.log_posterior import FloatArray
 
+
+# --- ensembles ------------------------------------------------------------------------------------
+
+# Ensembles of walkers that advance together, so that one call evaluates the proposals of all
+# ensembles.
+#
+# Each ensemble has emcee's moves and its own random stream. The draws are exactly those of emcee's
+# `EnsembleSampler`, which evaluates one ensemble after another in a loop over walkers. A likelihood
+# of few numbers takes as long for one ensemble as for four, and less time than the loop of emcee.
+
+
+#: returns the log density (walker,) at (walker, free), never NaN
+Weigh = Callable[["FloatArray"], "FloatArray"]
+
+
+class Walk:
+    """An ensemble of walkers, with the draws, the move and the random stream of the ensemble."""
+
+    def __init__(
+        self,
+        backend: Any,
+        move: Any,
+        random: np.random.RandomState,
+        initial_theta: FloatArray | None,
+    ) -> None:
+        self.backend = backend  #: emcee's backend in memory, with all steps so far
+        self.move, self.random = move, random
+        self.initial_theta = initial_theta  #: (walker, free) before the first step; None after it
+
+    @property
+    def iteration(self) -> int:
+        """Return the number of steps that the walkers have made."""
+        return int(self.backend.iteration)
+
+    def prepare(self, steps: int, weigh: Weigh) -> None:
+        """Reserve memory for ``steps`` more steps of the walkers, and load their state after the
+        last step.
+        """
+        if self.initial_theta is not None and self.iteration == 0:
+            self._state = emcee.State(self.initial_theta.copy(), log_prob=weigh(self.initial_theta))
+        else:
+            self._state = emcee.State(self.backend.get_last_sample(), copy=True)
+        self.backend.grow(steps, None)
+
+    def begin_step(self) -> None:
+        """Split the walkers into parts for one step; the proposals for each part depend on the
+        other parts.
+        """
+        self.random.random_sample()  # emcee draws one of several moves with this number
+        self.move.setup(self._state.coords)
+        self._part = np.arange(len(self._state.coords)) % self.move.nsplits
+        if self.move.randomize_split:
+            self.random.shuffle(self._part)
+        self._accepted = np.zeros(len(self._part), dtype=bool)
+
+    def propose(self, split: int) -> FloatArray:
+        """Return the proposed coordinates (walker, free parameter) for one part of the walkers."""
+        sets = [self._state.coords[self._part == other] for other in range(self.move.nsplits)]
+        others = sets[:split] + sets[split + 1 :]
+        self._proposed, self._factors = self.move.get_proposal(sets[split], others, self.random)
+        proposed: FloatArray = self._proposed
+        return proposed
+
+    def decide(self, split: int, log: FloatArray) -> None:
+        """Accept or reject the proposed coordinates of one part of the walkers."""
+        own = np.flatnonzero(self._part == split)
+        gain = self._factors + log - self._state.log_prob[own]
+        accepted = gain > np.log(self.random.rand(len(own)))
+        moved = own[accepted]
+        self._state.coords[moved], self._state.log_prob[moved] = (
+            self._proposed[accepted],
+            log[accepted],
+        )
+        self._accepted[moved] = True
+
+    def end_step(self) -> None:
+        """Add the walkers' coordinates after this step to the draws."""
+        self.backend.save_step(self._state, self._accepted)
+
+    def rest(self) -> None:
+        """Store the state of the random stream, so that a later run can continue from this
+        state.
+        """
+        self.backend.random_state = self.random.get_state()
+
+
+def walk_until(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
+    """Advance the ensembles until each has ``steps`` steps; ensembles with the fewest steps go
+    first.
+    """
+    while (now := min(walk.iteration for walk in walks)) < steps:
+        behind = [walk for walk in walks if walk.iteration == now]
+        until = min([steps, *(walk.iteration for walk in walks if walk.iteration > now)])
+        _together(behind, until - now, weigh)
+
+
+def _together(walks: Sequence[Walk], steps: int, weigh: Weigh) -> None:
+    for walk in walks:
+        walk.prepare(steps, weigh)
+    for _ in range(steps):
+        for walk in walks:
+            walk.begin_step()
+        for split in range(walks[0].move.nsplits):
+            log = weigh(np.concatenate([walk.propose(split) for walk in walks]))
+            for walk, own in zip(walks, np.split(log, len(walks)), strict=True):
+                walk.decide(split, own)
+        for walk in walks:
+            walk.end_step()
+    for walk in walks:
+        walk.rest()
+
+
+# --- guided move ----------------------------------------------------------------------------------
+
+# A move of walkers that also proposes places from a density like the posterior, whatever the
+# walkers' own places.
+
+
+_SHARE = 0.8  #: of the proposals that come from the density
+
+
+class GuidedMove:
+    """A move of emcee that proposes some of the new places from a density, by which walkers also
+    change modes.
+
+    Each proposal has the factor of Metropolis and Hastings, so that the chains have the posterior
+    as their limit, however well or badly the density agrees with it.
+    """
+
+    def __init__(self, move: Any, density: Density) -> None:
+        self.move, self.density = move, density
+        self.nsplits, self.randomize_split = move.nsplits, move.randomize_split
+
+    def setup(self, places: FloatArray) -> None:
+        """Prepare the move of emcee for walkers at ``places``."""
+        self.move.setup(places)
+
+    def get_proposal(
+        self, own: FloatArray, others: Sequence[FloatArray], random: np.random.RandomState
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return proposed places (walker, free), and the logarithm of the factor of each in its
+        acceptance.
+        """
+        proposed, factors = self.move.get_proposal(own, others, random)
+        drawn, ratio = self.density.propose(own, random)
+        guided = random.random_sample(len(own)) < _SHARE
+        return np.where(guided[:, None], drawn, proposed), np.where(guided, ratio, factors)
+
+
+# --- emcee sampler --------------------------------------------------------------------------------
+
+# Sampling of a sensor's posterior with emcee: four ensembles of walkers, until the chains are long
+# enough.
+#
+# Only this file and `emcee_sampler` import emcee. After each round all draws are written in emcee's
+# HDF5 format, behind a seal in the first bytes, which HDF5 leaves to its users. A killed run
+# continues from the last round and gives the same draws, to the last bit, as a run that never
+# stopped. Chains whose file has no right seal start anew.
+
+
 ENSEMBLES = 4
 STRANDED = 20.0  #: nats by which the median of a stranded walker lies below that of all walkers
-_FIRST, _GROWTH, _LONGEST = 250, 1.25, 32_000  #: steps of the first round; growth by round; most steps
-_TAUS, _CHANGE = 50.0, 0.01  #: least length of a chain in tau, and the largest change of tau in its last round
+#: steps of the first round; growth by round; most steps
+_FIRST, _GROWTH, _LONGEST = 250, 1.25, 32_000
+#: least length of a chain in tau, and the largest change of tau in its last round
+_TAUS, _CHANGE = 50.0, 0.01
 _SURELY = 100.0  #: length of a chain in tau at which any change of tau is allowed
 _BESIDE = 5.0  #: nats for each parameter by which a starting point may lie below the mode
 _SEAL = 512  #: bytes of the seal in front of the draws
@@ -59,13 +214,15 @@ class Chains:
 
 
 def move(name: str) -> Any:
-    """Return emcee's move with the name ``de`` or ``stretch``; raise `ValueError` for any other name."""
+    """Return emcee's move with the name ``de`` or ``stretch``; raise `ValueError` for any other
+    name.
+    """
     if name in _MOVES:
         return _MOVES[name]()
     if "snooker" in name.lower():
         raise ValueError(
-            "DESnookerMove of emcee up to 3.1.6 draws from a distribution that is 18 % too narrow (emcee's pull "
-            "request 531 corrects it): use de or stretch"
+            "DESnookerMove of emcee up to 3.1.6 draws from a distribution that is 18 % too narrow"
+            " (emcee's pull request 531 corrects it): use de or stretch"
         )
     raise ValueError(f"unknown move {name!r}: write de or stretch")
 
@@ -77,30 +234,36 @@ def sample(
     *,
     seed: int,
     walkers: int = 64,
-    how: str = "de",
-    wanted: int = 1000,
+    move_name: str = "de",
+    effective_size: int = 1000,
     progress: Progress = silent,
     guide: Guide | None = None,
 ) -> Chains:
-    """Sample until each chain is 50 autocorrelation times long and the effective sample size is at least ``wanted``.
+    """Sample until each chain is 50 autocorrelation times long and the effective sample size is at
+    least ``effective_size``.
 
-    ``file`` keeps the draws; if the file exists, the chains continue from its last step. With a ``guide`` the walkers
-    start at its samples, and most of their proposals are from its density.
+    ``file`` keeps the draws; if the file exists, the chains continue from its last step. With a
+    ``guide`` the walkers start at its samples, and most of their proposals are from its density.
     """
-    moves = GuidedMove(move(how), guide.density) if guide else move(how)
-    runs = [start_ensemble(problem, mode, file, index, seed, walkers, moves, guide) for index in range(ENSEMBLES)]
+    moves = GuidedMove(move(move_name), guide.density) if guide else move(move_name)
+    runs = [
+        start_ensemble(problem, mode, file, index, seed, walkers, moves, guide)
+        for index in range(ENSEMBLES)
+    ]
     before, steps = _round(min(run.iteration for run in runs))
-    tau_before, kept = _longest_time(runs, before) if before else np.inf, True
+    tau_before, stored = _longest_time(runs, before) if before else np.inf, True
     while True:
         walk_until(runs, steps, problem.log_posterior)
-        kept = _keep(file, [run.backend for run in runs], progress if kept else silent)
+        stored = _keep(file, [run.backend for run in runs], progress if stored else silent)
         tau = _longest_time(runs)
-        change = abs(tau - tau_before) / tau
-        long = steps >= (_TAUS + _BURN) * tau and (change < _CHANGE or steps >= (_SURELY + _BURN) * tau)
-        chains = _gathered(runs, tau, steps, long)
+        chains = _gathered(runs, tau, steps, _are_long(steps, tau, tau_before))
         size = chains.flat.shape[0] / tau
-        ends = (long and size >= wanted) or steps >= _LONGEST
-        needed = steps if ends else max(int(_GROWTH * steps), _steps_needed(steps, tau, size, wanted))
+        ends = _are_enough(chains, size, effective_size)
+        needed = (
+            steps
+            if ends
+            else max(int(_GROWTH * steps), _steps_needed(steps, tau, size, effective_size))
+        )
         where = f"{steps} of about {needed} steps of {ENSEMBLES} x {walkers} walkers"
         progress(f"{where}: tau {tau:.1f}, effective sample size {size:.0f}")
         if ends:
@@ -108,9 +271,22 @@ def sample(
         tau_before, steps = tau, int(_GROWTH * steps)
 
 
-def _steps_needed(steps: int, tau: float, size: float, wanted: int) -> int:
-    """Return how many steps the chains need in all, if autocorrelation time and rate of draws stay as they are."""
-    return min(int(max((_TAUS + _BURN) * tau, steps * wanted / max(size, 1.0))), _LONGEST)
+def _are_long(steps: int, tau: float, tau_before: float) -> bool:
+    """Return True if the chains are many autocorrelation times long, and this time is settled."""
+    change = abs(tau - tau_before) / tau
+    return steps >= (_TAUS + _BURN) * tau and (change < _CHANGE or steps >= (_SURELY + _BURN) * tau)
+
+
+def _are_enough(chains: Chains, size: float, effective_size: int) -> bool:
+    """Return True if the sampling ends: chains are long and draws many, or nothing helps."""
+    return (chains.long and size >= effective_size) or chains.steps >= _LONGEST
+
+
+def _steps_needed(steps: int, tau: float, size: float, effective_size: int) -> int:
+    """Return how many steps the chains need in all, if autocorrelation time and rate of draws
+    stay as they are.
+    """
+    return min(int(max((_TAUS + _BURN) * tau, steps * effective_size / max(size, 1.0))), _LONGEST)
 
 
 def _longest_time(runs: Sequence[Walk], steps: int | None = None) -> float:
@@ -118,7 +294,9 @@ def _longest_time(runs: Sequence[Walk], steps: int | None = None) -> float:
 
 
 def _round(iteration: int) -> tuple[int, int]:
-    """Return the numbers of steps at which two successive rounds of sampling end, before and after ``iteration``."""
+    """Return the numbers of steps at which two successive rounds of sampling end, before and
+    after ``iteration``.
+    """
     before, steps = 0, _FIRST
     while steps < iteration:
         before, steps = steps, int(_GROWTH * steps)
@@ -135,7 +313,9 @@ def start_ensemble(
     moves: Any,
     guide: Guide | None = None,
 ) -> Walk:
-    """Return an ensemble that continues the draws in ``file``, or starts near the mode or at samples of the guide."""
+    """Return an ensemble that continues the draws in ``file``, or starts near the mode or at
+    samples of the guide.
+    """
     dimensions = len(problem.names)
     backend = _read(file, index)
     if backend is not None and backend.shape == (walkers, dimensions):
@@ -150,8 +330,12 @@ def start_ensemble(
     return Walk(backend, moves, random, start)
 
 
-def _alive(problem: SensorPosterior, mode: LaplaceFit, walkers: int, rng: np.random.Generator) -> FloatArray:
-    """Return starting points (walker, parameter) near the posterior mode, where the posterior is not almost zero."""
+def _alive(
+    problem: SensorPosterior, mode: LaplaceFit, walkers: int, rng: np.random.Generator
+) -> FloatArray:
+    """Return starting points (walker, parameter) near the posterior mode, where the posterior is
+    not almost zero.
+    """
     points = np.empty((0, len(mode.theta)))
     for _ in range(50):
         drawn = mode.draw(4 * walkers, rng)
@@ -160,19 +344,24 @@ def _alive(problem: SensorPosterior, mode: LaplaceFit, walkers: int, rng: np.ran
         if len(points) >= walkers:
             return points[:walkers]
     raise ValueError(
-        "samples around the mode have almost no posterior density, so no chain can start there: give narrower priors"
+        "samples around the mode have almost no posterior density, so no chain can start there:"
+        " give narrower priors"
     )
 
 
 def autocorrelation_time(chain: FloatArray) -> float:
-    """Return the longest autocorrelation time of the coordinates in a chain (step, walker, parameter)."""
+    """Return the longest autocorrelation time of the coordinates in a chain (step, walker,
+    parameter).
+    """
     with np.errstate(invalid="ignore"):
         tau = float(np.max(emcee.autocorr.integrated_time(chain, tol=0, has_walkers=True)))
     return tau if np.isfinite(tau) else float(len(chain))  # NaN for walkers that never move
 
 
 def stranded(log: FloatArray) -> int:
-    """Return the number of walkers whose log posterior ``log`` (..., step, walker) is far below that of the others."""
+    """Return the number of walkers whose log posterior ``log`` (..., step, walker) is far below
+    that of the others.
+    """
     middle = np.median(log, -2)
     return int((middle < np.median(middle) - STRANDED).sum())
 
@@ -186,7 +375,8 @@ def _gathered(runs: Sequence[Walk], tau: float, steps: int, long: bool) -> Chain
 
 
 def _read(file: Path, index: int) -> Any:
-    """Read the draws of an ensemble into a backend in memory; return None if the file cannot be read or trusted.
+    """Read the draws of an ensemble into a backend in memory; return None if the file cannot be
+    read or trusted.
 
     A copy is read, because the file may be replaced after its signature was compared.
     """
@@ -203,14 +393,14 @@ def _read(file: Path, index: int) -> Any:
 
 
 def _unpacked(file: Path, index: int) -> Any:
-    kept = emcee.backends.HDFBackend(str(file), name=f"ensemble{index}", read_only=True)
+    stored = emcee.backends.HDFBackend(str(file), name=f"ensemble{index}", read_only=True)
     memory = emcee.backends.Backend()
-    with kept.open() as opened:
-        hdf5_needs(file, [opened[kept.name]])
-    memory.reset(*kept.shape)
-    memory.chain, memory.log_prob = kept.get_chain(), kept.get_log_prob()
-    memory.accepted, memory.iteration = kept.accepted, kept.iteration
-    memory.random_state = kept.random_state
+    with stored.open() as opened:
+        hdf5_needs(file, [opened[stored.name]])
+    memory.reset(*stored.shape)
+    memory.chain, memory.log_prob = stored.get_chain(), stored.get_log_prob()
+    memory.accepted, memory.iteration = stored.accepted, stored.iteration
+    memory.random_state = stored.random_state
     np.random.RandomState().set_state(memory.random_state)
     return memory
 
@@ -218,12 +408,21 @@ def _unpacked(file: Path, index: int) -> Any:
 def _is_whole(memory: Any) -> bool:
     """Return True if draws and log densities of every step are there and are numbers."""
     steps = memory.iteration
-    shapes = memory.chain.shape == (steps, *memory.shape) and memory.log_prob.shape == (steps, memory.shape[0])
-    return steps > 0 and shapes and bool(np.isfinite(memory.chain).all() and np.isfinite(memory.log_prob).all())
+    shapes = memory.chain.shape == (steps, *memory.shape) and memory.log_prob.shape == (
+        steps,
+        memory.shape[0],
+    )
+    return (
+        steps > 0
+        and shapes
+        and bool(np.isfinite(memory.chain).all() and np.isfinite(memory.log_prob).all())
+    )
 
 
 def _keep(file: Path, backends: Sequence[Any], progress: Progress) -> bool:
-    """Write the draws to a file; if this fails, for example on a full disk, report the error and return False."""
+    """Write the draws to a file; if this fails, for example on a full disk, report the error and
+    return False.
+    """
     try:
         _write(file, backends)
     except (OSError, RuntimeError) as error:  # h5py raises both
@@ -235,22 +434,23 @@ def _keep(file: Path, backends: Sequence[Any], progress: Progress) -> bool:
 def _write(file: Path, backends: Sequence[Any]) -> None:
     """Write the draws of all ensembles to one file with an atomic rename.
 
-    HDF5 writes to a temporary folder first, because after an error of the disk it can no longer close its file.
+    HDF5 writes to a temporary folder first, because after an error of the disk it can no longer
+    close its file.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_suffix(f".{os.getpid()}.part")
+    temporary = file.with_suffix(f".{os.getpid()}.part")
     try:
         with TemporaryDirectory(prefix="neusee-") as folder:
-            whole = Path(folder) / "draws.h5"
-            _write_draws(whole, backends)
-            content = whole.read_bytes()[_SEAL:]
-        with open(part, "wb") as written:
+            draws_file = Path(folder) / "draws.h5"
+            _write_draws(draws_file, backends)
+            content = draws_file.read_bytes()[_SEAL:]
+        with open(temporary, "wb") as written:
             written.write(seal_file("draws", file.stem, content).ljust(_SEAL, b"\0") + content)
             written.flush()
             os.fsync(written.fileno())
-        os.replace(part, file)
+        os.replace(temporary, file)
     finally:
-        part.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
 
 
 def _write_draws(path: Path, backends: Sequence[Any]) -> None:
@@ -260,11 +460,11 @@ def _write_draws(path: Path, backends: Sequence[Any]) -> None:
     with h5py.File(path, "w", userblock_size=_SEAL):
         pass
     for index, memory in enumerate(backends):
-        kept = emcee.backends.HDFBackend(str(path), name=f"ensemble{index}")
-        kept.reset(*memory.shape)
-        kept.grow(memory.iteration, None)
-        with kept.open("a") as opened:
-            group = opened[kept.name]
+        backend = emcee.backends.HDFBackend(str(path), name=f"ensemble{index}")
+        backend.reset(*memory.shape)
+        backend.grow(memory.iteration, None)
+        with backend.open("a") as opened:
+            group = opened[backend.name]
             group["chain"][...], group["log_prob"][...] = memory.chain, memory.log_prob
             group["accepted"][...] = memory.accepted
             group.attrs["iteration"] = memory.iteration

@@ -1,12 +1,13 @@
-"""Tests of the frames of a calibration before any likelihood, and what follows from these tests for the posterior."""
+"""Tests of the frames of a calibration, and intervals from several response models."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Container, Iterable, Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 
 from neusee.nodes.calibrate import (
@@ -20,27 +21,192 @@ from neusee.nodes.calibrate import (
     open_errors,
 )
 from neusee.nodes.values import Levels
-from neusee.workflows.calibration.log_posterior import SensorPosterior, only_step
-from neusee.workflows.calibration.model_spread import IntervalEstimate, ModelSpread
+from neusee.workflows.calibration.importance_sampling import draw_samples, weights
+from neusee.workflows.calibration.log_posterior import (
+    SensorPosterior,
+    initial_theta,
+    only_step,
+    search_mode,
+)
 from neusee.workflows.calibration.posterior_checks import Check
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.recipe.distributions.joint import Z_90
+from neusee.workflows.recipe.distributions.joint_distribution import Z_90
 from neusee.workflows.report.study_page import Mark, Section
 from neusee.workflows.store.result_store import Store
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.emcee_sampler import Chains
 
-_MARKS: dict[str, Mark] = {"passed": "pass", "modelled": "pass", "widened": "warn", "refused": "fail"}
+
+# --- model spread ---------------------------------------------------------------------------------
+
+# Parameter intervals for a camera of unknown response, from posteriors with several models of the
+# response.
+
+
+TERMS = ("bend", "twist")  #: terms of the response, in the order in which models add them
+
+
+@dataclass(frozen=True)
+class IntervalEstimate:
+    """The value of a parameter and its central 90 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def holds(self, value: float) -> bool:
+        """Return True if the interval contains ``value``."""
+        return self.low <= value <= self.high
+
+
+@dataclass(frozen=True)
+class ModelSpread:
+    """The posterior of one parameter with each model of the camera's response, and the interval
+    to report.
+    """
+
+    name: str
+    #: the posterior with 0, 1, 2 terms of the response, as far as they are free
+    models: tuple[IntervalEstimate, ...]
+    stated: IntervalEstimate
+
+
+_Posterior = dict[str, tuple[float, float]]  #: mean and standard deviation of each coordinate
+
+
+def compare_models(recipe: Recipe, store: Store, seed: int = 0) -> list[ModelSpread]:
+    """Return the posterior with each model of the camera's response and the interval to report, for
+    each parameter.
+
+    The stated value is the mean of the two models with the most terms. The stated width is the
+    standard deviation of this mean (`width_of_mean`) and half the distance of both values, added in
+    quadrature.
+
+    One model is not enough. For 36 simulated cameras a response with 1 million pixels a level,
+    cubic by 5 % at 4095 DN, the 90 % interval of two terms contained the true gain in 44 % of all
+    cases. Models weighted by their probability at the mode were no better, because the best of
+    several wrong models takes all weight. For a power of 6 the share was 81 %. Half the distance of
+    all three models contained the true gain in 94 % and more, but with twice the standard deviation
+    (1.7 % to 1.0 %; for a linear bend 1.1 % to 0.24 %), because the straight line counts although
+    the levels have refuted it. The mean of two models contained the true gain in 94 % and more, for
+    a linear camera too.
+
+    Raises: `ValueError` if there are too few levels, no mode is found, or the effective sample size
+            is too small.
+    """
+    full = SensorPosterior.of(recipe, store)
+    if not isinstance(full.levels, Levels):
+        raise ValueError(
+            f"the likelihood of {recipe.name} assumes identical pixels: use the node"
+            " calibrate.camera instead"
+        )
+    terms = [name for name in TERMS if name in full.names]
+    _check_levels(full, full.levels, terms)
+    rng = np.random.default_rng(seed)
+    models = [_without(recipe, full.step, terms[count:]) for count in range(len(terms) + 1)]
+    problems = [SensorPosterior.of(model, store) for model in models]
+    posteriors = [_posterior(problem, rng) for problem in problems]
+    return [_spread(name, problems[0], posteriors) for name in problems[0].names]
+
+
+def _check_levels(problem: SensorPosterior, levels: Levels, terms: list[str]) -> None:
+    """Raise `ValueError` if too few lit levels exist to tell the non-linear response ``terms`` from
+    lamp drift.
+
+    For 60 simulated cameras and two terms, 90 % intervals contained the truth in 93 % with 4 lit
+    levels, and in 58 % with 2 lit levels.
+    """
+    fitted = problem.likelihood(initial_theta(problem)[None]).degrees_of_freedom > 0
+    lit = len(set(levels.photons[fitted & (levels.photons > 0)].tolist()))
+    if lit < len(terms) + 2:
+        raise ValueError(
+            f"{lit} lit levels do not separate a response of {len(terms)} terms from a drifting"
+            f" lamp: give {len(terms) + 2} or more levels of different light below saturation, or"
+            f" fix {' and '.join(terms[max(0, lit - 2) :])} at 0"
+        )
+
+
+def _without(recipe: Recipe, weighing: str, terms: list[str]) -> Recipe:
+    """Return the recipe with the response ``terms`` fixed at zero in the prior and the
+    likelihood step ``weighing``.
+    """
+    steps = dict(recipe.steps)
+    for name, step in steps.items():
+        if step.node.path == "calibrate.camera_prior":
+            steps[name] = replace(step, params={**step.params, **dict.fromkeys(terms)})
+        elif name == weighing:
+            steps[name] = replace(step, params={**step.params, **dict.fromkeys(terms, 0.0)})
+    return replace(recipe, steps=steps)
+
+
+def _posterior(problem: SensorPosterior, rng: np.random.Generator) -> _Posterior:
+    mode = search_mode(problem)
+    if not mode.settled:
+        raise ValueError(
+            f"no posterior mode of {', '.join(problem.names)} was found: give narrower priors"
+        )
+    samples, log = draw_samples(problem, mode, rng)
+    weight = weights(log)
+    centre = weight @ samples
+    width = np.sqrt(weight @ (samples - centre) ** 2)
+    return dict(zip(problem.names, zip(centre.tolist(), width.tolist(), strict=True), strict=True))
+
+
+def _spread(name: str, problem: SensorPosterior, posteriors: list[_Posterior]) -> ModelSpread:
+    linear = name in problem.coordinates.linear
+    models = [posterior[name] for posterior in posteriors]
+    (low, narrow), (high, wide) = models[-2:] if len(models) > 1 else models * 2
+    middle, width = 0.5 * (low + high), math.hypot(width_of_mean(narrow, wide), 0.5 * (high - low))
+    return ModelSpread(
+        name, tuple(_interval(*model, linear) for model in models), _interval(middle, width, linear)
+    )
+
+
+def width_of_mean(fewer: float, richer: float) -> float:
+    """Return the standard deviation of the mean of the values that two nested models give for the
+    same levels.
+
+    ``fewer`` and ``richer`` are the widths of the posteriors with fewer and with more terms. An
+    efficient estimate and its difference to any other unbiased estimate of the same data are
+    independent, so that the difference has the variance more^2 - fewer^2, and the mean has fewer^2
+    and a quarter of that. The wider posterior alone was too wide: for 24 simulated cameras the
+    errors of the gain scatter by 0.68 of it, and by 0.82 of what is stated now.
+
+    Source: Hausman, Econometrica 46, 1251 (1978), for the variance of the difference.
+    """
+    difference = max(0.0, richer**2 - fewer**2)
+    return math.sqrt(fewer**2 + difference / 4)
+
+
+def _interval(centre: float, width: float, linear: bool) -> IntervalEstimate:
+    ends = [centre, centre - Z_90 * width, centre + Z_90 * width]
+    return IntervalEstimate(*(ends if linear else [float(np.exp(x)) for x in ends]))
+
+
+# --- frame validity -------------------------------------------------------------------------------
+
+# Tests of the frames of a calibration before any likelihood, and what follows from these tests for
+# the posterior.
+
+
+_MARKS: dict[str, Mark] = {
+    "passed": "pass",
+    "modelled": "pass",
+    "widened": "warn",
+    "refused": "fail",
+}
 _NOISES = ("read_noise", "temporal_dark_noise")
-_IN_ELECTRONS = (*_NOISES, "offset", "dark_current", "full_well", "quantum_efficiency")  #: inversely to the gain
+#: inversely to the gain
+_IN_ELECTRONS = (*_NOISES, "offset", "dark_current", "full_well", "quantum_efficiency")
 _SMALL = 1e-5  #: relative error below which no interval is widened
 _LIKELIHOODS = ("calibrate.density", "calibrate.camera", "calibrate.stray_light")
 
 
 def inspect_recipe(recipe: Recipe, store: Store) -> list[FrameTest]:
-    """Return the tests of the frames that the likelihood of a recipe describes; none for a picture of a point source.
+    """Return the tests of the frames that the likelihood of a recipe describes; none for a picture
+    of a point source.
 
     Of a table of moments only the dark noise is tested.
     """
@@ -58,7 +224,9 @@ def inspect_recipe(recipe: Recipe, store: Store) -> list[FrameTest]:
 
 
 def _share(weighing: Step, steps: Sequence[Step]) -> float | None:
-    """Return the share of saturation above which the likelihood leaves levels out, or None if it uses all levels."""
+    """Return the share of saturation above which the likelihood leaves levels out, or None if it
+    uses all levels.
+    """
     reduced = next((step for step in steps if step.node.path == "calibrate.sufficient"), weighing)
     share = reduced.params.get("share")
     return None if share is None else float(share)
@@ -71,7 +239,7 @@ def _upstream(recipe: Recipe, step: Step) -> Iterator[Step]:
         sources = recipe.steps[new.pop()].sources
         new += [name for name in sources if name not in names]
         names.update(sources)
-    return (each for name, each in recipe.steps.items() if name in names)
+    return (source for name, source in recipe.steps.items() if name in names)
 
 
 def _stacks(recipe: Recipe, store: Store, steps: Sequence[Step]) -> Iterator[Stack]:
@@ -85,15 +253,21 @@ def _stacks(recipe: Recipe, store: Store, steps: Sequence[Step]) -> Iterator[Sta
                 yield Stack(name, photons, exposure, scatter, frames)
 
 
-def frames_and_mask(recipe: Recipe, store: Store, step: Step) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """Return the frames that a step of `calibrate.reduce` receives, and the mask of its hot pixels if it has one."""
+def frames_and_mask(
+    recipe: Recipe, store: Store, step: Step
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """Return the frames that a step of `calibrate.reduce` receives, and the mask of its hot
+    pixels if it has one.
+    """
     source, mask = str(step.wires["frames"]), step.wires.get("mask")
     values = run(recipe, store, (source, str(mask)) if mask else (source,)).values
     return values[source], values[str(mask)] if mask else None
 
 
 def lines(tests: Sequence[FrameTest]) -> Iterator[str]:
-    """Yield a line for each test of frames that has something to say, and one for all that passed."""
+    """Yield a line for each test of frames that has something to say, and one for all that
+    passed.
+    """
     passed = [test for test in tests if test.verdict == "passed"]
     for test in tests:
         if test.verdict != "passed":
@@ -102,23 +276,32 @@ def lines(tests: Sequence[FrameTest]) -> Iterator[str]:
         yield f"frames: {len(passed)} of {len(tests)} tests passed"
 
 
-def frame_checks(tests: Sequence[FrameTest], given: bool = True) -> list[Check]:
-    """Return each test of frames as a check of the posterior, which fails if the frames are refused."""
-    found = [Check(t.name, f"{t.verdict}: {t.sentence}", _bar(t), _MARKS[t.verdict]) for t in tests]
-    if len(tests) < 2 and given:
+def frame_checks(tests: Sequence[FrameTest], has_frames: bool = True) -> list[Check]:
+    """Return each test of frames as a check of the posterior, which fails if the frames are
+    refused.
+    """
+    checks = [
+        Check(t.name, f"{t.verdict}: {t.sentence}", _bar(t), _MARKS[t.verdict]) for t in tests
+    ]
+    if len(tests) < 2 and has_frames:
         text = "only moments are given: noise, patterns and numbers of the frames are not tested"
-        found.append(Check("the frames are tested", text, "frames in the recipe", "warn"))
-    return found
+        checks.append(Check("the frames are tested", text, "frames in the recipe", "warn"))
+    return checks
 
 
 def hidden_checks(tests: Sequence[FrameTest], may_hide: Container[str]) -> list[Check]:
-    """Return what faults that the frames have or may hide leave open, as a check that cannot fail."""
+    """Return what faults that the frames have or may hide leave open, as a check that cannot
+    fail.
+    """
     hidden = hidden_faults(tests, may_hide)
     if not hidden:
         return []
     words = [f"{name} by {100 * size:.2g} %" for name, size in open_errors(hidden).items() if size]
     faults = " and ".join(sorted({fault.fault for fault in hidden}))
-    bar = "more pixels hide less; a fault that the camera cannot have is `none` in the step of the priors"
+    bar = (
+        "more pixels hide less; a fault that the camera cannot have is `none` in the step of the"
+        " priors"
+    )
     text = f"{' and '.join(words)}, which the frames show or may hide; nothing is corrected"
     return [Check(f"intervals include {faults}", text, bar, "pass")]
 
@@ -132,27 +315,42 @@ def data_check(pairs: float) -> Check:
     text = f"{pairs:.3g} pairs of pixels in the lit levels of the fit"
     enough = pairs >= CLEAN_PAIRS
     if not enough:
-        text += ": intervals are wider than by statistics alone, because so few may hide mixing and lag"
+        text += (
+            ": intervals are wider than by statistics alone, because so few may hide mixing and lag"
+        )
     bar = f"at least {CLEAN_PAIRS:.2g}, such as 10 levels of 2 frames of {side} x {side} pixels"
     return Check("the frames are numerous enough", text, bar, "pass" if enough else "warn")
 
 
 def _bar(test: FrameTest) -> str:
-    return f"{abs(test.number):.3g}, {'at least' if test.limit < 0 else 'at most'} {abs(test.limit):.3g}"
+    return (
+        f"{abs(test.number):.3g}, {'at least' if test.limit < 0 else 'at most'}"
+        f" {abs(test.limit):.3g}"
+    )
 
 
 def frame_section(tests: Sequence[FrameTest]) -> Section:
     """Return the section of a calibration's page with the tests of its frames."""
-    text = """Each test asks if the frames are such as the likelihood describes. Modelled: the likelihood describes it.
-        Widened: the intervals include the error that may follow, and no value is corrected. Refused: the error may
-        exceed 2 %, or is unknown. Only levels that the fit uses are tested.
-        Numbers and limits of noise and patterns are in standard deviations of chance; all tests together fail for
-        frames without fault in less than 2 % of all measurements."""
+    text = """Each test asks if the frames are such as the likelihood describes. Modelled: the
+        likelihood describes it. Widened: the intervals include the error that may follow, and no
+        value is corrected. Refused: the error may exceed 2 %, or is unknown. Only levels that the
+        fit uses are tested. Numbers and limits of noise and patterns are in standard deviations of
+        chance; all tests together fail for frames without fault in less than 2 % of all
+        measurements."""
     if len(tests) < 2:
-        text = "Only moments are given, so that noise, patterns and numbers of the frames are not tested."
+        text = (
+            "Only moments are given, so that noise, patterns and numbers of the frames are not"
+            " tested."
+        )
     rows = [(t.name, abs(t.number), abs(t.limit), t.verdict, t.sentence) for t in tests]
     marks: dict[tuple[int, int], Mark] = {(i, 3): _MARKS[t.verdict] for i, t in enumerate(tests)}
-    return Section("The frames", text, ("test", "number", "limit", "verdict", "what it says"), rows, marks=marks)
+    return Section(
+        "The frames",
+        text,
+        ("test", "number", "limit", "verdict", "what it says"),
+        rows,
+        marks=marks,
+    )
 
 
 def as_rows(tests: Iterable[FrameTest]) -> list[dict[str, Any]]:
@@ -161,18 +359,32 @@ def as_rows(tests: Iterable[FrameTest]) -> list[dict[str, Any]]:
 
 
 def hidden_faults(tests: Iterable[FrameTest], may_hide: Container[str]) -> list[Hidden]:
-    """Return the faults that change gain and noise: those that a test found, and those that ``may_hide`` from it."""
-    return [h for test in tests for h in test.hidden if test.verdict != "passed" or h.fault in may_hide]
+    """Return the faults that change gain and noise: those that a test found, and those that
+    ``may_hide`` from it.
+    """
+    faults: list[Hidden] = []
+    for test in tests:
+        failed = test.verdict != "passed"
+        faults += [hidden for hidden in test.hidden if failed or hidden.fault in may_hide]
+    return faults
 
 
 def relative_shifts(tests: Iterable[FrameTest]) -> dict[str, float]:
-    """Return the relative standard deviations of gain and of dark noise in DN that the tests of frames leave open."""
+    """Return the relative standard deviations of gain and of dark noise in DN that the tests of
+    frames leave open.
+    """
     tests = list(tests)
-    return {name: math.hypot(*(t.shifts.get(name, 0.0) for t in tests), 0.0) for name in ("gain", "noise")}
+    return {
+        name: math.hypot(*(t.shifts.get(name, 0.0) for t in tests), 0.0)
+        for name in ("gain", "noise")
+    }
 
 
-def widened(problem: SensorPosterior, chains: Chains, tests: Sequence[FrameTest], seed: int) -> Chains:
-    """Return the draws of a posterior with the errors that frames leave open, as independent normal draws.
+def widened(
+    problem: SensorPosterior, chains: Chains, tests: Sequence[FrameTest], seed: int
+) -> Chains:
+    """Return the draws of a posterior with the errors that frames leave open, as independent normal
+    draws.
 
     An error of the gain changes all values in electrons inversely. No mean is changed.
     """
@@ -181,7 +393,9 @@ def widened(problem: SensorPosterior, chains: Chains, tests: Sequence[FrameTest]
         return chains
     generator = torch.Generator().manual_seed(seed)
     normal = torch.randn(2, chains.log.size, generator=generator, dtype=torch.float64)
-    gain, noise = (errors[n] * x.view(chains.log.shape) for n, x in zip(("gain", "noise"), normal, strict=True))
+    gain, noise = (
+        errors[n] * x.view(chains.log.shape) for n, x in zip(("gain", "noise"), normal, strict=True)
+    )
     values = problem.parameters(chains.draws)
     if "gain" in values:
         values["gain"] = values["gain"] * gain.exp()
@@ -195,11 +409,16 @@ def widened_models(
 ) -> list[ModelSpread]:
     """Return the intervals to report with the errors that the frames leave open."""
     errors = errors_of_parameters(tests, may_hide)
-    return [replace(m, stated=wider(m.stated, errors[m.name])) if m.name in errors else m for m in models]
+    return [
+        replace(m, stated=wider(m.stated, errors[m.name])) if m.name in errors else m
+        for m in models
+    ]
 
 
 def open_by_tests(tests: Iterable[FrameTest], may_hide: Container[str]) -> dict[str, float]:
-    """Return the relative standard deviations of gain and of dark noise in DN that tests and hidden faults leave."""
+    """Return the relative standard deviations of gain and of dark noise in DN that tests and
+    hidden faults leave.
+    """
     tests = list(tests)
     hidden, shifts = open_errors(hidden_faults(tests, may_hide)), relative_shifts(tests)
     return {name: math.hypot(hidden[name], shifts[name]) for name in ("gain", "noise")}
@@ -217,6 +436,9 @@ def wider(interval: IntervalEstimate, shift: float) -> IntervalEstimate:
     if shift < _SMALL:
         return interval
     factors = [
-        math.exp(math.hypot(math.log(interval.value / end), Z_90 * shift)) for end in (interval.low, interval.high)
+        math.exp(math.hypot(math.log(interval.value / end), Z_90 * shift))
+        for end in (interval.low, interval.high)
     ]
-    return IntervalEstimate(interval.value, interval.value / factors[0], interval.value * factors[1])
+    return IntervalEstimate(
+        interval.value, interval.value / factors[0], interval.value * factors[1]
+    )

@@ -1,4 +1,6 @@
-"""Identifiability of a sensor's parameters: the parameters that the measured light levels determine."""
+"""Identifiability of a sensor's parameters: the parameters that the measured light levels
+determine.
+"""
 
 from __future__ import annotations
 
@@ -10,24 +12,32 @@ import numpy as np
 import torch
 
 from neusee.nodes.calibrate import Ridge
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import LaplaceFit
+from neusee.workflows.calibration.log_posterior import LaplaceFit, SensorPosterior
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.log_posterior import FloatArray
 
-WEAK = 3.0  #: ratio of the prior's standard deviation to that of the levels; below, the prior constrains more
+#: ratio of the prior's standard deviation to that of the levels; below, the prior constrains more
+WEAK = 3.0
 _PART = 0.1  #: least component with which a parameter counts as part of a direction of length 1
 _ALONE = 0.97  #: least component with which a direction counts as that of one parameter alone
-_WIDER = 1.25  #: largest factor by which doubled priors may widen the posterior of a determined parameter
-_FAR = 3.0  #: distance from the prior's middle, in standard deviations, at which the likelihood is compared
-_TELLS = 0.5  #: standard deviations of the prior by which a limit must lie inside that of the prior alone
+#: largest factor by which doubled priors may widen the posterior of a determined parameter
+_WIDER = 1.25
+#: distance from the prior's middle, in standard deviations, at which the likelihood is compared
+_FAR = 3.0
+#: standard deviations of the prior by which a limit must lie inside that of the prior alone
+_TELLS = 0.5
 _ENDS = (0.05, 0.95)
 _ALONE_DRAWS = 20_000  #: draws of the prior
 _FALLS = 4.0  #: nats by which the likelihood must fall at this distance to set a limit
 
-KINDS = {"estimate": "", "upper": "only an upper limit", "lower": "only a lower limit",
-         "between": "only limits on both sides", "none": "not from these frames"}  # fmt: skip
+KINDS = {
+    "estimate": "",
+    "upper": "only an upper limit",
+    "lower": "only a lower limit",
+    "between": "only limits on both sides",
+    "none": "not from these frames",
+}
 #: by parameter and kind: the reason why the frames set only a limit, or none
 _REASONS = {
     ("full_well", "lower"): ": no frame is saturated by the well",
@@ -41,7 +51,9 @@ _ELECTRONS = ("offset", "read_noise", "temporal_dark_noise", "dark_current", "fu
 
 @dataclass(frozen=True)
 class Identifiability:
-    """The parameters and parameter combinations that the measured light levels determine or leave to the prior."""
+    """The parameters and parameter combinations that the measured light levels determine or
+    leave to the prior.
+    """
 
     kinds: dict[str, str]  #: one of `KINDS` for each parameter
     directions: Sequence[str]  #: a sentence for each direction that the levels do not determine
@@ -60,21 +72,16 @@ class Identifiability:
 
 
 def identify(problem: SensorPosterior, mode: LaplaceFit) -> Identifiability:
-    """Find the parameters that the light levels determine, by singular values of the levels' derivatives."""
+    """Find the parameters that the light levels determine, by singular values of the levels'
+    derivatives.
+    """
     _, s, v = np.linalg.svd(mode.scaled_slopes)
     s = np.concatenate([s, np.zeros(len(v) - len(s))])
-    kinds = {n: "estimate" if own else "none" for n, own in zip(problem.names, _own(s, v), strict=True)}
+    kinds = {
+        n: "estimate" if own else "none" for n, own in zip(problem.names, _own(s, v), strict=True)
+    }
     weak = _sorted_out(v[s < WEAK])
-    sentences = []
-    for row in weak:
-        parts = [(n, x) for n, x in zip(problem.names, row, strict=True) if abs(x) >= _PART]
-        if len(parts) == 1 or max(abs(x) for _, x in parts) > _ALONE:
-            name = max(parts, key=lambda part: abs(part[1]))[0]
-            kinds[name] = _limit(problem, mode, name)
-            reason = _REASONS.get((name, kinds[name]), "")
-            sentences.append(f"{_plain(name)}: {KINDS[kinds[name]]}{reason}")
-        else:
-            sentences.append(_together(parts))
+    sentences = [_weak_direction(problem, mode, row, kinds) for row in weak]
     for ridge in problem.coordinates.ridges(torch.from_numpy(mode.theta)):
         if _as_good(problem, mode, ridge):
             kinds |= ridge.kinds
@@ -85,57 +92,110 @@ def identify(problem: SensorPosterior, mode: LaplaceFit) -> Identifiability:
     return Identifiability(kinds, sentences, s.tolist(), refused)
 
 
-def identify_from_draws(
-    problem: SensorPosterior, mode: LaplaceFit, known: Identifiability, samples: FloatArray, weight: FloatArray
-) -> Identifiability:
-    """Find what the data determine from weighted draws, for a posterior that is not like that about its mode.
+def _weak_direction(
+    problem: SensorPosterior, mode: LaplaceFit, direction: FloatArray, kinds: dict[str, str]
+) -> str:
+    """Return a text about a direction that the light levels do not determine; set the kind of its
+    parameter in ``kinds`` if it is nearly that of one parameter.
+    """
+    parts = [(n, x) for n, x in zip(problem.names, direction, strict=True) if abs(x) >= _PART]
+    if len(parts) > 1 and max(abs(x) for _, x in parts) <= _ALONE:
+        return _together(parts)
+    name = max(parts, key=lambda pair: abs(pair[1]))[0]
+    kinds[name] = _limit(problem, mode, name)
+    reason = _REASONS.get((name, kinds[name]), "")
+    return f"{_plain(name)}: {KINDS[kinds[name]]}{reason}"
 
-    A parameter whose posterior is less than a third as wide as its prior has a value. Any other has a limit on each
-    side on which the posterior ends clearly inside the prior, counting only the draws of the prior that are possible;
-    where parameters far along a ridge fit as well, the limits are those of the ridge.
+
+def identify_from_draws(
+    problem: SensorPosterior,
+    mode: LaplaceFit,
+    about_mode: Identifiability,
+    samples: FloatArray,
+    weight: FloatArray,
+) -> Identifiability:
+    """Find what the data determine from weighted draws, for a posterior that is not like that about
+    its mode.
+
+    A parameter whose posterior is less than a third as wide as its prior has a value. Any other has
+    a limit on each side on which the posterior ends clearly inside the prior, counting only the
+    draws of the prior that are possible; where parameters far along a ridge fit as well, the limits
+    are those of the ridge.
     """
     z, alone = problem.whitened(samples), _possible(problem)
     kinds = {}
-    for at, name in enumerate(problem.names):
-        low, high = weighted_quantiles(z[:, at], weight, _ENDS)
-        low_alone, high_alone = np.quantile(alone[:, at], _ENDS)
-        tells = bool(low > low_alone + _TELLS), bool(high < high_alone - _TELLS)
-        limit = {(True, False): "lower", (False, True): "upper", (True, True): "between"}.get(tells, "none")
-        width = float(np.sqrt(weight @ (z[:, at] - weight @ z[:, at]) ** 2))
-        kinds[name] = "estimate" if width < 1 / WEAK else limit
+    for index, name in enumerate(problem.names):
+        kinds[name] = _kind_from_draws(z[:, index], alone[:, index], weight)
     sentences, named = [], set()
     for ridge in problem.coordinates.ridges(torch.from_numpy(mode.theta)):
-        if ridge.text in known.directions and "estimate" not in {kinds[name] for name in ridge.kinds}:
-            kinds |= ridge.kinds  # the data alone give no limit along the ridge, whatever the priors say
+        estimated = "estimate" in [kinds.get(name) for name in ridge.kinds]
+        if ridge.text in about_mode.directions and not estimated:
+            # the data alone give no limit along the ridge, whatever the priors say
+            kinds |= ridge.kinds
             sentences.append(ridge.text)
             named |= set(ridge.kinds)
-    rest = [name for name, kind in kinds.items() if kind != "estimate" and name not in named]
-    sentences += [f"{_plain(name)}: {KINDS[kinds[name]]}" for name in rest]
+    undetermined = [
+        name for name, kind in kinds.items() if kind != "estimate" and name not in named
+    ]
+    sentences += [f"{_plain(name)}: {KINDS[kinds[name]]}" for name in undetermined]
     sentences = withheld_electrons(kinds, sentences)
-    return replace(known, kinds=kinds, directions=sentences)
+    return replace(about_mode, kinds=kinds, directions=sentences)
+
+
+def _kind_from_draws(z: FloatArray, alone: FloatArray, weight: FloatArray) -> str:
+    """Return if the data give a parameter a value, or on which sides a limit.
+
+    ``z`` has its weighted draws, ``alone`` those of its prior, both in units of the prior.
+    """
+    if float(np.sqrt(weight @ (z - weight @ z) ** 2)) < 1 / WEAK:
+        return "estimate"
+    low, high = weighted_quantiles(z, weight, _ENDS)
+    low_alone, high_alone = np.quantile(alone, _ENDS)
+    tells = bool(low > low_alone + _TELLS), bool(high < high_alone - _TELLS)
+    limits = {(True, False): "lower", (False, True): "upper", (True, True): "between"}
+    return limits.get(tells, "none")
 
 
 def withheld_electrons(kinds: dict[str, str], sentences: Sequence[str]) -> list[str]:
-    """Set each parameter in electrons to ``none`` where the gain is ``none``; return the sentences that then hold.
+    """Set each parameter in electrons to ``none`` where the gain is ``none``; return the sentences
+    that then hold.
 
     The frames are in digital numbers: without a gain, electrons come from its prior.
     """
-    known = [name for name in _ELECTRONS if kinds.get("gain") == "none" and kinds.get(name, "none") != "none"]
-    kinds |= dict.fromkeys(known, "none")
-    kept = [text for text in sentences if not text.startswith(tuple(f"{_plain(name)}: " for name in known))]
-    return [*(f"{_plain(name)}: {KINDS['none']}: no value in electrons without the gain" for name in known), *kept]
+    withheld = [
+        name
+        for name in _ELECTRONS
+        if kinds.get("gain") == "none" and kinds.get(name, "none") != "none"
+    ]
+    kinds |= dict.fromkeys(withheld, "none")
+    others = [
+        text
+        for text in sentences
+        if not text.startswith(tuple(f"{_plain(name)}: " for name in withheld))
+    ]
+    return [
+        *(
+            f"{_plain(name)}: {KINDS['none']}: no value in electrons without the gain"
+            for name in withheld
+        ),
+        *others,
+    ]
 
 
-def weighted_quantiles(values: FloatArray, weight: FloatArray, shares: Sequence[float]) -> FloatArray:
+def weighted_quantiles(
+    values: FloatArray, weight: FloatArray, shares: Sequence[float]
+) -> FloatArray:
     """Return the values below which the ``shares`` of the weights lie."""
     order = np.argsort(values)
-    at = np.searchsorted(np.cumsum(weight[order]), shares).clip(0, len(values) - 1)
-    quantiles: FloatArray = values[order][at]
+    index = np.searchsorted(np.cumsum(weight[order]), shares).clip(0, len(values) - 1)
+    quantiles: FloatArray = values[order][index]
     return quantiles
 
 
 def _possible(problem: SensorPosterior) -> FloatArray:
-    """Return draws of the prior (draw, free) at which the posterior is not zero, in its standard deviations."""
+    """Return draws of the prior (draw, free) at which the posterior is not zero, in its standard
+    deviations.
+    """
     z = np.random.default_rng(0).standard_normal((_ALONE_DRAWS, len(problem.names)))
     places = problem.theta(problem.coordinates.from_whitened(torch.from_numpy(z)))
     inside = np.flatnonzero(np.isfinite(places).all(1))
@@ -144,17 +204,23 @@ def _possible(problem: SensorPosterior) -> FloatArray:
 
 
 def _as_good(problem: SensorPosterior, mode: LaplaceFit, ridge: Ridge) -> bool:
-    """Return True if parameters far from the mode fit as well, the priors of the limited parameters left out."""
+    """Return True if parameters far from the mode fit as well, the priors of the limited
+    parameters left out.
+    """
     places = np.stack([ridge.place.numpy(), mode.theta])
     limited = [problem.names.index(name) for name in ridge.kinds]
-    without = problem.log_posterior(places) + 0.5 * (problem.whitened(places)[:, limited] ** 2).sum(1)
+    without = problem.log_posterior(places) + 0.5 * (problem.whitened(places)[:, limited] ** 2).sum(
+        1
+    )
     return bool(without[1] - without[0] < _FALLS)
 
 
 def _own(s: FloatArray, v: FloatArray) -> FloatArray:
-    """Return an array that is True for each free parameter that the light levels determine rather than the priors.
+    """Return an array that is True for each free parameter that the light levels determine rather
+    than the priors.
 
-    The posterior of such a parameter is less than a third as wide as its prior, and hardly widens with doubled priors.
+    The posterior of such a parameter is less than a third as wide as its prior, and hardly widens
+    with doubled priors.
     """
     sd, wide = ((v.T**2 / (s**2 + width**-2)).sum(1) ** 0.5 for width in (1.0, 2.0))
     own: FloatArray = (sd < 1 / WEAK) & (wide < _WIDER * sd)
@@ -162,7 +228,8 @@ def _own(s: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def _sorted_out(weak: FloatArray) -> Sequence[FloatArray]:
-    """Return orthogonal directions of undetermined parameters: first single parameters, then combinations.
+    """Return orthogonal directions of undetermined parameters: first single parameters, then
+    combinations.
 
     A mixture of weak directions is weak too, so that any basis of the same space is allowed.
     """
@@ -173,10 +240,12 @@ def _sorted_out(weak: FloatArray) -> Sequence[FloatArray]:
 
 
 def _limit(problem: SensorPosterior, mode: LaplaceFit, name: str) -> str:
-    """Return the limit that the light levels set on a parameter (upper, lower, none), with all others at the mode."""
-    at = problem.names.index(name)
+    """Return the limit that the light levels set on a parameter (upper, lower, none), with all
+    others at the mode.
+    """
+    index = problem.names.index(name)
     z = np.repeat(problem.whitened(mode.theta)[None], 2, 0)
-    z[:, at] = _FAR, -_FAR
+    z[:, index] = _FAR, -_FAR
     samples = problem.theta(problem.coordinates.from_whitened(torch.from_numpy(z)))
     likelihood = problem.likelihood(np.concatenate([samples, mode.theta[None]]))
     above, below, best = likelihood.log.nan_to_num(nan=-np.inf, neginf=-np.inf).tolist()
@@ -185,11 +254,17 @@ def _limit(problem: SensorPosterior, mode: LaplaceFit, name: str) -> str:
 
 
 def _together(parts: Sequence[tuple[str, float]]) -> str:
-    """Return a text about several parameters that the light levels determine only in combination."""
-    first = max(parts, key=lambda part: abs(part[1]))
-    rest = [(name, bool(x * first[1] > 0)) for name, x in parts if name != first[0]]
-    more, less = ([_plain(name) for name, same in rest if same is up] for up in (True, False))
-    changes = [f"more {_listed(more)}"] * bool(more) + [f"less {_listed(less)}"] * bool(less)
+    """Return a text about several parameters that the light levels determine only in
+    combination.
+    """
+    first = max(parts, key=lambda pair: abs(pair[1]))
+    others = [(name, bool(x * first[1] > 0)) for name, x in parts if name != first[0]]
+    raised, lowered = (
+        [_plain(name) for name, same in others if same is up] for up in (True, False)
+    )
+    changes = [f"more {_listed(raised)}"] * bool(raised) + [f"less {_listed(lowered)}"] * bool(
+        lowered
+    )
     names = _listed([_plain(name) for name, _ in parts])
     return f"{names} only together: more {_plain(first[0])} with {_listed(changes)}"
 

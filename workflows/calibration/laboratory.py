@@ -1,4 +1,6 @@
-"""What the laboratory of a recipe states of its light and temperature, and what follows for draws and intervals."""
+"""What the laboratory of a recipe states of its light and temperature, and what follows for
+draws and intervals.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +13,9 @@ import numpy as np
 import torch
 
 from neusee.nodes.calibrate import Laboratory, Traceability
-from neusee.workflows.calibration.frame_validity import wider
+from neusee.workflows.calibration.frame_validity import ModelSpread, wider
 from neusee.workflows.calibration.identifiability import Identifiability
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.model_spread import ModelSpread
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe
 
@@ -24,34 +25,52 @@ if TYPE_CHECKING:
 
 EFFICIENCY = "quantum_efficiency"
 RELATIVE = "quantum efficiency: not from these frames: the photons are known up to a factor only"
-#: quantities that may have a temperature coefficient: what is positive, so that a relative change has a meaning
-WITH_COEFFICIENT = frozenset({
-    "gain", EFFICIENCY, "dark_signal", "temporal_dark_noise", "dark_current", "offset", "read_noise", "full_well",
-})  # fmt: skip
+#: quantities that may have a temperature coefficient: what is positive, so that a relative change
+#: has a meaning
+WITH_COEFFICIENT = frozenset(
+    {
+        "gain",
+        EFFICIENCY,
+        "dark_signal",
+        "temporal_dark_noise",
+        "dark_current",
+        "offset",
+        "read_noise",
+        "full_well",
+    }
+)
 _STREAM = 9  #: of random numbers, apart from those of other draws
 
 
 def stated(recipe: Recipe) -> Traceability:
-    """Return what the recipe states of its light and temperature; nothing for a recipe without the block."""
+    """Return what the recipe states of its light and temperature; nothing for a recipe without
+    the block.
+    """
     return recipe.traceability or Traceability()
 
 
 def laboratory_of(recipe: Recipe) -> Laboratory:
-    """Return the uncertainties that a recipe states; raise ValueError for a coefficient of an unknown quantity."""
-    told = stated(recipe)
-    if wrong := [name for name in told.temperature.coefficients if name not in WITH_COEFFICIENT]:
+    """Return the uncertainties that a recipe states; raise ValueError for a coefficient of an
+    unknown quantity.
+    """
+    statements = stated(recipe)
+    if wrong := [
+        name for name in statements.temperature.coefficients if name not in WITH_COEFFICIENT
+    ]:
         hint = nearest(wrong[0], WITH_COEFFICIENT)
-        raise ValueError(f"traceability.temperature.coefficients: {wrong[0]} has no coefficient; {hint}")
-    width = told.lamp.centroid_uncertainty
+        raise ValueError(
+            f"traceability.temperature.coefficients: {wrong[0]} has no coefficient; {hint}"
+        )
+    width = statements.lamp.centroid_uncertainty
     return Laboratory(
-        photons=told.photons.relative_uncertainty,
-        photons_distribution=told.photons.distribution,
-        photons_freedom=told.photons.degrees_of_freedom,
-        drift=told.lamp.drift,
+        photons=statements.photons.relative_uncertainty,
+        photons_distribution=statements.photons.distribution,
+        photons_freedom=statements.photons.degrees_of_freedom,
+        drift=statements.lamp.drift,
         wavelength=None if width is None else 1e9 * width,
-        slope=told.lamp.efficiency_per_nm,
-        temperature=told.temperature.uncertainty,
-        coefficients=told.temperature.coefficients,
+        slope=statements.lamp.efficiency_per_nm,
+        temperature=statements.temperature.uncertainty,
+        coefficients=statements.temperature.coefficients,
     )
 
 
@@ -60,18 +79,26 @@ def is_relative(recipe: Recipe) -> bool:
     return stated(recipe).photons.known == "relative"
 
 
-def without_efficiency(found: Identifiability) -> Identifiability:
-    """Return what frames determine whose photons are known up to a factor: no quantum efficiency."""
-    if EFFICIENCY not in found.kinds:
-        return found
-    return replace(found, kinds={**found.kinds, EFFICIENCY: "none"}, directions=[*found.directions, RELATIVE])
+def without_efficiency(identifiability: Identifiability) -> Identifiability:
+    """Return what frames determine whose photons are known up to a factor: no quantum
+    efficiency.
+    """
+    if EFFICIENCY not in identifiability.kinds:
+        return identifiability
+    return replace(
+        identifiability,
+        kinds={**identifiability.kinds, EFFICIENCY: "none"},
+        directions=[*identifiability.directions, RELATIVE],
+    )
 
 
-def with_laboratory(problem: SensorPosterior, chains: Chains, laboratory: Laboratory, seed: int) -> Chains:
+def with_laboratory(
+    problem: SensorPosterior, chains: Chains, laboratory: Laboratory, seed: int
+) -> Chains:
     """Return the draws of a posterior with the uncertainty of the light and of the temperature.
 
-    The light moves the quantum efficiency alone, by errors that are independent of everything else; the temperature
-    moves all parameters with a coefficient together.
+    The light moves the quantum efficiency alone, by errors that are independent of everything else;
+    the temperature moves all parameters with a coefficient together.
     """
     values = problem.parameters(chains.draws)
     factors = _factors(laboratory, list(values), chains.log.shape, seed)
@@ -81,7 +108,9 @@ def with_laboratory(problem: SensorPosterior, chains: Chains, laboratory: Labora
     return replace(chains, draws=problem.theta(values))
 
 
-def _factors(laboratory: Laboratory, names: Sequence[str], shape: tuple[int, ...], seed: int) -> dict[str, FloatArray]:
+def _factors(
+    laboratory: Laboratory, names: Sequence[str], shape: tuple[int, ...], seed: int
+) -> dict[str, FloatArray]:
     """Return a factor for each draw of each parameter that light or temperature move, by name."""
     rng = np.random.default_rng([seed, _STREAM])
     factors: dict[str, FloatArray] = {}
@@ -110,12 +139,16 @@ def relative_widths(laboratory: Laboratory, names: Sequence[str]) -> Mapping[str
     kelvin = laboratory.temperature or 0.0
     light = math.hypot(*(u for _, u in laboratory.light), 0.0)
     return {
-        name: math.hypot(light * (name == EFFICIENCY), kelvin * laboratory.coefficients.get(name, 0.0))
+        name: math.hypot(
+            light * (name == EFFICIENCY), kelvin * laboratory.coefficients.get(name, 0.0)
+        )
         for name in names
     }
 
 
-def with_laboratory_models(models: Sequence[ModelSpread], laboratory: Laboratory) -> list[ModelSpread]:
+def with_laboratory_models(
+    models: Sequence[ModelSpread], laboratory: Laboratory
+) -> list[ModelSpread]:
     """Return the intervals to report with the uncertainty of the light and of the temperature."""
     widths = relative_widths(laboratory, [model.name for model in models])
     return [replace(model, stated=wider(model.stated, widths[model.name])) for model in models]

@@ -1,24 +1,221 @@
-"""Statistical checks of a posterior: chains, mode, importance sampling, and fit of the model to the levels."""
+"""Statistical checks of a posterior: chains, mode, and fit of the model to the levels."""
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 from neusee.nodes.calibrate import Likelihood, Rings
+from neusee.nodes.values import Levels
 from neusee.workflows.calibration.identifiability import Identifiability
 from neusee.workflows.calibration.importance_sampling import Guide, draw_guide, weights
-from neusee.workflows.calibration.level_misfit import is_camera, misfits
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import LaplaceFit
+from neusee.workflows.calibration.log_posterior import LaplaceFit, SensorPosterior
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from neusee.workflows.calibration.emcee_sampler import Chains
-    from neusee.workflows.calibration.log_posterior import FloatArray
+    from neusee.workflows.calibration.log_posterior import FloatArray, SensorPosterior
+
+
+# --- level misfit ---------------------------------------------------------------------------------
+
+# Tests of how the levels of a real camera deviate from its model, where fitted widths take up what
+# the model lacks.
+
+
+ALARM = 1e-3  #: probability with which chance alone fails a test
+_DRAWS = 500  #: of the posterior, for the prediction of a level left out
+_SLOW = 6  #: slowest waves over the levels
+_LEAST = 10  #: lit levels, with fewer of which their order says too little
+#: largest standard deviations, relative, of the light and of the variances beyond which the model
+#: does not hold
+BOUNDS = {"lamp": 0.1, "scatter": 0.05}
+
+
+class Deviations(NamedTuple):
+    """How far each measured level lies from its prediction by the other levels, in standard
+    deviations.
+    """
+
+    variance: FloatArray  #: (level,), of the levels that are used, in rising order of the mean
+    mean: FloatArray  #: (level,) as `variance`
+    photons: FloatArray  #: (level,)
+    exposure: FloatArray  #: (level,) s
+
+    @property
+    def lit(self) -> NDArray[np.bool_]:
+        """Return (level,) True for a level with light."""
+        return self.photons > 0
+
+
+class Misfit(NamedTuple):
+    """The result of one test of the levels: what was found, the criterion, and if it holds."""
+
+    name: str
+    found: str
+    bar: str
+    good: bool
+
+
+def is_camera(problem: SensorPosterior) -> bool:
+    """Return True if the likelihood is that of a real camera, whose widths are fitted to the
+    levels.
+    """
+    return problem.recipe.steps[problem.step].node.path == "calibrate.camera"
+
+
+def misfits(
+    problem: SensorPosterior, samples: FloatArray, weights: FloatArray, theta: FloatArray
+) -> Iterator[Misfit]:
+    """Test the levels of a real camera against posterior ``samples`` (draw, free) with ``weights``.
+
+    ``theta`` (free,) is the mode. The widths of the model grow until its deviance is as expected,
+    so that the deviance finds no misfit. What remains is the order of the deviations along the
+    levels, a level that the others do not predict, and widths that no lamp and no electronics have.
+    """
+    deviations = left_out(problem, samples, weights)
+    yield _prediction(deviations)
+    if deviations.lit.sum() >= _LEAST:
+        for name, z in (
+            ("variances", deviations.variance[deviations.lit]),
+            ("means", deviations.mean[deviations.lit]),
+        ):
+            p = min(1.0, 2 * min(runs(z), waves(z)))
+            text = (
+                f"{_signs(z)} runs of sign over {len(z)} levels, waves of {_strength(z):.1f}; p ="
+                f" {p:.2g}"
+            )
+            yield Misfit(
+                f"the {name} deviate without a trend", text, f"a p-value above {ALARM}", p >= ALARM
+            )
+    yield from _widths(problem, theta)
+
+
+def _prediction(deviations: Deviations) -> Misfit:
+    """Return the test of the level that deviates most from its prediction by the others."""
+    limit = _limit(ALARM / (4 * len(deviations.variance)))
+    quantity, z = max(
+        (("variance", deviations.variance), ("mean", deviations.mean)),
+        key=lambda pair: np.abs(pair[1]).max(),
+    )
+    worst = int(np.abs(z).argmax())
+    light = (
+        f"of {deviations.photons[worst]:.5g} photons"
+        if deviations.photons[worst]
+        else "without light"
+    )
+    text = (
+        f"the {quantity} of the level {light} and {deviations.exposure[worst]:.4g} s deviates by"
+        f" {z[worst]:+.1f} sd from its "
+    )
+    text, good = f"{text}prediction by the other levels", abs(z[worst]) <= limit
+    if not good:
+        why = (
+            "its light or exposure may not be as stated"
+            if quantity == "mean"
+            else "its frames may be disturbed"
+        )
+        text += f": {why}; measure it again, or leave it out"
+    return Misfit("each level is predicted by the others", text, f"at most {limit:.1f} sd", good)
+
+
+def _widths(problem: SensorPosterior, theta: FloatArray) -> Iterator[Misfit]:
+    """Yield the test of each fitted width, beyond which a misfit is taken for a scatter."""
+    params = problem.recipe.steps[problem.step].params
+    values = {**params, **{name: float(x) for name, x in problem.parameters(theta).items()}}
+    words = {
+        "lamp": "the light scatters from level to level",
+        "scatter": "the variances scatter beyond chance",
+    }
+    for name, bound in BOUNDS.items():
+        text = f"{words[name]} by {values[name]:.2%}"
+        yield Misfit(
+            f"{name} is that of a laboratory", text, f"at most {bound:.0%}", values[name] <= bound
+        )
+
+
+def left_out(problem: SensorPosterior, samples: FloatArray, weights: FloatArray) -> Deviations:
+    """Return how far each level lies from its prediction by all other levels.
+
+    Draws of the posterior are weighted by the inverse of the likelihood of the level. The weighted
+    probability of less than was measured is given in standard deviations of a normal distribution.
+    """
+    from scipy.special import ndtr, ndtri
+
+    rng = np.random.default_rng(3)
+    drawn = samples[rng.choice(len(samples), _DRAWS, p=weights)]
+    look = problem.likelihood(drawn)
+    variance, narrow, mean, width = np.split(look.scaled.numpy(), 4, axis=-1)  # (draw, level)
+    log = -0.5 * (variance**2 + mean**2) - narrow - width
+    weight = np.exp(-(log - log.min(0)))
+    # truncated importance sampling
+    weight = np.minimum(weight, weight.mean(0) * math.sqrt(len(weight)))
+    weight /= weight.sum(0)
+    tiny = 1e-12
+    z = [ndtri(np.clip((weight * ndtr(x)).sum(0), tiny, 1 - tiny)) for x in (variance, mean)]
+    levels = problem.levels
+    assert isinstance(levels, Levels)
+    fitted = look.degrees_of_freedom.numpy() > 0
+    order = np.argsort(levels.mean.numpy()[fitted])
+    return Deviations(
+        *(x[order] for x in (*z, levels.photons.numpy()[fitted], levels.exposure.numpy()[fitted]))
+    )
+
+
+def runs(z: FloatArray) -> float:
+    """Return the probability that so few runs of equal sign come by chance (Wald and Wolfowitz
+    1940).
+    """
+    from scipy.special import ndtr
+
+    up, down = int((z > 0).sum()), int((z <= 0).sum())
+    if not up or not down:
+        return float(2.0 ** (1 - len(z)))
+    expected = 1 + 2 * up * down / len(z)
+    variance = (expected - 1) * (expected - 2) / (len(z) - 1)
+    return float(ndtr((_signs(z) + 0.5 - expected) / math.sqrt(max(variance, 1e-12))))
+
+
+def _signs(z: FloatArray) -> int:
+    return 1 + int((np.diff(z > 0)).sum())
+
+
+def _strength(z: FloatArray) -> float:
+    """Return the sum of squares of the slowest components of a cosine transform, for deviations
+    of unit size.
+    """
+    from scipy.fft import dct
+
+    scale = max(1.0, float(np.square(z).mean()))
+    return float((dct(z, norm="ortho")[:_SLOW] ** 2).sum() / scale)
+
+
+def waves(z: FloatArray) -> float:
+    """Return the probability that chance alone gives so strong slow waves over the levels."""
+    from scipy.special import betainc
+
+    total = float(np.square(z).sum())
+    share = min(1.0, _strength(z) * max(1.0, float(np.square(z).mean())) / total) if total else 0.0
+    return float(1 - betainc(_SLOW / 2, (len(z) - _SLOW) / 2, share))
+
+
+def _limit(probability: float) -> float:
+    from scipy.special import ndtri
+
+    return float(-ndtri(probability))
+
+
+# --- posterior checks -----------------------------------------------------------------------------
+
+# Statistical checks of a posterior: chains, mode, importance sampling, and fit of the model to the
+# levels.
+
 
 Mark = Literal["pass", "warn", "fail"]
 MISFIT = 1e-3  #: probability below which chance does not explain a deviance
@@ -26,8 +223,10 @@ _NEVER = -1e6  #: log weight of an impossible sample
 _RHAT, _INDEPENDENT, _ACCEPTED = 1.01, 1000.0, (0.1, 0.7)
 _TAIL, _SD, _MEAN, _BELOW = 0.5, 0.05, 0.1, 2.0
 _WEIGHTED = 0.1  #: least effective share of weighted draws
-_SLOW, _SMOOTH = 8, 5e-3  #: slowest waves over the rings, and probability below which chance does not explain them
-_SURPRISE = 3.5  #: standard deviations of its prior by which a mean may lie from the middle of the prior
+#: slowest waves over the rings, and probability below which chance does not explain them
+_SLOW_MIXING, _SMOOTH = 8, 5e-3
+#: standard deviations of its prior by which a mean may lie from the middle of the prior
+_SURPRISE = 3.5
 _LUCK = 4.0  #: standard errors by which the widths of two samples may differ
 
 
@@ -43,7 +242,9 @@ class Check:
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """The deviance of all light levels, and the probability that chance alone gives a deviance at least as large."""
+    """The deviance of all light levels, and the probability that chance alone gives a deviance
+    at least as large.
+    """
 
     deviance: float
     freedom: float  #: degrees of freedom
@@ -75,20 +276,26 @@ class ImportanceSamples:
         return sd
 
     def doubt(self, like: FloatArray) -> FloatArray:
-        """Return the relative standard error of each standard deviation, with the kurtosis of the draws ``like``."""
+        """Return the relative standard error of each standard deviation, with the kurtosis of
+        the draws ``like``.
+        """
         z = (like - like.mean(0)) / like.std(0)
         error: FloatArray = np.sqrt(((z**4).mean(0) - 1) * (self.weights**2).sum() / 4)
         return error
 
 
 def arviz() -> Any:
-    """Import and return ArviZ; raise `ImportError` with the command that installs ArviZ if the import fails."""
+    """Import and return ArviZ; raise `ImportError` with the command that installs ArviZ if the
+    import fails.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # ArviZ warns of its next version
             import arviz as library
     except ImportError:
-        raise ImportError('calibration needs arviz and h5py: pip install "neusee[calibrate]"') from None
+        raise ImportError(
+            'calibration needs arviz and h5py: pip install "neusee[calibrate]"'
+        ) from None
     return library
 
 
@@ -103,10 +310,19 @@ def importance_samples(problem: SensorPosterior, mode: LaplaceFit, seed: int) ->
 
 
 def checks(
-    problem: SensorPosterior, mode: LaplaceFit, identifiability: Identifiability, chains: Chains, law: ImportanceSamples
+    problem: SensorPosterior,
+    mode: LaplaceFit,
+    identifiability: Identifiability,
+    chains: Chains,
+    law: ImportanceSamples,
 ) -> list[Check]:
-    """Run all checks of a posterior and return the results; if a check fails, the posterior is not fit for use."""
-    peak, data = _of_peak(problem, mode, identifiability, chains, law), _of_data(problem, mode, identifiability, law)
+    """Run all checks of a posterior and return the results; if a check fails, the posterior is
+    not fit for use.
+    """
+    peak, data = (
+        _of_peak(problem, mode, identifiability, chains, law),
+        _of_data(problem, mode, identifiability, law),
+    )
     return [*_of_chains(chains), *peak, *data]
 
 
@@ -123,37 +339,73 @@ def _of_chains(chains: Chains) -> Iterator[Check]:
     coordinates = np.moveaxis(chains.draws, -1, 0)
     rhat = max(map(_rhat, coordinates))
     yield Check("ensembles agree", f"R-hat {rhat:.4f}", f"at most {_RHAT}", _mark(rhat <= _RHAT))
-    bulk, tail = (min(_effective_sample_size(draws, part) for draws in coordinates) for part in ("bulk", "tail"))
-    size, enough = f"effective sample size {bulk:.0f}, {tail:.0f} in the tails", min(bulk, tail) >= _INDEPENDENT
-    yield Check("draws are numerous enough", size, f"each at least {_INDEPENDENT:.0f} draws", _mark(enough))
+    bulk, tail = (
+        min(_effective_sample_size(draws, method) for draws in coordinates)
+        for method in ("bulk", "tail")
+    )
+    size, enough = (
+        f"effective sample size {bulk:.0f}, {tail:.0f} in the tails",
+        min(bulk, tail) >= _INDEPENDENT,
+    )
+    yield Check(
+        "draws are numerous enough", size, f"each at least {_INDEPENDENT:.0f} draws", _mark(enough)
+    )
     low, high = _ACCEPTED
     well = low <= chains.accepted <= high
     yield Check(
-        "moves are accepted", f"{chains.accepted:.0%} of the moves", f"{low:.0%} to {high:.0%}", _mark(well, "warn")
+        "moves are accepted",
+        f"{chains.accepted:.0%} of the moves",
+        f"{low:.0%} to {high:.0%}",
+        _mark(well, "warn"),
     )
-    lost = emcee_sampler.stranded(chains.log)  # R-hat cannot see stranded walkers that all ensembles have
-    text = f"{lost} of {chains.log.shape[0] * chains.log.shape[2]} lie {emcee_sampler.STRANDED:.0f} nats below the rest"
+    # R-hat cannot see stranded walkers that all ensembles have
+    lost = emcee_sampler.stranded(chains.log)
+    text = (
+        f"{lost} of {chains.log.shape[0] * chains.log.shape[2]} lie {emcee_sampler.STRANDED:.0f}"
+        " nats below the rest"
+    )
     yield Check("no walker is stranded", text, "none", _mark(lost == 0))
 
 
 def _of_peak(
-    problem: SensorPosterior, mode: LaplaceFit, identifiability: Identifiability, chains: Chains, law: ImportanceSamples
+    problem: SensorPosterior,
+    mode: LaplaceFit,
+    identifiability: Identifiability,
+    chains: Chains,
+    law: ImportanceSamples,
 ) -> Iterator[Check]:
     search = "settled" if mode.settled else "the search stopped"
     yield Check("the search found the mode", search, "settled", _mark(mode.settled))
     below = mode.log - float(chains.log.max())
     distance = f"{abs(below):.2g} nats {'below' if below > 0 else 'above'} the mode"
-    yield Check("the best draw is near the mode", distance, f"within {_BELOW:.0f} nats", _mark(abs(below) <= _BELOW))
+    yield Check(
+        "the best draw is near the mode",
+        distance,
+        f"within {_BELOW:.0f} nats",
+        _mark(abs(below) <= _BELOW),
+    )
     bent = problem.coordinates.bent
-    at = [i for i, name in enumerate(problem.names) if bent or identifiability.kinds[name] == "estimate"]
-    if not at:
+    columns = [
+        i
+        for i, name in enumerate(problem.names)
+        if bent or identifiability.kinds[name] == "estimate"
+    ]
+    if not columns:
         return
     if bent:
         size = 1 / float((law.weights**2).sum())
-        text, least = f"effective sample size {size:.0f} of {len(law.weights)}", _WEIGHTED * len(law.weights)
-        yield Check("weighted draws are numerous enough", text, f"at least {least:.0f}", _mark(size >= least, "warn"))
-    sd, mean = law.sd()[at], law.mean()[at]
-    flat = chains.flat[:, at]
+        text, enough = (
+            f"effective sample size {size:.0f} of {len(law.weights)}",
+            _WEIGHTED * len(law.weights),
+        )
+        yield Check(
+            "weighted draws are numerous enough",
+            text,
+            f"at least {enough:.0f}",
+            _mark(size >= enough, "warn"),
+        )
+    sd, mean = law.sd()[columns], law.mean()[columns]
+    flat = chains.flat[:, columns]
     apart, off = np.abs(flat.std(0) / sd - 1), np.max(np.abs(flat.mean(0) - mean) / sd)
     allowed = np.maximum(_SD, _LUCK * law.doubt(flat))
     worst = int(np.argmax(apart / allowed))
@@ -161,21 +413,34 @@ def _of_peak(
     bar = f"{allowed[worst]:.0%} and {_MEAN} sd, where k-hat is below {_TAIL}"
     agrees = bool((apart <= allowed).all()) and off <= _MEAN
     yield Check(
-        "importance sampling agrees with the chains", text, bar, _mark(agrees, "fail" if law.tail < _TAIL else "warn")
+        "importance sampling agrees with the chains",
+        text,
+        bar,
+        _mark(agrees, "fail" if law.tail < _TAIL else "warn"),
     )
 
 
 def _of_data(
-    problem: SensorPosterior, mode: LaplaceFit, identifiability: Identifiability, law: ImportanceSamples
+    problem: SensorPosterior,
+    mode: LaplaceFit,
+    identifiability: Identifiability,
+    law: ImportanceSamples,
 ) -> Iterator[Check]:
     look = problem.likelihood(mode.theta[None])
     if float(look.degrees_of_freedom.sum()) > len(identifiability.estimated):
         fit = goodness_of_fit(look, len(identifiability.estimated))
-        text = f"deviance {fit.deviance:.1f} of {fit.freedom:.0f} degrees of freedom, p = {fit.p:.2g}"
-        yield Check("the model of the sensor fits the levels", text, f"a p-value above {MISFIT}", _mark(fit.good))
+        text = (
+            f"deviance {fit.deviance:.1f} of {fit.freedom:.0f} degrees of freedom, p = {fit.p:.2g}"
+        )
+        yield Check(
+            "the model of the sensor fits the levels",
+            text,
+            f"a p-value above {MISFIT}",
+            _mark(fit.good),
+        )
     if is_camera(problem):
-        for found in misfits(problem, law.samples, law.weights, mode.theta):
-            yield Check(found.name, found.found, found.bar, _mark(found.good))
+        for misfit in misfits(problem, law.samples, law.weights, mode.theta):
+            yield Check(misfit.name, misfit.found, misfit.bar, _mark(misfit.good))
     if isinstance(problem.levels, Rings):
         yield from _of_rings(problem, law, law.guide)
     count = len(identifiability.directions)
@@ -202,41 +467,58 @@ def _of_rings(problem: SensorPosterior, law: ImportanceSamples, guide: Guide) ->
     )
     middle = law.weights @ problem.whitened(guide.samples)
     worst = int(np.abs(middle).argmax())
-    text = f"{problem.names[worst].replace('_', ' ')} {middle[worst]:+.1f} sd of its prior from the middle"
+    text = (
+        f"{problem.names[worst].replace('_', ' ')} {middle[worst]:+.1f} sd of its prior from the"
+        " middle"
+    )
     surprised = abs(float(middle[worst])) > _SURPRISE
     bar = f"each mean within {_SURPRISE} sd; else prior and picture contradict each other"
     yield Check("the priors agree with the picture", text, bar, _mark(not surprised, "warn"))
 
 
 def slow_waves(deviation: FloatArray) -> tuple[float, float]:
-    """Return the strength of slow waves in the deviations of rings, and the probability that chance alone gives it.
+    """Return the strength of slow waves in the deviations of rings, and the probability that chance
+    alone gives it.
 
-    ``deviation`` (ring,) is in standard deviations. A wrong model deviates over many rings in one direction, even
-    where the relative scatter of the rings is free and takes up all that the model lacks. The strength is the sum of
-    squares of the slowest components of a cosine transform.
+    ``deviation`` (ring,) is in standard deviations. A wrong model deviates over many rings in one
+    direction, even where the relative scatter of the rings is free and takes up all that the model
+    lacks. The strength is the sum of squares of the slowest components of a cosine transform.
     """
     from scipy.fft import dct
     from scipy.special import chdtrc
 
-    strength = float((dct(deviation, norm="ortho")[:_SLOW] ** 2).sum())
-    return strength, float(chdtrc(_SLOW, strength))
+    strength = float((dct(deviation, norm="ortho")[:_SLOW_MIXING] ** 2).sum())
+    return strength, float(chdtrc(_SLOW_MIXING, strength))
 
 
 def goodness_of_fit(likelihood: Likelihood, free: int = 0) -> GoodnessOfFit:
-    """Return the goodness of fit of one sensor with ``free`` parameters that were fitted to the same light levels.
+    """Return the goodness of fit of one sensor with ``free`` parameters that were fitted to the
+    same light levels.
 
-    Raises: `ValueError` for a likelihood without deviances, for several sensors, and for no degree of freedom.
+    Raises: `ValueError` for a likelihood without deviances, for several sensors, and for no degree
+            of freedom.
     """
     from scipy.special import chdtrc
 
     if not len(likelihood.degrees_of_freedom):
-        raise ValueError("the likelihood has no deviances: set told: true in the step of the likelihood")
+        raise ValueError(
+            "the likelihood has no deviances: set told: true in the step of the likelihood"
+        )
     if likelihood.deviance.numel() != len(likelihood.degrees_of_freedom):
         shape = tuple(likelihood.deviance.shape)
-        raise ValueError(f"deviances of shape {shape} belong to several sensors: compute the likelihood of one sensor")
-    deviance, freedom = float(likelihood.deviance.sum()), float(likelihood.degrees_of_freedom.sum()) - free
+        raise ValueError(
+            f"deviances of shape {shape} belong to several sensors: compute the likelihood of one"
+            " sensor"
+        )
+    deviance, freedom = (
+        float(likelihood.deviance.sum()),
+        float(likelihood.degrees_of_freedom.sum()) - free,
+    )
     if freedom <= 0:
-        raise ValueError(f"{freedom + free:.0f} measured numbers cannot test {free} free parameters: give more levels")
+        raise ValueError(
+            f"{freedom + free:.0f} measured numbers cannot test {free} free parameters: give more"
+            " levels"
+        )
     return GoodnessOfFit(deviance, freedom, float(chdtrc(freedom, deviance)))
 
 
@@ -245,16 +527,20 @@ def _mark(good: bool, else_: Mark = "fail") -> Mark:
 
 
 def _rhat(draws: FloatArray) -> float:
-    """Return R-hat of draws (ensemble, step, walker); an ensemble is one chain, because its walkers are correlated."""
+    """Return R-hat of draws (ensemble, step, walker); an ensemble is one chain, because its
+    walkers are correlated.
+    """
     return float(arviz().rhat(draws.reshape(len(draws), -1)))
 
 
-def _effective_sample_size(draws: FloatArray, part: str) -> float:
-    """Return the effective sample size of draws (ensemble, step, walker) in the ``bulk`` or in the ``tail``."""
+def _effective_sample_size(draws: FloatArray, method: str) -> float:
+    """Return the effective sample size of draws (ensemble, step, walker) in the ``bulk`` or in
+    the ``tail``.
+    """
     chains = draws.transpose(0, 2, 1).reshape(-1, draws.shape[1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # short chains fail by their effective sample size
-        return float(arviz().ess(chains, method=part))
+        return float(arviz().ess(chains, method=method))
 
 
 def count_failures(checks: Sequence[Check]) -> int:

@@ -1,4 +1,6 @@
-"""The command ``neusee calibrate``: the posterior of a recipe's sensor, and the folder with the results."""
+"""The command ``neusee calibrate``: the posterior of a recipe's sensor, and the folder with the
+results.
+"""
 
 from __future__ import annotations
 
@@ -14,18 +16,19 @@ import numpy as np
 
 from neusee.nodes.calibrate import FrameTest, Laboratory, Rings
 from neusee.nodes.values import Levels
-from neusee.workflows.calibration.budget_page import COLUMNS, budget_document, budget_rows
-from neusee.workflows.calibration.calibration_budget import budgets
 from neusee.workflows.calibration.calibration_page import (
     NOT_TOLD,
     CalibrationResult,
+    agreement,
     banner,
+    compared,
     estimated_models,
     lead,
     sections,
 )
 from neusee.workflows.calibration.frame_validity import (
     as_rows,
+    compare_models,
     data_check,
     frame_checks,
     frame_section,
@@ -44,16 +47,33 @@ from neusee.workflows.calibration.laboratory import (
     with_laboratory_models,
     without_efficiency,
 )
-from neusee.workflows.calibration.level_misfit import is_camera
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.model_spread import compare_models
-from neusee.workflows.calibration.posterior_checks import Check, arviz, checks, count_failures, importance_samples
-from neusee.workflows.calibration.posterior_mode import LaplaceFit, search_mode
-from neusee.workflows.calibration.standard_fit import agreement, compared
+from neusee.workflows.calibration.log_posterior import LaplaceFit, SensorPosterior, search_mode
+from neusee.workflows.calibration.posterior_checks import (
+    Check,
+    arviz,
+    checks,
+    count_failures,
+    importance_samples,
+    is_camera,
+)
+from neusee.workflows.calibration.uncertainty_budget import (
+    COLUMNS,
+    budget_document,
+    budget_rows,
+    budgets,
+)
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.report.study_folder import Content, CsvTable, Progress, StudyReport, StudyRun, as_json, silent
+from neusee.workflows.keys.code_digest import engine
+from neusee.workflows.report.study_folder import (
+    Content,
+    CsvTable,
+    Progress,
+    StudyReport,
+    StudyRun,
+    as_json,
+    silent,
+)
 from neusee.workflows.store.result_store import Store
 
 _KEPT = 4000  #: draws in the file ``draws.npz``
@@ -64,11 +84,15 @@ class CalibrationRefused(ValueError):
 
 
 class FramesRefused(CalibrationRefused):
-    """Error raised if the frames are not such as any likelihood describes; ``tests`` has the tests of the frames."""
+    """Error raised if the frames are not such as any likelihood describes; ``tests`` has the
+    tests of the frames.
+    """
 
     def __init__(self, tests: Sequence[FrameTest]) -> None:
         self.tests = tests
-        super().__init__("; ".join(f"{t.name}: {t.sentence}" for t in tests if t.verdict == "refused"))
+        super().__init__(
+            "; ".join(f"{t.name}: {t.sentence}" for t in tests if t.verdict == "refused")
+        )
 
 
 def calibrate(
@@ -84,9 +108,10 @@ def calibrate(
 ) -> Path:
     """Draw from the posterior of the sensor of ``recipe``, and return the folder with the results.
 
-    A second call continues an interrupted calibration and does not repeat draws. Where the frames are refused, nothing
-    is drawn, and the page and the document have the tests of the frames and no parameter. Raises: `CalibrationRefused`
-    before any sampling if the levels constrain the sensor too little, `ValueError` for a recipe without a likelihood.
+    A second call continues an interrupted calibration and does not repeat draws. Where the frames
+    are refused, nothing is drawn, and the page and the document have the tests of the frames and no
+    parameter. Raises: `CalibrationRefused` before any sampling if the levels constrain the sensor
+    too little, `ValueError` for a recipe without a likelihood.
     """
     study_run = StudyRun("calibrate", recipe, command)
     try:
@@ -94,16 +119,24 @@ def calibrate(
     except FramesRefused as refused:
         document = study_run.document(_refused_document(refused))
         return study_run.write(
-            runs, digest(document["frames"]), document, _refused_report(recipe, document, refused), "posterior"
+            runs,
+            digest(document["frames"]),
+            document,
+            _refused_report(recipe, document, refused),
+            "posterior",
         )
     document = study_run.document(_document(result))
-    return study_run.write(runs, digest(document["parameters"]), document, _report(result, document), "posterior")
+    return study_run.write(
+        runs, digest(document["parameters"]), document, _report(result, document), "posterior"
+    )
 
 
 def find_posterior(
     recipe: Recipe, store: Store, progress: Progress, *, walkers: int, move: str, draws: int
 ) -> CalibrationResult:
-    """Compute the posterior of a recipe's sensor, with identifiability, checks and models of the response."""
+    """Compute the posterior of a recipe's sensor, with identifiability, checks and models of the
+    response.
+    """
     from neusee.workflows.calibration import emcee_sampler
 
     emcee_sampler.move(move)  # raises for a wrong name before anything is computed
@@ -115,11 +148,15 @@ def find_posterior(
     identifiability = identify(problem, mode)
     if identifiability.refused:
         raise CalibrationRefused(identifiability.refused)
-    key = digest("posterior", engine("calibration.emcee_sampler"), problem.key, walkers, move, recipe.seed)
+    key = digest(
+        "posterior", engine("calibration.emcee_sampler"), problem.key, walkers, move, recipe.seed
+    )
     file = store.root / "posterior" / f"{key}.h5"
     law = importance_samples(problem, mode, recipe.seed)
     if problem.coordinates.bent:
-        identifiability = identify_from_draws(problem, mode, identifiability, law.samples, law.weights)
+        identifiability = identify_from_draws(
+            problem, mode, identifiability, law.samples, law.weights
+        )
     for line in identifiability.directions:
         progress(f"not identifiable: {line}")
     chains = emcee_sampler.sample(
@@ -128,40 +165,59 @@ def find_posterior(
         file,
         seed=recipe.seed,
         walkers=walkers,
-        how=move,
-        wanted=draws,
+        move_name=move,
+        effective_size=draws,
         progress=progress,
         guide=law.guide,
     )
-    models = compare_models(recipe, store, recipe.seed) if isinstance(problem.levels, Levels) else []
+    models = (
+        compare_models(recipe, store, recipe.seed) if isinstance(problem.levels, Levels) else []
+    )
     tested = [
         *frame_checks(tests, not isinstance(problem.levels, Rings)),
         *_data_checks(problem, mode, tests),
         *checks(problem, mode, identifiability, chains, law),
     ]
-    result = _widened(CalibrationResult(problem, mode, identifiability, chains, tested, models, tests), laboratory)
-    return replace(result, checks=[*tested, *agreement(result.beside)]) if is_camera(problem) else result
+    result = _widened(
+        CalibrationResult(problem, mode, identifiability, chains, tested, models, tests), laboratory
+    )
+    return (
+        replace(result, checks=[*tested, *agreement(result.beside)])
+        if is_camera(problem)
+        else result
+    )
 
 
-def _data_checks(problem: SensorPosterior, mode: LaplaceFit, tests: Sequence[FrameTest]) -> list[Check]:
-    """Return what the frames may hide, and if they have the least data of a clean statement; none without frames."""
-    found = hidden_checks(tests, problem.coordinates.prior.may_hide)
-    if not found or not isinstance(problem.levels, Levels):
-        return found
+def _data_checks(
+    problem: SensorPosterior, mode: LaplaceFit, tests: Sequence[FrameTest]
+) -> list[Check]:
+    """Return what the frames may hide, and if they have the least data of a clean statement;
+    none without frames.
+    """
+    checks = hidden_checks(tests, problem.coordinates.prior.may_hide)
+    if not checks or not isinstance(problem.levels, Levels):
+        return checks
     levels = problem.levels
-    used = problem.likelihood(mode.theta[None]).degrees_of_freedom > 0
-    return [*found, data_check(float(levels.degrees_of_freedom[used & (levels.photons > 0)].sum()))]
+    fitted = problem.likelihood(mode.theta[None]).degrees_of_freedom > 0
+    return [
+        *checks,
+        data_check(float(levels.degrees_of_freedom[fitted & (levels.photons > 0)].sum())),
+    ]
 
 
 def _widened(result: CalibrationResult, laboratory: Laboratory) -> CalibrationResult:
-    """Return a calibration with what the frames show or may hide, with what the laboratory states, and its budgets."""
+    """Return a calibration with what the frames show or may hide, with what the laboratory
+    states, and its budgets.
+    """
     problem, tests = result.problem, result.frames
-    told = result.identifiability
+    identifiability = result.identifiability
     chains = widened(problem, result.chains, tests, problem.recipe.seed)
     models = widened_models(result.models, tests, problem.coordinates.prior.may_hide)
     result = replace(
         result,
-        identifiability=without_efficiency(told) if is_relative(problem.recipe) else told,
+        identifiability=without_efficiency(identifiability)
+        if is_relative(problem.recipe)
+        else identifiability,
         chains=with_laboratory(problem, chains, laboratory, problem.recipe.seed),
         models=with_laboratory_models(models, laboratory),
         walk=result.chains,
@@ -170,7 +226,9 @@ def _widened(result: CalibrationResult, laboratory: Laboratory) -> CalibrationRe
 
 
 def _accepted_frames(recipe: Recipe, store: Store, progress: Progress) -> Sequence[FrameTest]:
-    """Return the tests of the frames of a calibration; raises `FramesRefused` where no likelihood describes them."""
+    """Return the tests of the frames of a calibration; raises `FramesRefused` where no
+    likelihood describes them.
+    """
     tests = inspect_recipe(recipe, store)
     for line in lines(tests):
         progress(line)
@@ -180,36 +238,47 @@ def _accepted_frames(recipe: Recipe, store: Store, progress: Progress) -> Sequen
 
 
 def _refused_document(refused: FramesRefused) -> dict[str, Any]:
-    """Return the document of a calibration whose frames are refused, without a value of any parameter."""
-    found = frame_checks(refused.tests)
+    """Return the document of a calibration whose frames are refused, without a value of any
+    parameter.
+    """
+    checks = frame_checks(refused.tests)
     return {
-        "failed": count_failures(found),
+        "failed": count_failures(checks),
         "parameters": {},
         "frames": as_rows(refused.tests),
-        "checks": [asdict(check) for check in found],
+        "checks": [asdict(check) for check in checks],
     }
 
 
-def _refused_report(recipe: Recipe, document: Mapping[str, Any], refused: FramesRefused) -> StudyReport:
-    lead = "The frames are refused, and nothing was drawn: no likelihood describes them, so no parameter is stated."
+def _refused_report(
+    recipe: Recipe, document: Mapping[str, Any], refused: FramesRefused
+) -> StudyReport:
+    lead = (
+        "The frames are refused, and nothing was drawn: no likelihood describes them, so no"
+        " parameter is stated."
+    )
     files: dict[str, Content] = {"posterior.json": as_json(document)}
     wrong = f"Not fit for use: {document['failed']} tests of the frames fail. {refused}."
     return StudyReport(
-        f"{recipe.name}: frames refused", lead, [frame_section(refused.tests)], files=files, banner=wrong
+        f"{recipe.name}: frames refused",
+        lead,
+        [frame_section(refused.tests)],
+        files=files,
+        banner=wrong,
     )
 
 
 def _document(result: CalibrationResult) -> dict[str, Any]:
     """Return the results of a calibration for ``posterior.json``."""
     problem, flat = result.problem, result.chains.flat
-    told = [i for i, name in enumerate(problem.names) if name in result.identifiability.told]
+    determined = [i for i, name in enumerate(problem.names) if name in result.identifiability.told]
     return {
         "failed": count_failures(result.checks),
         "parameters": {row.name: _plain(asdict(row)) for row in result.rows()},
         "gaussian": {
-            "coordinates": [problem.coordinates.labels[i] for i in told],
-            "mean": flat[:, told].mean(0).tolist(),
-            "covariance": np.cov(flat[:, told].T).reshape(len(told), -1).tolist(),
+            "coordinates": [problem.coordinates.labels[i] for i in determined],
+            "mean": flat[:, determined].mean(0).tolist(),
+            "covariance": np.cov(flat[:, determined].T).reshape(len(determined), -1).tolist(),
         },
         "stated": {model.name: asdict(model.stated) for model in estimated_models(result)},
         "least_squares": compared(result.beside),
@@ -222,15 +291,19 @@ def _document(result: CalibrationResult) -> dict[str, Any]:
 def _plain(row: Mapping[str, Any]) -> dict[str, Any]:
     """Return the results of a parameter, without the numbers that the frames do not give."""
     not_told = NOT_TOLD[row["kind"]]
-    kept = {name: value for name, value in row.items() if name not in not_told}
-    return {name: None if isinstance(x, float) and not math.isfinite(x) else x for name, x in kept.items()}
+    determined = {name: value for name, value in row.items() if name not in not_told}
+    return {
+        name: None if isinstance(x, float) and not math.isfinite(x) else x
+        for name, x in determined.items()
+    }
 
 
 def _report(result: CalibrationResult, document: Mapping[str, Any]) -> StudyReport:
     parts = sections(result)
     curve = "rings" if isinstance(result.problem.levels, Rings) else "transfer"
     pictures: dict[str, bytes | None] = {
-        name: part.picture for name, part in zip((curve, "corner", "chains"), parts[-3:], strict=True)
+        name: section.picture
+        for name, section in zip((curve, "corner", "chains"), parts[-3:], strict=True)
     }
     pictures["budget"] = result.budget_picture
     files: dict[str, Content] = {
@@ -245,16 +318,22 @@ def _report(result: CalibrationResult, document: Mapping[str, Any]) -> StudyRepo
 
 
 def _draws(result: CalibrationResult) -> bytes:
-    """Return the bytes of an npz file with posterior draws of each parameter that the frames tell, evenly from all."""
+    """Return the bytes of an npz file with posterior draws of each parameter that the frames
+    tell, evenly from all.
+    """
     every = max(1, result.chains.flat.shape[0] // _KEPT)
     out = io.BytesIO()
-    draws: dict[str, Any] = {name: result.draws[name].reshape(-1)[::every] for name in result.identifiability.told}
+    draws: dict[str, Any] = {
+        name: result.draws[name].reshape(-1)[::every] for name in result.identifiability.told
+    }
     np.savez(out, **draws)
     return out.getvalue()
 
 
 def _inference_data(result: CalibrationResult) -> Any:
-    """Return the draws of what the frames tell as ArviZ inference data, with each walker as a chain."""
+    """Return the draws of what the frames tell as ArviZ inference data, with each walker as a
+    chain.
+    """
     chains = result.chains
 
     def by_walker(draws: Any) -> Any:
@@ -264,7 +343,10 @@ def _inference_data(result: CalibrationResult) -> Any:
     attributes = {"recipe": result.problem.recipe.name, "inference_library": "emcee"}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # ArviZ warns of more walkers than steps
-        data = arviz().from_dict(posterior, sample_stats={"lp": by_walker(chains.log)}, attrs=attributes)
+        data = arviz().from_dict(
+            posterior, sample_stats={"lp": by_walker(chains.log)}, attrs=attributes
+        )
     for group in data.groups():
-        data[group].attrs.pop("created_at", None)  # the date is that of the command, in provenance.json
+        # the date is that of the command, in provenance.json
+        data[group].attrs.pop("created_at", None)
     return data

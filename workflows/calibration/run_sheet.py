@@ -8,8 +8,25 @@ from pathlib import Path
 from typing import Any
 
 from neusee.nodes.calibrate import Budget, EmvaSheet, emva_sheet, sheet_budgets
-from neusee.workflows.calibration import emva_figures, emva_pdf
-from neusee.workflows.calibration.budget_page import (
+from neusee.workflows.calibration import emva_figures
+from neusee.workflows.calibration import emva_figures as emva_pdf
+from neusee.workflows.calibration.emva_sheet import (
+    OPERATING_POINT,
+    EmvaFrames,
+    Release,
+    banner,
+    frames_of_recipe,
+    group_of,
+    lead,
+    operating_point,
+    pattern_tables,
+    requirements,
+    sections,
+    temporal_variance,
+)
+from neusee.workflows.calibration.frame_validity import as_rows
+from neusee.workflows.calibration.laboratory import is_relative, laboratory_of, stated
+from neusee.workflows.calibration.uncertainty_budget import (
     BUDGETED,
     COLUMNS,
     budget_document,
@@ -17,25 +34,15 @@ from neusee.workflows.calibration.budget_page import (
     budget_rows,
     budget_sections,
 )
-from neusee.workflows.calibration.emva_frames import OPERATING_POINT, EmvaFrames, Release, frames_of_recipe
-from neusee.workflows.calibration.emva_page import (
-    banner,
-    group_of,
-    lead,
-    operating_point,
-    requirements,
-    sections,
-    temporal_variance,
-)
-from neusee.workflows.calibration.emva_patterns import pattern_tables
-from neusee.workflows.calibration.frame_validity import as_rows
-from neusee.workflows.calibration.laboratory import is_relative, laboratory_of, stated
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.study_folder import StudyReport, StudyRun, as_json
 from neusee.workflows.store.result_store import Store
 
-_PLUS = "U is the expanded uncertainty; + says that a source of it is not stated, which budget.json names."
+_PLUS = (
+    "U is the expanded uncertainty; + says that a source of it is not stated, which budget.json"
+    " names."
+)
 _MORE = " The files `budget.json` and `budget.csv` have the budgets of all quantities with a value."
 _COLUMNS = ("section", "key", "symbol", "quantity", "bound", "value", "unit", "reason")
 _TRANSFER = ("photons", "exposure", "mean", "variance", "mean_dark", "variance_dark")
@@ -51,34 +58,46 @@ def write_sheet(
     relative: bool = False,
     state: Sequence[str] = (),
 ) -> Path:
-    """Write the EMVA 1288 sheet of the frames of a recipe: page, PDF, JSON, CSV and pictures; return the folder.
+    """Write the EMVA 1288 sheet of the frames of a recipe: page, PDF, JSON, CSV and pictures;
+    return the folder.
 
-    ``release`` says whose variance in time is taken; by default that which the descriptor states, otherwise release 4.
-    With ``relative`` the photons of the recipe are known up to a factor, and nothing in photons is stated. ``state``
-    has what is told of the operating point, such as ``temperature=25 °C``.
-    Raises: ValueError for a recipe without frames, without dark frames or without two lit levels, and for a wrong
+    ``release`` says whose variance in time is taken; by default that which the descriptor states,
+    otherwise release 4. With ``relative`` the photons of the recipe are known up to a factor, and
+    nothing in photons is stated. ``state`` has what is told of the operating point, such as
+    ``temperature=25 °C``.
+    Raises: ValueError for a recipe without frames, without dark frames or without two lit levels,
+            and for a wrong
     statement.
     """
-    study_run, told = StudyRun("sheet", recipe, command), operating_point(state, stated(recipe))
+    study_run, statements = (
+        StudyRun("sheet", recipe, command),
+        operating_point(state, stated(recipe)),
+    )
     laboratory, photons_told = laboratory_of(recipe), not (relative or is_relative(recipe))
     frames = frames_of_recipe(recipe, store, release)
     sheet = emva_sheet(frames.levels, frames.spatial, photons_told=photons_told)
     budgets = sheet_budgets(frames.levels, sheet, laboratory, photons_told)
-    document = study_run.document(_document(sheet, frames, told, release is not None))
-    report = _report(recipe, sheet, frames, told, document, budgets)
+    document = study_run.document(_document(sheet, frames, statements, release is not None))
+    report = _report(recipe, sheet, frames, statements, document, budgets)
     return study_run.write(runs, digest(document["quantities"]), document, report, "emva1288")
 
 
-def _document(sheet: EmvaSheet, frames: EmvaFrames, told: Mapping[str, Any], chosen: bool) -> dict[str, Any]:
-    """Return the content of ``emva1288.json``; ``chosen`` is True if the user chose the release."""
+def _document(
+    sheet: EmvaSheet, frames: EmvaFrames, statements: Mapping[str, Any], by_user: bool
+) -> dict[str, Any]:
+    """Return the content of ``emva1288.json``; ``by_user`` is True if the user chose the
+    release.
+    """
     return {
         "standard": "EMVA 1288, release 4.0 Linear",
-        "temporal variance": temporal_variance(frames, chosen),
+        "temporal variance": temporal_variance(frames, by_user),
         "fails": banner(sheet, frames.tests),
-        "quantities": {q.key: {"section": group_of(q, sheet), **asdict(q)} for q in sheet.quantities},
-        "operating point": dict(told),
+        "quantities": {
+            q.key: {"section": group_of(q, sheet), **asdict(q)} for q in sheet.quantities
+        },
+        "operating point": dict(statements),
         "frames": as_rows(frames.tests),
-        "demands": [each._asdict() for each in requirements(sheet, frames, told)],
+        "demands": [demand._asdict() for demand in requirements(sheet, frames, statements)],
         "deviation": None if sheet.linearity is None else sheet.linearity.deviation.tolist(),
     }
 
@@ -87,7 +106,7 @@ def _report(
     recipe: Recipe,
     sheet: EmvaSheet,
     frames: EmvaFrames,
-    told: Mapping[str, Any],
+    statements: Mapping[str, Any],
     document: Mapping[str, Any],
     budgets: Sequence[Budget],
 ) -> StudyReport:
@@ -95,12 +114,15 @@ def _report(
     named = [budget for budget in budgets if budget.key in BUDGETED]
     budget = {"budget": budget_picture(named)} if named else {}
     traced = budget_sections(named, stated(recipe), budget.get("budget"), _MORE)
-    summary = [f"{name}: {'not stated' if told[key] is None else told[key]}" for key, name in OPERATING_POINT.items()]
+    summary = [
+        f"{name}: {'not stated' if statements[key] is None else statements[key]}"
+        for key, name in OPERATING_POINT.items()
+    ]
     summary += [document["temporal variance"], _PLUS, document["fails"]]
     return StudyReport(
         title,
         lead(sheet, document["temporal variance"]),
-        sections(sheet, frames, told, pictures, traced),
+        sections(sheet, frames, statements, pictures, traced),
         pictures | budget,
         tables={
             "emva1288.csv": (_COLUMNS, _rows(sheet)),

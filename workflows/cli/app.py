@@ -1,4 +1,4 @@
-"""The entry point of the command line: ``neusee --help`` works without typer, and an error is printed as one line."""
+"""The entry point of the command line: help without typer, threads, errors as one line."""
 
 from __future__ import annotations
 
@@ -6,40 +6,101 @@ import gc
 import os
 import sys
 import warnings
+from collections.abc import MutableMapping
 from io import TextIOWrapper
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.cli.command_list import BAD, COLUMNS, DONE, FAILED, INTERRUPTED, REPEATED, TYPED, help_page
+from neusee.workflows.cli.commands_and_exit_codes import (
+    BAD,
+    COLUMNS,
+    DONE,
+    FAILED,
+    INTERRUPTED,
+    REPEATED,
+    TYPED,
+    help_page,
+)
 from neusee.workflows.cli.interrupt_signal import Interrupts, said, say_stopped
+from neusee.workflows.engine.machine_resources import free_processors
 
 if TYPE_CHECKING:
     import typer
 
-app: typer.Typer  #: the program with the options of all commands, built when a caller first reads the name
+
+# --- thread settings ------------------------------------------------------------------------------
+
+# Threads of torch beside other work, decided before torch is imported, because OpenMP reads its
+# settings only then.
+#
+# A thread of OpenMP that waits for another spins for a thousandth of a second or more. Where the
+# processors are busy, the other thread is not running, so that two threads burn ten times the
+# processor time of one and take as much longer.
+
+
+#: variables that say how a thread waits
+_WAITING = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
+_NUMBER = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_DRAWN = ("run",)  #: commands beside whose short steps a process draws pictures
+_TIMED = ("study",)  #: commands whose stored times belong to a number of threads
+
+
+def settle_threads(command: str, environ: MutableMapping[str, str] = os.environ) -> None:
+    """Let waiting threads sleep, and leave the processors that are busy to other work; keep what
+    the user has set.
+
+    Steps beside which pictures are drawn leave one processor to these: on two processors `neusee
+    run first_light` took 10.0 s with two threads and 8.1 s with one. Nothing changes where torch is
+    imported already.
+    """
+    if "torch" in sys.modules:
+        return
+    if not any(name in environ for name in _WAITING):
+        environ["OMP_WAIT_POLICY"] = "PASSIVE"
+    threads = free_processors()
+    if (
+        command not in _TIMED
+        and not any(name in environ for name in _NUMBER)
+        and threads is not None
+    ):
+        environ["OMP_NUM_THREADS"] = str(max(1, threads - (command in _DRAWN)))
+
+
+# --- app ------------------------------------------------------------------------------------------
+
+# The entry point of the command line: ``neusee --help`` works without typer, and an error is
+# printed as one line.
+
+
+#: the program with the options of all commands, built when a caller first reads the name
+app: typer.Typer
 
 
 def __getattr__(name: str) -> Any:
     if name != "app":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from neusee.workflows.cli.typer_program import program
+    from neusee.workflows.cli.program_options import program
 
     return globals().setdefault("app", program())
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit; print an error as one line, or with ``--debug`` as a traceback."""
+    """Run the command line and exit; print an error as one line, or with ``--debug`` as a
+    traceback.
+    """
     interrupts = Interrupts()
     if arguments is None:  # else a caller inside Python, whose signals and garbage are its own
         interrupts.watch()
-        gc.disable()  # a search for garbage among imported modules takes a tenth of the start-up time
-    arguments = sys.argv[1:] if arguments is None else arguments
+        # a search for garbage among imported modules takes a tenth of the start-up time
+        gc.disable()
+        arguments = sys.argv[1:]
     TYPED[:] = arguments
     said.clear()
     _print_any_character()
     try:
         code = _run(arguments)
-        if code == INTERRUPTED or (interrupts.came and code != DONE):  # typer, too, ends at an interrupt
+        # typer, too, ends at an interrupt
+        if code == INTERRUPTED or (interrupts.came and code != DONE):
             code = _stopped()
     except BrokenPipeError:
         sys.stderr.close()
@@ -55,7 +116,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _print_any_character() -> None:
-    """Print characters that the terminal lacks, such as µ on one of ASCII, as escapes in place of an error."""
+    """Print characters that the terminal lacks, such as µ on one of ASCII, as escapes in place
+    of an error.
+    """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
@@ -68,7 +131,11 @@ def _stopped() -> int:
 
 def _run(arguments: list[str]) -> int:
     completes = "_NEUSEE_COMPLETE" in os.environ
-    if arguments in (["--help"], ["-h"]) and not completes and get_terminal_size().columns >= COLUMNS:
+    if (
+        arguments in (["--help"], ["-h"])
+        and not completes
+        and get_terminal_size().columns >= COLUMNS
+    ):
         print(help_page())
         return DONE
     if not completes and arguments[:1] and arguments[0] in REPEATED:
@@ -76,9 +143,8 @@ def _run(arguments: list[str]) -> int:
 
         if say_stored_answer(arguments):
             return DONE
-    from neusee.workflows.cli.interruption import print_warning
-    from neusee.workflows.cli.thread_settings import settle_threads
-    from neusee.workflows.cli.typer_program import run_program
+    from neusee.workflows.cli.command_frame import print_warning
+    from neusee.workflows.cli.program_options import run_program
 
     settle_threads(arguments[0] if arguments else "")
     with warnings.catch_warnings():

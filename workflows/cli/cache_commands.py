@@ -1,4 +1,6 @@
-"""The commands of ``neusee cache``: ls, verify, gc, pin, unpin and why, and the lines that they print."""
+"""The commands of ``neusee cache``: ls, verify, gc, pin, unpin and why, and the lines that they
+print.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from neusee.workflows.answers import answer_upkeep
+from neusee.workflows.answers import stored_answer
 from neusee.workflows.cli.command_frame import failing, say, the_store
-from neusee.workflows.cli.command_list import MISSED
-from neusee.workflows.report.text_table import columns
-from neusee.workflows.store.byte_sizes import format_size, parse_size
+from neusee.workflows.cli.commands_and_exit_codes import MISSED
+from neusee.workflows.report.terminal_text import columns
+from neusee.workflows.store.cache_settings import format_size, parse_size
 from neusee.workflows.store.metadata import is_kept
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from neusee.workflows.store.derived_files import DerivedFiles
     from neusee.workflows.store.result_store import Store
@@ -24,20 +26,27 @@ if TYPE_CHECKING:
 _PAGE = 50  #: results that `ls` shows
 _HEAD = ("date", "bytes", "seconds", "step", "recipe", "key", "")
 
-cache = typer.Typer(help="List, check, remove and keep stored results.", no_args_is_help=True, rich_markup_mode=None)
+cache = typer.Typer(
+    help="List, check, remove and keep stored results.", no_args_is_help=True, rich_markup_mode=None
+)
 
-Key = Annotated[str, typer.Argument(metavar="KEY", help="The first digits of a key, as `cache ls` shows them.")]
+Key = Annotated[
+    str, typer.Argument(metavar="KEY", help="The first digits of a key, as `cache ls` shows them.")
+]
 
 
 @cache.command("ls")
 def ls(
-    whole: Annotated[bool, typer.Option("--all", help="List every stored result, the newest last.")] = False,
+    every: Annotated[
+        bool, typer.Option("--all", help="List every stored result, the newest last.")
+    ] = False,
 ) -> None:
     """List the newest stored results.
 
-    For each result: when it was computed, its bytes and seconds, its step and the recipe that first needed it.
+    For each result: when it was computed, its bytes and seconds, its step and the recipe that first
+    needed it.
     """
-    for line in ls_lines(the_store(), whole):
+    for line in ls_lines(the_store(), every):
         print(line)
 
 
@@ -55,12 +64,17 @@ def verify() -> None:
 
 @cache.command("gc")
 def gc(
-    budget: Annotated[str, typer.Option("--budget", help="Largest size of the cache, such as 20 GB.")] = "",
-    dry: Annotated[bool, typer.Option("--dry-run", help="Say what would be removed, and remove nothing.")] = False,
+    budget: Annotated[
+        str, typer.Option("--budget", help="Largest size of the cache, such as 20 GB.")
+    ] = "",
+    dry: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would be removed, and remove nothing.")
+    ] = False,
 ) -> None:
     """Remove files that belong to no stored result, and results beyond a budget.
 
-    Beyond the budget, the results that save the fewest seconds for each byte are removed first. Pinned results stay.
+    Beyond the budget, the results that save the fewest seconds for each byte are removed first.
+    Pinned results stay.
     """
     with failing(ValueError, before="--budget: "):
         say(gc_lines(the_store(), budget or None, dry))
@@ -92,51 +106,57 @@ def why(key: Key) -> None:
         say(why_key_lines(the_store(), key))
 
 
-# --- what the commands print ------------------------------------------------------------------------------------------
+# --- what the commands print ----------------------------------------------------------------------
 
 
-def ls_lines(store: Store, whole: bool = False) -> Iterator[str]:
-    """Yield a line for each cached result with its date, bytes, seconds, step, recipe and key, the newest last.
+def ls_lines(store: Store, every: bool = False) -> Iterator[str]:
+    """Yield a line for each cached result with its date, bytes, seconds, step, recipe and key, the
+    newest last.
 
-    Without ``whole``, these are the newest 50. In a long journal their number and bytes are those that it tells, so
-    that the time does not grow with each result. Of each result, one short text is held in memory.
+    Without ``every``, these are the newest 50. In a long journal their number and bytes are those
+    that it tells, so that the time does not grow with each result. Of each result, one short text
+    is held in memory.
     """
     pins = store.pinned()
-    if whole or not store.journal.is_long():
-        rows, kept, size = _every_row(store, pins)
-        receipts, by = len(rows) - kept, ""
+    if every or not store.journal.is_long():
+        rows, values, size = _every_row(store, pins)
+        receipts, by = len(rows) - values, ""
     else:
         rows = _newest_rows(store, pins)
-        kept, size, receipts = store.journal.totals()
+        values, size, receipts = store.journal.totals()
         by = " by the journal"
-    shown = rows if whole else rows[-_PAGE:]
+    shown = rows if every else rows[-_PAGE:]
     yield from _aligned(shown)
-    if kept + receipts > len(shown):
+    if values + receipts > len(shown):
         yield f"the newest {len(shown)}; `neusee cache ls --all` lists all"
-    last = f"{_count(kept, 'result')}, {format_size(size)}{by}, in {store.root}"
+    last = f"{_count(values, 'result')}, {format_size(size)}{by}, in {store.root}"
     if receipts:
         last += f"; of {_count(receipts, 'more result')} the receipt alone"
-    last += _answers_text(answer_upkeep.answers(store.disk))
+    last += _answers_text(stored_answer.answers(store.disk))
     if store.budget is not None:
         last += f"; the budget is {format_size(store.budget)}"
     yield last
 
 
 def _every_row(store: Store, pins: set[str]) -> tuple[list[str], int, int]:
-    """Return the row of each result in order of time, the number of stored values and their bytes."""
-    rows, kept, size = list[str](), 0, 0
+    """Return the row of each result in order of time, the number of stored values and their
+    bytes.
+    """
+    rows, values, size = list[str](), 0, 0
     for key, about in store.entries():
         rows.append("\0".join(_row(key, about, key in pins)))
         if is_kept(about):
-            kept, size = kept + 1, size + _size(about)
-    return sorted(rows, key=_row_date), kept, size
+            values, size = values + 1, size + _size(about)
+    return sorted(rows, key=_row_date), values, size
 
 
 def _newest_rows(store: Store, pins: set[str]) -> list[str]:
-    """Return the rows of the newest results of the journal that still have metadata, in order of time."""
+    """Return the rows of the newest results of the journal that still have metadata, in order of
+    time.
+    """
     newest = dict.fromkeys(row["key"] for row in reversed(store.journal.latest()))
-    found = ((key, store.about(key)) for key in newest)
-    some = itertools.islice(((key, about) for key, about in found if about is not None), _PAGE)
+    entries = ((key, store.about(key)) for key in newest)
+    some = itertools.islice(((key, about) for key, about in entries if about is not None), _PAGE)
     return sorted(("\0".join(_row(key, about, key in pins)) for key, about in some), key=_row_date)
 
 
@@ -150,11 +170,15 @@ def _aligned(rows: Sequence[str]) -> Iterator[str]:
     for row in rows:
         widths = [*map(max, widths, map(len, row.split("\0")))]
     for line in ("\0".join(_HEAD), *rows) if rows else ():
-        yield "  ".join(f"{cell:<{width}}" for cell, width in zip(line.split("\0"), widths, strict=True)).rstrip()
+        yield "  ".join(
+            f"{cell:<{width}}" for cell, width in zip(line.split("\0"), widths, strict=True)
+        ).rstrip()
 
 
 def verify_lines(store: Store) -> tuple[list[str], int]:
-    """Read every result in the cache; return a line for each damaged result, and the number of damaged results."""
+    """Read every result in the cache; return a line for each damaged result, and the number of
+    damaged results.
+    """
     from neusee.workflows.store.derived_files import DerivedFiles
 
     files = DerivedFiles(store)
@@ -166,50 +190,91 @@ def verify_lines(store: Store) -> tuple[list[str], int]:
             damaged.append(f"{entry.key}  {about.get('step') or '?'}  {problem}")
         elif is_kept(about):
             sizes.append(_size(about))
-    answers, broken = answer_upkeep.check(store.disk)
-    damaged += [f"{each.name}  the answer of a command, which is not what was written" for each in broken]
-    last = f"{_count(len(sizes), 'result')}, {format_size(sum(sizes))}{_answers_text(answers)}, as written"
+    answers, broken = stored_answer.check(store.disk)
+    damaged += [
+        f"{answer.name}  the answer of a command, which is not what was written"
+        for answer in broken
+    ]
+    last = (
+        f"{_count(len(sizes), 'result')}, {format_size(sum(sizes))}{_answers_text(answers)}, as"
+        " written"
+    )
     if damaged:
-        last += f"; {len(damaged)} damaged, put aside in {store.root / 'bad'}: the next run computes those it needs"
+        last += (
+            f"; {len(damaged)} damaged, put aside in {store.root / 'bad'}: the next run computes"
+            " those it needs"
+        )
     return [*damaged, last], len(damaged)
 
 
 def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list[str]:
-    """Remove files that belong to no cached result, and cached values beyond ``budget``; return the lines to print.
+    """Remove files that belong to no cached result, and cached values beyond ``budget``; return the
+    lines to print.
 
     Raises `ValueError` for a budget that is not a size.
     """
     swept = store.gc(None if budget is None else parse_size(budget), dry)
-    full = budget is not None and swept.left + sum(map(_bytes, answer_upkeep.answers(store.disk))) > parse_size(budget)
-    old = answer_upkeep.sweep(store.disk, dry, everything=full)
+    full = budget is not None and _is_beyond(store, swept.left, parse_size(budget))
+    old = stored_answer.sweep(store.disk, dry, everything=full)
     abouts = ((key, store.about(key)) for key in swept.evicted)  # the receipts of what went
     rows = [[*_row(key, about, False)[1:4], key[:8]] for key, about in abouts if about is not None]
-    went = f"{_count(len(swept.evicted), 'value')} and {_count(swept.orphans, 'file')} that belonged to no result"
+    went = (
+        f"{_count(len(swept.evicted), 'value')} and {_count(swept.orphans, 'file')} that belonged"
+        " to no result"
+    )
     freed, left = format_size(swept.freed), format_size(swept.left)
-    last = f"{went} {'would go' if dry else 'went'}: {freed}; {left} stay in {store.root}"
-    refused = f"{_count(len(swept.refused), 'value')} of other users could not be removed"
-    of_answers = f"{_answers_text(old)[2:]} {'would go' if dry else 'went'}"
-    more = [*([refused] if swept.refused else []), *([of_answers] if old else [])]
-    return [*(columns(rows) if rows else []), *more, last]
+    verb = "would go" if dry else "went"
+    last = f"{went} {verb}: {freed}; {left} stay in {store.root}"
+    lines = list(columns(rows)) if rows else []
+    if swept.refused:
+        lines.append(f"{_count(len(swept.refused), 'value')} of other users could not be removed")
+    if old:
+        lines.append(f"{_answers_text(old)[2:]} {verb}")
+    return [*lines, last]
+
+
+def _is_beyond(store: Store, left: int, budget: int) -> bool:
+    """Return True if the values that are left and the stored answers need more than a budget."""
+    return left + sum(map(_bytes, stored_answer.answers(store.disk))) > budget
 
 
 def pin_lines(store: Store, prefix: str, pin: bool = True) -> list[str]:
-    """Pin or unpin the cached value whose key begins with ``prefix``; raise `ValueError` for no or several matches."""
-    keys = {key for key, about in store.entries() if is_kept(about)} if pin else store.pinned()
+    """Pin or unpin the cached value whose key begins with ``prefix``; raise `ValueError` for no
+    or several matches.
+    """
+    if pin:
+        keys = {key for key, about in store.entries() if is_kept(about)}
+        key = _only_key(keys, prefix, "value")
+        store.pin(key)
+    else:
+        key = _only_key(store.pinned(), prefix, "pinned value")
+        store.unpin(key)
+    step = (store.about(key) or {}).get("step") or "a value that is not here"
+    return [f"{'pinned' if pin else 'no longer pinned'}: {key}  {step}"]
+
+
+def _only_key(keys: Iterable[str], prefix: str, noun: str) -> str:
+    """Return the key that begins with ``prefix``; raise `ValueError` for no or several matches."""
     named = sorted(key for key in keys if key.startswith(prefix.lower()))
-    if len(named) != 1:
-        what = "value" if pin else "pinned value"
-        few = f"it matches {', '.join(key[:12] for key in named[:5])}" if named else "it matches no key"
-        raise ValueError(f"{prefix!r} must be the start of the key of one {what}: {few} (`neusee cache ls` lists keys)")
-    (store.pin if pin else store.unpin)(named[0])
-    step = (store.about(named[0]) or {}).get("step") or "a value that is not here"
-    return [f"{'pinned' if pin else 'no longer pinned'}: {named[0]}  {step}"]
+    if len(named) == 1:
+        return named[0]
+    few = f"it matches {', '.join(key[:12] for key in named[:5])}" if named else "it matches no key"
+    raise ValueError(
+        f"{prefix!r} must be the start of the key of one {noun}: {few} (`neusee cache ls` lists"
+        " keys)"
+    )
 
 
 def _picture_problem(files: DerivedFiles, key: str, about: dict[str, Any]) -> str:
-    """Check the file of a stored picture; if the file is damaged, move the file away and return the problem as text."""
+    """Check the file of a stored picture; if the file is damaged, move the file away and return
+    the problem as text.
+    """
     name = about.get("file")
-    if not name or not is_kept(about) or files.find(key, os.path.basename(name)[len(key) :]) is not None:
+    if (
+        not name
+        or not is_kept(about)
+        or files.find(key, os.path.basename(name)[len(key) :]) is not None
+    ):
         return ""
     problem = f"its file {name} is not what was written"
     files.store.put_aside(key, ValueError(problem))
@@ -217,9 +282,20 @@ def _picture_problem(files: DerivedFiles, key: str, about: dict[str, Any]) -> st
 
 
 def _row(key: str, about: dict[str, Any], pinned: bool) -> list[str]:
-    took, date = f"{about.get('seconds') or 0.0:.3f}", str(about.get("date") or "")[:19].replace("T", " ")
+    took, date = (
+        f"{about.get('seconds') or 0.0:.3f}",
+        str(about.get("date") or "")[:19].replace("T", " "),
+    )
     mark = "pinned" if pinned else "" if is_kept(about) else "receipt"
-    return [date, format_size(_size(about)), took, about.get("step") or "", about.get("recipe") or "", key[:8], mark]
+    return [
+        date,
+        format_size(_size(about)),
+        took,
+        about.get("step") or "",
+        about.get("recipe") or "",
+        key[:8],
+        mark,
+    ]
 
 
 def _size(about: dict[str, Any]) -> int:
@@ -228,15 +304,17 @@ def _size(about: dict[str, Any]) -> int:
     return size
 
 
-def _answers_text(answers: Sequence[answer_upkeep.Kept]) -> str:
-    """Return how many stored answers there are and their bytes, after a comma, or an empty text without answers."""
+def _answers_text(answers: Sequence[stored_answer.Kept]) -> str:
+    """Return how many stored answers there are and their bytes, after a comma, or an empty text
+    without answers.
+    """
     size = format_size(sum(map(_bytes, answers)))
     return f", {_count(len(answers), 'answer')} of commands of {size}" if answers else ""
 
 
-def _bytes(answer: answer_upkeep.Kept) -> int:
+def _bytes(answer: stored_answer.Kept) -> int:
     return answer.size
 
 
-def _count(count: int, what: str) -> str:
-    return f"{count} {what}{'s' * (count != 1)}"
+def _count(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' * (count != 1)}"

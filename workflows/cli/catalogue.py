@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterator
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from types import MappingProxyType, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
@@ -16,7 +16,7 @@ from neusee.workflows.cli.command_frame import failing, refusing, say
 from neusee.workflows.cli.command_options import Debug
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.report.paper_readings import READINGS, SETTLED
-from neusee.workflows.report.text_table import columns
+from neusee.workflows.report.terminal_text import columns
 
 if TYPE_CHECKING:
     from neusee.nodes import Node
@@ -46,7 +46,8 @@ _QUANTITIES = {
 }
 
 
-#: examples of types of `neusee.nodes.units` whose usual values are far from the example of their unit
+#: examples of types of `neusee.nodes.units` whose usual values are far from the example of their
+#: unit
 _EXAMPLES = {
     "Wavelength": "550 nm",
     "Linewidth": "10 nm",
@@ -67,14 +68,19 @@ def recipes() -> None:
 
 
 def nodes(
-    name: Annotated[str | None, typer.Argument(help="One node, such as optics.psf; `reading`, or `glossary`.")] = None,
-    recipe: Annotated[str | None, typer.Option("--recipe", help="Include the nodes that this recipe names.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(help="One node, such as optics.psf; `reading`, or `glossary`.")
+    ] = None,
+    recipe: Annotated[
+        str | None, typer.Option("--recipe", help="Include the nodes that this recipe names.")
+    ] = None,
     debug: Debug = False,
 ) -> None:
     """List the nodes, or explain one node.
 
-    For one node: its physics, source, error, inputs and parameters, and the recipes that use it. `reading` lists how
-    the paper is read where it contradicts itself. `glossary` lists the terms of the field, one a line.
+    For one node: its physics, source, error, inputs and parameters, and the recipes that use it.
+    `reading` lists how the paper is read where it contradicts itself. `glossary` lists the terms of
+    the field, one a line.
     """
     own = _own(recipe)
     with failing(LookupError):
@@ -82,7 +88,9 @@ def nodes(
 
 
 def schema(
-    recipe: Annotated[str | None, typer.Argument(help="Include the nodes that this recipe names.")] = None,
+    recipe: Annotated[
+        str | None, typer.Argument(help="Include the nodes that this recipe names.")
+    ] = None,
 ) -> None:
     """Print the JSON schema of recipes for editors."""
     import json
@@ -102,7 +110,7 @@ def _own(recipe: str | None) -> Own:
         return families_of(recipe)
 
 
-# --- what the commands print ------------------------------------------------------------------------------------------
+# --- what the commands print ----------------------------------------------------------------------
 
 
 def recipe_lines() -> list[str]:
@@ -110,7 +118,10 @@ def recipe_lines() -> list[str]:
     from neusee.workflows.recipe import loading
 
     titles = columns([[recipe.name, recipe.title] for recipe in loading.recipes()])
-    groups = (f"  {name}: {', '.join(o.name for o in options)}" for name, options in loading.groups().items())
+    groups = (
+        f"  {name}: {', '.join(o.name for o in options)}"
+        for name, options in loading.groups().items()
+    )
     return [*titles, "", "groups, as in `neusee run laser=six`", *groups]
 
 
@@ -131,36 +142,58 @@ def nodes_lines(own: Own = MappingProxyType({})) -> list[str]:
 
 def _networks(own: Own) -> list[str]:
     """Return a line for each network class of the user's families."""
-    from neusee.nodes.network_classes import network_classes
+    from neusee.nodes.own_modules import network_classes
 
     lines = ["", "Network classes, for restore.network"]
     for family, module in own.items():
         lines += [
-            f"{family}.{name}  {first_sentence(vars(x).get('__doc__'))}" for name, x in network_classes(module).items()
+            f"{family}.{name}  {first_sentence(vars(x).get('__doc__'))}"
+            for name, x in network_classes(module).items()
         ]
     return lines if len(lines) > 2 else []
 
 
 def node_lines(name: str, own: Own = MappingProxyType({})) -> list[str]:
-    """Return the help on one node; for `reading` the interpretations of the paper, for `glossary` the field's terms."""
+    """Return the help on one node; for `reading` the interpretations of the paper, for
+    `glossary` the field's terms.
+    """
     from neusee.workflows.recipe.node_families import all_nodes
 
     if name == "glossary":
         return glossary_lines()
     if name == "reading":
-        settled = [line for row in SETTLED for line in (f"{row.number}: {row.matter}", f"  no key: {row.why}", "")]
-        return [line for row in READINGS for line in (*_reading(row.path), "")] + settled
+        return _reading_lines()
     nodes = dict(all_nodes(own))
     if name not in nodes:
         raise LookupError(f"there is no node {name}: {nearest(name, nodes)}")
-    node, uses = nodes[name], list(_uses(name))
-    lines = [name, "", *inspect.cleandoc(node.__doc__ or "").splitlines(), "", "inputs"]
-    lines += [f"  {i}{' (optional)' if i in node.optional else ''}" for i in node.inputs] or ["  none"]
-    rows = [[f"  {name}", words] for name, words in parameter_rows(node)]
-    lines += ["", "parameters", *(columns(rows) or ["  none"])]
-    for path in dict.fromkeys(path for _, step in uses for path in _readings_of(step)):
+    uses = list(_uses(name))
+    paths = dict.fromkeys(chain.from_iterable(_readings_of(step) for _, step in uses))
+    lines = [name, "", *_signature_lines(nodes[name])]
+    for path in paths:
         lines += ["", *_reading(path)]
-    return [*lines, "", f"written in  {', '.join(dict.fromkeys(file for file, _ in uses)) or 'no recipe'}"]
+    recipes = dict.fromkeys(file for file, _ in uses)
+    return [*lines, "", f"written in  {', '.join(recipes) or 'no recipe'}"]
+
+
+def _reading_lines() -> list[str]:
+    """Return each interpretation of the paper, and then what the paper settles."""
+    lines: list[str] = []
+    for reading in READINGS:
+        lines += [*_reading(reading.path), ""]
+    for row in SETTLED:
+        lines += [f"{row.number}: {row.matter}", f"  no key: {row.why}", ""]
+    return lines
+
+
+def _signature_lines(node: Node) -> list[str]:
+    """Return the docstring of a node, its inputs and its parameters."""
+    inputs = [f"  {i}{' (optional)' if i in node.optional else ''}" for i in node.inputs]
+    rows = [[f"  {name}", words] for name, words in parameter_rows(node)]
+    return [
+        *inspect.cleandoc(node.__doc__ or "").splitlines(),
+        *("", "inputs", *(inputs or ["  none"])),
+        *("", "parameters", *(columns(rows) or ["  none"])),
+    ]
 
 
 def glossary_lines() -> list[str]:
@@ -186,7 +219,9 @@ def parameter_rows(node: Node) -> list[list[str]]:
 
 
 def _kind(hint: Any) -> str:
-    """Describe a parameter's type in words: its unit, its allowed texts, or the range of its numbers."""
+    """Describe a parameter's type in words: its unit, its allowed texts, or the range of its
+    numbers.
+    """
     from neusee.nodes import units
 
     for name, words in _TYPES_IN_WORDS.items():
@@ -201,25 +236,47 @@ def _kind(hint: Any) -> str:
         return f"{_kind(arguments[0])} {_limits(hint)}".strip()
     if arguments:
         return _composed(hint, arguments)
-    names = {"int": "whole number", "float": "number", "bool": "true | false", "NoneType": "none", "str": "text",
-             "Any": "any value", "Architecture": "a network class of yours, such as mynet.SmallUNet"}  # fmt: skip
+    names = {
+        "int": "whole number",
+        "float": "number",
+        "bool": "true | false",
+        "NoneType": "none",
+        "str": "text",
+        "Any": "any value",
+        "Architecture": "a network class of yours, such as mynet.SmallUNet",
+    }
     return names.get(getattr(hint, "__name__", ""), str(hint))
 
 
 def _quantity(hint: Any) -> str:
-    """Describe a quantity by its name, its range and an example, or return "" for a number without a unit."""
+    """Describe a quantity by its name, its range and an example, or return "" for a number
+    without a unit.
+    """
     from neusee.nodes import units
     from neusee.nodes.units import in_words, number_ranges
 
-    found = next(number_ranges(hint), None)
-    if found is None or not found.si or found.least is None or found.greatest is None:
+    number_range = next(number_ranges(hint), None)
+    if (
+        number_range is None
+        or not number_range.si
+        or number_range.least is None
+        or number_range.greatest is None
+    ):
         return ""
-    name, usual = _QUANTITIES[found.si]
-    example = next((text for kind, text in _EXAMPLES.items() if hint == getattr(units, kind)), usual)
-    greatest = in_words(found.greatest, found.si)
-    if found.least == 0:
-        return f"{name} {'above' if 'gt=0' in repr(hint) else 'from'} 0 to {greatest}, such as {example}"
-    return f"{name} from {in_words(found.least, found.si)} to {greatest}, such as {example}"
+    name, usual = _QUANTITIES[number_range.si]
+    example = next(
+        (text for kind, text in _EXAMPLES.items() if hint == getattr(units, kind)), usual
+    )
+    greatest = in_words(number_range.greatest, number_range.si)
+    if number_range.least == 0:
+        return (
+            f"{name} {'above' if 'gt=0' in repr(hint) else 'from'} 0 to {greatest}, such as"
+            f" {example}"
+        )
+    return (
+        f"{name} from {in_words(number_range.least, number_range.si)} to {greatest}, such as"
+        f" {example}"
+    )
 
 
 def _limits(hint: Any) -> str:
@@ -236,11 +293,17 @@ def _composed(hint: Any, arguments: tuple[Any, ...]) -> str:
         return " or ".join(parts)
     if get_origin(hint) is dict:
         return f"mapping of {parts[0]}: {parts[-1]}"
-    return f"list of {parts[0]}" if Ellipsis in arguments or len(parts) == 1 else f"[{', '.join(parts)}]"
+    return (
+        f"list of {parts[0]}"
+        if Ellipsis in arguments or len(parts) == 1
+        else f"[{', '.join(parts)}]"
+    )
 
 
 def _uses(name: str) -> Iterator[tuple[str, Any]]:
-    """Yield each packaged recipe file with a step that runs the node ``name``, together with this step."""
+    """Yield each packaged recipe file with a step that runs the node ``name``, together with
+    this step.
+    """
     from ruamel.yaml import YAML
 
     for path in sorted(_recipes().rglob("*.yaml")):
@@ -254,16 +317,20 @@ def _uses(name: str) -> Iterator[tuple[str, Any]]:
 
 
 def _readings_of(step: Any) -> Iterator[str]:
-    """Yield each recipe key that chooses an interpretation of the paper and to which a parameter of ``step`` refers."""
-    known = {row.path for row in READINGS}
+    """Yield each recipe key that chooses an interpretation of the paper and to which a parameter
+    of ``step`` refers.
+    """
+    paths = {row.path for row in READINGS}
     for value in (step.get("with") or {}).values():
         match = re.fullmatch(r"\$\{(\w+\.\w+)\??\}", str(value))
-        if match and (match[1].startswith("reading.") or match[1] in known):
+        if match and (match[1].startswith("reading.") or match[1] in paths):
             yield match[1]
 
 
 def _reading(path: str) -> list[str]:
-    """Return lines about a contradiction in the paper: its text, both interpretations and their options."""
+    """Return lines about a contradiction in the paper: its text, both interpretations and their
+    options.
+    """
     row = next((r for r in READINGS if r.path == path), None)
     if row is None:
         return [path]
@@ -277,4 +344,10 @@ def _reading(path: str) -> list[str]:
 
 def first_sentence(text: str | None) -> str:
     """Return the first sentence of a text."""
-    return inspect.cleandoc(text or "").partition("\n\n")[0].replace("\n", " ").partition(". ")[0].rstrip(".")
+    return (
+        inspect.cleandoc(text or "")
+        .partition("\n\n")[0]
+        .replace("\n", " ")
+        .partition(". ")[0]
+        .rstrip(".")
+    )

@@ -1,31 +1,44 @@
-"""Functions that all commands use to read a recipe, check options, print lines and report errors."""
+"""What all commands share: read a recipe, print lines, report errors, stop and go on."""
 
 from __future__ import annotations
 
 import gc
 import itertools
+import json
 import shlex
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO, cast
 
 import typer
 
-from neusee.workflows.cli.command_list import BAD
+from neusee.workflows.cli.commands_and_exit_codes import BAD, FAILED, INTERRUPTED, TYPED
+from neusee.workflows.cli.interrupt_signal import say_stopped
+from neusee.workflows.keys.sealed_files import text_of
+from neusee.workflows.report.terminal_text import json_line
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
     from neusee.workflows.store.result_store import Store
 
+
+# --- command frame --------------------------------------------------------------------------------
+
+# Functions that all commands use to read a recipe, check options, print lines and report errors.
+
+
 DEFAULT = "first_light"
 _MOST = 100  #: lines of an error that are printed
-_NEW_OBJECTS = 10_000  #: containers that are new, after which Python searches for garbage; 700 at first
+#: containers that are new, after which Python searches for garbage; 700 at first
+_NEW_OBJECTS = 10_000
 
 
 def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int]:
-    """Return the recipe, by default `first_light`, and the changes in the arguments, and the first change's number.
+    """Return the recipe, by default `first_light`, and the changes in the arguments, and the first
+    change's number.
 
     ``before`` is the number of arguments that stand before ``words`` on the command line.
     """
@@ -39,13 +52,17 @@ def split(words: list[str] | None, before: int = 0) -> tuple[str, list[str], int
 
 
 def split_frames(words: list[str]) -> tuple[list[str], list[str], int]:
-    """Return the files and the changes in the arguments of a command, and the number of the first change.
+    """Return the files and the changes in the arguments of a command, and the number of the first
+    change.
 
     A file may have the sign = in its name if it exists.
     """
     from pathlib import Path
 
-    count = next((n for n, word in enumerate(words) if _is_change(word) and not Path(word).exists()), len(words))
+    count = next(
+        (n for n, word in enumerate(words) if _is_change(word) and not Path(word).exists()),
+        len(words),
+    )
     frames, changes = words[:count], words[count:]
     for number, word in enumerate(changes):
         if not _is_change(word):
@@ -56,12 +73,14 @@ def split_frames(words: list[str]) -> tuple[list[str], list[str], int]:
 
 
 def _fix(words: list[str], number: int) -> str:
-    """Return how to write the word at ``number``, which is not a change and often the rest of a value with a space."""
+    """Return how to write the word at ``number``, which is not a change and often the rest of a
+    value with a space.
+    """
     if number == 0:
         return "write key=value, +key=value or ~key"
-    rest = itertools.takewhile(lambda word: not _is_change(word), words[number:])
-    whole = " ".join([words[number - 1], *rest])
-    return f"quote a value that has a space: {shlex.quote(whole)}"
+    following = itertools.takewhile(lambda word: not _is_change(word), words[number:])
+    value = " ".join([words[number - 1], *following])
+    return f"quote a value that has a space: {shlex.quote(value)}"
 
 
 def _is_change(word: str) -> bool:
@@ -69,17 +88,23 @@ def _is_change(word: str) -> bool:
 
 
 def search_for_garbage() -> None:
-    """Let Python search for garbage from here on, but not among what was imported; the program begins without.
+    """Let Python search for garbage from here on, but not among what was imported; the program
+    begins without.
 
-    The searches are rare, because packages that are imported later make many objects and hardly any garbage.
+    The searches are rare, because packages that are imported later make many objects and hardly any
+    garbage.
     """
     gc.freeze()
     gc.set_threshold(_NEW_OBJECTS)
     gc.enable()
 
 
-def load(words: list[str] | None, *command: str, before: int = 0, exact: bool = False) -> tuple[Recipe, list[str]]:
-    """Return the recipe that the arguments ``words`` name and change, and the command line that runs this recipe."""
+def load(
+    words: list[str] | None, *command: str, before: int = 0, exact: bool = False
+) -> tuple[Recipe, list[str]]:
+    """Return the recipe that the arguments ``words`` name and change, and the command line that
+    runs this recipe.
+    """
     name, changes, first = split(words, before)
     from neusee.workflows.recipe.loading import load as read
 
@@ -92,26 +117,34 @@ def load(words: list[str] | None, *command: str, before: int = 0, exact: bool = 
 
 @contextmanager
 def refusing() -> Iterator[None]:
-    """Print every mistake of a recipe and end the command if the ``with`` block raises `RecipeError`."""
+    """Print every mistake of a recipe and end the command if the ``with`` block raises
+    `RecipeError`.
+    """
     from neusee.workflows.graph.diagnostics import RecipeError
 
     try:
         yield
     except RecipeError as error:
         count = len(error.diagnostics)
-        fail("\n".join([*_first_lines(str(error)), f"{count} problem{'s' * (count > 1)}, nothing was run"]))
+        fail(
+            "\n".join(
+                [*_first_lines(str(error)), f"{count} problem{'s' * (count > 1)}, nothing was run"]
+            )
+        )
 
 
 def _first_lines(text: str) -> list[str]:
     """Return the lines of an error, at most `_MOST` of them, and how many more there are."""
     lines = text.splitlines()
-    more = len(lines) - _MOST
-    return [*lines[:_MOST], f"and {more} more like these"] if more > 0 else lines
+    hidden = len(lines) - _MOST
+    return [*lines[:_MOST], f"and {hidden} more like these"] if hidden > 0 else lines
 
 
 @contextmanager
 def failing(*errors: type[Exception], code: int = BAD, before: str = "") -> Iterator[None]:
-    """If the ``with`` block raises one of ``errors``, print ``before`` and the error, and exit with ``code``."""
+    """If the ``with`` block raises one of ``errors``, print ``before`` and the error, and exit
+    with ``code``.
+    """
     try:
         yield
     except errors as error:
@@ -129,7 +162,9 @@ class _ForResult:
 
 
 def keep_for_result(context: typer.Context) -> None:
-    """Keep stdout for what `say` prints: what own code prints goes to stderr until the command ends."""
+    """Keep stdout for what `say` prints: what own code prints goes to stderr until the command
+    ends.
+    """
     if not isinstance(sys.stdout, _ForResult):
         context.with_resource(redirect_stdout(cast(TextIO, _ForResult(sys.stdout))))
 
@@ -137,7 +172,12 @@ def keep_for_result(context: typer.Context) -> None:
 def say(lines: list[str]) -> None:
     """Print lines to stdout."""
     stream = sys.stdout
-    print(*lines, sep="\n", file=stream.result if isinstance(stream, _ForResult) else stream, flush=True)
+    print(
+        *lines,
+        sep="\n",
+        file=stream.result if isinstance(stream, _ForResult) else stream,
+        flush=True,
+    )
 
 
 def say_line(line: str) -> None:
@@ -154,8 +194,98 @@ def fail(message: str, code: int = BAD) -> NoReturn:
 
 
 def the_store() -> Store:
-    """Open the result store that the environment variable ``NEUSEE_CACHE`` names, or the default store."""
+    """Open the result store that the environment variable ``NEUSEE_CACHE`` names, or the default
+    store.
+    """
     from neusee.workflows.store.remote_store import open_store
 
     with failing(ValueError, ModuleNotFoundError, before="NEUSEE_CACHE: "):
         return open_store()
+
+
+# --- interruption ---------------------------------------------------------------------------------
+
+# What a command prints if it is stopped, or if its results cannot be written: what is kept, and how
+# to go on.
+
+
+def typed_command() -> str:
+    """Return the command that runs, as the user typed it, quoted for a shell."""
+    return shlex.join(["neusee", *TYPED])
+
+
+@contextmanager
+def resumable(state: Callable[[], str]) -> Iterator[None]:
+    """If the ``with`` block is stopped by Ctrl-C or by an error of a file, say what is kept, by
+    ``state``, and how to go on.
+
+    The exit code is 130 after Ctrl-C, and 1 after an error of a file.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        say_stopped(f"stopped: {state()}; to go on: {typed_command()}")
+        raise typer.Exit(INTERRUPTED) from None
+    except OSError as error:
+        if isinstance(error, BrokenPipeError) or "--debug" in TYPED:
+            raise
+        fail(f"{error}\nfailed: {state()}; to go on: {typed_command()}", FAILED)
+
+
+def kept_in(store: Store, subject: str) -> str:
+    """Return a clause that says that ``subject`` is kept in the cache, or why the cache keeps
+    nothing.
+    """
+    if store.failure:
+        return f"nothing is kept, because the cache {store.root} cannot be written"
+    return f"{subject} kept in the cache {store.root}"
+
+
+def kept_training(out: Path, recipe: str) -> str:
+    """Return a clause that says up to which iteration the newest checkpoint keeps a training of
+    ``recipe``.
+    """
+    from neusee.workflows.training.loop.resumable_loop import StateFile
+
+    states = [*out.glob(f"{recipe}_*/state.pt"), *out.glob(f"{recipe}_*/mask.state")]
+    if not states:
+        return "no checkpoint is written yet, so nothing is kept"
+    newest = max(states, key=lambda path: path.stat().st_mtime)
+    state: dict[str, Any] = {}
+    with suppress(ValueError):
+        state = StateFile(newest).read(strict=False)
+    stage = f" of stage {state['stage']}" if state.get("stage") else ""
+    upto = f" up to iteration {state['iteration']}{stage}" if "iteration" in state else ""
+    return f"the training{upto} is kept in {newest.parent}"
+
+
+def say_json(document: dict[str, Any]) -> None:
+    """Print the result of a command as one JSON object on one line of stdout; a number that is
+    not finite is null.
+    """
+    say([json_line(document)])
+
+
+def say_folder(folder: Path, as_json: bool, *further: str) -> None:
+    """Print the path of the page in a folder of results, or the page's document and the files
+    ``further`` as JSON.
+    """
+    page = str(folder / "report.html")
+    if not as_json:
+        return say([page])
+    files = ("provenance.json", *further)
+    document: dict[str, Any] = {"report": page}
+    for name in files:
+        document |= json.loads(text_of(folder / name))
+    say_json(document)
+
+
+def print_warning(message: Warning | str, *where: object, **details: object) -> None:
+    """Print a warning as one line on stderr, in place of Python's form, which shows a line of
+    source code.
+    """
+    from neusee.workflows.cli.repetition import doubt_answer
+    from neusee.workflows.graph.diagnostics import visible
+
+    doubt_answer()
+    print(f"warning: {visible(str(message))}", file=sys.stderr, flush=True)

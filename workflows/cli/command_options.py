@@ -1,4 +1,6 @@
-"""The arguments and options that several commands share, and functions that read and check their values."""
+"""The arguments and options that several commands share, and functions that read and check their
+values.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing, keep_for_result
-from neusee.workflows.cli.interruption import print_warning
-from neusee.workflows.report.text_table import lasts
-from neusee.workflows.store.byte_sizes import parse_size
+from neusee.workflows.cli.command_frame import fail, failing, keep_for_result, print_warning
+from neusee.workflows.report.terminal_text import lasts
+from neusee.workflows.store.cache_settings import parse_size
 
 if TYPE_CHECKING:
     from neusee.workflows.engine.step_job import Executor
@@ -31,7 +32,10 @@ Words = Annotated[
     ),
 ]
 Debug = Annotated[bool, typer.Option("--debug", help="Show where in the code an error arose.")]
-Device = Annotated[str, typer.Option("--device", help="Where to compute: cpu, cuda, or several: cuda:0,cuda:1,cpu.")]
+Device = Annotated[
+    str,
+    typer.Option("--device", help="Where to compute: cpu, cuda, or several: cuda:0,cuda:1,cpu."),
+]
 OneDevice = Annotated[str, typer.Option("--device", help="Where to compute: cpu or cuda.")]
 
 
@@ -43,10 +47,15 @@ def _result_alone(context: typer.Context, value: bool) -> bool:
 
 
 _JSON = "Print the result as one JSON object, and nothing else."
-Quiet = Annotated[bool, typer.Option("--quiet", help="Print only the path of the result.", callback=_result_alone)]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", help="Print only the path of the result.", callback=_result_alone)
+]
 AsJson = Annotated[bool, typer.Option("--json", help=_JSON, callback=_result_alone)]
 Exact = Annotated[bool, typer.Option("--exact", help="Compute every step in full; omit nothing.")]
-_MEMORY = "Limit of the memory of the program, and of each GPU: 6 GB. One call of a library may pass it a little."
+_MEMORY = (
+    "Limit of the memory of the program, and of each GPU: 6 GB. One call of a library may pass it a"
+    " little."
+)
 Memory = Annotated[str, typer.Option("--memory", help=_MEMORY)]
 
 
@@ -58,20 +67,30 @@ def _writable(out: Path) -> Path:
         return writable_folder(out)
 
 
-Out = Annotated[Path, typer.Option("--out", help="Folder in which to make the folder of results.", callback=_writable)]
+Out = Annotated[
+    Path,
+    typer.Option(
+        "--out", help="Folder in which to make the folder of results.", callback=_writable
+    ),
+]
 
 
-_COUNT = re.compile(r"(?P<what>(?:stage \d, )?\D{0,20})(?P<done>\d+)(?: draws)?(?: of |/)(?:about )?(?P<all>\d+)\b")
+_COUNT = re.compile(
+    r"(?P<what>(?:stage \d, )?\D{0,20})(?P<done>\d+)(?: draws)?(?: of |/)(?:about )?(?P<all>\d+)\b"
+)
 _STEPS = re.compile(r"\d+ of about \d+ ")
 _COUNT_AT_END = re.compile(r"(?P<what>)\((?P<done>\d+) of (?P<all>\d+)\)$")
 
 
 class ProgressLines:
-    """A printer of lines of progress, which adds the time that is left to a line with a count, such as ``3 of 20``."""
+    """A printer of lines of progress, which adds the time that is left to a line with a count,
+    such as ``3 of 20``.
+    """
 
     def __init__(self, quiet: bool, clock: Callable[[], float] = time.monotonic) -> None:
         self._quiet, self._clock, self._before = quiet, clock, clock()
-        self._began: dict[str, tuple[float, int]] = {}  #: by kind of line: time and count from which the rate is taken
+        #: by kind of line: time and count from which the rate is taken
+        self._began: dict[str, tuple[float, int]] = {}
         self._last: dict[str, int] = {}
 
     def __call__(self, line: str) -> None:
@@ -83,22 +102,23 @@ class ProgressLines:
         self._before = now
         if not (count := _COUNT_AT_END.search(line) or _COUNT.match(line)):
             return ""
-        what, done, whole = count["what"], int(count["done"]), int(count["all"])
-        if what not in self._began or done <= self._last[what]:  # a stopped study may begin with any count
-            self._began[what] = (before, 0) if done == 1 else (now, done)
-        self._last[what] = done
-        began, first = self._began[what]
+        task, done, total = count["what"], int(count["done"]), int(count["all"])
+        # a stopped study may begin with any count
+        if task not in self._began or done <= self._last[task]:
+            self._began[task] = (before, 0) if done == 1 else (now, done)
+        self._last[task] = done
+        began, first = self._began[task]
         if done == first:
             return ""
-        seconds = (now - began) / (done - first) * (whole - done)
+        seconds = (now - began) / (done - first) * (total - done)
         return f"; about {lasts(seconds)} left" if seconds >= 1 else ""
 
 
 class FewLines(ProgressLines):
     """A printer of lines of progress that keeps lines with a count few.
 
-    On a terminal a line with a count takes the place of the one before. Elsewhere, as in a file, it is printed after
-    half a minute, and then each time when the command has run twice as long.
+    On a terminal a line with a count takes the place of the one before. Elsewhere, as in a file, it
+    is printed after half a minute, and then each time when the command has run twice as long.
     """
 
     def __init__(self, quiet: bool, clock: Callable[[], float] = time.monotonic) -> None:
@@ -120,41 +140,53 @@ class FewLines(ProgressLines):
 
 
 def progress_lines(quiet: bool) -> Callable[[str], None]:
-    """Return a function that prints a line of progress, or that prints nothing if ``quiet`` is True."""
+    """Return a function that prints a line of progress, or that prints nothing if ``quiet`` is
+    True.
+    """
     return ProgressLines(quiet)
 
 
 def option_words(options: Mapping[str, Any]) -> list[str]:
-    """Return the words ``--name`` and ``value`` of each option; omit options that are False, 0 or empty.
+    """Return the words ``--name`` and ``value`` of each option; omit options that are False, 0 or
+    empty.
 
     The value True has no word.
     """
-    given = {name: value for name, value in options.items() if value}
-    return [word for name, value in given.items() for word in (f"--{name}", str(value))[: 1 if value is True else 2]]
+    words: list[str] = []
+    for name, value in options.items():
+        if value is True:
+            words.append(f"--{name}")
+        elif value:
+            words += [f"--{name}", str(value)]
+    return words
 
 
 def check_device(device: str) -> None:
     """End the command if this machine does not have ``device``, which may be a list with commas."""
-    from neusee.workflows.engine.device_names import check_devices
+    from neusee.workflows.engine.local_executor import check_devices
 
     with failing(ValueError, before="--device "):
         check_devices(device)
 
 
 def memory_limit(text: str) -> int | None:
-    """Return the value of the option ``--memory``, such as ``6 GB``, in bytes, or None for an empty text."""
+    """Return the value of the option ``--memory``, such as ``6 GB``, in bytes, or None for an
+    empty text.
+    """
     with failing(ValueError, before="--memory: "):
         return parse_size(text) if text else None
 
 
 @contextmanager
 def within_memory(text: str) -> Iterator[int | None]:
-    """Yield the value of ``--memory`` in bytes, as `memory_limit`, and hold the readers of input files to it."""
+    """Yield the value of ``--memory`` in bytes, as `memory_limit`, and hold the readers of input
+    files to it.
+    """
     limit = memory_limit(text)
     if limit is None:
         yield None
         return
-    from neusee.workflows.engine.memory_watch import limited
+    from neusee.workflows.engine.memory_limits import limited
 
     with limited(limit):
         yield limit
@@ -162,9 +194,13 @@ def within_memory(text: str) -> Iterator[int | None]:
 
 @contextmanager
 def executor_of(
-    place: str, store: Store, job: Sequence[str] = (), say: Callable[[str], None] = lambda line: None
+    place: str,
+    store: Store,
+    job: Sequence[str] = (),
+    say: Callable[[str], None] = lambda line: None,
 ) -> Iterator[Executor | None]:
-    """Yield None for ``local``, or an executor on the cluster ``place``, and close it after the ``with`` block.
+    """Yield None for ``local``, or an executor on the cluster ``place``, and close it after the
+    ``with`` block.
 
     ``job`` are the options of jobs of SLURM. ``say`` is told what is waited for.
     """
@@ -176,17 +212,19 @@ def executor_of(
 
         from neusee.workflows.engine.dask_cluster import cluster
     except ModuleNotFoundError as error:
-        fail(f'--executor {place}: {error.name} is not installed: pip install "neusee[distributed]"')
+        fail(
+            f'--executor {place}: {error.name} is not installed: pip install "neusee[distributed]"'
+        )
     with cluster(place, store, job, say, print_warning) as executor:
         yield executor
 
 
 def check_executor(place: str, job: Sequence[str]) -> None:
-    """End the command before any work for a place that is none, or for options of jobs that cannot be."""
-    kind, _, count = place.partition(":")
-    counted = not count or (count.isdecimal() and int(count) > 0)
-    known = place == "local" or (kind == "dask" and (counted or count == "here")) or (kind == "slurm" and counted)
-    if not known and "://" not in place:
+    """End the command before any work for a place that is none, or for options of jobs that
+    cannot be.
+    """
+    kind = place.partition(":")[0]
+    if not _is_place(place) and "://" not in place:
         forms = "local, dask, dask:4, slurm:4, or a scheduler's address such as tcp://host:8786"
         fail(f"--executor {place}: write {forms}")
     if job and kind != "slurm":
@@ -195,9 +233,22 @@ def check_executor(place: str, job: Sequence[str]) -> None:
         return
     if find_spec("dask_jobqueue") is None:
         fail(f'--executor {place}: dask_jobqueue is not installed: pip install "neusee[slurm]"')
-    from neusee.workflows.engine.slurm_options import SlurmOptions, missing_command
+    from neusee.workflows.engine.dask_cluster import SlurmOptions, missing_command
 
     with failing(ValueError, before="--job "):
         SlurmOptions.read(job)
     if name := missing_command():
-        fail(f"--executor {place}: this machine has no command {name}: run it where jobs of SLURM are submitted")
+        fail(
+            f"--executor {place}: this machine has no command {name}: run it where jobs of SLURM"
+            " are submitted"
+        )
+
+
+def _is_place(place: str) -> bool:
+    """Return True for ``local``, ``dask:here``, and ``dask`` or ``slurm`` with or without a number
+    of workers.
+    """
+    kind, _, count = place.partition(":")
+    if place == "local" or place == "dask:here":
+        return True
+    return kind in ("dask", "slurm") and (not count or (count.isdecimal() and int(count) > 0))

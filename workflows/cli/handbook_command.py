@@ -11,24 +11,31 @@ from typing import Annotated
 import typer
 
 from neusee.workflows.cli.command_frame import failing, say
-from neusee.workflows.cli.command_list import FAILED
 from neusee.workflows.cli.command_options import Debug, Quiet, progress_lines
+from neusee.workflows.cli.commands_and_exit_codes import FAILED
 
 
 def handbook(
-    opens: Annotated[bool, typer.Option("--open/--no-open", help="Open the first page in the browser.")] = True,
-    pictures: Annotated[
-        bool, typer.Option("--pictures/--no-pictures", help="Run the commands of the pages for their pictures.")
+    opens: Annotated[
+        bool, typer.Option("--open/--no-open", help="Open the first page in the browser.")
     ] = True,
-    out: Annotated[Path, typer.Option("--out", help="Folder of the handbook.")] = Path("runs/handbook"),
+    pictures: Annotated[
+        bool,
+        typer.Option(
+            "--pictures/--no-pictures", help="Run the commands of the pages for their pictures."
+        ),
+    ] = True,
+    out: Annotated[Path, typer.Option("--out", help="Folder of the handbook.")] = Path(
+        "runs/handbook"
+    ),
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
     """Build the handbook with its pictures and open it.
 
-    Tutorial, how-tos, ideas, gallery and reference as pages that a browser shows without a network. The first build
-    takes minutes, because it runs the commands of the pages; a later one takes their results from the cache. Needs
-    `pip install "neusee[docs]"`.
+    Tutorial, how-tos, ideas, gallery and reference as pages that a browser shows without a network.
+    The first build takes minutes, because it runs the commands of the pages; a later one takes
+    their results from the cache. Needs `pip install "neusee[docs]"`.
     """
     from neusee.workflows.handbook import guide_pages, site_build
 
@@ -36,9 +43,11 @@ def handbook(
         site_build.check_modules()
         site_build.check_folder(out)
     from neusee.workflows.cli.handbook_reference import reference_pages
-    from neusee.workflows.handbook.command_pictures import NoPicture
+    from neusee.workflows.handbook.guide_pages import NoPicture
 
-    with failing(site_build.HandbookError, NoPicture, OSError, code=FAILED, before="neusee handbook: "):
+    with failing(
+        site_build.HandbookError, NoPicture, OSError, code=FAILED, before="neusee handbook: "
+    ):
         reference = reference_pages(guide_pages.GUIDE.parent)
         page = site_build.build_handbook(out, reference, pictures, progress_lines(quiet))
     say([str(page)])
@@ -47,5 +56,9 @@ def handbook(
 
 
 def _has_display() -> bool:
-    """Return True if a browser with windows could be opened; a browser on the terminal would take the terminal."""
-    return not sys.platform.startswith("linux") or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    """Return True if a browser with windows could be opened; a browser on the terminal would
+    take the terminal.
+    """
+    return not sys.platform.startswith("linux") or any(
+        os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")
+    )

@@ -1,4 +1,6 @@
-"""The pages of the handbook that the program writes about itself: nodes, commands, the recipe language and Python."""
+"""The pages of the handbook that the program writes about itself: nodes, commands, the recipe
+language and Python.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +16,15 @@ import typer
 from typer.main import get_command
 
 from neusee.workflows.cli.catalogue import first_sentence, parameter_rows
-from neusee.workflows.cli.command_list import EXIT_CODES
-from neusee.workflows.cli.typer_program import program
-from neusee.workflows.handbook.plain_markdown import escaped, prose, table
-from neusee.workflows.handbook.python_reference import python_page
-from neusee.workflows.handbook.recipe_reference import recipe_page
+from neusee.workflows.cli.commands_and_exit_codes import EXIT_CODES
+from neusee.workflows.cli.program_options import program
+from neusee.workflows.handbook.recipe_and_python_reference import (
+    escaped,
+    prose,
+    python_page,
+    recipe_page,
+    table,
+)
 from neusee.workflows.recipe.node_families import all_nodes, family_title
 
 if TYPE_CHECKING:
@@ -26,7 +32,9 @@ if TYPE_CHECKING:
 
 
 def reference_pages(recipes: Path) -> dict[str, str]:
-    """Return every page of the reference by its path; ``recipes`` is the folder of the packaged recipes."""
+    """Return every page of the reference by its path; ``recipes`` is the folder of the packaged
+    recipes.
+    """
     return {
         "reference/nodes.md": nodes_page(),
         **family_pages(uses_of_nodes(recipes)),
@@ -36,14 +44,16 @@ def reference_pages(recipes: Path) -> dict[str, str]:
     }
 
 
-# --- nodes ------------------------------------------------------------------------------------------------------------
+# --- nodes ----------------------------------------------------------------------------------------
 
 
 def uses_of_nodes(recipes: Path) -> dict[str, list[str]]:
     """Return the packaged files with a step of a node, by the name of the node."""
     uses: dict[str, list[str]] = defaultdict(list)
     for path in sorted(recipes.rglob("*.yaml")):
-        for name in dict.fromkeys(re.findall(r"\bnode: ([\w.]+)", path.read_text(encoding="utf-8"))):
+        for name in dict.fromkeys(
+            re.findall(r"\bnode: ([\w.]+)", path.read_text(encoding="utf-8"))
+        ):
             uses[name].append(str(path.relative_to(recipes)))
     return uses
 
@@ -53,11 +63,17 @@ def nodes_page() -> str:
     lines = [
         "# Nodes",
         "",
-        "A node is the function that computes one step. `neusee nodes optics.psf` explains one on the terminal.",
+        (
+            "A node is the function that computes one step. `neusee nodes optics.psf` explains one"
+            " on the terminal."
+        ),
     ]
-    for family, names in groupby(dict(all_nodes()).items(), lambda each: each[0].partition(".")[0]):
+    for family, names in groupby(dict(all_nodes()).items(), lambda item: item[0].partition(".")[0]):
         rows = [
-            [f"[`{name}`](nodes/{family}.md#{_anchor(name)})", escaped(first_sentence(node.__doc__))]
+            [
+                f"[`{name}`](nodes/{family}.md#{_anchor(name)})",
+                escaped(first_sentence(node.__doc__)),
+            ]
             for name, node in names
         ]
         lines += [
@@ -70,11 +86,14 @@ def nodes_page() -> str:
 
 
 def family_pages(uses: Mapping[str, list[str]]) -> dict[str, str]:
-    """Return a page for each family of nodes: formulas, sources, errors, inputs and parameters of each node."""
+    """Return a page for each family of nodes: formulas, sources, errors, inputs and parameters
+    of each node.
+    """
     pages = {}
-    for family, names in groupby(dict(all_nodes()).items(), lambda each: each[0].partition(".")[0]):
+    for family, names in groupby(dict(all_nodes()).items(), lambda item: item[0].partition(".")[0]):
         lines = [f"# {family}", "", f"{escaped(first_sentence(family_title(family)))}.", ""]
-        lines += [line for name, node in names for line in _node(name, node, uses.get(name, []))]
+        for name, node in names:
+            lines += _node(name, node, uses.get(name, []))
         pages[f"reference/nodes/{family}.md"] = "\n".join(lines) + "\n"
     return pages
 
@@ -84,27 +103,47 @@ def _anchor(name: str) -> str:
 
 
 def _node(name: str, node: Node, files: list[str]) -> Iterator[str]:
-    yield from (f"## {name} {{ #{_anchor(name)} }}", "", *prose(inspect.cleandoc(node.__doc__ or "")), "")
-    inputs = [f"`{each}`{' (optional)' if each in node.optional else ''}" for each in node.inputs]
+    yield from (
+        f"## {name} {{ #{_anchor(name)} }}",
+        "",
+        *prose(inspect.cleandoc(node.__doc__ or "")),
+        "",
+    )
+    inputs = [
+        f"`{name_of_input}`{' (optional)' if name_of_input in node.optional else ''}"
+        for name_of_input in node.inputs
+    ]
     yield from (f"**Inputs:** {', '.join(inputs) or 'none'}.", "")
-    rows = [[f"`{parameter}`", *map(escaped, words.rsplit("; ", 1))] for parameter, words in parameter_rows(node)]
-    yield from (*(table(["parameter", "value", ""], rows) if rows else ["**Parameters:** none."]), "")
-    yield from (f"**Written in:** {', '.join(f'`{file}`' for file in files) or 'no packaged recipe'}.", "")
+    rows = [
+        [f"`{parameter}`", *map(escaped, words.rsplit("; ", 1))]
+        for parameter, words in parameter_rows(node)
+    ]
+    yield from (
+        *(table(["parameter", "value", ""], rows) if rows else ["**Parameters:** none."]),
+        "",
+    )
+    yield from (
+        f"**Written in:** {', '.join(f'`{file}`' for file in files) or 'no packaged recipe'}.",
+        "",
+    )
 
 
-# --- commands ---------------------------------------------------------------------------------------------------------
+# --- commands -------------------------------------------------------------------------------------
 
 
 def commands_page() -> str:
     """Return the page on every command: what it does, its arguments and its options."""
-    whole = get_command(program())
-    context = typer.Context(whole, info_name="neusee")
+    command = get_command(program())
+    context = typer.Context(command, info_name="neusee")
     lines = [
         "# Options of all commands",
         "",
-        f"What `--help` prints, for every command. [Commands](../commands.md) has examples. {EXIT_CODES}",
+        (
+            "What `--help` prints, for every command. [Commands](../commands.md) has examples."
+            f" {EXIT_CODES}"
+        ),
         "",
-        *_command(whole, context, 1),
+        *_command(command, context, 1),
     ]
     return "\n".join(lines) + "\n"
 
@@ -115,7 +154,10 @@ def _command(command: Any, context: typer.Context, level: int) -> Iterator[str]:
         usage = " ".join([context.command_path, *command.collect_usage_pieces(context)])
         text = inspect.cleandoc(command.help or "")
         yield from (f"{'#' * level} {context.command_path}", "", f"`{usage}`", "", *prose(text))
-    rows = [[_spelled(each), escaped(getattr(each, "help", None) or ""), _default(each)] for each in command.params]
+    rows = [
+        [_spelled(parameter), escaped(getattr(parameter, "help", None) or ""), _default(parameter)]
+        for parameter in command.params
+    ]
     yield from (*(table(["", "meaning", "default"], rows) if rows else ()), "")
     for name in command.list_commands(context) if hasattr(command, "list_commands") else ():
         inner = command.get_command(context, name)

@@ -1,4 +1,6 @@
-"""Ctrl-C: the signal becomes one `KeyboardInterrupt`, which no library swallows, and a second one ends at once."""
+"""Ctrl-C: the signal becomes one `KeyboardInterrupt`, which no library swallows, and a second
+one ends at once.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,7 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
-from neusee.workflows.cli.command_list import INTERRUPTED
+from neusee.workflows.cli.commands_and_exit_codes import INTERRUPTED
 
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
@@ -17,7 +19,9 @@ if TYPE_CHECKING:
 
 STOPPED = "stopped; finished results are kept, and the same command goes on from there"
 said: list[str] = []  #: the sentences that this command has printed because it was stopped
-_ONE_PRESS = 1.0  #: seconds in which several signals are one press of the keys: a shell and its terminal may both send
+#: seconds in which several signals are one press of the keys: a shell and its terminal may both
+#: send
+_ONE_PRESS = 1.0
 
 
 def say_stopped(sentence: str = STOPPED) -> None:
@@ -40,7 +44,9 @@ class Interrupts:
         return self._first > 0
 
     def watch(self) -> None:
-        """Take the signal, unless it is ignored, as in a script that runs the program in the background."""
+        """Take the signal, unless it is ignored, as in a script that runs the program in the
+        background.
+        """
         if threading.current_thread() is not threading.main_thread():
             return
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -63,7 +69,9 @@ class Interrupts:
         raise KeyboardInterrupt
 
     def _swallowed(self, problem: UnraisableHookArgs) -> None:
-        """Raise an interrupt again that came while Python could not raise it, such as in a callback of a library."""
+        """Raise an interrupt again that came while Python could not raise it, such as in a
+        callback of a library.
+        """
         if problem.exc_type is KeyboardInterrupt:
             self._was_swallowed = True
             signal.raise_signal(signal.SIGINT)

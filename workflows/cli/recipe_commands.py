@@ -1,4 +1,4 @@
-"""The commands for one recipe or one run of a recipe: run, validate, plan, why, config and report."""
+"""Commands on recipes and runs: run, validate, plan, why, report, safety, sweep, restore …"""
 
 from __future__ import annotations
 
@@ -10,8 +10,22 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, say_line, the_store
-from neusee.workflows.cli.command_list import FAILED, MISSED
+from neusee.workflows.cli.command_frame import (
+    fail,
+    failing,
+    kept_in,
+    load,
+    print_warning,
+    refusing,
+    resumable,
+    say,
+    say_json,
+    say_line,
+    search_for_garbage,
+    split,
+    split_frames,
+    the_store,
+)
 from neusee.workflows.cli.command_options import (
     AsJson,
     Debug,
@@ -24,29 +38,47 @@ from neusee.workflows.cli.command_options import (
     check_device,
     check_executor,
     executor_of,
+    option_words,
     within_memory,
 )
-from neusee.workflows.cli.interruption import kept_in, print_warning, resumable, say_json
-from neusee.workflows.cli.repetition import keep_run, say_and_keep
-from neusee.workflows.report.json_output import json_line
-from neusee.workflows.report.next_commands import commands_to_try
+from neusee.workflows.cli.commands_and_exit_codes import FAILED, MISSED, TYPED
+from neusee.workflows.cli.repetition import keep_answer, keep_run, say_and_keep
+from neusee.workflows.report.terminal_text import commands_to_try, json_line
 
 if TYPE_CHECKING:
+    from neusee.workflows.explain.run_forecast import Plan
     from neusee.workflows.graph.recipe_graph import Recipe
     from neusee.workflows.simulation.simulate_recipe import Simulation
     from neusee.workflows.store.result_store import Store
 
+
+# --- recipe commands ------------------------------------------------------------------------------
+
+# The commands for one recipe or one run of a recipe: run, validate, plan, why, config and report.
+
+
 Rerun = Annotated[
     list[str] | None,
-    typer.Option("--rerun", metavar="STEP", help="Compute this step, and all that follow, though stored; repeatable."),
+    typer.Option(
+        "--rerun",
+        metavar="STEP",
+        help="Compute this step, and all that follow, though stored; repeatable.",
+    ),
 ]
 Where = Annotated[
     str,
-    typer.Option("--executor", help="Who computes: local, dask:4 (workers), slurm:4 (jobs), or tcp://scheduler:8786."),
+    typer.Option(
+        "--executor",
+        help="Who computes: local, dask:4 (workers), slurm:4 (jobs), or tcp://scheduler:8786.",
+    ),
 ]
 Job = Annotated[
     list[str] | None,
-    typer.Option("--job", metavar="NAME=VALUE", help="What a job of SLURM asks for: queue=gpu, cores=4; repeatable."),
+    typer.Option(
+        "--job",
+        metavar="NAME=VALUE",
+        help="What a job of SLURM asks for: queue=gpu, cores=4; repeatable.",
+    ),
 ]
 
 
@@ -65,13 +97,15 @@ def run(
 ) -> None:
     """Run a recipe and write its report.
 
-    Steps whose results are in the cache are not computed again. Without a name the recipe is first_light. The folder
-    of results holds report.html, the numbers, the pictures and the recipe with every final value.
+    Steps whose results are in the cache are not computed again. Without a name the recipe is
+    first_light. The folder of results holds report.html, the numbers, the pictures and the recipe
+    with every final value.
     """
-    check_executor(executor, job or [])
+    jobs, again = job or [], rerun or []
+    check_executor(executor, jobs)
     with within_memory(memory) as limit:
         recipe, command = load(words, "run", exact=exact)
-    _check_rerun(recipe, rerun or [])
+    _check_rerun(recipe, again)
     from neusee.workflows.report import console, contents
     from neusee.workflows.simulation.simulate_recipe import simulate
     from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -82,19 +116,37 @@ def run(
     store = the_store()
     predicted = _predicted(recipe, store, device, limit, executor == "local", silent)
     cheaper = with_substitutions(recipe, contents.wanted(recipe))
-    table = console.RunTable(cheaper, contents.steps_of(cheaper), console.mode_for(silent), predicted)
+    table = console.RunTable(
+        cheaper, contents.steps_of(cheaper), console.mode_for(silent), predicted
+    )
     with (
-        resumable(lambda: kept_in(store, f"{table.finished} steps are finished, and results that take time are")),
-        executor_of(executor, store, job or [], lambda line: None if silent else say_line(line)) as cluster,
+        resumable(
+            lambda: kept_in(
+                store, f"{table.finished} steps are finished, and results that take time are"
+            )
+        ),
+        executor_of(executor, store, jobs, _speaker(silent)) as cluster,
         table,
     ):
-        done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit, rerun or [])
+        done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit, again)
     hints = [] if silent else commands_to_try(recipe, command[2 : -1 if exact else None], _loads)
-    _say_briefly(done, as_json) if silent else say(console.closing(done.document, str(done.page), hints))
+    _say_briefly(done, as_json) if silent else say(
+        console.closing(done.document, str(done.page), hints)
+    )
     if done.document["missed"]:
         raise typer.Exit(MISSED)
-    if executor == "local" and not rerun:
+    if executor == "local" and not again:
         keep_run(_text([*before, *table.printed()], done, hints), as_json, out, done, recipe, store)
+
+
+def _speaker(silent: bool) -> Callable[[str], None]:
+    """Return a function that prints a line, or that prints nothing if ``silent``."""
+
+    def speak(line: str) -> None:
+        if not silent:
+            say_line(line)
+
+    return speak
 
 
 def _opening(recipe: Recipe, command: Sequence[str], silent: bool) -> list[str]:
@@ -118,7 +170,9 @@ def _check_rerun(recipe: Recipe, names: Sequence[str]) -> None:
         fail(f"--rerun: {error}")
 
 
-def _text(before: Sequence[str], done: Simulation, hints: Sequence[str]) -> Callable[[str, str], str]:
+def _text(
+    before: Sequence[str], done: Simulation, hints: Sequence[str]
+) -> Callable[[str, str], str]:
     """Return a function from the folder and the seconds of a run to all that the run has printed.
 
     Without ``hints`` that is the path of the page alone.
@@ -133,7 +187,9 @@ def _text(before: Sequence[str], done: Simulation, hints: Sequence[str]) -> Call
 
 
 def _say_briefly(done: Simulation, as_json: bool) -> None:
-    """Print the path of the page of a run, or its document as JSON, and the warnings of the run on stderr."""
+    """Print the path of the page of a run, or its document as JSON, and the warnings of the run
+    on stderr.
+    """
     if as_json:
         say_json({"report": str(done.page), **done.document})
     else:
@@ -145,24 +201,39 @@ def _say_briefly(done: Simulation, as_json: bool) -> None:
 def _predicted(
     recipe: Recipe, store: Store, device: str, memory: int | None, local: bool, silent: bool
 ) -> dict[str, float]:
-    """Print how long a run will take, and return the predicted seconds of each step, as far as they are known.
+    """Print how long a run will take, and return the predicted seconds of each step, as far as they
+    are known.
 
-    A run on this machine ends before any step if the limit of memory, or the memory that is free, is too small.
+    A run on this machine ends before any step if the limit of memory, or the memory that is free,
+    is too small.
     """
     from neusee.workflows.explain.run_forecast import lanes_for, planned
-    from neusee.workflows.report.console import forecast_line
 
     if silent and not local:
         return {}
     plan = planned(recipe, store, lanes_for(recipe, device, memory))
-    if local and plan.refused:
-        fail(f"{'memory' if memory is None else '--memory'}: {plan.refused}; nothing was run")
-    slots = plan.schedule.slots if plan.schedule else ()
-    unknown = sum(not estimate.known for estimate in plan.expected.values())
-    line = forecast_line(plan.schedule.makespan if plan.schedule else 0.0, len(plan.expected), unknown)
+    if local:
+        _refuse_beyond_memory(plan, memory)
+    line = _forecast_of(plan)
     if line and not silent:
         say([line])
+    slots = plan.schedule.slots if plan.schedule else ()
     return {slot.task: slot.end - slot.start for slot in slots if plan.expected[slot.task].known}
+
+
+def _refuse_beyond_memory(plan: Plan, memory: int | None) -> None:
+    """End the command for a run that needs more than ``--memory``, or than the free memory."""
+    if plan.refused:
+        fail(f"{'memory' if memory is None else '--memory'}: {plan.refused}; nothing was run")
+
+
+def _forecast_of(plan: Plan) -> str:
+    """Return the line that says how long a run will take, or an empty text."""
+    from neusee.workflows.report.console import forecast_line
+
+    unknown = sum(not estimate.known for estimate in plan.expected.values())
+    seconds = plan.schedule.makespan if plan.schedule else 0.0
+    return forecast_line(seconds, len(plan.expected), unknown)
 
 
 def _loads(words: Sequence[str]) -> bool:
@@ -200,15 +271,18 @@ def plan(
     memory: Memory = "",
     exact: Exact = False,
     devices: Annotated[
-        str, typer.Option("--devices", help="Simulate these machines: a YAML file, or the example eight_a100.")
+        str,
+        typer.Option(
+            "--devices", help="Simulate these machines: a YAML file, or the example eight_a100."
+        ),
     ] = "",
 ) -> None:
     """Show which steps a run would compute, where and for how long.
 
-    Nothing is computed. Bytes follow from the shape of each result; seconds and memory from laws of each node that
-    were measured, and from earlier runs on this machine, each with its range. A guess for a node without a
-    measurement is marked and counts at its upper end. With --devices the run is simulated on machines that you do
-    not have: makespan, utilisation and critical path.
+    Nothing is computed. Bytes follow from the shape of each result; seconds and memory from laws of
+    each node that were measured, and from earlier runs on this machine, each with its range. A
+    guess for a node without a measurement is marked and counts at its upper end. With --devices the
+    run is simulated on machines that you do not have: makespan, utilisation and critical path.
     """
     with within_memory(memory) as limit:
         recipe, command = load(words, "plan", exact=exact)
@@ -218,15 +292,21 @@ def plan(
     store = the_store()
     if devices:
         with refusing():
-            found = run_forecast.Forecast(run_forecast.simulated_lines(recipe, store, devices), [], {}, False)
+            forecast = run_forecast.Forecast(
+                run_forecast.simulated_lines(recipe, store, devices), [], {}, False
+            )
     else:
-        found = run_forecast.forecast(recipe, store, device, limit)
-    text = json_line({"command": shlex.join(command), **asdict(found)}) if as_json else "\n".join(found.lines)
-    if found.totals.get("steps") == 0 and not found.refused:
-        say_and_keep(text, recipe, store, found.totals["memory_of_report"] or 0.0)
+        forecast = run_forecast.forecast(recipe, store, device, limit)
+    text = (
+        json_line({"command": shlex.join(command), **asdict(forecast)})
+        if as_json
+        else "\n".join(forecast.lines)
+    )
+    if forecast.totals.get("steps") == 0 and not forecast.refused:
+        say_and_keep(text, recipe, store, forecast.totals["memory_of_report"] or 0.0)
     else:
         say([text])
-    if found.refused:
+    if forecast.refused:
         raise typer.Exit(FAILED)
 
 
@@ -262,13 +342,276 @@ def config(words: Words = None, debug: Debug = False) -> None:
 
 
 def report(
-    folder: Annotated[str, typer.Argument(metavar="RUN_FOLDER", help="A run's folder, or `latest`.")] = "latest",
-    out: Annotated[Path, typer.Option("--out", help="Folder that holds the folders of runs.")] = Path("runs"),
+    folder: Annotated[
+        str, typer.Argument(metavar="RUN_FOLDER", help="A run's folder, or `latest`.")
+    ] = "latest",
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder that holds the folders of runs.")
+    ] = Path("runs"),
     debug: Debug = False,
 ) -> None:
     """Write the page of a run again from stored results."""
-    from neusee.workflows.report.run_folder import find_run
-    from neusee.workflows.report.run_html import rebuild
+    from neusee.workflows.report.run_folder import find_run, rebuild
 
     with failing(FileNotFoundError):
         say([str(rebuild(find_run(folder, out)))])
+
+
+# --- safety command -------------------------------------------------------------------------------
+
+# The command ``neusee safety``: is the sensor damaged or dazzled by a laser, and from which
+# distance?
+
+
+def safety(
+    words: Words = None,
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
+    out: Out = Path("runs"),
+) -> None:
+    """Estimate damage and dazzle by a laser, and the distances.
+
+    The recipe needs a block `safety` and a laser in watts: see safety_pointer. The page has the
+    limits of the sensor with their sources, the distances where the laser exceeds them, behind the
+    plain lens, a mask, a grey filter and a smaller stop, and the limit of the eye beside them. It
+    is an estimate, no certificate.
+    """
+    recipe, command = load(words, "safety")
+    store = the_store()
+    from neusee.workflows.graph.run_error import RunError
+    from neusee.workflows.safety.run_safety import assess
+    from neusee.workflows.safety.safety_text import lines
+
+    with refusing(), failing(RunError, code=FAILED):
+        folder, assessment = assess(recipe, store, out, command)
+
+    def text(page: str) -> str:
+        if as_json:
+            return json_line({"report": page, **assessment.document})
+        return page if quiet else "\n".join([*lines(assessment.paragraphs), "", f"page   {page}"])
+
+    say([text(str(folder / "report.html"))])
+    keep_answer(text, as_json, out, folder, assessment.report, recipe)
+
+
+# --- sweep command --------------------------------------------------------------------------------
+
+# The command ``neusee sweep``: run a recipe at several values of its parameters.
+
+
+def sweep(
+    words: Words = None,
+    paired: Annotated[
+        bool, typer.Option("--zip", help="Pair the values of the axes instead of combining them.")
+    ] = False,
+    on_error: Annotated[
+        str,
+        typer.Option("--on-error", help="After a failed point: stop, or continue with the next."),
+    ] = "stop",
+    workers: Annotated[
+        int,
+        typer.Option(
+            "--workers",
+            min=0,
+            max=10_000,
+            help="Number of points that run at the same time; 0: by free processors.",
+        ),
+    ] = 0,
+    netcdf: Annotated[
+        bool, typer.Option("--netcdf", help="Write sweep.nc too (needs neusee[xarray]).")
+    ] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+    device: Device = "cpu",
+    out: Out = Path("runs"),
+) -> None:
+    """Run a recipe at several values of its parameters.
+
+    Write values as a=1,2,3 or b='linspace(450 nm, 650 nm, 5)'. All combinations run unless --zip
+    pairs them. Run the same command again to continue a sweep that was stopped.
+    """
+    name, words, first = split(words)
+    if on_error not in ("stop", "continue"):
+        fail(f"--on-error {on_error}: write stop or continue")
+    check_device(device)
+    store = the_store()
+    from neusee.workflows.cli.sweep_screen import run_sweep
+
+    with refusing(), resumable(lambda: kept_in(store, "the points that are finished are")):
+        search_for_garbage()
+        code = run_sweep(
+            name,
+            words,
+            first=first,
+            zip=paired,
+            on_error="continue" if on_error == "continue" else "stop",
+            netcdf=netcdf,
+            device=device,
+            out=out,
+            store=store,
+            quiet=quiet,
+            as_json=as_json,
+            workers=workers,
+        )
+    if code:
+        raise typer.Exit(code)
+
+
+# --- restore command ------------------------------------------------------------------------------
+
+# The command ``neusee restore``: the scene from a frame that somebody took, and what is not known
+# of it.
+
+
+Frames = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="FRAME... [OVERRIDE]...",
+        help="Frames or folders of frames, then changes: a.b=1, +a.b=1, ~a.b, restore=wiener.",
+        show_default=False,
+    ),
+]
+
+
+def restore(
+    words: Frames,
+    camera: Annotated[
+        str, typer.Option("--camera", help="Recipe of the camera, or file of its sensor group.")
+    ],
+    mask: Annotated[
+        str, typer.Option("--mask", help="Mask: an option of the group doe, or a height-map file.")
+    ] = "",
+    psf: Annotated[
+        str, typer.Option("--psf", help="Folder of frames of point sources: measure the PSF.")
+    ] = "",
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
+    device: Device = "cpu",
+    memory: Memory = "",
+    out: Out = Path("runs"),
+) -> None:
+    """Restore the scene from frames that a camera took.
+
+    A frame has the digital numbers of the sensor in three channels, without a tone curve: PNG or
+    TIFF of 8 or 16 bits, OpenEXR or .npy. Of the recipe --camera the lens, mask, sensor and
+    illuminant count, not the scene and the laser. With --psf, the PSF by field is measured from
+    frames of point sources, and its error enters the uncertainty. The page has the picture, the
+    uncertainty of each pixel, and what is invented because pixels were saturated.
+    """
+    frames, changes, first = split_frames(words)
+    check_device(device)
+    folder = Path.cwd()
+    from neusee.workflows.restoration.frame_recipes import named_frames, recipes_of
+
+    with within_memory(memory) as limit, refusing():
+        files = named_frames(frames, folder)
+        recipes = recipes_of(files, camera, mask, changes, folder, first, psf)
+    store, silent = the_store(), quiet or as_json
+    options = option_words({"camera": camera, "mask": mask, "psf": psf})
+    from neusee.workflows.graph.run_error import RunError
+
+    with resumable(lambda: kept_in(store, "finished steps are")), failing(RunError, code=FAILED):
+        for file, recipe in zip(files, recipes, strict=True):
+            command = ["neusee", "restore", str(file), *changes, *options]
+            done = _restored(recipe, store, out, command, (device, limit), silent)
+            _say(done, as_json, quiet)
+
+
+def _restored(
+    recipe: Recipe,
+    store: Store,
+    out: Path,
+    command: list[str],
+    place: tuple[str, int | None],
+    silent: bool,
+) -> Simulation:
+    """Run the recipe of a frame, with the lines of its steps unless the command is silent."""
+    from neusee.workflows.explain.run_forecast import lanes_for, planned
+    from neusee.workflows.report import console, contents
+    from neusee.workflows.simulation.simulate_recipe import simulate
+    from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+
+    device, limit = place
+    _refuse_beyond_memory(planned(recipe, store, lanes_for(recipe, device, limit)), limit)
+    if not silent:
+        say(console.opening(recipe, shlex.join(command[1:])))
+    cheaper = with_substitutions(recipe, contents.wanted(recipe))
+    with console.RunTable(
+        cheaper, contents.steps_of(cheaper), console.mode_for(silent), {}
+    ) as table:
+        return simulate(cheaper, store, out, command, device, table.watch, None, limit)
+
+
+def _say(done: Simulation, as_json: bool, quiet: bool) -> None:
+    if as_json:
+        say_json({"report": str(done.page), **done.document})
+    elif quiet:
+        say([str(done.page)])
+    else:
+        from neusee.workflows.report.console import story_lines
+
+        say(
+            [
+                *story_lines(done.document),
+                "",
+                f"restored {done.folder / 'data' / 'restored.png'}",
+                f"report   {done.page}",
+            ]
+        )
+    for line in done.document["warnings"] if quiet or as_json else ():
+        print_warning(line)
+
+
+# --- compare command ------------------------------------------------------------------------------
+
+# The command ``neusee compare``: what differs between two runs?
+
+
+_RUN = "A run's folder: a name below --out, a path, or `latest`."
+
+
+def compare(
+    left: Annotated[str, typer.Argument(help=_RUN)],
+    right: Annotated[str, typer.Argument(help=_RUN)],
+    fail_above: Annotated[
+        float,
+        typer.Option(
+            "--fail-above",
+            min=0.0,
+            help="Exit with code 3 if a number differs by more, relatively.",
+        ),
+    ] = float("inf"),
+    quiet: Quiet = False,
+    as_json: AsJson = False,
+    debug: Debug = False,
+    out: Out = Path("runs"),
+) -> None:
+    """Compare two runs: numbers, pictures, recipe and code.
+
+    The environment is compared too, and nothing is computed again. The page shows the pictures side
+    by side with their difference. The exit code is 0 also where the runs differ, unless
+    --fail-above says what may differ at most; a number that only one run has differs by more than
+    any limit.
+    """
+    from neusee.workflows.comparison.run_record import NotComparable, read_record
+
+    with failing(NotComparable):
+        records = [read_record(where, out) for where in (left, right)]
+        from neusee.workflows.comparison import comparison_report
+
+        comparison = comparison_report.compare(*records)
+    page = comparison_report.write_comparison(comparison, out, ["neusee", *TYPED]) / "report.html"
+    if as_json:
+        say_json({"report": str(page), **comparison_report.document(comparison)})
+    else:
+        say([str(page)] if quiet else [*comparison_report.lines(comparison), "", f"page   {page}"])
+    if comparison.largest > fail_above:
+        worst = max(comparison.numbers, key=lambda number: number.relative)
+        fail(
+            f"{worst.name} differs by {comparison.largest:.3g} relatively, more than"
+            f" {fail_above:g}",
+            MISSED,
+        )

@@ -1,4 +1,6 @@
-"""The stored answer of a command that is repeated: printed before the command is imported, and kept after it."""
+"""The stored answer of a command that is repeated: printed before the command is imported, and
+kept after it.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ _COMPUTED = {"-h", "--help", "--debug"}  #: words of a command that no stored an
 
 
 def say_stored_answer(words: Sequence[str]) -> bool:
-    """Print the stored answer of a command, and write its folder of results again; return False if there is none."""
+    """Print the stored answer of a command, and write its folder of results again; return False
+    if there is none.
+    """
     if _COMPUTED & set(words):
         return False
     shown = [[stream.isatty(), stream.encoding] for stream in (sys.stdout, sys.stderr)]
@@ -33,12 +37,17 @@ def say_stored_answer(words: Sequence[str]) -> bool:
     return True
 
 
-def say_and_keep(text: str, recipe: Recipe, store: Store | None = None, memory: float = 0.0) -> None:
-    """Print the text of a command that writes nothing, and keep this text as the answer of the command.
+def say_and_keep(
+    text: str, recipe: Recipe, store: Store | None = None, memory: float = 0.0
+) -> None:
+    """Print the text of a command that writes nothing, and keep this text as the answer of the
+    command.
 
-    ``store``: the store on which the answer rests. ``memory``: bytes that must be free, without which it would differ.
+    ``store``: the store on which the answer rests. ``memory``: bytes that must be free, without
+    which it would differ.
     """
-    from neusee.workflows.cli.command_frame import say_line  # imports typer, which a stored answer does not need
+    # imports typer, which a stored answer does not need
+    from neusee.workflows.cli.command_frame import say_line
 
     say_line(text)
     for command in repeated_command.running:
@@ -46,7 +55,12 @@ def say_and_keep(text: str, recipe: Recipe, store: Store | None = None, memory: 
 
 
 def keep_answer(
-    text: Callable[[str], str], as_json: bool, out: Path, folder: Path, report: StudyReport, recipe: Recipe
+    text: Callable[[str], str],
+    as_json: bool,
+    out: Path,
+    folder: Path,
+    report: StudyReport,
+    recipe: Recipe,
 ) -> None:
     """Keep what a command has printed and written, if the command is one whose answer is kept.
 
@@ -59,13 +73,19 @@ def keep_answer(
 
 
 def keep_run(
-    text: Callable[[str, str], str], as_json: bool, out: Path, done: Simulation, recipe: Recipe, store: Store
+    text: Callable[[str, str], str],
+    as_json: bool,
+    out: Path,
+    done: Simulation,
+    recipe: Recipe,
+    store: Store,
 ) -> None:
     """Keep what a run has printed and written, if all its results came from the cache.
 
-    ``text`` returns the text of the command for the path of the folder of the run and the seconds that it took.
+    ``text`` returns the text of the command for the path of the folder of the run and the seconds
+    that it took.
     """
-    from neusee.workflows.answers.repeated_run import FOLDER, TOOK, RunResults
+    from neusee.workflows.answers.results_folder import FOLDER, TOOK, RunResults
 
     for command in repeated_command.running:
         results = RunResults(done.folder, out, done.document, done.taken, store)

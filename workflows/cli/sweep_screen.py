@@ -1,4 +1,6 @@
-"""The screen of ``neusee sweep``: the table of a running sweep, and the lines before and after the table."""
+"""The screen of ``neusee sweep``: the table of a running sweep, and the lines before and after
+the table.
+"""
 
 from __future__ import annotations
 
@@ -10,21 +12,25 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.cli.command_frame import say_line
-from neusee.workflows.cli.command_list import DONE, FAILED, INTERRUPTED
-from neusee.workflows.cli.interruption import say_json
+from neusee.workflows.cli.command_frame import say_json, say_line
+from neusee.workflows.cli.commands_and_exit_codes import DONE, FAILED, INTERRUPTED
 from neusee.workflows.report.console import Mode, ProgressTable, mode_for
-from neusee.workflows.report.text_table import lasts
+from neusee.workflows.report.terminal_text import lasts
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import read_words
-from neusee.workflows.sweeps.sweep_files import require_xarray
 from neusee.workflows.sweeps.sweep_points import OnError, PointOutcome, outcomes
 from neusee.workflows.sweeps.sweep_run import Sweep, Sweeping, SweepState, counted, write_sweep
-from neusee.workflows.sweeps.sweep_table import AxisColumn, cell_text, headline, point_cells
+from neusee.workflows.sweeps.sweep_table import (
+    AxisColumn,
+    cell_text,
+    headline,
+    point_cells,
+    require_xarray,
+)
 
 if TYPE_CHECKING:
-    from neusee.workflows.graph.step_record import Event
+    from neusee.workflows.graph.recipe_graph import Event
     from neusee.workflows.sweeps.axes import Point
 
 _NUMBERS = 4  #: results in the row of a point
@@ -46,16 +52,19 @@ def run_sweep(
     as_json: bool = False,
     workers: int = 0,
 ) -> int:
-    """Run, show and write a sweep to ``out/sweeps/<date>_<recipe>_<key>/``; return the exit code of the command.
+    """Run, show and write a sweep to ``out/sweeps/<date>_<recipe>_<key>/``; return the exit code of
+    the command.
 
-    With ``as_json`` the result is printed as one JSON object, and nothing else. ``words`` are the changes and axes;
-    the first of them is argument ``first`` of the command line.
+    With ``as_json`` the result is printed as one JSON object, and nothing else. ``words`` are the
+    changes and axes; the first of them is argument ``first`` of the command line.
     Raises: RecipeError with every mistake of every point, before anything runs.
     """
     if netcdf:
         require_xarray("--netcdf")
     began, place = time.perf_counter(), Path().absolute()
-    work = Sweeping(recipe, read_words(words, place, first), place, store or open_store(), zip, device)
+    work = Sweeping(
+        recipe, read_words(words, place, first), place, store or open_store(), zip, device
+    )
     again = _command(recipe, words, zip, on_error, netcdf, device, out)
     silent = quiet or as_json
     if not silent:
@@ -66,25 +75,46 @@ def run_sweep(
     result = work.sweep(done, state)
     path = write_sweep(work, result, again, out, netcdf, time.perf_counter() - began)
     if silent:
-        print(*_failures(result), sep="\n", end="\n" if result.failed else "", file=sys.stderr)
-        if as_json:
-            say_json(_document(result, path, again))
-        else:
-            say_line(str(path / "sweep.csv"))
+        _say_briefly(result, path, again, as_json)
     else:
-        print(*_closing(result, path, again, time.perf_counter() - began, work.store.failure), sep="\n", flush=True)
-    return INTERRUPTED if state == "interrupted" else FAILED if result.failed else DONE
+        print(
+            *_closing(result, path, again, time.perf_counter() - began, work.store.failure),
+            sep="\n",
+            flush=True,
+        )
+    return _exit_code(result)
+
+
+def _exit_code(result: Sweep) -> int:
+    if result.state == "interrupted":
+        return INTERRUPTED
+    return FAILED if result.failed else DONE
+
+
+def _say_briefly(result: Sweep, path: Path, again: Sequence[str], as_json: bool) -> None:
+    """Print the path of the table of a sweep, or its document as JSON, and the failures on
+    stderr.
+    """
+    print(*_failures(result), sep="\n", end="\n" if result.failed else "", file=sys.stderr)
+    if as_json:
+        say_json(_document(result, path, again))
+    else:
+        say_line(str(path / "sweep.csv"))
 
 
 def _document(result: Sweep, path: Path, again: Sequence[str]) -> dict[str, Any]:
-    """Return the result of a sweep for ``--json``: its table, its state, and every number of every point."""
+    """Return the result of a sweep for ``--json``: its table, its state, and every number of
+    every point.
+    """
     return {
         "table": str(path / "sweep.csv"),
         "command": shlex.join(again),
         "recipe": result.recipe,
         "state": result.state,
         "points": result.points,
-        "failed": [{"point": o.point.number, "step": o.step, "message": o.message} for o in result.failed],
+        "failed": [
+            {"point": o.point.number, "step": o.step, "message": o.message} for o in result.failed
+        ],
         "rows": result.rows,
     }
 
@@ -92,10 +122,15 @@ def _document(result: Sweep, path: Path, again: Sequence[str]) -> dict[str, Any]
 def _opening(work: Sweeping) -> Iterator[str]:
     """Yield the lines that appear on the screen before a sweep starts."""
     recipe, shared = work.plan.recipe, work.sharing
-    sizes = f" {'+' if work.paired else '×'} ".join(f"{axis.name}: {len(axis.coordinates)}" for axis in work.axes)
+    sizes = f" {'+' if work.paired else '×'} ".join(
+        f"{axis.name}: {len(axis.coordinates)}" for axis in work.axes
+    )
     yield f"neusee sweep: {recipe.title or recipe.name}"
     yield f"checked  {shared.points} points ({sizes}), {shared.steps} steps: all right"
-    yield f"shared   {shared.made} different results: {100 * shared.saved:.0f} % less work than point by point"
+    yield (
+        f"shared   {shared.made} different results: {100 * shared.saved:.0f} % less work than point"
+        " by point"
+    )
     if work.plan.costs and any(work.plan.work):
         yield f"time     about {lasts(sum(work.plan.work))}, as earlier runs took"
     yield from (f"note     {line}" for line in work.plan.notes)
@@ -104,9 +139,13 @@ def _opening(work: Sweeping) -> Iterator[str]:
 def _run_points(
     work: Sweeping, on_error: OnError, quiet: bool, workers: int
 ) -> tuple[list[PointOutcome], SweepState, Exception | None]:
-    """Run a sweep and show its progress; return the outcome of each parameter set, also after Ctrl-C or a failure."""
+    """Run a sweep and show its progress; return the outcome of each parameter set, also after
+    Ctrl-C or a failure.
+    """
     table = SweepTable(work.columns, len(work.plan.checked), mode_for(quiet))
-    running = outcomes(work.plan, work.store, on_error, work.device, table.started, table.watch, workers)
+    running = outcomes(
+        work.plan, work.store, on_error, work.device, table.started, table.watch, workers
+    )
     try:
         with table, closing(running):
             for outcome in running:
@@ -119,7 +158,13 @@ def _run_points(
 
 
 def _command(
-    recipe: str, words: Sequence[str], paired: bool, on_error: str, netcdf: bool, device: str, out: Path
+    recipe: str,
+    words: Sequence[str],
+    paired: bool,
+    on_error: str,
+    netcdf: bool,
+    device: str,
+    out: Path,
 ) -> list[str]:
     """Return the words of the command that runs a sweep again."""
     options = ["--zip"] * paired + ["--netcdf"] * netcdf
@@ -129,7 +174,9 @@ def _command(
     return ["neusee", "sweep", recipe, *words, *options]
 
 
-def _closing(result: Sweep, path: Path, again: Sequence[str], seconds: float, failure: str) -> Iterator[str]:
+def _closing(
+    result: Sweep, path: Path, again: Sequence[str], seconds: float, failure: str
+) -> Iterator[str]:
     """Yield the lines that appear on the screen after the end of a sweep."""
     yield ""
     yield f"{counted(result)}  ({lasts(seconds)})"
@@ -138,13 +185,16 @@ def _closing(result: Sweep, path: Path, again: Sequence[str], seconds: float, fa
     if failure:
         yield f"warning  {failure}"
     if result.state != "complete":
-        kept = "nothing is kept in the cache" if failure else "what is done is kept"
-        yield f"partial: {kept}; to go on: {shlex.join(again)}"
+        state = "nothing is kept in the cache" if failure else "what is done is kept"
+        yield f"partial: {state}; to go on: {shlex.join(again)}"
 
 
 def _failures(result: Sweep) -> Iterator[str]:
     for outcome in result.failed:
-        yield f"failed: point {outcome.point.number}, {outcome.point.shown}: {outcome.message.splitlines()[0]}"
+        yield (
+            f"failed: point {outcome.point.number}, {outcome.point.shown}:"
+            f" {outcome.message.splitlines()[0]}"
+        )
 
 
 class SweepTable(ProgressTable):
@@ -157,7 +207,15 @@ class SweepTable(ProgressTable):
         self.running: Point | None = None
         self.step = ""
         self.lines = list[list[str]]()
-        self.header = ["done", "point", *(c.header for c in columns), "state", "seconds", "left", "results"]
+        self.header = [
+            "done",
+            "point",
+            *(c.header for c in columns),
+            "state",
+            "seconds",
+            "left",
+            "results",
+        ]
         widest = [max(map(len, (c.header, *map(cell_text, c.cells)))) for c in columns]
         count = len(str(points))
         self.widths = [max(4, 2 * count + 1), max(5, count), *widest, 6, 8, 12, 0]
@@ -167,7 +225,9 @@ class SweepTable(ProgressTable):
         self.running, self.step = point, ""
 
     def watch(self, event: Event) -> None:
-        """Record that a step of a sweep begins or ends, for the parameter set that is being computed."""
+        """Record that a step of a sweep begins or ends, for the parameter set that is being
+        computed.
+        """
         self.step = event.step if event.done is None else ""
 
     def finished(self, outcome: PointOutcome) -> None:
@@ -178,15 +238,30 @@ class SweepTable(ProgressTable):
         self.show_row(self.lines[-1])
         if outcome.state == "failed":
             lines = [f"  {line}" for line in outcome.message.splitlines()]
-            self.show_error(lines, f"point {outcome.point.number}: {outcome.point.shown}\n{outcome.message}")
+            self.show_error(
+                lines, f"point {outcome.point.number}: {outcome.point.shown}\n{outcome.message}"
+            )
 
     def cells(self, outcome: PointOutcome) -> list[str]:
-        """Return the table row of a parameter set: number, values, state, seconds, remaining time and first results."""
+        """Return the table row of a parameter set: number, values, state, seconds, remaining
+        time and first results.
+        """
         values = map(cell_text, point_cells(outcome.point, self.columns))
         numbers = list(headline(outcome.numbers).items())[:_NUMBERS]
         results = "  ".join(f"{name} {value}" for name, value in numbers)
-        done, left = f"{len(self.outcomes)}/{self.points}", lasts(outcome.left) if outcome.left else ""
-        return [done, str(outcome.point.number), *values, outcome.state, f"{outcome.seconds:.3f}", left, results]
+        done, left = (
+            f"{len(self.outcomes)}/{self.points}",
+            lasts(outcome.left) if outcome.left else "",
+        )
+        return [
+            done,
+            str(outcome.point.number),
+            *values,
+            outcome.state,
+            f"{outcome.seconds:.3f}",
+            left,
+            results,
+        ]
 
     def live_rows(self) -> Iterator[tuple[list[str], str]]:
         """Yield the table rows of the last parameter sets, each with its state."""
@@ -194,7 +269,9 @@ class SweepTable(ProgressTable):
         yield from ((line, line[state]) for line in self.lines[-_LAST:])
 
     def caption(self) -> str:
-        """Return the number of the running parameter set, its running step, and the remaining time as text."""
+        """Return the number of the running parameter set, its running step, and the remaining
+        time as text.
+        """
         if self.running is None:
             return ""
         left = self.outcomes[-1].left if self.outcomes else 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
@@ -12,8 +12,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from neusee.workflows.cli.command_frame import fail, failing, load, refusing, say, the_store
-from neusee.workflows.cli.command_list import FAILED
+from neusee.workflows.cli.command_frame import (
+    fail,
+    failing,
+    kept_training,
+    load,
+    refusing,
+    resumable,
+    say,
+    say_json,
+    the_store,
+)
 from neusee.workflows.cli.command_options import (
     AsJson,
     Debug,
@@ -24,8 +33,8 @@ from neusee.workflows.cli.command_options import (
     check_device,
     progress_lines,
 )
-from neusee.workflows.cli.interruption import kept_training, resumable, say_json
-from neusee.workflows.keys.regular_file import text_of
+from neusee.workflows.cli.commands_and_exit_codes import FAILED
+from neusee.workflows.keys.sealed_files import text_of
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
@@ -40,10 +49,16 @@ class Stages(StrEnum):
     MASK = "mask"
 
 
-_STAGES = "1: mask and network; 2: network alone; both: 1, then 2; mask: mask alone, without images."
-_MESH = "DATAxBAND processes of torchrun: 4x2, four groups that share the bands by two; else all share the data."
+_STAGES = (
+    "1: mask and network; 2: network alone; both: 1, then 2; mask: mask alone, without images."
+)
+_MESH = (
+    "DATAxBAND processes of torchrun: 4x2, four groups that share the bands by two; else all share"
+    " the data."
+)
 _LINES = 10  #: lines of progress for a stage, outside a terminal
-_NUMBERS = {Stages.FIRST: (1,), Stages.SECOND: (2,), Stages.MASK: (0,)}  #: the `stages` that `verbs.train` takes
+#: the `stages` that `verbs.train` takes
+_NUMBERS = {Stages.FIRST: (1,), Stages.SECOND: (2,), Stages.MASK: (0,)}
 
 
 def train(
@@ -58,30 +73,30 @@ def train(
 ) -> None:
     """Train the mask of a recipe and its restoring network.
 
-    Pictures come from the folder `train.photographs`; the paper trains in two stages. With --stage mask the mask is
-    designed without images, as `train.mask` says; --stage 2 then trains the network behind that mask. The recipe
-    `train_lift` trains a network from RGB to spectra instead. Without a name the recipe is train_small. Run the same
-    command again to continue a training that was stopped.
+    Pictures come from the folder `train.photographs`; the paper trains in two stages. With --stage
+    mask the mask is designed without images, as `train.mask` says; --stage 2 then trains the
+    network behind that mask. The recipe `train_lift` trains a network from RGB to spectra instead.
+    Without a name the recipe is train_small. Run the same command again to continue a training that
+    was stopped.
 
-    Several processes share one training: torchrun --nproc-per-node 8 --no-python neusee train RECIPE --device cuda
-    --mesh 4x2.
+    Several processes share one training: torchrun --nproc-per-node 8 --no-python neusee train
+    RECIPE --device cuda --mesh 4x2.
     """
     recipe, command = load(words or ["train_small"], "train")
     if recipe.lifting is not None:
-        if stage is not Stages.BOTH or mesh:
-            fail(f"{recipe.name} learns a lift, which has neither stages nor a mesh: leave --stage and --mesh out")
+        _refuse_stage_and_mesh(recipe, stage, mesh)
         check_device(device)
         return _lift(recipe, command, out, device, quiet, as_json)
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
-    from neusee.workflows.training.parallel.process_mesh import MeshError, device_here, joined, processes
+    from neusee.workflows.training.process_mesh import MeshError, device_here, joined, processes
 
     device, (rank, world) = device_here(device), processes()
     check_device(device)
     silent, who = quiet or as_json or rank > 0, f"process {rank}: " if world > 1 else ""
     stages = _NUMBERS.get(stage, recipe.training.learnt if recipe.training else ())
     command += ["--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
-    lengths = {s: recipe.training.stages[s].iterations for s in stages if s} if recipe.training else {}
+    lengths = _lengths(recipe, stages)
     with (
         resumable(lambda: kept_training(out, recipe.name)),
         failing(RunError, ValueError, ArithmeticError, code=FAILED, before=who),
@@ -90,10 +105,35 @@ def train(
         joined(mesh, device) as processes_here,
         _loss_bar(silent, lengths) as watch,
     ):
-        folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress_lines(silent),
-                             command=command, stages=stages, watch=watch, mesh=processes_here)  # fmt: skip
+        folder = verbs.train(
+            recipe,
+            store=the_store(),
+            device=device,
+            out=out,
+            progress=progress_lines(silent),
+            command=command,
+            stages=stages,
+            watch=watch,
+            mesh=processes_here,
+        )
     if rank == 0:
         _say_results(folder, as_json, [] if silent else _next(folder, stage))
+
+
+def _refuse_stage_and_mesh(recipe: Recipe, stage: Stages, mesh: str) -> None:
+    """End the command for options that the training of a lift does not have."""
+    if stage is not Stages.BOTH or mesh:
+        fail(
+            f"{recipe.name} learns a lift, which has neither stages nor a mesh: leave --stage"
+            " and --mesh out"
+        )
+
+
+def _lengths(recipe: Recipe, stages: Iterable[int]) -> dict[int, int]:
+    """Return the iterations of each stage, but for the design of a mask."""
+    if not recipe.training:
+        return {}
+    return {stage: recipe.training.stages[stage].iterations for stage in stages if stage}
 
 
 def _say_results(folder: Path, as_json: bool, lines: list[str]) -> None:
@@ -101,11 +141,13 @@ def _say_results(folder: Path, as_json: bool, lines: list[str]) -> None:
     if not as_json:
         return say([*lines, str(folder)])
     files = (folder / name for name in ("mask.json", "training.json"))
-    found = {path.stem: json.loads(text_of(path)) for path in files if path.is_file()}
-    say_json({"folder": str(folder), **found})
+    documents = {path.stem: json.loads(text_of(path)) for path in files if path.is_file()}
+    say_json({"folder": str(folder), **documents})
 
 
-def _lift(recipe: Recipe, command: list[str], out: Path, device: str, quiet: bool, as_json: bool) -> None:
+def _lift(
+    recipe: Recipe, command: list[str], out: Path, device: str, quiet: bool, as_json: bool
+) -> None:
     """Train the network of a recipe that reconstructs spectra from RGB."""
     from neusee.workflows.api import verbs
     from neusee.workflows.graph.run_error import RunError
@@ -118,11 +160,24 @@ def _lift(recipe: Recipe, command: list[str], out: Path, device: str, quiet: boo
         refusing(),
         _loss_bar(silent, lengths) as watch,
     ):
-        folder = verbs.train(recipe, store=the_store(), device=device, out=out, progress=progress_lines(silent),
-                             command=command, watch=watch)  # fmt: skip
+        folder = verbs.train(
+            recipe,
+            store=the_store(),
+            device=device,
+            out=out,
+            progress=progress_lines(silent),
+            command=command,
+            watch=watch,
+        )
     weights = folder / "mst_plus_plus.safetensors"
-    again = shlex.join(["neusee", "run", "first_light", "lift=mst_plus_plus", f"lift.weights={weights}"])
-    lines = [f"weights: {weights}", f"curves:  {folder / 'curves.png'}", f"judged:  {folder / 'training.json'}"]
+    again = shlex.join(
+        ["neusee", "run", "first_light", "lift=mst_plus_plus", f"lift.weights={weights}"]
+    )
+    lines = [
+        f"weights: {weights}",
+        f"curves:  {folder / 'curves.png'}",
+        f"judged:  {folder / 'training.json'}",
+    ]
     _say_results(folder, as_json, [] if silent else [*lines, f"next:    {again}"])
 
 
@@ -137,27 +192,46 @@ def _next(folder: Path, stage: Stages) -> list[str]:
 
 
 @contextmanager
-def _loss_bar(quiet: bool, lengths: Mapping[int, int]) -> Iterator[Callable[[int, int, Mapping[str, float]], None]]:
-    """Show a progress bar on a terminal, and a line for each tenth of a stage elsewhere; yield a function for both.
+def _loss_bar(
+    quiet: bool, lengths: Mapping[int, int]
+) -> Iterator[Callable[[int, int, Mapping[str, float]], None]]:
+    """Show a progress bar on a terminal, and a line for each tenth of a stage elsewhere; yield a
+    function for both.
 
     The function shows the losses of an iteration.
     """
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
     console = Console(stderr=True)
     hidden = quiet or not console.is_terminal
     bar = Progress(*columns, TextColumn("{task.fields[losses]}"), console=console, disable=hidden)
     lines = ProgressLines(quiet)
-    tasks = {s: bar.add_task(f"stage {s}" if s else "lift", total=n, losses="") for s, n in lengths.items()}
+    tasks = {
+        s: bar.add_task(f"stage {s}" if s else "lift", total=n, losses="")
+        for s, n in lengths.items()
+    }
 
     def watch(stage: int, done: int, losses: Mapping[str, float]) -> None:
         names = [name for name in ("LSR", "L1", "critics", "MRAE", "RMSE") if name in losses]
         text = " ".join(f"{name} {losses[name]:.3g}" for name in names)
         bar.update(tasks[stage], completed=done, losses=text)
         if bar.disable and not quiet and done % max(1, lengths[stage] // _LINES) == 0:
-            lines(f"{f'stage {stage}, ' if stage else ''}iteration {done} of {lengths[stage]}: {text}")
+            lines(
+                f"{f'stage {stage}, ' if stage else ''}iteration {done} of {lengths[stage]}: {text}"
+            )
 
     with bar:
         yield watch

@@ -1,4 +1,6 @@
-"""The folder of a run as it is read for a comparison, with one located error for a folder that cannot be compared."""
+"""The folder of a run as it is read for a comparison, with one located error for a folder that
+cannot be compared.
+"""
 
 from __future__ import annotations
 
@@ -12,22 +14,28 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.final_values import flow
-from neusee.workflows.keys.regular_file import NotRegular, text_of
+from neusee.workflows.keys.sealed_files import NotRegular, text_of
 from neusee.workflows.recipe.text.yaml_values import read
-from neusee.workflows.report.run_code import CODE
-from neusee.workflows.report.run_folder import find_run
+from neusee.workflows.report.run_folder import CODE, find_run
 
 M = TypeVar("M", bound=BaseModel)
 
 _OTHER = {
-    "sweep.yaml": "a sweep: compare reads folders of `neusee run`; the results of each point are in sweep.csv",
-    "training.json": "a training: compare reads folders of `neusee run`, such as two runs with the trained weights",
+    "sweep.yaml": (
+        "a sweep: compare reads folders of `neusee run`; the results of each point are in sweep.csv"
+    ),
+    "training.json": (
+        "a training: compare reads folders of `neusee run`, such as two runs with the trained"
+        " weights"
+    ),
 }
 _AGAIN = "the file is damaged, or of another version of neusee: run the recipe again"
 
 
 class NotComparable(ValueError):
-    """Error for a folder that is not the complete folder of a run; the text names the place and the way out."""
+    """Error for a folder that is not the complete folder of a run; the text names the place and
+    the way out.
+    """
 
 
 class StepRow(BaseModel):
@@ -92,10 +100,11 @@ class RunRecord:
 
 
 def read_record(where: str, root: Path) -> RunRecord:
-    """Return the record of a run; ``where`` is ``latest``, the name of a folder in ``root`` or a path.
+    """Return the record of a run; ``where`` is ``latest``, the name of a folder in ``root`` or a
+    path.
 
-    Raises `NotComparable`, with the file and the place in the file, for a folder that is missing, damaged or of
-    something else than a run.
+    Raises `NotComparable`, with the file and the place in the file, for a folder that is missing,
+    damaged or of something else than a run.
     """
     for path in (root / where, Path(where)):
         for file, text in _OTHER.items():
@@ -105,12 +114,16 @@ def read_record(where: str, root: Path) -> RunRecord:
         folder = find_run(where, root).resolve()
     except FileNotFoundError as error:
         raise NotComparable(str(error)) from None
-    found = _json(folder / "provenance.json")
-    kind = found.get("study") or found.get("stage") if isinstance(found, dict) else None
+    provenance = _json(folder / "provenance.json")
+    kind = (
+        provenance.get("study") or provenance.get("stage") if isinstance(provenance, dict) else None
+    )
     if kind:
         text = f"{folder} is the folder of `{kind}`: compare reads folders of `neusee run`"
-        raise NotComparable(f"{text}; the numbers of this folder are in its tables and its page report.html")
-    document = _checked(folder / "provenance.json", RunDocument, found)
+        raise NotComparable(
+            f"{text}; the numbers of this folder are in its tables and its page report.html"
+        )
+    document = _checked(folder / "provenance.json", RunDocument, provenance)
     code = folder / CODE
     digests = _checked(code, CodeDigests, _json(code)) if code.is_file() else None
     return RunRecord(folder, document, _values(folder / "recipe.yaml"), digests)
@@ -139,16 +152,18 @@ def _checked(path: Path, model: type[M], content: Any) -> M:
 
 
 def _values(path: Path) -> dict[str, FinalValue]:
-    """Return the final values in the ``recipe.yaml`` of a run, each with its source from the comment behind it."""
+    """Return the final values in the ``recipe.yaml`` of a run, each with its source from the
+    comment behind it.
+    """
     try:
         document = read(path, str(path))
     except RecipeError as error:
         raise NotComparable(str(error)) from None
     lines = text_of(path, "utf-8-sig").splitlines()
     sources = [line.rpartition(" # ")[::2] for line in lines]
-    found = {}
+    values = {}
     for leaf in document.root.leaves():
         before, source = sources[leaf.key.line - 1]
         if before:  # a block of which every value is a default has no source
-            found[leaf.name] = FinalValue(flow(leaf.plain), source.strip())
-    return found
+            values[leaf.name] = FinalValue(flow(leaf.plain), source.strip())
+    return values

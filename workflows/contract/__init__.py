@@ -1,6 +1,8 @@
-"""Does a node keep what a node promises: documents, types, reference, gradient, bounds, key and surroundings?
+"""Does a node keep what a node promises: documents, types, reference, gradient, bounds, key and
+surroundings?
 
 The nodes of neusee pass the same rules in the tests.
 Nothing here reads a recipe or a cache.
-Offers: `node_contract.check_node`, `whole_contract.check_all`, `elsewhere_client.elsewhere`, `finding.Finding`.
+Offers: `node_contract.check_node`, `node_contract.check_all`, `surroundings.elsewhere`,
+        `node_rules.Finding`.
 """

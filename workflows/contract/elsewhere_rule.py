@@ -1,24 +1,182 @@
-"""Rule on surroundings: the same call in other processes, of which everything around the call is changed."""
+"""Rule on surroundings: the same call in processes of which everything else is changed."""
 
 from __future__ import annotations
 
+import decimal
+import faulthandler
+import inspect
+import locale
+import multiprocessing
+import os
 import pickle
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import random
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from neusee.nodes.own_modules import own_files
-from neusee.workflows.contract.elsewhere_client import Elsewhere, NotStartedError
-from neusee.workflows.contract.elsewhere_process import Asked
-from neusee.workflows.contract.finding import Finding
-from neusee.workflows.contract.outcomes import Difference, Outcome, difference, outcome_of
-from neusee.workflows.contract.surroundings import FRESH, HASH, THREADS, VARIABLES, WORK, Others, Surrounding
+import numpy as np
+import torch
+from torch import nn
+
+from neusee.nodes.own_modules import Architecture, import_missing, own_files
+from neusee.nodes.restore import own_network
+from neusee.workflows.contract.node_rules import (
+    Call,
+    Difference,
+    Finding,
+    Outcome,
+    difference,
+    failed,
+    outcome_of,
+)
+from neusee.workflows.contract.surroundings import (
+    FRESH,
+    HASH,
+    THREADS,
+    VARIABLES,
+    WORK,
+    Elsewhere,
+    NotStartedError,
+    Others,
+    Settings,
+    Surrounding,
+)
+from neusee.workflows.keys.code_digest import Code
+
+# --- elsewhere process ----------------------------------------------------------------------------
+
+# What runs in a process with other surroundings: its forks import the modules of the calls, and
+# send the outcomes.
+
+
+#: s of a call after which its process ends: the one that asked, which waits less, has died
+_LONGEST = 600
+_SIDE = 64  #: of the matrices of unrelated work
+_errors: list[object] = [None]  #: what NumPy does at an error, as this process has set it last
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """The calls that a process makes, each pickled as a function without arguments, with the
+    module of its code.
+    """
+
+    settings: Settings
+    files: tuple[str, ...]  #: files and folders of the user to import
+    calls: tuple[tuple[str, bytes], ...]
+
+
+def serve(pipe: int) -> None:
+    """Answer what is asked through a pipe, given by its number, until its other end is closed.
+
+    Each answer comes from a fork, which has imported no code of the user before, and ends with its
+    exit code.
+    """
+    fork = multiprocessing.get_context("fork")
+    with Connection(pipe) as connection:
+        connection.send_bytes(b"ready")
+        try:
+            while True:
+                asked: Asked = pickle.loads(connection.recv_bytes())
+                process = fork.Process(target=_answer, args=(connection, asked))
+                process.start()
+                process.join()
+                connection.send_bytes(pickle.dumps(process.exitcode))
+        except (EOFError, OSError):
+            return
+
+
+def _answer(connection: Connection, asked: Asked) -> None:
+    """Send the outcome of each call, in the order that was asked for."""
+    _settle(asked.settings)
+    for module, pickled in asked.calls:
+        faulthandler.dump_traceback_later(_LONGEST, exit=True)
+        connection.send_bytes(pickle.dumps(_called(asked, module, pickled)))
+        faulthandler.cancel_dump_traceback_later()
+
+
+def _called(asked: Asked, module: str, pickled: bytes) -> Outcome:
+    _disturb(asked.settings)
+    try:
+        import_missing(asked.files, module)
+        function = pickle.loads(pickled)
+    except (Exception, SystemExit) as error:
+        outcome = failed(error, module)
+        return Outcome(failure=f"cannot be imported: it {outcome.failure}", place=outcome.place)
+    _disturb(asked.settings)  # again, as the import may have changed it back
+    return outcome_of(function, module)
+
+
+def _settle(settings: Settings) -> None:
+    """Change what is set once: the folder, variables, the zone, the locale, the threads of
+    torch.
+    """
+    for name, value in settings.variables.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
+    time.tzset()
+    if settings.folder:
+        os.chdir(settings.folder)
+    if settings.has_locale:
+        locale.setlocale(locale.LC_ALL, "")
+    if settings.threads:
+        torch.set_num_threads(settings.threads)
+
+
+def _disturb(settings: Settings) -> None:
+    """Change what other code changes between two calls: other work, states of generators, errors
+    of NumPy.
+    """
+    if settings.has_other_work:
+        _work()
+    if settings.has_other_states:
+        torch.manual_seed(4711)
+        np.random.seed(4711)
+        random.seed(4711)
+    # so that a second time does not change it back
+    if settings.has_other_errors and np.geterr() != _errors[0]:
+        np.seterr(
+            **{
+                name: "ignore" if reaction == "raise" else "raise"
+                for name, reaction in np.geterr().items()
+            }
+        )
+        _errors[0] = np.geterr()
+
+
+def _work() -> None:
+    """Do what other steps may have done before: numbers, and settings of libraries that code of
+    others changes.
+    """
+    x = torch.full((_SIDE, _SIDE), 3.0)
+    torch.fft.fft2(x @ x).abs().sort()
+    np.linalg.svd(np.full((_SIDE, _SIDE), 7.0))
+    np.set_printoptions(precision=3, suppress=True)
+    torch.set_printoptions(precision=2)  # type: ignore[no-untyped-call]
+    decimal.getcontext().prec = 9
+
+
+# --- elsewhere rule -------------------------------------------------------------------------------
+
+# Rule on surroundings: the same call in other processes, of which everything around the call is
+# changed.
+
 
 RULE = "elsewhere"
-_MORE_SEEDS = 3  #: hash seeds that are tried where two gave the same order: a set of two words has only two orders
-_UNSTEADY = "two processes in the same surroundings differ, so draw from the argument rng and read no clock:"
+#: hash seeds that are tried where two gave the same order: a set of two words has only two orders
+_MORE_SEEDS = 3
+_UNSTEADY = (
+    "two processes in the same surroundings differ, so draw from the argument rng and read no"
+    " clock:"
+)
 
 Changes = frozenset[Surrounding]
 Found = dict[str, Outcome]  #: by the name of the call
@@ -43,25 +201,33 @@ class Trial:
         self.others = others
         self.findings = dict[str, Finding]()  #: by the name of the call
         self._pickled = dict[str, bytes]()
-        for each in tried:
+        for attempt in tried:
             try:
-                self._pickled[each.name] = pickle.dumps(each.function)
+                self._pickled[attempt.name] = pickle.dumps(attempt.function)
             except Exception as error:
-                text = f"not tried: its example cannot be sent to another process: {type(error).__name__}: {error}"
-                self.findings[each.name] = Finding(RULE, None, text)
-        self._tried = {each.name: each for each in tried if each.name in self._pickled}
+                text = (
+                    "not tried: its example cannot be sent to another process:"
+                    f" {type(error).__name__}: {error}"
+                )
+                self.findings[attempt.name] = Finding(RULE, None, text)
+        self._tried = {attempt.name: attempt for attempt in tried if attempt.name in self._pickled}
         self._here: Found = {}
         self._processes = dict[Changes, Elsewhere]()  # by what only a new process can have
 
     def compare(self, first: Elsewhere) -> None:
-        """Find what differs in the process ``first``, in which all is changed, and then what decides it."""
+        """Find what differs in the process ``first``, in which all is changed, and then what
+        decides it.
+        """
         with ExitStack() as self._stack:
             self._compare(first)
 
     def _compare(self, first: Elsewhere) -> None:
         away = self._outcomes(first, frozenset(self.others.changed()))
         self._leave_out_ends([name for name, outcome in away.items() if outcome.is_end])
-        self._here = {name: outcome_of(each.function, each.module) for name, each in self._tried.items()}
+        self._here = {
+            name: outcome_of(attempt.function, attempt.module)
+            for name, attempt in self._tried.items()
+        }
         open_names = list[str]()
         for name, here in self._here.items():
             if here.failure:
@@ -74,51 +240,70 @@ class Trial:
         self._settle_others([name for name in open_names if name not in self.findings])
 
     def ends(self, name: str) -> bool:
-        """Return True if a call ends its process also in the same surroundings, so that it is not made here."""
+        """Return True if a call ends its process also in the same surroundings, so that it is
+        not made here.
+        """
         return name not in self._here and name in self._pickled
 
-    # --- processes ----------------------------------------------------------------------------------------------------
+    # --- processes --------------------------------------------------------------------------------
 
-    def _outcomes(self, process: Elsewhere, changes: Changes, others: Others | None = None) -> Found:
-        """Return the outcome of each call in a process, in the other order where other work is changed."""
+    def _outcomes(
+        self, process: Elsewhere, changes: Changes, others: Others | None = None
+    ) -> Found:
+        """Return the outcome of each call in a process, in the other order where other work is
+        changed.
+        """
         names = [*self._tried]
         if WORK in changes:
             names.reverse()
-        declared = {name: value for each in self._tried.values() for name, value in each.declared.items()}
+        declared: dict[str, str] = {}
+        for attempt in self._tried.values():
+            declared |= attempt.declared
         settings = (others or self.others).settings(changes, Path(process.folder.name), declared)
         calls = tuple((self._tried[name].module, self._pickled[name]) for name in names)
         return dict(zip(names, process.outcomes(Asked(settings, own_files(), calls)), strict=True))
 
-    def _each(self, *sets: Iterable[Surrounding]) -> list[Found]:
-        """Return the outcomes for each set of changes; the processes that they need start at the same time."""
-        changes = [frozenset(each) for each in sets]
-        for each in changes:
-            if each & FRESH not in self._processes:
-                self._processes[each & FRESH] = self._stack.enter_context(closing(Elsewhere(self.others, each)))
-        return [self._outcomes(self._processes[each & FRESH], each) for each in changes]
+    def _each(self, sets: Sequence[Iterable[Surrounding]]) -> list[Found]:
+        """Return the outcomes for each set of changes; the processes that they need start at the
+        same time.
+        """
+        changes = [frozenset(change_set) for change_set in sets]
+        for change_set in changes:
+            if change_set & FRESH not in self._processes:
+                self._processes[change_set & FRESH] = self._stack.enter_context(
+                    closing(Elsewhere(self.others, change_set))
+                )
+        return [
+            self._outcomes(self._processes[change_set & FRESH], change_set)
+            for change_set in changes
+        ]
 
-    # --- what decides -------------------------------------------------------------------------------------------------
+    # --- what decides -----------------------------------------------------------------------------
 
     def _leave_out_ends(self, names: list[str]) -> None:
-        """Find whether calls that ended their process end it in the same surroundings; these are not made here."""
+        """Find whether calls that ended their process end it in the same surroundings; these are
+        not made here.
+        """
         if not names:
             return
-        [same] = self._each(())
+        [same] = self._each([()])
         for name in names:
             if same[name].is_end:
-                self._fail(name, f"the call {same[name].failure}; the rules on values were not tried")
+                self._fail(
+                    name, f"the call {same[name].failure}; the rules on values were not tried"
+                )
                 del self._tried[name]
 
     def _settle_rounding(self, names: list[str], away: Found) -> None:
         """Say which results differ by rounding alone, and with the number of threads alone."""
         sizes = dict[str, float]()
         for name in names:
-            found = self._difference(name, away[name], self._here[name])
-            if found and found.is_rounding:
-                sizes[name] = found.size
+            deviation = self._difference(name, away[name], self._here[name])
+            if deviation and deviation.is_rounding:
+                sizes[name] = deviation.size
         if not sizes:
             return
-        [others] = self._each(set(self.others.changed()) - {THREADS})
+        [others] = self._each([set(self.others.changed()) - {THREADS}])
         for name, size in sizes.items():
             if not self._difference(name, others[name], self._here[name]):
                 self._say_same(name, size)
@@ -128,28 +313,49 @@ class Trial:
         if not names:
             return
         changed = self.others.changed()
-        same, *singles = self._each((), *([each] for each in changed))
-        unsteady = {name: one for name in names if (one := self._difference(name, same[name], self._here[name]))}
-        again = self._each(())[0] if unsteady else same
+        same, *singles = self._each([(), *([surrounding] for surrounding in changed)])
+        unsteady = self._differences(names, same, self._here)
+        again = self._each([()])[0] if unsteady else same
         for name in names:
-            if found := self._difference(name, again[name], same[name]):
-                self._fail(name, f"{_UNSTEADY} {found.text}; other surroundings were not compared", found.place)
-                continue
-            for surrounding, outcomes in zip(changed, singles, strict=True):
-                found = self._difference(name, outcomes[name], same[name])
-                if found and not (surrounding is THREADS and found.is_rounding):
-                    variables = self._deciding(name, same) if surrounding is VARIABLES else []
-                    self._fail_in(name, surrounding, found, variables)
+            if deviation := self._difference(name, again[name], same[name]):
+                self._fail(
+                    name,
+                    f"{_UNSTEADY} {deviation.text}; other surroundings were not compared",
+                    deviation.place,
+                )
+            else:
+                for surrounding, outcomes in zip(changed, singles, strict=True):
+                    self._settle_one(name, surrounding, outcomes, same)
         self._settle_hidden([name for name in names if name not in self.findings], same, unsteady)
 
+    def _settle_one(
+        self, name: str, surrounding: Surrounding, outcomes: Found, same: Found
+    ) -> None:
+        """Say if a result depends on one surrounding, by more than rounding if on the threads."""
+        deviation = self._difference(name, outcomes[name], same[name])
+        if deviation and not (surrounding is THREADS and deviation.is_rounding):
+            variables = self._deciding(name, same) if surrounding is VARIABLES else []
+            self._fail_in(name, surrounding, deviation, variables)
+
+    def _differences(
+        self, names: Iterable[str], actual: Found, expected: Found
+    ) -> dict[str, Difference]:
+        """Return how the outcomes differ, by name, of those that do."""
+        pairs = ((name, self._difference(name, actual[name], expected[name])) for name in names)
+        return {name: deviation for name, deviation in pairs if deviation}
+
     def _deciding(self, name: str, same: Found) -> list[str]:
-        """Return the variables of the environment without any of which a result differs, by halving."""
+        """Return the variables of the environment without any of which a result differs, by
+        halving.
+        """
         process = self._processes[frozenset()]
         todo, deciding = [self.others.variables], list[str]()
         while todo:
             few = todo.pop()
-            found = self._outcomes(process, frozenset({VARIABLES}), replace(self.others, variables=few))
-            if not few or not self._difference(name, found[name], same[name]):
+            outcomes = self._outcomes(
+                process, frozenset({VARIABLES}), replace(self.others, variables=few)
+            )
+            if not few or not self._difference(name, outcomes[name], same[name]):
                 continue
             if len(few) == 1:
                 deciding += few
@@ -157,52 +363,76 @@ class Trial:
                 todo += [few[: len(few) // 2], few[len(few) // 2 :]]
         return sorted(deciding)
 
-    def _settle_hidden(self, names: list[str], same: Found, unsteady: Mapping[str, Difference]) -> None:
+    def _settle_hidden(
+        self, names: list[str], same: Found, unsteady: Mapping[str, Difference]
+    ) -> None:
         """Say what decides where no surrounding that was changed alone does."""
         if not names:
             return
         for seed in range(_MORE_SEEDS):
             others = replace(self.others, hash_seed=self.others.hash_seed + 1 + seed)
             with closing(Elsewhere(others, frozenset({HASH}))) as process:
-                found = self._outcomes(process, frozenset({HASH}))
+                outcomes = self._outcomes(process, frozenset({HASH}))
             for name in names:
-                one = self._difference(name, found[name], same[name])
-                if one and name not in self.findings:
-                    self._fail_in(name, HASH, one)
+                deviation = self._difference(name, outcomes[name], same[name])
+                if deviation and name not in self.findings:
+                    self._fail_in(name, HASH, deviation)
         for name in names:
             if name in self.findings:
                 continue
             if name in unsteady:
-                found_text = f"in a process that has done nothing else, {unsteady[name].text}: {WORK.fix}"
+                found_text = (
+                    f"in a process that has done nothing else, {unsteady[name].text}: {WORK.fix}"
+                )
                 self._fail(name, found_text, unsteady[name].place)
             else:
-                self._fail(name, f"with all of these changed together, but none alone: {self.others.said()}")
+                self._fail(
+                    name,
+                    f"with all of these changed together, but none alone: {self.others.said()}",
+                )
 
-    # --- words --------------------------------------------------------------------------------------------------------
+    # --- words ------------------------------------------------------------------------------------
 
-    def _difference(self, name: str, found: Outcome, wanted: Outcome) -> Difference | None:
-        return difference(found, wanted, self._tried[name].rtol)
+    def _difference(self, name: str, outcome: Outcome, expected: Outcome) -> Difference | None:
+        return difference(outcome, expected, self._tried[name].rtol)
 
     def _say_same(self, name: str, rounding: float = 0.0) -> None:
         count = len(self.others.changed()) - (rounding > 0)
-        text = f"the same bits in {count} changed surroundings: {self.others.said(without_threads=rounding > 0)}"
+        text = (
+            f"the same bits in {count} changed surroundings:"
+            f" {self.others.said(without_threads=rounding > 0)}"
+        )
         if rounding:
-            text += f"; equal to rounding with {self.others.in_threads()} ({rounding:.1g} of the largest value)"
+            text += (
+                f"; equal to rounding with {self.others.in_threads()} ({rounding:.1g} of the"
+                " largest value)"
+            )
         self.findings[name] = Finding(RULE, True, f"{text}; the clock was not changed")
 
-    def _fail_in(self, name: str, surrounding: Surrounding, found: Difference, variables: Sequence[str] = ()) -> None:
+    def _fail_in(
+        self,
+        name: str,
+        surrounding: Surrounding,
+        deviation: Difference,
+        variables: Sequence[str] = (),
+    ) -> None:
         differs = self.others.differs(surrounding, variables)
         fix = surrounding.fix.replace("NAME", variables[0]) if variables else surrounding.fix
-        self._fail(name, f"{differs} {found.text}: {fix}", found.place)
+        self._fail(name, f"{differs} {deviation.text}: {fix}", deviation.place)
 
     def _fail(self, name: str, text: str, place: str = "") -> None:
         """Add a sentence on a call; several surroundings make several sentences."""
         before = f"{self.findings[name].text}; " if name in self.findings else ""
-        self.findings[name] = Finding(RULE, False, f"{before}{place or self._tried[name].place}: {text}")
+        self.findings[name] = Finding(
+            RULE, False, f"{before}{place or self._tried[name].place}: {text}"
+        )
 
 
-def check_elsewhere(tried: Sequence[Tried], process: Callable[[], Elsewhere]) -> tuple[dict[str, Finding], set[str]]:
-    """Return what was found on each call, by name, and the names of those that may not be called here.
+def check_elsewhere(
+    tried: Sequence[Tried], process: Callable[[], Elsewhere]
+) -> tuple[dict[str, Finding], set[str]]:
+    """Return what was found on each call, by name, and the names of those that may not be called
+    here.
 
     ``process`` returns a process in which all surroundings are changed.
     """
@@ -213,5 +443,84 @@ def check_elsewhere(tried: Sequence[Tried], process: Callable[[], Elsewhere]) ->
         trial = Trial(tried, first.others)
         trial.compare(first)
     except NotStartedError as error:
-        return {each.name: Finding(RULE, None, f"not tried: {error}") for each in tried}, set()
-    return trial.findings, {each.name for each in tried if trial.ends(each.name)}
+        return {
+            attempt.name: Finding(RULE, None, f"not tried: {error}") for attempt in tried
+        }, set()
+    return trial.findings, {attempt.name for attempt in tried if trial.ends(attempt.name)}
+
+
+# --- tried calls ----------------------------------------------------------------------------------
+
+# Calls of nodes and networks as another process makes them: pickled, with full paths, and with what
+# keys cover.
+
+
+_TRIED_SIDE = 32  #: pixels of a picture
+_VARIABLE = "env:"  #: begins the declaration of a variable of the environment
+
+
+def node_call(name: str, call: Call) -> Tried:
+    """Return the call of a node's example; files of its parameters are named by their full
+    paths.
+    """
+    full = Call(
+        call.node, call.inputs, {key: _with_full_paths(value) for key, value in call.params.items()}
+    )
+    return _tried(name, call.node.fn, call.node.rtol, full.result, call.node.depends)
+
+
+def network_call(name: str, network: type[nn.Module]) -> Tried:
+    """Return the call of a network, built with its defaults, on a small picture."""
+    rtol = 1e-5  # as a node by default
+    return _tried(name, network, rtol, partial(_on_a_picture, Architecture(name, network)), ())
+
+
+def _tried(
+    name: str, code: Any, rtol: float, function: Callable[[], Any], depends: tuple[str, ...]
+) -> Tried:
+    module = code.__module__
+    variables = [*depends, *_declarations(module)]
+    names = {entry.removeprefix(_VARIABLE) for entry in variables if entry.startswith(_VARIABLE)}
+    declared = {
+        variable: os.environ[variable] for variable in sorted(names) if variable in os.environ
+    }
+    return Tried(name, module, _place(code), rtol, function, declared)
+
+
+def _declarations(module: str) -> Iterator[str]:
+    """Yield what a module, and those that it imports, declare that they read."""
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            looks = Code(Path(folder) / "code.json").looks(module)
+        except LookupError:
+            return  # the rule on the key says so
+    for look in looks.values():
+        yield from look.summary.depends if look.summary else ()
+
+
+def _with_full_paths(value: Any) -> Any:
+    if isinstance(value, Path):
+        return value.absolute()
+    return type(value)(map(_with_full_paths, value)) if type(value) in (tuple, list) else value
+
+
+def _on_a_picture(architecture: Architecture) -> torch.Tensor:
+    net = own_network(architecture, None, None).eval()
+    picture = torch.rand(
+        1,
+        3,
+        _TRIED_SIDE + 1,
+        _TRIED_SIDE + 3,
+        generator=torch.Generator().manual_seed(3),
+    )
+    with torch.no_grad(), torch.random.fork_rng(devices=[]):
+        result: torch.Tensor = net(picture)
+    return result
+
+
+def _place(code: Any) -> str:
+    try:
+        lines = inspect.getsourcelines(inspect.unwrap(code))[1]
+        return f"{Path(inspect.getfile(inspect.unwrap(code))).name}:{lines}"
+    except (OSError, TypeError):
+        return str(code.__module__)

@@ -1,17 +1,32 @@
-"""The surroundings of a call that a result must not depend on, and how a new process gets others.
-
-Nothing here imports torch: a process with other surroundings starts before it does.
-"""
+"""The surroundings that a result must not depend on, and a process that has others."""
 
 from __future__ import annotations
 
 import os
+import pickle
+import signal
 import subprocess
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Pipe
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from neusee.workflows.observation.known_variables import OF_LANGUAGES, OF_THREADS, is_known
+
+if TYPE_CHECKING:
+    from neusee.workflows.contract.elsewhere_rule import Asked
+    from neusee.workflows.contract.node_rules import Outcome
+
+
+# --- surroundings ---------------------------------------------------------------------------------
+
+# The surroundings of a call that a result must not depend on, and how a new process gets others.
+#
+# Nothing here imports torch: a process with other surroundings starts before it does.
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +41,8 @@ class Surrounding:
 FOLDER = Surrounding(
     "folder",
     "in another working folder",
-    'take the file as a parameter of type DataFile, or write depends=["table.csv"] for a file beside the module',
+    'take the file as a parameter of type DataFile, or write depends=["table.csv"] for a file'
+    " beside the module",
 )
 LOCALE = Surrounding(
     "locale",
@@ -56,7 +72,8 @@ RANDOM = Surrounding(
 WORK = Surrounding(
     "order of work",
     "after other work in the process",
-    "keep nothing in the module from one call to the next, and set in the node what a library remembers",
+    "keep nothing in the module from one call to the next, and set in the node what a library"
+    " remembers",
 )
 ERRORS = Surrounding(
     "np.seterr",
@@ -78,13 +95,30 @@ MEMORY = Surrounding(
     "where new memory has other bits",
     "fill all that torch.empty or np.empty gives, or write zeros",
 )
-#: those of a new process of Python; the others change in a fork of one, before it imports code of the user
+#: those of a new process of Python; the others change in a fork of one, before it imports code of
+#: the user
 FRESH = frozenset({LOCALE, HASH, THREADS, MEMORY})
 ALL = (FOLDER, LOCALE, HASH, THREADS, ZONE, RANDOM, WORK, ERRORS, HOME, VARIABLES, MEMORY)
 
 ZONE_ELSEWHERE = "NSC-13:45"  #: a zone that needs no table: UTC and 13 h 45 min
 #: languages that write 1,5; Turkish first, whose i is another letter
-_LANGUAGES = ("tr_", "de_", "fr_", "es_", "it_", "nl_", "pt_", "pl_", "sv_", "da_", "fi_", "nb_", "cs_", "ru_", "uk_")
+_LANGUAGES = (
+    "tr_",
+    "de_",
+    "fr_",
+    "es_",
+    "it_",
+    "nl_",
+    "pt_",
+    "pl_",
+    "sv_",
+    "da_",
+    "fi_",
+    "nb_",
+    "cs_",
+    "ru_",
+    "uk_",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,15 +146,21 @@ class Others:
 
     def changed(self) -> tuple[Surrounding, ...]:
         """Return the surroundings that can be changed here."""
-        return tuple(each for each in ALL if self._can_change(each))
+        return tuple(surrounding for surrounding in ALL if self._can_change(surrounding))
 
     def differs(self, surrounding: Surrounding, variables: Sequence[str] = ()) -> str:
-        """Return in which surrounding a result differs; ``variables`` of the environment decide it."""
+        """Return in which surrounding a result differs; ``variables`` of the environment decide
+        it.
+        """
         return surrounding.differs.format(
             locale=self.locale,
             threads=self.in_threads(),
             threads_here=self.threads_here,
-            names=f"variable{'s' * (len(variables) > 1)} {', '.join(variables)}" if variables else "variables",
+            names=(
+                f"variable{'s' * (len(variables) > 1)} {', '.join(variables)}"
+                if variables
+                else "variables"
+            ),
         )
 
     def in_threads(self) -> str:
@@ -132,34 +172,58 @@ class Others:
         words = {
             LOCALE: f"locale ({self.locale})",
             THREADS: self.in_threads(),
-            VARIABLES: f"{len(self.variables)} environment variable{'s' * (len(self.variables) != 1)} left out",
+            VARIABLES: (
+                f"{len(self.variables)} environment variable{'s' * (len(self.variables) != 1)}"
+                " left out"
+            ),
         }
-        changed = [each for each in self.changed() if not (without_threads and each is THREADS)]
-        text = ", ".join(words.get(each, each.name) for each in changed)
+        changed = [
+            surrounding
+            for surrounding in self.changed()
+            if not (without_threads and surrounding is THREADS)
+        ]
+        text = ", ".join(words.get(surrounding, surrounding.name) for surrounding in changed)
         return text if self.locale else f"{text}; locale not changed: no other is installed"
 
-    def environment(self, changes: frozenset[Surrounding], environ: Mapping[str, str]) -> dict[str, str]:
-        """Return the environment of a new process of Python with those of ``changes`` that only a new one can have."""
-        given = {**environ, "PYTHONHASHSEED": str(self.hash_seed + 1 if HASH in changes else self.hash_seed)}
-        given.setdefault("XDG_CACHE_HOME", os.path.join(os.path.expanduser("~"), ".cache"))  # of compiled programs
+    def environment(
+        self, changes: frozenset[Surrounding], environ: Mapping[str, str]
+    ) -> dict[str, str]:
+        """Return the environment of a new process of Python with those of ``changes`` that only
+        a new one can have.
+        """
+        variables = {
+            **environ,
+            "PYTHONHASHSEED": str(self.hash_seed + 1 if HASH in changes else self.hash_seed),
+        }
+        # of compiled programs
+        variables.setdefault("XDG_CACHE_HOME", os.path.join(os.path.expanduser("~"), ".cache"))
         if LOCALE in changes:
-            given = {name: value for name, value in given.items() if name not in OF_LANGUAGES}
-            given |= {"LC_ALL": self.locale, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+            variables = {
+                name: value for name, value in variables.items() if name not in OF_LANGUAGES
+            }
+            variables |= {"LC_ALL": self.locale, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
         if THREADS in changes:
-            given |= dict.fromkeys(OF_THREADS, str(self.threads))
+            variables |= dict.fromkeys(OF_THREADS, str(self.threads))
         if MEMORY in changes:
-            given["MALLOC_PERTURB_"] = "165"  # the library of C fills what it gives and takes
-        return given
+            variables["MALLOC_PERTURB_"] = "165"  # the library of C fills what it gives and takes
+        return variables
 
-    def settings(self, changes: frozenset[Surrounding], folder: Path, declared: Mapping[str, str]) -> Settings:
-        """Return what a fork changes; ``folder`` is empty, and variables that are ``declared`` stay."""
+    def settings(
+        self, changes: frozenset[Surrounding], folder: Path, declared: Mapping[str, str]
+    ) -> Settings:
+        """Return what a fork changes; ``folder`` is empty, and variables that are ``declared``
+        stay.
+        """
         variables = dict[str, str | None]()
         if VARIABLES in changes:
             variables |= dict.fromkeys(name for name in self.variables if name not in declared)
         if ZONE in changes:
             variables["TZ"] = ZONE_ELSEWHERE
         if HOME in changes:
-            variables |= {"HOME": str(folder), **dict.fromkeys(("USER", "LOGNAME", "USERNAME"), "somebody")}
+            variables |= {
+                "HOME": str(folder),
+                **dict.fromkeys(("USER", "LOGNAME", "USERNAME"), "somebody"),
+            }
         return Settings(
             folder=str(folder) if FOLDER in changes else "",
             variables={name: value for name, value in variables.items() if name not in declared},
@@ -170,8 +234,14 @@ class Others:
             has_other_errors=ERRORS in changes,
         )
 
-    def _can_change(self, each: Surrounding) -> bool:
-        return bool(self.locale) if each is LOCALE else bool(self.variables) if each is VARIABLES else True
+    def _can_change(self, surrounding: Surrounding) -> bool:
+        return (
+            bool(self.locale)
+            if surrounding is LOCALE
+            else bool(self.variables)
+            if surrounding is VARIABLES
+            else True
+        )
 
 
 def others(environ: Mapping[str, str]) -> Others:
@@ -192,29 +262,44 @@ def others(environ: Mapping[str, str]) -> Others:
 def installed_locales(environ: Mapping[str, str]) -> list[str]:
     """Return the names of the locales of this machine; none where it cannot say them."""
     try:
-        done = subprocess.run(["locale", "-a"], capture_output=True, text=True, check=False, errors="replace")
+        done = subprocess.run(
+            ["locale", "-a"], capture_output=True, text=True, check=False, errors="replace"
+        )
         names = done.stdout.split()
     except OSError:
         names = []
     own = [Path(folder) for folder in environ.get("LOCPATH", "").split(":") if folder]
-    return names + [path.name for folder in own if folder.is_dir() for path in sorted(folder.iterdir())]
+    for folder in own:
+        if folder.is_dir():
+            names += sorted(path.name for path in folder.iterdir())
+    return names
 
 
 def other_locale(now: str, names: Iterable[str], environ: Mapping[str, str]) -> str:
-    """Return a locale that is not ``now``: one with a decimal comma and other letters than UTF-8 if there is one.
+    """Return a locale that is not ``now``: one with a decimal comma and other letters than UTF-8 if
+    there is one.
 
     The locale C, in which a text is ASCII, is the last choice. No text if there is no other.
     """
 
     def rank(name: str) -> tuple[int, bool, str]:
-        language = next((number for number, each in enumerate(_LANGUAGES) if name.startswith(each)), len(_LANGUAGES))
+        language = next(
+            (number for number, prefix in enumerate(_LANGUAGES) if name.startswith(prefix)),
+            len(_LANGUAGES),
+        )
         return language, _is_utf8(name), name
 
     plain = ("C", "POSIX")
-    found = sorted((n for n in names if n.split(".")[0] not in plain and _same(n) != _same(now)), key=rank)
-    if found:
-        return found[0]
-    is_ascii = now in plain and environ.get("PYTHONUTF8") == "0" and environ.get("PYTHONCOERCECLOCALE") == "0"
+    candidates = sorted(
+        (n for n in names if n.split(".")[0] not in plain and _same(n) != _same(now)), key=rank
+    )
+    if candidates:
+        return candidates[0]
+    is_ascii = (
+        now in plain
+        and environ.get("PYTHONUTF8") == "0"
+        and environ.get("PYTHONCOERCECLOCALE") == "0"
+    )
     return "C" if "C" in names and not is_ascii else ""
 
 
@@ -228,3 +313,151 @@ def _same(name: str) -> str:
 
 def _is_utf8(name: str) -> bool:
     return "utf8" in _same(name)
+
+
+# --- elsewhere client -----------------------------------------------------------------------------
+
+# A process with other surroundings, seen from the process that asks it for outcomes.
+
+
+LONGEST = 300.0  #: s of one call
+_SCRIPT = """
+import sys
+sys.path[:] = sys.argv[2:]
+from neusee.workflows.contract.elsewhere_rule import serve
+pipe, sys.argv[1:] = int(sys.argv[1]), []
+serve(pipe)
+"""
+
+
+class NotStartedError(RuntimeError):
+    """Error for a process that ends before it is asked anything."""
+
+
+class Elsewhere:
+    """A process with some of the other surroundings; it imports torch while the caller does
+    other things.
+    """
+
+    def __init__(self, others: Others, changes: frozenset[Surrounding]) -> None:
+        self.others, self._fresh = others, changes & FRESH
+        self.folder = tempfile.TemporaryDirectory(prefix="neusee-check-")
+        try:
+            self._start()
+        except OSError as error:
+            self.folder.cleanup()
+            raise NotStartedError(f"a process of Python does not start: {error}") from None
+
+    def outcomes(self, asked: Asked) -> list[Outcome]:
+        """Return the outcome of each call, made in a fork of the process; raise `NotStartedError`.
+
+        After a call that ends its fork, or that does not end, the other calls are made in another
+        one.
+        """
+        outcomes: list[Outcome] = []
+        while len(outcomes) < len(asked.calls):
+            outcomes += self._up_to_an_end(replace(asked, calls=asked.calls[len(outcomes) :]))
+        return outcomes
+
+    def close(self) -> None:
+        """End the process and remove its folder."""
+        self._end()
+        self.folder.cleanup()
+
+    def _start(self) -> None:
+        """Start the process in a group of its own, with which its forks end."""
+        self._pipe, theirs = Pipe()
+        self._is_ready = False
+        path = [os.path.abspath(entry) for entry in sys.path]
+        quiet = subprocess.DEVNULL
+        with theirs:
+            self._process = subprocess.Popen(
+                [
+                    sys.executable,
+                    "-P",
+                    *["-O"] * sys.flags.optimize,
+                    "-c",
+                    _SCRIPT,
+                    str(theirs.fileno()),
+                    *path,
+                ],
+                stdin=quiet,
+                stdout=quiet,
+                stderr=quiet,
+                env=self.others.environment(self._fresh, os.environ),
+                pass_fds=[theirs.fileno()],
+                process_group=0,
+            )
+
+    def _end(self) -> None:
+        """End the process and its forks, if they run still."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        self._pipe.close()
+
+    def _up_to_an_end(self, asked: Asked) -> list[Outcome]:
+        """Return the outcomes of the calls up to the first that ends its process or has no end."""
+        try:
+            if not self._is_ready:
+                self._pipe.recv_bytes()
+                self._is_ready = True
+            self._pipe.send_bytes(pickle.dumps(asked))  # `send` would share the memory of a tensor
+            return self._received(asked)
+        except (EOFError, OSError):
+            code = self._process.wait()
+            raise NotStartedError(f"a process of Python ended, {_words(code)}") from None
+
+    def _received(self, asked: Asked) -> list[Outcome]:
+        outcomes: list[Outcome] = []
+        while True:
+            if not self._pipe.poll(LONGEST):
+                self._end()
+                self._start()
+                return [*outcomes, _ended(f"does not end within {LONGEST:.0f} s")]
+            answer = pickle.loads(self._pipe.recv_bytes())
+            if isinstance(answer, int):
+                has_all = len(outcomes) == len(asked.calls)
+                return (
+                    outcomes
+                    if has_all
+                    else [*outcomes, _ended(f"ends the process, {_words(answer)}")]
+                )
+            outcomes.append(answer)
+
+
+@contextmanager
+def elsewhere(early: bool = True) -> Iterator[Callable[[], Elsewhere]]:
+    """Give a function that returns a process in which all surroundings are changed, and end the
+    process at last.
+
+    The process starts with the ``with`` block if ``early``, so that it imports torch beside this
+    process.
+    """
+    begun = list[Elsewhere]()
+
+    def process() -> Elsewhere:
+        if not begun:
+            settings = others(os.environ)
+            begun.append(Elsewhere(settings, frozenset(settings.changed())))
+        return begun[0]
+
+    try:
+        if early:
+            with suppress(NotStartedError):  # said where it is needed
+                process()
+        yield process
+    finally:
+        for started in begun:
+            started.close()
+
+
+def _ended(failure: str) -> Outcome:
+    from neusee.workflows.contract.node_rules import Outcome
+
+    return Outcome(failure=failure, is_end=True)
+
+
+def _words(code: int) -> str:
+    """Return an exit code of a process in words."""
+    return f"with {signal.Signals(-code).name}" if code < 0 else f"with exit code {code}"

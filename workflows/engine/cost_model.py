@@ -1,31 +1,302 @@
-"""Cost model: run time, size of the result and memory of a step, predicted from shapes and from earlier runs.
-
-The result has the bytes of its shape and type. For time and memory, runs of the same node at the same size on this
-machine come first; then the law of the node (`cost_laws`), scaled by the runs of this machine; then, for a node that
-was never measured, the upper end of what shipped nodes need.
-"""
+"""Cost model: seconds and memory of a step, from laws of its node and from earlier runs."""
 
 from __future__ import annotations
 
 import itertools
+import json
+import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cache
+from importlib import resources
 from statistics import median
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
-from neusee.workflows.engine.cost_laws import EXACT, Law, Loading, Range, Size, Spread, guess, shipped
-from neusee.workflows.graph.recipe_graph import Step
+from neusee.nodes import Node
+from neusee.workflows.engine.node_call import bands_in
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.graph.step_shapes import (
+    Form,
+    alike,
+    bytes_of,
+    complete,
+    form_of,
+    has_path,
+    inputs_of,
+    is_same,
+    without_values,
+)
 from neusee.workflows.keys.cache_key import device_kind
-from neusee.workflows.recipe.known_before_run import machine_memory
+from neusee.workflows.recipe.step_checks import machine_memory
+
+# --- cost laws ------------------------------------------------------------------------------------
+
+# Laws of the cost of a node: seconds and peak memory from shapes and parameters, with coefficients
+# that were measured.
+#
+# The peak memory of a step is ``a + b inputs + c result + d work`` bytes beyond the memory in use
+# before, and its time is ``e + f operations`` seconds. ``node_costs.json`` has the coefficients of
+# each shipped node, which tests/benchmarks/fit_costs.py fits to runs of the shipped recipes on a
+# CPU, and the spread of the runs about the law. Seconds are the processor time of one thread, so
+# that a busy machine does not make a law slow.
+
+
+#: bytes of a result whose shape is not known, in a recipe without any known shape
+_LEAST = float(1 << 26)
+
+
+class Size(NamedTuple):
+    """The size of the problem that a step solves, from which its costs follow."""
+
+    inputs: float  #: bytes
+    result: float  #: bytes
+    work: float  #: bytes beside inputs and result, up to a factor: `Hooks.work` of the node
+    operations: float  #: up to a factor
+    bands: int = 0  #: number of bands that can be computed one after another; 0 if not known
+    known: bool = True  #: False where the shape of the result is a guess
+
+
+class Range(NamedTuple):
+    """The least and the largest value that a cost may take, as multiples of its prediction."""
+
+    least: float = 1.0
+    most: float = 1.0
+
+
+Spread = tuple[Range, Range]  #: of the peak memory, and of the seconds
+EXACT: Spread = (Range(), Range())
+
+
+class Loading(NamedTuple):
+    """The additional cost of the first step of a process that uses some libraries, because it
+    loads them.
+    """
+
+    libraries: tuple[str, ...]
+    memory: float  #: bytes, which the process keeps
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Law:
+    """The costs of a node as functions of the `Size` of a step."""
+
+    memory: tuple[float, float, float, float]  #: bytes, and factors of inputs, result and work
+    seconds: tuple[float, float]  #: s, and s for each operation
+    spread: Spread = EXACT  #: of runs about the law
+    #: the libraries that the node loads, whose cost is not in the numbers above
+    loads: Loading | None = None
+    #: bytes of the largest result that was measured, for a node without a rule of the shape
+    most: float = 0.0
+
+    def peak(self, size: Size) -> float:
+        """Return the peak memory of a step in bytes beyond the memory in use before; at least
+        its result.
+        """
+        a, b, c, d = self.memory
+        return max(size.result, a + b * size.inputs + c * size.result + d * size.work)
+
+    def time(self, size: Size) -> float:
+        """Return the time of a step in s on the CPU."""
+        return self.seconds[0] + self.seconds[1] * size.operations
+
+
+@cache
+def _file() -> Mapping[str, Any]:
+    text = resources.files(__package__).joinpath("node_costs.json").read_text(encoding="utf-8")
+    costs: dict[str, Any] = json.loads(text)
+    return costs
+
+
+@cache
+def shipped() -> Mapping[str, Law]:
+    """Return the laws of the shipped nodes, by the path of the node."""
+    return {path: _law(law) for path, law in _file()["nodes"].items()}
+
+
+@cache
+def guess() -> Law:
+    """Return the law of a node that was never measured: the largest costs for its size that any
+    shipped node has.
+    """
+    return _law(_file()["guess"])
+
+
+def _law(law: Mapping[str, Any]) -> Law:
+    spread = (Range(*law["spread"][0]), Range(*law["spread"][1])) if "spread" in law else EXACT
+    loads = Loading(tuple(law["loads"][0]), *law["loads"][1:]) if "loads" in law else None
+    return Law(tuple(law["memory"]), tuple(law["seconds"]), spread, loads, law.get("most", 0.0))
+
+
+def libraries_of(paths: Iterable[str]) -> float:
+    """Return the bytes of the libraries that the nodes with these paths load, and this process
+    has not loaded yet.
+    """
+    total, loaded = 0.0, set[str]()
+    for path in paths:
+        law = shipped().get(path)
+        if (
+            law
+            and law.loads
+            and not all(name in loaded or name in sys.modules for name in law.loads.libraries)
+        ):
+            loaded.update(law.loads.libraries)
+            total += law.loads.memory
+    return total
+
+
+class Sized(NamedTuple):
+    """The size of a step, and what it follows from: the points of a sweep share most steps."""
+
+    step: Step
+    inputs: Sequence[Any]
+    below: Sequence[Size]
+    least: float
+    form: Form
+    size: Size
+    reads_file: bool  #: which may change
+
+    def holds(
+        self, step: Step, inputs: Sequence[Any], below: Sequence[Size], smallest: float
+    ) -> bool:
+        """Return True if a step has the same node, parameters and known inputs, and therefore
+        the same size.
+        """
+        if (
+            self.reads_file
+            or step.node is not self.step.node
+            or smallest != self.least
+            or below != self.below
+        ):
+            return False
+        same = len(inputs) == len(self.inputs) and all(map(is_same, inputs, self.inputs))
+        return same and (step.params is self.step.params or _equal(step.params, self.step.params))
+
+
+def _equal(params: Mapping[str, Any], others: Mapping[str, Any]) -> bool:
+    with suppress(Exception):  # values such as tensors, which have no single answer
+        return bool(params == others)
+    return False
+
+
+_sized: dict[str, Sized] = {}  # by step
+_MOST_SIZED = 4096
+
+
+def _remember(sized: Sized) -> None:
+    """Keep the size of a step for the next recipe."""
+    if len(_sized) >= _MOST_SIZED:
+        _sized.clear()
+    _sized[sized.step.name] = sized
+
+
+def sizes_of(recipe: Recipe, order: Sequence[str]) -> dict[str, Size]:
+    """Return the size of each step in ``order`` before anything runs; ``order`` lists each step
+    after its inputs.
+
+    A result of unknown shape counts as large as its inputs, or as the largest known result of the
+    recipe if that is larger.
+    """
+    sizes = _sizes(recipe, order, 0.0)
+    if all(size.known for size in sizes.values()):
+        return sizes
+    known_bytes = [size.result for size in sizes.values() if size.known and size.result < math.inf]
+    return _sizes(recipe, order, max(known_bytes, default=_LEAST))
+
+
+def _sizes(recipe: Recipe, order: Sequence[str], smallest: float) -> dict[str, Size]:
+    forms: dict[str, Form] = {}
+    sizes: dict[str, Size] = {}
+    for name in order:
+        step = recipe.steps[name]
+        inputs, below = (
+            inputs_of(step, forms),
+            [sizes[source] for source in dict.fromkeys(step.sources)],
+        )
+        remembered = _sized.get(name)
+        if remembered is not None and remembered.holds(step, inputs, below, smallest):
+            forms[name], sizes[name] = remembered.form, remembered.size
+            continue
+        try:
+            forms[name] = form_of(step.node, inputs, step.params)
+        except OverflowError:
+            sizes[name] = Size(0.0, math.inf, math.inf, math.inf)
+            continue
+        sizes[name] = _size(step, inputs, forms[name], below, smallest)
+        # a guess, so that the sizes of later steps can be computed
+        if forms[name] is None and not sizes[name].known:
+            forms[name] = next((x for x in inputs if x is not None), None)
+        if remembered is not None and alike(forms[name], remembered.form):
+            # the same object, so that later steps have the size that they had
+            forms[name] = remembered.form
+        _remember(
+            Sized(step, inputs, below, smallest, forms[name], sizes[name], has_path(step.params))
+        )
+    return sizes
+
+
+def _size(
+    step: Step, inputs: Sequence[Form], form: Form, below: Sequence[Size], smallest: float
+) -> Size:
+    is_known = all(size.known for size in below)
+    if form is not None and complete(step.node, inputs):
+        return size_of(step.node, inputs, step.params, form)._replace(known=is_known)
+    read = sum(size.result for size in below)
+    law = shipped().get(step.node.path)
+    if form is not None:
+        result = bytes_of(form)
+    elif law and law.most:
+        result = law.most
+    else:
+        result, is_known = max(read, smallest), False
+    return Size(read, result, 0.0, (read + result) / 4, 0, is_known)
+
+
+def size_of(node: Node, inputs: Sequence[Any], params: Mapping[str, Any], result: Any) -> Size:
+    """Return the size of a step from its inputs and its result, which may be values or forms
+    without values.
+    """
+    read, written = bytes_of(list(inputs)), bytes_of(result)
+    work, operations = 0.0, (read + written) / 4
+    if node.hooks.work is not None:
+        work, operations = node.hooks.work(result, *inputs, **params)
+    return Size(read, written, float(work), float(operations), bands_in(node, inputs))
+
+
+def measured_size(
+    node: Node, inputs: Sequence[Any], params: Mapping[str, Any], result: Any
+) -> list[float] | None:
+    """Return the size of a step that ran, as the journal keeps it, or None if the rule of the
+    node fails.
+    """
+    try:
+        forms = [without_values(x) for x in inputs]
+        return list(size_of(node, forms, params, without_values(result))[:4])
+    except Exception:  # a wrong rule of a node must not lose its result
+        return None
+
+
+# --- cost model -----------------------------------------------------------------------------------
+
+# Cost model: run time, size of the result and memory of a step, predicted from shapes and from
+# earlier runs.
+#
+# The result has the bytes of its shape and type. For time and memory, runs of the same node at the
+# same size on this machine come first; then the law of the node (`cost_model`), scaled by the runs
+# of this machine; then, for a node that was never measured, the upper end of what shipped nodes
+# need.
+
 
 _FASTER = 10.0  #: speed of another kind of device relative to the CPU, until both are measured
 _NEWEST = 5  #: number of earlier results that are used
 _MOST = 100  #: earlier results of a step or a node among which those of its size are searched
-_LEAST = 1 << 25  #: bytes of a peak below which the memory of the process is mostly noise
-_FARTHEST = 8  #: how much larger a step of a node without a law may be than the largest one that was measured
+_LEAST_COST = 1 << 25  #: bytes of a peak below which the memory of the process is mostly noise
+#: how much larger a step of a node without a law may be than the largest one that was measured
+_FARTHEST = 8
 _SHORT = 1e-3  #: s of a step below which its time is mostly overhead
 
 Row = Mapping[str, Any]  #: a line of the journal
@@ -42,7 +313,8 @@ class Estimate:
     spread: Spread = EXACT  #: of the peak memory and of the seconds
     bands: int = 0  #: number of bands that can be computed one after another; 0 if not known
     sized: bool = True  #: False where the size of the result is a guess as well
-    libraries: float = 0.0  #: bytes of the libraries that the step loads, which count in the memory of the program
+    #: bytes of the libraries that the step loads, which count in the memory of the program
+    libraries: float = 0.0
 
     @property
     def peak(self) -> float:
@@ -53,8 +325,12 @@ class Estimate:
 class Costs:
     """Measured costs of steps and nodes, from the journal of a result store in order of time."""
 
-    def __init__(self, rows: Iterable[Row], sizes: Mapping[str, Size] = MappingProxyType({})) -> None:
-        """Read measured costs; ``sizes`` has the size of each step of the recipe, from `cost_laws.sizes_of`."""
+    def __init__(
+        self, rows: Iterable[Row], sizes: Mapping[str, Size] = MappingProxyType({})
+    ) -> None:
+        """Read measured costs; ``sizes`` has the size of each step of the recipe, from
+        `cost_model.sizes_of`.
+        """
         self._sizes = sizes
         self._steps: dict[str, list[Row]] = {}
         self._nodes: dict[str, list[Row]] = {}
@@ -73,58 +349,80 @@ class Costs:
             self._ratio = {"cpu": 1.0, **self._measured_ratios()}
 
     def of(self, step: Step, kinds: Sequence[str], exact: Row | None = None) -> Estimate:
-        """Predict the cost of ``step`` on each kind of device; ``exact`` holds measured costs of the same result."""
+        """Predict the cost of ``step`` on each kind of device; ``exact`` holds measured costs of
+        the same result.
+        """
         size = self._sizes.get(step.name)
         if exact and _is_measured(exact):
             return self._repeated([exact], kinds, size)
         if size is not None and size.known:
             return self._predicted(step.node.path, kinds, size)
         rows = self._steps.get(f"{step.name} {step.node.path}", [])[-_NEWEST:]
-        return self._repeated(rows, kinds, None) if rows else self._guess(step.node.path, kinds, size)
+        return (
+            self._repeated(rows, kinds, None) if rows else self._guess(step.node.path, kinds, size)
+        )
 
-    def in_turn(self, steps: Iterable[tuple[str, Step, Row | None]], kinds: Sequence[str]) -> dict[str, Estimate]:
-        """Predict the costs of steps that run one after another: a library costs the first step that loads it.
+    def in_turn(
+        self, steps: Iterable[tuple[str, Step, Row | None]], kinds: Sequence[str]
+    ) -> dict[str, Estimate]:
+        """Predict the costs of steps that run one after another: a library costs the first step
+        that loads it.
 
-        Args: steps: a key, the step, and the measured costs of the same result or None. Returns: the costs by key.
+        Args: steps: a key, the step, and the measured costs of the same result or None. Returns:
+                the costs by key.
         """
-        found, loaded = dict[str, Estimate](), set[str]()
+        estimates, loaded = dict[str, Estimate](), set[str]()
         for key, step, exact in steps:
-            found[key] = self.of(step, kinds, exact)
+            estimates[key] = self.of(step, kinds, exact)
             law = shipped().get(step.node.path)
-            if law and law.loads and not all(name in loaded or name in sys.modules for name in law.loads.libraries):
+            if (
+                law
+                and law.loads
+                and not all(name in loaded or name in sys.modules for name in law.loads.libraries)
+            ):
                 loaded.update(law.loads.libraries)
                 if not self._measured(step, exact):
-                    found[key] = _loading(found[key], law.loads)
-        return found
+                    estimates[key] = _loading(estimates[key], law.loads)
+        return estimates
 
     def _measured(self, step: Step, exact: Row | None) -> bool:
-        """Return True if the costs of a step are those of earlier runs, which loaded the libraries as well."""
+        """Return True if the costs of a step are those of earlier runs, which loaded the
+        libraries as well.
+        """
         size = self._sizes.get(step.name)
         rows = self._nodes.get(step.node.path, [])
         return (
             bool(exact and _is_measured(exact))
             or size is None
-            or any(_alike(_size(row), size) for row in rows if _size(row))
+            or any(_alike(_size_of_work(row), size) for row in rows if _size_of_work(row))
         )
 
     def with_sizes(self, sizes: Mapping[str, Size]) -> Costs:
         """Return the same measurements for the steps with other ``sizes``."""
-        found = copy(self)
-        found._sizes = sizes
-        return found
+        costs = copy(self)
+        costs._sizes = sizes
+        return costs
 
     def size_of(self, step: str) -> float:
-        """Return the bytes of the result of the step with this name, or 0 if its shape is not known."""
+        """Return the bytes of the result of the step with this name, or 0 if its shape is not
+        known.
+        """
         return self._sizes[step].result if step in self._sizes else 0.0
 
     def _predicted(self, path: str, kinds: Sequence[str], size: Size) -> Estimate:
-        """Predict a step from runs at the same size, or from the law of its node, scaled by runs on this machine."""
+        """Predict a step from runs at the same size, or from the law of its node, scaled by runs
+        on this machine.
+        """
         law, past = shipped().get(path), self._nodes.get(path, [])
-        newest = (row for row in reversed(past) if (other := _size(row)) and _alike(other, size))
+        newest = (
+            row for row in reversed(past) if (other := _size_of_work(row)) and _alike(other, size)
+        )
         if same := list(itertools.islice(newest, _NEWEST)):
             return self._repeated(same[::-1], kinds, size, law)
-        rows = [row for row in past if _size(row)]
-        if law is None and _FARTHEST * max((_extent(_size(row)) for row in rows), default=0.0) < _extent(size):
+        rows = [row for row in past if _size_of_work(row)]
+        if law is None and _FARTHEST * max(
+            (_extent(_size_of_work(row)) for row in rows), default=0.0
+        ) < _extent(size):
             return self._guess(path, kinds, size, rows[-_NEWEST:])
         base = law or guess()
         factors = _scales(base, rows[-_NEWEST:], self._faster)
@@ -139,24 +437,36 @@ class Costs:
         """Predict a step by the median of earlier runs of the same size."""
         result = size.result if size else float(median(row["bytes"] for row in rows))
         peaks = [float(row["peak"]) for row in rows if row.get("peak") is not None]
-        least = law.peak(size) * law.spread[0].least if law and size else 0.0
-        peak = max(median(peaks) if peaks else 0.0, result, least)
+        lower_bound = law.peak(size) * law.spread[0].least if law and size else 0.0
+        peak = max(median(peaks) if peaks else 0.0, result, lower_bound)
         seconds = {kind: self._seconds(rows, kind) for kind in kinds}
         usual = law.spread if law else EXACT
-        spread = (_range(peaks, peak, usual[0]), _range([row["seconds"] for row in rows], None, usual[1]))
+        spread = (
+            _range(peaks, peak, usual[0]),
+            _range([row["seconds"] for row in rows], None, usual[1]),
+        )
         return Estimate(seconds, result, peak - result, True, spread, size.bands if size else 0)
 
-    def _guess(self, path: str, kinds: Sequence[str], size: Size | None, rows: Sequence[Row] = ()) -> Estimate:
-        """Predict the upper end of the costs of a step whose shape is unknown or whose node never ran at such a size.
+    def _guess(
+        self, path: str, kinds: Sequence[str], size: Size | None, rows: Sequence[Row] = ()
+    ) -> Estimate:
+        """Predict the upper end of the costs of a step whose shape is unknown or whose node never
+        ran at such a size.
 
-        ``rows`` has runs at sizes that are much smaller: a node that took more there than the law says takes more here.
+        ``rows`` has runs at sizes that are much smaller: a node that took more there than the law
+        says takes more here.
         """
         size, law = size or Size(0.0, 0.0, 0.0, 0.0, known=False), shipped().get(path) or guess()
-        more = [max(1.0, factor) for factor in _scales(law, rows, self._faster)]
-        on_cpu, peak = more[1] * law.spread[1].most * law.time(size), more[0] * law.spread[0].most * law.peak(size)
+        factors = [max(1.0, factor) for factor in _scales(law, rows, self._faster)]
+        on_cpu, peak = (
+            factors[1] * law.spread[1].most * law.time(size),
+            factors[0] * law.spread[0].most * law.peak(size),
+        )
         seconds = {kind: on_cpu / self._faster(kind) for kind in kinds}
         spread = (Range(size.result / peak if peak else 0.0, 1.0), Range(0.0, 1.0))
-        return Estimate(seconds, size.result, peak - size.result, False, spread, size.bands, size.known)
+        return Estimate(
+            seconds, size.result, peak - size.result, False, spread, size.bands, size.known
+        )
 
     def _seconds(self, rows: Sequence[Row], kind: str) -> float:
         here = [row for row in rows if _kind(row) == kind]
@@ -169,8 +479,10 @@ class Costs:
         return self._ratio.get(kind, _FASTER)
 
     def _measured_ratios(self) -> dict[str, float]:
-        """Return the speed of each kind of device relative to the CPU, from the steps that were measured on both."""
-        found: dict[str, list[float]] = {}
+        """Return the speed of each kind of device relative to the CPU, from the steps that were
+        measured on both.
+        """
+        ratios_by_kind: dict[str, list[float]] = {}
         for rows in self._steps.values():
             by_kind: dict[str, list[float]] = {}
             for row in rows:
@@ -178,8 +490,8 @@ class Costs:
             cpu = median(by_kind.pop("cpu", [0.0]))
             for kind, seconds in by_kind.items():
                 if cpu > 0 and median(seconds) > 0:
-                    found.setdefault(kind, []).append(cpu / median(seconds))
-        return {kind: median(ratios) for kind, ratios in found.items()}
+                    ratios_by_kind.setdefault(kind, []).append(cpu / median(seconds))
+        return {kind: median(ratios) for kind, ratios in ratios_by_kind.items()}
 
 
 def _append(rows: list[Row], row: Row) -> None:
@@ -196,7 +508,9 @@ def _loading(cost: Estimate, loads: Loading) -> Estimate:
 
 
 def _range(values: Sequence[float], expected: float | None, usual: Range) -> Range:
-    """Return the range of measured ``values`` about their median, or ``usual`` for fewer than two values."""
+    """Return the range of measured ``values`` about their median, or ``usual`` for fewer than
+    two values.
+    """
     expected = expected or (median(values) if values else 0.0)
     if len(values) < 2 or expected <= 0.0:
         return usual
@@ -204,40 +518,47 @@ def _range(values: Sequence[float], expected: float | None, usual: Range) -> Ran
 
 
 def _is_measured(row: Row) -> bool:
-    """Return True for a journal line with a time, a size and a peak of memory that this machine can have."""
+    """Return True for a journal line with a time, a size and a peak of memory that this machine
+    can have.
+    """
     fits = _kind(row) != "cpu" or (row.get("peak") or 0) <= machine_memory()
     return fits and row.get("seconds") is not None and row.get("bytes") is not None
 
 
 def _scales(law: Law, rows: Sequence[Row], faster: Any) -> tuple[float, float]:
-    """Return the factors from a law to the runs of this machine, for memory and for time; 1 where nothing was measured.
+    """Return the factors from a law to the runs of this machine, for memory and for time; 1 where
+    nothing was measured.
 
     Small steps are left out, because allocators and overheads hide what they need.
     """
     peaks, times = [], []
     for row in rows:
-        size = _size(row)
-        if row.get("peak") and law.peak(size) > _LEAST and _kind(row) == "cpu":
+        size = _size_of_work(row)
+        if row.get("peak") and law.peak(size) > _LEAST_COST and _kind(row) == "cpu":
             peaks.append(row["peak"] / law.peak(size))
         if law.time(size) > _SHORT:
             times.append(row["seconds"] * faster(_kind(row)) / law.time(size))
     return (median(peaks) if peaks else 1.0), (median(times) if times else 1.0)
 
 
-def _size(row: Row) -> Any:
+def _size_of_work(row: Row) -> Any:
     """Return the size of the step of a journal line, or None for a line without a valid size."""
-    found = row.get("size")
-    valid = isinstance(found, list | tuple) and len(found) == 4 and all(isinstance(x, int | float) for x in found)
-    return Size(*found) if valid else None  # type: ignore[misc]
+    numbers = row.get("size")
+    valid = (
+        isinstance(numbers, list | tuple)
+        and len(numbers) == 4
+        and all(isinstance(x, int | float) for x in numbers)
+    )
+    return Size(*numbers) if valid else None  # type: ignore[misc]
 
 
 def _extent(size: Size) -> float:
     return size.inputs + size.result
 
 
-def _alike(one: Size, other: Size) -> bool:
-    return one[:4] == other[:4] or all(
-        abs(a - b) <= 1e-9 * max(abs(a), abs(b)) for a, b in zip(one[:4], other[:4], strict=True)
+def _alike(size: Size, other: Size) -> bool:
+    return size[:4] == other[:4] or all(
+        abs(a - b) <= 1e-9 * max(abs(a), abs(b)) for a, b in zip(size[:4], other[:4], strict=True)
     )
 
 

@@ -1,19 +1,270 @@
-"""The clusters on which the command line computes: workers on this machine, those of a scheduler, or jobs of SLURM."""
+"""Clusters of the command line: on this machine, of a scheduler, or of jobs of SLURM."""
 
 from __future__ import annotations
 
+import asyncio
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
-from typing import Any
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
 
-from neusee.workflows.engine.dask_executor import Dask
-from neusee.workflows.engine.scheduler_link import connected, silence_logs
-from neusee.workflows.engine.slurm_jobs import slurm_cluster, wait_for_job
-from neusee.workflows.engine.slurm_options import SlurmOptions
+import torch
+
+from neusee.workflows.engine.dask_executor import ClusterLost, Dask, connected, silence_logs
+from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.store.cache_settings import parse_size
 from neusee.workflows.store.result_store import Store
 
-_QUIET = {"DASK_LOGGING__DISTRIBUTED": "critical"}  #: in the environment of workers whose terminal is that of the user
+# --- slurm options --------------------------------------------------------------------------------
+
+# The options of the jobs that SLURM starts for a run, as the command line states them:
+# ``queue=gpu``, ``cores=4``.
+
+
+_COMMANDS = ("sbatch", "scancel")
+N = TypeVar("N", int, float)
+#: of SLURM: minutes, hours:minutes:seconds, or days-hours:minutes:seconds
+_TIME = re.compile(r"(\d+-)?\d+(:\d+){0,2}")
+
+
+@dataclass(frozen=True)
+class SlurmOptions:
+    """What one job of SLURM asks for; a text that is empty leaves the default of the site."""
+
+    queue: str = ""  #: partition
+    account: str = ""
+    #: processors of a job, and threads of its worker; 0: as many as this program computes with
+    cores: int = 0
+    memory: str = "8 GB"  #: of a job; the worker is ended at 95 % of it
+    walltime: str = ""  #: such as 02:00:00; without it half an hour
+    wait: float = 5.0  #: minutes until the first job has to start
+    interface: str = ""  #: network between scheduler and workers, such as ib0
+    python: str = ""  #: program of the workers; without it the one that runs this program
+    logs: str = "slurm_logs"  #: folder
+    directive: tuple[str, ...] = ()  #: further lines of #SBATCH, such as --gres=gpu:1
+    prologue: tuple[str, ...] = ()  #: commands before the worker, such as module load cuda
+
+    @classmethod
+    def read(cls, words: Sequence[str]) -> SlurmOptions:
+        """Return the options in words such as ``queue=gpu``; raise ValueError for a word that is
+        none.
+        """
+        options = cls()
+        for word in words:
+            name, sign, value = word.partition("=")
+            current = {field.name: getattr(options, field.name) for field in fields(cls)}
+            if not sign or name not in current:
+                hint = nearest(name, current) or f"write one of {', '.join(current)}"
+                raise ValueError(f"{word}: write NAME=VALUE, such as queue=gpu; {hint}")
+            options = replace(options, **{name: _value(name, value, current[name])})
+        return options
+
+
+def missing_command() -> str:
+    """Return the name of the first command of SLURM that this machine lacks, or an empty text."""
+    return next((name for name in _COMMANDS if not shutil.which(name)), "")
+
+
+def _value(name: str, text: str, before: Any) -> Any:
+    """Return the value of an option; raise ValueError for one that SLURM cannot read."""
+    if isinstance(before, tuple):
+        return (*before, text)
+    try:
+        if name == "memory":
+            parse_size(text)
+        if isinstance(before, int):
+            return _at_least_one(int(text))
+        if isinstance(before, float):
+            return _at_least_one(float(text.removesuffix("min").strip()) * 60) / 60
+    except ValueError:
+        raise ValueError(f"{name}={text}: must be {_KINDS[name]}") from None
+    if name == "walltime" and not _TIME.fullmatch(text):
+        raise ValueError(f"{name}={text}: must be a time of SLURM, such as 02:00:00")
+    if "\n" in text or not text:
+        raise ValueError(f"{name}={text!r}: must be one line of text")
+    return text
+
+
+_KINDS = {
+    "memory": 'a size such as "16 GB"',
+    "cores": "a whole number of at least 1",
+    "wait": "minutes, such as 30",
+}
+
+
+def _at_least_one(number: N) -> N:
+    if not number >= 1:
+        raise ValueError
+    return number
+
+
+# --- slurm jobs -----------------------------------------------------------------------------------
+
+# Jobs of SLURM whose workers compute a run: submitted through dask-jobqueue, waited for, and
+# cancelled at the end.
+
+
+_LOOK = 5.0  #: s between two looks at the queue
+_CLOSING = 10.0  #: s for dask to close
+
+
+@dataclass
+class SlurmJobs:
+    """The jobs of one run."""
+
+    cluster: Any = None  #: `dask_jobqueue.SLURMCluster`
+    ids: list[str] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)  #: what sbatch said
+
+    async def submit(self, command: str, script: str) -> str:
+        """Run the command that submits a script, and return what it prints; note what it
+        refuses.
+        """
+        process = await asyncio.create_subprocess_exec(
+            *shlex.split(command), script, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+        out, error = (text.decode(errors="replace") for text in await process.communicate())
+        number = next((word for word in out.replace(";", " ").split() if word.isdecimal()), "")
+        if process.returncode or not number:
+            said = " ".join(
+                (error.strip() or out.strip() or f"exit code {process.returncode}").split()
+            )
+            said = said.removeprefix("sbatch: error: ")
+            self.refused.append(said)
+            raise ClusterLost(said)
+        self.ids.append(number)
+        return out
+
+    def queue(self) -> str:
+        """Return what squeue says of the jobs, such as ``2 PENDING (Resources)``; an empty text
+        if none is left.
+        """
+        try:
+            words = ["squeue", "--noheader", "--jobs", ",".join(self.ids), "--format", "%T (%r)"]
+            done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            return f"nothing: {error}"
+        lines = [line.strip() for line in done.stdout.splitlines() if line.strip()]
+        if done.returncode and "invalid job id" not in done.stderr.lower():
+            return f"nothing: {' '.join(done.stderr.split())}"
+        return ", ".join(f"{lines.count(line)} {line}" for line in dict.fromkeys(lines))
+
+    def cancel(self) -> None:
+        """Cancel all jobs; a job that has ended already is none to cancel."""
+        if self.ids:
+            with suppress(OSError, subprocess.TimeoutExpired):
+                subprocess.run(["scancel", *self.ids], capture_output=True, timeout=60)
+
+
+@contextmanager
+def slurm_cluster(count: int, options: SlurmOptions) -> Iterator[SlurmJobs]:
+    """Submit ``count`` jobs, and cancel them after the ``with`` block, however it ends."""
+    cluster_class, job_class = _dask_jobqueue()
+    jobs = SlurmJobs()
+    try:
+        jobs.cluster = cluster_class(job_cls=_told(job_class, jobs), **_settings(options))
+        jobs.cluster.scale(jobs=count)
+        yield jobs
+    finally:
+        jobs.cancel()
+        if jobs.cluster is not None:
+            with suppress(Exception):
+                jobs.cluster.close(timeout=_CLOSING)
+
+
+def wait_for_job(
+    jobs: SlurmJobs, client: Any, options: SlurmOptions, say: Callable[[str], None]
+) -> None:
+    """Wait until a worker of the jobs is connected; raise `ClusterLost` if sbatch refuses, or if
+    none comes in time.
+    """
+    began = looked = time.monotonic()
+    announced = False
+    while not client.nthreads():
+        now = time.monotonic()
+        if jobs.refused:
+            raise ClusterLost(f"sbatch refused a job: {jobs.refused[0]}")
+        if jobs.ids and not announced:
+            announced = True
+            say(
+                f"jobs     {', '.join(jobs.ids)}: waiting up to {options.wait:g} min for the first"
+                " worker"
+            )
+        if now - looked > _LOOK and jobs.ids:
+            looked = now
+            if not (queue := jobs.queue()):
+                raise ClusterLost(
+                    f"the jobs {', '.join(jobs.ids)} ended before a worker came: see"
+                    f" {options.logs}/"
+                )
+            if now - began > 60 * options.wait:
+                raise ClusterLost(
+                    f"no worker came within {options.wait:g} min; squeue says: {queue}"
+                )
+        time.sleep(0.2)
+
+
+def _dask_jobqueue() -> tuple[type[Any], type[Any]]:
+    """Return the classes of a cluster and of a job; leave Ctrl-C as it is, for which the package
+    exits with 0.
+    """
+    before = signal.getsignal(signal.SIGINT)
+    from dask_jobqueue.slurm import SLURMCluster, SLURMJob
+
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, before)
+    return SLURMCluster, SLURMJob
+
+
+def _told(job_class: type[Any], jobs: SlurmJobs) -> type[Any]:
+    """Return a class of jobs that tell ``jobs`` their numbers and what sbatch refuses."""
+
+    async def submit(self: Any, script: str) -> str:
+        return await jobs.submit(self.submit_command, script)
+
+    return type("Job", (job_class,), {"_submit_job": submit})
+
+
+def _settings(options: SlurmOptions) -> dict[str, Any]:
+    """Return the arguments of a cluster; what is not stated is left to the configuration of the
+    site.
+    """
+    stated = {
+        name: getattr(options, name)
+        for name in ("queue", "account", "walltime", "interface", "python")
+    }
+    return {
+        # of dask, which would compute as many steps at once: the threads are those of torch
+        "cores": 1,
+        "processes": 1,
+        "job_cpu": options.cores or torch.get_num_threads(),
+        "memory": parse_size(options.memory),
+        "job_name": "neusee",
+        "log_directory": options.logs,
+        "job_extra_directives": list(options.directive),
+        "job_script_prologue": list(options.prologue),
+        "scheduler_options": {"dashboard_address": ":0", "dashboard": False},
+        "silence_logs": False,
+        **{name: value for name, value in stated.items() if value},
+    }
+
+
+# --- dask cluster ---------------------------------------------------------------------------------
+
+# The clusters on which the command line computes: workers on this machine, those of a scheduler, or
+# jobs of SLURM.
+
+
+#: in the environment of workers whose terminal is that of the user
+_QUIET = {"DASK_LOGGING__DISTRIBUTED": "critical"}
 
 
 @contextmanager
@@ -26,9 +277,9 @@ def cluster(
 ) -> Iterator[Dask]:
     """Yield an executor for workers that the text ``where`` names.
 
-    ``dask:4`` are four local workers, ``dask:here`` is this process, ``slurm:4`` are four jobs of SLURM with the
-    options ``job``, such as ``queue=gpu``; anything else is the address of a scheduler. ``say`` is told what is waited
-    for, and ``warn`` of a scheduler that is silent.
+    ``dask:4`` are four local workers, ``dask:here`` is this process, ``slurm:4`` are four jobs of
+    SLURM with the options ``job``, such as ``queue=gpu``; anything else is the address of a
+    scheduler. ``say`` is told what is waited for, and ``warn`` of a scheduler that is silent.
     Raises `ClusterLost` if no scheduler or no worker comes.
     """
     silence_logs()
@@ -58,6 +309,11 @@ def _local(count: str) -> Iterator[Any]:
     workers = 1 if here or not count else int(count)
     quiet = {} if here else {"env": _QUIET}
     with LocalCluster(
-        n_workers=workers, threads_per_worker=1, processes=not here, dashboard_address=":0", silence_logs=50, **quiet
+        n_workers=workers,
+        threads_per_worker=1,
+        processes=not here,
+        dashboard_address=":0",
+        silence_logs=50,
+        **quiet,
     ) as local:
         yield local

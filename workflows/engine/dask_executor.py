@@ -1,30 +1,361 @@
-"""Executor on a dask.distributed cluster, which receives cache keys instead of tensors.
-
-A task is a chain of steps with the keys of its inputs. The worker reads values by key from the
-store, or takes values of earlier tasks from memory, and writes the last result of the chain to the
-store. The worker returns only the metadata of the results. If a worker dies, its finished results
-are in the store, and a second worker may write a result again without harm.
-"""
+"""Executor on a dask.distributed cluster, with its link to the scheduler and its workers."""
 
 from __future__ import annotations
 
+import logging
+import random
+import sys
 import time
 import warnings
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from itertools import chain
+from typing import Any, get_args, get_origin
 
 import torch
 
-from neusee.workflows.engine.dask_worker import lane_here, work_here
-from neusee.workflows.engine.scheduler_link import SchedulerLink
-from neusee.workflows.engine.step_job import Lane, Outcome, StepJob
+from neusee.nodes.own_modules import own_modules
+from neusee.workflows.engine.machine_resources import FRESH, there_is
+from neusee.workflows.engine.step_job import InputMissing, Lane, Outcome, StepJob, carry_out
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.keys.cache_key import Key
-from neusee.workflows.keys.seal import signature
+from neusee.workflows.keys.cache_key import Key, code_of, is_private
+from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.keys.module_digest import imported
+from neusee.workflows.keys.sealed_files import Unsigned, check_signature, secrets, signature
+from neusee.workflows.keys.user_code import own_code, taint_code, taints_of
+from neusee.workflows.observation.observed_call import tainted_modules
+from neusee.workflows.recipe.node_families import all_nodes
+from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.serialization import tensors_in
+
+# --- scheduler link -------------------------------------------------------------------------------
+
+# The link to a scheduler of dask: whether it answers, which workers it has, and when to give up.
+#
+# A link that is cut for less than `PATIENCE` comes back by itself: the client connects again, and
+# what was not told is asked for again. Beyond it the run ends with one sentence, and what is
+# finished stays in the cache.
+
+
+PATIENCE = 60.0  #: s without a scheduler, or without any worker, after which a run gives up
+_ANSWER = 10.0  #: s in which a scheduler answers a question
+_ATTEMPT = 5.0  #: s of one attempt to connect again
+_BETWEEN = 5.0  #: s between two questions while steps are computed
+_LOGGERS = ("distributed", "tornado", "tornado.application", "asyncio")
+
+
+class ClusterLost(OSError):
+    """Error of a run whose scheduler or workers are gone; the finished steps stay in the cache."""
+
+
+class SchedulerLink:
+    """The connection to a scheduler through a `distributed.Client`, made anew where it was lost."""
+
+    def __init__(self, client: Any, warn: Callable[[str], None]) -> None:
+        self.client, self._warn = client, warn
+        self.address = str(client.scheduler.address)
+        self._asked = self._workers_seen = time.monotonic()
+        self.newest: Mapping[str, int] = {}  #: the workers that the scheduler told last
+        self._lost: list[Any] = []  # clients before, which futures of lost tasks still name
+
+    def renewed(self) -> bool:
+        """Return True if the connection was lost and is made anew, so that all tasks are lost.
+
+        Raises `ClusterLost` if the scheduler does not return, or had no worker for too long.
+        """
+        client = self.client
+        if (
+            client.status != "running"
+            or client.scheduler_comm is None
+            or client.scheduler_comm.closed()
+        ):
+            self._connect_again()
+            return True
+        if time.monotonic() - self._asked > _BETWEEN:
+            self.workers()
+        return False
+
+    def workers(self) -> Mapping[str, int] | None:
+        """Return the number of threads by address of the connected workers, or None if the
+        scheduler does not answer.
+
+        Raises `ClusterLost` if there was none for too long.
+        """
+        threads: Mapping[str, int] | None = None
+        with suppress(OSError, AttributeError):  # the latter while the client closes
+            threads = self.client.sync(
+                self.client.scheduler.ncores, workers=None, callback_timeout=_ANSWER
+            )
+        self._asked = now = time.monotonic()
+        self.newest = threads or {}
+        if threads or threads is None:
+            self._workers_seen = now
+        elif now - self._workers_seen > PATIENCE:
+            raise ClusterLost(
+                f"the scheduler {self.address} has had no worker for {PATIENCE:.0f} s"
+            )
+        return threads
+
+    def wait_for_workers(self) -> Mapping[str, int]:
+        """Return the connected workers as soon as there is one."""
+        while not (workers := self.workers()):
+            self.renewed()
+            time.sleep(10 * FRESH)
+        return workers
+
+    def close(self) -> None:
+        """Close the connection, and those before it."""
+        for client in (self.client, *self._lost):
+            with suppress(Exception):
+                client.close(timeout=_ANSWER)
+
+    def _connect_again(self) -> None:
+        """Connect to the scheduler with a new client, because one that waits for a lost packet
+        misses the return.
+        """
+        self._warn(
+            f"the scheduler {self.address} does not answer: waiting up to {PATIENCE:.0f} s for it"
+            " to return"
+        )
+        self._lost.append(self.client)
+        end = time.monotonic() + PATIENCE
+        while time.monotonic() < end:
+            with suppress(ClusterLost):
+                self.client = connected(self.address, _ATTEMPT)
+                self._workers_seen = time.monotonic()
+                return
+            time.sleep(10 * FRESH)
+        raise ClusterLost(f"the scheduler {self.address} has ended, or the network to it is cut")
+
+
+def connected(address: Any, seconds: float = PATIENCE) -> Any:
+    """Return a `distributed.Client` of a scheduler; raise `ClusterLost` if none answers there."""
+    from distributed import Client
+
+    try:
+        return Client(address, timeout=seconds, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise ClusterLost(
+            f"no scheduler of dask answers at {address} within {seconds:.0f} s"
+        ) from error
+
+
+def silence_logs() -> None:
+    """Let dask and its network print nothing in this process: what a user needs to know is said
+    in a sentence.
+    """
+    import distributed  # noqa: F401  makes its loggers, each with a handler of its own
+
+    made = [name for name in logging.root.manager.loggerDict if name.startswith(f"{_LOGGERS[0]}.")]
+    for name in (*_LOGGERS, *made):
+        logger = logging.getLogger(name)
+        logger.handlers[:] = [logging.NullHandler()]
+        logger.propagate = False
+
+
+# --- dask worker ----------------------------------------------------------------------------------
+
+# The side of a worker of `dask.distributed`: it computes chains of steps, and returns outcomes
+# without values.
+#
+# The worker reads values by key from the store, or takes values of earlier tasks from memory, and
+# writes the last result of the chain to the store.
+
+
+_PLANNED = 0.6  #: fraction of the memory of a worker that a schedule may use
+
+
+class _Here:
+    """State of one worker between tasks: the store, digests of code, and the most recently used
+    values.
+    """
+
+    def __init__(self, where: str, room: float) -> None:
+        self.store = open_store(where)
+        self._codes: dict[frozenset[str] | None, Code] = {None: Code(self.store.code_memo)}
+        self._own = own_modules()
+        self.values: OrderedDict[Key, Any] = OrderedDict()
+        self.room, self.held = room, 0
+
+    def look_again(self) -> None:
+        """Compute digests of code anew if a job has brought modules of a user, which may change
+        what others compute.
+        """
+        if self._own != own_modules():
+            self._codes, self._own = {None: Code(self.store.code_memo)}, own_modules()
+
+    def code_for(self, work: StepJob) -> Code | None:
+        """Return the digests of code by which a step has the digest of the caller, or None where
+        its code differs.
+
+        What a package of the user holds depends on which of its modules were imported. The caller's
+        count: this worker imports those that it lacks, and leaves out those that steps of other
+        recipes imported here.
+        """
+        for loaded in (None, work.own.followed if work.own else frozenset[str]()):
+            for module in sorted(loaded or ()):
+                imported(module)
+            code = self._codes.get(loaded) or self._codes.setdefault(
+                loaded, Code(self.store.code_memo, loaded)
+            )
+            if code_of(work.step, code) == work.origin["code"]:
+                return code
+        return None
+
+    def fetch(self, key: Key, kinds: Mapping[Key, Any]) -> Any:
+        """Return the value of a key; ``kinds`` are the annotated types of the inputs of a step,
+        by their keys.
+        """
+        if key not in self.values:
+            try:
+                self.keep(key, self.store.get(key, kinds.get(key, Any)))
+            except KeyError:
+                raise InputMissing(key) from None
+        self.values.move_to_end(key)
+        return self.values[key]
+
+    def keep(self, key: Key, value: Any) -> None:
+        self.held += _size(value) - _size(self.values.get(key))
+        self.values[key] = value
+        self.values.move_to_end(key)
+        while self.held > self.room and len(self.values) > 1:
+            self.held -= _size(self.values.popitem(last=False)[1])
+
+
+_here: dict[str, _Here] = {}
+
+
+def _chance_of_its_own() -> None:
+    """Give dask a generator of its own: its threads draw beside a step, which would be taken for
+    draws of the step.
+    """
+    for name, module in list(sys.modules.items()):
+        if name.startswith(("distributed.", "dask.")) and getattr(module, "random", None) is random:
+            module.random = random.Random()  # type: ignore[attr-defined]
+
+
+def lane_here(dask_worker: Any) -> tuple[str, float]:
+    """Return the device of a worker, and the memory (bytes) that a schedule may use on this
+    device.
+    """
+    if torch.cuda.is_available():
+        return "cuda:0", _PLANNED * there_is("cuda:0")
+    allowed = getattr(dask_worker.memory_manager, "memory_limit", None)
+    return "cpu", _PLANNED * min(there_is("cpu"), allowed or float("inf"))
+
+
+def work_here(
+    chain: tuple[StepJob, ...], where: str, threads: int, room: float, signed: str = ""
+) -> list[Outcome]:
+    """Compute a chain of jobs on a worker; return outcomes without values, and cache up to ``room``
+    bytes of values.
+
+    ``signed`` is a signature by the secret of the caller, which this worker needs too.
+    """
+    if not _same_secret(signed):
+        text = (
+            "NEUSEE_CACHE_SECRET of a worker is not that of this process: set the same secret there"
+        )
+        return [Outcome(chain[0], error=RunError(chain[0].step, [], OSError(text)))]
+    if torch.get_num_threads() != threads:
+        torch.set_num_threads(threads)
+    _chance_of_its_own()
+    here = _here.get(where) or _here.setdefault(where, _Here(where, room))
+    here.look_again()
+    outcomes: list[Outcome] = []
+    refetch = chain[0].refetch_seconds
+    for work in chain:
+        outcome = _one_here(replace(work, refetch_seconds=refetch), here)
+        outcomes.append(outcome)
+        if outcome.held or outcome.error or outcome.lost:
+            break
+        refetch = 0.0 if outcome.kept else outcome.seconds + refetch
+    return [_light(outcome) for outcome in outcomes]
+
+
+def _same_secret(signed: str) -> bool:
+    try:
+        check_signature(signed, "worker", "", b"")
+    except Unsigned:
+        return False
+    return bool(secrets()) == bool(signed)
+
+
+def _one_here(work: StepJob, here: _Here) -> Outcome:
+    if is_private(work.key):
+        text = (
+            "the loaded code is not that of its file, so no other process can use the result:"
+            " restart Python"
+        )
+        return Outcome(work, error=RunError(work.step, [], OSError(text)))
+    code = here.code_for(work)
+    if code is None:
+        text = (
+            f"the code of {work.step.node.path} differs on a worker: install the same version and"
+            " packages there, and set the same time zone and settings of NumPy and torch"
+        )
+        return Outcome(work, error=RunError(work.step, [], OSError(text)))
+    work = replace(work, own=own_code(work.step, code))
+    # of an earlier job, whose memo may still hold it
+    if work.own and (earlier_taints := taints_of(work.own.modules)):
+        return Outcome(work, taints=earlier_taints)
+    outcome = carry_out(work, partial(here.fetch, kinds=kinds_of(work)), here.store)
+    if work.own and outcome.taints:
+        taint_code(tainted_modules(work.own, outcome.taints), outcome.taints)
+        outcome.value = None
+    if outcome.value is not None:
+        here.keep(work.key, outcome.value)
+    return outcome
+
+
+def kinds_of(work: StepJob) -> dict[Key, Any]:
+    """Return the annotated type of each input of a job, by the key of the input.
+
+    Where a type is not annotated, the value may be a named tuple of any node, so all families of
+    nodes are imported.
+    """
+    node, kinds = work.step.node, dict[Key, Any]()
+    for name, read in zip(node.inputs, work.reads, strict=True):
+        kind = node.hints.get(name, Any)
+        if isinstance(read, tuple):
+            lists = [
+                candidate for candidate in (kind, *get_args(kind)) if get_origin(candidate) is list
+            ]
+            kind = get_args(lists[0])[0] if lists else Any
+        if kind is Any:
+            list(all_nodes())
+        kinds |= dict.fromkeys(read if isinstance(read, tuple) else [read] if read else [], kind)
+    return kinds
+
+
+def _light(outcome: Outcome) -> Outcome:
+    """Return an outcome that pickle can send: without the value, and with any error as a
+    `RunError`.
+    """
+    outcome.value = None
+    if outcome.error is not None and not isinstance(outcome.error, RunError):
+        outcome.error = RunError(outcome.work.step, [], outcome.error)
+    return outcome
+
+
+def _size(value: Any) -> int:
+    return 0 if value is None else sum(t.nbytes for t in tensors_in(value))
+
+
+# --- dask executor --------------------------------------------------------------------------------
+
+# Executor on a dask.distributed cluster, which receives cache keys instead of tensors.
+#
+# A task is a chain of steps with the keys of its inputs. The worker reads values by key from the
+# store, or takes values of earlier tasks from memory, and writes the last result of the chain to
+# the store. The worker returns only the metadata of the results. If a worker dies, its finished
+# results are in the store, and a second worker may write a result again without harm.
+
 
 _SHARE = 0.4  #: fraction of the planned memory for values that the next tasks of a worker may read
 _LOOK = 1.0  #: s between two queries for the connected workers
@@ -32,17 +363,26 @@ _TRIES = 3  #: number of workers that may die during one chain before the run fa
 
 
 class Dask:
-    """An `Executor` on a cluster: ``client`` is a `distributed.Client`, and every worker can open ``store``."""
+    """An `Executor` on a cluster: ``client`` is a `distributed.Client`, and every worker can
+    open ``store``.
+    """
 
     shares = False
 
     def __init__(
-        self, client: Any, store: Store, threads: int = 0, warn: Callable[[str], None] = warnings.warn
+        self,
+        client: Any,
+        store: Store,
+        threads: int = 0,
+        warn: Callable[[str], None] = warnings.warn,
     ) -> None:
-        """Use ``threads`` threads on a worker, by default as many as here; ``warn`` is told at once of a lost link."""
+        """Use ``threads`` threads on a worker, by default as many as here; ``warn`` is told at
+        once of a lost link.
+        """
         self.where = getattr(store, "url", None) or str(store.root.absolute())
         self.link = SchedulerLink(client, warn)
-        self.threads = threads or torch.get_num_threads()  # as many as here give the same round-off as here
+        # as many as here give the same round-off as here
+        self.threads = threads or torch.get_num_threads()
         self._lanes: dict[str, Lane] = {}
         self._looked = -_LOOK
         self._running: dict[Any, tuple[StepJob, ...]] = {}
@@ -56,15 +396,21 @@ class Dask:
 
     @property
     def lanes(self) -> Mapping[str, Lane]:
-        """Return the device and memory of each worker, by address; the workers are queried at most once a second."""
+        """Return the device and memory of each worker, by address; the workers are queried at
+        most once a second.
+        """
         if time.monotonic() - self._looked > _LOOK or not self._lanes:
             self._look()
         return self._lanes
 
     def submit(self, work: Sequence[StepJob]) -> None:
-        """Send a chain of jobs to the assigned worker, or to another worker if the assigned worker is gone."""
+        """Send a chain of jobs to the assigned worker, or to another worker if the assigned
+        worker is gone.
+        """
         lane = work[0].lane
-        there = {"workers": [lane], "allow_other_workers": True} if lane in self.link.newest else {}
+        assignment = (
+            {"workers": [lane], "allow_other_workers": True} if lane in self.link.newest else {}
+        )
         self._tries[work[0].key] = self._tries.get(work[0].key, 0) + 1
         future = self.client.submit(
             work_here,
@@ -76,10 +422,10 @@ class Dask:
             key=f"neusee-{work[0].key}-{work[-1].key}-{self._tries[work[0].key]}",
             pure=False,
             retries=_TRIES,
-            **there,
+            **assignment,
         )
         self._running[future] = tuple(work)
-        if there:
+        if assignment:
             self._bound.add(future)
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
@@ -96,13 +442,15 @@ class Dask:
                 self._submit_again(self._running)
             self._free_of_lost_workers()
             ended = [future for future in self._running if future.status != "pending"]
-            found = [outcome for future in ended for outcome in self._taken(future)]
-            if found or left <= 0:
-                return found
+            outcomes = [*chain.from_iterable(map(self._taken, ended))]
+            if outcomes or left <= 0:
+                return outcomes
         return []
 
     def cancel(self) -> None:
-        """Drop the tasks that have not begun; running tasks continue, and their results are stored."""
+        """Drop the tasks that have not begun; running tasks continue, and their results are
+        stored.
+        """
         for future in self._running:
             future.release()  # waits for no answer, which a lost scheduler does not give
         self._running = {}
@@ -117,9 +465,11 @@ class Dask:
             future.release()
 
     def _free_of_lost_workers(self) -> None:
-        """Send again what was meant for a worker that is gone: dask would keep it for that worker if none was left."""
-        if there := self.link.newest:
-            self._submit_again([f for f in self._bound if self._running[f][0].lane not in there])
+        """Send again what was meant for a worker that is gone: dask would keep it for that
+        worker if none was left.
+        """
+        if present := self.link.newest:
+            self._submit_again([f for f in self._bound if self._running[f][0].lane not in present])
 
     def _rest(self, seconds: float) -> None:
         """Wait until a task ends, or for a time."""
@@ -129,7 +479,9 @@ class Dask:
             wait(list(self._running), seconds, return_when="FIRST_COMPLETED")
 
     def _taken(self, future: Any) -> list[Outcome]:
-        """Return the outcomes of a chain of jobs, or one outcome with a `RunError` if the workers died."""
+        """Return the outcomes of a chain of jobs, or one outcome with a `RunError` if the
+        workers died.
+        """
         chain = self._running.pop(future)
         self._bound.discard(future)
         if future.status == "finished":
@@ -139,23 +491,26 @@ class Dask:
                     outcome.work = replace(outcome.work, lane=chain[0].lane)
                 return outcomes
         cause = future.exception() if future.status == "error" else None
-        if cause is None and self._tries[chain[0].key] < _TRIES:  # the task was lost with its worker or its scheduler
+        # the task was lost with its worker or its scheduler
+        if cause is None and self._tries[chain[0].key] < _TRIES:
             self.submit(chain)
             return []
         return [Outcome(chain[0], error=RunError(chain[0].step, [], OSError(_why_not(cause))))]
 
     def _look(self) -> None:
-        """Update the list of connected workers and their devices; wait until a worker is connected."""
-        there = self.link.workers()
-        if there is None and self._lanes:  # a cut, which may end
+        """Update the list of connected workers and their devices; wait until a worker is
+        connected.
+        """
+        present = self.link.workers()
+        if present is None and self._lanes:  # a cut, which may end
             return
-        there = there or self.link.wait_for_workers()
-        new = [address for address in there if address not in self._lanes]
-        found: dict[str, Any] = {}
+        present = present or self.link.wait_for_workers()
+        new = [address for address in present if address not in self._lanes]
+        answers: dict[str, Any] = {}
         with suppress(OSError):
-            found = self.client.run(lane_here, workers=new, on_error="ignore") if new else {}
-        known = {**self._lanes, **{address: Lane(*about) for address, about in found.items()}}
-        self._lanes = {address: known[address] for address in sorted(there) if address in known}
+            answers = self.client.run(lane_here, workers=new, on_error="ignore") if new else {}
+        lanes = {**self._lanes, **{address: Lane(*about) for address, about in answers.items()}}
+        self._lanes = {address: lanes[address] for address in sorted(present) if address in lanes}
         self._looked = time.monotonic()
 
 
@@ -164,5 +519,8 @@ def _why_not(cause: BaseException | None) -> str:
     if cause is None:
         return "the link to the cluster was lost again and again while a worker computed the step"
     if type(cause).__name__ == "KilledWorker":
-        return "every worker that computed the step died: too little memory, or killed; the log of a worker says more"
+        return (
+            "every worker that computed the step died: too little memory, or killed; the log of a"
+            " worker says more"
+        )
     return f"no worker could carry out the step: {type(cause).__name__}: {cause}"

@@ -22,7 +22,7 @@ from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import settle
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
-from neusee.workflows.tolerance.error_budget import ErrorBudget
+from neusee.workflows.tolerance.skip_decision import ErrorBudget
 
 Theta = Mapping[str, Any]
 
@@ -33,7 +33,10 @@ _MARKS = {
     "vjp": ("setup_context", "functorch", "second derivative"),
 }
 _OTHERWISE = {
-    "vmap": ", or take dataclasses.replace(recipe, exact=True), where no step is left out for its values",
+    "vmap": (
+        ", or take dataclasses.replace(recipe, exact=True), where no step is left out for its"
+        " values"
+    ),
     "jvp": ", or torch.func.vjp",
     "vjp": ", which differentiates more nodes",
 }
@@ -51,54 +54,69 @@ def as_function(
 ) -> _Function:
     """Return the recipe as a differentiable function ``theta -> {output: value}``.
 
-    Every value equals the value of `run` bit for bit. `torch.func.vjp` and `jvp` follow all outputs of the packaged
-    recipes, networks excepted. `torch.func.vmap` needs ``randomness="same"`` and passes PSFs and what is measured of
-    them (`lsr`, `bsr`, `outside`, `peak`); with ``dataclasses.replace(recipe, exact=True)`` it passes the raw and the
-    developed picture too, but no restoration. A node that does not pass raises RunError with its place and the
-    transform; ``recipes/guide/torch_func.md`` lists every node.
+    Every value equals the value of `run` bit for bit. `torch.func.vjp` and `jvp` follow all outputs
+    of the packaged recipes, networks excepted. `torch.func.vmap` needs ``randomness="same"`` and
+    passes PSFs and what is measured of them (`lsr`, `bsr`, `outside`, `peak`); with
+    ``dataclasses.replace(recipe, exact=True)`` it passes the raw and the developed picture too, but
+    no restoration. A node that does not pass raises RunError with its place and the transform;
+    ``recipes/guide/torch_func.md`` lists every node.
 
-    Args: free: parameters such as ``"spot.strength"``, or steps such as ``"height"``, whose result the caller
-    provides. Steps that do not depend on ``free`` are computed once, here, or read from the store. Noise is the
-    same at every call, because its stream depends on the seed and the step. Random steps in ``redraw`` are
-    computed at every call, which may have another seed. ``caller`` replaces `call` for all steps computed at a call.
+    Args: free: parameters such as ``"spot.strength"``, or steps such as ``"height"``, whose result
+            the caller
+    provides. Steps that do not depend on ``free`` are computed once, here, or read from the store.
+    Noise is the same at every call, because its stream depends on the seed and the step. Random
+    steps in ``redraw`` are computed at every call, which may have another seed. ``caller`` replaces
+    `call` for all steps computed at a call.
     """
-    wanted = recipe.outputs if outputs is None else tuple(outputs)
-    given, tuned = _read(recipe, free)
-    recipe = with_substitutions(recipe, wanted, given | tuned.keys())
-    sources = {name: () if name in given else step.sources for name, step in recipe.steps.items()}
-    order = in_order(sources, wanted)
-    if idle := sorted((given | tuned.keys()) - set(order)):
+    names = recipe.outputs if outputs is None else tuple(outputs)
+    replaced, tuned = _read(recipe, free)
+    recipe = with_substitutions(recipe, names, replaced | tuned.keys())
+    sources = {
+        name: () if name in replaced else step.sources for name, step in recipe.steps.items()
+    }
+    order = in_order(sources, names)
+    if idle := sorted((replaced | tuned.keys()) - set(order)):
         raise ValueError(f"no output depends on {', '.join(idle)}")
-    live, roots = dict[str, None](), {*given, *tuned, *redraw}
+    live, roots = dict[str, None](), {*replaced, *tuned, *redraw}
     for name in order:
         if name in roots or not live.keys().isdisjoint(sources[name]):
             live[name] = None
-    border = {name for step in live for name in sources[step]} | set(wanted)
+    border = set(names).union(*(sources[step] for step in live))
     fixed = run(recipe, store, sorted(border - live.keys()), device=device)
-    left_out = {name: done.bound or 0.0 for name, done in fixed.done.items() if done.state == "left out"}
-    return _Function(recipe, free, wanted, given, tuned, list(live), fixed.values, left_out, device, caller)
+    left_out = {
+        name: done.bound or 0.0 for name, done in fixed.done.items() if done.state == "left out"
+    }
+    return _Function(
+        recipe, free, names, replaced, tuned, list(live), fixed.values, left_out, device, caller
+    )
 
 
 def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, dict[str, str]]]:
-    """Split the names ``free`` into names of steps, and full names of parameters grouped by step."""
-    given: set[str] = set()
+    """Split the names ``free`` into names of steps, and full names of parameters grouped by
+    step.
+    """
+    replaced: set[str] = set()
     tuned: dict[str, dict[str, str]] = {}
     for name in free:
         step, _, param = name.rpartition(".")
         if name in recipe.steps:
-            given.add(name)
+            replaced.add(name)
         elif step not in recipe.steps:
             raise ValueError(unknown_step(step or name, recipe.steps))
         elif param not in recipe.steps[step].params:
-            raise ValueError(f"{step} has no parameter {param!r}; {nearest(param, recipe.steps[step].params)}")
+            raise ValueError(
+                f"{step} has no parameter {param!r}; {nearest(param, recipe.steps[step].params)}"
+            )
         else:
             tuned.setdefault(step, {})[param] = name
-    return given, tuned
+    return replaced, tuned
 
 
 @dataclass(eq=False, repr=False)
 class _Function:
-    """A differentiable function: the steps that depend on the free values, and the fixed inputs of these steps."""
+    """A differentiable function: the steps that depend on the free values, and the fixed inputs
+    of these steps.
+    """
 
     recipe: Recipe
     free: tuple[str, ...]
@@ -115,24 +133,40 @@ class _Function:
         self._facts: dict[str, TensorStats | None] = {}
         self._spent = _spent(self.recipe, self.fixed, self.left_out)
         live = [name for name in self.live if name not in self.given]
-        self._last = {source: name for name in live for source in self.recipe.steps[name].sources}
+        self._last: dict[str, str] = {}
+        for name in live:
+            self._last.update(dict.fromkeys(self.recipe.steps[name].sources, name))
 
     def __call__(self, theta: Theta, seed: int | None = None) -> dict[str, Any]:
-        """Return the outputs for the free values ``theta``; the seed of the noise is ``seed`` or the recipe's seed."""
+        """Return the outputs for the free values ``theta``; the seed of the noise is ``seed`` or
+        the recipe's seed.
+        """
         seed = self.recipe.seed if seed is None else seed
         if set(theta) != set(self.free):
-            raise ValueError(f"theta must hold exactly {', '.join(self.free)}, not {', '.join(theta) or 'nothing'}")
+            raise ValueError(
+                f"theta must hold exactly {', '.join(self.free)}, not"
+                f" {', '.join(theta) or 'nothing'}"
+            )
         values, ledger = dict(self.fixed), self._spent.copy()
         for name in self.live:
-            step, given = self.recipe.steps[name], name in self.given
-            values[name] = settle(theta[name]) if given else self._evaluate(step, values, theta, ledger, seed)
-            for source in () if given else set(step.sources):
+            step, is_given = self.recipe.steps[name], name in self.given
+            values[name] = (
+                settle(theta[name])
+                if is_given
+                else self._evaluate(step, values, theta, ledger, seed)
+            )
+            for source in () if is_given else set(step.sources):
                 if self._last[source] == name and source not in self.wanted:
                     del values[source]
         return {name: values[name] for name in self.wanted}
 
-    def _evaluate(self, step: Step, values: dict[str, Any], theta: Theta, ledger: ErrorBudget, seed: int) -> Any:
-        params = {**step.params, **{p: theta[full] for p, full in self.tuned.get(step.name, {}).items()}}
+    def _evaluate(
+        self, step: Step, values: dict[str, Any], theta: Theta, ledger: ErrorBudget, seed: int
+    ) -> Any:
+        params = {
+            **step.params,
+            **{p: theta[full] for p, full in self.tuned.get(step.name, {}).items()},
+        }
         inputs = [gathered(step.wires.get(name), values.__getitem__) for name in step.node.inputs]
         try:
             return self._result(step, inputs, params, values, ledger, seed)
@@ -140,10 +174,17 @@ class _Function:
             raise _told(error, step, inputs, self.recipe.exact) from error
 
     def _result(
-        self, step: Step, inputs: list[Any], params: dict[str, Any], values: dict[str, Any], ledger: ErrorBudget,
+        self,
+        step: Step,
+        inputs: list[Any],
+        params: dict[str, Any],
+        values: dict[str, Any],
+        ledger: ErrorBudget,
         seed: int,
-    ) -> Any:  # fmt: skip
-        """Return the result of a step, or that of a cheaper step where the tolerance of the recipe allows it."""
+    ) -> Any:
+        """Return the result of a step, or that of a cheaper step where the tolerance of the
+        recipe allows it.
+        """
         if step.node.hooks.skip_bound is not None:
             with torch.no_grad():
                 verdict = ledger.verdict(step, params, lambda name: self._facts_of(name, values))
@@ -156,14 +197,20 @@ class _Function:
     def _facts_of(self, name: str, values: dict[str, Any]) -> Any:
         if name not in self.fixed:
             value = values[name]
-            return _Ends(value) if isinstance(value, Tensor) and value.dtype == torch.float32 else TensorStats.of(value)
+            return (
+                _Ends(value)
+                if isinstance(value, Tensor) and value.dtype == torch.float32
+                else TensorStats.of(value)
+            )
         if name not in self._facts:
             self._facts[name] = TensorStats.of(self.fixed[name])
         return self._facts[name]
 
 
 def _told(error: Exception, step: Step, inputs: list[Any], exact: bool) -> Exception:
-    """Return an error that names the step and the transform of `torch.func` that it does not pass, or ``error``."""
+    """Return an error that names the step and the transform of `torch.func` that it does not
+    pass, or ``error``.
+    """
     interpreter = peek_interpreter_stack()
     if interpreter is None:
         return error
@@ -172,19 +219,28 @@ def _told(error: Exception, step: Step, inputs: list[Any], exact: bool) -> Excep
     name = {"Vmap": "vmap", "Jvp": "jvp", "Grad": "vjp"}.get(interpreter.key().name, "")
     if not name or not any(mark in said for mark in _MARKS[name]):
         return error
-    way = "call the function for one tensor after another" if name == "vmap" else "use torch.autograd"
+    way = (
+        "call the function for one tensor after another" if name == "vmap" else "use torch.autograd"
+    )
     other = "" if exact and name == "vmap" else _OTHERWISE[name]
-    text = f"torch.func.{name} does not pass {step.node.path} ({said[:120]} ...): {way}{other}; {_PAGE}"
+    text = (
+        f"torch.func.{name} does not pass {step.node.path} ({said[:120]} ...): {way}{other};"
+        f" {_PAGE}"
+    )
     return RunError(step, inputs, NotImplementedError(text))
 
 
 class _Ends:
-    """Statistics of an image; minimum and maximum are computed at once, any other statistic at its first use."""
+    """Statistics of an image; minimum and maximum are computed at once, any other statistic at
+    its first use.
+    """
 
     def __init__(self, value: Tensor) -> None:
         self._value = value.detach()
         self.shape, self.dtype = tuple(value.shape), "float32"
-        self.min, self.max = map(float, torch.aminmax(self._value)) if value.numel() else (math.nan, math.nan)
+        self.min, self.max = (
+            map(float, torch.aminmax(self._value)) if value.numel() else (math.nan, math.nan)
+        )
         self.finite = not value.numel() or (math.isfinite(self.min) and math.isfinite(self.max))
 
     @cached_property
@@ -196,7 +252,9 @@ class _Ends:
 
 
 def _spent(recipe: Recipe, fixed: Mapping[str, Any], left_out: Mapping[str, float]) -> ErrorBudget:
-    """Return an error budget with the error bounds of all steps that do not depend on the free values."""
+    """Return an error budget with the error bounds of all steps that do not depend on the free
+    values.
+    """
     ledger = ErrorBudget(recipe)
     for name in needed(recipe, fixed):
         ledger.pass_on(recipe.steps[name])

@@ -1,4 +1,6 @@
-"""Dispatch of jobs: each job is submitted when its inputs are ready, and its outcome is collected."""
+"""Dispatch of jobs: each job is submitted when its inputs are ready, and its outcome is
+collected.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +20,22 @@ MemoryProfile = Callable[[StepJob, Sequence[StepJob]], bool]
 
 
 class Loop:
-    """Progress of a run: chains of jobs that wait for inputs, chains that are ready, and the chain on each device."""
+    """Progress of a run: chains of jobs that wait for inputs, chains that are ready, and the
+    chain on each device.
+    """
 
     def __init__(
-        self, chains: Sequence[Chain], executor: Executor, begin: Callable[[StepJob], StepJob], room: MemoryProfile
+        self,
+        chains: Sequence[Chain],
+        executor: Executor,
+        begin: Callable[[StepJob], StepJob],
+        room: MemoryProfile,
     ) -> None:
         self.executor, self.begin, self.room = executor, begin, room
         self.busy: dict[str, Chain] = {}
-        self._chain_of = {work.key: i for i, chain in enumerate(chains) for work in chain}
+        self._chain_of: dict[Key, int] = {}
+        for i, chain in enumerate(chains):
+            self._chain_of.update({work.key: i for work in chain})
         self._chains = list(chains)
         self._missing = [self._outside(chain) for chain in chains]
         self._after: dict[Key, list[int]] = {}
@@ -34,15 +44,22 @@ class Loop:
                 self._after.setdefault(key, []).append(i)
         self._ready = [i for i, missing in enumerate(self._missing) if not missing]
         self._ready.reverse()  # the next chain is the last item, which a list can remove fastest
-        self._held: dict[int, tuple[float, float]] = {}  # chain -> time of the next attempt, and the wait after it
+        # chain -> time of the next attempt, and the wait after it
+        self._held: dict[int, tuple[float, float]] = {}
         self._open = len(chains)
 
     def outcomes(self) -> Iterator[Outcome]:
-        """Yield the outcome of each job, with the error of a failed job, when it arrives, until all jobs are done."""
+        """Yield the outcome of each job, with the error of a failed job, when it arrives, until
+        all jobs are done.
+        """
         while self._open:
             self._hand_out()
             if not self.busy and not self._held:
-                name = self._chains[self._ready[-1]][0].step.name if self._ready else "the remaining steps"
+                name = (
+                    self._chains[self._ready[-1]][0].step.name
+                    if self._ready
+                    else "the remaining steps"
+                )
                 raise RuntimeError(f"no device or worker is left to compute {name}")
             for outcome in self.executor.wait(self._patience()):
                 self._settle(outcome)
@@ -50,12 +67,17 @@ class Loop:
                     yield outcome
 
     def _outside(self, chain: Chain) -> set[Key]:
-        """Return the keys of the values that a chain of jobs reads from other chains of the same run."""
+        """Return the keys of the values that a chain of jobs reads from other chains of the same
+        run.
+        """
         own = {work.key for work in chain}
-        return {key for work in chain for key in work.sources if key in self._chain_of and key not in own}
+        read = set[Key]().union(*(work.sources for work in chain))
+        return {key for key in read if key in self._chain_of and key not in own}
 
     def _hand_out(self) -> None:
-        """Submit to every idle device or worker the first ready chain of jobs that may run there."""
+        """Submit to every idle device or worker the first ready chain of jobs that may run
+        there.
+        """
         self._look_again()
         for lane, where in self.executor.lanes.items():
             if lane in self.busy or not self._ready:
@@ -69,16 +91,19 @@ class Loop:
                 self.executor.submit(chain)
 
     def _first_for(self, lane: str, device: str) -> int | None:
-        """Return the index of the next ready chain of jobs that the device or worker ``lane`` may compute, or None.
+        """Return the index of the next ready chain of jobs that the device or worker ``lane`` may
+        compute, or None.
 
         A chain of another lane may move to ``lane`` if the other lane is busy or lost.
         """
         running = [work for chain in self.busy.values() for work in chain]
-        there = self.executor.lanes
+        lanes = self.executor.lanes
         for place in range(len(self._ready) - 1, -1, -1):
             chain = self._chains[self._ready[place]]
             own = chain[0].lane
-            moved = (own in self.busy or own not in there) and device_kind(chain[0].device) == device_kind(device)
+            moved = (own in self.busy or own not in lanes) and device_kind(
+                chain[0].device
+            ) == device_kind(device)
             if (own == lane or moved) and (not running or self.room(chain[0], running)):
                 return place
         return None
@@ -90,7 +115,9 @@ class Loop:
             self._held[i] = (float("inf"), self._held[i][1])
 
     def _patience(self) -> float | None:
-        """Return the time (s) to wait for running jobs; if only other processes compute, first sleep for this time."""
+        """Return the time (s) to wait for running jobs; if only other processes compute, first
+        sleep for this time.
+        """
         waits = [when for when, _ in self._held.values() if when < float("inf")]
         if not waits:
             return None
@@ -100,14 +127,13 @@ class Loop:
         return pause
 
     def _settle(self, outcome: Outcome) -> None:
-        """Mark the device of a finished job as idle, and the chains that waited only for its result as ready."""
+        """Mark the device of a finished job as idle, and the chains that waited only for its
+        result as ready.
+        """
         i = self._chain_of[outcome.work.key]
-        chain = self._chains[i]
-        last = outcome.work.key == chain[-1].key
+        last = outcome.work.key == self._chains[i][-1].key
         if outcome.held:
-            pause = min(_LONGEST, 2 * self._held.get(i, (0.0, _FIRST_LOOK / 2))[1])
-            self._held[i] = (time.monotonic() + pause, pause)
-            self._chains[i] = chain[[w.key for w in chain].index(outcome.work.key) :]
+            self._hold(i, outcome.work.key)
         elif last:
             self._open -= 1
             self._held.pop(i, None)
@@ -123,18 +149,31 @@ class Loop:
         if len(self.executor.lanes) > 1 or freed:
             self._ready.sort(reverse=True)
 
+    def _hold(self, i: int, key: Key) -> None:
+        """Let a chain wait, twice as long as before, from the job whose result another process
+        computes.
+        """
+        chain = self._chains[i]
+        pause = min(_LONGEST, 2 * self._held.get(i, (0.0, _FIRST_LOOK / 2))[1])
+        self._held[i] = (time.monotonic() + pause, pause)
+        self._chains[i] = chain[[work.key for work in chain].index(key) :]
+
 
 def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
-    """Group jobs into chains: single jobs, or if ``fused``, jobs on one device that each feed only the next job."""
+    """Group jobs into chains: single jobs, or if ``fused``, jobs on one device that each feed
+    only the next job.
+    """
     if not fused:
         return [(work,) for work in works]
-    readers = Counter(key for work in works for key in set(work.sources))
+    readers = Counter[Key]()
+    for work in works:
+        readers.update(set(work.sources))
     planned = {work.key for work in works}
     chains: dict[Key, list[StepJob]] = {}  # by the key of the last job
     for work in works:
         above = [key for key in dict.fromkeys(work.sources) if key in planned]
-        chain = chains.get(above[0]) if len(above) == 1 else None
-        if chain and readers[above[0]] == 1 and not chain[-1].wanted and chain[-1].lane == work.lane:
+        chain = chains.get(above[0]) if len(above) == 1 and readers[above[0]] == 1 else None
+        if chain and not chain[-1].wanted and chain[-1].lane == work.lane:
             del chains[above[0]]
             chains[work.key] = [*chain, work]
         else:
@@ -144,5 +183,11 @@ def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
 
 
 def _moved(work: StepJob, lane: str, device: str) -> StepJob:
-    """Assign a job to another device or worker and return the job; a job that needs the CPU still uses the CPU."""
-    return replace(work, lane=lane, device=device if device_kind(work.device) == device_kind(device) else work.device)
+    """Assign a job to another device or worker and return the job; a job that needs the CPU
+    still uses the CPU.
+    """
+    return replace(
+        work,
+        lane=lane,
+        device=device if device_kind(work.device) == device_kind(device) else work.device,
+    )

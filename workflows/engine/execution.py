@@ -1,46 +1,198 @@
-"""Execution of one run: the keys of the steps, the choice to load or compute each value, and the records.
-
-No function is recursive over the graph. Values are kept by key: two steps with one key are computed once. A step that
-is left out has the key of its input.
-"""
+"""Execution of one run: keys of the steps, values in memory, and records."""
 
 from __future__ import annotations
 
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 from neusee.nodes import TensorStats
-from neusee.workflows.engine.cost_laws import sizes_of
-from neusee.workflows.engine.cost_model import Costs, Estimate
+from neusee.workflows.engine.cost_model import Costs, Estimate, sizes_of
 from neusee.workflows.engine.dispatch import Loop, chains_of
-from neusee.workflows.engine.finished_step import facts_in, loaded, ran, unneeded
-from neusee.workflows.engine.load_or_recompute import Upstream, cheaper_to_recompute, uses_of, worth_solving
+from neusee.workflows.engine.load_or_recompute import (
+    Upstream,
+    cheaper_to_recompute,
+    uses_of,
+    worth_solving,
+)
 from neusee.workflows.engine.local_executor import Local
 from neusee.workflows.engine.node_call import places
-from neusee.workflows.engine.placement_inputs import joined, past_costs, prepare, room_for, small_result
-from neusee.workflows.engine.private_steps import refuse_taints
-from neusee.workflows.engine.run_series import RunSeries
-from neusee.workflows.engine.step_job import Executor, InputMissing, Outcome, Read, Show, StepJob
-from neusee.workflows.engine.values_in_memory import ValuesInMemory
-from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire, dependents, in_order, needed, nodes_of
+from neusee.workflows.engine.placement_inputs import (
+    joined,
+    past_costs,
+    prepare,
+    room_for,
+    small_result,
+)
+from neusee.workflows.engine.provenance import facts_in, loaded, ran, unneeded
+from neusee.workflows.engine.step_job import (
+    Executor,
+    InputMissing,
+    Outcome,
+    Read,
+    Show,
+    StepJob,
+    WriteBehind,
+)
+from neusee.workflows.graph.recipe_graph import (
+    Event,
+    Recipe,
+    Step,
+    StepRecord,
+    Wire,
+    dependents,
+    in_order,
+    needed,
+    nodes_of,
+)
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.graph.step_record import Event, StepRecord
 from neusee.workflows.keys.cache_key import Key, is_private
-from neusee.workflows.keys.user_code import own_code
+from neusee.workflows.keys.code_digest import Code, KnownKeys
+from neusee.workflows.keys.module_digest import say_once
+from neusee.workflows.keys.user_code import own_code, taint_code
+from neusee.workflows.observation.observed_call import WORDS, tainted_modules
 from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.error_budget import ErrorBudget
-from neusee.workflows.tolerance.skip_decision import SkipDecision
+from neusee.workflows.tolerance.skip_decision import ErrorBudget, SkipDecision
+
+# --- run series -----------------------------------------------------------------------------------
+
+# A series of runs, such as those of the points of a sweep: what a run found that holds for the next
+# run as well.
+
+
+@dataclass(eq=False)
+class RunSeries:
+    """What the runs of a series share: the code of nodes, keys of steps, and statistics of results.
+
+    The key of a result decides its statistics, so that they hold whatever has become of the result
+    in the store.
+    """
+
+    known_keys: KnownKeys
+    #: of the results of the newest run alone
+    facts: dict[Key, TensorStats] = field(default_factory=dict)
+
+    @classmethod
+    def begun(cls, store: Store) -> RunSeries:
+        """Return a series without a run, whose code is read now."""
+        return cls(KnownKeys(Code(store.code_memo)))
+
+    def read_code_again(self, store: Store) -> None:
+        """Forget the digests of code and the keys that rest on them."""
+        self.known_keys = KnownKeys(Code(store.code_memo))
+
+    def keep(self, facts: Mapping[Key, TensorStats | None], keys: Iterable[Key]) -> None:
+        """Keep the statistics of the results ``keys`` for the next run, in place of those of
+        earlier runs.
+
+        The next run computes private results again, which may differ then.
+        """
+        public = [key for key in keys if not is_private(key)]
+        self.facts = {key: stats for key in public if (stats := facts.get(key)) is not None}
+
+
+# --- values in memory -----------------------------------------------------------------------------
+
+# The values of a run that are in memory, each until no later step of the run needs it.
+
+
+class ValuesInMemory(dict[Key, Any]):
+    """Values by cache key, with what this run knows of their copies in the store.
+
+    ``later`` has the values that are being written in the background.
+    """
+
+    def __init__(self, store: Store, later: WriteBehind) -> None:
+        super().__init__()
+        self._store, self._later = store, later
+        # values that the store may lack; True after a write in the background
+        self._unsure = dict[Key, bool]()
+
+    def add(self, outcome: Outcome) -> None:
+        """Add the value of a step that was computed."""
+        key = outcome.work.key
+        self[key] = outcome.value
+        self._unsure.pop(key, None)
+        if outcome.waits or not outcome.kept:
+            self._unsure[key] = outcome.waits
+
+    def free(self, keys: Iterable[Key], uses: Counter[Key], keep: bool) -> None:
+        """Delete the values that no later step needs; with ``keep``, only those of which the
+        store has a copy.
+        """
+        for key in keys:
+            unused = uses[key] <= 0 and key in self and key not in self._later
+            if unused and not (keep and self._is_only_here(key)):
+                del self[key]
+
+    def _is_only_here(self, key: Key) -> bool:
+        """Return True if the store has no copy of a value; a write in the background may have
+        failed.
+        """
+        return key in self._unsure and (not self._unsure[key] or not self._store.has(key))
+
+
+# --- private steps --------------------------------------------------------------------------------
+
+# Steps whose results hold for this process alone, since own code was seen to read what its key does
+# not cover.
+
+
+class TaintedRun(Exception):
+    """Signal of a run whose keys no longer hold: an own step reached what its key does not cover.
+
+    The run begins again with private keys for this code and for all that follows from it.
+    """
+
+    def __init__(self, outcome: Outcome) -> None:
+        super().__init__(outcome.work.step.name)
+        self.outcome = outcome
+
+
+def refuse_taints(outcome: Outcome) -> None:
+    """Taint the code of a step that was seen to reach what its key does not cover; say so, and
+    raise `TaintedRun`.
+
+    A step whose code was tainted before has a private key, and its run goes on.
+    """
+    if not outcome.taints or outcome.work.own is None:
+        return
+    step = outcome.work.step
+    for taint in outcome.taints:
+        text = (
+            f"{step.name} ({step.node.path}): {WORDS[taint.kind]} {taint.what}, which its cache key"
+            " does not cover"
+        )
+        say_once(
+            step.node.fn.__module__,
+            f"{text}: its result, and all that follow, are not stored."
+            f" {taint.fix[0].upper()}{taint.fix[1:]}",
+        )
+    if taint_code(tainted_modules(outcome.work.own, outcome.taints), outcome.taints):
+        raise TaintedRun(outcome)
+
+
+# --- execution ------------------------------------------------------------------------------------
+
+# Execution of one run: the keys of the steps, the choice to load or compute each value, and the
+# records.
+#
+# No function is recursive over the graph. Values are kept by key: two steps with one key are
+# computed once. A step that is left out has the key of its input.
+
 
 _QUICK = 1e-3  #: s below which two processes may both compute a step without a lease
 _UNKNOWN = 100.0  #: s of a step without measurement, when loading is compared with computing
 
 
 class Execution:
-    """State of a run in progress: keys of the steps, values in memory, and records of finished steps."""
+    """State of a run in progress: keys of the steps, values in memory, and records of finished
+    steps.
+    """
 
     def __init__(
         self,
@@ -48,7 +200,7 @@ class Execution:
         store: Store,
         devices: list[str],
         watch: Callable[[Event], None],
-        wanted: Iterable[str],
+        outputs: Iterable[str],
         executor: Executor | None,
         memory: int | None,
         show: Show = lambda *_: None,
@@ -56,8 +208,14 @@ class Execution:
         carried: Mapping[str, Outcome] | None = None,
         anew: Collection[str] = (),
     ) -> None:
-        self.recipe, self.store, self.devices, self.watch, self.show = recipe, store, devices, watch, show
-        self.wanted = frozenset(wanted)
+        self.recipe, self.store, self.devices, self.watch, self.show = (
+            recipe,
+            store,
+            devices,
+            watch,
+            show,
+        )
+        self.wanted = frozenset(outputs)
         self.own = Local(devices, store, self._fetch, memory, nodes_of(recipe, self.wanted))
         self.executor = executor or self.own
         self.series = series or RunSeries.begun(store)
@@ -73,21 +231,29 @@ class Execution:
         self.again: dict[Key, float] = {}  # s to obtain again a value that was computed in this run
         self.took: dict[str, float] = {}  # the longest time of a step of each node, s
         self.verdicts, self.ledger = dict[str, SkipDecision](), ErrorBudget(recipe)
-        self.done, self._asleep = dict[str, StepRecord](), dict[str, StepRecord]()  # and of steps that did not run
+        # and of steps that did not run
+        self.done, self._asleep = dict[str, StepRecord](), dict[str, StepRecord]()
         self.receipts: dict[Key, dict[str, Any]] = {}  # metadata of values that were not kept
         self.costs: Costs | None = None
-        self.expected: Mapping[Key, Estimate] = {}  # predicted costs of the steps that are being computed
+        # predicted costs of the steps that are being computed
+        self.expected: Mapping[Key, Estimate] = {}
         self.schedule: Schedule | None = None
 
     def resolve(self, order: list[str]) -> None:
-        """Compute the cache key of every step; leave out each step whose effect is within the tolerance."""
+        """Compute the cache key of every step; leave out each step whose effect is within the
+        tolerance.
+        """
         for name in order:
             step = self.recipe.steps[name]
             if step.node.hooks.skip_bound is not None:
-                verdict = self.verdicts[name] = self.ledger.verdict(step, step.params, self._facts_of)
+                verdict = self.verdicts[name] = self.ledger.verdict(
+                    step, step.params, self._facts_of
+                )
                 if verdict.left_out:
                     key = self.keys[name] = self.keys[verdict.instead]
-                    self._finish(StepRecord(name, "left out", verdict.why, 0.0, key, bound=verdict.bound))
+                    self._finish(
+                        StepRecord(name, "left out", verdict.why, 0.0, key, bound=verdict.bound)
+                    )
                     continue
             else:
                 self.ledger.pass_on(step)
@@ -104,11 +270,16 @@ class Execution:
                 self._take_over(name, key, origin)
 
     def _take_over(self, name: str, key: Key, origin: dict[str, Any]) -> None:
-        """Use the value that an attempt before this one computed and could not store, if its inputs are the same."""
+        """Use the value that an attempt before this one computed and could not store, if its
+        inputs are the same.
+        """
         before = self._carried.get(name)
         if before is None or before.value is None:  # a worker sends no value
             return
-        if any(before.work.origin[part] != origin[part] for part in ("params", "inputs")):
+        if any(
+            before.work.origin[origin_part] != origin[origin_part]
+            for origin_part in ("params", "inputs")
+        ):
             return
         outcome = replace(before, work=replace(before.work, key=key, origin=origin))
         self.values.add(outcome)
@@ -119,24 +290,27 @@ class Execution:
     def make(self, targets: list[Key], keep: bool, later: Sequence[Key] = ()) -> None:
         """Load or compute the values with the cache keys ``targets``.
 
-        Values that the keys ``later`` need stay in memory, and with ``keep`` also each value that is not stored.
+        Values that the keys ``later`` need stay in memory, and with ``keep`` also each value that
+        is not stored.
         """
         while True:
             below = Upstream(self.known, self.sources)
             order = in_order(below, targets)
             if again := self._dear(below, targets):
-                below = Upstream(lambda key, again=again: key not in again and self.known(key), self.sources)  # type: ignore[misc]
+                below = Upstream(partial(self._known_but, again), self.sources)
                 order = in_order(below, targets)
             try:
                 plan = [key for key in order if key in below.missing]
-                known = self.known if again else below.knows
-                uses = uses_of(plan, [*targets, *later], known, self.sources)
+                is_known = self.known if again else below.knows
+                uses = uses_of(plan, [*targets, *later], is_known, self.sources)
                 return self._execute(plan, again, targets, keep, uses, asked=not (keep or later))
             except InputMissing:
                 continue
 
     def close(self) -> None:
-        """Save the digests of code, finish all writes, and delete the values and the executor, which refers to this."""
+        """Save the digests of code, finish all writes, and delete the values and the executor,
+        which refers to this.
+        """
         self.series.keep(self.facts, self.makers)
         self.code.save()
         self.own.cancel()
@@ -144,7 +318,9 @@ class Execution:
         del self.own, self.executor
 
     def account(self, order: list[str]) -> dict[str, StepRecord]:
-        """Return the record of every step in running order; create records for the steps that did not run."""
+        """Return the record of every step in running order; create records for the steps that
+        did not run.
+        """
         for name in order:
             if name in self.done:
                 continue
@@ -153,19 +329,33 @@ class Execution:
             if twin is None or twin.state == "not needed":
                 self._finish(self.asleep(name))
             else:
-                self._finish(replace(twin, step=name, state="cached", why=f"the same key as {twin.step}", seconds=0.0))
+                self._finish(
+                    replace(
+                        twin,
+                        step=name,
+                        state="cached",
+                        why=f"the same key as {twin.step}",
+                        seconds=0.0,
+                    )
+                )
         return {name: self.done[name] for name in order}
 
     def asleep(self, name: str) -> StepRecord:
         """Return the record of a step whose value no other step needed."""
         if name not in self._asleep:
             key = self.keys[name]
-            about = self.store.about(key) if self.recipe.steps[name].node.hooks.approximation_error else None
+            about = (
+                self.store.about(key)
+                if self.recipe.steps[name].node.hooks.approximation_error
+                else None
+            )
             self._asleep[name] = unneeded(name, key, about, self._bound(name))
         return self._asleep[name]
 
     def missing(self, names: Iterable[str]) -> set[Key]:
-        """Return the cache keys of all values that must be computed to obtain the results of the steps ``names``."""
+        """Return the cache keys of all values that must be computed to obtain the results of the
+        steps ``names``.
+        """
         in_order(below := Upstream(self.known, self.sources), [self.keys[name] for name in names])
         return set(below.missing)
 
@@ -173,7 +363,9 @@ class Execution:
         return [self.keys[name] for name in self.makers[key].sources]
 
     def known(self, key: Key) -> bool:
-        """Return True if a value is in memory or in the store; remember the metadata of a value that was not stored."""
+        """Return True if a value is in memory or in the store; remember the metadata of a value
+        that was not stored.
+        """
         if key in self.values:
             return True
         about = None if key in self._anew else self.store.about(key)
@@ -181,6 +373,10 @@ class Execution:
             return about is not None
         self.receipts[key] = about
         return False
+
+    def _known_but(self, again: Collection[Key], key: Key) -> bool:
+        """Return True for a stored value that is not to be computed again."""
+        return key not in again and self.known(key)
 
     def _dear(self, below: Upstream, targets: list[Key]) -> frozenset[Key]:
         """Return the keys of the stored values that are cheaper to compute than to read."""
@@ -190,7 +386,13 @@ class Execution:
             return float(about.get("seconds") or 0.0) if about else _UNKNOWN
 
         def load(key: Key) -> float:
-            return 0.0 if key in self.values else self._reading(key) if self.known(key) else float("inf")
+            return (
+                0.0
+                if key in self.values
+                else self._reading(key)
+                if self.known(key)
+                else float("inf")
+            )
 
         read = [key for key in below if key not in below.missing and key not in self.values]
         if not any(worth_solving(self._reading(key), compute(key)) for key in read):
@@ -198,17 +400,26 @@ class Execution:
         return frozenset(cheaper_to_recompute(targets, self.sources, load, compute))
 
     def _reading(self, key: Key) -> float:
-        """Return the predicted time (s) for reading a stored value, or infinity if the value is not stored."""
+        """Return the predicted time (s) for reading a stored value, or infinity if the value is
+        not stored.
+        """
         about = self.store.about(key)
         return self.store.read_seconds(about.get("bytes") or 0) if about else float("inf")
 
     def _execute(
-        self, plan: list[Key], again: frozenset[Key], targets: list[Key], keep: bool, uses: Counter[Key], asked: bool
+        self,
+        plan: list[Key],
+        again: frozenset[Key],
+        targets: list[Key],
+        keep: bool,
+        uses: Counter[Key],
+        asked: bool,
     ) -> None:
         self.values.free(list(self.values), uses, keep)
-        for part, executor in self._by_executor(plan):
-            read = {key for each in plan if each not in part for key in self.sources(each)}
-            for outcome in self._outcomes(part, again, {*targets, *read}, asked, executor):
+        for keys, executor in self._by_executor(plan):
+            elsewhere = [key for key in plan if key not in keys]
+            read = set[Key]().union(*map(self.sources, elsewhere))
+            for outcome in self._outcomes(keys, again, {*targets, *read}, asked, executor):
                 key, sources = outcome.work.key, outcome.work.sources
                 if outcome.value is not None or not outcome.kept:
                     self.values.add(outcome)
@@ -219,21 +430,37 @@ class Execution:
             self._fetch(key)
 
     def _by_executor(self, plan: list[Key]) -> list[tuple[list[Key], Executor]]:
-        """Return the steps that other processes may compute, and then those whose results hold for this one alone."""
+        """Return the steps that other processes may compute, and then those whose results hold
+        for this one alone.
+        """
         private = [key for key in plan if self.executor is not self.own and is_private(key)]
         public = [key for key in plan if key not in private]
-        return [part for part in ((public, self.executor), (private, self.own)) if part[0]]
+        return [group for group in ((public, self.executor), (private, self.own)) if group[0]]
 
     def _outcomes(
-        self, plan: list[Key], again: frozenset[Key], targets: Collection[Key], asked: bool, executor: Executor
+        self,
+        plan: list[Key],
+        again: frozenset[Key],
+        targets: Collection[Key],
+        asked: bool,
+        executor: Executor,
     ) -> Iterator[Outcome]:
-        """Compute the values with the keys ``plan`` and yield each outcome; after an error no further step begins."""
-        self.costs = self.costs or past_costs(self.store, sizes_of(self.recipe, needed(self.recipe, self.wanted)))
-        most = 0.0 if asked else small_result(executor)  # a small one stays in memory until it is read
-        kept = {key for key in targets if self.costs.size_of(self.makers[key].name) >= most}
-        works = [self._work(key, key in again, key in kept, executor) for key in plan]
+        """Compute the values with the keys ``plan`` and yield each outcome; after an error no
+        further step begins.
+        """
+        self.costs = self.costs or past_costs(
+            self.store, sizes_of(self.recipe, needed(self.recipe, self.wanted))
+        )
+        # a small one stays in memory until it is read
+        threshold = 0.0 if asked else small_result(executor)
+        large_targets = {
+            key for key in targets if self.costs.size_of(self.makers[key].name) >= threshold
+        }
+        works = [self._work(key, key in again, key in large_targets, executor) for key in plan]
         try:
-            prepared = prepare(works, self.costs, self.receipts, executor.lanes, targets, self.values)
+            prepared = prepare(
+                works, self.costs, self.receipts, executor.lanes, targets, self.values
+            )
         except TooLarge as error:
             raise RunError(self.recipe.steps[error.task], [], error) from error
         self.schedule = joined(self.schedule, prepared.schedule)
@@ -255,20 +482,50 @@ class Execution:
         reads = tuple(self._read(step.wires.get(name)) for name in step.node.inputs)
         device, lanes = places(step, self.devices)[0], executor.lanes
         lane = next(iter(lanes)) if len(lanes) == 1 else ""
-        wanted, name, seed = target or step.name in self.wanted, self.recipe.name, self.recipe.seed
+        is_requested, name, seed = (
+            target or step.name in self.wanted,
+            self.recipe.name,
+            self.recipe.seed,
+        )
         recompute = recompute or key in self._anew
-        work = StepJob(step, key, self.origins[key], reads, seed, name, device, lane, wanted, recompute=recompute)
+        work = StepJob(
+            step,
+            key,
+            self.origins[key],
+            reads,
+            seed,
+            name,
+            device,
+            lane,
+            is_requested,
+            recompute=recompute,
+        )
         return replace(work, own=own_code(step, self.code))
 
     def _read(self, wire: Wire) -> Read:
-        return self.keys[wire] if isinstance(wire, str) else wire and tuple(self.keys[name] for name in wire)
+        return (
+            self.keys[wire]
+            if isinstance(wire, str)
+            else wire and tuple(self.keys[name] for name in wire)
+        )
 
     def _begin(self, work: StepJob) -> StepJob:
-        """Report that a job begins; return the job with the predicted time for obtaining its inputs again."""
+        """Report that a job begins; return the job with the predicted time for obtaining its
+        inputs again.
+        """
         self.watch(Event(work.step.name, None))
-        refetch = sum(self.again[key] if key in self.again else self._reading(key) for key in set(work.sources))
+        refetch = sum(
+            self.again[key] if key in self.again else self._reading(key)
+            for key in set(work.sources)
+        )
         path, expected = work.step.node.path, self.expected[work.key]
-        seconds = self.took[path] if path in self.took else expected.seconds["cpu"] if expected.known else _QUICK
+        seconds = (
+            self.took[path]
+            if path in self.took
+            else expected.seconds["cpu"]
+            if expected.known
+            else _QUICK
+        )
         return replace(work, refetch_seconds=refetch, unlocked=seconds < _QUICK)
 
     def _note(self, outcome: Outcome) -> None:
@@ -277,7 +534,11 @@ class Execution:
         if outcome.lost:
             raise InputMissing(*outcome.lost)
         if outcome.error is not None:
-            raise outcome.error if isinstance(outcome.error, RunError) else RunError(step, [], outcome.error)
+            raise (
+                outcome.error
+                if isinstance(outcome.error, RunError)
+                else RunError(step, [], outcome.error)
+            )
         if outcome.found:
             self._finish(self._cached(key, "another process computed this result"))
             return
@@ -288,14 +549,26 @@ class Execution:
         self.took[path] = max(outcome.seconds, self.took.get(path, 0.0))
         computing = outcome.seconds + work.refetch_seconds
         self.again[key] = self.store.read_seconds(outcome.bytes) if outcome.kept else computing
-        self._finish(ran(outcome, self._why(step.name, key), self._bound(step.name), self.began, self.expected[key]))
+        self._finish(
+            ran(
+                outcome,
+                self._why(step.name, key),
+                self._bound(step.name),
+                self.began,
+                self.expected[key],
+            )
+        )
 
     def _fetch(self, key: Key) -> Any:
-        """Return a value from memory or from the store; raise `InputMissing` if neither has the value."""
+        """Return a value from memory or from the store; raise `InputMissing` if neither has the
+        value.
+        """
         if key not in self.values:
             began = time.perf_counter()
             try:
-                self.values[key] = self.store.get(key, self.makers[key].node.hints.get("return", Any))
+                self.values[key] = self.store.get(
+                    key, self.makers[key].node.hints.get("return", Any)
+                )
             except KeyError:
                 raise InputMissing(key) from None
             if self.makers[key].name not in self.done:
@@ -310,16 +583,22 @@ class Execution:
         return loaded(name, key, about, self._bound(name), why, seconds)
 
     def _facts_of(self, name: str) -> TensorStats | None:
-        """Return the statistics of the result of a step; compute the result if no statistics are known."""
-        key, known = self.keys[name], self.known_facts(name)
-        if known is None and key not in self.facts:
+        """Return the statistics of the result of a step; compute the result if no statistics are
+        known.
+        """
+        key, stats = self.keys[name], self.known_facts(name)
+        if stats is None and key not in self.facts:
             self.make([key], keep=True)
-        return known or self.known_facts(name)
+        return stats or self.known_facts(name)
 
     def known_facts(self, name: str) -> TensorStats | None:
         """Return the statistics of the result of a step, from this run or from an earlier run."""
         key = self.keys[name]
-        if key not in self.facts and key not in self._anew and (about := self.store.about(key)) is not None:
+        if (
+            key not in self.facts
+            and key not in self._anew
+            and (about := self.store.about(key)) is not None
+        ):
             self.facts[key] = facts_in(about)
         return self.facts.get(key)
 

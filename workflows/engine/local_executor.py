@@ -1,7 +1,4 @@
-"""Executor in this process: one thread for each device, or the thread of the caller if there is only one device.
-
-``cpu:0,cpu:1`` are two lanes of one CPU, so that two small steps run at the same time.
-"""
+"""Executor in this process: one thread for each device, with the names of the devices."""
 
 from __future__ import annotations
 
@@ -13,34 +10,91 @@ from typing import Any
 
 import torch
 
-from neusee.workflows.engine.cost_laws import libraries_of
-from neusee.workflows.engine.memory_use import free_memory, pool_of, process_memory, there_is
-from neusee.workflows.engine.step_job import Lane, Outcome, StepJob, carry_out
-from neusee.workflows.engine.write_behind import WriteBehind
+from neusee.workflows.engine.cost_model import libraries_of
+from neusee.workflows.engine.machine_resources import free_memory, pool_of, process_memory, there_is
+from neusee.workflows.engine.step_job import Lane, Outcome, StepJob, WriteBehind, carry_out
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
+
+# --- device names ---------------------------------------------------------------------------------
+
+# Names of the devices of this machine that a run may use, such as ``cpu`` or ``cuda:0,cuda:1``.
+
+
+def check_devices(text: str) -> None:
+    """Raise ValueError for a list of devices with the same device twice, or with one that cannot
+    compute a recipe here.
+
+    ``cpu:0,cpu:1`` are two lanes of one CPU, and so two devices.
+    """
+    names = dict[tuple[str, int], str]()
+    for name in text.split(","):
+        try:
+            place = torch.empty(0, device=name).device
+        except (RuntimeError, AssertionError) as error:
+            raise ValueError(f"{name}: {_reason(str(error))}") from error
+        if place.type == "meta":
+            raise ValueError(f"{name}: a tensor there has a shape and no values: write cpu or cuda")
+        lane = place.type, torch.device(name).index or place.index or 0
+        if lane in names:
+            again = name if name == names[lane] else f"{names[lane]} and {name} are one device"
+            raise ValueError(
+                f"{text}: names a device twice ({again}): name each device once; cpu:0,cpu:1 are"
+                " two lanes"
+            )
+        names[lane] = name
+
+
+def _reason(text: str) -> str:
+    """Return why a device cannot compute here, from the error of torch, without the names of its
+    operators.
+    """
+    if "aten::" in text:
+        return (
+            "this build of PyTorch cannot compute there: write cpu, or cuda on a machine with a GPU"
+            " of NVIDIA"
+        )
+    return text.partition("\n")[0]
+
+
+# --- local executor -------------------------------------------------------------------------------
+
+# Executor in this process: one thread for each device, or the thread of the caller if there is only
+# one device.
+#
+# ``cpu:0,cpu:1`` are two lanes of one CPU, so that two small steps run at the same time.
+
 
 _SHARE = 0.9  #: fraction of a device's memory that a schedule may use
 
 
-def lanes_of(devices: Sequence[str], memory: int | None = None, nodes: Iterable[str] = ()) -> dict[str, Lane]:
-    """Return one `Lane` for each device; devices with a common memory divide the bytes that a schedule may use.
+def lanes_of(
+    devices: Sequence[str], memory: int | None = None, nodes: Iterable[str] = ()
+) -> dict[str, Lane]:
+    """Return one `Lane` for each device; devices with a common memory divide the bytes that a
+    schedule may use.
 
-    Args: memory: the limit of the memory of each GPU, and for the CPU of the memory of this process with what the
-    program itself holds; if None, most of a GPU, or most of the memory that is free now. nodes: the paths of the nodes
-    that will run, whose libraries the program holds as well.
+    Args: memory: the limit of the memory of each GPU, and for the CPU of the memory of this process
+            with what the
+    program itself holds; if None, most of a GPU, or most of the memory that is free now. nodes: the
+    paths of the nodes that will run, whose libraries the program holds as well.
     """
     pools = [pool_of(device) for device in devices]
-    found = {}
+    lanes = {}
     for device in devices:
         held = program_memory(nodes) if pool_of(device) == "cpu" else 0
-        limit = memory_limit(memory) if pool_of(device) == "cpu" else memory or _SHARE * there_is(device)
-        found[device] = Lane(device, (limit - held) / pools.count(pool_of(device)), held)
-    return found
+        limit = (
+            memory_limit(memory)
+            if pool_of(device) == "cpu"
+            else memory or _SHARE * there_is(device)
+        )
+        lanes[device] = Lane(device, (limit - held) / pools.count(pool_of(device)), held)
+    return lanes
 
 
 def memory_limit(memory: int | None, workers: int = 1) -> float:
-    """Return the largest memory of this process in bytes: ``memory``, or most of what is free beside the process.
+    """Return the largest memory of this process in bytes: ``memory``, or most of what is free
+    beside the process.
 
     Several processes, ``workers``, divide what is free.
     """
@@ -48,12 +102,16 @@ def memory_limit(memory: int | None, workers: int = 1) -> float:
 
 
 def program_memory(nodes: Iterable[str] = ()) -> float:
-    """Return the memory of this process in bytes before the first step, with the libraries that ``nodes`` load."""
+    """Return the memory of this process in bytes before the first step, with the libraries that
+    ``nodes`` load.
+    """
     return process_memory() + libraries_of(nodes)
 
 
 class Local:
-    """An `Executor` in this process; with one device, `wait` computes the steps in the thread of the caller."""
+    """An `Executor` in this process; with one device, `wait` computes the steps in the thread of
+    the caller.
+    """
 
     shares = True
 
@@ -78,10 +136,16 @@ class Local:
             if len(self.lanes) == 1:
                 self._queue.append(job)
             else:
-                self._running.add(self._pool(job.lane).submit(carry_out, job, self._fetch, self._store, self.later))
+                self._running.add(
+                    self._pool(job.lane).submit(
+                        carry_out, job, self._fetch, self._store, self.later
+                    )
+                )
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
-        """Compute the next job in the queue and return its outcome, or wait for jobs in other threads."""
+        """Compute the next job in the queue and return its outcome, or wait for jobs in other
+        threads.
+        """
         if self._queue:
             return [carry_out(self._queue.popleft(), self._fetch, self._store, self.later)]
         if not self._running:
@@ -90,7 +154,9 @@ class Local:
         return [future.result() for future in done]
 
     def cancel(self) -> None:
-        """Drop the jobs that have not begun, wait for the running jobs, and finish the writes of results."""
+        """Drop the jobs that have not begun, wait for the running jobs, and finish the writes of
+        results.
+        """
         self._queue.clear()
         for pool in self._pools.values():
             pool.shutdown(wait=True, cancel_futures=True)

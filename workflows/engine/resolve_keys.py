@@ -5,47 +5,52 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from neusee.nodes import TensorStats
-from neusee.workflows.engine.finished_step import facts_in
 from neusee.workflows.engine.node_call import place
+from neusee.workflows.engine.provenance import facts_in
 from neusee.workflows.engine.resolved_keys import Resolved
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import key_of
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.tolerance.error_budget import ErrorBudget
+from neusee.workflows.tolerance.skip_decision import ErrorBudget
 
 
 def resolve(
-    recipe: Recipe, order: Iterable[str], store: Store, device: str = "cpu", code: Code | None = None
+    recipe: Recipe,
+    order: Iterable[str],
+    store: Store,
+    device: str = "cpu",
+    code: Code | None = None,
 ) -> Resolved:
-    """Return the cache key of each step for a run on ``device``; ``order`` lists each step after its inputs.
+    """Return the cache key of each step for a run on ``device``; ``order`` lists each step after
+    its inputs.
 
     ``code`` has the digests of nodes that were read a moment ago, if there are any.
     """
-    found, code, ledger = Resolved(), code or Code(store.code_memo), ErrorBudget(recipe)
+    resolved, code, ledger = Resolved(), code or Code(store.code_memo), ErrorBudget(recipe)
 
     def facts_of(name: str) -> TensorStats | None:
-        known = facts_in(store.about(found.keys[name]))
-        if known is None:
+        facts = facts_in(store.about(resolved.keys[name]))
+        if facts is None:
             raise LookupError(name)
-        return known
+        return facts
 
     for name in order:
         step = recipe.steps[name]
         if step.node.hooks.skip_bound is not None:
             try:
-                found.verdicts[name] = ledger.verdict(step, step.params, facts_of)
+                resolved.verdicts[name] = ledger.verdict(step, step.params, facts_of)
             except RunError:
-                found.verdicts[name] = None
+                resolved.verdicts[name] = None
         else:
             ledger.pass_on(step)
-        verdict = found.verdicts.get(name)
+        verdict = resolved.verdicts.get(name)
         if verdict is not None and verdict.left_out:
-            found.keys[name] = found.keys[verdict.instead]
+            resolved.keys[name] = resolved.keys[verdict.instead]
             continue
-        key, origin = key_of(step, found.keys, recipe.seed, code, place(step, device))
-        found.keys[name], found.origins[key] = key, origin
-        found.makers.setdefault(key, name)
+        key, origin = key_of(step, resolved.keys, recipe.seed, code, place(step, device))
+        resolved.keys[name], resolved.origins[key] = key, origin
+        resolved.makers.setdefault(key, name)
     code.save()
-    return found
+    return resolved

@@ -1,4 +1,6 @@
-"""The cache keys of the steps of a recipe as `resolve_keys.resolve` found them; torch is not needed."""
+"""The cache keys of the steps of a recipe as `resolve_keys.resolve` found them; torch is not
+needed.
+"""
 
 from __future__ import annotations
 
@@ -14,20 +16,32 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Resolved:
-    """Cache keys of steps, the parts of each key, and the decisions on the steps that may be left out."""
+    """Cache keys of steps, the parts of each key, and the decisions on the steps that may be
+    left out.
+    """
 
     keys: dict[str, Key] = field(default_factory=dict)
     origins: dict[Key, Mapping[str, Any]] = field(default_factory=dict)
-    makers: dict[Key, str] = field(default_factory=dict)  #: the first step of each key that is not left out
-    verdicts: dict[str, SkipDecision | None] = field(default_factory=dict)  #: None where statistics are missing
+    #: the first step of each key that is not left out
+    makers: dict[Key, str] = field(default_factory=dict)
+    #: None where statistics are missing
+    verdicts: dict[str, SkipDecision | None] = field(default_factory=dict)
 
     def left_out(self, name: str) -> bool | None:
-        """Return True if a step is left out, False if it runs, and None if only the values of its inputs can decide."""
+        """Return True if a step is left out, False if it runs, and None if only the values of
+        its inputs can decide.
+        """
         verdict = self.verdicts.get(name)
-        return None if verdict is None and name in self.verdicts else verdict is not None and verdict.left_out
+        return (
+            None
+            if verdict is None and name in self.verdicts
+            else verdict is not None and verdict.left_out
+        )
 
     def stands_for(self, name: str) -> str:
-        """Return ``name``, or if the step ``name`` is left out, the name of the upstream step that is used instead."""
+        """Return ``name``, or if the step ``name`` is left out, the name of the upstream step
+        that is used instead.
+        """
         while (verdict := self.verdicts.get(name)) is not None and verdict.left_out:
             name = verdict.instead
         return name

@@ -1,13 +1,14 @@
-"""Job of one step: the step with the keys of its inputs, and the outcome of the job.
-
-A job contains keys and parameters but no tensor, so that any process can compute the step. The cost
-of a value decides whether the store keeps the value.
-"""
+"""Job of one step: the step with the keys of its inputs, its outcome, and its late writes."""
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any, Protocol, TypeVar
@@ -15,39 +16,118 @@ from typing import Any, Protocol, TypeVar
 import torch
 
 from neusee.nodes import Check, TensorStats
-from neusee.workflows.engine.allocation_limit import refusing_allocations
-from neusee.workflows.engine.band_results import call_by_band, plain_of
-from neusee.workflows.engine.cost_laws import measured_size
-from neusee.workflows.engine.memory_use import PeakMemory
-from neusee.workflows.engine.memory_watch import guarded
-from neusee.workflows.engine.node_call import call, examine
+from neusee.workflows.engine.cost_model import measured_size
+from neusee.workflows.engine.machine_resources import PeakMemory
+from neusee.workflows.engine.memory_limits import guarded, refusing_allocations
+from neusee.workflows.engine.node_call import call, call_by_band, examine, plain_of
 from neusee.workflows.engine.provenance import timestamp, versions
 from neusee.workflows.engine.step_process import ProcessEnded, call_in_fork, may_fork
-from neusee.workflows.engine.write_behind import LARGE, WriteBehind
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.keys.cache_key import Key, device_kind, is_private, plain
-from neusee.workflows.keys.input_file_digest import file_stamps
-from neusee.workflows.keys.tainted_code import hold_back, may_be_stored
-from neusee.workflows.keys.user_code import OwnCode
-from neusee.workflows.observation.own_call import call_observed, say_hidden, say_lost, tainted_modules, undeclared
+from neusee.workflows.keys.cache_key import Key, device_kind, file_stamps, is_private, plain
+from neusee.workflows.keys.user_code import OwnCode, hold_back, may_be_stored
+from neusee.workflows.observation.observed_call import (
+    call_observed,
+    say_hidden,
+    say_lost,
+    tainted_modules,
+    undeclared,
+)
 from neusee.workflows.observation.taints import Taint
 from neusee.workflows.store.lease import Lease
 from neusee.workflows.store.metadata import INLINE
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.serialization import pack, tensors_in
 
-Read = Key | tuple[Key, ...] | None  #: content of one input: one value, a list of values, or nothing
+# --- write behind ---------------------------------------------------------------------------------
+
+# Writes of large results in the background, while the next steps compute.
+#
+# A run ends after all writes. A result that waits stays in memory and keeps its lease, so that
+# another process that needs the same result finds either the lease or the result.
+
+
+LARGE = 1 << 20  #: bytes; a larger result is written during the next step
+_ROOM = 1 << 29  #: bytes that may wait; a larger result waits alone
+_NICE = 10  #: how much nicer the writing thread is; 19 is the nicest
+
+
+class WriteBehind:
+    """Pending writes of results, one at a time in the background."""
+
+    def __init__(self) -> None:
+        self._pool: ThreadPoolExecutor | None = None
+        self._sizes: dict[Key, int] = {}
+        self._writes: dict[Key, Future[Any]] = {}
+        self._guard = threading.Lock()
+
+    def __contains__(self, key: Key) -> bool:
+        return key in self._sizes
+
+    def add(self, key: Key, size: int, write: Callable[[], Any]) -> None:
+        """Start a write in the background; wait for earlier writes if too many bytes would be
+        pending.
+        """
+        while self._sizes and sum(list(self._sizes.values())) + size > _ROOM:
+            wait(
+                [self._writes[key] for key in list(self._sizes) if key in self._writes],
+                return_when=FIRST_COMPLETED,
+            )
+        with self._guard:
+            self._pool = self._pool or ThreadPoolExecutor(1, "neusee store", _lower_priority)
+            self._sizes[key] = size
+            self._writes[key] = self._pool.submit(self._write, key, write)
+
+    def finish(self) -> None:
+        """Wait for all writes; raise the error of a failed write."""
+        with self._guard:
+            pool, self._pool = self._pool, None
+            writes, self._writes = self._writes, {}
+        if pool is not None:
+            pool.shutdown(wait=True)
+        for future in writes.values():
+            future.result()
+
+    def _write(self, key: Key, write: Callable[[], Any]) -> None:
+        try:
+            write()
+        finally:
+            del self._sizes[key]
+
+
+def _lower_priority() -> None:
+    """Lower the priority of the writing thread, so that the computing threads run first."""
+    if sys.platform == "linux":  # on other systems the call would affect the whole process
+        with suppress(OSError):
+            thread = threading.get_native_id()
+            os.setpriority(
+                os.PRIO_PROCESS, thread, min(os.getpriority(os.PRIO_PROCESS, thread) + _NICE, 19)
+            )
+
+
+# --- step job -------------------------------------------------------------------------------------
+
+# Job of one step: the step with the keys of its inputs, and the outcome of the job.
+#
+# A job contains keys and parameters but no tensor, so that any process can compute the step. The
+# cost of a value decides whether the store keeps the value.
+
+
+#: content of one input: one value, a list of values, or nothing
+Read = Key | tuple[Key, ...] | None
 Fetch = Callable[[Key], Any]
-#: function that is told each computed result: the recipe of the run, the keys known so far, the step and its value
+#: function that is told each computed result: the recipe of the run, the keys known so far, the
+#: step and its value
 Show = Callable[[Recipe, Mapping[str, Key], str, Any], None]
 T = TypeVar("T")
-_STATS = tuple(each.name for each in fields(TensorStats))
+_STATS = tuple(field.name for field in fields(TensorStats))
 _WATCHED = 1 << 20  #: bytes of inputs from which the memory of a step is measured
 
 
 class InputMissing(Exception):
-    """Error for a stored result that is damaged or missing when it is read; the run then computes the result."""
+    """Error for a stored result that is damaged or missing when it is read; the run then
+    computes the result.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,15 +144,20 @@ class StepJob:
     lane: str  #: name of the `Lane` (device or worker) that computes the job
     wanted: bool = False  #: True if the result is requested, and therefore kept whatever its cost
     unlocked: bool = False  #: compute without a lease, because the node takes so little time
-    recompute: bool = False  #: True to compute a stored result because computing is faster than reading
+    #: True to compute a stored result because computing is faster than reading
+    recompute: bool = False
     refetch_seconds: float = 0.0  #: s to obtain the inputs again if this result is not kept
     parts: int = 1  #: number of passes over the bands, for less memory
-    own: OwnCode | None = None  #: the code of a step that is not of neusee, which is observed while it computes
+    #: the code of a step that is not of neusee, which is observed while it computes
+    own: OwnCode | None = None
 
     @property
     def sources(self) -> tuple[Key, ...]:
         """Return the cache keys of all values that the job reads."""
-        return tuple(k for read in self.reads for k in ((read,) if isinstance(read, str) else read or ()))
+        keys: list[Key] = []
+        for read in self.reads:
+            keys += [read] if isinstance(read, str) else read or ()
+        return tuple(keys)
 
 
 @dataclass(slots=True)
@@ -86,16 +171,19 @@ class Outcome:
     began: float = 0.0  #: s, by `time.time`
     seconds: float = 0.0
     bytes: int = 0
-    deviation: tuple[float, float] | None = None  #: error of a cheaper form: `Node.approximation_error`
+    #: error of a cheaper form: `Node.approximation_error`
+    deviation: tuple[float, float] | None = None
     peak: int | None = None  #: peak bytes beside the memory in use before
-    size: list[float] | None = None  #: the size of the step: `cost_laws.Size`
+    size: list[float] | None = None  #: the size of the step: `cost_model.Size`
     kept: bool = False  #: True if the store has the value
-    waits: bool = False  #: True if the value is written during the next steps; its lease is released afterwards
+    #: True if the value is written during the next steps; its lease is released afterwards
+    waits: bool = False
     held: bool = False  #: True if another process computes this result
     found: bool = False  #: True if another process has already stored this result
     error: BaseException | None = None
     lost: tuple[Key, ...] = ()  #: inputs that could not be read
-    taints: tuple[Taint, ...] = ()  #: what an own step reached that its key does not cover; its value is not stored
+    #: what an own step reached that its key does not cover; its value is not stored
+    taints: tuple[Taint, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,20 +209,30 @@ class Executor(Protocol):
 
     @property
     def shares(self) -> bool:
-        """Return True if values stay in this process, and False if steps exchange values through the store."""
+        """Return True if values stay in this process, and False if steps exchange values through
+        the store.
+        """
 
     def submit(self, work: Sequence[StepJob]) -> None:
-        """Start a chain of jobs on one device or worker; each job computes an input of the next job."""
+        """Start a chain of jobs on one device or worker; each job computes an input of the next
+        job.
+        """
 
     def wait(self, seconds: float | None = None) -> list[Outcome]:
-        """Return the outcomes of jobs since the last call; while jobs run, wait at most ``seconds`` for an outcome."""
+        """Return the outcomes of jobs since the last call; while jobs run, wait at most
+        ``seconds`` for an outcome.
+        """
 
     def cancel(self) -> None:
         """Start no further job, and wait for the running jobs."""
 
 
-def carry_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | None = None) -> Outcome:
-    """Compute one step and store its result if storing saves time; return an error as part of the outcome."""
+def carry_out(
+    work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | None = None
+) -> Outcome:
+    """Compute one step and store its result if storing saves time; return an error as part of
+    the outcome.
+    """
     if work.unlocked or is_private(work.key):
         return _carried_out(work, fetch, store, None, Lease())
     lease = store.claim(work.key)
@@ -151,7 +249,9 @@ def carry_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | No
             lease.release()
 
 
-def _carried_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | None, lease: Lease) -> Outcome:
+def _carried_out(
+    work: StepJob, fetch: Fetch, store: Store, later: WriteBehind | None, lease: Lease
+) -> Outcome:
     try:
         inputs = [gathered(read, fetch) for read in work.reads]
     except InputMissing as error:
@@ -163,7 +263,9 @@ def _carried_out(work: StepJob, fetch: Fetch, store: Store, later: WriteBehind |
 
 
 def gathered(read: Read, fetch: Fetch) -> Any:
-    """Fetch the value of an input: a single value, a list of values, or None for an absent input."""
+    """Fetch the value of an input: a single value, a list of values, or None for an absent
+    input.
+    """
     if read is None or isinstance(read, str):
         return None if read is None else fetch(read)
     return [fetch(key) for key in read]
@@ -171,32 +273,58 @@ def gathered(read: Read, fetch: Fetch) -> Any:
 
 def _computed(work: StepJob, inputs: list[Any], store: Store) -> Outcome:
     """Compute a step and return its value with statistics, checks and costs."""
-    step = work.step
-    seen = _Seen()
-    evaluate = _observing(partial(call, step, params=step.params, seed=work.seed, device=work.device), work, seen)
+    step, hooks = work.step, work.step.node.hooks
+    observations = _Seen()
     stamps = file_stamps(step.params)
     began, clock = time.time(), time.perf_counter()
     size = sum(t.nbytes for t in tensors_in(inputs))
     watched = size >= _WATCHED or not work.unlocked
     own_here = work.own is not None and work.device.startswith("cpu") and not _is_apart(work)
-    with PeakMemory(work.device, watched) as peak, torch.no_grad(), guarded(), refusing_allocations(own_here):
-        if step.node.bands and (work.parts > 1 or work.device.startswith("cpu")):
-            value = call_by_band(step, inputs, evaluate, work.origin["code"], store.blobs, work.parts)
-        else:
-            value = evaluate(inputs)
+    with (
+        PeakMemory(work.device, watched) as peak,
+        torch.no_grad(),
+        guarded(),
+        refusing_allocations(own_here),
+    ):
+        value = _value(work, inputs, store, observations)
         bare = plain_of(value)
-        checks = _observing(examine, work, seen)(step, bare, inputs) if step.node.hooks.check else ()
+        checks = _observing(examine, work, observations)(step, bare, inputs) if hooks.check else ()
     seconds = time.perf_counter() - clock
-    same = stamps == file_stamps(step.params)
-    if not same or work.origin["params"] != {name: plain(param) for name, param in step.params.items()}:
-        raise RunError(step, [], OSError("an input file changed while it was read: run again"))
-    found = sum(t.nbytes for t in tensors_in(bare))
-    sized = measured_size(step.node, inputs, step.params, bare)
-    deviation = step.node.hooks.approximation_error(bare) if step.node.hooks.approximation_error else None
-    facts = TensorStats.of(bare)
-    taints = tuple(dict.fromkeys(seen.taints))
-    most = None if peak.bytes is None else peak.bytes + seen.peak
-    return Outcome(work, value, facts, checks, began, seconds, found, deviation, most, sized, taints=taints)
+    _refuse_changed_files(work, stamps)
+    return Outcome(
+        work,
+        value,
+        bytes=sum(t.nbytes for t in tensors_in(bare)),
+        size=measured_size(step.node, inputs, step.params, bare),
+        deviation=hooks.approximation_error(bare) if hooks.approximation_error else None,
+        facts=TensorStats.of(bare),
+        checks=checks,
+        began=began,
+        seconds=seconds,
+        peak=None if peak.bytes is None else peak.bytes + observations.peak,
+        taints=tuple(dict.fromkeys(observations.taints)),
+    )
+
+
+def _value(work: StepJob, inputs: list[Any], store: Store, observations: _Seen) -> Any:
+    """Return the value of a step, computed band by band where its node and memory ask for it."""
+    step = work.step
+    evaluate = _observing(
+        partial(call, step, params=step.params, seed=work.seed, device=work.device),
+        work,
+        observations,
+    )
+    if step.node.bands and (work.parts > 1 or work.device.startswith("cpu")):
+        return call_by_band(step, inputs, evaluate, work.origin["code"], store.blobs, work.parts)
+    return evaluate(inputs)
+
+
+def _refuse_changed_files(work: StepJob, stamps: Any) -> None:
+    """Raise `RunError` if an input file is not what it was when the step began."""
+    params = work.step.params
+    same = stamps == file_stamps(params)
+    if not same or work.origin["params"] != {name: plain(param) for name, param in params.items()}:
+        raise RunError(work.step, [], OSError("an input file changed while it was read: run again"))
 
 
 @dataclass(slots=True)
@@ -207,67 +335,94 @@ class _Seen:
     peak: int = 0  #: peak bytes of a process of its own
 
 
-def _observing(function: Callable[..., T], work: StepJob, seen: _Seen) -> Callable[..., T]:
-    """Return a function that is observed where the code is not of neusee, and that adds what it finds to ``seen``."""
+def _observing(function: Callable[..., T], work: StepJob, observations: _Seen) -> Callable[..., T]:
+    """Return a function that is observed where the code is not of neusee, and that adds what it
+    finds to ``observations``.
+    """
     own = work.own
     if own is None:
         return function
 
-    def watched(*args: Any, **more: Any) -> T:
+    def watched(*args: Any, **named: Any) -> T:
         try:
-            value, found = _called_observed(partial(function, *args, **more), own, _is_apart(work), seen)
+            value, taints = _called_observed(
+                partial(function, *args, **named), own, _is_apart(work), observations
+            )
         except ProcessEnded as error:
             raise RunError(work.step, [], error) from error
-        seen.taints.extend(found)
-        if found:
-            hold_back(tainted_modules(own, found))
+        observations.taints.extend(taints)
+        if taints:
+            hold_back(tainted_modules(own, taints))
         return value
 
     return watched
 
 
 def _is_apart(work: StepJob) -> bool:
-    """Return True for code that may change what other code finds: it runs in a process of its own."""
-    return work.own is not None and work.own.may_change and work.device.startswith("cpu") and may_fork()
+    """Return True for code that may change what other code finds: it runs in a process of its
+    own.
+    """
+    return (
+        work.own is not None
+        and work.own.may_change
+        and work.device.startswith("cpu")
+        and may_fork()
+    )
 
 
-def _called_observed(function: Callable[[], T], own: OwnCode, apart: bool, seen: _Seen) -> tuple[T, list[Taint]]:
-    """Call a function of own code, in a process of its own if ``apart`` and its value can be sent."""
+def _called_observed(
+    function: Callable[[], T], own: OwnCode, apart: bool, observations: _Seen
+) -> tuple[T, list[Taint]]:
+    """Call a function of own code, in a process of its own if ``apart`` and its value can be
+    sent.
+    """
     returned = call_in_fork(partial(call_observed, function, own), own.variables) if apart else None
     if returned is None:
         return call_observed(function, own)
-    seen.peak = max(seen.peak, returned.peak or 0)
-    value, found = returned.value
-    home, lost = min(own.modules), [taint for taint in found if taint.kind == "memory"]
+    observations.peak = max(observations.peak, returned.peak or 0)
+    value, taints = returned.value
+    home, lost = min(own.modules), [taint for taint in taints if taint.kind == "memory"]
     say_lost(home, lost)
     say_hidden(home, returned.asked, own.free)
-    return value, [*(taint for taint in found if taint not in lost), *undeclared(own, returned.asked)]
+    return value, [
+        *(taint for taint in taints if taint not in lost),
+        *undeclared(own, returned.asked),
+    ]
 
 
 def _kept(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Lease) -> Outcome:
-    """Store the metadata of a result, and also its value if reading is faster than computing the result again."""
+    """Store the metadata of a result, and also its value if reading is faster than computing the
+    result again.
+    """
     own = outcome.work.own
     if is_private(outcome.work.key) or outcome.taints or (own and not may_be_stored(own.modules)):
         outcome.value = plain_of(outcome.value)
         return outcome
+    try:
+        _store(outcome, store, later, lease)
+    except TypeError as error:
+        raise RunError(outcome.work.step, [], error) from error
+    outcome.value = plain_of(outcome.value)
+    return outcome
+
+
+def _store(outcome: Outcome, store: Store, later: WriteBehind | None, lease: Lease) -> None:
+    """Store a result as it pays: its metadata alone, with a small value, or with a file that may
+    be written later.
+    """
     work, value, about = outcome.work, outcome.value, _about(outcome)
     small = outcome.bytes <= INLINE
     not_worth = not (work.wanted or small or _pays(outcome, store, outcome.bytes))
-    try:
-        if work.unlocked and (not_worth or (small and not _pays(outcome, store, 0))):
-            outcome.kept = store.put_small(work.key, value, about)
-        elif not_worth:
-            store.put_receipt(work.key, about)
-        elif later is not None and outcome.bytes >= LARGE:
-            pack(value)  # a value that cannot be stored raises here, where the step is known
-            later.add(work.key, outcome.bytes, lambda: _written(store, work.key, value, about, lease))
-            outcome.kept = outcome.waits = True
-        else:
-            outcome.kept = store.put(work.key, value, about)
-    except TypeError as error:
-        raise RunError(work.step, [], error) from error
-    outcome.value = plain_of(outcome.value)
-    return outcome
+    if work.unlocked and (not_worth or (small and not _pays(outcome, store, 0))):
+        outcome.kept = store.put_small(work.key, value, about)
+    elif not_worth:
+        store.put_receipt(work.key, about)
+    elif later is not None and outcome.bytes >= LARGE:
+        pack(value)  # a value that cannot be stored raises here, where the step is known
+        later.add(work.key, outcome.bytes, lambda: _written(store, work.key, value, about, lease))
+        outcome.kept = outcome.waits = True
+    else:
+        outcome.kept = store.put(work.key, value, about)
 
 
 def _written(store: Store, key: Key, value: Any, about: dict[str, Any], lease: Lease) -> None:
@@ -276,8 +431,12 @@ def _written(store: Store, key: Key, value: Any, about: dict[str, Any], lease: L
 
 
 def _pays(outcome: Outcome, store: Store, size: int) -> bool:
-    """Return True if computing a result again takes longer than writing and reading ``size`` bytes."""
-    return outcome.seconds + outcome.work.refetch_seconds > store.write_seconds(size) + store.read_seconds(size)
+    """Return True if computing a result again takes longer than writing and reading ``size``
+    bytes.
+    """
+    return outcome.seconds + outcome.work.refetch_seconds > store.write_seconds(
+        size
+    ) + store.read_seconds(size)
 
 
 def _about(outcome: Outcome) -> dict[str, Any]:

@@ -1,8 +1,10 @@
-"""Call of own code in a process of its own: whatever it changes in Python, or in a library, ends with the call.
+"""Call of own code in a process of its own: whatever it changes in Python, or in a library, ends
+with the call.
 
-Code of a user may set an option of a library, fill a table, patch a function or move the working folder. No list of
-such changes is complete, so a step of code that may make one is computed by a fork of this process. The fork has the
-inputs at hand, sends the value back, and ends. The next step, of the user or of neusee, finds the process as it was.
+Code of a user may set an option of a library, fill a table, patch a function or move the working
+folder. No list of such changes is complete, so a step of code that may make one is computed by a
+fork of this process. The fork has the inputs at hand, sends the value back, and ends. The next
+step, of the user or of neusee, finds the process as it was.
 """
 
 from __future__ import annotations
@@ -20,9 +22,8 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 import torch
 
-from neusee.workflows.engine.allocation_limit import refusing_allocations
-from neusee.workflows.engine.memory_use import resident
-from neusee.workflows.engine.memory_watch import guarded, limit_now, limited
+from neusee.workflows.engine.machine_resources import resident
+from neusee.workflows.engine.memory_limits import guarded, limit_now, limited, refusing_allocations
 from neusee.workflows.engine.worker_processes import deaf_fork, end_with, ignore_interrupts
 from neusee.workflows.observation.hidden_variables import Asked, hide_for_good
 from neusee.workflows.observation.observed_call import one_at_a_time, watched_in_fork
@@ -60,14 +61,19 @@ def may_fork() -> bool:
 
     A lock that a thread of another library holds would stay locked in a fork, as in a notebook.
     """
-    return sys.platform == "linux" and is_alone() and all(_is_a_file(stream) for stream in (sys.stdout, sys.stderr))
+    return (
+        sys.platform == "linux"
+        and is_alone()
+        and all(_is_a_file(stream) for stream in (sys.stdout, sys.stderr))
+    )
 
 
 def call_in_fork(function: Callable[[], T], variables: frozenset[str]) -> Returned[T] | None:
-    """Return what a function gives in a fork of this process; None if its value cannot be sent, or nothing is forked.
+    """Return what a function gives in a fork of this process; None if its value cannot be sent, or
+    nothing is forked.
 
-    ``variables`` are those of the environment that the code declares. Raises what the function raises, with its text
-    and without its traceback, and `ProcessEnded`.
+    ``variables`` are those of the environment that the code declares. Raises what the function
+    raises, with its text and without its traceback, and `ProcessEnded`.
     """
     with one_at_a_time():
         return _called(function, variables)
@@ -90,8 +96,8 @@ def _called(function: Callable[[], T], variables: frozenset[str]) -> Returned[T]
         sent: _Sent = torch.load(f"/proc/self/fd/{file.fileno()}", mmap=True, weights_only=False)
     for name, text in sent.printed.items():
         getattr(sys, name).write(text)
-    for each in sent.said:
-        warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+    for warning in sent.said:
+        warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
     if sent.error is not None:
         raise sent.error
     return sent.returned
@@ -104,11 +110,12 @@ def _is_a_file(stream: Any) -> bool:
         return False
 
 
-# --- in the process that waits ----------------------------------------------------------------------------------------
+# --- in the process that waits --------------------------------------------------------------------
 
 
 def _forked() -> int:
-    for stream in (sys.stdout, sys.stderr):  # or the fork would print what still waits here once more
+    # or the fork would print what still waits here once more
+    for stream in (sys.stdout, sys.stderr):
         if stream is not None:
             stream.flush()
     with warnings.catch_warnings(), deaf_fork():  # Python 3.12 warns of every fork beside a thread
@@ -117,7 +124,9 @@ def _forked() -> int:
 
 
 def _waited(child: int) -> int:
-    """Return the exit code of a process, negative for a signal, when it has ended; kill it if an exception comes."""
+    """Return the exit code of a process, negative for a signal, when it has ended; kill it if an
+    exception comes.
+    """
     try:
         with _descriptor(child) as descriptors:
             while True:
@@ -150,14 +159,21 @@ def _reason(code: int) -> str:
     if code > 0:
         return f"the process of the step ended with the exit code {code}"
     name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
-    kinds = {"SIGKILL": "killed, as by a system that has too little memory", "SIGSEGV": "a library crashed"}
-    return f"the process of the step was ended by {name}" + (f": {kinds[name]}" if name in kinds else "")
+    kinds = {
+        "SIGKILL": "killed, as by a system that has too little memory",
+        "SIGSEGV": "a library crashed",
+    }
+    return f"the process of the step was ended by {name}" + (
+        f": {kinds[name]}" if name in kinds else ""
+    )
 
 
-# --- in the fork ------------------------------------------------------------------------------------------------------
+# --- in the fork ----------------------------------------------------------------------------------
 
 
-def _answer(begin_watch: Callable[[], None], work: Callable[[], _Sent], file: int, parent: int) -> None:
+def _answer(
+    begin_watch: Callable[[], None], work: Callable[[], _Sent], file: int, parent: int
+) -> None:
     """Do the work, write what it gives to a file, and end this process, whatever happens."""
     code, collected = 1, _collected()
     try:
@@ -166,7 +182,10 @@ def _answer(begin_watch: Callable[[], None], work: Callable[[], _Sent], file: in
             begin_watch()
             _print_as_parent()
             sent = work()
-            code = _write(sent._replace(printed={name: text.getvalue() for name, text in collected.items()}), file)
+            code = _write(
+                sent._replace(printed={name: text.getvalue() for name, text in collected.items()}),
+                file,
+            )
     finally:
         for stream in (sys.stdout, sys.stderr):
             with suppress(Exception):
@@ -175,16 +194,28 @@ def _answer(begin_watch: Callable[[], None], work: Callable[[], _Sent], file: in
 
 
 def _collected() -> dict[str, io.StringIO]:
-    """Collect what is printed to streams that draw beside a table: a thread of the parent may hold their lock."""
-    collected = {name: io.StringIO() for name in ("stdout", "stderr") if hasattr(getattr(sys, name), _BESIDE_TABLE)}
+    """Collect what is printed to streams that draw beside a table: a thread of the parent may
+    hold their lock.
+    """
+    collected = {
+        name: io.StringIO()
+        for name in ("stdout", "stderr")
+        if hasattr(getattr(sys, name), _BESIDE_TABLE)
+    }
     for name, text in collected.items():
         setattr(sys, name, text)
     return collected
 
 
 def _print_as_parent() -> None:
-    """Let libraries of C print to stderr where Python does, while stdout is kept for the result of the command."""
-    if sys.stdout is not None and not isinstance(sys.stdout, io.StringIO) and sys.stdout.fileno() == 2:
+    """Let libraries of C print to stderr where Python does, while stdout is kept for the result
+    of the command.
+    """
+    if (
+        sys.stdout is not None
+        and not isinstance(sys.stdout, io.StringIO)
+        and sys.stdout.fileno() == 2
+    ):
         os.dup2(2, 1)
 
 
@@ -196,7 +227,9 @@ def _sent(function: Callable[[], Any], variables: frozenset[str], limit: float |
             return _Sent(None, error, said, {})
 
 
-def _returned(function: Callable[[], Any], variables: frozenset[str], limit: float | None) -> Returned[Any]:
+def _returned(
+    function: Callable[[], Any], variables: frozenset[str], limit: float | None
+) -> Returned[Any]:
     with ExitStack() as stack:
         if limit is not None:
             stack.enter_context(limited(limit))
@@ -212,14 +245,18 @@ def _returned(function: Callable[[], Any], variables: frozenset[str], limit: flo
 
 def _write(sent: _Sent, file: int) -> int:
     """Write what the parent reads; return the exit code of the fork."""
-    plain = [_plain_warning(each) for each in sent.said]
+    plain = [_plain_warning(warning) for warning in sent.said]
     try:
         with open(file, "wb", closefd=False) as binary:
             torch.save(sent._replace(said=plain), binary)
-    except Exception:  # of the class of any value: it cannot be pickled, or does not fit into memory once more
+    except (
+        Exception
+    ):  # of the class of any value: it cannot be pickled, or does not fit into memory once more
         return _UNSENT
     return 0
 
 
-def _plain_warning(each: warnings.WarningMessage) -> warnings.WarningMessage:
-    return warnings.WarningMessage(str(each.message), each.category, each.filename, each.lineno)
+def _plain_warning(warning: warnings.WarningMessage) -> warnings.WarningMessage:
+    return warnings.WarningMessage(
+        str(warning.message), warning.category, warning.filename, warning.lineno
+    )

@@ -1,10 +1,12 @@
-"""Worker processes that share independent work, such as the points of a sweep or the draws of a study.
+"""Worker processes that share independent work, such as the points of a sweep or the draws of a
+study.
 
-Each worker is a fork of this process with one thread of torch, so that it has the recipe, the modules and all large
-values at hand, and only the numbers of the pieces of work and their results go through a pipe. A worker computes with
-the same code on one thread: its results are those of this process on one thread, bit for bit. Work that a worker did
-not finish, because it failed, was killed or had too little memory, is left to this process, which then meets the error
-as if there were no workers. Workers end with this process, also after ``kill -9``.
+Each worker is a fork of this process with one thread of torch, so that it has the recipe, the
+modules and all large values at hand, and only the numbers of the pieces of work and their results
+go through a pipe. A worker computes with the same code on one thread: its results are those of this
+process on one thread, bit for bit. Work that a worker did not finish, because it failed, was killed
+or had too little memory, is left to this process, which then meets the error as if there were no
+workers. Workers end with this process, also after ``kill -9``.
 """
 
 from __future__ import annotations
@@ -19,12 +21,13 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
+from itertools import chain
 from multiprocessing.connection import Connection, wait
 from typing import Generic, TypeVar
 
 import torch
 
-from neusee.workflows.engine.processors import free_processors
+from neusee.workflows.engine.machine_resources import free_processors
 from neusee.workflows.observation.step_thread import is_alone
 from neusee.workflows.store.lease import retire
 
@@ -34,7 +37,9 @@ _PARENT_DIES = 1  #: PR_SET_PDEATHSIG of Linux
 
 @contextmanager
 def deaf_fork() -> Iterator[None]:
-    """Hold Ctrl-C back while the ``with`` block forks, so that it reaches the fork only after `ignore_interrupts`."""
+    """Hold Ctrl-C back while the ``with`` block forks, so that it reaches the fork only after
+    `ignore_interrupts`.
+    """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -49,10 +54,12 @@ def ignore_interrupts() -> None:
 
 
 def workers_for(pieces: int, asked: int = 0) -> int:
-    """Return how many workers share a number of pieces of work: ``asked``, or by default one for each free processor.
+    """Return how many workers share a number of pieces of work: ``asked``, or by default one for
+    each free processor.
 
-    1 means that this process works alone, as where a fork is not possible, or by default beside threads of others, such
-    as those of a notebook: a lock that such a thread holds stays locked in a fork.
+    1 means that this process works alone, as where a fork is not possible, or by default beside
+    threads of others, such as those of a notebook: a lock that such a thread holds stays locked in
+    a fork.
     """
     if sys.platform != "linux":
         return 1
@@ -60,7 +67,9 @@ def workers_for(pieces: int, asked: int = 0) -> int:
 
 
 def end_with(parent: int) -> bool:
-    """Let this fork end when the process that forked it, ``parent``, ends, also after ``kill -9``; False if it did."""
+    """Let this fork end when the process that forked it, ``parent``, ends, also after ``kill
+    -9``; False if it did.
+    """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(_PARENT_DIES, signal.SIGKILL)
@@ -70,11 +79,14 @@ def end_with(parent: int) -> bool:
 def shared(
     work: Callable[[int], T], order: Sequence[int], workers: int, apart: bool = False
 ) -> Generator[tuple[int, tuple[T] | None], None, None]:
-    """Yield each number in ``order`` with its ``work(number)`` as the only item of a tuple, in the order of the ends.
+    """Yield each number in ``order`` with its ``work(number)`` as the only item of a tuple, in the
+    order of the ends.
 
-    None in place of the tuple means that the caller must do this piece itself. With one worker that is every piece.
+    None in place of the tuple means that the caller must do this piece itself. With one worker that
+    is every piece.
 
-    Args: apart: each worker takes a run of ``order`` of its own, and helps the others when its own is done. This keeps
+    Args: apart: each worker takes a run of ``order`` of its own, and helps the others when its own
+            is done. This keeps
     neighbours, which share results, with one worker. By default all workers take the next piece.
     """
     if workers < 2:
@@ -88,13 +100,15 @@ def shared(
 
 
 def shared_in_order(work: Callable[[int], T], count: int, workers: int) -> Iterator[T]:
-    """Yield ``work(number)`` for each number below ``count``, in order; this process does what no worker finished."""
-    found, due = dict[int, tuple[T] | None](), 0
+    """Yield ``work(number)`` for each number below ``count``, in order; this process does what
+    no worker finished.
+    """
+    done, due = dict[int, tuple[T] | None](), 0
     with closing(shared(work, range(count), workers)) as ended:
-        for number, given in ended:
-            found[number] = given
-            while due in found:
-                ready = found.pop(due)
+        for number, value in ended:
+            done[number] = value
+            while due in done:
+                ready = done.pop(due)
                 yield ready[0] if ready else work(due)
                 due += 1
 
@@ -102,12 +116,15 @@ def shared_in_order(work: Callable[[int], T], count: int, workers: int) -> Itera
 class _Team(Generic[T]):
     """The workers that share one list of pieces of work."""
 
-    def __init__(self, work: Callable[[int], T], order: Sequence[int], workers: int, apart: bool) -> None:
+    def __init__(
+        self, work: Callable[[int], T], order: Sequence[int], workers: int, apart: bool
+    ) -> None:
         self._work = work
         runs, size = workers if apart else 1, len(order)
         self._left = [deque(order[i * size // runs : (i + 1) * size // runs]) for i in range(runs)]
         self._lost = deque[int]()  # pieces for the caller
-        self._now: dict[Connection, tuple[int, int]] = {}  # by pipe: the worker's index, and the piece that it has
+        # by pipe: the worker's index, and the piece that it has
+        self._now: dict[Connection, tuple[int, int]] = {}
         self._processes = list[multiprocessing.process.BaseProcess]()
         self._pipes = list[Connection]()
         for index in range(workers):
@@ -120,12 +137,12 @@ class _Team(Generic[T]):
             for pipe in wait(list(self._now)) if self._now else ():
                 assert isinstance(pipe, Connection)
                 index, number = self._now.pop(pipe)
-                found = self._answer(pipe)
-                if found is not None:
+                answer = self._answer(pipe)
+                if answer is not None:
                     self._hand(index, pipe)
-                yield number, found[0] if found else None
+                yield number, answer[0] if answer else None
             if not self._now:  # no worker is left
-                self._lost += [number for run in self._left for number in run]
+                self._lost += chain.from_iterable(self._left)
                 self._left = []
 
     def close(self) -> None:
@@ -140,24 +157,29 @@ class _Team(Generic[T]):
 
     def _begin(self, index: int) -> None:
         context = multiprocessing.get_context("fork")
-        mine, there = context.Pipe()
-        arguments = (there, [*self._pipes, mine], self._work, os.getpid())
-        process = context.Process(target=_serve, args=arguments, name=f"neusee worker {index}", daemon=True)
+        mine, theirs = context.Pipe()
+        arguments = (theirs, [*self._pipes, mine], self._work, os.getpid())
+        process = context.Process(
+            target=_serve, args=arguments, name=f"neusee worker {index}", daemon=True
+        )
         try:
-            with warnings.catch_warnings(), deaf_fork():  # Python 3.12 warns of every fork beside a thread
+            # Python 3.12 warns of every fork beside a thread
+            with warnings.catch_warnings(), deaf_fork():
                 warnings.simplefilter("ignore", DeprecationWarning)
                 process.start()
         except OSError:  # no memory or no permission: the others do the work, or this process
             mine.close()
             return
         finally:
-            there.close()
+            theirs.close()
         self._processes.append(process)
         self._pipes.append(mine)
         self._hand(index, mine)
 
     def _hand(self, index: int, pipe: Connection) -> None:
-        """Give a worker the next piece of its own run, or the last piece of the longest other run."""
+        """Give a worker the next piece of its own run, or the last piece of the longest other
+        run.
+        """
         own = self._left[min(index, len(self._left) - 1)]
         run = own or max(self._left, key=len)
         if run:
@@ -170,17 +192,21 @@ class _Team(Generic[T]):
                 self._now[pipe] = index, number
 
     def _answer(self, pipe: Connection) -> tuple[tuple[T] | None] | None:
-        """Return the answer of a worker, with None in it for a piece that failed; None if the worker has ended."""
+        """Return the answer of a worker, with None in it for a piece that failed; None if the
+        worker has ended.
+        """
         try:
-            found, said = pickle.loads(pipe.recv_bytes())
+            value, said = pickle.loads(pipe.recv_bytes())
         except (EOFError, OSError, pickle.UnpicklingError):
             return None
         for text, category in said:
             warnings.warn(text, category, stacklevel=2)
-        return (found,)
+        return (value,)
 
 
-def _serve(pipe: Connection, others: Sequence[Connection], work: Callable[[int], T], parent: int) -> None:
+def _serve(
+    pipe: Connection, others: Sequence[Connection], work: Callable[[int], T], parent: int
+) -> None:
     """Do the pieces of work that the pipe names, until its other end closes."""
     for other in others:
         other.close()  # else the pipes of a killed process stay open
@@ -195,15 +221,17 @@ def _serve(pipe: Connection, others: Sequence[Connection], work: Callable[[int],
 
 
 def _done(work: Callable[[int], T], number: int) -> bytes:
-    """Return a pickled piece of work with the warnings that it gave, or None in its place if it failed."""
+    """Return a pickled piece of work with the warnings that it gave, or None in its place if it
+    failed.
+    """
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("default")
         try:
-            found: tuple[T] | None = (work(number),)
+            value: tuple[T] | None = (work(number),)
         except BaseException:  # the parent does this piece, and meets the error again
-            found = None
-    told = [(str(each.message), each.category) for each in said]
+            value = None
+    messages = [(str(warning.message), warning.category) for warning in said]
     try:
-        return pickle.dumps((found, told if found else []), protocol=5)
+        return pickle.dumps((value, messages if value else []), protocol=5)
     except Exception:  # a result that cannot be sent
         return pickle.dumps((None, []), protocol=5)

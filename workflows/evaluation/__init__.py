@@ -2,5 +2,6 @@
 
 Pipelines, scenes and points of an evaluation, confidence intervals, and the page of the comparison.
 Nothing here is trained; metrics are nodes.
-Offers: `run_evaluation.evaluate`, `pipelines.read_pipelines`, `evaluation_result.EvaluationResult`.
+Offers: `run_evaluation.evaluate`, `pipelines.read_pipelines`,
+        `evaluation_result.EvaluationResult`.
 """

@@ -1,4 +1,4 @@
-"""Confidence intervals of mean image errors over scenes, and of the differences between two methods in these scenes."""
+"""Confidence intervals of mean image errors, and of differences between two pipelines."""
 
 from __future__ import annotations
 
@@ -9,15 +9,33 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+# --- confidence intervals -------------------------------------------------------------------------
+
+# Confidence intervals of mean image errors over scenes, and of the differences between two methods
+# in these scenes.
+
+
 Numbers = NDArray[np.float64]
 CONFIDENCE = 0.95
 FEW = 5  #: smallest number of photographs for the bootstrap
-METRICS = ("l1", "psnr", "ssim", "l1 small", "psnr small", "ssim small", "saturated", "peak", "above")
+METRICS = (
+    "l1",
+    "psnr",
+    "ssim",
+    "l1 small",
+    "psnr small",
+    "ssim small",
+    "saturated",
+    "peak",
+    "above",
+)
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean over scenes and its 95 % confidence interval, with NaN as limits if there are too few photographs."""
+    """A mean over scenes and its 95 % confidence interval, with NaN as limits if there are too
+    few photographs.
+    """
 
     mean: float
     low: float
@@ -36,7 +54,9 @@ class Interval:
 
 @dataclass(frozen=True)
 class MetricTable:
-    """The metrics of one mask and restorer as arrays (scene, laser strength), with NaN if a value is missing."""
+    """The metrics of one mask and restorer as arrays (scene, laser strength), with NaN if a
+    value is missing.
+    """
 
     strengths: tuple[float, ...]
     values: Mapping[str, Numbers]
@@ -52,10 +72,12 @@ class MetricTable:
         return mean(self.scenes(metric), self.photographs)
 
     def at(self, metric: str, strength: int) -> Interval:
-        """Return the mean of a metric at one laser strength, over the scenes that have a value, and its interval."""
+        """Return the mean of a metric at one laser strength, over the scenes that have a value,
+        and its interval.
+        """
         column = self.values[metric][:, strength]
-        kept = ~np.isnan(column)
-        return mean(column[kept], self.photographs[kept])
+        valid = ~np.isnan(column)
+        return mean(column[valid], self.photographs[valid])
 
 
 def sums_by_photograph(values: Numbers, photographs: Numbers) -> Numbers:
@@ -64,11 +86,15 @@ def sums_by_photograph(values: Numbers, photographs: Numbers) -> Numbers:
     return np.bincount(number.reshape(-1), weights=values).astype(np.float64)
 
 
-def mean(values: Sequence[float] | Numbers, photographs: Sequence[float] | Numbers | None = None) -> Interval:
-    """Return the mean over scenes of a metric, and its confidence interval from Student's t distribution.
+def mean(
+    values: Sequence[float] | Numbers, photographs: Sequence[float] | Numbers | None = None
+) -> Interval:
+    """Return the mean over scenes of a metric, and its confidence interval from Student's t
+    distribution.
 
-    ``photographs`` has the number of the photograph of each scene; without it each scene has a photograph of its own.
-    The interval is over photographs: several scenes of one photograph count as one draw.
+    ``photographs`` has the number of the photograph of each scene; without it each scene has a
+    photograph of its own. The interval is over photographs: several scenes of one photograph count
+    as one draw.
     """
     x = np.asarray(values, dtype=np.float64)
     owner = np.asarray(range(len(x)) if photographs is None else photographs, dtype=np.float64)
@@ -77,8 +103,8 @@ def mean(values: Sequence[float] | Numbers, photographs: Sequence[float] | Numbe
         return Interval(centre, math.nan, math.nan)
     from scipy.stats import t
 
-    rest = sums_by_photograph(x - centre, owner)
-    spread = math.sqrt(float((rest**2).sum()) * count / (count - 1)) / len(x)
+    residuals = sums_by_photograph(x - centre, owner)
+    spread = math.sqrt(float((residuals**2).sum()) * count / (count - 1)) / len(x)
     half = float(t.ppf((1 + CONFIDENCE) / 2, count - 1)) * spread
     return Interval(centre, centre - half, centre + half)
 
@@ -90,11 +116,132 @@ def metric_table(
 ) -> MetricTable:
     """Arrange the metrics of one mask and restorer as arrays (scene, laser strength).
 
-    ``photographs`` has the number of the photograph of each scene; without it every scene has its own.
+    ``photographs`` has the number of the photograph of each scene; without it every scene has its
+    own.
     """
-    each = {
-        metric: np.array([[point.get(k, {}).get(metric, math.nan) for k in strengths] for point in points])
+    values = {
+        metric: np.array(
+            [[point.get(k, {}).get(metric, math.nan) for k in strengths] for point in points]
+        )
         for metric in METRICS
     }
     owner = range(len(points)) if photographs is None else photographs
-    return MetricTable(tuple(strengths), each, np.array(owner, dtype=np.float64))
+    return MetricTable(tuple(strengths), values, np.array(owner, dtype=np.float64))
+
+
+# --- paired intervals -----------------------------------------------------------------------------
+
+# Confidence intervals of the difference between two pipelines on the same pictures, drawn over
+# photographs.
+#
+# Pictures of one photograph are alike, so that they are no independent draws: the bootstrap draws
+# whole photographs. It draws the error of the mean in units of its own standard error
+# (bootstrap-t), because quantiles of the plain bootstrap hold the truth of eight to twelve skewed
+# photographs in 81 to 89 instead of 95 of 100 cases.
+
+
+_DRAWS = 10_000  #: sets of photographs that the bootstrap draws
+#: photographs below which neither end may lie nearer than that of Student's t distribution
+_SMALL = 30
+_AT_ONCE = 500  #: sets in memory at once
+
+
+def ratio(top: Numbers, bottom: Numbers, photographs: Numbers, seed: int) -> Interval:
+    """Return the ratio of the sums of two values over pictures, and its 95 % interval over
+    photographs.
+
+    Args: top, bottom: (picture,) values of the same unit, or 1 as ``bottom`` for the mean of
+            ``top``. photographs:
+    (picture,) the number of the photograph of each picture. seed: of the draws.
+    The limits are NaN for fewer than five photographs. For fewer than thirty each end is that of
+    the bootstrap or of Student's t distribution, whichever lies farther away, times the root of
+    n/(n - 1), by which drawn sets of n photographs scatter too little; skewed photographs need
+    both.
+    Source: Davison and Hinkley, Bootstrap Methods and their Application (1997), section 5.2.1,
+            studentized bootstrap.
+    """
+    a, b = sums_by_photograph(top, photographs), sums_by_photograph(bottom, photographs)
+    value, count = float(a.sum() / b.sum()), len(a)
+    if count < FEW:
+        return Interval(value, math.nan, math.nan)
+    residuals = a - value * b
+    error = _standard_error((residuals**2).sum(), b.sum(), count)
+    low, high = np.quantile(_drawn_errors(residuals, b, seed), _LIMITS, method="inverted_cdf")
+    if count < _SMALL:
+        quantile, wider = _student(count - 1), math.sqrt(count / (count - 1))
+        low, high = wider * min(low, -quantile), wider * max(high, quantile)
+    return Interval(value, *(float(value - q * error) if error else value for q in (high, low)))
+
+
+def _student(freedom: int) -> float:
+    from scipy.stats import t
+
+    return float(t.ppf(_LIMITS[1], freedom))
+
+
+_LIMITS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)
+
+
+def _standard_error(squares: Numbers, total: Numbers, count: int) -> Numbers:
+    """Return the standard error of a ratio from the sum of the squared residuals of the
+    photographs.
+    """
+    error: Numbers = np.sqrt(count / (count - 1) * squares) / total
+    return error
+
+
+def _drawn_errors(residuals: Numbers, b: Numbers, seed: int) -> Numbers:
+    """Return the error of the ratio in each drawn set of photographs, in units of the standard
+    error in that set.
+    """
+    rng, count = np.random.default_rng(seed), len(residuals)
+    products = np.stack([residuals, b, residuals * residuals, residuals * b, b * b], 1)
+    errors: list[Numbers] = []
+    for _ in range(0, _DRAWS, _AT_ONCE):
+        times = rng.multinomial(count, np.full(count, 1 / count), _AT_ONCE).astype(np.float64)
+        r, total, rr, rb, bb = (times @ products).T
+        moved = r / total
+        squares = np.maximum(rr - 2 * moved * rb + moved**2 * bb, 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            errors.append(np.where(moved == 0, 0.0, moved / _standard_error(squares, total, count)))
+    return np.concatenate(errors)
+
+
+def less(values: Numbers, reference: Numbers, photographs: Numbers, seed: int) -> Interval:
+    """Return by how much a metric lies below that of the reference on the same pictures, in the
+    unit of the metric.
+    """
+    return ratio(reference - values, np.ones_like(reference), photographs, seed)
+
+
+def gain(values: Numbers, reference: Numbers, photographs: Numbers, seed: int) -> Interval:
+    """Return by which fraction the mean of a metric lies below the mean of the reference, such
+    as 0.101 for 10.1 %.
+    """
+    x = ratio(values, reference, photographs, seed)
+    return Interval(1.0 - x.mean, 1.0 - x.high, 1.0 - x.low)
+
+
+def compare_with(values: MetricTable, reference: MetricTable, seed: int) -> dict[str, Interval]:
+    """Return the decrease of L1 error against the reference: absolute, relative, and relative
+    for small pictures.
+    """
+    own, other, photographs = values.scenes("l1"), reference.scenes("l1"), values.photographs
+    small = values.scenes("l1 small"), reference.scenes("l1 small")
+    return {
+        "l1 less": less(own, other, photographs, seed),
+        "l1 gain": gain(own, other, photographs, seed),
+        "l1 small gain": gain(*small, photographs, seed),
+    }
+
+
+def gains_by_strength(values: MetricTable, reference: MetricTable, seed: int) -> list[Interval]:
+    """Return by which fraction the L1 error of the small pictures is lower, at each laser
+    strength.
+    """
+    gains = []
+    for i in range(len(values.strengths)):
+        own, other = values.values["l1 small"][:, i], reference.values["l1 small"][:, i]
+        both = ~np.isnan(own + other)
+        gains.append(gain(own[both], other[both], values.photographs[both], seed))
+    return gains

@@ -1,44 +1,328 @@
-"""The report page of an evaluation of masks and restorers, with tables, pictures and explanations."""
+"""The page of an evaluation of masks and restorers, with its figures and tables."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, astuple
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.evaluation import evaluation_figures as figures
-from neusee.workflows.evaluation.confidence_intervals import METRICS, Interval, mean
+import numpy as np
+import torch
+
+from neusee.nodes.metrics import most_contrast
+from neusee.workflows.evaluation.confidence_intervals import (
+    METRICS,
+    Interval,
+    MetricTable,
+    Numbers,
+    gains_by_strength,
+    mean,
+)
 from neusee.workflows.evaluation.equal_protection import protection_section
-from neusee.workflows.evaluation.paired_intervals import gains_by_strength
+from neusee.workflows.evaluation.evaluation_points import shown_commands
 from neusee.workflows.evaluation.pipelines import CASES, DRAWN
-from neusee.workflows.evaluation.point_commands import shown_commands
+from neusee.workflows.report.figures.camera_pictures import high
+from neusee.workflows.report.figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    VERMILION,
+    canvas,
+    drawn,
+    encoded,
+    picture,
+)
 from neusee.workflows.report.study_page import Mark, Section
 
 if TYPE_CHECKING:
-    from neusee.workflows.evaluation.evaluation_result import EvaluationResult
+    from neusee.workflows.evaluation.evaluation_result import (
+        EvaluationResult,
+        MaskOptics,
+        MistoldPoint,
+        Panel,
+    )
+
+
+# --- evaluation figures ---------------------------------------------------------------------------
+
+# Figures of an evaluation of masks: pictures by laser, error by laser strength, laser suppression,
+# and contrast.
+
+
+_COLOURS = (BLUE, VERMILION, GREEN, ORANGE, "#56B4E9", "#CC79A7", BLACK, "#777777")
+_STYLES = ("-", "--", ":", "-.")  #: line styles, of which the next begins when all colours are used
+#: marker of a point beside the line style of a curve
+_MARKERS = dict(zip(_STYLES, "osD^", strict=True))
+_GREY = "#777777"
+_LETTERS = 16  #: characters of the longest row name that stays on one line
+
+
+def _looks(names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return the colour and the line style of the curve of each mask, or of each mask with
+    restorer.
+    """
+    count = len(_COLOURS)
+    return {
+        name: {"color": _COLOURS[i % count], "linestyle": _STYLES[i // count % len(_STYLES)]}
+        for i, name in enumerate(names)
+    }
+
+
+@drawn
+def cases(panels: Sequence[Panel]) -> Any:
+    """Draw the pictures of the plain lens, and of every mask with restorer, in rows below the true
+    picture.
+
+    The columns have different lasers. All pictures have the same scale.
+    """
+    rows = list(panels[0].pictures)
+    white = high(panels[0].pictures["truth"])
+    figure, axes = canvas(1.95 * len(panels) + 0.6, 2.0 * len(rows) + 0.3, len(rows), len(panels))
+    for i, panel in enumerate(panels):
+        for j, (name, shown) in enumerate(panel.pictures.items()):
+            title = f"{panel.case}, {_power(panel.strength)}" if panel.strength else "no laser"
+            picture(axes[j, i], encoded(shown / white), "" if j else title)
+            if i == 0:
+                axes[j, i].set_ylabel(_broken(name), fontsize=10)
+    return figure
+
+
+def _power(strength: float) -> str:
+    return f"$10^{{{np.log10(strength):.3g}}}$"
+
+
+def _broken(name: str) -> str:
+    return (
+        name
+        if len(name) <= _LETTERS
+        else re.sub(r" ?\+ ?", "\n+ ", name).replace(", ", ",\n").replace("@", "\n@ ")
+    )
+
+
+@drawn
+def strengths(tables: Mapping[str, MetricTable], small: int) -> Any:
+    """Draw the L1 error of every mask and restorer with its 95 % interval over the laser strength.
+
+    The left plot is for pictures of full size, the right plot for reduced pictures. Intervals of
+    few scenes are much wider than the means are apart; they do not stretch the axis.
+    """
+    figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
+    looks = _looks(list(tables))
+    titles = {"l1": "full size", "l1 small": f"shorter side {small} pixels"}
+    for ax, (metric, title) in zip(axes[0], titles.items(), strict=True):
+        for name, table in tables.items():
+            _line(ax, table, metric, looks[name], name)
+        ax.set_title(f"L1, {title}")
+        ax.set_xlabel("laser strength (multiples of saturation)")
+        values = next(iter(tables.values())).strengths
+        ax.set_xticks(_places(values), ["none" if k == 0 else _power(k) for k in values])
+        ax.set_ylim(0, _top(tables.values(), metric))
+    axes[0, 0].set_ylabel("L1 (sRGB, 0 to 1)")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(3, len(labels)))
+    return figure
+
+
+def _line(ax: Any, table: MetricTable, metric: str, look: Mapping[str, Any], name: str) -> None:
+    intervals = [table.at(metric, i) for i in range(len(table.strengths))]
+    places = _places(table.strengths)
+    ax.plot(
+        places,
+        [x.mean for x in intervals],
+        marker="o",
+        markersize=4,
+        linewidth=1.4,
+        label=name,
+        **look,
+    )
+    low, up = [x.low for x in intervals], [x.high for x in intervals]
+    ax.fill_between(places, low, up, color=look["color"], alpha=0.15, linewidth=0)
+
+
+def _top(tables: Iterable[MetricTable], metric: str) -> float:
+    """Return the end of an axis that shows every mean, and intervals up to three times the
+    largest mean.
+    """
+    intervals: list[Interval] = []
+    for table in tables:
+        intervals += [table.at(metric, i) for i in range(len(table.strengths))]
+    largest = max((x.mean for x in intervals if x.mean > 0), default=0.0)
+    return (
+        1.05
+        * max(
+            largest, min(3 * largest, max([x.high for x in intervals if x.high > 0], default=0.0))
+        )
+        or 1.0
+    )
+
+
+def _places(values: Sequence[float]) -> list[float]:
+    """Return the positions of laser strengths on a logarithmic axis, with strength 0 one decade
+    below the others.
+    """
+    logs = [float(np.log10(k)) for k in values if k > 0]
+    return [float(np.log10(k)) if k > 0 else (min(logs) - 1 if logs else 0.0) for k in values]
+
+
+@drawn
+def wavelengths(result: EvaluationResult) -> Any:
+    """Draw the L1 error of the reduced pictures at the largest strength over the drawn
+    wavelength of each scene.
+    """
+    figure, axes = canvas(11.0, 4.2)
+    ax, looks = axes[0, 0], _looks([p.name for p in result.pipelines])
+    x = np.array([math.nan if metres is None else metres * 1e9 for metres in result.wavelengths])
+    for p in result.pipelines:
+        y = result.tables[p.name].values["l1 small"][:, -1]
+        ax.plot(x, y, ".", markersize=5, alpha=0.6, color=looks[p.name]["color"])
+        ax.plot(*_means(x, y), linewidth=1.6, label=p.name, **looks[p.name])
+    ax.set_xlabel("wavelength of the laser (nm)")
+    ax.set_ylabel("L1 (sRGB, 0 to 1)")
+    ax.set_ylim(bottom=0)
+    handles, labels = ax.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(3, len(labels)))
+    return figure
+
+
+def _means(x: Numbers, y: Numbers) -> tuple[Numbers, Numbers]:
+    """Return the mean of x and y in each sixth of the range of x that has a value."""
+    valid = ~np.isnan(x + y)
+    x, y = x[valid], y[valid]
+    if not len(x):
+        return x, y
+    bin_numbers = np.minimum((6 * (x - x.min()) / max(float(np.ptp(x)), 1e-9)).astype(int), 5)
+    filled = [i for i in range(6) if (bin_numbers == i).any()]
+    return np.array([x[bin_numbers == i].mean() for i in filled]), np.array(
+        [y[bin_numbers == i].mean() for i in filled]
+    )
+
+
+@drawn
+def curves(masks: Mapping[str, MaskOptics]) -> Any:
+    """Draw the laser and background suppression ratios (LSR, BSR) of every mask over the
+    wavelength.
+    """
+    figure, axes = canvas(11.0, 4.2, 1, 2, sharex=True)
+    looks = _looks(list(masks))
+    left, right = axes[0]
+    for name, mask in masks.items():
+        left.plot(mask.wavelengths, mask.lsr, linewidth=1.6, label=name, **looks[name])
+        right.plot(mask.wavelengths, mask.bsr, linewidth=1.6, **looks[name])
+    first = next(iter(masks.values()))
+    left.plot(
+        first.wavelengths,
+        first.floor,
+        color=_GREY,
+        linewidth=1.2,
+        linestyle=(0, (1, 2)),
+        label="energy floor",
+    )
+    left.set_yscale("log")
+    left.set_title("laser suppression ratio: less is better")
+    right.set_title("background suppression ratio: 1 is best")
+    right.set_ylim(0, max(1.1, 1.05 * max(float(mask.bsr.max()) for mask in masks.values())))
+    for ax, name in ((left, "LSR"), (right, "BSR")):
+        ax.set_xlabel("wavelength (nm)")
+        ax.set_ylabel(name)
+    handles, labels = left.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(5, len(labels)))
+    return figure
+
+
+@drawn
+def plane(masks: Mapping[str, MaskOptics]) -> Any:
+    """Draw the image contrast of each mask over its mean laser suppression ratio, and shade what
+    no mask can reach.
+    """
+    figure, axes = canvas(8.4, 5.2)
+    ax = axes[0, 0]
+    floor = float(np.mean([mask.floor.mean() for mask in masks.values()]))
+    smallest = min(floor, *(float(mask.lsr.mean()) for mask in masks.values()))
+    x = np.geomspace(smallest / 3, 1.6, 200)
+    unsuppressed = float(next(iter(masks.values())).unsuppressed.mean())
+    bound = most_contrast(unsuppressed, torch.from_numpy(x)).numpy()
+    ax.fill_between(x, bound, 1.5, color=_GREY, alpha=0.15, linewidth=0)
+    ax.plot(
+        x,
+        bound,
+        color=_GREY,
+        linewidth=1.2,
+        label="rms contrast: no mask that keeps its light is above (Parseval)",
+    )
+    ax.axvspan(
+        x[0],
+        floor,
+        color=BLUE,
+        alpha=0.12,
+        linewidth=0,
+        label="LSR: no mask that keeps its light is here",
+    )
+    looks = _looks(list(masks))
+    for name, mask in masks.items():
+        laser_ratio, colour, mark = (
+            float(mask.lsr.mean()),
+            looks[name]["color"],
+            _MARKERS[looks[name]["linestyle"]],
+        )
+        ax.plot(
+            [laser_ratio, laser_ratio],
+            [mask.median.mean(), mask.rms.mean()],
+            color=colour,
+            linewidth=0.8,
+        )
+        ax.plot(
+            laser_ratio, mask.rms.mean(), mark, markersize=6, markerfacecolor="none", color=colour
+        )
+        ax.plot(laser_ratio, mask.median.mean(), mark, markersize=7, color=colour, label=name)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlim(x[0], x[-1])
+    lowest = min(float(mask.median.mean()) for mask in masks.values())
+    ax.set_ylim(max(min(lowest, float(bound[0])) / 2, 1e-6), 1.2)
+    ax.set_xlabel("mean LSR: to the left, lasers are weaker")
+    ax.set_ylabel("contrast: dot median, ring rms")
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure
+
+
+# --- evaluation page ------------------------------------------------------------------------------
+
+# The report page of an evaluation of masks and restorers, with tables, pictures and explanations.
+
 
 _EACH = ("mean", "low", "high")
-COLUMNS = ("pipeline", "mask", "restorer", "scenes", *(f"{m} {e}" for m in METRICS for e in _EACH),
-           *(f"{name} {e}" for name in ("l1 less", "l1 gain", "l1 small gain") for e in _EACH))  # fmt: skip
-_COARSE = 1.05  #: tolerance of a bound, because a circular aperture is sampled on a square grid of frequencies
+COLUMNS = (
+    "pipeline",
+    "mask",
+    "restorer",
+    "scenes",
+    *map(" ".join, itertools.product(METRICS, _EACH)),
+    *map(" ".join, itertools.product(("l1 less", "l1 gain", "l1 small gain"), _EACH)),
+)
+#: tolerance of a bound, because a circular aperture is sampled on a square grid of frequencies
+_COARSE = 1.05
 _DIGITS = {"psnr": ".2f", "l1": ".4f", "ssim": ".3f", "saturated": ".0f", "above": ".2f"}
 
 
 def draw_pictures(result: EvaluationResult) -> dict[str, bytes]:
     """Draw the figures of the evaluation page, and return the PNG files by name."""
-    waves = {"wavelengths": figures.wavelengths(result)} if _drawn(result) else {}
+    waves = {"wavelengths": wavelengths(result)} if _drawn(result) else {}
     return waves | {
-        "cases": figures.cases(result.panels),
-        "strengths": figures.strengths(result.tables, result.small),
-        "curves": figures.curves(result.masks),
-        "plane": figures.plane(result.masks),
+        "cases": cases(result.panels),
+        "strengths": strengths(result.tables, result.small),
+        "curves": curves(result.masks),
+        "plane": plane(result.masks),
     }
 
 
 def summary(result: EvaluationResult) -> dict[str, Any]:
-    """Return the mean and the interval of every metric, and the gain over the reference, for each mask and restorer."""
+    """Return the mean and the interval of every metric, and the gain over the reference, for
+    each mask and restorer.
+    """
     return {
         p.name: {
             "mask": p.front,
@@ -51,62 +335,109 @@ def summary(result: EvaluationResult) -> dict[str, Any]:
 
 
 def rows(result: EvaluationResult) -> list[Sequence[Any]]:
-    """Return the rows of ``table.csv``, one for each mask and restorer, with the numbers from `summary`."""
+    """Return the rows of ``table.csv``, one for each mask and restorer, with the numbers from
+    `summary`.
+    """
     listed: list[Sequence[Any]] = []
     for p in result.pipelines:
-        each = [result.tables[p.name].mean(metric) for metric in METRICS] + list(result.against[p.name].values())
-        numbers = [x for interval in each for x in astuple(interval)]
-        listed.append((p.name, p.front, p.back, len(result.scenes), *("" if math.isnan(x) else x for x in numbers)))
+        intervals = [result.tables[p.name].mean(metric) for metric in METRICS] + list(
+            result.against[p.name].values()
+        )
+        numbers = itertools.chain(*map(astuple, intervals))
+        listed.append(
+            (
+                p.name,
+                p.front,
+                p.back,
+                len(result.scenes),
+                *("" if math.isnan(x) else x for x in numbers),
+            )
+        )
     return listed
 
 
 def lead(result: EvaluationResult) -> str:
     """Return a few sentences with the main result of the evaluation."""
     best = min(result.pipelines, key=lambda p: float(result.tables[p.name].scenes("l1").mean()))
-    least = _with_interval(result.tables[best.name].mean("l1"), "l1")
-    strengths = ", ".join("none" if k == 0 else f"{k:g}".replace("e+0", "e") for k in result.strengths)
-    enough = len(result.scenes) >= len(CASES) or _drawn(result)
-    few = "" if enough else f" These are too few scenes for all {len(CASES)} lasers of the protocol."
+    lowest = _with_interval(result.tables[best.name].mean("l1"), "l1")
+    strengths = ", ".join(_strength_names(result))
+    return f"""{len(result.scenes)} scenes, laser strengths {strengths} (1 saturates a pixel of the
+        plain lens), {len(result.pipelines)} pipelines of a mask and a restorer. Lowest L1:
+        {best.name}, {lowest}. {_few_text(result)}{_drawn_text(result)}{_equal_text(result)}"""
+
+
+def _few_text(result: EvaluationResult) -> str:
+    """Return that the scenes are too few for all lasers, if they are."""
+    if len(result.scenes) >= len(CASES) or _drawn(result):
+        return ""
+    return f" These are too few scenes for all {len(CASES)} lasers of the protocol."
+
+
+def _drawn_text(result: EvaluationResult) -> str:
+    """Return which values are drawn for each scene."""
+    laser = ""
+    if _drawn(result):
+        laser = " The wavelength of the laser of each scene is drawn by the law of the recipe."
     uncertain = result.recipe.uncertain
-    names = [name for name in (uncertain.names if uncertain else ()) if not name.startswith("lasers.")]
-    laser = " The wavelength of the laser of each scene is drawn by the law of the recipe." if _drawn(result) else ""
-    drawn = f"{laser} These values are drawn for each scene: {', '.join(names)}." if names else laser
+    drawn = uncertain.names if uncertain else ()
+    names = [name for name in drawn if not name.startswith("lasers.")]
+    return f"{laser} These values are drawn for each scene: {', '.join(names)}." if names else laser
+
+
+def _equal_text(result: EvaluationResult) -> str:
+    """Return to which peak filters and stops bring the pipelines, if they do."""
     level = result.protection.level if result.protection else 0.0
+    if not level:
+        return ""
     which = "every pipeline" if all(p.shade for p in result.pipelines) else "each of them once more"
-    equal = f" Filters and stops bring {which} to a peak of {level:g} of the plain lens's." if level else ""
-    return f"""{len(result.scenes)} scenes, laser strengths {strengths} (1 saturates a pixel of the plain lens),
-        {len(result.pipelines)} pipelines of a mask and a restorer. Lowest L1: {best.name}, {least}.
-        {few}{drawn}{equal}"""
+    return f" Filters and stops bring {which} to a peak of {level:g} of the plain lens's."
 
 
 def sections(result: EvaluationResult, shown: Mapping[str, bytes]) -> list[Section]:
     """Return all sections of the report page of an evaluation."""
     compared = (_compared(result, name) for name in dict.fromkeys(result.references.values()))
     gained = (_gained(result, name) for name in dict.fromkeys(result.references.values()))
-    parts = [*protection_section(result), _crossed(result), _by_strength(result), *gained, _numbers(result), *compared]
+    parts = [
+        *protection_section(result),
+        _crossed(result),
+        _by_strength(result),
+        *gained,
+        _numbers(result),
+        *compared,
+    ]
     parts += _mistold(result)
-    text = """Mean over scenes and its 95 % interval. A scene without a laser counts only at the strength none, so
-        that every scene of the other points has a laser. The axis ends at most at three times the largest mean; an
-        interval of few scenes may reach beyond."""
+    text = """Mean over scenes and its 95 % interval. A scene without a laser counts only at the
+        strength none, so that every scene of the other points has a laser. The axis ends at most at
+        three times the largest mean; an interval of few scenes may reach beyond."""
     parts.append(Section("Error over strength", text, picture=shown["strengths"]))
     if "wavelengths" in shown:
-        text = f"""One dot for each scene: its drawn wavelength, and its L1 at the strength {max(result.strengths):g} at
-            {result.small} pixels. Lines: means over sixths of the range."""
+        text = f"""One dot for each scene: its drawn wavelength, and its L1 at the strength
+            {max(result.strengths):g} at {result.small} pixels. Lines: means over sixths of the
+            range."""
         parts.append(Section("Error over wavelength", text, picture=shown["wavelengths"]))
-    text = """The first scene with each laser of the protocol and without a laser, all with the same scale. The rows are
-        the truth, the picture of the plain lens without restoration, and every pipeline; the figure with six lasers has
-        the pictures of the sensor behind each mask too."""
+    text = """The first scene with each laser of the protocol and without a laser, all with the same
+        scale. The rows are the truth, the picture of the plain lens without restoration, and every
+        pipeline; the figure with six lasers has the pictures of the sensor behind each mask too."""
     parts.append(Section("With each laser and without a laser", text, picture=shown["cases"]))
-    return [*parts, _suppression(result, shown["curves"]), _plane(result, shown["plane"]), *_data(result)]
+    return [
+        *parts,
+        _suppression(result, shown["curves"]),
+        _plane(result, shown["plane"]),
+        *_data(result),
+    ]
 
 
 def _crossed(result: EvaluationResult) -> Section:
     masks = list(dict.fromkeys(p.front for p in result.pipelines))
     restorers = list(dict.fromkeys(p.back for p in result.pipelines))
-    l1 = {(p.front, p.back): _with_interval(result.tables[p.name].mean("l1"), "l1") for p in result.pipelines}
+    l1 = {
+        (p.front, p.back): _with_interval(result.tables[p.name].mean("l1"), "l1")
+        for p in result.pipelines
+    }
     listed = [(mask, *(l1.get((mask, back)) for back in restorers)) for mask in masks]
-    text = """L1 at full size (sRGB from 0 to 1, as a display shows it): the mean over the strengths of each scene, then
-        mean and 95 % confidence interval (Student's t). Scenes of one photograph count as one draw."""
+    text = """L1 at full size (sRGB from 0 to 1, as a display shows it): the mean over the strengths
+        of each scene, then mean and 95 % confidence interval (Student's t). Scenes of one
+        photograph count as one draw."""
     return Section("Mask by restorer", text, ("mask", *restorers), listed)
 
 
@@ -119,27 +450,34 @@ def _strength_names(result: EvaluationResult) -> list[str]:
 
 
 def _by_strength(result: EvaluationResult) -> Section:
-    text = f"""L1 of the pictures reduced to {result.small} pixels of their shorter side, at each laser strength: mean
-        and 95 % interval."""
+    text = f"""L1 of the pictures reduced to {result.small} pixels of their shorter side, at each
+        laser strength: mean and 95 % interval."""
     columns = ("pipeline", *_strength_names(result))
     listed = [
-        (p.name, *(_with_interval(result.tables[p.name].at("l1 small", i), "l1") for i in range(len(columns) - 1)))
+        (
+            p.name,
+            *(
+                _with_interval(result.tables[p.name].at("l1 small", i), "l1")
+                for i in range(len(columns) - 1)
+            ),
+        )
         for p in result.pipelines
     ]
     return Section(f"L1 by strength, {result.small} pixels", text, columns, listed)
 
 
 def _gained(result: EvaluationResult, reference: str) -> Section:
-    text = f"""By which fraction the L1 of the reduced pictures lies below that of {reference} on the same pictures, at
-        each laser strength, with 95 % intervals as below. A colour marks an interval without zero."""
+    text = f"""By which fraction the L1 of the reduced pictures lies below that of {reference} on
+        the same pictures, at each laser strength, with 95 % intervals as below. A colour marks an
+        interval without zero."""
     listed: list[Sequence[Any]] = []
     marks: dict[tuple[int, int], Mark] = {}
     for name in (name for name, other in result.references.items() if other == reference != name):
-        found = gains_by_strength(result.tables[name], result.tables[reference], result.recipe.seed)
-        for i, x in enumerate(found, 1):
+        gains = gains_by_strength(result.tables[name], result.tables[reference], result.recipe.seed)
+        for i, x in enumerate(gains, 1):
             if x.excludes_zero:
                 marks[len(listed), i] = "pass" if x.mean > 0 else "fail"
-        listed.append((name, *(_between(x, ".1%") for x in found)))
+        listed.append((name, *(_between(x, ".1%") for x in gains)))
     columns = ("pipeline", *_strength_names(result))
     return Section(f"Gain by strength over {reference}", text, columns, listed, marks=marks)
 
@@ -151,37 +489,57 @@ def _with_interval(x: Interval, metric: str) -> str:
 
 
 def _numbers(result: EvaluationResult) -> Section:
-    text = f"""Mean and 95 % interval over scenes. Small: the picture that a display shows, reduced to {result.small}
-        pixels of its shorter side in linear light, antialiased. Saturated: number of saturated pixels of the raw
-        picture. Above: fraction of the points whose brightest pixel exceeds `reading.damage_multiple`
-        times saturation, where the paper expects damage: a reading of the paper and no verdict, because 1e6 are
-        2 W/cm2 at its exposure, which damages nothing that is known. PSNR is a mean of decibels."""
+    text = f"""Mean and 95 % interval over scenes. Small: the picture that a display shows, reduced
+        to {result.small} pixels of its shorter side in linear light, antialiased. Saturated: number
+        of saturated pixels of the raw picture. Above: fraction of the points whose brightest pixel
+        exceeds `reading.damage_multiple` times saturation, where the paper expects damage: a
+        reading of the paper and no verdict, because 1e6 are 2 W/cm2 at its exposure, which damages
+        nothing that is known. PSNR is a mean of decibels."""
     metrics = [metric for metric in METRICS if metric != "peak"]
     columns = ("pipeline", *(_column(metric) for metric in metrics))
     listed = [
-        (p.name, *(_with_interval(result.tables[p.name].mean(metric), metric) for metric in metrics))
+        (
+            p.name,
+            *(_with_interval(result.tables[p.name].mean(metric), metric) for metric in metrics),
+        )
         for p in result.pipelines
     ]
     return Section("All numbers", text, columns, listed)
 
 
 def _mistold(result: EvaluationResult) -> list[Section]:
-    """Return the section of restorers that are told optics or laser with an error, if there are any."""
+    """Return the section of restorers that are told optics or laser with an error, if there are
+    any.
+    """
     if not result.mistold:
         return []
     errors = list(dict.fromkeys(point.error for point in result.mistold))
-    strength, listed = result.mistold[0].strength, []
-    for name in dict.fromkeys(point.pipeline for point in result.mistold):
-        own = [point for point in result.mistold if point.pipeline == name]
-        told = {point.scene.number: point.true["psnr"] for point in own}
-        each = [[p.wrong["psnr"] for p in own if p.error == error] for error in errors]
-        cells = (_with_interval(mean(values), "psnr") if values else "" for values in each)
-        listed.append((name, _with_interval(mean(list(told.values())), "psnr"), *cells))
-    text = f"""PSNR in dB of the restored picture at the strength {strength:g}, in the first scenes with a laser: mean
-        and 95 % interval. In every other table the restorer is told the exact PSF and the exact pattern of the laser,
-        which no camera knows. Here it is told one of them with the error of the column. The recipe sets these errors in
-        `evaluate.mismatch`; mistold.csv has every point."""
-    return [Section("What the restorer is not told", text, ("pipeline", "told exactly", *errors), listed)]
+    names = dict.fromkeys(point.pipeline for point in result.mistold)
+    strength = result.mistold[0].strength
+    listed = [_mistold_row(result.mistold, name, errors) for name in names]
+    text = f"""PSNR in dB of the restored picture at the strength {strength:g}, in the first scenes
+        with a laser: mean and 95 % interval. In every other table the restorer is told the exact
+        PSF and the exact pattern of the laser, which no camera knows. Here it is told one of them
+        with the error of the column. The recipe sets these errors in `evaluate.mismatch`;
+        mistold.csv has every point."""
+    return [
+        Section(
+            "What the restorer is not told", text, ("pipeline", "told exactly", *errors), listed
+        )
+    ]
+
+
+def _mistold_row(
+    points: Sequence[MistoldPoint], name: str, errors: Sequence[str]
+) -> tuple[str, ...]:
+    """Return the PSNR of one pipeline that is told the truth, and that with each error."""
+    own = [point for point in points if point.pipeline == name]
+    exact = {point.scene.number: point.true["psnr"] for point in own}
+    cells = [_with_interval(mean(list(exact.values())), "psnr")]
+    for error in errors:
+        values = [point.wrong["psnr"] for point in own if point.error == error]
+        cells.append(_with_interval(mean(values), "psnr") if values else "")
+    return (name, *cells)
 
 
 def _column(metric: str) -> str:
@@ -192,10 +550,11 @@ def _column(metric: str) -> str:
 
 
 def _compared(result: EvaluationResult, reference: str) -> Section:
-    text = f"""Differences from {reference} in the same scenes. L1 less: by how much L1 is lower. Gain: the same
-        as a fraction of the mean L1 of the reference. Intervals of 95 % come from 10 000 draws of the photographs
-        (bootstrap-t); fewer than five photographs have no interval. A colour marks an interval without zero. If many
-        pipelines are compared with one reference, about one in twenty is marked by chance."""
+    text = f"""Differences from {reference} in the same scenes. L1 less: by how much L1 is lower.
+        Gain: the same as a fraction of the mean L1 of the reference. Intervals of 95 % come from 10
+        000 draws of the photographs (bootstrap-t); fewer than five photographs have no interval. A
+        colour marks an interval without zero. If many pipelines are compared with one reference,
+        about one in twenty is marked by chance."""
     listed: list[Sequence[Any]] = []
     marks: dict[tuple[int, int], Mark] = {}
     for p in result.pipelines:
@@ -205,21 +564,26 @@ def _compared(result: EvaluationResult, reference: str) -> Section:
         for column, interval in ((1, less), (2, share), (3, small)):
             if interval.excludes_zero:
                 marks[len(listed), column] = "pass" if interval.mean > 0 else "fail"
-        listed.append((p.name, _between(less, ".4f"), _between(share, ".1%"), _between(small, ".1%")))
+        listed.append(
+            (p.name, _between(less, ".4f"), _between(share, ".1%"), _between(small, ".1%"))
+        )
     columns = ("pipeline", "L1 less", "gain", "gain, small")
     return Section(f"Against {reference}", text, columns, listed, marks=marks)
 
 
 def _between(x: Interval, digits: str) -> str:
-    return f"{x.mean:{digits}}" + ("" if math.isnan(x.low) else f" ({x.low:{digits}} to {x.high:{digits}})")
+    return f"{x.mean:{digits}}" + (
+        "" if math.isnan(x.low) else f" ({x.low:{digits}} to {x.high:{digits}})"
+    )
 
 
 def _suppression(result: EvaluationResult, picture: bytes) -> Section:
     own = next(p.front for p in result.pipelines if p.name == result.reference)
-    text = f"""LSR: the brightest pixel of a laser with the mask, divided by the brightest pixel without the mask; BSR:
-        share of the scene's light that stays in the field, at most 1, mean over scenes. Energy floor: the
-        LSR of light that is spread evenly over the window of the PSF. Stronger: the mean LSR of {own} divided by the
-        mean LSR of the mask. The file suppression.csv has LSR and BSR by wavelength."""
+    text = f"""LSR: the brightest pixel of a laser with the mask, divided by the brightest pixel
+        without the mask; BSR: share of the scene's light that stays in the field, at most 1, mean
+        over scenes. Energy floor: the LSR of light that is spread evenly over the window of the
+        PSF. Stronger: the mean LSR of {own} divided by the mean LSR of the mask. The file
+        suppression.csv has LSR and BSR by wavelength."""
     base = float(result.masks[own].lsr.mean())
     listed: list[Sequence[Any]] = []
     for name, m in result.masks.items():
@@ -231,11 +595,13 @@ def _suppression(result: EvaluationResult, picture: bytes) -> Section:
 
 
 def _plane(result: EvaluationResult, picture: bytes) -> Section:
-    text = """Means over wavelengths, with the contrast within the band that the clear aperture passes. A low peak costs
-        contrast: by Parseval the rms over all sampled frequencies is at most sqrt(LSR p0), where p0 is the fraction of
-        light in the brightest pixel of the clear lens, and the rms within the band, a fraction 4 p0 of the frequencies,
-        is at most sqrt(LSR) / 2; the median is at most 1.41 times the rms. If a mask sends light out of the window, the
-        contrast is that of the remaining light, and the bound of the mask, in the table, is higher."""
+    text = """Means over wavelengths, with the contrast within the band that the clear aperture
+        passes. A low peak costs contrast: by Parseval the rms over all sampled frequencies is at
+        most sqrt(LSR p0), where p0 is the fraction of light in the brightest pixel of the clear
+        lens, and the rms within the band, a fraction 4 p0 of the frequencies, is at most sqrt(LSR)
+        / 2; the median is at most 1.41 times the rms. If a mask sends light out of the window, the
+        contrast is that of the remaining light, and the bound of the mask, in the table, is
+        higher."""
     listed: list[Sequence[Any]] = []
     marks: dict[tuple[int, int], Mark] = {}
     for name, m in result.masks.items():
@@ -246,28 +612,43 @@ def _plane(result: EvaluationResult, picture: bytes) -> Section:
 
 
 def _commands(result: EvaluationResult) -> list[Section]:
-    """Return the section with the command of one point of each pipeline, beside the numbers that it gives."""
+    """Return the section with the command of one point of each pipeline, beside the numbers that
+    it gives.
+    """
     listed: list[Sequence[Any]] = []
     for name, place, strength, command in shown_commands(result.commands):
         point = result.points[name][place][strength]
-        numbers = (f"{point['l1']:.6g}", f"{point['psnr']:.6g}", f"{point['ssim']:.6g}", f"{point['saturated']:.0f}")
-        said = command or "no command: a random part of the camera, such as dirt, has the seed of the evaluation"
+        numbers = (
+            f"{point['l1']:.6g}",
+            f"{point['psnr']:.6g}",
+            f"{point['ssim']:.6g}",
+            f"{point['saturated']:.0f}",
+        )
+        said = (
+            command
+            or "no command: a random part of the camera, such as dirt, has "
+            "the seed of the evaluation"
+        )
         listed.append((name, result.scenes[place].number, f"{strength:g}", *numbers, said))
     if not listed:
         return []
-    text = """One point of each pipeline, with the command that gives its numbers at full size, in the folder in which
-        this evaluation was started: `metrics.csv` of the run has them. Each point has its command in `points.csv`. The
-        same recipe with another seed, another part of the photograph, or another direction of the laser gives other
-        numbers."""
+    text = """One point of each pipeline, with the command that gives its numbers at full size, in
+        the folder in which this evaluation was started: `metrics.csv` of the run has them. Each
+        point has its command in `points.csv`. The same recipe with another seed, another part of
+        the photograph, or another direction of the laser gives other numbers."""
     columns = ("pipeline", "scene", "strength", "L1", "PSNR", "SSIM", "saturated", "command")
     return [Section("The same numbers again", text, columns, listed)]
 
 
 def _data(result: EvaluationResult) -> list[Section]:
-    text = """Scenes in the order of their numbers. The seed of the recipe chooses part of a photograph for each scene.
-        The seed of a scene decides the direction of the laser and the noise, which are the same for every pipeline."""
+    text = """Scenes in the order of their numbers. The seed of the recipe chooses part of a
+        photograph for each scene. The seed of a scene decides the direction of the laser and the
+        noise, which are the same for every pipeline."""
     listed = [(s.number, s.name, s.case, s.seed) for s in result.scenes]
-    parts = [Section("Scenes", text, ("scene", "photograph", "laser", "seed"), listed), *_commands(result)]
+    parts = [
+        Section("Scenes", text, ("scene", "photograph", "laser", "seed"), listed),
+        *_commands(result),
+    ]
     if result.broken:
         broken = [(path.name, reason) for path, reason in result.broken]
         parts.append(Section("Photographs that cannot be read", "", ("file", "why"), broken))

@@ -1,33 +1,163 @@
-"""The evaluation points: the metrics of one scene at one laser strength with one pipeline (mask and restorer)."""
+"""The metrics of one scene, laser and pipeline, and the command that repeats them."""
 
 from __future__ import annotations
 
+import shlex
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.metrics import quality
+from neusee.nodes.resampling import resize
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.node_call import call, place
-from neusee.workflows.evaluation.evaluation_scenes import Scene
-from neusee.workflows.evaluation.mistold_filter import shifted
-from neusee.workflows.evaluation.pipelines import BEAM, NONE, PipelineRecipes
-from neusee.workflows.graph.recipe_graph import Recipe, Step, dependents, needed
-from neusee.workflows.graph.told_copies import TOLD
+from neusee.workflows.evaluation.evaluation_scenes import PHOTOGRAPH, Scene
+from neusee.workflows.evaluation.pipelines import (
+    BEAM,
+    NONE,
+    WAVELENGTHS,
+    PipelineRecipes,
+    laser_line,
+)
+from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.graph.recipe_graph import (
+    FRAME,
+    TOLD,
+    Recipe,
+    Step,
+    dependents,
+    knowers,
+    known,
+    needed,
+    with_copies,
+)
 from neusee.workflows.keys.cache_key import device_kind, digest, key_of
-from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.keys.code_digest import Code, engine
+from neusee.workflows.recipe.blocks.evaluate_block import Mismatch
+from neusee.workflows.recipe.distributions.shapes import written
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs, NothingDrawn
-from neusee.workflows.store.memo import compute_once
-from neusee.workflows.store.result_store import Store
+from neusee.workflows.recipe.loading import load
+from neusee.workflows.recipe.text.overrides import Override
+from neusee.workflows.store.result_store import Store, compute_once
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+
+# --- mistold filter -------------------------------------------------------------------------------
+
+# Recipes whose restorer is told optics and laser with one error, while the camera stays as it is.
+#
+# The steps that compute what the restorer knows are copied with another parameter; the copies have
+# the prefix ``told_``.
+
+
+def errors_of(recipe: Recipe, mismatch: Mismatch) -> dict[str, Mapping[str, Any]]:
+    """Return the errors in what the restorer of a recipe is told: by text, what is added to which
+    parameters.
+
+    A parameter with None is removed: the input ``dirt`` of a pupil. The result is empty if the
+    restorer knows nothing.
+    """
+    told_steps = known(recipe, _readers(recipe))
+    if not told_steps:
+        return {}
+    steps = needed(recipe, told_steps)
+    return _laser_errors(recipe, mismatch, steps) | _pupil_errors(recipe, mismatch, steps)
+
+
+def _laser_errors(
+    recipe: Recipe, mismatch: Mismatch, steps: Sequence[str]
+) -> dict[str, Mapping[str, Any]]:
+    """Return the errors in direction and wavelength of a laser whose direction ``steps`` read."""
+    direction, line = f"direction[{BEAM}]", f"line[{BEAM}]"
+    glare = [name for name in steps if direction in recipe.steps[name].sources]
+    if not glare:
+        return {}
+    errors: dict[str, Mapping[str, Any]] = {}
+    if mismatch.pixels:
+        lens = recipe.steps[glare[0]].params
+        angle = mismatch.pixels * lens["pixel_pitch"] / lens["focal_length"]
+        errors[f"direction {mismatch.pixels:g} px off"] = {f"{direction}.angle": (angle, angle)}
+    if mismatch.wavelength and "wavelength" in recipe.steps[line].params:
+        text = f"wavelength {mismatch.wavelength * 1e9:g} nm off"
+        errors[text] = {f"{line}.wavelength": mismatch.wavelength}
+    return errors
+
+
+def _pupil_errors(
+    recipe: Recipe, mismatch: Mismatch, steps: Sequence[str]
+) -> dict[str, Mapping[str, Any]]:
+    """Return the errors in defocus and dirt of the pupils among ``steps``."""
+    pupils = [name for name in steps if recipe.steps[name].node.path == "optics.pupil"]
+    dirty = [name for name in pupils if recipe.steps[name].wires.get("dirt") is not None]
+    errors: dict[str, Mapping[str, Any]] = {}
+    if mismatch.defocus and pupils:
+        text = f"defocus {mismatch.defocus:g} waves off"
+        errors[text] = _of_each(pupils, "defocus", mismatch.defocus)
+    if mismatch.dirt and dirty:
+        errors["dirt not told"] = _of_each(dirty, "dirt", None)
+    return errors
+
+
+def _of_each(steps: Sequence[str], parameter: str, value: Any) -> dict[str, Any]:
+    """Return the same value of a parameter of each step."""
+    return {f"{step}.{parameter}": value for step in steps}
+
+
+def mistold(recipe: Recipe, error: Mapping[str, Any]) -> Recipe:
+    """Return the recipe with a copy of each step that the error changes, from which alone the
+    restorer knows.
+    """
+    added = {
+        name: value for name, value in error.items() if name.rpartition(".")[0] in recipe.steps
+    }
+    changed = {name.rpartition(".")[0] for name in added}
+    readers = _readers(recipe)
+    copied = {
+        name
+        for name in dependents(recipe, changed) & set(needed(recipe, known(recipe, readers)))
+        if not recipe.steps[name].node.random or name in changed  # another name would draw anew
+    }
+    return with_copies(recipe, readers, copied, lambda step: _changed(step, added))
+
+
+def shifted(value: Any, by: Any) -> Any:
+    """Return a parameter to which an error is added: a number, or the two angles of a direction."""
+    return (
+        tuple(a + b for a, b in zip(value, by, strict=True))
+        if isinstance(by, tuple)
+        else value + by
+    )
+
+
+def _readers(recipe: Recipe) -> list[str]:
+    """Return the steps that restore the picture of the mask and know optics or lasers."""
+    return knowers(recipe, dependents(recipe, [FRAME])) if FRAME in recipe.steps else []
+
+
+def _changed(step: Step, error: Mapping[str, Any]) -> Step:
+    params, wires = dict(step.params), dict(step.wires)
+    for full, by in error.items():
+        name, _, param = full.rpartition(".")
+        if name != step.name:
+            continue
+        if by is None:
+            wires[param] = None
+        elif params[param] is not None:  # a direction is drawn for each scene
+            params[param] = shifted(params[param], by)
+    return replace(step, params=params, wires=wires)
+
+
+# --- evaluation points ----------------------------------------------------------------------------
+
+# The evaluation points: the metrics of one scene at one laser strength with one pipeline (mask and
+# restorer).
+
 
 _MOVED = ("spot", "photons")  #: names of the first steps that depend on the laser strength
 
@@ -48,7 +178,9 @@ class PointRequest:
 
 
 class EvaluationPoints:
-    """The computation of evaluation points, in which a result that several evaluation points use is computed once."""
+    """The computation of evaluation points, in which a result that several evaluation points use
+    is computed once.
+    """
 
     def __init__(self, store: Store, small: int, device: str = "cpu") -> None:
         self.store, self.small, self.device = store, small, device
@@ -56,15 +188,21 @@ class EvaluationPoints:
         self.seconds = 0.0  #: computing time of these evaluation points
         self._code = Code(store.code_memo)
         self._functions: dict[tuple[str, str, int], Any] = {}  #: a recipe is known by its identity
-        #: by identity of a recipe; the recipe is kept too, so that no other recipe gets the same identity
+        #: by identity of a recipe; the recipe is kept too, so that no other recipe gets the same
+        #: identity
         self._drawn: dict[Any, tuple[Recipe, Inputs | None]] = {}
-        self._fixed: dict[str, Any] = {}  #: by key, results that do not depend on a scene: one copy for all functions
+        #: by key, results that do not depend on a scene: one copy for all functions
+        self._fixed: dict[str, Any] = {}
         self._kept = _SharedResults()
 
     def point(self, pipeline: PipelineRecipes, point: PointRequest) -> PointNumbers:
-        """Return the metrics of an evaluation point from the store, or compute and store the metrics."""
+        """Return the metrics of an evaluation point from the store, or compute and store the
+        metrics.
+        """
         compute = partial(self._measure, pipeline, point)
-        return compute_once(self.store, self.key(pipeline, point), dict, compute, {"step": "evaluate"})
+        return compute_once(
+            self.store, self.key(pipeline, point), dict, compute, {"step": "evaluate"}
+        )
 
     def _measure(self, pipeline: PipelineRecipes, point: PointRequest) -> PointNumbers:
         began = time.perf_counter()
@@ -73,22 +211,28 @@ class EvaluationPoints:
         self.computed += 1
         return numbers
 
-    def values(self, pipeline: PipelineRecipes, point: PointRequest, more: Sequence[str] = ()) -> dict[str, Any]:
-        """Run a pipeline on one scene and laser, and return the outputs and the results of the steps ``more``."""
-        outputs = (*pipeline.pipeline.outputs, *more)
+    def values(
+        self, pipeline: PipelineRecipes, point: PointRequest, further: Sequence[str] = ()
+    ) -> dict[str, Any]:
+        """Run a pipeline on one scene and laser, and return the outputs and the results of the
+        ``further`` steps.
+        """
+        outputs = (*pipeline.pipeline.outputs, *further)
         function = self._function(pipeline, point.lit, outputs)
         self._kept.turn(point)
         with torch.no_grad():
             changed = self._changed(pipeline, point, outputs)
-            known = {name: value for name, value in changed.items() if name in function.free}
-            values: dict[str, Any] = function({"scene": point.scene.picture, **known})
+            free_values = {name: value for name, value in changed.items() if name in function.free}
+            values: dict[str, Any] = function({"scene": point.scene.picture, **free_values})
         return values
 
     def forget(self) -> None:
         """Remove all results that depend on the laser from memory."""
         self._functions = {name: f for name, f in self._functions.items() if name[1] == NONE}
-        used = {id(value) for f in self._functions.values() for value in f.fixed.values()}
-        self._fixed = {key: value for key, value in self._fixed.items() if id(value) in used}
+        in_use = set[int]()
+        for function in self._functions.values():
+            in_use |= set(map(id, function.fixed.values()))
+        self._fixed = {key: value for key, value in self._fixed.items() if id(value) in in_use}
         self._kept.clear()
 
     def release(self) -> None:
@@ -99,14 +243,30 @@ class EvaluationPoints:
         self._kept.clear()
 
     def key(self, pipeline: PipelineRecipes, point: PointRequest) -> str:
-        """Return the cache key of an evaluation point from the keys of its steps and the settings of the comparison."""
+        """Return the cache key of an evaluation point from the keys of its steps and the
+        settings of the comparison.
+        """
         recipe, outputs = pipeline.recipe(point.lit), pipeline.pipeline.outputs
         keys = self.point_keys(pipeline, point, outputs)
-        within = [recipe.tolerance, recipe.exact, recipe.estimates, device_kind(self.device), self.small]
-        own = [self._code.digest(used.__module__) for used in (quality, resize)]
-        return digest("evaluate", engine("evaluation.evaluation_points"), [keys[name] for name in outputs], within, own)
+        within = [
+            recipe.tolerance,
+            recipe.exact,
+            recipe.estimates,
+            device_kind(self.device),
+            self.small,
+        ]
+        own = [self._code.digest(function.__module__) for function in (quality, resize)]
+        return digest(
+            "evaluate",
+            engine("evaluation.evaluation_points"),
+            [keys[name] for name in outputs],
+            within,
+            own,
+        )
 
-    def point_keys(self, pipeline: PipelineRecipes, point: PointRequest, outputs: Sequence[str]) -> dict[str, str]:
+    def point_keys(
+        self, pipeline: PipelineRecipes, point: PointRequest, outputs: Sequence[str]
+    ) -> dict[str, str]:
         """Return the cache keys of the steps of an evaluation point."""
         recipe = pipeline.recipe(point.lit)
         params: dict[str, dict[str, Any]] = {}
@@ -119,8 +279,12 @@ class EvaluationPoints:
         }
         return self.keys(replace(recipe, steps={**recipe.steps, **steps}), outputs, point.scene)
 
-    def keys(self, recipe: Recipe, outputs: Iterable[str], scene: Scene | None = None) -> dict[str, str]:
-        """Return the cache key of each step, with the seed of the scene for all steps that depend on the scene."""
+    def keys(
+        self, recipe: Recipe, outputs: Iterable[str], scene: Scene | None = None
+    ) -> dict[str, str]:
+        """Return the cache key of each step, with the seed of the scene for all steps that
+        depend on the scene.
+        """
         keys = {"scene": scene.key(self._code)} if scene else {}
         live = dependents(recipe, keys)
         for name in needed(recipe, outputs):
@@ -134,23 +298,37 @@ class EvaluationPoints:
         name = (f"{pipeline.name} {outputs}", case, id(pipeline.recipe))
         if name not in self._functions:
             recipe = replace(pipeline.recipe(case), estimates=False)  # one PSF for all scenes
-            whole = with_substitutions(recipe, outputs)  # as in `run`, but the scene is an argument
-            steps = set(needed(whole, outputs))
+            full_recipe = with_substitutions(
+                recipe, outputs
+            )  # as in `run`, but the scene is an argument
+            steps = set(needed(full_recipe, outputs))
             inputs = self.inputs(pipeline, case, outputs)
-            free = ["scene", *(r for r in (inputs.readers if inputs else ()) if r.rpartition(".")[0] in steps)]
+            free = [
+                "scene",
+                *(r for r in (inputs.readers if inputs else ()) if r.rpartition(".")[0] in steps),
+            ]
             if case != NONE:
-                free += [f"direction[{BEAM}].angle", *(f"{spot}.strength" for spot in spots(recipe, outputs))]
+                free += [
+                    f"direction[{BEAM}].angle",
+                    *(f"{spot}.strength" for spot in spots(recipe, outputs)),
+                ]
             free += [TOLD + name for name in free if TOLD + name.rpartition(".")[0] in steps]
-            caller = self._kept.caller(dependents(whole, list(filter(_is_moved, whole.steps))))
+            caller = self._kept.caller(
+                dependents(full_recipe, list(filter(_is_moved, full_recipe.steps)))
+            )
             ways: dict[str, Any] = {"store": self.store, "device": self.device, "caller": caller}
-            self._functions[name] = as_function(whole, *free, outputs=outputs, **ways)
-            self._share(self._functions[name], whole)
+            self._functions[name] = as_function(full_recipe, *free, outputs=outputs, **ways)
+            self._share(self._functions[name], full_recipe)
         return self._functions[name]
 
-    def _changed(self, pipeline: PipelineRecipes, point: PointRequest, outputs: Sequence[str]) -> dict[str, Any]:
-        """Return the parameters that an evaluation point sets: sampled values, laser direction and laser strength.
+    def _changed(
+        self, pipeline: PipelineRecipes, point: PointRequest, outputs: Sequence[str]
+    ) -> dict[str, Any]:
+        """Return the parameters that an evaluation point sets: sampled values, laser direction and
+        laser strength.
 
-        A copy of a step from which the restorer is told gets the same values, with the error of the pipeline.
+        A copy of a step from which the restorer is told gets the same values, with the error of the
+        pipeline.
         """
         recipe = pipeline.recipe(point.lit)
         inputs = self.inputs(pipeline, point.lit, outputs)
@@ -158,15 +336,24 @@ class EvaluationPoints:
         if point.lit != NONE:
             changed[f"direction[{BEAM}].angle"] = point.scene.angle(recipe)
             changed |= {f"{spot}.strength": point.strength for spot in spots(recipe, outputs)}
-        copies = {name: value for name, value in changed.items() if TOLD + name.rpartition(".")[0] in recipe.steps}
+        copies = {
+            name: value
+            for name, value in changed.items()
+            if TOLD + name.rpartition(".")[0] in recipe.steps
+        }
         wrong = {name: value for name, value in pipeline.error.items() if value is not None}
-        told = {TOLD + name: shifted(x, wrong[name]) if name in wrong else x for name, x in copies.items()}
-        return changed | told
+        told_values = {
+            TOLD + name: shifted(x, wrong[name]) if name in wrong else x
+            for name, x in copies.items()
+        }
+        return changed | told_values
 
     def inputs(self, pipeline: PipelineRecipes, case: str, outputs: Sequence[str]) -> Inputs | None:
-        """Return the uncertain inputs of a pipeline, or None if no output depends on an uncertain input.
+        """Return the uncertain inputs of a pipeline, or None if no output depends on an uncertain
+        input.
 
-        A restorer that is told an error gets the values of the recipe without the error, whose steps it copies.
+        A restorer that is told an error gets the values of the recipe without the error, whose
+        steps it copies.
         """
         recipe = (pipeline.true or pipeline.recipe)(case)
         if recipe.uncertain is None or not recipe.uncertain.names:
@@ -179,20 +366,24 @@ class EvaluationPoints:
         return self._drawn[key][1]
 
     def _share(self, function: Any, recipe: Recipe) -> None:
-        """Replace constant results in a recipe function by the equal results of an earlier function, to save memory."""
+        """Replace constant results in a recipe function by the equal results of an earlier
+        function, to save memory.
+        """
         keys = self.keys(recipe, function.fixed)
         for name, value in function.fixed.items():
             function.fixed[name] = self._fixed.setdefault(keys[name], value)
 
     def _numbers(self, pipeline: PipelineRecipes, values: Mapping[str, Any]) -> PointNumbers:
         line, truth = pipeline.pipeline, values["truth"]
-        small = whole = values[line.quality]
+        small = full = values[line.quality]
         if min(truth.shape[-2:]) > self.small:
             domain = pipeline.recipe(NONE).steps[line.quality].params["domain"]
-            small = quality(reduced(values[line.picture], self.small), reduced(truth, self.small), domain=domain)
+            small = quality(
+                reduced(values[line.picture], self.small), reduced(truth, self.small), domain=domain
+            )
         peak, saturated = values["peak[mask]"], values["saturated[mask]"]
         return {
-            **{name: float(value) for name, value in whole._asdict().items()},
+            **{name: float(value) for name, value in full._asdict().items()},
             **{f"{name} small": float(value) for name, value in small._asdict().items()},
             "saturated": float(saturated.pixels),
             "peak": float(peak.irradiance),
@@ -202,7 +393,9 @@ class EvaluationPoints:
 
 
 class _SharedResults:
-    """A cache of results that successive evaluation points have in common, by scene and by laser strength."""
+    """A cache of results that successive evaluation points have in common, by scene and by laser
+    strength.
+    """
 
     def __init__(self) -> None:
         self._of_scene: dict[Any, tuple[Any, Any]] = {}
@@ -217,7 +410,9 @@ class _SharedResults:
         self._of_strength.clear()
 
     def turn(self, point: PointRequest) -> None:
-        """Begin an evaluation point, and remove the cached results of other scenes, lasers and laser strengths."""
+        """Begin an evaluation point, and remove the cached results of other scenes, lasers and
+        laser strengths.
+        """
         scene = (point.scene.number, point.scene.seed, point.scene.case)
         if scene != self._scene:
             self._of_scene.clear()
@@ -226,19 +421,23 @@ class _SharedResults:
         self._scene, self._strength, self._seed = scene, point.strength, point.scene.seed
 
     def caller(self, moved: set[str]) -> Callable[..., Any]:
-        """Return a function that computes a step, or returns the cached result if the input objects are the same.
+        """Return a function that computes a step, or returns the cached result if the input objects
+        are the same.
 
         ``moved`` names the steps that depend on the laser strength.
         """
 
-        def compute(step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str) -> Any:
-            kept = self._of_strength if step.name in moved else self._of_scene
+        def compute(
+            step: Step, inputs: Sequence[Any], params: Mapping[str, Any], seed: int, device: str
+        ) -> Any:
+            results = self._of_strength if step.name in moved else self._of_scene
             own = (step.name, self._seed) if step.node.random else ()
             identities = [tuple(map(id, x)) if type(x) is list else id(x) for x in inputs]
             key = (own, step.node.path, repr(sorted(params.items())), device, *identities)
-            if key not in kept:  # the inputs are kept too, so that no other object gets their identity
-                kept[key] = (inputs, call(step, inputs, params, self._seed, device))
-            return kept[key][1]
+            # the inputs are kept too, so that no other object gets their identity
+            if key not in results:
+                results[key] = (inputs, call(step, inputs, params, self._seed, device))
+            return results[key][1]
 
         return compute
 
@@ -254,7 +453,194 @@ def spots(recipe: Recipe, outputs: Sequence[str]) -> list[str]:
 
 
 def reduced(picture: Tensor, side: int) -> Tensor:
-    """Clip a picture to [0, 1], and resize it, antialiased, so that its shorter side has ``side`` pixels."""
+    """Clip a picture to [0, 1], and resize it, antialiased, so that its shorter side has
+    ``side`` pixels.
+    """
     y, x = picture.shape[-2:]
     scale = side / min(y, x)
     return resize(picture.clamp(0, 1), round(y * scale), round(x * scale))
+
+
+# --- point commands -------------------------------------------------------------------------------
+
+# The command of `neusee run` that gives the numbers of an evaluation point, to the last bit.
+#
+# The command has the camera of the evaluation, the mask and the restorer, the part of the
+# photograph, the laser with its direction, the seed of the scene, and the values that were drawn
+# for the scene.
+
+
+_WAVELENGTH, _DIRECTION = f"lasers.{BEAM}.wavelength", f"direction[{BEAM}]"
+
+
+@dataclass(frozen=True)
+class PointCommands:
+    """What the commands of all points of an evaluation have in common."""
+
+    recipe: str
+    changes: Sequence[str | Override]
+    folder: Path  #: in which the commands are run
+    bench: EvaluationPoints
+
+    def commands(
+        self,
+        pipelines: Sequence[PipelineRecipes],
+        scenes: Sequence[Scene],
+        strengths: Sequence[float],
+    ) -> dict[str, list[dict[float, str]]]:
+        """Return the command of each point by pipeline, scene and strength; empty where no command
+        gives the point.
+
+        One point of each pipeline is proved, and one beyond the scene 0, which has the seed of the
+        evaluation: the command loads a recipe whose steps have the same keys.
+        """
+        proved: dict[tuple[str, bool], bool] = {}
+        listed: dict[str, list[dict[float, str]]] = {}
+        for pipeline in pipelines:
+            listed[pipeline.name] = []
+            for scene in scenes:
+                points = [
+                    PointRequest(scene, k) for k in (strengths if scene.case != NONE else (0.0,))
+                ]
+                kind = (pipeline.name, scene.number == 0)
+                if kind not in proved:
+                    proved[kind] = self.is_same(pipeline, points[-1])
+                own = {
+                    point.strength: self._command(pipeline, point) if proved[kind] else ""
+                    for point in points
+                }
+                listed[pipeline.name].append(own)
+        return listed
+
+    def _command(self, pipeline: PipelineRecipes, point: PointRequest) -> str:
+        return shlex.join(["neusee", "run", self.recipe, *self.words(pipeline, point)])
+
+    def words(
+        self, pipeline: PipelineRecipes, point: PointRequest, strength: float | None = None
+    ) -> list[str]:
+        """Return the arguments of `neusee run` after the recipe; ``strength`` replaces that of
+        the laser.
+        """
+        scene, line = point.scene, pipeline.pipeline
+        recipe = pipeline.recipe(point.lit)
+        drawn = self._drawn(pipeline, point)
+        wavelength = drawn.pop(_WAVELENGTH, None)
+        words = [change if isinstance(change, str) else change.text for change in self.changes]
+        words += [
+            *pipeline.words,
+            *_scene_words(recipe, scene),
+            _laser_word(pipeline, point, wavelength, strength),
+        ]
+        words += [f"{path}={value}" for path, value in drawn.items()]
+        outputs = ", ".join(f'"{name}"' for name in (line.quality, "saturated[mask]", "peak[mask]"))
+        return [*words, f"seed={scene.seed}", "estimates=false", f"outputs=[{outputs}]"]
+
+    def _drawn(self, pipeline: PipelineRecipes, point: PointRequest) -> dict[str, str]:
+        """Return the values that were drawn for a scene, as they are written in a recipe."""
+        inputs = self.bench.inputs(pipeline, point.lit, pipeline.pipeline.outputs)
+        if inputs is None:
+            return {}
+        laws, units = inputs.uncertain.laws, inputs.uncertain.units
+        drawn = point.scene.draw(inputs)
+        return {
+            path: str(written(value, laws[path].unit if path in laws else units[path]))
+            for path, value in drawn.items()
+        }
+
+    def is_same(self, pipeline: PipelineRecipes, point: PointRequest) -> bool:
+        """Return True if the recipe of a command has the steps of an evaluation point, with equal
+        keys.
+
+        An evaluation computes a laser of strength 1 and gives each spot its strength, and so does
+        this comparison. A random step that no scene reaches, such as dirt on the lens, has the seed
+        of the evaluation, which the command gives only for the scene 0.
+        """
+        outputs = [name for name in pipeline.pipeline.outputs if name != "bsr[mask]"]
+        try:
+            recipe = load(self.recipe, self.words(pipeline, point, 1.0), self.folder)
+        except RecipeError:
+            return False
+        scene = point.scene
+        if scene.seed != scene.recipe.seed and _has_fixed_noise(recipe, outputs):
+            return False
+        if scene.path is not None and not _shows(recipe, scene):
+            return False
+        steps = dict(recipe.steps)
+        for name in spots(recipe, outputs):
+            steps[name] = replace(
+                steps[name], params={**steps[name].params, "strength": point.strength}
+            )
+        same_seed = replace(recipe, seed=scene.recipe.seed, steps=steps)
+        return self.bench.keys(same_seed, outputs, scene) == self.bench.point_keys(
+            pipeline, point, outputs
+        )
+
+
+def _has_fixed_noise(recipe: Recipe, outputs: Sequence[str]) -> bool:
+    order = needed(recipe, outputs)
+    moved = dependents(recipe, ["scene"], order) | {_DIRECTION}
+    return any(recipe.steps[name].node.random for name in order if name not in moved)
+
+
+def _shows(recipe: Recipe, scene: Scene) -> bool:
+    """Return True if the scene of a recipe is the part of the photograph that an evaluation
+    shows.
+    """
+    step = recipe.steps["scene"]
+    if step.node.path != PHOTOGRAPH or scene.path is None:
+        return False
+    file, shape, crop = (step.params.get(name) for name in ("file", "shape", "crop"))
+    same_file = Path(str(file)).absolute() == scene.path.absolute()
+    return (
+        same_file
+        and tuple(shape or ()) == scene.shape
+        and tuple(crop or ()) == (scene.recipe.seed, scene.number)
+    )
+
+
+def _scene_words(recipe: Recipe, scene: Scene) -> list[str]:
+    """Return the words that show a part of a photograph, or nothing for the recipe's own scene."""
+    if scene.path is None:
+        return []
+    file, crop = _quoted(scene.path), f"[{scene.recipe.seed}, {scene.number}]"
+    step = recipe.steps["scene"]
+    if step.node.path == PHOTOGRAPH and "scene.file" in recipe.config.settings:
+        return [f"scene.file={file}", f"+steps.scene.with.crop={crop}"]
+    shape = list(scene.shape)
+    return [
+        f"steps.scene={{node: {PHOTOGRAPH}, with: {{file: {file}, shape: {shape}, crop: {crop}}}}}"
+    ]
+
+
+def _laser_word(
+    pipeline: PipelineRecipes, point: PointRequest, wavelength: str | None, strength: float | None
+) -> str:
+    """Return the word that sets the laser of a scene, with its direction and strength."""
+    if point.lit == NONE:
+        return "lasers={}"
+    y, x = point.scene.angle(pipeline.recipe(point.lit))
+    if wavelength is None:
+        line = laser_line(WAVELENGTHS[point.lit], pipeline.fwhm)
+    else:
+        line = f"wavelength: '{wavelength}', fwhm: {pipeline.fwhm * 1e9:g} nm"
+    shown = point.strength if strength is None else strength
+    return f"lasers={{{BEAM}: {{{line}, strength: {shown!r}, angle: [{y!r} rad, {x!r} rad]}}}}"
+
+
+def _quoted(path: Path) -> str:
+    return "'" + str(path.absolute()).replace("'", "''") + "'"
+
+
+def shown_commands(
+    commands: Mapping[str, Sequence[Mapping[float, str]]],
+) -> list[tuple[str, int, float, str]]:
+    """Return pipeline, place of the scene, strength and command of one point of each pipeline:
+    the strongest laser.
+    """
+    rows: list[tuple[str, int, float, str]] = []
+    for pipeline, scenes in commands.items():
+        lit = [(place, max(own)) for place, own in enumerate(scenes) if own]
+        if lit:
+            place, strength = max(lit, key=lambda point: (point[1], -point[0]))
+            rows.append((pipeline, place, strength, scenes[place][strength]))
+    return rows

@@ -1,24 +1,202 @@
-"""The result of an evaluation: the metrics of every mask and restorer in every scene, and statistics over scenes."""
+"""Everything that an evaluation measures: points, mask optics, wrongly told restorers."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
-from neusee.workflows.evaluation.comparison_pictures import Panel
-from neusee.workflows.evaluation.confidence_intervals import Interval, MetricTable
-from neusee.workflows.evaluation.evaluation_points import PointNumbers
-from neusee.workflows.evaluation.evaluation_scenes import Scene
-from neusee.workflows.evaluation.mask_optics import MaskOptics
-from neusee.workflows.evaluation.pipelines import Pipeline
+import numpy as np
+from torch import Tensor
+
+from neusee.nodes import metrics
+from neusee.nodes.metrics import least_lsr, most_unsuppressed
+from neusee.workflows.engine.runner import run
+from neusee.workflows.evaluation.confidence_intervals import METRICS, Interval, MetricTable, Numbers
+from neusee.workflows.evaluation.evaluation_points import (
+    EvaluationPoints,
+    PointNumbers,
+    PointRequest,
+    errors_of,
+    mistold,
+    reduced,
+)
+from neusee.workflows.evaluation.evaluation_scenes import Scene, UnreadablePhotograph
+from neusee.workflows.evaluation.pipelines import (
+    CASES,
+    FLAT,
+    NONE,
+    SIX,
+    EvaluationRefused,
+    Pipeline,
+    PipelineRecipes,
+    compose_pipelines,
+)
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.protection.equal_shade import EqualProtection
+from neusee.workflows.keys.cache_key import digest
+from neusee.workflows.protection.equal_rivals import EqualProtection
+from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings, Mismatch
+from neusee.workflows.recipe.text.overrides import Override
+from neusee.workflows.report.study_folder import Progress
+from neusee.workflows.store.result_store import Store, compute_once
+
+# --- mask optics ----------------------------------------------------------------------------------
+
+# Figures of merit of a mask by wavelength: laser suppression and image contrast, with their
+# physical bounds.
+
+
+@dataclass(frozen=True)
+class MaskOptics:
+    """The laser suppression and the image contrast of a mask, by spectral band."""
+
+    wavelengths: Numbers  #: nm
+    lsr: Numbers
+    bsr: Numbers  #: mean over scenes
+    median: Numbers  #: median contrast over the frequencies that the clear aperture passes
+    rms: Numbers  #: rms contrast over the same frequencies
+    floor: Numbers  #: smallest LSR of a mask that keeps all light in the field
+    most: Numbers  #: largest rms contrast that the peak allows
+    unsuppressed: Numbers  #: largest rms contrast of a mask with an LSR of 1 that keeps all light
+
+
+def masks(
+    pipelines: Sequence[PipelineRecipes],
+    store: Store,
+    device: str,
+    points: Mapping[str, Sequence[Mapping[float, Any]]],
+) -> dict[str, MaskOptics]:
+    """Return the laser suppression and the image contrast of each mask, by name of the mask."""
+    optics: dict[str, MaskOptics] = {}
+    for pipeline in pipelines:
+        if pipeline.pipeline.front not in optics:
+            bsr = [next(iter(point.values()))["bsr"] for point in points[pipeline.name]]
+            optics[pipeline.pipeline.front] = _mask(pipeline, store, device, np.mean(bsr, axis=0))
+    return optics
+
+
+def _mask(pipeline: PipelineRecipes, store: Store, device: str, bsr: Numbers) -> MaskOptics:
+    names = ("bands", "lsr[mask]", "mtf[mask]", "psf[mask]")
+    values = run(pipeline.recipe(NONE), store, names, device=device).values
+    bands, lsr, mtf, psf = (values[name] for name in names)
+    return MaskOptics(
+        wavelengths=_numbers(bands.centres) * 1e9,
+        lsr=_numbers(lsr),
+        bsr=bsr,
+        median=_numbers(mtf.median),
+        rms=_numbers(mtf.rms),
+        floor=_numbers(least_lsr(psf)),
+        most=_numbers(metrics.limits(psf).passed),
+        unsuppressed=_numbers(most_unsuppressed(psf)),
+    )
+
+
+def _numbers(tensor: Tensor) -> Numbers:
+    array: Numbers = tensor.double().cpu().numpy()
+    return array
+
+
+# --- comparison pictures --------------------------------------------------------------------------
+
+# Pictures for the comparison figure of the paper: one scene with each laser, for each mask and
+# restorer.
+
+
+_SIDE = 200  #: pixels of the shorter side of a picture in the figure
+_PLAIN, _MASKED = "developed[plain]", "developed[mask]"
+_WEAKEST = 1e4  #: strength of the first laser in the figure of the paper
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A column of the figure that compares masks and restorers: pictures with one laser, in
+    linear sRGB (3, y, x).
+    """
+
+    case: str
+    strength: float
+    pictures: dict[str, Tensor]  #: by name of the row: "truth", "plain lens" or a pipeline
+
+
+def panels(
+    bench: EvaluationPoints,
+    pipelines: Sequence[PipelineRecipes],
+    scene: Scene,
+    strengths: Sequence[float],
+    figure: Collection[str] | None = None,
+) -> list[Panel]:
+    """Return the columns of the figure that compares masks and restorers, one for each laser and
+    one without a laser.
+
+    The strengths of the lasers rise from 1e4, as in the paper, to the largest of ``strengths``.
+    ``figure`` names the lasers; the columns then have the pictures of the sensor behind each mask
+    too.
+    """
+    columns = []
+    lasers = [case for case in figure or CASES if case != NONE]
+    top = max(max(strengths), _WEAKEST)
+    steps = [_WEAKEST * (top / _WEAKEST) ** (i / (len(lasers) - 1)) for i in range(len(lasers))]
+    for case, strength in zip((*lasers, NONE), (*steps, 0.0), strict=True):
+        bench.forget()
+        point = PointRequest(replace(scene, case=case), strength)
+        key = digest(
+            "evaluate pictures",
+            _SIDE,
+            bool(figure),
+            [[p.name, bench.key(p, point)] for p in pipelines],
+        )
+        compute = partial(_develop, bench, pipelines, point, bool(figure))
+        columns.append(
+            Panel(
+                case, strength, compute_once(bench.store, key, dict, compute, {"step": "evaluate"})
+            )
+        )
+    return columns
+
+
+def _develop(
+    bench: EvaluationPoints,
+    pipelines: Sequence[PipelineRecipes],
+    point: PointRequest,
+    sensors: bool,
+) -> dict[str, Tensor]:
+    """Return the pictures of one laser by name, with those of the sensor behind each mask first
+    if ``sensors``.
+    """
+    pictures: dict[str, Tensor] = {}
+    restored: dict[str, Tensor] = {}
+    for pipeline in pipelines:
+        line = pipeline.pipeline
+        sensor = sensors and line.mask != FLAT and f"{line.front}, sensor" not in pictures
+        further = (_MASKED,) if sensor else ()
+        values = bench.values(pipeline, point, (_PLAIN, *further) if not pictures else further)
+        if not pictures:
+            pictures = {"truth": _shrink(values["truth"]), "plain lens": _shrink(values[_PLAIN])}
+        if sensor:
+            pictures[f"{line.front}, sensor"] = _shrink(values[_MASKED])
+        if not sensors or line.restorer != NONE:
+            restored[pipeline.name] = _shrink(values[line.picture])
+    return pictures | restored
+
+
+def _shrink(picture: Tensor) -> Tensor:
+    side = min(_SIDE, *picture.shape[-2:])
+    return reduced(picture.detach().cpu().float(), side).contiguous()
+
+
+# --- evaluation result ----------------------------------------------------------------------------
+
+# The result of an evaluation: the metrics of every mask and restorer in every scene, and statistics
+# over scenes.
 
 
 @dataclass(frozen=True)
 class MistoldPoint:
-    """The metrics of one scene whose restorer was told the truth, and told optics or laser with one error."""
+    """The metrics of one scene whose restorer was told the truth, and told optics or laser with
+    one error.
+    """
 
     pipeline: str
     error: str
@@ -30,7 +208,9 @@ class MistoldPoint:
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """The result of an evaluation: scenes, metrics by scene, statistics over scenes, masks and pictures."""
+    """The result of an evaluation: scenes, metrics by scene, statistics over scenes, masks and
+    pictures.
+    """
 
     recipe: Recipe
     scenes: Sequence[Scene]
@@ -47,9 +227,221 @@ class EvaluationResult:
     mistold: Sequence[MistoldPoint] = ()
     protection: EqualProtection | None = None  #: if pipelines were brought to one peak
     wavelengths: Sequence[float | None] = ()  #: of the laser of each scene, in m
-    commands: Mapping[str, Sequence[Mapping[float, str]]] = field(default_factory=dict)  #: as `points`, one each
+    #: as `points`, one each
+    commands: Mapping[str, Sequence[Mapping[float, str]]] = field(default_factory=dict)
 
     @property
     def reference(self) -> str:
         """Return the pipeline with which the first pipeline and those like it are compared."""
         return next(iter(self.references.values()))
+
+
+# --- mistold points -------------------------------------------------------------------------------
+
+# Evaluation points of restorers that are told optics or laser with an error, beside those that are
+# told the truth.
+
+
+def told_with_errors(
+    bench: EvaluationPoints,
+    pipelines: Sequence[PipelineRecipes],
+    shown: Sequence[Scene],
+    strengths: Sequence[float],
+    progress: Progress,
+) -> list[MistoldPoint]:
+    """Compute the metrics of restorers that are told optics or laser with one error, in the first
+    scenes with a laser.
+
+    The recipe declares the errors; a pipeline whose restorer knows nothing of optics and lasers has
+    none.
+    """
+    mismatch = (pipelines[0].recipe(NONE).evaluation or EvaluateSettings()).mismatch
+    if mismatch is None:
+        return []
+    strength = _mismatch_strength(mismatch, strengths)
+    if not strength:
+        return []
+    lit = [PointRequest(scene, strength) for scene in shown if scene.case != NONE]
+    points: list[MistoldPoint] = []
+    for pipeline in (p for p in pipelines if p.pipeline.restorer != NONE):
+        variants = _variants(pipeline, mismatch)
+        if variants:
+            points += _mistold_points(bench, pipeline, variants, lit[: mismatch.scenes])
+            progress(f"{pipeline.name}, told with errors: {bench.computed} points computed")
+    return points
+
+
+def _mismatch_strength(mismatch: Mismatch, strengths: Sequence[float]) -> float:
+    """Return the strength of the laser at which restorers are told errors."""
+    return max(strengths) if mismatch.strength is None else mismatch.strength
+
+
+def _variants(pipeline: PipelineRecipes, mismatch: Mismatch) -> dict[str, PipelineRecipes]:
+    """Return the pipeline with each error in what its restorer is told, by text."""
+    errors = errors_of(pipeline.recipe(next(iter(CASES))), mismatch)
+    return {text: _variant(pipeline, text, error) for text, error in errors.items()}
+
+
+def _mistold_points(
+    bench: EvaluationPoints,
+    pipeline: PipelineRecipes,
+    variants: Mapping[str, PipelineRecipes],
+    requests: Sequence[PointRequest],
+) -> list[MistoldPoint]:
+    """Return the points of a pipeline with each of its errors, beside those without."""
+    points = []
+    for request in requests:
+        bench.forget()
+        true = bench.point(pipeline, request)
+        for text, variant in variants.items():
+            wrong = bench.point(variant, request)
+            points.append(
+                MistoldPoint(pipeline.name, text, request.scene, request.strength, true, wrong)
+            )
+    return points
+
+
+def _variant(pipeline: PipelineRecipes, text: str, error: Mapping[str, Any]) -> PipelineRecipes:
+    @cache
+    def recipe(case: str, *laser: Any) -> Recipe:
+        return mistold(pipeline.recipe(case, *laser), error)
+
+    return PipelineRecipes(pipeline.pipeline, recipe, text, error, pipeline.recipe)
+
+
+def mistold_rows(points: Sequence[MistoldPoint]) -> list[Sequence[Any]]:
+    """Return the rows of ``mistold.csv``, with the truth and with each error."""
+    rows: dict[Any, Sequence[Any]] = {}
+    for p in points:
+        for error, numbers in (("exactly", p.true), (p.error, p.wrong)):
+            place = (
+                p.pipeline,
+                error,
+                p.scene.number,
+                p.scene.name,
+                p.scene.case,
+                f"{p.strength:g}",
+            )
+            rows[place] = (*place, *(numbers[metric] for metric in METRICS))
+    return list(rows.values())
+
+
+# --- measured points ------------------------------------------------------------------------------
+
+# Everything that an evaluation measures: the points of all scenes, restorers told with errors,
+# masks and pictures.
+
+
+class AskedCamera(NamedTuple):
+    """The camera of an evaluation, and where its results are kept."""
+
+    recipe: str
+    changes: Sequence[str | Override]
+    folder: Path
+    store: Store
+    settings: EvaluateSettings
+    progress: Progress
+
+
+class Measured(NamedTuple):
+    """What an evaluation measured."""
+
+    points: dict[str, list[dict[float, PointNumbers]]]  #: by pipeline and scene
+    scenes: list[Scene]
+    broken: list[tuple[Path, str]]  #: photographs that could not be decoded
+    mistold: list[MistoldPoint]
+    masks: dict[str, MaskOptics]
+    panels: list[Panel]
+
+
+def measure(
+    asked: AskedCamera,
+    bench: EvaluationPoints,
+    pipelines: list[PipelineRecipes],
+    shown: Sequence[Scene],
+    strengths: tuple[float, ...],
+) -> Measured:
+    """Return the numbers of all points, those of restorers told with errors, the masks, and the
+    pictures to show.
+    """
+    points, readable, broken = _points(bench, pipelines, shown, strengths, asked.progress)
+    mistold = told_with_errors(bench, pipelines, readable, strengths, asked.progress)
+    optics = masks(pipelines, asked.store, bench.device, points)
+    if figure_changes := asked.settings.figure:
+        bench.release()
+        lines = [p.pipeline for p in pipelines]
+        pipelines = compose_pipelines(
+            asked.recipe, [*asked.changes, *figure_changes], lines, asked.folder
+        )
+    figure = SIX if asked.settings.lasers == "drawn" else None
+    return Measured(
+        points,
+        readable,
+        broken,
+        mistold,
+        optics,
+        panels(bench, pipelines, readable[0], strengths, figure),
+    )
+
+
+def _points(
+    bench: EvaluationPoints,
+    pipelines: Sequence[PipelineRecipes],
+    shown: Sequence[Scene],
+    strengths: Sequence[float],
+    progress: Progress,
+) -> tuple[dict[str, list[dict[float, PointNumbers]]], list[Scene], list[tuple[Path, str]]]:
+    """Compute all evaluation points, and return them, their scenes, and the photographs that could
+    not be decoded.
+
+    The scenes come laser by laser, because scenes with the same laser have common optical results.
+    """
+    points: dict[int, dict[str, dict[float, PointNumbers]]] = {}
+    broken: list[tuple[Path, str]] = []
+    before = ""
+    for done, scene in enumerate(_laser_by_laser(shown), 1):
+        if before not in ("", scene.case):
+            bench.forget()
+        before, own = scene.case, {p.name: dict[float, PointNumbers]() for p in pipelines}
+        try:
+            _scene_points(bench, pipelines, scene, strengths, own)
+        except UnreadablePhotograph as error:
+            broken.append((scene.path or Path(scene.name), str(error)))
+            progress(f"not read, and left out: {scene.name}")
+            continue
+        points[scene.number] = own
+        progress(
+            f"scene {done} of {len(shown)} ({scene.case}, {scene.name}): {bench.computed} points"
+            " computed"
+        )
+    readable = [scene for scene in shown if scene.number in points]
+    if not readable:
+        raise EvaluationRefused(broken[0][1])
+    return _by_pipeline([points[scene.number] for scene in readable]), readable, broken
+
+
+def _by_pipeline(
+    scenes: Sequence[Mapping[str, dict[float, PointNumbers]]],
+) -> dict[str, list[dict[float, PointNumbers]]]:
+    """Return the points of each scene, by pipeline."""
+    return {name: [points[name] for points in scenes] for name in scenes[0]}
+
+
+def _laser_by_laser(shown: Sequence[Scene]) -> list[Scene]:
+    """Return the scenes sorted by their lasers, in the order of the first scene of each laser."""
+    order = [scene.case for scene in shown]
+    return sorted(shown, key=lambda scene: order.index(scene.case))
+
+
+def _scene_points(
+    bench: EvaluationPoints,
+    pipelines: Sequence[PipelineRecipes],
+    scene: Scene,
+    strengths: Sequence[float],
+    points: dict[str, dict[float, PointNumbers]],
+) -> None:
+    """Compute the points of one scene into ``points``, by pipeline."""
+    alone = replace(scene)  # a copy, which releases the picture when it is deleted
+    for strength in strengths if scene.case != NONE else (0.0,):
+        for pipeline in pipelines:
+            points[pipeline.name][strength] = bench.point(pipeline, PointRequest(alone, strength))

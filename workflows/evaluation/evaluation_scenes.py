@@ -1,4 +1,6 @@
-"""The scenes of an evaluation, each with a crop of a photograph, a laser direction and a random seed."""
+"""The scenes of an evaluation, each with a crop of a photograph, a laser direction and a random
+seed.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +16,17 @@ from neusee.nodes import ParameterError
 from neusee.nodes.scene import choose_photograph, crop_photograph, list_photographs
 from neusee.workflows.engine.node_call import call
 from neusee.workflows.engine.runner import run
-from neusee.workflows.evaluation.pipelines import BEAM, NONE, EvaluationRefused, PipelineRecipes, one_line
+from neusee.workflows.evaluation.pipelines import (
+    BEAM,
+    NONE,
+    EvaluationRefused,
+    PipelineRecipes,
+    one_line,
+)
 from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.cache_key import digest, key_of, stream_seed
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.keys.cache_key import digest, file_digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.input_file_digest import file_digest
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs, NothingDrawn
 from neusee.workflows.store.result_store import Store
 
@@ -27,7 +34,9 @@ PHOTOGRAPH = "scene.photograph"
 
 
 class UnreadablePhotograph(EvaluationRefused):
-    """Error for a photograph that has the header and the end of a picture, but cannot be decoded."""
+    """Error for a photograph that has the header and the end of a picture, but cannot be
+    decoded.
+    """
 
 
 @dataclass(frozen=True)
@@ -66,15 +75,29 @@ class Scene:
     def key(self, code: Code) -> str:
         """Return the cache key of the picture of the scene."""
         if self.path is None:
-            return digest("own scene", key_of(self.recipe.steps["scene"], {}, self.recipe.seed, code)[0])
+            return digest(
+                "own scene", key_of(self.recipe.steps["scene"], {}, self.recipe.seed, code)[0]
+            )
         own = code.digest(crop_photograph.__module__)
-        return digest("photograph", own, file_digest(self.path), list(self.shape), self.recipe.seed, self.number)
+        return digest(
+            "photograph",
+            own,
+            file_digest(self.path),
+            list(self.shape),
+            self.recipe.seed,
+            self.number,
+        )
 
     def draw(self, inputs: Inputs) -> dict[str, float]:
-        """Sample the uncertain values of the scene in SI units, equal for every mask, restorer and laser."""
+        """Sample the uncertain values of the scene in SI units, equal for every mask, restorer
+        and laser.
+        """
         import numpy as np
 
-        z = [np.random.default_rng([self.seed, stream_seed(0, name)]).standard_normal() for name in inputs.names]
+        z = [
+            np.random.default_rng([self.seed, stream_seed(0, name)]).standard_normal()
+            for name in inputs.names
+        ]
         return dict(zip(inputs.names, map(float, inputs.at(np.array([z]))[0]), strict=True))
 
     def angle(self, recipe: Recipe) -> tuple[float, float]:
@@ -94,78 +117,124 @@ class Scene:
 def scenes(
     recipe: Recipe, store: Store, root: Path | None, count: int | None, cases: Sequence[str]
 ) -> tuple[list[Scene], list[tuple[Path, str]]]:
-    """Return ``count`` scenes with the lasers ``cases`` in turn, and the photographs that cannot be read, with reasons.
+    """Return ``count`` scenes with the lasers ``cases`` in turn, and the photographs that cannot be
+    read, with reasons.
 
     Without ``count`` every photograph is in one scene.
     """
-    broken: list[tuple[Path, str]] = []
-    own = recipe.steps["scene"]
-    shape = _shape(recipe)
-    paths: Sequence[Path] = [own.params["file"]] if own.node.path == PHOTOGRAPH else []
-    if root is not None:
-        if not root.is_dir():
-            raise EvaluationRefused(f"--data {root}: this folder does not exist")
-        paths, broken = list_photographs(root)
-        if not paths:
-            reason = f"; {broken[0][0].name}: {broken[0][1]}" if broken else ""
-            raise EvaluationRefused(f"--data {root}: the folder contains no readable PNG or JPEG file{reason}")
+    own, shape = recipe.steps["scene"], _shape(recipe)
+    paths, broken = _photographs(own, root)
     shown = []
     for i in range(max(1, len(paths)) if count is None else count):
         path = choose_photograph(paths, recipe.seed, i) if paths else None
-        name = own.node.path if path is None else path.relative_to(root).as_posix() if root else path.name
+        name = _scene_name(own, path, root)
         shown.append(Scene(i, cases[i % len(cases)], name, path, shape, recipe, store))
     return shown, broken
+
+
+def _photographs(own: Step, root: Path | None) -> tuple[Sequence[Path], list[tuple[Path, str]]]:
+    """Return the photographs of a folder, or that of the recipe, and those that are unreadable."""
+    if root is None:
+        return ([own.params["file"]] if own.node.path == PHOTOGRAPH else []), []
+    if not root.is_dir():
+        raise EvaluationRefused(f"--data {root}: this folder does not exist")
+    paths, broken = list_photographs(root)
+    if not paths:
+        reason = f"; {broken[0][0].name}: {broken[0][1]}" if broken else ""
+        raise EvaluationRefused(
+            f"--data {root}: the folder contains no readable PNG or JPEG file{reason}"
+        )
+    return paths, broken
+
+
+def _scene_name(own: Step, path: Path | None, root: Path | None) -> str:
+    """Return the name of a scene: the photograph within its folder, or the node of the recipe."""
+    if path is None:
+        return own.node.path
+    return path.relative_to(root).as_posix() if root else path.name
 
 
 def photographs(shown: Sequence[Scene]) -> list[int]:
     """Return the number of the photograph of each scene, over which intervals are drawn.
 
-    Equal files are one photograph, whatever their names. Scenes that are all of one photograph differ in laser and
-    noise only; each then counts as one draw.
+    Equal files are one photograph, whatever their names. Scenes that are all of one photograph
+    differ in laser and noise only; each then counts as one draw.
     """
     contents = [scene.name if scene.path is None else file_digest(scene.path) for scene in shown]
     different = list(dict.fromkeys(contents))
-    return [different.index(content) for content in contents] if len(different) > 1 else list(range(len(shown)))
+    return (
+        [different.index(content) for content in contents]
+        if len(different) > 1
+        else list(range(len(shown)))
+    )
 
 
 def wavelengths(pipeline: PipelineRecipes, shown: Sequence[Scene]) -> list[float | None]:
-    """Return the wavelength of the laser of each scene in m, or None for a scene without a laser."""
+    """Return the wavelength of the laser of each scene in m, or None for a scene without a
+    laser.
+    """
     inputs: dict[str, Inputs | None] = {}
     for case in {scene.case for scene in shown if scene.case != NONE}:
         inputs[case] = None
         with suppress(NothingDrawn):
             inputs[case] = Inputs.of(pipeline.recipe(case), pipeline.pipeline.outputs)
     return [
-        scene.wavelength(pipeline.recipe(scene.case), inputs[scene.case]) if scene.case != NONE else None
+        scene.wavelength(pipeline.recipe(scene.case), inputs[scene.case])
+        if scene.case != NONE
+        else None
         for scene in shown
     ]
 
 
 def refuse_directions(pipeline: PipelineRecipes, shown: Sequence[Scene]) -> None:
-    """Raise `EvaluationRefused` if the laser of a scene comes from where the pupil of the recipe does not reach.
+    """Raise `EvaluationRefused` if the laser of a scene comes from where the pupil of the recipe
+    does not reach.
 
     Of each laser only the scenes with the largest angles over wavelength along y and x are tried.
     """
-    each = dict(zip((scene.number for scene in shown), wavelengths(pipeline, shown), strict=True))
+    numbers = (scene.number for scene in shown)
+    wavelength_of = dict(zip(numbers, wavelengths(pipeline, shown), strict=True))
     wrong: dict[str, None] = {}
     for case in dict.fromkeys(scene.case for scene in shown if scene.case != NONE):
         lit = [(scene, scene.angle(pipeline.recipe(case))) for scene in shown if scene.case == case]
         for axis in (0, 1):
-            scene, direction = max(lit, key=lambda pair: abs(pair[1][axis]) / (each[pair[0].number] or 1.0))
-            try:
-                pipeline.recipe(case, direction, each[scene.number])
-            except RecipeError as error:
-                wrong |= dict.fromkeys(f"scene {scene.number + 1} ({case}): {one_line(p)}" for p in error.diagnostics)
+            scene, direction = max(
+                lit, key=lambda pair: abs(pair[1][axis]) / (wavelength_of[pair[0].number] or 1.0)
+            )
+            wrong |= _direction_faults(pipeline, scene, direction, wavelength_of[scene.number])
     if wrong:
         text = "\n".join(wrong)
-        raise EvaluationRefused(f"{text}\nThe directions are drawn over the sensor: choose a smaller sensor.shape")
+        raise EvaluationRefused(
+            f"{text}\nThe directions are drawn over the sensor: choose a smaller sensor.shape"
+        )
+
+
+def _direction_faults(
+    pipeline: PipelineRecipes,
+    scene: Scene,
+    direction: tuple[float, float],
+    wavelength: float | None,
+) -> dict[str, None]:
+    """Return a line for each mistake of the recipe with the laser of a scene."""
+    try:
+        pipeline.recipe(scene.case, direction, wavelength)
+    except RecipeError as error:
+        start = f"scene {scene.number + 1} ({scene.case})"
+        return dict.fromkeys(f"{start}: {one_line(p)}" for p in error.diagnostics)
+    return {}
 
 
 def _shape(recipe: Recipe) -> tuple[int, int]:
-    """Return the size (y, x) of the scene in pixels; raise `EvaluationRefused` if the recipe sets no size."""
+    """Return the size (y, x) of the scene in pixels; raise `EvaluationRefused` if the recipe
+    sets no size.
+    """
     shape = recipe.steps["scene"].params.get("shape")
     if shape is None and recipe.steps["scene"].node.path == PHOTOGRAPH:
-        raise EvaluationRefused("scene.shape is missing: write the size to crop from photographs, such as [768, 768]")
+        raise EvaluationRefused(
+            "scene.shape is missing: write the size to crop from photographs, such as [768, 768]"
+        )
     if shape is None:
-        raise EvaluationRefused("scene.shape is missing: write the size of the scene in pixels, such as [768, 768]")
+        raise EvaluationRefused(
+            "scene.shape is missing: write the size of the scene in pixels, such as [768, 768]"
+        )
     return int(shape[0]), int(shape[1])

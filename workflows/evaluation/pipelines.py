@@ -1,9 +1,12 @@
-"""The pipelines that an evaluation compares: a mask and a restorer each, with one recipe for each laser."""
+"""The pipelines that an evaluation compares: a mask and a restorer each, with one recipe for
+each laser.
+"""
 
 from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
@@ -12,17 +15,17 @@ from typing import Any, NamedTuple
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.protection.equal_shade import EqualShade
+from neusee.workflows.protection.equal_rivals import EqualShade
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.recipe.text.composition import compose
-from neusee.workflows.recipe.text.named_files import refuse_outside
+from neusee.workflows.recipe.text.composition import compose, refuse_outside
 from neusee.workflows.recipe.text.overrides import Override
 
 NONE = "none"  #: name of the restorer that restores nothing, and of the case without a laser
 FLAT = "flat"  #: option of `doe` without a mask
 BEAM = "beam"  #: name of the laser in every recipe of an evaluation
 
-#: the lasers of the paper with wavelengths in m: where the paper names only a colour, a common laser of this colour
+#: the lasers of the paper with wavelengths in m: where the paper names only a colour, a common
+#: laser of this colour
 CASES: dict[str, float | None] = {
     "violet": 405e-9,
     "blue": 450e-9,
@@ -33,10 +36,20 @@ CASES: dict[str, float | None] = {
 }
 DRAWN = "drawn"  #: name of a laser whose wavelength follows the law of the recipe
 #: lasers of the figure with six lasers, with wavelengths in m
-SIX: dict[str, float | None] = {"violet": 405e-9, "blue": 450e-9, "cyan": 488e-9, **dict(list(CASES.items())[2:])}
+SIX: dict[str, float | None] = {
+    "violet": 405e-9,
+    "blue": 450e-9,
+    "cyan": 488e-9,
+    **dict(list(CASES.items())[2:]),
+}
 WAVELENGTHS = {name: metres for name, metres in SIX.items() if metres is not None}
-_PIPELINE = re.compile(r"(?P<mask>[\w-]+)(?:@(?P<height>[^+]+))?\+(?P<restorer>[\w-]+)(?:@(?P<weights>.+))?")
-_HOW = "write MASK+RESTORER, such as flat+none, five_half_rings+wiener or pixelwise@mask.npy+nafnet@net.safetensors"
+_PIPELINE = re.compile(
+    r"(?P<mask>[\w-]+)(?:@(?P<height>[^+]+))?\+(?P<restorer>[\w-]+)(?:@(?P<weights>.+))?"
+)
+_HOW = (
+    "write MASK+RESTORER, such as flat+none, five_half_rings+wiener or"
+    " pixelwise@mask.npy+nafnet@net.safetensors"
+)
 
 
 class EvaluationRefused(ValueError):
@@ -45,36 +58,49 @@ class EvaluationRefused(ValueError):
 
 @dataclass(frozen=True)
 class Pipeline:
-    """A mask in front of the lens, together with the method that restores the picture behind the lens."""
+    """A mask in front of the lens, together with the method that restores the picture behind the
+    lens.
+    """
 
     mask: str  #: an option of `doe`
     restorer: str  #: an option of `restore`, or none
     height_file: Path | None = None
     weights: Path | None = None
-    shade: EqualShade | None = None  #: filter and stop that make the protection of all pipelines equal
+    #: filter and stop that make the protection of all pipelines equal
+    shade: EqualShade | None = None
     height_name: str = ""  #: of the height map; empty: the name of its file
     weights_name: str = ""  #: of the weights; empty: the name of their file
 
     @property
     def name(self) -> str:
-        """Return the name of a pipeline, such as ``flat+none`` or ``plain lens + filter 0.01, wiener``."""
+        """Return the name of a pipeline, such as ``flat+none`` or ``plain lens + filter 0.01,
+        wiener``.
+        """
         if self.shade is not None:
             return f"{self.front}, {'not restored' if self.restorer == NONE else self.back}"
         return f"{self.front}+{self.back}"
 
     @property
     def front(self) -> str:
-        """Return the name of the mask with that of its file, or in words with the filter and the stop that it has."""
+        """Return the name of the mask with that of its file, or in words with the filter and the
+        stop that it has.
+        """
         file = f"@{self.height_name or self.height_file.name}" if self.height_file else ""
         if self.shade is None:
             return self.mask + file
-        spoken = "plain lens" if self.mask == FLAT else self.mask.replace("half_ring", "half-ring").replace("_", " ")
+        spoken = (
+            "plain lens"
+            if self.mask == FLAT
+            else self.mask.replace("half_ring", "half-ring").replace("_", " ")
+        )
         return spoken + file + self.shade.said
 
     @property
     def back(self) -> str:
         """Return the name of the restorer, followed by the name of its file if it has a file."""
-        return self.restorer + (f"@{self.weights_name or self.weights.name}" if self.weights else "")
+        return self.restorer + (
+            f"@{self.weights_name or self.weights.name}" if self.weights else ""
+        )
 
     @property
     def picture(self) -> str:
@@ -83,7 +109,9 @@ class Pipeline:
 
     @property
     def quality(self) -> str:
-        """Return the name of the step that measures the error of a picture against the true picture."""
+        """Return the name of the step that measures the error of a picture against the true
+        picture.
+        """
         return "developed_quality[mask]" if self.restorer == NONE else "restored_quality"
 
     @property
@@ -94,14 +122,19 @@ class Pipeline:
 
 @dataclass(frozen=True)
 class PipelineRecipes:
-    """A pipeline (mask and restorer) with one recipe for each laser, which differ only in the laser wavelength."""
+    """A pipeline (mask and restorer) with one recipe for each laser, which differ only in the
+    laser wavelength.
+    """
 
     pipeline: Pipeline
-    recipe: Callable[..., Recipe]  #: returns the recipe of a laser by name; also by direction, and then by wavelength
+    #: returns the recipe of a laser by name; also by direction, and then by wavelength
+    recipe: Callable[..., Recipe]
     told: str = ""  #: the error in what the restorer is told, as text
-    error: Mapping[str, Any] = field(default_factory=dict)  #: what is added to which parameters of what it is told
+    #: what is added to which parameters of what it is told
+    error: Mapping[str, Any] = field(default_factory=dict)
     true: Callable[..., Recipe] | None = None  #: the same without the error
-    words: tuple[str, ...] = ()  #: arguments that make its mask and restorer from the recipe of the evaluation
+    #: arguments that make its mask and restorer from the recipe of the evaluation
+    words: tuple[str, ...] = ()
     fwhm: float = 10e-9  #: spectral width of its lasers in m
 
     @property
@@ -110,28 +143,54 @@ class PipelineRecipes:
 
 
 def read_pipelines(text: str, folder: Path, mark: Location | None = None) -> list[Pipeline]:
-    """Parse pipelines such as ``flat+none, five_half_rings+wiener``; raise `EvaluationRefused` with all mistakes.
+    """Parse pipelines such as ``flat+none, five_half_rings+wiener``; raise `EvaluationRefused` with
+    all mistakes.
 
     ``mark`` is the place of the text, if it stands in a recipe.
     """
-    found: list[Pipeline] = []
+    words = [word for word in map(str.strip, text.split(",")) if word]
+    pipelines: list[Pipeline] = []
     wrong: list[str] = []
-    for word in filter(None, (part.strip() for part in text.split(","))):
-        match = _PIPELINE.fullmatch(word)
-        if match is None:
-            wrong.append(f"{word}: {_HOW}")
-            continue
-        height, weights = (folder / Path(x).expanduser() if (x := match[k]) else None for k in ("height", "weights"))
-        found.append(Pipeline(match["mask"], match["restorer"], height, weights))
-        wrong += [f"{word}: {why}" for path in (height, weights) if path and (why := _fault(path, mark))]
-    found = named_apart(found)
-    twice = {p.name for p in found if [q.name for q in found].count(p.name) > 1}
-    wrong += [f"{name} is listed twice: remove one" for name in sorted(twice)]
-    if not found and not wrong:
+    for word in words:
+        try:
+            pipelines.append(_pipeline(word, folder))
+        except ValueError as error:
+            wrong.append(f"{word}: {error}")
+        else:
+            wrong += [f"{word}: {fault}" for fault in _faults(pipelines[-1], mark)]
+    pipelines = named_apart(pipelines)
+    wrong += [f"{name} is listed twice: remove one" for name in _twice(pipelines)]
+    if not words:
         wrong = [f"there is no pipeline: {_HOW}"]
     if wrong:
         raise EvaluationRefused("\n".join(wrong))
-    return found
+    return pipelines
+
+
+def _pipeline(word: str, folder: Path) -> Pipeline:
+    """Return the pipeline that a word names; raise `ValueError` for another form of word."""
+    match = _PIPELINE.fullmatch(word)
+    if match is None:
+        raise ValueError(_HOW)
+    height, weights = (_named_file(match[group], folder) for group in ("height", "weights"))
+    return Pipeline(match["mask"], match["restorer"], height, weights)
+
+
+def _faults(pipeline: Pipeline, mark: Location | None) -> list[str]:
+    """Return why files of a pipeline cannot be used."""
+    faults = [_fault(path, mark) for path in (pipeline.height_file, pipeline.weights) if path]
+    return [fault for fault in faults if fault]
+
+
+def _named_file(text: str | None, folder: Path) -> Path | None:
+    """Return the file that a pipeline names, if it names one."""
+    return folder / Path(text).expanduser() if text else None
+
+
+def _twice(pipelines: Sequence[Pipeline]) -> list[str]:
+    """Return the names that several pipelines have, in alphabetical order."""
+    counts = Counter(pipeline.name for pipeline in pipelines)
+    return sorted(name for name, count in counts.items() if count > 1)
 
 
 def _fault(path: Path, mark: Location | None) -> str:
@@ -145,11 +204,16 @@ def _fault(path: Path, mark: Location | None) -> str:
 
 
 def named_apart(pipelines: Sequence[Pipeline]) -> list[Pipeline]:
-    """Return pipelines in which different files have different names: with as many folders as that needs."""
-    files = [file for p in pipelines for file in (p.height_file, p.weights) if file is not None]
-    names = _shortest_names(files)
+    """Return pipelines in which different files have different names: with as many folders as
+    that needs.
+    """
+    files: list[Path | None] = []
+    for p in pipelines:
+        files += [p.height_file, p.weights]
+    names = _shortest_names([file for file in files if file is not None])
     return [
-        replace(p, height_name=names.get(p.height_file, ""), weights_name=names.get(p.weights, "")) for p in pipelines
+        replace(p, height_name=names.get(p.height_file, ""), weights_name=names.get(p.weights, ""))
+        for p in pipelines
     ]
 
 
@@ -160,7 +224,11 @@ def _shortest_names(files: Sequence[Path]) -> dict[Path | None, str]:
     for file, place in places.items():
         others = [other for other in places.values() if other != place]
         ends = (Path(*place.parts[-count:]) for count in range(1, len(place.parts) + 1))
-        shortest = next(end for end in ends if not any(other.parts[-len(end.parts) :] == end.parts for other in others))
+        shortest = next(
+            end
+            for end in ends
+            if not any(other.parts[-len(end.parts) :] == end.parts for other in others)
+        )
         names[file] = shortest.as_posix()
     return names
 
@@ -168,9 +236,11 @@ def _shortest_names(files: Sequence[Path]) -> dict[Path | None, str]:
 def compose_pipelines(
     recipe: str, changes: Sequence[str | Override], pipelines: Sequence[Pipeline], folder: Path
 ) -> list[PipelineRecipes]:
-    """Return each pipeline (mask and restorer) with its recipes; raise `EvaluationRefused` with all mistakes."""
+    """Return each pipeline (mask and restorer) with its recipes; raise `EvaluationRefused` with
+    all mistakes.
+    """
     own = _own_laser(recipe, changes, folder)
-    found: list[PipelineRecipes] = []
+    composed: list[PipelineRecipes] = []
     wrong: dict[str, None] = {}
     for pipeline in pipelines:
         try:
@@ -178,14 +248,16 @@ def compose_pipelines(
             recipe_of = cache(partial(_with_laser, recipe, [*changes, *words], own, folder))
             for case in (NONE, next(iter(CASES))):
                 _check(recipe_of(case), pipeline)
-            found.append(PipelineRecipes(pipeline, recipe_of, words=tuple(words), fwhm=own.fwhm))
+            composed.append(PipelineRecipes(pipeline, recipe_of, words=tuple(words), fwhm=own.fwhm))
         except RecipeError as error:
-            wrong |= dict.fromkeys(f"{pipeline.name}: {one_line(problem)}" for problem in error.diagnostics)
+            wrong |= dict.fromkeys(
+                f"{pipeline.name}: {one_line(problem)}" for problem in error.diagnostics
+            )
         except EvaluationRefused as error:
             wrong[f"{pipeline.name}: {error}"] = None
     if wrong:
         raise EvaluationRefused("\n".join(wrong))
-    return found
+    return composed
 
 
 def one_line(problem: Diagnostic) -> str:
@@ -194,7 +266,9 @@ def one_line(problem: Diagnostic) -> str:
 
 
 def _words(pipeline: Pipeline, takes: Callable[[str, str], str]) -> list[str]:
-    """Return the recipe arguments that set the mask and the restorer of a pipeline, such as ``doe=flat``."""
+    """Return the recipe arguments that set the mask and the restorer of a pipeline, such as
+    ``doe=flat``.
+    """
     words = [f"doe={pipeline.mask}"]
     if pipeline.height_file:
         words.append(f"doe.{takes('doe', pipeline.mask)}={pipeline.height_file.absolute()}")
@@ -205,13 +279,21 @@ def _words(pipeline: Pipeline, takes: Callable[[str, str], str]) -> list[str]:
     return words + (pipeline.shade.words if pipeline.shade else [])
 
 
-def _takes(recipe: str, changes: Sequence[str | Override], folder: Path, group: str, option: str) -> str:
-    """Return the name of the file parameter of a mask or restorer; raise `EvaluationRefused` if there is none.
+def _takes(
+    recipe: str, changes: Sequence[str | Override], folder: Path, group: str, option: str
+) -> str:
+    """Return the name of the file parameter of a mask or restorer; raise `EvaluationRefused` if
+    there is none.
 
-    The option may be packaged, or of the user: beside the recipe, or in a folder that every recipe searches.
+    The option may be packaged, or of the user: beside the recipe, or in a folder that every recipe
+    searches.
     """
     composed = compose(recipe, [*changes, f"{group}={option}"], folder) if option != NONE else None
-    if composed and (problem := next((p for p in composed.diagnostics if p.message.startswith("no option")), None)):
+    if composed and (
+        problem := next(
+            (p for p in composed.diagnostics if p.message.startswith("no option")), None
+        )
+    ):
         raise EvaluationRefused(problem.message)
     block = composed.root.items.get(group) if composed else None
     for name in ("file", "weights"):
@@ -229,7 +311,9 @@ def _with_laser(
     direction: tuple[float, float] | None = None,
     wavelength: float | None = None,
 ) -> Recipe:
-    """Load a recipe with the laser ``case``; its strength, and usually its direction, is set later for each point."""
+    """Load a recipe with the laser ``case``; its strength, and usually its direction, is set
+    later for each point.
+    """
     laser = ""
     if case != NONE:
         metres = wavelength or WAVELENGTHS.get(case)
@@ -259,7 +343,9 @@ def _own_laser(recipe: str, changes: Sequence[str | Override], folder: Path) -> 
     written = compose(recipe, changes, folder).root.below(["lasers"])
     laser = next(iter(written.items.values()), None) if written else None
     texts = {"fwhm": f"{fwhm * 1e9:g} nm", **(laser.plain if laser else {})}
-    return _OwnLaser(fwhm, ", ".join(f"{k}: '{texts[k]}'" for k in ("wavelength", "fwhm") if k in texts))
+    return _OwnLaser(
+        fwhm, ", ".join(f"{k}: '{texts[k]}'" for k in ("wavelength", "fwhm") if k in texts)
+    )
 
 
 def base_recipe(recipe: str, changes: Sequence[str | Override], folder: Path) -> Recipe:
@@ -267,20 +353,33 @@ def base_recipe(recipe: str, changes: Sequence[str | Override], folder: Path) ->
     try:
         return load(recipe, changes, folder)
     except RecipeError as error:
-        raise EvaluationRefused("\n".join(dict.fromkeys(map(one_line, error.diagnostics)))) from None
+        raise EvaluationRefused(
+            "\n".join(dict.fromkeys(map(one_line, error.diagnostics)))
+        ) from None
 
 
 def refuse_fixed_laser(recipe: Recipe) -> None:
-    """Raise `EvaluationRefused` if the first laser of a recipe has no law from which its wavelength is drawn."""
-    first = next((name.partition("[")[2][:-1] for name in recipe.steps if name.startswith("line[")), None)
+    """Raise `EvaluationRefused` if the first laser of a recipe has no law from which its
+    wavelength is drawn.
+    """
+    first = next(
+        (name.partition("[")[2][:-1] for name in recipe.steps if name.startswith("line[")), None
+    )
     if recipe.uncertain is None or f"lasers.{first}.wavelength" not in recipe.uncertain.names:
         raise EvaluationRefused(
-            "evaluate.lasers is drawn, but no law says which wavelength the first laser of the recipe has: add "
-            'laser=drawn, or write a law such as wavelength: "uniform(400 nm, 700 nm)"'
+            "evaluate.lasers is drawn, but no law says which wavelength the first laser of the"
+            ' recipe has: add laser=drawn, or write a law such as wavelength: "uniform(400 nm, 700'
+            ' nm)"'
         )
 
 
 def _check(recipe: Recipe, pipeline: Pipeline) -> None:
-    missing = [name for name in ("scene", *pipeline.outputs, "lsr[mask]", "mtf[mask]") if name not in recipe.steps]
+    missing = [
+        name
+        for name in ("scene", *pipeline.outputs, "lsr[mask]", "mtf[mask]")
+        if name not in recipe.steps
+    ]
     if missing:
-        raise EvaluationRefused(f"{recipe.name} lacks these steps, which an evaluation needs: {', '.join(missing)}")
+        raise EvaluationRefused(
+            f"{recipe.name} lacks these steps, which an evaluation needs: {', '.join(missing)}"
+        )

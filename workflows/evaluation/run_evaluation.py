@@ -1,10 +1,12 @@
-"""The evaluation of masks and restorers as in the paper, with the same scenes and laser strengths for all.
+"""The evaluation of masks and restorers as in the paper, with the same scenes and laser strengths
+for all.
 
-    evaluate("first_light", read_pipelines("flat+none, five_half_rings+wiener", Path()), data=Path("photographs"))
+    evaluate("first_light", read_pipelines("flat+none, five_half_rings+wiener", Path()),
+    data=Path("photographs"))
 
-Each point has a scene, a laser strength and a pipeline, and its metrics equal those of a run of the recipe to the last
-bit. A run that cannot prove its tolerance is computed again more strictly; a point is computed once. The store keeps
-all points, so that an interrupted evaluation continues.
+Each point has a scene, a laser strength and a pipeline, and its metrics equal those of a run of the
+recipe to the last bit. A run that cannot prove its tolerance is computed again more strictly; a
+point is computed once. The store keeps all points, so that an interrupted evaluation continues.
 """
 
 from __future__ import annotations
@@ -17,10 +19,24 @@ from typing import Any
 import numpy as np
 
 from neusee.workflows.evaluation import equal_protection
-from neusee.workflows.evaluation.confidence_intervals import METRICS, metric_table
+from neusee.workflows.evaluation.confidence_intervals import METRICS, compare_with, metric_table
 from neusee.workflows.evaluation.equal_protection import protect, read_protection
-from neusee.workflows.evaluation.evaluation_points import EvaluationPoints
-from neusee.workflows.evaluation.evaluation_result import EvaluationResult
+from neusee.workflows.evaluation.evaluation_page import (
+    COLUMNS,
+    draw_pictures,
+    lead,
+    rows,
+    sections,
+    summary,
+)
+from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointCommands
+from neusee.workflows.evaluation.evaluation_result import (
+    AskedCamera,
+    EvaluationResult,
+    Measured,
+    measure,
+    mistold_rows,
+)
 from neusee.workflows.evaluation.evaluation_scenes import (
     Scene,
     photographs,
@@ -28,9 +44,6 @@ from neusee.workflows.evaluation.evaluation_scenes import (
     scenes,
     wavelengths,
 )
-from neusee.workflows.evaluation.measured_points import AskedCamera, Measured, measure
-from neusee.workflows.evaluation.mistold_points import mistold_rows
-from neusee.workflows.evaluation.paired_intervals import compare_with
 from neusee.workflows.evaluation.pipelines import (
     CASES,
     DRAWN,
@@ -43,11 +56,10 @@ from neusee.workflows.evaluation.pipelines import (
     read_pipelines,
     refuse_fixed_laser,
 )
-from neusee.workflows.evaluation.point_commands import PointCommands
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.protection.equal_shade import EqualProtection
+from neusee.workflows.protection.equal_rivals import EqualProtection
 from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport, StudyRun, silent
@@ -64,7 +76,8 @@ __all__ = [
     "read_settings",
 ]
 
-STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)  #: strengths of the paper, in multiples of saturation
+#: strengths of the paper, in multiples of saturation
+STRENGTHS = (0.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
 SMALL = 256  #: pixels of the shorter side of the pictures that the paper restores
 
 
@@ -86,13 +99,16 @@ def evaluate(
     device: str = "cpu",
     folder: Path | None = None,
 ) -> Path:
-    """Evaluate every pipeline on ``count`` scenes at all laser ``strengths``, and return the folder of the results.
+    """Evaluate every pipeline on ``count`` scenes at all laser ``strengths``, and return the folder
+    of the results.
 
-    Args: recipe, changes: the camera, as for `load`; its block ``evaluate`` says which lasers the scenes have. data: a
-    folder of photographs, by default the scene of the recipe. count: by default 20, None means every photograph once.
-    small: shorter side of the reduced pictures, which are compared too. reference: the pipeline with which all other
-    pipelines are compared, by default the first pipeline. equal: the peak to which filters and stops bring every
-    pipeline. progress: receives a line for each scene.
+    Args: recipe, changes: the camera, as for `load`; its block ``evaluate`` says which lasers the
+            scenes have. data: a
+    folder of photographs, by default the scene of the recipe. count: by default 20, None means
+    every photograph once. small: shorter side of the reduced pictures, which are compared too.
+    reference: the pipeline with which all other pipelines are compared, by default the first
+    pipeline. equal: the peak to which filters and stops bring every pipeline. progress: receives a
+    line for each scene.
     Raises: `EvaluationRefused` with every mistake before anything runs.
     """
     place = folder or Path.cwd()
@@ -104,22 +120,38 @@ def evaluate(
     study_run = StudyRun("evaluate", base, command)
     if settings.lasers == "drawn":
         refuse_fixed_laser(base)
-    shown, broken = scenes(base, asked.store, data, count, [DRAWN] if settings.lasers == "drawn" else list(CASES))
+    shown, broken = scenes(
+        base, asked.store, data, count, [DRAWN] if settings.lasers == "drawn" else list(CASES)
+    )
     refuse_directions(bare[0], shown)
-    each, references = _equalled(asked, bare, reference, equal)
-    _report_scenes(shown, broken, strengths, each, progress)
+    composed, references = _equalled(asked, bare, reference, equal)
+    _report_scenes(shown, broken, strengths, composed, progress)
     bench = EvaluationPoints(asked.store, small, device)
-    found = measure(asked, bench, each, shown, strengths)
-    waves = tuple(wavelengths(bare[0], found.scenes))
-    result = _result(base, strengths, small, references, found, [p.pipeline for p in each], equal, broken, waves)
-    commands = PointCommands(recipe, changes, place, bench).commands(each, found.scenes, strengths)
+    measured = measure(asked, bench, composed, shown, strengths)
+    waves = tuple(wavelengths(bare[0], measured.scenes))
+    result = _result(
+        base,
+        strengths,
+        small,
+        references,
+        measured,
+        [p.pipeline for p in composed],
+        equal,
+        broken,
+        waves,
+    )
+    commands = PointCommands(recipe, changes, place, bench).commands(
+        composed, measured.scenes, strengths
+    )
     result = replace(result, commands=commands)
     document = study_run.document(_document(result, bench))
     return study_run.write(runs, digest(document["summary"]), document, _report(result))
 
 
 def read_settings(recipe: str, changes: Sequence[str | Override], folder: Path) -> EvaluateSettings:
-    """Return the block ``evaluate`` of a recipe; raise `EvaluationRefused` with all mistakes in the recipe."""
+    """Return the block ``evaluate`` of a recipe; raise `EvaluationRefused` with all mistakes in
+    the recipe.
+    """
     return base_recipe(recipe, changes, folder).evaluation or EvaluateSettings()
 
 
@@ -132,7 +164,9 @@ def options_of(
     by: str | None,
     folder: Path,
 ) -> dict[str, Any]:
-    """Return arguments of `evaluate`: those that are given, and else those of the settings of the recipe."""
+    """Return arguments of `evaluate`: those that are given, and else those of the settings of
+    the recipe.
+    """
     lines = settings.pipelines if pipelines is None else pipelines
     mark = Location("evaluate.pipelines", 1, folder=str(folder)) if pipelines is None else None
     level = settings.equal_protection if equal_protection is None else equal_protection
@@ -147,10 +181,14 @@ def options_of(
 def _equalled(
     asked: AskedCamera, bare: list[PipelineRecipes], reference: str, equal: EqualProtection | None
 ) -> tuple[list[PipelineRecipes], dict[str, str]]:
-    """Return the pipelines, at equal protection if that was asked for, and the name of the reference of each."""
+    """Return the pipelines, at equal protection if that was asked for, and the name of the
+    reference of each.
+    """
     if equal is None:
         return bare, dict.fromkeys((p.name for p in bare), reference)
-    shaded = protect(asked.recipe, asked.changes, bare, equal, asked.store, asked.folder, asked.progress)
+    shaded = protect(
+        asked.recipe, asked.changes, bare, equal, asked.store, asked.folder, asked.progress
+    )
     rival = {old.name: new.name for old, new in zip(bare, shaded, strict=True)}[reference]
     references = dict.fromkeys((p.name for p in shaded), rival)
     if not asked.settings.beside:
@@ -163,25 +201,44 @@ def _result(
     strengths: tuple[float, ...],
     small: int,
     references: dict[str, str],
-    found: Measured,
+    measured: Measured,
     pipelines: Sequence[Pipeline],
     equal: EqualProtection | None,
     broken: Sequence[tuple[Path, str]],
     waves: Sequence[float | None],
 ) -> EvaluationResult:
     """Return the result of an evaluation with its statistics over scenes."""
-    owners, lost = photographs(found.scenes), [*broken, *found.broken]
-    tables = {name: metric_table(own, strengths, owners) for name, own in found.points.items()}
-    least = min(small, *(base.steps["truth"].params["shape"])) if "truth" in base.steps else small
-    more = {name: compare_with(own, tables[references[name]], base.seed) for name, own in tables.items()}
-    rest = (found.masks, found.panels, pipelines, found.mistold, equal, waves)
-    return EvaluationResult(base, found.scenes, lost, strengths, least, references, found.points, tables, more, *rest)
+    owners = photographs(measured.scenes)
+    tables = {name: metric_table(own, strengths, owners) for name, own in measured.points.items()}
+    if "truth" in base.steps:
+        small = min(small, min(base.steps["truth"].params["shape"]))
+    against = {
+        name: compare_with(own, tables[references[name]], base.seed) for name, own in tables.items()
+    }
+    return EvaluationResult(
+        recipe=base,
+        scenes=measured.scenes,
+        broken=[*broken, *measured.broken],
+        strengths=strengths,
+        small=small,
+        references=references,
+        points=measured.points,
+        tables=tables,
+        against=against,
+        masks=measured.masks,
+        panels=measured.panels,
+        pipelines=pipelines,
+        mistold=measured.mistold,
+        protection=equal,
+        wavelengths=waves,
+    )
 
 
 def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
     if not strengths or min(strengths) < 0 or not all(map(np.isfinite, strengths)):
         raise EvaluationRefused(
-            "--strengths: write finite multiples of saturation that are not negative, such as 0,1e1,1e6"
+            "--strengths: write finite multiples of saturation that are not negative, such as"
+            " 0,1e1,1e6"
         )
     return tuple(sorted(set(map(float, strengths))))
 
@@ -189,7 +246,9 @@ def _strengths(strengths: Sequence[float]) -> tuple[float, ...]:
 def _reference(reference: str, pipelines: Sequence[Pipeline]) -> str:
     names = [pipeline.name for pipeline in pipelines]
     if reference and reference not in names:
-        raise EvaluationRefused(f"--reference {reference} is not evaluated: write one of {', '.join(names)}")
+        raise EvaluationRefused(
+            f"--reference {reference} is not evaluated: write one of {', '.join(names)}"
+        )
     return reference or names[0]
 
 
@@ -197,23 +256,23 @@ def _report_scenes(
     shown: Sequence[Scene],
     broken: Sequence[tuple[Path, str]],
     strengths: Sequence[float],
-    each: Sequence[PipelineRecipes],
+    pipelines: Sequence[PipelineRecipes],
     progress: Progress,
 ) -> None:
-    names = ", ".join(pipeline.name for pipeline in each)
-    progress(f"{len(shown)} scenes, {len(strengths)} strengths, {len(each)} pipelines: {names}")
+    names = ", ".join(pipeline.name for pipeline in pipelines)
+    progress(
+        f"{len(shown)} scenes, {len(strengths)} strengths, {len(pipelines)} pipelines: {names}"
+    )
     for path, reason in broken[:5]:
         progress(f"not read: {path.name}: {reason}")
     if len(broken) > 5:
         progress(f"not read: {len(broken) - 5} more")
 
 
-# --- the folder -------------------------------------------------------------------------------------------------------
+# --- the folder -----------------------------------------------------------------------------------
 
 
 def _document(result: EvaluationResult, bench: EvaluationPoints) -> dict[str, Any]:
-    from neusee.workflows.evaluation.evaluation_page import summary
-
     return {
         "scenes": [[s.number, s.name, s.case, s.seed] for s in result.scenes],
         "not read": [[str(path), reason] for path, reason in result.broken],
@@ -229,40 +288,60 @@ def _document(result: EvaluationResult, bench: EvaluationPoints) -> dict[str, An
 
 
 def _report(result: EvaluationResult) -> StudyReport:
-    from neusee.workflows.evaluation.evaluation_page import COLUMNS, draw_pictures, lead, rows, sections
-
     pictures = draw_pictures(result)
     tables: dict[str, CsvTable] = {
         "points.csv": ((*_POINT, *METRICS, "command"), _point_rows(result)),
         "table.csv": (COLUMNS, rows(result)),
-        "mistold.csv": ((*_POINT[:1], "told", *_POINT[3:6], *_POINT[7:], *METRICS), mistold_rows(result.mistold)),
-        "suppression.csv": (("mask", "wavelength (nm)", "lsr", "bsr", "floor"), _curve_rows(result)),
+        "mistold.csv": (
+            (*_POINT[:1], "told", *_POINT[3:6], *_POINT[7:], *METRICS),
+            mistold_rows(result.mistold),
+        ),
+        "suppression.csv": (
+            ("mask", "wavelength (nm)", "lsr", "bsr", "floor"),
+            _curve_rows(result),
+        ),
     }
     if result.protection is not None:
-        tables["protection.csv"] = equal_protection.COLUMNS, equal_protection.protection_rows(result)
+        tables["protection.csv"] = (
+            equal_protection.COLUMNS,
+            equal_protection.protection_rows(result),
+        )
     shown = ("command", "date", "seconds", "computed", "seconds a point", "reference", "versions")
     title = f"{result.recipe.name}: evaluated"
-    return StudyReport(title, lead(result), sections(result, pictures), pictures, tables, shown=shown)
+    return StudyReport(
+        title, lead(result), sections(result, pictures), pictures, tables, shown=shown
+    )
 
 
-_POINT = ("pipeline", "mask", "restorer", "scene", "photograph", "laser", "wavelength (nm)", "strength")
+_POINT = (
+    "pipeline",
+    "mask",
+    "restorer",
+    "scene",
+    "photograph",
+    "laser",
+    "wavelength (nm)",
+    "strength",
+)
 
 
 def _point_rows(result: EvaluationResult) -> list[Sequence[Any]]:
     waves = ["" if metres is None else f"{metres * 1e9:.6g}" for metres in result.wavelengths]
-    return [
-        (p.name, p.front, p.back, s.number, s.name, s.case, nm, f"{k:g}", *(point[m] for m in METRICS), commands[k])
-        for p in result.pipelines
-        for s, at, nm, commands in zip(
+    rows: list[Sequence[Any]] = []
+    for p in result.pipelines:
+        scenes = zip(
             result.scenes, result.points[p.name], waves, result.commands[p.name], strict=True
         )
-        for k, point in at.items()
-    ]
+        for s, points, nm, commands in scenes:
+            start = (p.name, p.front, p.back, s.number, s.name, s.case, nm)
+            for k, point in points.items():
+                rows.append((*start, f"{k:g}", *(point[m] for m in METRICS), commands[k]))
+    return rows
 
 
 def _curve_rows(result: EvaluationResult) -> list[Sequence[Any]]:
-    return [
-        (name, f"{x:.6g}", *row)
-        for name, mask in result.masks.items()
-        for x, *row in zip(mask.wavelengths, mask.lsr, mask.bsr, mask.floor, strict=True)
-    ]
+    rows: list[Sequence[Any]] = []
+    for name, mask in result.masks.items():
+        columns = zip(mask.wavelengths, mask.lsr, mask.bsr, mask.floor, strict=True)
+        rows += [(name, f"{x:.6g}", *row) for x, *row in columns]
+    return rows

@@ -1,22 +1,349 @@
-"""Causes of a changed result: differences between a new and an earlier result, in the step or upstream of it.
-
-A pair is a new and an earlier result. The two results are compared by the parts of their keys, so that no
-tensor is read. The search goes from a pair to the pairs of its inputs whose keys differ.
-"""
+"""Causes of a changed result: parameters, files and code that differ, in words."""
 
 from __future__ import annotations
 
+import ast
 import functools
-from collections.abc import Mapping
+import math
+import re
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from neusee.nodes.units import read_quantity
 from neusee.workflows.engine.resolved_keys import Resolved
-from neusee.workflows.explain.change_wording import Wording
-from neusee.workflows.explain.code_changes import edits
-from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.cache_key import Key, is_private
+from neusee.workflows.graph.final_values import Setting, flow
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.keys.cache_key import USUAL, Key, is_private
+from neusee.workflows.keys.module_digest import read_parts
+from neusee.workflows.keys.module_origin import source_file
 from neusee.workflows.store.result_store import Store
+
+# --- code changes ---------------------------------------------------------------------------------
+
+# Changes of code: the functions, classes and constants that differ between two digests of code.
+
+
+_STATE, _SETTINGS = "state of ", "settings"
+_PROGRAM = "neusee.workflows"
+_OTHER = frozenset({"Python", _SETTINGS, "closure", _PROGRAM})
+
+
+def edits(root: Path, old: str, new: str) -> list[str]:
+    """Return one text clause for each definition that differs between two versions of code; []
+    if no record exists.
+    """
+    before, after = read_parts(root, old), read_parts(root, new)
+    if not before or not after:
+        return []
+    source = _edited_modules(before, after)
+    beside: list[str] = []
+    for name in dict.fromkeys([*after, *before]):
+        if not _is_module(name) and not name.startswith(_STATE):
+            beside += _beside(name, before.get(name, {}), after.get(name, {}))
+    return source + beside or [
+        f"a value that {_file(name.removeprefix(_STATE))} holds was changed while the program ran:"
+        " a constant, a table, a default or a function"
+        for name in after
+        if name.startswith(_STATE) and before.get(name, after[name]) != after[name]
+    ]
+
+
+def _edited_modules(
+    before: Mapping[str, dict[str, str]], after: Mapping[str, dict[str, str]]
+) -> list[str]:
+    """Return one text clause for each definition that differs, and for each module that is imported
+    now, or no longer.
+    """
+    now, then = list(filter(_is_module, after)), list(filter(_is_module, before))
+    inside: list[str] = []
+    for name in now:
+        if name in before:
+            inside += _inside(name, before[name], after[name])
+    came = [f"{_file(name)} is imported now" for name in now if name not in before]
+    removed = [f"{_file(name)} is no longer imported" for name in then if name not in after]
+    return sorted(inside, key=lambda text: text.startswith("the ")) + came + removed
+
+
+def _is_module(name: str) -> bool:
+    return all(word.isidentifier() for word in name.split(".")) and name not in _OTHER
+
+
+def _beside(name: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
+    """Return one text clause for each difference in versions, settings and declared
+    dependencies.
+    """
+    labels = [label for label in dict.fromkeys([*new, *old]) if old.get(label) != new.get(label)]
+    if not labels:
+        return []
+    if name == _SETTINGS:
+        return [
+            f"{label} {old.get(label, USUAL.get(label))} -> {new.get(label, USUAL.get(label))},"
+            " a setting of this process"
+            for label in labels
+        ]
+    if name == "Python" or name.startswith("package "):
+        return [_other_version(name, old.get("version"), new.get("version"))]
+    if name == "closure":
+        return ["a value that the function of the node holds from the function around it changed"]
+    if name == _PROGRAM:
+        return ["the program itself changed, which the node imports (neusee/workflows)"]
+    if not old or not new:
+        return [f"{name} is declared {'now' if new else 'no more'}"]
+    return [f"declared {name} changed" if name.startswith("file ") else f"{name} changed"]
+
+
+def _other_version(name: str, before: str | None, after: str | None) -> str:
+    """Return the text clause for Python or a package of another version, or with other files."""
+    if not before or not after:
+        return f"{name} is {'used now' if after else 'no longer used'}"
+    if before == after:
+        return f"{name} has other files, under the same version: {after}"
+    return f"{before} -> {after}{', an installed package' if name != 'Python' else ''}"
+
+
+def _inside(module: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
+    """Return one text clause for each changed, added or removed definition of a module."""
+    file = _file(module)
+    differ = [label for label in new if label in old and old[label] != new[label]]
+    lines = _lines(module) if differ else {}
+    places = {label: f" (line {lines[label]})" if label in lines else "" for label in differ}
+    changed = [
+        f"{'code of ' + label if label.endswith('()') else _named(label)} in {file}"
+        f" changed{places[label]}"
+        for label in differ
+    ]
+    added = [f"{_named(label)} was added to {file}" for label in new if label not in old]
+    removed = [f"{_named(label)} was removed from {file}" for label in old if label not in new]
+    return changed + added + removed
+
+
+def _lines(module: str) -> dict[str, int]:
+    """Return the line of each function, hook, class and constant at the top of a module, as its
+    file is now.
+    """
+    path = source_file(module)
+    try:
+        body = ast.parse(path.read_bytes()).body if path else []
+    except (OSError, SyntaxError):
+        return {}
+    lines = dict[str, int]()
+    for item in body:
+        lines |= dict.fromkeys(_labels_of(item), item.lineno)
+    return lines
+
+
+def _labels_of(item: ast.stmt) -> list[str]:
+    """Return the names of what a statement defines, as the parts of a digest name it."""
+    if isinstance(item, ast.ClassDef):
+        return [f"class {item.name}"]
+    if isinstance(item, ast.FunctionDef):
+        hooks = [ast.unparse(decorator) for decorator in item.decorator_list]
+        return [f"{name}()" for name in (hooks if item.name == "_" and hooks else [item.name])]
+    targets = item.targets if isinstance(item, ast.Assign) else []
+    return [f"constant {target.id}" for target in targets if isinstance(target, ast.Name)]
+
+
+def _named(label: str) -> str:
+    """Return the name of a definition with its kind, such as ``function psf()`` or ``the
+    imports``.
+    """
+    if label.endswith("()"):
+        return f"function {label}"
+    return label if label.startswith(("class ", "constant ")) else f"the {label}"
+
+
+def _file(module: str) -> str:
+    path = source_file(module)
+    package = path is not None and path.name == "__init__.py"
+    return module.replace(".", "/") + ("/__init__.py" if package else ".py")
+
+
+# --- change wording -------------------------------------------------------------------------------
+
+# Texts that describe changed parameters, with path, unit and location in the recipe.
+
+
+_QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\D.*)")
+_ABSENT = object()
+
+
+class Wording:
+    """Texts that describe changed parameters in the units of a recipe, or without a recipe in SI
+    units.
+    """
+
+    def __init__(self, recipe: Recipe | None = None) -> None:
+        self._recipe = recipe
+
+    def params(self, label: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+        """Return one text clause for each parameter that differs between two results of the step
+        ``label``.
+        """
+        step = self._recipe.steps.get(label) if self._recipe else None
+        names = [n for n in dict.fromkeys([*old, *new]) if old.get(n) != new.get(n)]
+        return [self._param(step, n, old.get(n, _ABSENT), new.get(n, _ABSENT)) for n in names]
+
+    def source(self, *path: str) -> str:
+        """Return the location of a value in the recipe, such as `` (recipe.yaml:3:7)``, or an
+        empty string.
+        """
+        setting = self._recipe.config.settings.get(".".join(path)) if self._recipe else None
+        return f" ({setting.source})" if setting else ""
+
+    def _param(self, step: Step | None, name: str, old: Any, new: Any) -> str:
+        if new is _ABSENT:
+            return f"{name} is no longer a parameter"
+        setting, source = self._setting(step, name)
+        path = ".".join(map(str, setting.path)) if setting else name
+        where = f" ({source})" if source else ""
+        if isinstance(new, Mapping) and "file" in new:
+            inside = f" ({path}{f', {source}' if source else ''})" if setting else where
+            return f"file {_file_wording(step, name)}: {_other_file(old, new)}{inside}"
+        written = (
+            setting.value
+            if setting and not (isinstance(setting.value, str) and "${" in setting.value)
+            else None
+        )
+        if old is _ABSENT:
+            return f"{path} is new: {_as_written(written, new)}{where}"
+        before, after = _both(written, old, new)
+        return f"{path} {before} -> {after}{where}"
+
+    def _setting(self, step: Step | None, name: str) -> tuple[Setting | None, str]:
+        """Return the recipe setting that gives a parameter its value, or None, and the location
+        of the value.
+        """
+        if step is None:
+            return None, ""
+        if name not in step.param_marks:
+            return None, f"default of {step.node.path}"
+        mark = str(step.param_marks[name])
+        marked = self._marked.get(mark, [])
+        here = ("steps", step.name.partition("[")[0], "with", name)
+        named = [s for s in marked if s.path == here] or [
+            s for s in marked if s.path[-1:] == (name,)
+        ]
+        setting = (named or marked)[0] if named or len(marked) == 1 else None
+        return setting, setting.source if setting else mark
+
+    @cached_property
+    def _marked(self) -> Mapping[str, list[Setting]]:
+        """Return the settings that the user wrote, by location in the recipe files."""
+        settings = defaultdict(list)
+        for setting in self._recipe.config.settings.values() if self._recipe else ():
+            if not setting.default:
+                settings[setting.source.partition(", ")[0]].append(setting)
+        return settings
+
+
+def _file_wording(step: Step | None, name: str) -> str:
+    value = step.params.get(name) if step else None
+    return value.name if isinstance(value, Path) else name
+
+
+def _other_file(old: Any, new: Mapping[str, Any]) -> str:
+    if not isinstance(old, Mapping) or "file" not in old:
+        return "is given now"
+    return (
+        "other content" if old["file"] != new["file"] else f"{new['suffix']}, not {old['suffix']}"
+    )
+
+
+def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
+    """Return the old and the new value of a parameter as text, both in the unit of the new
+    value.
+    """
+    after = _as_written(written, new)
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        parts = (
+            written if isinstance(written, list) and len(written) == len(old) else [None] * len(old)
+        )
+        return f"[{', '.join(map(_in_unit_of, parts, new, old))}]", after
+    if isinstance(old, Mapping) and isinstance(new, Mapping):
+        return _items(old, new)
+    unit = _unit(written, new)
+    before = spoken(unit[0](old)) if unit and _is_number(old) else spoken(old)
+    # the values differ by less than the shown digits
+    if before in (spoken(new), after.partition(" ")[0]):
+        return repr(old), repr(new)
+    return before, after
+
+
+def _in_unit_of(written: Any, new: Any, old: Any) -> str:
+    unit = _unit(written, new)
+    return f"{spoken(unit[0](old))} {unit[1]}" if unit and _is_number(old) else spoken(old)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float | int) and not isinstance(value, bool)
+
+
+def _items(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, str]:
+    """Return two texts: the entries that only the old mapping has, and the entries that only the
+    new mapping has.
+    """
+    pairs = [[(str(key), value) for key, value in m.get("items", ())] for m in (old, new)]
+    only = [
+        [f"{k}: {spoken(v)}" for k, v in pairs[i] if (k, v) not in pairs[1 - i]] for i in (0, 1)
+    ]
+    return f"{{{', '.join(only[0])}}}", f"{{{', '.join(only[1])}}}"
+
+
+def _as_written(written: Any, new: Any) -> str:
+    """Return a parameter value as text: as the user wrote the value if that text has a unit,
+    else in short form.
+    """
+    if _unit(written, new) or (isinstance(written, list) and isinstance(new, list)):
+        return flow(written)
+    return spoken(new)
+
+
+def _unit(written: Any, new: Any) -> tuple[Callable[[float], float], str] | None:
+    """Return a function from SI units to the unit that the user wrote, and this unit; None if
+    there is no unit.
+    """
+    match = _QUANTITY.fullmatch(written.strip()) if isinstance(written, str) else None
+    if match is None or not _is_number(new):
+        return None
+    if match[2].strip() == "e-/DN":
+        return (lambda si: 1.0 / si if si else math.inf), match[2]
+    if new and float(match[1]):
+        return _times(float(match[1]) / new), match[2]
+    for si in ("m", "s", "rad", "K", "e-", "waves", "DN/e-"):
+        with suppress(ValueError):
+            return _times(1.0 / read_quantity(f"1 {match[2]}", si)), match[2]
+    return None
+
+
+def _times(factor: float) -> Callable[[float], float]:
+    return lambda si: si * factor
+
+
+def spoken(value: Any) -> str:
+    """Return a short text for the value of a parameter."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Mapping):
+        items = ", ".join(f"{spoken(k)}: {spoken(v)}" for k, v in value.get("items", ()))
+        return f"a {value['suffix']} file".replace("  ", " ") if "file" in value else f"{{{items}}}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(spoken, value))}]"
+    return "none" if value is None else flow(value)
+
+
+# --- change causes --------------------------------------------------------------------------------
+
+# Causes of a changed result: differences between a new and an earlier result, in the step or
+# upstream of it.
+#
+# A pair is a new and an earlier result. The two results are compared by the parts of their keys, so
+# that no tensor is read. The search goes from a pair to the pairs of its inputs whose keys differ.
+
 
 Origin = Mapping[str, Any]  #: the parts of a key: node, code, params, inputs, stream
 _FEW = 4  #: steps of an input that a clause names
@@ -36,13 +363,17 @@ Found = tuple[list[str], list[Pair]]  #: differences at a pair itself, and the p
 
 @dataclass(frozen=True, slots=True)
 class Roots:
-    """Root causes of a changed result, the nearest first, with the path from the compared step to each cause."""
+    """Root causes of a changed result, the nearest first, with the path from the compared step
+    to each cause.
+    """
 
     found: dict[str, Pair]  #: by the description of the cause
     above: dict[Pair, Pair | None]
 
     def chain(self, text: str) -> list[str]:
-        """Return the names of the steps from the compared step to the step with the cause ``text``."""
+        """Return the names of the steps from the compared step to the step with the cause
+        ``text``.
+        """
         way: list[str] = []
         pair: Pair | None = self.found[text]
         while pair is not None:
@@ -54,99 +385,145 @@ class Roots:
 class Comparison:
     """Comparison of the results of a recipe, or of a stored result, with earlier stored results."""
 
-    def __init__(self, store: Store, recipe: Recipe | None = None, resolved: Resolved | None = None) -> None:
+    def __init__(
+        self, store: Store, recipe: Recipe | None = None, resolved: Resolved | None = None
+    ) -> None:
         self.store, self.recipe, self.resolved = store, recipe, resolved or Resolved()
         self.wording = Wording(recipe)
         self.seen: dict[Pair, Found] = {}
         self.about = functools.cache(store.about)
         self._edited = functools.cache(functools.partial(edits, store.root))
 
-    def roots(self, start: Pair, most: float = float("inf")) -> Roots | None:
-        """Return the root causes of the change of a result, or None if there are more than ``most`` causes."""
+    def roots(self, start: Pair, limit: float = float("inf")) -> Roots | None:
+        """Return the root causes of the change of a result, or None if there are more than
+        ``limit`` causes.
+        """
         above: dict[Pair, Pair | None] = {start: None}
-        found: dict[str, Pair] = {}
+        pairs: dict[str, Pair] = {}
         todo = [start]
         for pair in todo:  # the list grows during the loop, so that the nearest pairs come first
             texts, below = self.compare(pair)
             for text in texts:
-                found.setdefault(text, pair)
-            if len(found) > most:
+                pairs.setdefault(text, pair)
+            if len(pairs) > limit:
                 return None
             for other in below:
                 if other not in above:
                     above[other] = pair
                     todo.append(other)
-        return Roots(found, above)
+        return Roots(pairs, above)
 
     def compare(self, pair: Pair) -> Found:
-        """Return the differences between two results of a step, and the pairs of their inputs that differ."""
+        """Return the differences between two results of a step, and the pairs of their inputs
+        that differ.
+        """
         if pair not in self.seen:
             self.seen[pair] = self._compare(pair)
         return self.seen[pair]
 
     def own(self, label: str, old: Origin, new: Origin) -> list[str]:
-        """Return the differences between two results of a step in node, parameters, code and random stream."""
+        """Return the differences between two results of a step in node, parameters, code and
+        random stream.
+        """
         if old["node"] != new["node"]:
             where = self.wording.source("steps", label.partition("[")[0], "node")
             return [f"{old['node']} -> {new['node']}{where}"]
-        found = self.wording.params(label, old["params"], new["params"])
-        if not found and old.get("written") != new.get("written"):
-            found = ["a file of a parameter has another name, or a mapping another order"]
+        texts = self.wording.params(label, old["params"], new["params"])
+        if not texts and old.get("written") != new.get("written"):
+            texts = ["a file of a parameter has another name, or a mapping another order"]
         if old["code"] != new["code"]:
-            private = [f"the loaded code of {new['node']} is not that of its file any more: restart Python"]
-            found += (
+            private = [
+                f"the loaded code of {new['node']} is not that of its file any more: restart Python"
+            ]
+            texts += (
                 private
                 if is_private(new["code"])
-                else self._edited(old["code"], new["code"]) or [f"the code of {new['node']} changed"]
+                else self._edited(old["code"], new["code"])
+                or [f"the code of {new['node']} changed"]
             )
-        return found + self._stream(old.get("stream"), new.get("stream"))
+        return texts + self._stream(old.get("stream"), new.get("stream"))
 
     def origin(self, key: Key) -> Origin | None:
-        """Return the parts of a cache key, from the recipe or from the store, or None if the key is unknown."""
+        """Return the parts of a cache key, from the recipe or from the store, or None if the key
+        is unknown.
+        """
         return self.resolved.origins.get(key) or (self.about(key) or {}).get("origin")
 
     def step(self, key: Key) -> str | None:
-        """Return the name of the first step with the cache key ``key``, or None if the key is unknown."""
+        """Return the name of the first step with the cache key ``key``, or None if the key is
+        unknown.
+        """
         return self.resolved.makers.get(key) or (self.about(key) or {}).get("step")
 
     def _compare(self, pair: Pair) -> Found:
         old, new = self.origin(pair.old), self.origin(pair.new)
         if old is None or new is None:
-            return [f"the {'earlier origin' if old is None else 'origin'} of {pair.label} is no longer known"], []
+            return [
+                f"the {'earlier origin' if old is None else 'origin'} of {pair.label} is no longer"
+                " known"
+            ], []
         texts = self.own(pair.label, old, new)
         if old["node"] != new["node"] or len(old["inputs"]) != len(new["inputs"]):
             return texts, []
         pairs: list[Pair] = []
-        for (path, labels), after, before in zip(self._labels(pair, new), new["inputs"], old["inputs"], strict=True):
+        for (path, labels), after, before in zip(
+            self._labels(pair, new), new["inputs"], old["inputs"], strict=True
+        ):
             if after != before:
-                more, behind = self._input(path, labels, _listed(after), _listed(before))
-                texts, pairs = texts + more, pairs + behind
+                input_texts, behind = self._input(path, labels, _listed(after), _listed(before))
+                texts, pairs = texts + input_texts, pairs + behind
         return texts, pairs
 
     def _labels(self, pair: Pair, origin: Origin) -> list[tuple[tuple[str, ...], list[str]]]:
-        """Return the path of each input in the recipe, and the names of the steps that this input reads."""
+        """Return the path of each input in the recipe, and the names of the steps that this
+        input reads.
+        """
         step = self.recipe.steps.get(pair.label) if self.recipe else None
         if step is None or self.resolved.keys.get(pair.label) != pair.new:
-            return [((), [self.step(key) or "a step" for key in _listed(keys)]) for keys in origin["inputs"]]
+            return [
+                ((), [self.step(key) or "a step" for key in _listed(keys)])
+                for keys in origin["inputs"]
+            ]
         path = ("steps", pair.label.partition("[")[0], "from")
         wires = [(name, _listed(step.wires.get(name))) for name in step.node.inputs]
-        return [((*path, name), [self.resolved.stands_for(wire) for wire in wired]) for name, wired in wires]
+        return [
+            ((*path, name), [self.resolved.stands_for(wire) for wire in wired])
+            for name, wired in wires
+        ]
 
-    def _input(self, path: tuple[str, ...], labels: list[str], new: list[Key], old: list[Key]) -> Found:
+    def _input(
+        self, path: tuple[str, ...], labels: list[str], new: list[Key], old: list[Key]
+    ) -> Found:
         """Return the differences between the new and the earlier steps that one input reads."""
         if len(new) == 1 and len(old) == 1:
             return self._source(path, labels[0], new[0], old[0])
         then = dict(zip([self.step(key) or key for key in old], old, strict=True))
         now = dict(zip(labels, new, strict=True))
         if len(old) == len(new) and (len(then) < len(old) or not then.keys() & now.keys()):
-            found = [self._source(path, *row) for row in zip(labels, new, old, strict=True)]
-            return [t for texts, _ in found for t in texts], [p for _, pairs in found for p in pairs]
-        texts = self._joined(path, [n for n in now if n not in then], [n for n in then if n not in now])
-        pairs = [Pair(name, key, then[name]) for name, key in now.items() if then.get(name, key) != key]
+            return self._one_by_one(path, labels, new, old)
+        texts = self._joined(
+            path, [n for n in now if n not in then], [n for n in then if n not in now]
+        )
+        pairs = [
+            Pair(name, key, then[name]) for name, key in now.items() if then.get(name, key) != key
+        ]
         return texts or ([] if pairs else ["the order of its sources changed"]), pairs
 
+    def _one_by_one(
+        self, path: tuple[str, ...], labels: list[str], new: list[Key], old: list[Key]
+    ) -> Found:
+        """Return the differences of steps whose order tells which was which."""
+        texts, pairs = list[str](), list[Pair]()
+        for label, key, earlier in zip(labels, new, old, strict=True):
+            of_source = self._source(path, label, key, earlier)
+            texts += of_source[0]
+            pairs += of_source[1]
+        return texts, pairs
+
     def _source(self, path: tuple[str, ...], label: str, new: Key, old: Key) -> Found:
-        """Return how one source of an input differs: a step has changed, or was exchanged, added or removed."""
+        """Return how one source of an input differs: a step has changed, or was exchanged, added
+        or removed.
+        """
         if new == old:
             return [], []
         was = self.step(old)
@@ -167,14 +544,22 @@ class Comparison:
         return [exchanged], []
 
     def _joined(self, path: tuple[str, ...], came: list[str], went: list[str]) -> list[str]:
-        """Return one text clause for the added and one for the removed steps that an input reads."""
+        """Return one text clause for the added and one for the removed steps that an input
+        reads.
+        """
         where = self._wired(path) if any("[" not in name for name in came) else ""
         texts = [f"reads {_few(came)} now{where}"] if came else []
         null = self.recipe.absent.get(went[0].partition("[")[0]) if went and self.recipe else None
-        return [*texts, f"reads {_few(went)} no more{f': it is {null}' if null else ''}"] if went else texts
+        return (
+            [*texts, f"reads {_few(went)} no more{f': it is {null}' if null else ''}"]
+            if went
+            else texts
+        )
 
-    def _between(self, key: Key, wanted: tuple[str | None, ...]) -> tuple[list[str], Key | None]:
-        """Go upstream along first inputs to a step in ``wanted``; return the passed steps and the key found."""
+    def _between(self, key: Key, steps: tuple[str | None, ...]) -> tuple[list[str], Key | None]:
+        """Go upstream along first inputs to a step in ``steps``; return the passed steps and
+        the key found.
+        """
         passed: list[str] = []
         for _ in range(_FAR):
             first = next(iter((self.origin(key) or {}).get("inputs", ())), None)
@@ -182,7 +567,7 @@ class Comparison:
                 break
             passed.append(self.step(key) or "a step")
             key = first
-            if self.step(key) in wanted:
+            if self.step(key) in steps:
                 return passed, key
         return [], None
 
@@ -197,25 +582,33 @@ class Comparison:
         return f"{name} is left out now: {verdict.why}" if verdict and verdict.left_out else ""
 
     def _wired(self, path: tuple[str, ...]) -> str:
-        """Return the location of an input in the recipe as text in brackets, such as `` (recipe.yaml:3:7)``."""
+        """Return the location of an input in the recipe as text in brackets, such as ``
+        (recipe.yaml:3:7)``.
+        """
         return self.wording.source(*path) or self.wording.source(*path[:-1]) if path else ""
 
     def _stream(self, old: list[Any] | None, new: list[Any] | None) -> list[str]:
         """Return one text clause for each difference in the random stream of a step."""
         if old is None or new is None:
-            return [] if old == new else ["it draws noise now" if new else "it draws no noise any more"]
+            return (
+                []
+                if old == new
+                else ["it draws noise now" if new else "it draws no noise any more"]
+            )
         texts = (
             f"seed {old[0]} -> {new[0]}{self.wording.source('seed')}",
             f"its noise uses the stream of {new[1]}, not of {old[1]}",
             f"its noise is drawn on {new[2]}, not on {old[2]}",
         )
-        return [text for text, before, after in zip(texts, old, new, strict=True) if before != after]
+        return [
+            text for text, before, after in zip(texts, old, new, strict=True) if before != after
+        ]
 
 
 def _few(names: list[str]) -> str:
     """Return the first names of a list as text, such as ``a, b and 4 more``."""
-    rest = len(names) - _FEW
-    return ", ".join(names) if rest <= 0 else f"{', '.join(names[:_FEW])} and {rest} more"
+    hidden = len(names) - _FEW
+    return ", ".join(names) if hidden <= 0 else f"{', '.join(names[:_FEW])} and {hidden} more"
 
 
 def _listed(value: Any) -> list[Any]:

@@ -11,19 +11,26 @@ from neusee.workflows.engine.placement_inputs import parts_of
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.placement.heft_schedule import Schedule, Task, TooLarge, heft
 from neusee.workflows.placement.machine_file import Machines
-from neusee.workflows.report.text_table import columns
-from neusee.workflows.store.byte_sizes import format_size
+from neusee.workflows.report.terminal_text import columns
+from neusee.workflows.store.cache_settings import format_size
 
 _SHOWN = 24  #: steps of the critical path
 
 
-def cluster_lines(recipe: Recipe, estimates: Mapping[str, Estimate], machines: Machines) -> list[str]:
-    """Return text on the makespan, the devices, the transfers and the critical path of a run with an empty store.
+def cluster_lines(
+    recipe: Recipe, estimates: Mapping[str, Estimate], machines: Machines
+) -> list[str]:
+    """Return text on the makespan, the devices, the transfers and the critical path of a run with
+    an empty store.
 
-    The seconds on a device are the measured seconds on the CPU, divided by the relative speed of the device.
+    The seconds on a device are the measured seconds on the CPU, divided by the relative speed of
+    the device.
     """
     devices, alone = len(machines.devices), sum(cost.seconds["cpu"] for cost in estimates.values())
-    head = f"{_count(len(estimates), 'step')} on {_count(devices, 'device')}: {machines.title or 'no title'}"
+    head = (
+        f"{_count(len(estimates), 'step')} on {_count(devices, 'device')}:"
+        f" {machines.title or 'no title'}"
+    )
     try:
         schedule = simulated(recipe, estimates, machines)
     except TooLarge as error:
@@ -34,7 +41,10 @@ def cluster_lines(recipe: Recipe, estimates: Mapping[str, Estimate], machines: M
     return [
         head,
         "",
-        f"makespan     {_time(schedule.makespan)}; where they were measured, one after another, {_time(alone)}{faster}",
+        (
+            f"makespan     {_time(schedule.makespan)}; where they were measured, one after another,"
+            f" {_time(alone)}{faster}"
+        ),
         f"transferred  {sent}",
         *([f"in parts     {cut}"] if cut else []),
         "",
@@ -46,24 +56,44 @@ def cluster_lines(recipe: Recipe, estimates: Mapping[str, Estimate], machines: M
 
 
 def simulated(recipe: Recipe, estimates: Mapping[str, Estimate], machines: Machines) -> Schedule:
-    """Return the schedule of the steps of a recipe on other machines; raise `TooLarge` if the memory is too small."""
-    tasks = [_task(recipe.steps[name], cost, estimates, machines) for name, cost in estimates.items()]
-    return heft(tasks, machines.cluster, [name for name in dict.fromkeys(recipe.outputs) if name in estimates])
+    """Return the schedule of the steps of a recipe on other machines; raise `TooLarge` if the
+    memory is too small.
+    """
+    tasks = [
+        _task(recipe.steps[name], cost, estimates, machines) for name, cost in estimates.items()
+    ]
+    return heft(
+        tasks,
+        machines.cluster,
+        [name for name in dict.fromkeys(recipe.outputs) if name in estimates],
+    )
 
 
 def _task(step: Step, cost: Estimate, among: Mapping[str, Estimate], machines: Machines) -> Task:
     hint = step.device or step.node.device
-    allowed = [d for d in machines.devices if fits(d.name.rpartition("/")[2], d.kind, hint)] or machines.devices
-    seconds = {d.name: cost.seconds["cpu"] / machines.speed(d.name, step.node.path) for d in allowed}
+    allowed = [
+        d for d in machines.devices if fits(d.name.rpartition("/")[2], d.kind, hint)
+    ] or machines.devices
+    seconds = {
+        d.name: cost.seconds["cpu"] / machines.speed(d.name, step.node.path) for d in allowed
+    }
     sources = tuple(dict.fromkeys(name for name in step.sources if name in among))
     return Task(step.name, sources, seconds, cost.bytes, cost.work, parts_of(step, cost))
 
 
 def _devices(schedule: Schedule, machines: Machines) -> list[str]:
-    """Return one text line for each device: busy fraction of the makespan, number of steps and peak memory."""
+    """Return one text line for each device: busy fraction of the makespan, number of steps and
+    peak memory.
+    """
     shares, steps = schedule.utilisation(), Counter(slot.device for slot in schedule.slots)
     rows = [
-        [d.name, f"{shares[d.name]:.0%}", str(steps[d.name]), format_size(schedule.peak[d.name]), format_size(d.memory)]
+        [
+            d.name,
+            f"{shares[d.name]:.0%}",
+            str(steps[d.name]),
+            format_size(schedule.peak[d.name]),
+            format_size(d.memory),
+        ]
         for d in machines.devices
     ]
     mean = sum(shares.values()) / len(shares)
@@ -77,7 +107,9 @@ def _path(schedule: Schedule) -> list[str]:
     busy = sum(slot.end - slot.start for slot in path)
     wait = f" of {_time(schedule.makespan)}; the rest is waiting for data or memory"
     share = wait if busy < 0.999 * schedule.makespan else ""
-    times = [[slot.task, slot.device, _time(slot.start), _time(slot.end - slot.start)] for slot in path]
+    times = [
+        [slot.task, slot.device, _time(slot.start), _time(slot.end - slot.start)] for slot in path
+    ]
     rows = [["critical path", "device", "at", "takes"], *times]
     if len(path) > _SHOWN:
         half = _SHOWN // 2
@@ -89,13 +121,13 @@ def _guesses(estimates: Mapping[str, Estimate]) -> list[str]:
     names = [name for name, cost in estimates.items() if not cost.known]
     if not names:
         return []
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ["", f"guesses, never measured: {', '.join(names[:_SHOWN])}{more}"]
+    remainder = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ["", f"guesses, never measured: {', '.join(names[:_SHOWN])}{remainder}"]
 
 
 def _time(seconds: float) -> str:
     return f"{seconds:.3g} s" if seconds >= 1 or seconds == 0 else f"{seconds * 1e3:.3g} ms"
 
 
-def _count(number: int, one: str, many: str = "") -> str:
-    return f"{number} {one if number == 1 else many or one + 's'}"
+def _count(number: int, singular: str, many: str = "") -> str:
+    return f"{number} {singular if number == 1 else many or singular + 's'}"

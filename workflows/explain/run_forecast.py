@@ -1,29 +1,256 @@
-"""Forecast of a run from earlier runs: cache hits, bytes, seconds, memory and devices."""
+"""Forecast of a run from earlier runs: cache hits, seconds, memory and devices."""
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+import re
+from collections import Counter
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from textwrap import wrap
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.engine.cost_laws import sizes_of
-from neusee.workflows.engine.cost_model import Costs, Estimate
-from neusee.workflows.engine.local_executor import lanes_of, memory_limit
+from neusee.workflows.engine.cost_model import Costs, Estimate, Range, sizes_of
+from neusee.workflows.engine.local_executor import lanes_of, memory_limit, program_memory
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import past_costs, prepare, running_peak
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.step_job import Lane, StepJob
-from neusee.workflows.explain.forecast_table import forecast_rows, seconds_text, table_lines
-from neusee.workflows.explain.report_memory import held_beside, report_peak, shown_steps
 from neusee.workflows.graph.recipe_graph import Recipe, needed, nodes_of
-from neusee.workflows.keys.cache_key import Key
+from neusee.workflows.keys.cache_key import Key, device_kind
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
-from neusee.workflows.report.contents import steps_of, wanted
-from neusee.workflows.store.byte_sizes import format_size
+from neusee.workflows.report.contents import FIGURES, files_of, steps_of, wanted
+from neusee.workflows.report.files_beside import LARGE, ROOM
+from neusee.workflows.report.terminal_text import columns
+from neusee.workflows.store.cache_settings import UNITS, format_size
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+
+if TYPE_CHECKING:
+    from neusee.workflows.engine.cost_model import Estimate
+    from neusee.workflows.store.result_store import Store
+
+
+# --- forecast table -------------------------------------------------------------------------------
+
+# Table of a forecast: what each step of a recipe would cost, with the range that is expected, in 80
+# columns.
+
+
+Row = dict[str, Any]
+_SHORT, _SMALL = 0.01, 1e6  #: s and bytes below which a cost is not written out in the table
+#: bytes of a peak below which its range is not written, because freed memory is used again
+_SURE = 1e7
+
+
+def forecast_rows(plan: Plan, store: Store) -> list[Row]:
+    """Return what is expected of each step of a recipe as values for JSON: its state, its costs and
+    their ranges.
+
+    A range is a dict with the keys ``expected``, ``least`` and ``most``. A guess counts at its
+    upper end.
+    """
+    return [_row(name, plan, store) for name in plan.order]
+
+
+def _row(name: str, plan: Plan, store: Store) -> Row:
+    step, about = plan.recipe.steps[name], store.about(plan.keys[name])
+    row: Row = {
+        "step": name,
+        "node": step.node.path,
+        "state": "",
+        "where": "",
+        "seconds": None,
+        "bytes": None,
+    }
+    row |= {"memory": None, "guess": False, "reads": list(dict.fromkeys(step.sources))}
+    if plan.left_out.get(name):
+        return row | {"state": "left out"}
+    if name in plan.expected:
+        where = plan.lanes.get(name, "?")
+        return row | {"state": "run", "where": where, **_costs(plan.expected[name], where)}
+    state = (
+        "stored" if store.has(plan.keys[name]) else "run" if name in plan.awake else "not needed"
+    )
+    measured = (
+        {"seconds": _ranged(about["seconds"], Range()), "bytes": about["bytes"]} if about else {}
+    )
+    return row | {"state": state, **measured}
+
+
+def _costs(cost: Estimate, where: str) -> Row:
+    seconds = cost.seconds.get(device_kind(where), cost.seconds["cpu"])
+    memory, time = cost.spread
+    peak = _ranged(cost.peak, memory)
+    peak["least"] = max(peak["least"], cost.bytes)
+    fields = {"seconds": _ranged(seconds, time), "bytes": cost.bytes, "memory": peak}
+    return fields | {"guess": not cost.known, "bytes_guessed": not cost.sized}
+
+
+def _ranged(expected: float, around: Range) -> dict[str, float]:
+    return {"expected": expected, "least": expected * around.least, "most": expected * around.most}
+
+
+def table_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the table of a forecast as lines of text, from the rows of `forecast_rows`.
+
+    A range is written behind its value, ``0.81 (0.7-1.2)``. What is negligible is written as below
+    a limit, and a guess as ``guess`` with its upper end.
+    """
+    head = ["step", "where", "seconds", "bytes", "memory"]
+    return columns([head, *(_cells(row) for row in rows)])
+
+
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    state = row["where"] or row["state"]
+    seconds, memory = row["seconds"], row["memory"]
+    size = "" if row["bytes"] is None else format_size(row["bytes"])
+    if row["guess"]:
+        size = f"guess <{size}" if row["bytes_guessed"] else size
+        return [
+            row["step"],
+            state,
+            f"guess <{seconds['most']:.2g}",
+            size,
+            f"guess <{format_size(memory['most'])}",
+        ]
+    return [
+        row["step"],
+        state,
+        seconds_text(seconds) if seconds else "",
+        size,
+        memory_text(memory) if memory else "",
+    ]
+
+
+def seconds_text(cost: Mapping[str, float]) -> str:
+    """Return a duration in s with its range as text, such as ``0.81 (0.7-1.2)``."""
+    if cost["expected"] < _SHORT:
+        return f"<{_SHORT}"
+    return f"{_figures(cost['expected'])}{_between(cost, 1.0)}"
+
+
+def memory_text(cost: Mapping[str, float]) -> str:
+    """Return a number of bytes with its range as text, such as ``120 MB (98-140)``."""
+    if cost["expected"] < _SMALL:
+        return f"<{format_size(_SMALL)}"
+    text = format_size(cost["expected"])
+    return text if cost["expected"] < _SURE else f"{text}{_between(cost, UNITS[text.split()[1]])}"
+
+
+def _between(cost: Mapping[str, float], unit: float) -> str:
+    """Return the range of a cost as text, or an empty text for a cost that is known exactly."""
+    low, high = (_figures(cost[end] / unit) for end in ("least", "most"))
+    return f" ({low}-{high})" if low != high else ""
+
+
+def _figures(value: float) -> str:
+    """Return a number as text without an exponent: two decimals below 1, one below 10, and none
+    above.
+    """
+    return f"{value:.{2 if value < 0.995 else 1 if value < 9.95 else 0}f}"
+
+
+# --- report memory --------------------------------------------------------------------------------
+
+# Memory of the report of a run: the results that its pictures and data files show, and the copies
+# that are written.
+#
+# Also of the results that files hold which are made beside the run.
+
+
+#: Three numbers that tests/benchmarks/bench_memory.py fits to the measured memory of the reports of
+#: shipped recipes.
+DRAWING = 74.3e6  #: bytes of the libraries that draw pictures and write files
+#: share of the memory of the steps that the process does not give back to the system
+HELD_BACK = 0.0101
+COPIES = 2.25  #: copies of the results in memory, while a picture or file of them is made
+# not a parameter and not a function of a step
+_NEED = re.compile(r"\??(?P<step>[\w.]+(\[[^\]]*\])?)$")
+
+
+def shown_steps(recipe: Recipe) -> list[str]:
+    """Return the steps whose results the pictures and data files of a run show, as far as the
+    recipe has them.
+    """
+    groups = [recipe.outputs, *chain.from_iterable(_jobs(recipe))]
+    names = dict.fromkeys(chain.from_iterable(groups))
+    return [name for name in names if name in recipe.steps]
+
+
+def held_beside(recipe: Recipe, costs: Costs, limit: float) -> float:
+    """Return the most bytes of results that files hold which are made beside a run, as
+    `FilesBeside` holds them.
+
+    The values that the run returns are not counted, because they stay in memory with or without
+    files. ``limit`` is the memory (bytes) that the process may use; with 0 no file is made beside
+    the run.
+    """
+    large, room, largest_shown = min(LARGE, limit / 32), min(ROOM, limit / 16), limit / 16
+    sizes = [costs.size_of(name) for name in shown_steps(recipe) if name not in wanted(recipe)]
+    small = sum(size for size in sizes if size <= large)
+    return min(small, room) + max(
+        (size for size in sizes if large < size <= largest_shown), default=0.0
+    )
+
+
+def report_peak(
+    works: list[StepJob],
+    recipe: Recipe,
+    keys: Mapping[str, str],
+    costs: Costs,
+    lanes: Mapping[str, Lane],
+    running: float = 0.0,
+) -> float:
+    """Return the predicted peak memory of this process in bytes while the report is written.
+
+    Args: works: the steps that only the report needs. keys: the keys of the results that are shown,
+            by step.
+    running: the predicted peak memory of this process while the steps run.
+    """
+    schedule = prepare(works, costs, {}, lanes, list(keys.values())).schedule if works else None
+    made = max(schedule.peak.values(), default=0.0) if schedule else 0.0
+    held = max((lane.held for lane in lanes.values()), default=0.0) or program_memory()
+    shown = COPIES * shown_at_once(recipe, costs)
+    return held + DRAWING + HELD_BACK * max(0.0, running - held) + max(made, shown)
+
+
+def shown_at_once(recipe: Recipe, costs: Costs) -> float:
+    """Return the largest number of bytes of results that are in memory together while pictures and
+    files are made.
+
+    The outputs of the recipe stay in memory. Another result is there from the first picture or file
+    that shows it to the last, as `workflows.report.shown_values` holds it.
+    """
+    largest = 0.0
+    for groups in _jobs(recipe):
+        uses, in_memory = Counter(chain.from_iterable(groups)), set(recipe.outputs)
+        for group in groups:
+            in_memory.update(group)
+            largest = max(
+                largest, sum(costs.size_of(name) for name in in_memory if name in recipe.steps)
+            )
+            uses.subtract(group)
+            in_memory = {name for name in in_memory if uses[name] > 0 or name in recipe.outputs}
+    return largest
+
+
+def _jobs(recipe: Recipe) -> tuple[Sequence[Sequence[str]], ...]:
+    """Return the steps that each picture shows, and the steps that each data file shows."""
+    pictures = [list(_found(recipe, figure.needs)) for figure in FIGURES]
+    return pictures, [list(_found(recipe, needs)) for _, needs in files_of(recipe).values()]
+
+
+def _found(recipe: Recipe, needs: Mapping[str, str]) -> Iterator[str]:
+    for match in filter(None, map(_NEED.match, needs.values())):
+        pattern = re.escape(match["step"]).replace(r"\*", "[^,]*")
+        yield from (name for name in recipe.steps if re.fullmatch(pattern, name))
+
+
+# --- run forecast ---------------------------------------------------------------------------------
+
+# Forecast of a run from earlier runs: cache hits, bytes, seconds, memory and devices.
 
 
 @dataclass(frozen=True)
@@ -40,20 +267,25 @@ class Plan:
     lanes: Mapping[str, str]  #: by step
     schedule: Schedule | None
     refused: str = ""  #: why the memory is too small
-    running: float = 0.0  #: peak memory of this process in bytes while the steps run, the program itself included
+    #: peak memory of this process in bytes while the steps run, the program itself included
+    running: float = 0.0
     reporting: float = 0.0  #: peak memory of this process in bytes while the report is written
 
 
 def lanes_for(recipe: Recipe, device: str, memory: int | None) -> dict[str, Lane]:
-    """Return the lanes of a run on the devices ``device``, with the libraries that its steps load in the program."""
+    """Return the lanes of a run on the devices ``device``, with the libraries that its steps
+    load in the program.
+    """
     cheaper = with_substitutions(recipe, wanted(recipe))
     return lanes_of(device.split(","), memory, nodes_of(cheaper, wanted(recipe)))
 
 
 def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane], beside: float = 0.0) -> Plan:
-    """Return the forecast of a run: the steps to compute and to read, their costs and their schedule.
+    """Return the forecast of a run: the steps to compute and to read, their costs and their
+    schedule.
 
-    ``beside`` is the memory (bytes) of a run that makes files beside its steps, and 0 for one that makes them later.
+    ``beside`` is the memory (bytes) of a run that makes files beside its steps, and 0 for one that
+    makes them later.
     """
     recipe = with_substitutions(recipe, wanted(recipe))
     order = steps_of(recipe)
@@ -73,43 +305,62 @@ def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane], beside: flo
     expected = costs.in_turn(((w.step.name, w.step, abouts.get(w.key)) for w in works), kinds)
     empty = Plan(recipe, order, keys, left_out, awake, loaded, expected, {}, None)
     try:
-        found = prepare(works, costs, abouts, lanes, [keys[name] for name in wanted(recipe)])
+        prepared = prepare(works, costs, abouts, lanes, [keys[name] for name in wanted(recipe)])
     except TooLarge as error:
         return replace(empty, refused=str(error))
-    where = {w.step.name: w.lane for w in found.works}
-    running = running_peak(found.schedule, lanes) + (held_beside(recipe, costs, beside) if works else 0.0)
-    plan = replace(empty, lanes=where, schedule=found.schedule, running=running)
+    where = {w.step.name: w.lane for w in prepared.works}
+    running = running_peak(prepared.schedule, lanes) + (
+        held_beside(recipe, costs, beside) if works else 0.0
+    )
+    plan = replace(empty, lanes=where, schedule=prepared.schedule, running=running)
     return _with_report(plan, store, costs, lanes, code)
 
 
-def _with_report(plan: Plan, store: Store, costs: Costs, lanes: Mapping[str, Lane], code: Code) -> Plan:
-    """Return the plan with the memory of the report, and with the reason if the limit is too small for the report."""
+def _with_report(
+    plan: Plan, store: Store, costs: Costs, lanes: Mapping[str, Lane], code: Code
+) -> Plan:
+    """Return the plan with the memory of the report, and with the reason if the limit is too
+    small for the report.
+    """
     cpu = [lane for lane in lanes.values() if lane.kind == "cpu"]
     shown = shown_steps(plan.recipe)
     order = needed(plan.recipe, shown)
-    keys = resolve(plan.recipe, order, store, ",".join(lane.device for lane in lanes.values()), code).keys
-    there = {plan.keys[name] for name in plan.order}
+    keys = resolve(
+        plan.recipe, order, store, ",".join(lane.device for lane in lanes.values()), code
+    ).keys
+    of_run = {plan.keys[name] for name in plan.order}
     makers: dict[Key, str] = {}
-    for name in _awake(plan.recipe, keys, store, shown, there)[0]:
+    for name in _awake(plan.recipe, keys, store, shown, of_run)[0]:
         makers.setdefault(keys[name], name)
     devices = [lane.device for lane in lanes.values()]
-    works = [_work(plan.recipe, name, keys, devices) for name in order if name in set(makers.values())]
+    works = [
+        _work(plan.recipe, name, keys, devices) for name in order if name in set(makers.values())
+    ]
     costs = costs.with_sizes(sizes_of(plan.recipe, order))
     try:
-        peak = report_peak(works, plan.recipe, {name: keys[name] for name in shown}, costs, lanes, plan.running)
+        peak = report_peak(
+            works, plan.recipe, {name: keys[name] for name in shown}, costs, lanes, plan.running
+        )
     except TooLarge as error:
         return replace(plan, refused=f"for the report, {error}")
     limit = sum(lane.memory for lane in cpu) + max((lane.held for lane in cpu), default=0.0)
     plan = replace(plan, reporting=peak)
     if not cpu or peak <= limit:
         return plan
-    why = f"the report needs {format_size(peak)} to show the results, and the limit is {format_size(limit)}"
-    return replace(plan, refused=f"{why}: give more memory, or choose a smaller picture or number of bands")
+    why = (
+        f"the report needs {format_size(peak)} to show the results, and the limit is"
+        f" {format_size(limit)}"
+    )
+    return replace(
+        plan, refused=f"{why}: give more memory, or choose a smaller picture or number of bands"
+    )
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """Forecast of a run for a reader: lines of text, and the costs of each step as values for JSON."""
+    """Forecast of a run for a reader: lines of text, and the costs of each step as values for
+    JSON.
+    """
 
     lines: list[str]
     steps: list[dict[str, Any]]
@@ -117,16 +368,24 @@ class Forecast:
     refused: bool  #: True if the run would lack memory
 
 
-def forecast(recipe: Recipe, store: Store, device: str = "cpu", memory: int | None = None) -> Forecast:
-    """Return the forecast of a run with the table of its steps, its totals, and whether it would lack memory."""
+def forecast(
+    recipe: Recipe, store: Store, device: str = "cpu", memory: int | None = None
+) -> Forecast:
+    """Return the forecast of a run with the table of its steps, its totals, and whether it would
+    lack memory.
+    """
     lanes = lanes_for(recipe, device, memory)
     plan = planned(recipe, store, lanes, memory_limit(None) if memory is None else 0.0)
     rows, totals = forecast_rows(plan, store), _totals(plan)
-    return Forecast([*table_lines(rows), *_sums(plan, lanes, totals)], rows, totals, bool(plan.refused))
+    return Forecast(
+        [*table_lines(rows), *_sums(plan, lanes, totals)], rows, totals, bool(plan.refused)
+    )
 
 
 def _totals(plan: Plan) -> dict[str, Any]:
-    """Return the totals of a forecast over all steps as values for JSON: seconds with their range, bytes and memory."""
+    """Return the totals of a forecast over all steps as values for JSON: seconds with their
+    range, bytes and memory.
+    """
     took = plan.schedule.makespan if plan.schedule else None
     sums = [(cost.seconds["cpu"], cost.spread[1]) for cost in plan.expected.values()]
     alone = sum(seconds for seconds, _ in sums)
@@ -146,7 +405,9 @@ def _totals(plan: Plan) -> dict[str, Any]:
 
 
 def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
-    """Return the forecast of a run with an empty store on the machines of a YAML file, as lines of text."""
+    """Return the forecast of a run with an empty store on the machines of a YAML file, as lines
+    of text.
+    """
     from neusee.workflows.explain.cluster_forecast import cluster_lines
     from neusee.workflows.placement.machine_file import read_machines
 
@@ -156,19 +417,34 @@ def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
         sorted({"cpu", *(device.kind for device in cluster.devices)}),
     )
     names = steps_of(recipe)
-    return cluster_lines(recipe, costs.in_turn(((name, recipe.steps[name], None) for name in names), kinds), cluster)
+    return cluster_lines(
+        recipe, costs.in_turn(((name, recipe.steps[name], None) for name in names), kinds), cluster
+    )
 
 
 def _sums(plan: Plan, lanes: Mapping[str, Lane], totals: Mapping[str, Any]) -> list[str]:
-    """Return text lines with the totals of a forecast over all steps, and with the steps that may be left out."""
+    """Return text lines with the totals of a forecast over all steps, and with the steps that
+    may be left out.
+    """
     lines = []
-    if unsure := [name for name, known in plan.left_out.items() if known is None]:
-        lines += _wrapped(f"left out or not, depending on the values of the inputs: {', '.join(unsure)}")
+    if unsure := [name for name, decision in plan.left_out.items() if decision is None]:
+        lines += _wrapped(
+            f"left out or not, depending on the values of the inputs: {', '.join(unsure)}"
+        )
     seconds = totals["seconds"]
-    took = f"about {seconds_text(seconds)} s" if seconds else "no schedule" if seconds is None else "no time"
+    took = (
+        f"about {seconds_text(seconds)} s"
+        if seconds
+        else "no schedule"
+        if seconds is None
+        else "no time"
+    )
     guessed = f", {totals['guesses']} of them guessed at the upper end, because never measured"
     read, new = format_size(sum(plan.loaded.values())), format_size(int(totals["bytes"]))
-    would = f"{totals['steps']} of {len(plan.order)} steps would run{guessed if totals['guesses'] else ''}"
+    would = (
+        f"{totals['steps']} of {len(plan.order)} steps would"
+        f" run{guessed if totals['guesses'] else ''}"
+    )
     lines += _wrapped(f"{would}: {took}, {new} new, {read} to load")
     if plan.schedule and plan.expected:
         for name, lane in lanes.items():
@@ -177,8 +453,9 @@ def _sums(plan: Plan, lanes: Mapping[str, Lane], totals: Mapping[str, Any]) -> l
     if plan.running and plan.expected:
         held = format_size(max(lane.held for lane in lanes.values()))
         lines += _wrapped(
-            f"memory  process: {format_size(plan.running)} while the steps run, of which the program itself holds "
-            f"{held}; {format_size(plan.reporting)} while the report is written"
+            f"memory  process: {format_size(plan.running)} while the steps run, of which the"
+            f" program itself holds {held}; {format_size(plan.reporting)} while the report is"
+            " written"
         )
     return [*lines, *(_wrapped(f"refused: {plan.refused}") if plan.refused else [])]
 
@@ -190,26 +467,36 @@ def _wrapped(text: str) -> list[str]:
 
 def _work(recipe: Recipe, name: str, keys: Mapping[str, Key], devices: Sequence[str]) -> StepJob:
     step = recipe.steps[name]
-    reads = tuple(tuple(keys[s] for s in ((w,) if isinstance(w, str) else w or ())) for w in step.wires.values())
-    return StepJob(step, keys[name], {}, reads, recipe.seed, recipe.name, places(step, devices)[0], "")
+    reads = tuple(
+        tuple(keys[s] for s in ((w,) if isinstance(w, str) else w or ()))
+        for w in step.wires.values()
+    )
+    return StepJob(
+        step, keys[name], {}, reads, recipe.seed, recipe.name, places(step, devices)[0], ""
+    )
 
 
 def _awake(
-    recipe: Recipe, keys: Mapping[str, Key], store: Store, targets: Iterable[str], there: Container[Key] = ()
+    recipe: Recipe,
+    keys: Mapping[str, Key],
+    store: Store,
+    targets: Iterable[str],
+    in_memory: Container[Key] = (),
 ) -> tuple[set[str], dict[str, int]]:
-    """Return the steps that a run must compute, and the size (bytes) of each stored result that the run must read.
+    """Return the steps that a run must compute, and the size (bytes) of each stored result that the
+    run must read.
 
-    Results with the keys ``there`` are known and need no step.
+    Results with the keys ``in_memory`` are known and need no step.
     """
-    found, loaded, todo = set[str](), dict[str, int](), [*targets]
+    awake, loaded, todo = set[str](), dict[str, int](), [*targets]
     while todo:
         name = todo.pop()
-        if name in found or name in loaded or keys[name] in there:
+        if name in awake or name in loaded or keys[name] in in_memory:
             continue
         if store.has(keys[name]):
             about: dict[str, Any] = store.about(keys[name]) or {}
             loaded[name] = about.get("bytes", 0)
         else:
-            found.add(name)
+            awake.add(name)
             todo += recipe.steps[name].sources
-    return found, loaded
+    return awake, loaded

@@ -1,4 +1,6 @@
-"""Reasons why a step runs again: the differences from the most similar earlier result of the step."""
+"""Reasons why a step runs again: the differences from the most similar earlier result of the
+step.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +12,7 @@ from neusee.workflows.engine.resolved_keys import Resolved
 from neusee.workflows.explain.change_causes import Comparison, Origin
 from neusee.workflows.explain.stored_origin import because, keys_in, state_of
 from neusee.workflows.graph.diagnostics import nearest
-from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
-from neusee.workflows.graph.step_record import Event
+from neusee.workflows.graph.recipe_graph import Event, Recipe, Step, needed
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -27,23 +28,32 @@ def why_lines(recipe: Recipe, store: Store, step: str, device: str = "cpu") -> l
     """
     names = [name for name in recipe.steps if step in (name, name.partition("[")[0])]
     if not names:
-        known = {*recipe.steps, *(name.partition("[")[0] for name in recipe.steps)}
-        raise ValueError(f"there is no step {step!r}; {nearest(step, known)}")
+        names_of_steps = {*recipe.steps, *(name.partition("[")[0] for name in recipe.steps)}
+        raise ValueError(f"there is no step {step!r}; {nearest(step, names_of_steps)}")
     recipe = with_substitutions(recipe, [*recipe.outputs, *names])
     resolved = resolve(recipe, needed(recipe, [*recipe.outputs, *names]), store, device)
     comparison = Comparison(store, recipe, resolved)
-    return [line for name in names for line in _step_lines(comparison, recipe, recipe.steps[name], resolved)]
+    lines: list[str] = []
+    for name in names:
+        lines += _step_lines(comparison, recipe, recipe.steps[name], resolved)
+    return lines
 
 
-def explained(recipe: Recipe, store: Store, watch: Callable[[Event], None]) -> Callable[[Event], None]:
-    """Return a function that adds the reason why a step ran to each event, and then calls ``watch``."""
+def explained(
+    recipe: Recipe, store: Store, watch: Callable[[Event], None]
+) -> Callable[[Event], None]:
+    """Return a function that adds the reason why a step ran to each event, and then calls
+    ``watch``.
+    """
     comparison = Comparison(store, recipe)
     before: dict[str, list[Key]] = {}
 
     def tell(event: Event) -> None:
         done = event.done
         if done is None:
-            before[event.step] = keys_in(row for row in store.journal.latest() if row["step"] == event.step)
+            before[event.step] = keys_in(
+                row for row in store.journal.latest() if row["step"] == event.step
+            )
         elif done.state == "run":
             why = _at_once(comparison, recipe.steps[done.step], done.key, before.pop(done.step, []))
             event = Event(event.step, replace(done, why=why))
@@ -52,7 +62,9 @@ def explained(recipe: Recipe, store: Store, watch: Callable[[Event], None]) -> C
     return tell
 
 
-def _step_lines(comparison: Comparison, recipe: Recipe, step: Step, resolved: Resolved) -> list[str]:
+def _step_lines(
+    comparison: Comparison, recipe: Recipe, step: Step, resolved: Resolved
+) -> list[str]:
     """Return lines with the state of one step and its differences from earlier results."""
     key, verdict = resolved.keys[step.name], resolved.verdicts.get(step.name)
     head = f"{step.name} ({step.node.path})"
@@ -64,7 +76,10 @@ def _step_lines(comparison: Comparison, recipe: Recipe, step: Step, resolved: Re
     if maker != step.name:
         lines.append(f"  same key as {maker}")
     if unsure := [name for name in needed(recipe, [step.name]) if resolved.left_out(name) is None]:
-        lines.append(f"  left out or not, depending on the values of the inputs: {', '.join(unsure[:_SHOWN])}")
+        lines.append(
+            "  left out or not, depending on the values of the inputs:"
+            f" {', '.join(unsure[:_SHOWN])}"
+        )
     return [*lines, *because(comparison, step.name, key, about, maker)]
 
 
@@ -75,15 +90,17 @@ def _at_once(comparison: Comparison, step: Step, key: Key, earlier: list[Key]) -
     best: list[str] = []
     for old in earlier[: -_AT_ONCE - 1 : -1]:
         before, now = comparison.origin(old), comparison.origin(key)
-        found = _direct(comparison, step, before, now) if before and now else []
-        best = min(filter(None, (best, found)), key=len, default=[])
+        differences = _direct(comparison, step, before, now) if before and now else []
+        best = min(filter(None, (best, differences)), key=len, default=[])
         if len(best) == 1:
             break
     return best[0] if best else ""
 
 
 def _direct(comparison: Comparison, step: Step, old: Origin, new: Origin) -> list[str]:
-    """Return the differences between two results of a step, followed by the names of inputs that differ."""
+    """Return the differences between two results of a step, followed by the names of inputs that
+    differ.
+    """
     texts = comparison.own(step.name, old, new)
     if old["node"] != new["node"] or len(old["inputs"]) != len(new["inputs"]):
         return texts

@@ -1,7 +1,8 @@
-"""The recipe of a calibration of the frames in a folder, which is written into the results."""
+"""The recipe of a calibration of a folder of frames, and the EMVA 1288 descriptor file."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,15 +10,76 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from neusee.nodes.calibrate import LeastSquares, frame_divisor, hot_pixels, least_squares, refuse_descriptor
+from neusee.nodes.calibrate import (
+    LeastSquares,
+    frame_divisor,
+    hot_pixels,
+    least_squares,
+    refuse_descriptor,
+)
 from neusee.workflows.engine.runner import run
-from neusee.workflows.frames.descriptor_file import descriptor_of, descriptors_in, quoted
-from neusee.workflows.frames.frame_folder import FolderLevel, FolderLevels, FolderRefused, find_levels
+from neusee.workflows.frames.frame_folder import (
+    FolderLevel,
+    FolderLevels,
+    FolderRefused,
+    find_levels,
+)
 from neusee.workflows.graph.final_values import Config
 from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.keys.sealed_files import text_of
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.report.study_folder import Progress, silent
 from neusee.workflows.store.result_store import Store
+
+# --- descriptor file ------------------------------------------------------------------------------
+
+# The descriptor file of a measurement in the data format of EMVA 1288.
+
+
+#: a line of a descriptor that begins a light level
+_LEVEL = re.compile(r"^[bd]\s+[\d.,]+(\s|$)", re.MULTILINE)
+
+
+def descriptors_in(folder: Path) -> list[Path]:
+    """Return the descriptor files of a folder."""
+    return [file for file in sorted(folder.glob("*.txt")) if _LEVEL.search(_text(file))]
+
+
+def _text(file: Path) -> str:
+    """Return the text of a file, or nothing of what is no text file, such as a pipe."""
+    try:
+        return text_of(file, "utf-8-sig", "replace")
+    except ValueError:
+        return ""
+
+
+def descriptor_of(path: Path) -> Path:
+    """Return the descriptor file that a path is, or the only one in the folder that a path is.
+
+    Raises: ValueError for a folder without a descriptor, or with several.
+    """
+    if not path.is_dir():
+        return path
+    descriptors = descriptors_in(path)
+    if len(descriptors) == 1:
+        return descriptors[0]
+    has = (
+        f"has {len(descriptors)} descriptors"
+        if descriptors
+        else "has no descriptor, a .txt with levels in lines b and d"
+    )
+    raise ValueError(f"{path} {has}: name one file")
+
+
+def quoted(text: str) -> str:
+    """Return a text as a scalar of YAML in single quotes."""
+    return "'" + text.replace("'", "''") + "'"
+
+
+# --- folder recipe --------------------------------------------------------------------------------
+
+# The recipe of a calibration of the frames in a folder, which is written into the results.
+
 
 _BITS = (8, 10, 12, 14)  #: of converters whose numbers are shifted to the left in files of 16 bits
 _EFFICIENCY = 0.5  #: electrons per photon, which relative light is scaled to
@@ -38,7 +100,8 @@ steps:
   measured: {{node: calibrate.levels, from: level}}
 """
 _REST = """  least_squares: {{node: calibrate.least_squares, from: measured}}
-  prior:   # free parameters, with a median and a factor each; signal and bends with a mean and a standard deviation
+  # free parameters, with a median and a factor each; signal and bends with mean and deviation
+  prior:
     node: calibrate.camera_prior
     with:
       gain: ["${{camera.gain}}", 10]
@@ -49,7 +112,7 @@ _REST = """  least_squares: {{node: calibrate.least_squares, from: measured}}
       scatter: ["${{camera.scatter}}", 3]
       lamp: ["${{camera.lamp}}", 10]
       drift: ["${{camera.drift}}", 5]
-      bend: [0, 0.05]                # y = K e (1 + bend x + twist x2), x = 1 at the brightest level used
+      bend: [0, 0.05]      # y = K e (1 + bend x + twist x2), x = 1 at the brightest level used
       twist: [0, 0.05]
   camera:
     node: calibrate.camera
@@ -75,7 +138,8 @@ camera:                    # first estimates by least squares; the frames decide
   drift: {drift:.3g}
 {traced}outputs: [measured, least_squares, camera]
 """
-_HOT = """  hot: {{node: calibrate.hot_pixels, with: {{files: [{files}]{divisor}}}}}   # in the longest dark exposure
+_HOT = """  hot: {{node: calibrate.hot_pixels, with: {{files: [{files}]{divisor}}}}}   # in the
+longest dark exposure
 """
 _RELATIVE = """traceability:
   photons: {known: relative}   # no radiometry: no quantum efficiency is told
@@ -91,50 +155,66 @@ class _Corrections:
 
 
 def recipe_of_folder(
-    folder: Path, store: Store, changes: Sequence[str] = (), progress: Progress = silent, every_pixel: bool = False
+    folder: Path,
+    store: Store,
+    changes: Sequence[str] = (),
+    progress: Progress = silent,
+    every_pixel: bool = False,
 ) -> Recipe:
-    """Return the recipe of a calibration of the frames in a folder; the frames are read, and reduced to moments.
+    """Return the recipe of a calibration of the frames in a folder; the frames are read, and
+    reduced to moments.
 
-    ``progress`` receives what was read as exposure before any frame is reduced, and what is divided or left out. With
-    ``every_pixel`` hot pixels count too, as EMVA 1288 demands of a sheet.
+    ``progress`` receives what was read as exposure before any frame is reduced, and what is divided
+    or left out. With ``every_pixel`` hot pixels count too, as EMVA 1288 demands of a sheet.
 
-    Raises: `FolderRefused` with all reasons why the frames are no measurement, `RecipeError` with all mistakes of
+    Raises: `FolderRefused` with all reasons why the frames are no measurement, `RecipeError` with
+            all mistakes of
     ``changes``.
     """
     name = "".join(c if c.isalnum() else "_" for c in folder.absolute().name) or "frames"
     if descriptors_in(folder):
         return _described(descriptor_of(folder), name, store, changes)
-    found, scale = find_levels(folder, progress), 1.0
-    needs = _corrections(found, progress, every_pixel)
-    fit = _fit(_loaded(name, _read(folder, found, scale, needs) + "outputs: [measured]\n"), store)
-    if found.light != "photons":
+    levels, scale = find_levels(folder, progress), 1.0
+    needs = _corrections(levels, progress, every_pixel)
+    fit = _fit(_loaded(name, _read(folder, levels, scale, needs) + "outputs: [measured]\n"), store)
+    if levels.light != "photons":
         scale = float(fit.efficiency) / _EFFICIENCY
-    times = len({level.exposure for level in found.levels if level.dark})
-    rest = _rest(fit, float(fit.efficiency) / scale, times, found.light != "photons")
-    return _loaded(name, _read(folder, found, scale, needs) + rest, changes)
+    times = len({level.exposure for level in levels.levels if level.dark})
+    model_text = _rest(fit, float(fit.efficiency) / scale, times, levels.light != "photons")
+    return _loaded(name, _read(folder, levels, scale, needs) + model_text, changes)
 
 
-def _corrections(found: FolderLevels, progress: Progress, every_pixel: bool) -> _Corrections:
+def _corrections(levels: FolderLevels, progress: Progress, every_pixel: bool) -> _Corrections:
     """Return which numbers are divided and which pixels are left out, and tell both."""
-    divisor = _shift(found)
+    divisor = _shift(levels)
     if divisor > 1:
-        progress(f"all numbers are multiples of {divisor}: shifted to the left in the files, and divided by {divisor}")
+        progress(
+            f"all numbers are multiples of {divisor}: shifted to the left in the files, and divided"
+            f" by {divisor}"
+        )
     if every_pixel:
         return _Corrections(divisor, ())
-    darkest = max((level for level in found.levels if level.dark), key=lambda level: level.exposure)
+    darkest = max(
+        (level for level in levels.levels if level.dark), key=lambda level: level.exposure
+    )
     mask = hot_pixels(files=darkest.files, divisor=divisor)
     count = int(mask.sum())
     if not count:
         return _Corrections(divisor, ())
     share = f"{count} of {mask.numel()} pixels ({count / mask.numel():.2%})"
-    progress(f"{share} are hot in the dark frames of {darkest.exposure:g} s: they are left out of all levels")
+    progress(
+        f"{share} are hot in the dark frames of {darkest.exposure:g} s: they are left out of all"
+        " levels"
+    )
     return _Corrections(divisor, darkest.files)
 
 
-def _shift(found: FolderLevels) -> int:
-    """Return the divisor of numbers of a converter of 8 to 14 bits that are shifted to the left in 16 bits, else 1."""
+def _shift(levels: FolderLevels) -> int:
+    """Return the divisor of numbers of a converter of 8 to 14 bits that are shifted to the left
+    in 16 bits, else 1.
+    """
     divisor = 0
-    for level in found.levels:
+    for level in levels.levels:
         divisor = int(np.gcd(divisor, frame_divisor(level.files[0])))
         if divisor == 1:
             return 1
@@ -166,17 +246,20 @@ def _loaded(name: str, text: str, changes: Sequence[str] = ()) -> Recipe:
         path.write_text(text, encoding="utf-8")
         recipe = load(path, changes)
     settings = recipe.config.settings.items()
-    gone = f"{path.parent.name}/"  # the sources of values name no folder that is gone
-    named = {key: replace(each, source=each.source.rpartition(gone)[-1]) for key, each in settings}
+    temporary = f"{path.parent.name}/"  # the sources of values name no folder that is gone
+    named = {
+        key: replace(setting, source=setting.source.rpartition(temporary)[-1])
+        for key, setting in settings
+    }
     return replace(recipe, config=Config(named))
 
 
-def _read(folder: Path, found: FolderLevels, scale: float, needs: _Corrections) -> str:
-    levels = "\n".join(_level(level, scale) for level in found.levels)
+def _read(folder: Path, folder_levels: FolderLevels, scale: float, needs: _Corrections) -> str:
+    levels = "\n".join(_level(level, scale) for level in folder_levels.levels)
     divisor = f", divisor: {needs.divisor}" if needs.divisor > 1 else ""
     return _READ.format(
         folder=" ".join(folder.name.split()) or ".",
-        source=found.source,
+        source=folder_levels.source,
         levels=levels,
         divisor=divisor,
         hot=_HOT.format(files=_listed(needs.hot), divisor=divisor) if needs.hot else "",
@@ -190,11 +273,16 @@ def _listed(files: Sequence[Path]) -> str:
 
 def _level(level: FolderLevel, scale: float) -> str:
     files = _listed(level.files)
-    return f"  {level.name}: {{photons: {level.light * scale:.8g}, exposure: {level.exposure:.9g} s, files: [{files}]}}"
+    return (
+        f"  {level.name}: {{photons: {level.light * scale:.8g}, exposure: {level.exposure:.9g} s,"
+        f" files: [{files}]}}"
+    )
 
 
 def _rest(fit: LeastSquares, efficiency: float, times: int, relative: bool) -> str:
-    """Return the steps after the levels, with first estimates; ``times`` is the number of exposures of darks."""
+    """Return the steps after the levels, with first estimates; ``times`` is the number of
+    exposures of darks.
+    """
     gain, noise = float(fit.gain), max(float(fit.temporal_dark_noise), 0.1)
     dark = float(fit.dark_current)
     return _REST.format(
@@ -203,7 +291,11 @@ def _rest(fit: LeastSquares, efficiency: float, times: int, relative: bool) -> s
         signal=float(fit.dark_signal),
         noise=noise,
         dark=dark if dark > 0 else float(times > 1),  # NaN where all darks have one exposure
-        current='["${camera.dark_current}", 10]' if times > 1 else "null   # all darks have one exposure",
+        current=(
+            '["${camera.dark_current}", 10]'
+            if times > 1
+            else "null   # all darks have one exposure"
+        ),
         drift=max(0.01 * noise * gain, 0.003),
         traced=_RELATIVE if relative else "",
     )

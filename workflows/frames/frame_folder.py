@@ -1,37 +1,346 @@
-"""The light levels in a folder of frames: which files belong together, and what is missing or does not fit."""
+"""The light levels in a folder of frames, by file names or a table, and what is missing."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from neusee.nodes.calibrate import FrameHeader, frame_header
-from neusee.workflows.frames.frame_names import NamedFrame, read_name
-from neusee.workflows.frames.frame_table import TableRow, find_table, read_table
-from neusee.workflows.frames.odd_frames import misplaced_frames
+import numpy as np
+
+from neusee.nodes.calibrate import FrameHeader, frame_header, frame_means
+from neusee.nodes.input_files import csv_rows
+from neusee.nodes.units import read_any
 from neusee.workflows.report.study_folder import Progress, silent
+
+# --- frame names ----------------------------------------------------------------------------------
+
+# Exposure, light and level of a frame by the name of its file.
+
+
+_NUMBER = r"(\d+(?:[.,p]\d+)?(?:e[-+]?\d+)?)"  #: 10p5 is 10.5, as in names without points
+_UNIT = r"(ns|us|µs|μs|ms|s)"
+_WORD = r"(?:exposure|exptime|texp|exp|t)"
+_SPACE = r"[ =_-]?"
+#: 1/200 of a second: a file name has no stroke; after a hyphen, and between lone numbers, it may be
+#: something else
+_FRACTION = re.compile(
+    rf"(?<![a-z0-9.,-]){_WORD}?{_SPACE}(?<![\d.,-])1(?:[-⁄]|over|div)([1-9][\d.]*)"
+    r" ?s(?:ec)?(?![a-z0-9])"
+)
+_DOUBTFUL = re.compile(r"(?<![\d.,])(?:(?<=[a-z-])1-|1[_/ ])([1-9]\d*) ?s(?:ec)?(?![a-z0-9])")
+_EXPOSURE = re.compile(rf"(?<![a-z0-9.,]){_WORD}?{_SPACE}{_NUMBER}[ _-]?{_UNIT}(?:ec)?(?![a-z0-9])")
+_UNIT_FIRST = re.compile(rf"(?<![a-z0-9]){_WORD}{_SPACE}{_UNIT}{_SPACE}{_NUMBER}(?![a-z.,0-9])")
+_SHORT_UNIT_FIRST = re.compile(rf"(?<![a-z0-9])(ns|us|µs|μs|ms){_SPACE}{_NUMBER}(?![a-z.,0-9])")
+_AFTER = re.compile(rf"(?<![a-z0-9.,]){_NUMBER}[ _-]?(?:photons?|ph)(?![a-z])")
+_BEFORE = re.compile(rf"(?<![a-z])(?:photons?|ph)[ =_-]?{_NUMBER}(?![a-z.,0-9])")
+_DARK = re.compile(r"(?<![a-z])(?:darks?(?:frames?)?|bias|closed|nolight)(?![a-z])")
+_INDEX = re.compile(r"(?:[ ._-]*(?:frame|image|img|shot|no|n|f|#)?[ ._-]*\d+|[ ._-][ab])$")
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
+
+
+class NamedFrame(NamedTuple):
+    """What the name of a file says of its frames; None for what it does not say."""
+
+    level: str  #: the name without exposure, light and the number of the frame
+    dark: bool
+    exposure: float | None  #: s
+    photons: float | None  #: per pixel and exposure
+    written: str = ""  #: the part of the name that is read as the exposure
+    doubtful: str = ""  #: a part that may be a fraction of a second, or a number and seconds
+
+
+class _Exposure(NamedTuple):
+    seconds: float
+    written: str
+
+
+def read_name(file: Path, folder: Path) -> NamedFrame:
+    """Return what the path of a file below ``folder`` says, such as ``flat_10ms_1200ph_2.tif``.
+
+    Folders count as parts of the name: ``dark/10ms/1.png``. An exposure is a number and its unit in
+    either order: ``10ms``, ``10p5ms``, ``exp_ms_10``, or a fraction of a second such as ``1-200s``.
+    """
+    parts = file.relative_to(folder).with_suffix("").parts
+    text = "/".join(parts).lower()
+    exposure, light = _exposure(text), _last(_AFTER, text) or _last(_BEFORE, text)
+    dark = _DARK.search(text) is not None
+    photons = 0.0 if dark else None if light is None else _float(light[1])
+    left = text.replace(exposure.written, "") if exposure else text
+    left = left.replace(light[0], "") if light else left
+    level = _INDEX.sub("", left).strip(" /._-")
+    seconds, written = (exposure.seconds, exposure.written) if exposure else (None, "")
+    doubtful = _last(_DOUBTFUL, text)
+    unsure = doubtful[0] if doubtful and not _last(_FRACTION, text) else ""
+    return NamedFrame(level, dark or photons == 0, seconds, photons, written.strip(" =_-"), unsure)
+
+
+def _exposure(text: str) -> _Exposure | None:
+    """Return the last exposure of a name; a fraction counts before a number, and a number before
+    a unit.
+    """
+    if fraction := _last(_FRACTION, text):
+        return _Exposure(1 / _float(fraction[1]), fraction[0])
+    if match := _last(_EXPOSURE, text):
+        return _Exposure(_float(match[1]) * _SECONDS[match[2]], match[0])
+    if match := _last(_UNIT_FIRST, text) or _last(_SHORT_UNIT_FIRST, text):
+        return _Exposure(_float(match[2]) * _SECONDS[match[1]], match[0])
+    return None
+
+
+def _last(pattern: re.Pattern[str], text: str) -> re.Match[str] | None:
+    matches = list(pattern.finditer(text))
+    return matches[-1] if matches else None
+
+
+def _float(number: str) -> float:
+    return float(number.replace(",", ".").replace("p", "."))
+
+
+# --- frame table ----------------------------------------------------------------------------------
+
+# A table that names the exposure and the light of each file of frames.
+
+
+_TIMES = {
+    "exposure": 0.0,
+    "exposure_s": 1.0,
+    "exposure_ms": 1e-3,
+    "exposure_us": 1e-6,
+    "exposure_ns": 1e-9,
+}
+_FRACTION_IN_TABLE = re.compile(r"\s*(\d+)\s*[/⁄]\s*([1-9]\d*(?:\.\d+)?)\s*(s|sec)?\s*")  #: 1/200 s
+_COLUMNS = "file, exposure (such as 10 ms) or exposure_ms, and photons or light"
+
+
+class TableRow(NamedTuple):
+    """A line of a table: a file and what is told of it; None for an empty cell or a column that
+    is missing.
+    """
+
+    line: int
+    file: Path
+    exposure: float | None  #: s
+    photons: float | None  #: per pixel and exposure
+    light: float | None  #: relative
+
+
+def find_table(folder: Path) -> Path | None:
+    """Return the only CSV file of a folder with a column ``file``, or None; raise ValueError for
+    several.
+    """
+    tables = [path for path in sorted(folder.glob("*.csv")) if "file" in _header(path)]
+    if len(tables) > 1:
+        raise ValueError(
+            f"{folder} has {len(tables)} tables of frames, {', '.join(p.name for p in tables)}:"
+            " keep one"
+        )
+    return tables[0] if tables else None
+
+
+def read_table(table: Path) -> list[TableRow]:
+    """Return the lines of a table of frames; raise ValueError with all mistakes, each with its
+    line.
+    """
+    items = list(_read(table))
+    rows = [item for item in items if isinstance(item, TableRow)]
+    if problems := [item for item in items if isinstance(item, str)]:
+        raise ValueError("\n".join(problems))
+    if not rows:
+        raise ValueError(f"{table.name} has no line below its header: write one line for each file")
+    return rows
+
+
+def _header(table: Path) -> list[str]:
+    try:
+        return next(([cell.strip().lower() for cell in row] for _, row in csv_rows(table)), [])
+    except ValueError:
+        return []
+
+
+def _read(table: Path) -> Iterator[TableRow | str]:
+    lines = csv_rows(table)
+    names = [cell.strip().lower() for cell in next(lines)[1]]
+    time = next((name for name in names if name in _TIMES), "")
+    if strange := [name for name in names if name not in (*_TIMES, "file", "photons", "light")]:
+        yield f"{table.name}:1: column {strange[0]} is unknown: write {_COLUMNS}"
+    for line, cells in lines:
+        row = dict(zip(names, (cell.strip() for cell in cells), strict=False))
+        try:
+            yield _table_row(table, line, row, time)
+        except ValueError as error:
+            yield f"{table.name}:{line}: {error}"
+
+
+def _table_row(table: Path, line: int, row: Mapping[str, str], time: str) -> TableRow:
+    """Return a line of a table; raise ValueError for a file that is not there, and for a value
+    that is no number.
+    """
+    file = table.parent / row.get("file", "")
+    if not file.is_file():
+        raise ValueError(f"no such file: {row.get('file') or '(empty)'}")
+    exposure = _exposure_of_row(row.get(time, ""), time)
+    return TableRow(line, file, exposure, _light(row, "photons"), _light(row, "light"))
+
+
+def _exposure_of_row(text: str, column: str) -> float | None:
+    if not text:
+        return None
+    scale = _TIMES[column]
+    if fraction := _FRACTION_IN_TABLE.fullmatch(text):
+        number, unit = float(fraction[1]) / float(fraction[2]), "s" if scale or fraction[3] else ""
+        scale = 0.0 if fraction[3] else scale
+    else:
+        number, unit = (float(text), "s") if scale else read_any(text)
+    if unit != "s" or not 0 < number < math.inf:
+        raise ValueError(
+            f"exposure {text}: write a time with a unit, such as 10 ms, or name the column"
+            " exposure_ms"
+        )
+    return number * (scale or 1.0)
+
+
+def _light(row: Mapping[str, str], column: str) -> float | None:
+    text = row.get(column, "")
+    if not text:
+        return None
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 <= number < math.inf:
+        raise ValueError(f"{column} {text}: write a number of 0 or more")
+    return number
+
+
+# --- odd frames -----------------------------------------------------------------------------------
+
+# Frames whose mean does not fit their level, as where a file has the wrong name.
+
+
+#: most difference of two frames: of their signal, and of the brightest signal
+_OFF, _FLOOR = 0.1, 0.01
+
+_CHANCE = 6.0  #: standard errors of a mean, added to the difference
+
+Files = tuple[str, bool, Sequence[Path]]  #: name of a level, True for a dark one, its files
+
+
+def _means(files: Sequence[Path]) -> list[tuple[Path, float, float]]:
+    """Return file, mean and standard error of each frame of a level."""
+    means = []
+    for file in files:
+        means += [(file, mean, error) for mean, error in frame_means(file)]
+    return means
+
+
+def misplaced_frames(levels: Sequence[Files], folder: Path) -> Iterator[str]:
+    """Yield a sentence for each level whose frames differ too much in their means, or one if
+    darks are not dark.
+    """
+    means = [_means(files) for _, _, files in levels]
+    middles = [float(np.median([mean for _, mean, _ in of_level])) for of_level in means]
+    darks, lit = _of_kind(middles, levels, dark=True), _of_kind(middles, levels, dark=False)
+    half_of_lit = float(np.median(lit))
+    if half_of_lit <= max(darks):
+        yield (
+            f"{folder}: dark frames have means up to {max(darks):.0f} DN, and half of the lit "
+            "levels no more than "
+            f"{half_of_lit:.0f} DN: cover the lens, or check which files are dark"
+        )
+        return
+    black, bright = min(darks), max(middles)
+    for (_, dark, _), of_level, middle in zip(levels, means, middles, strict=True):
+        room = _OFF * (0.0 if dark else middle - black) + _FLOOR * (bright - black)
+        room += _CHANCE * max(error for _, _, error in of_level)
+        frames = [(file, mean) for file, mean, _ in of_level]
+        if _spread(frames) > room:
+            yield _odd(frames, middle, room, folder)
+
+
+def _of_kind(middles: Sequence[float], levels: Sequence[Files], dark: bool) -> list[float]:
+    """Return the middle values of the dark or of the lit levels."""
+    return [middle for middle, level in zip(middles, levels, strict=True) if level[1] == dark]
+
+
+def _spread(frames: Sequence[tuple[Path, float]]) -> float:
+    """Return the difference of the largest and the smallest mean of frames."""
+    values = [mean for _, mean in frames]
+    return max(values) - min(values)
+
+
+def _odd(frames: Sequence[tuple[Path, float]], middle: float, room: float, folder: Path) -> str:
+    """Return which frame of a level does not fit the others, or both of a pair."""
+    values = [mean for _, mean in frames]
+    if len(values) == 2:
+        (a, first_mean), (b, second_mean) = frames
+        both = (
+            f"{_name(a, folder)} and {_name(b, folder)} count as one level, but have means of"
+            f" {first_mean:.1f} and"
+        )
+        return f"{both} {second_mean:.1f} DN: check names and table"
+    file, mean = max(frames, key=lambda pair: abs(pair[1] - middle))
+    return (
+        f"{_name(file, folder)} has a mean of {mean:.1f} DN, but its level {middle:.1f} DN, "
+        "which may differ by "
+        f"{room:.1f} DN: check its name, or remove it"
+    )
+
+
+def _name(file: Path, folder: Path) -> str:
+    return str(file.relative_to(folder)) if file.is_relative_to(folder) else str(file)
+
+
+# --- frame folder ---------------------------------------------------------------------------------
+
+# The light levels in a folder of frames: which files belong together, and what is missing or does
+# not fit.
+
 
 SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr", ".fits", ".fit", ".fts")
 #: suffixes of pictures that hold no raw grey numbers, or that nothing here reads
-NOT_READ = (".jpg", ".jpeg", ".jpe", ".jp2", ".heic", ".heif", ".webp", ".gif", ".bmp", ".dng", ".cr2", ".cr3", ".nef",
-            ".arw", ".raf", ".rw2", ".orf", ".avi", ".mp4", ".mov")  # fmt: skip
+NOT_READ = (
+    ".jpg",
+    ".jpeg",
+    ".jpe",
+    ".jp2",
+    ".heic",
+    ".heif",
+    ".webp",
+    ".gif",
+    ".bmp",
+    ".dng",
+    ".cr2",
+    ".cr3",
+    ".nef",
+    ".arw",
+    ".raf",
+    ".rw2",
+    ".orf",
+    ".avi",
+    ".mp4",
+    ".mov",
+)
 _LOSSY = (".jpg", ".jpeg", ".jpe", ".jp2", ".heic", ".heif", ".webp")
 _SHOWN = 3  #: files that a message names
-_LIT = 4  #: lit levels: a gain, a bend, a twist and the lamp are told from fewer only by their priors
+#: lit levels: a gain, a bend, a twist and the lamp are told from fewer only by their priors
+_LIT = 4
 _SAME = 1e-6  #: relative difference of two exposures that are one
-_HOW = """name files such as dark_10ms_1.png and lit_10ms_5000ph_1.png (exposure, photons of a pixel, number of the
-frame), or write a table frames.csv with the columns file, exposure and photons, or light for light that is known up to
-a factor""".replace("\n", " ")
+_HOW = """name files such as dark_10ms_1.png and lit_10ms_5000ph_1.png (exposure, photons of a
+pixel, number of the frame), or write a table frames.csv with the columns file, exposure and
+photons, or light for light that is known up to a factor""".replace("\n", " ")
 
 Light = Literal["photons", "relative", "exposure"]  #: how the light of the levels is known
 
 
 class FolderRefused(ValueError):
-    """Error raised if the frames of a folder are no measurement; the text has all reasons, one a line."""
+    """Error raised if the frames of a folder are no measurement; the text has all reasons, one a
+    line.
+    """
 
 
 @dataclass(frozen=True)
@@ -85,7 +394,9 @@ def find_levels(folder: Path, progress: Progress = silent) -> FolderLevels:
     levels = tuple(_named(groups))
     problems = [*_numbers(groups, levels, folder), *_light_problems(levels, light)]
     if not problems:
-        problems = list(misplaced_frames([(level.name, level.dark, level.files) for level in levels], folder))
+        problems = list(
+            misplaced_frames([(level.name, level.dark, level.files) for level in levels], folder)
+        )
     if problems:
         raise FolderRefused("\n".join(problems))
     return FolderLevels(levels, light, source)
@@ -97,19 +408,31 @@ def _no_frames(folder: Path, unread: Sequence[Path]) -> str:
         return f"{folder}: no frames: {_HOW}"
     kinds = "/".join(sorted({path.suffix.lower() for path in unread}))
     lossy = all(path.suffix.lower() in _LOSSY for path in unread)
-    why = "JPEG and its like change the noise of each pixel" if lossy else "no raw grey numbers are read from them"
-    return (f"{_some(unread, folder)}: {kinds} cannot be calibrated: {why}; save the raw frames of one channel as PNG "
-            f"or TIFF of 16 bits, FITS or NumPy, and {_HOW}")  # fmt: skip
+    why = (
+        "JPEG and its like change the noise of each pixel"
+        if lossy
+        else "no raw grey numbers are read from them"
+    )
+    return (
+        f"{_some(unread, folder)}: {kinds} cannot be calibrated: {why}; save the raw frames of "
+        "one channel as PNG "
+        f"or TIFF of 16 bits, FITS or NumPy, and {_HOW}"
+    )
 
 
 def _exposures(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
-    """Yield a line for each exposure with what said it, so that a wrong one is seen before the work."""
-    told: dict[tuple[bool, float, str], list[Path]] = defaultdict(list)
+    """Yield a line for each exposure with what said it, so that a wrong one is seen before the
+    work.
+    """
+    by_source: dict[tuple[bool, float, str], list[Path]] = defaultdict(list)
     for frame in frames:
-        told[not frame.dark, frame.exposure or 0.0, frame.told].append(frame.file)
-    for (lit, seconds, text), files in sorted(told.items()):
+        by_source[not frame.dark, frame.exposure or 0.0, frame.told].append(frame.file)
+    for (lit, seconds, text), files in sorted(by_source.items()):
         kind, count = "lit" if lit else "dark", f"{len(files)} file{'s' * (len(files) != 1)}"
-        yield f"{kind}: exposure {_readable(seconds)}, from {text}: {count} such as {_short(files[0], folder)}"
+        yield (
+            f"{kind}: exposure {_readable(seconds)}, from {text}: {count} such as"
+            f" {_short(files[0], folder)}"
+        )
 
 
 def _readable(seconds: float) -> str:
@@ -126,14 +449,14 @@ def _left(unread: Sequence[Path], folder: Path) -> Iterator[str]:
 
 def _found(folder: Path) -> tuple[list[Frame], str, list[str]]:
     """Return the frames of a folder, what told of them, and the problems of single files."""
-    frames, problems = list[Frame](), list[str]()
     try:
         table = find_table(folder)
         rows = read_table(table) if table else []
     except ValueError as error:
         return [], "", [str(error)]
     listed = {row.file.resolve(): row for row in rows}
-    files = [row.file for row in rows] or sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES)
+    files = [row.file for row in rows] if rows else _frame_files(folder)
+    frames, problems = list[Frame](), list[str]()
     for file in files:
         name, row = read_name(file, folder), listed.get(file.resolve())
         try:
@@ -145,17 +468,26 @@ def _found(folder: Path) -> tuple[list[Frame], str, list[str]]:
         problems += _contradiction(frames[-1], name, row, table, folder)
         if row is None or row.exposure is None:
             problems += _doubt(frames[-1], name, files, folder)
-    return frames, f"the table {table.name}" if table else "names and headers of the files", problems
+    return frames, _sources(table), problems
 
 
-def _frame(file: Path, name: NamedFrame, row: TableRow | None, header: FrameHeader, table: Path | None) -> Frame:
+def _sources(table: Path | None) -> str:
+    """Return what says light and exposure of the frames of a folder."""
+    return f"the table {table.name}" if table else "names and headers of the files"
+
+
+def _frame_files(folder: Path) -> list[Path]:
+    """Return the files of frames in a folder and the folders within, sorted."""
+    return sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+
+
+def _frame(
+    file: Path, name: NamedFrame, row: TableRow | None, header: FrameHeader, table: Path | None
+) -> Frame:
     """Return a frame with what a table says of it, else its name, else its header."""
     photons, exposure = (row.photons, row.exposure) if row else (name.photons, name.exposure)
     light = row.light if row else None
     dark = 0.0 in (photons, light, header.photons) or (name.dark and not photons and not light)
-    told = "the header"
-    if exposure is not None:
-        told = table.name if row and table else f"{name.written} of the name"
     return Frame(
         file=file,
         header=header,
@@ -164,8 +496,15 @@ def _frame(file: Path, name: NamedFrame, row: TableRow | None, header: FrameHead
         exposure=header.exposure if exposure is None else exposure,
         photons=header.photons if photons is None else photons,
         light=light,
-        told=told,
+        told=_source(exposure, name, table if row else None),
     )
+
+
+def _source(exposure: float | None, name: NamedFrame, table: Path | None) -> str:
+    """Return what says the exposure of a frame."""
+    if exposure is None:
+        return "the header"
+    return table.name if table else f"{name.written} of the name"
 
 
 def _contradiction(
@@ -180,7 +519,9 @@ def _contradiction(
 
 
 def _doubt(frame: Frame, name: NamedFrame, files: Sequence[Path], folder: Path) -> Iterator[str]:
-    """Yield a problem for a name such as ``dark_1_200s``, unless a frame 2 shows that the 1 is a number of frames."""
+    """Yield a problem for a name such as ``dark_1_200s``, unless a frame 2 shows that the 1 is a
+    number of frames.
+    """
     if not name.doubtful or frame.header.exposure is not None:
         return
     text = str(frame.file.relative_to(folder)).lower()
@@ -188,12 +529,19 @@ def _doubt(frame: Frame, name: NamedFrame, files: Sequence[Path], folder: Path) 
     if second in (str(path.relative_to(folder)).lower() for path in files):
         return
     seconds = float(re.findall(r"\d+", name.doubtful)[-1])
-    yield (f"{_short(frame.file, folder)}: {name.doubtful} may be 1/{seconds:g} s, or number 1 of {seconds:g} s: write "
-           f"{_readable(1 / seconds).replace(' ', '')} or {seconds:g}s, or a table frames.csv")  # fmt: skip
+    yield (
+        f"{_short(frame.file, folder)}: {name.doubtful} may be 1/{seconds:g} s, or number 1 of "
+        f"{seconds:g} s: write "
+        f"{_readable(1 / seconds).replace(' ', '')} or {seconds:g}s, or a table frames.csv"
+    )
 
 
 def _short(file: Path, folder: Path) -> str:
-    return str(file.resolve().relative_to(folder.resolve())) if file.is_relative_to(folder) else str(file)
+    return (
+        str(file.resolve().relative_to(folder.resolve()))
+        if file.is_relative_to(folder)
+        else str(file)
+    )
 
 
 def _some(files: Sequence[Path], folder: Path) -> str:
@@ -204,14 +552,19 @@ def _some(files: Sequence[Path], folder: Path) -> str:
 def _sizes(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
     """Yield a problem where frames differ in size or in the bits of a number from most others."""
     sizes = [f"{frame.header.shape[1]} x {frame.header.shape[0]}" for frame in frames]
-    for what, has in (("pixels", sizes), ("bits", [str(frame.header.bits) for frame in frames])):
+    for quantity, has in (
+        ("pixels", sizes),
+        ("bits", [str(frame.header.bits) for frame in frames]),
+    ):
         counts = Counter(has)
         if len(counts) > 1:
             usual = counts.most_common(1)[0][0]
             odd = [frame.file for frame, text in zip(frames, has, strict=True) if text != usual]
             others = ", ".join(sorted(counts.keys() - {usual}))
-            yield (f"{_some(odd, folder)}: {others} {what}, but {counts[usual]} files have {usual} {what}: give frames "
-                   "of one sensor and one setting")  # fmt: skip
+            yield (
+                f"{_some(odd, folder)}: {others} {quantity}, but {counts[usual]} files have {usual}"
+                f" {quantity}: give frames of one sensor and one setting"
+            )
 
 
 def _unknown(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
@@ -220,11 +573,22 @@ def _unknown(frames: Sequence[Frame], folder: Path) -> Iterator[str]:
         yield f"{_some(timeless, folder)}: the exposure is unknown: {_HOW}"
     lit = [frame for frame in frames if not frame.dark]
     if frames and len(lit) == len(frames):
-        yield f"{folder}: no dark frames: cover the lens, take two or more, and name them such as dark_10ms_1.png"
-    for name in ("photons", "light"):
-        missing = [frame.file for frame in lit if getattr(frame, name) is None]
-        if 0 < len(missing) < len(lit):
-            yield f"{_some(missing, folder)}: no {name}, which {len(lit) - len(missing)} other lit files have: {_HOW}"
+        yield (
+            f"{folder}: no dark frames: cover the lens, take two or more, and name them such as"
+            " dark_10ms_1.png"
+        )
+    yield from _partly_known("photons", lit, folder)
+    yield from _partly_known("light", lit, folder)
+
+
+def _partly_known(name: str, lit: Sequence[Frame], folder: Path) -> Iterator[str]:
+    """Yield that some lit frames lack a light that others have, if so."""
+    missing = [frame.file for frame in lit if getattr(frame, name) is None]
+    if 0 < len(missing) < len(lit):
+        yield (
+            f"{_some(missing, folder)}: no {name}, which {len(lit) - len(missing)} other lit"
+            f" files have: {_HOW}"
+        )
 
 
 def _kind_of_light(frames: Sequence[Frame]) -> Light:
@@ -238,9 +602,11 @@ _Key = tuple[bool, float, float, str]
 
 
 def _groups(frames: Sequence[Frame], light: Light) -> dict[_Key, list[Frame]]:
-    """Return the frames of each level, in rising order of light and exposure, by what they have in common.
+    """Return the frames of each level, in rising order of light and exposure, by what they have in
+    common.
 
-    Where only exposures tell the light, frames of one exposure are one level if their names agree too.
+    Where only exposures tell the light, frames of one exposure are one level if their names agree
+    too.
     """
     groups: dict[_Key, list[Frame]] = defaultdict(list)
     for frame in frames:
@@ -251,8 +617,8 @@ def _groups(frames: Sequence[Frame], light: Light) -> dict[_Key, list[Frame]]:
         elif light == "exposure":
             groups[False, time, time, frame.level].append(frame)
         else:
-            told = frame.photons if light == "photons" else frame.light
-            groups[False, float(told or 0.0), time, ""].append(frame)
+            amount = frame.photons if light == "photons" else frame.light
+            groups[False, float(amount or 0.0), time, ""].append(frame)
     return dict(sorted(groups.items(), key=lambda item: (not item[0][0], *item[0][1:])))
 
 
@@ -268,15 +634,23 @@ def _time(seconds: float) -> str:
     return f"{1e3 * seconds:.6g}ms".replace(".", "p").replace("+", "")
 
 
-def _numbers(groups: dict[_Key, list[Frame]], levels: Sequence[FolderLevel], folder: Path) -> Iterator[str]:
+def _numbers(
+    groups: dict[_Key, list[Frame]], levels: Sequence[FolderLevel], folder: Path
+) -> Iterator[str]:
     """Yield a problem for levels of one frame, and for too few lit levels."""
     single = [f[0].file for f in groups.values() if sum(frame.header.frames for frame in f) < 2]
     if single:
-        yield (f"{_some(single, folder)}: one frame of its level: take two or more frames of each exposure and light, "
-               "or give frames of one level one name with a number at its end, such as _1 and _2")  # fmt: skip
+        yield (
+            f"{_some(single, folder)}: one frame of its level: take two or more frames of each "
+            "exposure and light, "
+            "or give frames of one level one name with a number at its end, such as _1 and _2"
+        )
     lit = len({level.light for level in levels if not level.dark})
     if lit < _LIT:
-        yield f"{folder}: {lit} lit level{'s' * (lit != 1)}: take {_LIT} or more of different light, up to saturation"
+        yield (
+            f"{folder}: {lit} lit level{'s' * (lit != 1)}: take {_LIT} or more of different light,"
+            " up to saturation"
+        )
 
 
 def _light_problems(levels: Sequence[FolderLevel], light: Light) -> Iterator[str]:

@@ -1,22 +1,24 @@
-"""The option of the group ``sensor`` that a calibration gives, with its uncertainties as a joint distribution."""
+"""The option of the group ``sensor`` that a calibration gives, with its uncertainties as a joint
+distribution.
+"""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neusee.nodes.array_bytes import npz_needs
 from neusee.nodes.calibrate import SaturationSignal, frame_header, saturation_signal
+from neusee.nodes.file_headers import npz_needs
 from neusee.nodes.values import Levels
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.keys.regular_file import head_of, text_of
+from neusee.workflows.keys.sealed_files import head_of, text_of
 from neusee.workflows.store.result_store import Store
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*")
@@ -58,7 +60,10 @@ def sensor_target(name: str, folder: Path) -> Path:
         raise ValueError(f"--sensor {name}: write a word of a-z, 0-9 and _, such as mine")
     file = folder / "sensor" / f"{name}.yaml"
     if file.exists() and not head_of(file, len(FIRST)).decode("utf-8", "replace").startswith(FIRST):
-        raise ValueError(f"--sensor {name}: {file} exists and was not written by a calibration: choose another name")
+        raise ValueError(
+            f"--sensor {name}: {file} exists and was not written by a calibration: choose another"
+            " name"
+        )
     return file
 
 
@@ -67,10 +72,14 @@ def frames_of_sensor(recipe: Recipe, store: Store) -> SensorFrames:
 
     A level is full where its variance has fallen.
     """
-    files = [file for step in recipe.steps.values() for file in _files(step)]
+    files: list[Path] = []
+    for step in recipe.steps.values():
+        files += _files(step)
     header = frame_header(files[0])
     levels: Levels = run(recipe, store, ("measured",)).values["measured"]
-    brightest = max(float(levels.mean.max()), float(levels.cell_value.max()) if len(levels.cell_value) else 0.0)
+    brightest = max(
+        float(levels.mean.max()), float(levels.cell_value.max()) if len(levels.cell_value) else 0.0
+    )
     bits = next((b for b in _BITS if brightest < 2**b), header.bits)
     dark = levels.exposure[levels.photons == 0]
     return SensorFrames(header.shape, bits, saturation_signal(levels), float(dark.min()))
@@ -91,7 +100,10 @@ def sensor_text(results: Path, frames: SensorFrames) -> str:
     posterior = json.loads(text_of(results / "posterior.json"))
     budget = json.loads(text_of(results / "budget.json"))["quantities"]
     if posterior["failed"]:
-        raise ValueError(f"{posterior['failed']} checks of the calibration fail, so that no sensor group is written")
+        raise ValueError(
+            f"{posterior['failed']} checks of the calibration fail, so that no sensor group is"
+            " written"
+        )
     if "gain" not in budget:
         raise ValueError("the frames do not tell the gain, so that no sensor group is written")
     npz_needs(results / "draws.npz", 1.0, 8.0)
@@ -112,46 +124,89 @@ def _values(
 ) -> dict[str, _Value]:
     """Return each value of a sensor that the budget has, by its name in the group."""
     moved = {name: _moved(draws[name], row) for name, row in budget.items() if name in draws}
-    found = {new: _Value(budget[name]["value"], unit, moved[name]) for name, (new, unit) in _VALUES.items()
-             if name in moved}  # fmt: skip
+    values = {
+        new: _Value(budget[name]["value"], unit, moved[name])
+        for name, (new, unit) in _VALUES.items()
+        if name in moved
+    }
     if "dark_signal" in moved:
         electrons = moved["dark_signal"] / moved["gain"]
-        found["offset"] = _Value(budget["dark_signal"]["value"] / budget["gain"]["value"], "e-", electrons)
+        values["offset"] = _Value(
+            budget["dark_signal"]["value"] / budget["gain"]["value"], "e-", electrons
+        )
     if "dark_current" in moved:
         of = float(str(budget["dark_current"]["unit"]).removeprefix("e- in ").removesuffix(" s"))
-        one = frames.exposure / of
-        found["dark_current"] = _Value(one * budget["dark_current"]["value"], "e-", one * moved["dark_current"])
+        ratio = frames.exposure / of
+        values["dark_current"] = _Value(
+            ratio * budget["dark_current"]["value"], "e-", ratio * moved["dark_current"]
+        )
     if frames.full is not None:
         normal = np.random.default_rng(_STREAM).standard_normal(len(moved["gain"]))
         signal = frames.full.signal + frames.full.uncertainty * normal
-        found["full_well"] = _Value(frames.full.signal / budget["gain"]["value"], "e-", signal / moved["gain"])
-    return found
+        values["full_well"] = _Value(
+            frames.full.signal / budget["gain"]["value"], "e-", signal / moved["gain"]
+        )
+    return values
 
 
 def _moved(draws: NDArray[np.float64], row: Mapping[str, Any]) -> NDArray[np.float64]:
-    """Return draws that are shifted and scaled to the value and the combined standard uncertainty of a budget."""
+    """Return draws that are shifted and scaled to the value and the combined standard
+    uncertainty of a budget.
+    """
     z: NDArray[np.float64] = (draws - draws.mean()) / draws.std(ddof=1)
     moved: NDArray[np.float64] = row["value"] + row["combined standard uncertainty"] * z
     return moved
 
 
 def _written(values: Mapping[str, _Value], frames: SensorFrames, source: str) -> str:
-    lines = [f"{FIRST}: {source}.", "# What the frames do not tell is that of the packaged sensor: check pixel_pitch.",
-             "defaults: [small]", "sensor:", f"  shape: [{frames.shape[0]}, {frames.shape[1]}]",
-             f"  exposure: {frames.exposure:.9g} s", f"  bits: {frames.bits}"]  # fmt: skip
+    return "\n".join([*_head(frames, source), *_sensor(values, frames), *_posterior(values), ""])
+
+
+def _head(frames: SensorFrames, source: str) -> list[str]:
+    """Return the lines of what does not follow from the calibration."""
+    return [
+        f"{FIRST}: {source}.",
+        "# What the frames do not tell is that of the packaged sensor: check pixel_pitch.",
+        "defaults: [small]",
+        "sensor:",
+        f"  shape: [{frames.shape[0]}, {frames.shape[1]}]",
+        f"  exposure: {frames.exposure:.9g} s",
+        f"  bits: {frames.bits}",
+    ]
+
+
+def _sensor(values: Mapping[str, _Value], frames: SensorFrames) -> list[str]:
+    """Return the lines of the values, and of those that the frames do not give."""
+    lines = []
     if frames.full is None:
         lines.append("  # full_well: no frame reached saturation")
     for name, value in values.items():
         note = f"   # {_NOTES[name]}" if name in _NOTES else ""
         lines.append(f"  {name}: {_text(value.mean, value.unit)}{note}")
-    lines += [f"  # {name}: no value from these frames" for name in ("quantum_efficiency", "dark_current")
-              if name not in values]  # fmt: skip
+    missing = [name for name in ("quantum_efficiency", "dark_current") if name not in values]
+    return [*lines, *(f"  # {name}: no value from these frames" for name in missing)]
+
+
+def _posterior(values: Mapping[str, _Value]) -> list[str]:
+    """Return the lines of means, standard uncertainties and correlations."""
     correlation = np.atleast_2d(np.corrcoef([value.draws for value in values.values()]))
-    means = ", ".join(f"sensor.{name}: {_text(value.mean, value.unit)}" for name, value in values.items())
-    widths = ", ".join(f"sensor.{name}: {_text(float(v.draws.std(ddof=1)), v.unit)}" for name, v in values.items())
-    rows = ", ".join("[" + ", ".join(f"{x:.6f}" for x in row) + "]" for row in _symmetric(correlation))
-    return "\n".join([*lines, "posterior:   # standard uncertainties, which `neusee study uncertainty` draws together",
-                      f"  mean: {{{means}}}", f"  sd: {{{widths}}}", f"  correlation: [{rows}]", ""])  # fmt: skip
+    means = ", ".join(
+        f"sensor.{name}: {_text(value.mean, value.unit)}" for name, value in values.items()
+    )
+    widths = ", ".join(
+        f"sensor.{name}: {_text(float(v.draws.std(ddof=1)), v.unit)}" for name, v in values.items()
+    )
+    rows = ", ".join(map(_numbers, _symmetric(correlation)))
+    return [
+        "posterior:   # standard uncertainties, which `neusee study uncertainty` draws together",
+        f"  mean: {{{means}}}",
+        f"  sd: {{{widths}}}",
+        f"  correlation: [{rows}]",
+    ]
+
+
+def _numbers(row: Iterable[float]) -> str:
+    return "[" + ", ".join(f"{x:.6f}" for x in row) + "]"
 
 
 def _symmetric(correlation: NDArray[np.float64]) -> NDArray[np.float64]:

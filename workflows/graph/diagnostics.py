@@ -11,23 +11,27 @@ UNREAD = "unread"  #: code of a value to which no step refers
 _KNOWN = "there are: "  #: text before a list of known names
 
 
-#: characters that no reader sees and a terminal obeys: they move the cursor, clear the screen, or turn text around
+#: characters that no reader sees and a terminal obeys: they move the cursor, clear the screen, or
+#: turn text around
 CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 
 
 def visible(text: str) -> str:
     """Return a text with escapes such as ``\\x1b`` in place of characters that a terminal obeys."""
-    return CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
+    return CONTROL.sub(lambda match: ascii(match[0])[1:-1], text)
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Location:
-    """Location of a recipe value: line and column in a file, counted from 1, or an argument of a command (line 0)."""
+    """Location of a recipe value: line and column in a file, counted from 1, or an argument of a
+    command (line 0).
+    """
 
     file: str  #: as shown to the user: ``first_light.yaml``, ``sensor/neusee.yaml``, ``argument 2``
     line: int = 0
     column: int = 0
-    folder: str = field(default=".", compare=False)  #: folder to which paths in the file are relative
+    #: folder to which paths in the file are relative
+    folder: str = field(default=".", compare=False)
 
     def __str__(self) -> str:
         return f"{self.file}:{self.line}:{self.column}" if self.line else self.file
@@ -35,16 +39,21 @@ class Location:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Diagnostic:
-    """One mistake in a recipe: its location, the path of the wrong value, and a message with the fix."""
+    """One mistake in a recipe: its location, the path of the wrong value, and a message with the
+    fix.
+    """
 
     mark: Location
     path: str
     message: str
-    code: str = field(default="", compare=False)  #: kind of the mistake for programs, such as `UNREAD`
+    #: kind of the mistake for programs, such as `UNREAD`
+    code: str = field(default="", compare=False)
 
 
 class RecipeError(ValueError):
-    """Error for a recipe that cannot be run; the text of the error has one line for each mistake, in file order."""
+    """Error for a recipe that cannot be run; the text of the error has one line for each
+    mistake, in file order.
+    """
 
     def __init__(self, diagnostics: Iterable[Diagnostic]) -> None:
         self.diagnostics = tuple(sorted(_of_values_once(set(diagnostics))))
@@ -52,9 +61,15 @@ class RecipeError(ValueError):
 
 
 def _of_values_once(diagnostics: set[Diagnostic]) -> Iterator[Diagnostic]:
-    """Yield mistakes, without that of a setting where a step says the same of its value: `a` beside `a = -1 m`."""
-    of_steps = {(each.mark, each.path.partition(" = ")[0]) for each in diagnostics if " = " in each.path}
-    yield from (each for each in diagnostics if (each.mark, each.path) not in of_steps)
+    """Yield mistakes, without that of a setting where a step says the same of its value: `a`
+    beside `a = -1 m`.
+    """
+    of_steps = {
+        (mistake.mark, mistake.path.partition(" = ")[0])
+        for mistake in diagnostics
+        if " = " in mistake.path
+    }
+    yield from (mistake for mistake in diagnostics if (mistake.mark, mistake.path) not in of_steps)
 
 
 def _table(diagnostics: tuple[Diagnostic, ...]) -> str:
@@ -65,18 +80,30 @@ def _table(diagnostics: tuple[Diagnostic, ...]) -> str:
 
 
 def _lists_once(messages: Iterable[str]) -> Iterator[str]:
-    """Yield messages, with a list of known names in the first message alone if many messages end with this list."""
-    known = set[str]()
+    """Yield messages, with a list of known names in the first message alone if many messages end
+    with this list.
+    """
+    told_names = set[str]()
     for message in messages:
-        before, found, names = message.partition(_KNOWN)
-        yield f"{before}see the names above" if found and "," in names and names in known else message
-        known.add(names)
+        before, separator, names = message.partition(_KNOWN)
+        yield (
+            f"{before}see the names above"
+            if separator and "," in names and names in told_names
+            else message
+        )
+        told_names.add(names)
 
 
 def nearest(name: str, among: Iterable[str]) -> str:
-    """Return a hint with the known name most similar to ``name``, or with a list of known names if none is similar."""
+    """Return a hint with the known name most similar to ``name``, or with a list of known names
+    if none is similar.
+    """
     names = sorted(set(map(str, among)))
     close = difflib.get_close_matches(str(name), names, 1, 0.6)
     if close:
         return f"did you mean {close[0]}?"
-    return f"{_KNOWN}{', '.join(names[:12])}{', …' if len(names) > 12 else ''}" if names else "there are none"
+    return (
+        f"{_KNOWN}{', '.join(names[:12])}{', …' if len(names) > 12 else ''}"
+        if names
+        else "there are none"
+    )

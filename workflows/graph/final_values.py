@@ -1,4 +1,6 @@
-"""Final values of a recipe, each with its source, and a YAML file of these values that can be run again."""
+"""Final values of a recipe, each with its source, and a YAML file of these values that can be
+run again.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,9 @@ _WORDS = {"true", "false", "null", "yes", "no", "on", "off"}
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Final value of one recipe key with its source: a file location, a command argument or the default of a node."""
+    """Final value of one recipe key with its source: a file location, a command argument or the
+    default of a node.
+    """
 
     value: Any
     source: str
@@ -25,7 +29,9 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """All final values of a recipe, each under its dotted path such as ``sensor.read_noise``, in recipe order."""
+    """All final values of a recipe, each under its dotted path such as ``sensor.read_noise``, in
+    recipe order.
+    """
 
     settings: Mapping[str, Setting] = field(default_factory=dict)
 
@@ -38,7 +44,8 @@ class Config:
         return self.settings[path]
 
     def to_yaml(self) -> str:
-        """Return the final values of a recipe as YAML text, with the source of each value in a comment.
+        """Return the final values of a recipe as YAML text, with the source of each value in a
+        comment.
 
         The text has no groups. Default values of nodes are commented out.
         """
@@ -55,14 +62,24 @@ class Config:
 
 
 def changes(base: Config, other: Config, apart: str) -> list[str]:
-    """Return the overrides that turn the values of one recipe into those of another, but for the block ``apart``."""
+    """Return the overrides that turn the values of one recipe into those of another, but for the
+    block ``apart``.
+    """
     own, was = (
-        {path: s.value for path, s in config.settings.items() if not s.default and s.path[0] != apart}
+        {
+            path: s.value
+            for path, s in config.settings.items()
+            if not s.default and s.path[0] != apart
+        }
         for config in (other, base)
     )
-    gone = [f"~{path}" for path in was if path not in own]
+    removed = [f"~{path}" for path in was if path not in own]
     put = [f"{path}={flow(x)}" if path in was else f"+{path}={flow(x)}" for path, x in own.items()]
-    return gone + [text for text, (path, x) in zip(put, own.items(), strict=True) if path not in was or was[path] != x]
+    return removed + [
+        text
+        for text, (path, x) in zip(put, own.items(), strict=True)
+        if path not in was or was[path] != x
+    ]
 
 
 def _lines(tree: Mapping[str | int, Any], depth: int) -> Iterator[str]:
@@ -70,7 +87,10 @@ def _lines(tree: Mapping[str | int, Any], depth: int) -> Iterator[str]:
     for key, value in tree.items():
         if isinstance(value, Setting):
             text = f"{_scalar(key)}: {flow(value.value)}"
-            yield f"{indent}{'# ' if value.default else ''}{text:<{44 - len(indent)}} # {value.source}"
+            yield (
+                f"{indent}{'# ' if value.default else ''}{text:<{44 - len(indent)}} #"
+                f" {value.source}"
+            )
         else:
             yield f"{indent}{_scalar(key)}:"
             yield from _lines(value, depth + 1)

@@ -1,13 +1,13 @@
-"""Graph of a checked recipe: its steps, the connections between the steps, and the order in which the steps run."""
+"""Graph of a checked recipe: its steps, their connections and order, and their records."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from neusee.nodes import Node
+from neusee.nodes import Check, Node, TensorStats
 from neusee.workflows.graph.diagnostics import Location, nearest
 from neusee.workflows.graph.final_values import Config, Setting
 
@@ -15,22 +15,85 @@ if TYPE_CHECKING:
     from neusee.nodes.calibrate import Traceability
     from neusee.workflows.engine.runner import Result
     from neusee.workflows.engine.step_job import Executor
-    from neusee.workflows.graph.step_record import Event
     from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
     from neusee.workflows.recipe.blocks.safety_block import Safety
-    from neusee.workflows.recipe.blocks.train_block import Training
-    from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
+    from neusee.workflows.recipe.blocks.train_block import LiftTraining, Training
     from neusee.workflows.recipe.distributions.nominal_values import Uncertain
     from neusee.workflows.store.result_store import Store
 
-__all__ = ["Config", "Expectation", "Recipe", "Setting", "Step", "Substitution", "Wire", "in_order", "needed"]
 
-Wire = str | tuple[str, ...] | None  #: one step, the steps of all items, or no step for an optional input
+# --- step record ----------------------------------------------------------------------------------
+
+# Records of the steps of a run: the state of each step with its reason, and the device, time and
+# memory.
+
+
+State = Literal["run", "cached", "left out", "not needed"]
+
+
+@dataclass(frozen=True, slots=True)
+class StepRecord:
+    """Record of one step in a run: its state, the reason for this state, its time, memory and
+    checks.
+    """
+
+    step: str
+    state: State  #: ``not needed``: no step that ran needed this step
+    why: str
+    seconds: float
+    key: str  #: cache key of the result
+    facts: TensorStats | None = None
+    checks: tuple[Check, ...] = ()
+    device: str = "cpu"
+    bytes: int = 0
+    bound: float | None = None  #: upper bound of the change of the result if the step is omitted
+    began: float = 0.0  #: start time of the step in s after the start of the run
+    lane: str = ""  #: device or worker of the executor that computed the step
+    peak: int | None = None  #: peak memory in bytes beyond the memory in use before the step
+    predicted: float | None = None  #: time in s predicted from earlier runs
+    #: of a cheaper step: rms and maximum, relative to the largest element
+    error: tuple[float, float] | None = None
+    predicted_peak: float | None = None  #: predicted peak memory in bytes, as ``peak``
+    kept: bool = True  #: whether the value is in the store
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Start or end of a step during a run, reported to a live display; ``done`` is None at the
+    start.
+    """
+
+    step: str
+    done: StepRecord | None
+
+
+# --- recipe graph ---------------------------------------------------------------------------------
+
+# Graph of a checked recipe: its steps, the connections between the steps, and the order in which
+# the steps run.
+
+
+__all__ = [
+    "Config",
+    "Expectation",
+    "Recipe",
+    "Setting",
+    "Step",
+    "Substitution",
+    "Wire",
+    "in_order",
+    "needed",
+]
+
+#: one step, the steps of all items, or no step for an optional input
+Wire = str | tuple[str, ...] | None
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One step of a recipe: a node (a function), its validated parameters and the steps that compute its inputs."""
+    """One step of a recipe: a node (a function), its validated parameters and the steps that
+    compute its inputs.
+    """
 
     name: str  #: ``psf[mask]``, ``spot[mask,green]``
     node: Node
@@ -38,7 +101,8 @@ class Step:
     wires: Mapping[str, Wire]  #: by input, in the node's order
     mark: Location
     param_marks: Mapping[str, Location]  #: location of each given value
-    device: str = ""  #: requested device: ``cpu``, ``gpu``, ``cuda:1``; empty if any; never part of a key
+    #: requested device: ``cpu``, ``gpu``, ``cuda:1``; empty if any; never part of a key
+    device: str = ""
     cached: bool = True  #: False for ``cache: false``: computed in each run, and never stored
     #: names of all steps whose results are inputs of this step, in the order of the inputs
     sources: tuple[str, ...] = field(init=False, repr=False, compare=False)
@@ -60,7 +124,9 @@ class Substitution:
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """Number that a recipe expects in the result of ``step`` at the indices ``at``, with a relative tolerance."""
+    """Number that a recipe expects in the result of ``step`` at the indices ``at``, with a
+    relative tolerance.
+    """
 
     name: str
     step: str
@@ -71,12 +137,15 @@ class Expectation:
 
 
 _COPIES = 8  #: copies of a step that a message lists
-METRIC_TOLERANCE = 1e-3  #: largest error of an input of a metric, because a metric may depend on a small difference
+#: largest error of an input of a metric, because a metric may depend on a small difference
+METRIC_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Recipe:
-    """Checked recipe, in which all steps, values and connections of steps are valid and no step has run yet."""
+    """Checked recipe, in which all steps, values and connections of steps are valid and no step
+    has run yet.
+    """
 
     name: str
     title: str
@@ -87,31 +156,47 @@ class Recipe:
     expect: tuple[Expectation, ...] = ()
     config: Config = field(default_factory=Config)
     notes: tuple[str, ...] = ()
-    absent: Mapping[str, str] = field(default_factory=dict)  #: location of the null, by the name of a step that is null
+    #: location of the null, by the name of a step that is null
+    absent: Mapping[str, str] = field(default_factory=dict)
     exact: bool = False  #: whether every step is computed in full at any tolerance
-    estimates: bool = True  #: whether errors that are estimated, not proved, may count towards the tolerance
-    substitutions: tuple[Substitution, ...] = ()  #: cheaper steps in place of full steps; empty after loading
+    #: whether errors that are estimated, not proved, may count towards the tolerance
+    estimates: bool = True
+    #: cheaper steps in place of full steps; empty after loading
+    substitutions: tuple[Substitution, ...] = ()
     tolerance_scale: float = 1.0  #: fraction of the tolerance in use; below 1 after a failed proof
-    unsubstituted: Recipe | None = field(default=None, compare=False)  #: the recipe before substitutions, if any
-    uncertain: Uncertain | None = field(default=None, compare=False)  #: distributions for the study of uncertainty
-    training: Training | None = field(default=None, compare=False)  #: settings of the training of a network
-    cameras: tuple[Recipe, ...] = field(default=(), compare=False)  #: of `train.cameras`, one recipe each
-    lifting: LiftTraining | None = field(default=None, compare=False)  #: settings of the training of a lift
-    safety: Safety | None = field(default=None, compare=False)  #: settings of the estimate of damage and dazzle
-    evaluation: EvaluateSettings | None = field(default=None, compare=False)  #: settings of an evaluation
-    traceability: Traceability | None = field(default=None, compare=False)  #: what the laboratory states of its light
-    exports: Mapping[str, bool] | None = field(default=None, compare=False)  #: data files, True for half; None: all
-    unbounded: frozenset[str] = frozenset()  #: steps whose errors reach a node without an error bound
+    #: the recipe before substitutions, if any
+    unsubstituted: Recipe | None = field(default=None, compare=False)
+    #: distributions for the study of uncertainty
+    uncertain: Uncertain | None = field(default=None, compare=False)
+    #: settings of the training of a network
+    training: Training | None = field(default=None, compare=False)
+    #: of `train.cameras`, one recipe each
+    cameras: tuple[Recipe, ...] = field(default=(), compare=False)
+    #: settings of the training of a lift
+    lifting: LiftTraining | None = field(default=None, compare=False)
+    #: settings of the estimate of damage and dazzle
+    safety: Safety | None = field(default=None, compare=False)
+    #: settings of an evaluation
+    evaluation: EvaluateSettings | None = field(default=None, compare=False)
+    #: what the laboratory states of its light
+    traceability: Traceability | None = field(default=None, compare=False)
+    #: data files, True for half; None: all
+    exports: Mapping[str, bool] | None = field(default=None, compare=False)
+    #: steps whose errors reach a node without an error bound
+    unbounded: frozenset[str] = frozenset()
 
     def limit(self, step: str) -> float:
         """Return the largest relative error allowed in the result of a step.
 
-        This is the tolerance of the recipe, or at most `METRIC_TOLERANCE` if a later node has no error bound.
+        This is the tolerance of the recipe, or at most `METRIC_TOLERANCE` if a later node has no
+        error bound.
         """
         return min(self.tolerance, METRIC_TOLERANCE) if step in self.unbounded else self.tolerance
 
     def allowed(self, step: str) -> float:
-        """Return the total relative error that omitted and approximated steps may cause in the result of ``step``."""
+        """Return the total relative error that omitted and approximated steps may cause in the
+        result of ``step``.
+        """
         return self.limit(step) * self.tolerance_scale
 
     def run(
@@ -145,22 +230,25 @@ def copies_of(recipe: Recipe, names: Iterable[str]) -> set[str]:
 
     Raises `ValueError` for a name of no step.
     """
-    found = set[str]()
+    copies = set[str]()
     for name in names:
         own = {step for step in recipe.steps if name in (step, step.partition("[")[0])}
         if not own:
             raise ValueError(unknown_step(name, recipe.steps))
-        found |= own
-    return found
+        copies |= own
+    return copies
 
 
 def needed(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
-    """Return the names of the steps that must run to compute the steps ``outputs``, in topological order."""
+    """Return the names of the steps that must run to compute the steps ``outputs``, in
+    topological order.
+    """
     return ordered({name: step.sources for name, step in recipe.steps.items()}, outputs)
 
 
 def ordered(sources: Mapping[str, tuple[str, ...]], names: Iterable[str]) -> list[str]:
-    """Return what `in_order` returns; the order of a graph is found once, because points of a sweep share few graphs.
+    """Return what `in_order` returns; the order of a graph is found once, because points of a sweep
+    share few graphs.
 
     ``sources`` has the steps that each step reads.
     """
@@ -168,7 +256,9 @@ def ordered(sources: Mapping[str, tuple[str, ...]], names: Iterable[str]) -> lis
 
 
 @lru_cache(32)
-def _ordered(steps: tuple[str, ...], sources: tuple[tuple[str, ...], ...], names: tuple[str, ...]) -> tuple[str, ...]:
+def _ordered(
+    steps: tuple[str, ...], sources: tuple[tuple[str, ...], ...], names: tuple[str, ...]
+) -> tuple[str, ...]:
     return tuple(in_order(dict(zip(steps, sources, strict=True)), names))
 
 
@@ -177,25 +267,31 @@ def nodes_of(recipe: Recipe, outputs: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(recipe.steps[name].node.path for name in needed(recipe, outputs)))
 
 
-def dependents(recipe: Recipe, roots: Iterable[str], order: Iterable[str] | None = None) -> set[str]:
-    """Return the names of the steps ``roots`` and of all steps that depend on ``roots``, directly or not.
+def dependents(
+    recipe: Recipe, roots: Iterable[str], order: Iterable[str] | None = None
+) -> set[str]:
+    """Return the names of the steps ``roots`` and of all steps that depend on ``roots``, directly
+    or not.
 
-    ``order`` lists the steps to consider, in topological order; by default, all steps of the recipe.
+    ``order`` lists the steps to consider, in topological order; by default, all steps of the
+    recipe.
     """
-    found = set(roots)
+    names = set(roots)
     for name in needed(recipe, recipe.steps) if order is None else order:
-        if not found.isdisjoint(recipe.steps[name].sources):
-            found.add(name)
-    return found
+        if not names.isdisjoint(recipe.steps[name].sources):
+            names.add(name)
+    return names
 
 
 def in_order(sources: Mapping[str, Iterable[str]], names: Iterable[str]) -> list[str]:
-    """Return the steps ``names`` and all steps that they depend on, in topological order; the graph has no cycle."""
+    """Return the steps ``names`` and all steps that they depend on, in topological order; the
+    graph has no cycle.
+    """
     order: dict[str, None] = {}
     stack = [(name, iter(sources[name])) for name in reversed(list(names))]
     while stack:
-        name, rest = stack[-1]
-        below = next((s for s in rest if s not in order), None)
+        name, sources_left = stack[-1]
+        below = next((s for s in sources_left if s not in order), None)
         if below is not None:
             stack.append((below, iter(sources[below])))
             continue
@@ -205,9 +301,65 @@ def in_order(sources: Mapping[str, Iterable[str]], names: Iterable[str]) -> list
 
 
 def unknown_step(name: str, steps: Collection[str]) -> str:
-    """Return the error message for an unknown step name, which suggests names such as ``psf[mask]``."""
+    """Return the error message for an unknown step name, which suggests names such as
+    ``psf[mask]``.
+    """
     copies = sorted(step for step in steps if step.startswith(f"{name}["))
     if not copies:
         return f"no step {name!r}; {nearest(name, steps)}"
-    more = f" and {len(copies) - _COPIES} more" if len(copies) > _COPIES else ""
-    return f"no output {name}: this recipe has {', '.join(copies[:_COPIES])}{more}"
+    remainder = f" and {len(copies) - _COPIES} more" if len(copies) > _COPIES else ""
+    return f"no output {name}: this recipe has {', '.join(copies[:_COPIES])}{remainder}"
+
+
+# --- told copies ----------------------------------------------------------------------------------
+
+# Copies of the steps from which a restorer knows optics and laser, so that a camera may differ from
+# what is believed.
+#
+# The camera keeps its steps. The copies have the prefix ``told_``, and the restorer reads these in
+# place of the camera's.
+
+
+TOLD = "told_"  #: prefix of the copies
+#: inputs of a restorer that say what the optics and the laser are
+KNOWLEDGE = ("psf", "glare", "nearby")
+#: step of the frame behind the mask, before which the camera is and after which the user
+FRAME = "raw[mask]"
+
+
+def knowers(recipe: Recipe, steps: Iterable[str]) -> list[str]:
+    """Return those of the steps that read what optics or lasers are."""
+    return [name for name in steps if any(recipe.steps[name].wires.get(key) for key in KNOWLEDGE)]
+
+
+def known(recipe: Recipe, readers: Iterable[str]) -> list[str]:
+    """Return the steps whose results tell the steps ``readers`` what optics and lasers are."""
+    wires = (recipe.steps[name].wires.get(key) for name in readers for key in KNOWLEDGE)
+    return [name for wire in wires for name in ((wire,) if isinstance(wire, str) else wire or ())]
+
+
+def with_copies(
+    recipe: Recipe, readers: Iterable[str], copied: Collection[str], change: Callable[[Step], Step]
+) -> Recipe:
+    """Return the recipe with changed copies of the steps ``copied``, from which alone the
+    ``readers`` know.
+    """
+    steps = dict(recipe.steps)
+    for name in copied:
+        step = change(recipe.steps[name])
+        wires = {key: _told(wire, copied) for key, wire in step.wires.items()}
+        steps[TOLD + name] = replace(step, name=TOLD + name, wires=wires)
+    for name in readers:
+        step = recipe.steps[name]
+        wires = {
+            key: _told(wire, copied) if key in KNOWLEDGE else wire
+            for key, wire in step.wires.items()
+        }
+        steps[name] = replace(step, wires=wires)
+    return replace(recipe, steps=steps)
+
+
+def _told(wire: Wire, copied: Collection[str]) -> Wire:
+    if isinstance(wire, str):
+        return TOLD + wire if wire in copied else wire
+    return None if wire is None else tuple(TOLD + name if name in copied else name for name in wire)

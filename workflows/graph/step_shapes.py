@@ -1,14 +1,16 @@
 """Shapes, types and small values of the results of a recipe, found before anything runs.
 
-A form is a tensor on the device ``meta``, which has a shape and no values, a tensor of few numbers, or a named tuple of
-such tensors. The rule of a node (``@node.shape``) computes the form of its result from the forms of its inputs. No node
-runs for this, apart from those with ``before_run``, whose results have few numbers.
+A form is a tensor on the device ``meta``, which has a shape and no values, a tensor of few numbers,
+or a named tuple of such tensors. The rule of a node (``@node.shape``) computes the form of its
+result from the forms of its inputs. No node runs for this, apart from those with ``before_run``,
+whose results have few numbers.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,22 +24,29 @@ Form = Any  #: a tensor, a named tuple of tensors, or None where the shape is no
 
 
 def forms_of(recipe: Recipe, order: Iterable[str]) -> dict[str, Form]:
-    """Return the form of the result of each step in ``order``, which lists each step after its inputs."""
-    found: dict[str, Form] = {}
+    """Return the form of the result of each step in ``order``, which lists each step after its
+    inputs.
+    """
+    forms: dict[str, Form] = {}
     for name in order:
         step = recipe.steps[name]
-        found[name] = form_of(step.node, inputs_of(step, found), step.params)
-    return found
+        forms[name] = form_of(step.node, inputs_of(step, forms), step.params)
+    return forms
 
 
 def inputs_of(step: Step, forms: Mapping[str, Form]) -> list[Form]:
-    """Return the forms of the inputs of a step, in the order of the node; a list input is a list of forms."""
+    """Return the forms of the inputs of a step, in the order of the node; a list input is a list
+    of forms.
+    """
     wires = (step.wires.get(name) for name in step.node.inputs)
-    return [w and (forms.get(w) if isinstance(w, str) else [forms.get(n) for n in w]) for w in wires]
+    return [
+        w and (forms.get(w) if isinstance(w, str) else [forms.get(n) for n in w]) for w in wires
+    ]
 
 
 def form_of(node: Node, inputs: Sequence[Form], params: Mapping[str, Any]) -> Form:
-    """Return the form of the result of a node, or None if the node has no rule or the rule needs an unknown input.
+    """Return the form of the result of a node, or None if the node has no rule or the rule needs an
+    unknown input.
 
     Raises: OverflowError for a result with more bytes than any machine can address.
     """
@@ -55,27 +64,31 @@ def form_of(node: Node, inputs: Sequence[Form], params: Mapping[str, Any]) -> Fo
     return None
 
 
-def is_same(one: Form, other: Form) -> bool:
+def is_same(form: Form, other: Form) -> bool:
     """Return True if two forms of an input are the same object, or lists of the same objects."""
-    if type(one) is list and type(other) is list:
-        return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
-    return one is other
+    if type(form) is list and type(other) is list:
+        return len(form) == len(other) and all(a is b for a, b in zip(form, other, strict=True))
+    return form is other
 
 
 def has_path(value: Any) -> bool:
     """Return True if a parameter, or a part of it, is the path of a file, which may change."""
     if isinstance(value, Mapping):
         return any(map(has_path, value.values()))
-    return isinstance(value, Path) or (isinstance(value, list | tuple) and any(map(has_path, value)))
+    return isinstance(value, Path) or (
+        isinstance(value, list | tuple) and any(map(has_path, value))
+    )
 
 
 def complete(node: Node, inputs: Sequence[Form]) -> bool:
-    """Return True if the shape of every input that a node needs is known, and of every item of a list."""
+    """Return True if the shape of every input that a node needs is known, and of every item of a
+    list.
+    """
     named = zip(inputs, node.inputs, strict=False)
+    if any(x is None and name not in node.optional for x, name in named):
+        return False
     lists = (x for x in inputs if type(x) is list)
-    return all(x is not None or name in node.optional for x, name in named) and not any(
-        item is None for x in lists for item in x
-    )
+    return not any(item is None for item in chain.from_iterable(lists))
 
 
 def without_values(value: Any) -> Form:
@@ -94,7 +107,9 @@ _FEW = 4096  #: numbers of a tensor up to which the values may tell the work of 
 
 def bytes_of(form: Form) -> float:
     """Return the bytes of a result from its form, or of a list of results."""
-    return float(sum(math.prod(tensor.shape) * tensor.element_size() for tensor in tensors_of(form)))
+    return float(
+        sum(math.prod(tensor.shape) * tensor.element_size() for tensor in tensors_of(form))
+    )
 
 
 def tensors_of(form: Form) -> list[Tensor]:
@@ -103,18 +118,26 @@ def tensors_of(form: Form) -> list[Tensor]:
 
     if isinstance(form, Tensor):
         return [form]
-    return [tensor for item in form for tensor in tensors_of(item)] if isinstance(form, tuple | list) else []
+    return (
+        [tensor for item in form for tensor in tensors_of(item)]
+        if isinstance(form, tuple | list)
+        else []
+    )
 
 
-def alike(one: Form, other: Form) -> bool:
-    """Return True if two forms tell the same: equal shapes and types, and equal values as far as these are known."""
+def alike(form: Form, other: Form) -> bool:
+    """Return True if two forms tell the same: equal shapes and types, and equal values as far as
+    these are known.
+    """
     from torch import Tensor, equal
 
-    if type(one) is not type(other):
+    if type(form) is not type(other):
         return False
-    if isinstance(one, Tensor):
-        same = one.shape == other.shape and one.dtype == other.dtype and one.device == other.device
-        return same and (one.device.type == "meta" or equal(one, other))
-    if isinstance(one, list | tuple):
-        return len(one) == len(other) and all(map(alike, one, other))
-    return one is None or (isinstance(one, str | int | float) and one == other)
+    if isinstance(form, Tensor):
+        same = (
+            form.shape == other.shape and form.dtype == other.dtype and form.device == other.device
+        )
+        return same and (form.device.type == "meta" or equal(form, other))
+    if isinstance(form, list | tuple):
+        return len(form) == len(other) and all(map(alike, form, other))
+    return form is None or (isinstance(form, str | int | float) and form == other)

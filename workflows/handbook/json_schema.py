@@ -1,12 +1,13 @@
 """JSON schema of recipe files, with which an editor completes names and marks mistakes.
 
-The schema of a step depends on its ``node``, so that an editor reports a wrong name under ``with`` once, and not once
-for each node. The schema requires no key, because groups may complete a file.
+The schema of a step depends on its ``node``, so that an editor reports a wrong name under ``with``
+once, and not once for each node. The schema requires no key, because groups may complete a file.
 """
 
 from __future__ import annotations
 
 import inspect
+import itertools
 import math
 import re
 from collections.abc import Mapping
@@ -19,10 +20,10 @@ from pydantic_core import core_schema
 from neusee.nodes import Node, units
 from neusee.workflows.recipe.blocks.train_block import Training
 from neusee.workflows.recipe.distributions.law_text import KINDS
-from neusee.workflows.recipe.exported_files import ALL, HALF, NAMES, NONE
+from neusee.workflows.recipe.global_settings import ALL, HALF, NAMES, NONE
 from neusee.workflows.recipe.loading import groups
 from neusee.workflows.recipe.node_families import Own, all_nodes
-from neusee.workflows.recipe.wiring import takes_many
+from neusee.workflows.recipe.steps import takes_many
 
 Schema = dict[str, Any]
 
@@ -37,18 +38,29 @@ _NODES: Schema = {"anyOf": [{"type": "string"}, _FAMILY]}
 _MEANINGS = {
     "defaults": "Groups that come first, in order.",
     "nodes": "Files and modules with your own nodes.",
-    "steps": "The graph: under each name a node, its inputs and its parameters; null removes a step.",
+    "steps": (
+        "The graph: under each name a node, its inputs and its parameters; null removes a step."
+    ),
     "seed": "Start of all random numbers.",
     "tolerance": "Largest error of an output, relative to its largest element; 0 is exact.",
-    "estimates": "False: only errors with a proved bound count towards the tolerance; true: estimated errors too.",
+    "estimates": (
+        "False: only errors with a proved bound count towards the tolerance; true: estimated errors"
+        " too."
+    ),
     "outputs": "Steps whose results the run is for.",
-    "exports": "Data files that a run writes: all, none, or a list of names; NAME.exr@half has half floats.",
+    "exports": (
+        "Data files that a run writes: all, none, or a list of names; NAME.exr@half has half"
+        " floats."
+    ),
     "posterior": "Joint distribution of several values.",
     "train": "Settings of `neusee train`.",
     "train_lift": "Settings of the training of a network from RGB to spectra.",
     "safety": "Settings of `neusee safety`.",
     "evaluate": "Settings of `neusee evaluate`.",
-    "traceability": "What the laboratory states of its light and temperature, for `neusee calibrate` and `sheet`.",
+    "traceability": (
+        "What the laboratory states of its light and temperature, for `neusee calibrate` and"
+        " `sheet`."
+    ),
     "expect": "Numbers from an independent source, which each run checks.",
 }
 #: types of values that a reference may replace
@@ -66,9 +78,16 @@ def schema(own: Own = MappingProxyType({})) -> Schema:
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "neusee recipe",
         "type": "object",
-        "properties": {name: {**value, "description": _MEANINGS[name]} for name, value in _keys().items()},
+        "properties": {
+            name: {**value, "description": _MEANINGS[name]} for name, value in _keys().items()
+        },
         "additionalProperties": True,
-        "$defs": {"step": _step(nodes), "expectation": _expectation(), **_parameters(nodes), **_training()},
+        "$defs": {
+            "step": _step(nodes),
+            "expectation": _expectation(),
+            **_parameters(nodes),
+            **_training(),
+        },
     }
 
 
@@ -82,7 +101,13 @@ def _keys() -> dict[str, Schema]:
         "tolerance": {"anyOf": [{"type": "number", "minimum": 0}, REFERENCE]},
         "estimates": {"anyOf": [{"type": "boolean"}, REFERENCE]},
         "outputs": {"type": ["array", "string"], "items": {"type": "string"}},
-        "exports": {"anyOf": [{"enum": [ALL, NONE]}, {"type": "array", "items": {"enum": _exported()}}, REFERENCE]},
+        "exports": {
+            "anyOf": [
+                {"enum": [ALL, NONE]},
+                {"type": "array", "items": {"enum": _exported()}},
+                REFERENCE,
+            ]
+        },
         "posterior": {"anyOf": [{"type": "string"}, {"type": "object"}, {"type": "null"}]},
         "train": {"anyOf": [{"$ref": "#/$defs/train"}, {"type": "null"}]},
         "train_lift": {"type": ["object", "null"]},
@@ -99,23 +124,46 @@ def _exported() -> list[str]:
 
 
 def _defaults() -> Schema:
-    """Return the JSON schema of an entry in ``defaults``, which suggests packaged options and allows other names.
+    """Return the JSON schema of an entry in ``defaults``, which suggests packaged options and
+    allows other names.
 
     In the file of an option an entry is the name of another option of the same group.
     """
-    offered = {group: {"enum": [option.name for option in options]} for group, options in groups().items()}
-    options = {group: {"anyOf": [names, {"type": ["string", "null"]}]} for group, names in offered.items()}
-    one: Schema = {"type": "object", "properties": options, "minProperties": 1, "maxProperties": 1}
-    return {"anyOf": [one, {"type": "string"}]}
+    offered = {
+        group: {"enum": [option.name for option in options]} for group, options in groups().items()
+    }
+    options = {
+        group: {"anyOf": [names, {"type": ["string", "null"]}]} for group, names in offered.items()
+    }
+    group_choice: Schema = {
+        "type": "object",
+        "properties": options,
+        "minProperties": 1,
+        "maxProperties": 1,
+    }
+    return {"anyOf": [group_choice, {"type": "string"}]}
 
 
 def _step(nodes: Mapping[str, Node]) -> Schema:
-    """Return the JSON schema of a recipe step: the keys of all steps, and the inputs and parameters of each node."""
-    each: Schema = {"type": ["string", "array", "null"], "items": {"type": "string"}, "maxItems": 2}
+    """Return the JSON schema of a recipe step: the keys of all steps, and the inputs and
+    parameters of each node.
+    """
+    collection: Schema = {
+        "type": ["string", "array", "null"],
+        "items": {"type": "string"},
+        "maxItems": 2,
+    }
     names: Schema = {"anyOf": [{"enum": list(nodes)}, REFERENCE]}
     return {
         "type": ["object", "null"],
-        "properties": {"node": names, "each": each, "from": _ANY, "with": _ANY, "device": _DEVICE, "cache": _CACHED},
+        "properties": {
+            "node": names,
+            "each": collection,
+            "from": _ANY,
+            "with": _ANY,
+            "device": _DEVICE,
+            "cache": _CACHED,
+        },
         "additionalProperties": False,
         "allOf": [
             {
@@ -132,20 +180,34 @@ def _step(nodes: Mapping[str, Node]) -> Schema:
 
 
 def _inputs(node: Node) -> Schema:
-    """Return the JSON schema of a step's key ``from``, which names the inputs of the step's node."""
+    """Return the JSON schema of a step's key ``from``, which names the inputs of the step's
+    node.
+    """
     if not node.inputs:
         return {"type": "null"}
     all_items = {**_WIRE, "description": "all items"}
     wires = {name: all_items if takes_many(node, name) else _WIRE for name in node.inputs}
-    return {"type": ["string", "object", "null"], "properties": wires, "additionalProperties": False}
+    return {
+        "type": ["string", "object", "null"],
+        "properties": wires,
+        "additionalProperties": False,
+    }
 
 
 def _expectation() -> Schema:
     number: Schema = {"anyOf": [{"type": "number"}, REFERENCE]}
-    at: Schema = {"type": ["array", "integer", "string"], "items": {"type": ["integer", "string"]}}
-    properties = {"step": {"type": "string"}, "at": at, "value": number, "rtol": number}
+    place: Schema = {
+        "type": ["array", "integer", "string"],
+        "items": {"type": ["integer", "string"]},
+    }
+    properties = {"step": {"type": "string"}, "at": place, "value": number, "rtol": number}
     required = ["step", "value", "rtol"]
-    return {"type": "object", "properties": properties, "additionalProperties": False, "required": required}
+    return {
+        "type": "object",
+        "properties": properties,
+        "additionalProperties": False,
+        "required": required,
+    }
 
 
 def _parameters(nodes: Mapping[str, Node]) -> Schema:
@@ -155,14 +217,20 @@ def _parameters(nodes: Mapping[str, Node]) -> Schema:
         model = node.params.model_json_schema(schema_generator=_Generator)
         for field in model.get("properties", {}).values():
             field.pop("title", None)
-        allowed = {"type": ["object", "null"], "properties": model.get("properties", {}), "additionalProperties": False}
+        allowed = {
+            "type": ["object", "null"],
+            "properties": model.get("properties", {}),
+            "additionalProperties": False,
+        }
         schemas[name] = allowed | ({"$defs": model["$defs"]} if "$defs" in model else {})
     return schemas
 
 
 def _training() -> Schema:
     """Return the JSON schema of the block ``train`` of a recipe, in which every key is optional."""
-    model = Training.model_json_schema(schema_generator=_Generator, ref_template="#/$defs/train.{model}")
+    model = Training.model_json_schema(
+        schema_generator=_Generator, ref_template="#/$defs/train.{model}"
+    )
     blocks = {f"train.{name}": block for name, block in model.pop("$defs").items()}
     for block in (model, *blocks.values()):
         block.pop("required", None)
@@ -170,22 +238,29 @@ def _training() -> Schema:
 
 
 class _Generator(GenerateJsonSchema):
-    """Generator of JSON schemas whose values may also be quantities with units, references and distributions."""
+    """Generator of JSON schemas whose values may also be quantities with units, references and
+    distributions.
+    """
 
     def generate_inner(self, schema: Any) -> JsonSchemaValue:
         inner = super().generate_inner(schema)
         takes_reference = schema["type"] in _REFERABLE and REFERENCE not in inner.get("anyOf", ())
         return {"anyOf": [inner, REFERENCE]} if takes_reference else inner
 
-    def function_before_schema(self, schema: core_schema.BeforeValidatorFunctionSchema) -> JsonSchemaValue:
-        """Return the JSON schema of a physical quantity: a number with one of the units that the parameter allows."""
+    def function_before_schema(
+        self, schema: core_schema.BeforeValidatorFunctionSchema
+    ) -> JsonSchemaValue:
+        """Return the JSON schema of a physical quantity: a number with one of the units that the
+        parameter allows.
+        """
         read = schema["function"]["function"]
-        known = [unit for scale in units._SCALE.values() for unit in scale if _takes(read, unit)]
-        if not known:
+        every_unit = itertools.chain.from_iterable(units._SCALE.values())
+        allowed_units = [unit for unit in every_unit if _takes(read, unit)]
+        if not allowed_units:
             return super().function_before_schema(schema)
-        least = max(schema["schema"].get(bound, -math.inf) for bound in ("gt", "ge"))
-        sign = "[+]?" if least >= 0 else "[-+]?"
-        pattern = rf"^\s*{sign}{_NUMBER}\s*({'|'.join(map(re.escape, known))})\s*$"
+        lower_bound = max(schema["schema"].get(bound, -math.inf) for bound in ("gt", "ge"))
+        sign = "[+]?" if lower_bound >= 0 else "[-+]?"
+        pattern = rf"^\s*{sign}{_NUMBER}\s*({'|'.join(map(re.escape, allowed_units))})\s*$"
         return {"type": "string", "pattern": pattern}
 
 

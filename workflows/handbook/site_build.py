@@ -1,8 +1,11 @@
-"""The build of the handbook: pages, pictures and reference become a site that a browser opens as files."""
+"""The build of the handbook: pages, pictures and reference become a site that a browser opens as
+files.
+"""
 
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import os
 import shutil
 import subprocess
@@ -15,10 +18,10 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
-from neusee.workflows.handbook.command_pictures import draw_pictures
 from neusee.workflows.handbook.guide_pages import (
     GUIDE,
     Picture,
+    draw_pictures,
     pictures_of,
     read_pages,
     title_of,
@@ -27,7 +30,8 @@ from neusee.workflows.handbook.guide_pages import (
 )
 from neusee.workflows.report.run_folder import writable_folder
 
-_MARK = ".neusee_handbook"  #: the file by which a folder is known as a handbook, which a new build may replace
+#: the file by which a folder is known as a handbook, which a new build may replace
+_MARK = ".neusee_handbook"
 _REST = "More"  #: the section of the pages that the list `nav` of the settings does not name
 _NEEDED = ("mkdocs", "material")
 
@@ -35,7 +39,9 @@ Tree = list[dict[str, Any]]
 
 
 class HandbookError(RuntimeError):
-    """Error for a handbook that cannot be built: a module is missing, the folder is in use, or MkDocs failed."""
+    """Error for a handbook that cannot be built: a module is missing, the folder is in use, or
+    MkDocs failed.
+    """
 
 
 def check_modules() -> None:
@@ -51,16 +57,24 @@ def check_folder(out: Path) -> None:
     except ValueError as error:
         raise HandbookError(f"--out: {error}") from None
     if out.is_dir() and any(out.iterdir()) and not (out / _MARK).is_file():
-        raise HandbookError(f"{out} holds files that are no handbook, and a build replaces a folder: name a new folder")
+        raise HandbookError(
+            f"{out} holds files that are no handbook, and a build replaces a folder: name a new"
+            " folder"
+        )
 
 
 def build_handbook(
-    out: Path, reference: Mapping[str, str], pictures: bool, progress: Callable[[str], None], strict: bool = False
+    out: Path,
+    reference: Mapping[str, str],
+    pictures: bool,
+    progress: Callable[[str], None],
+    strict: bool = False,
 ) -> Path:
     """Build the handbook in the folder ``out`` and return the path of its first page.
 
-    ``reference`` has the pages that the program writes about itself, by path. Without ``pictures`` no command of a page
-    runs. A ``strict`` build fails at a link that leads nowhere, and at a command of a page that fails.
+    ``reference`` has the pages that the program writes about itself, by path. Without ``pictures``
+    no command of a page runs. A ``strict`` build fails at a link that leads nowhere, and at a
+    command of a page that fails.
     """
     check_modules()
     check_folder(out)
@@ -78,30 +92,45 @@ def build_handbook(
 
 
 def settings_text(pages: Mapping[str, str], docs: Path, site: Path) -> str:
-    """Return the settings of MkDocs: those of the guide, with the folders, and every page in the list `nav`."""
+    """Return the settings of MkDocs: those of the guide, with the folders, and every page in the
+    list `nav`.
+    """
     yaml = YAML()
     settings = yaml.load(GUIDE / "mkdocs.yml")
-    settings |= {"docs_dir": str(docs), "site_dir": str(site), "nav": complete_nav(settings["nav"], pages)}
+    settings |= {
+        "docs_dir": str(docs),
+        "site_dir": str(site),
+        "nav": complete_nav(settings["nav"], pages),
+    }
     text = StringIO()
     yaml.dump(settings, text)
     return text.getvalue()
 
 
 def complete_nav(nav: Tree, pages: Mapping[str, str]) -> Tree:
-    """Return the list `nav` without pages that do not exist, and with a section of the pages that it does not name.
+    """Return the list `nav` without pages that do not exist, and with a section of the pages that
+    it does not name.
 
     An entry that ends in ``/`` stands for all pages in a folder.
     """
     named = set(_named(nav, pages))
-    rest = [{title_of(text): path} for path, text in pages.items() if path not in named]
-    kept = [{title: _filled(entry, pages)} for each in nav for title, entry in each.items()]
-    return [*(each for each in kept if all(each.values())), *([{_REST: rest}] if rest else [])]
+    unnamed = [{title_of(text): path} for path, text in pages.items() if path not in named]
+    return _sections(nav, pages) + ([{_REST: unnamed}] if unnamed else [])
+
+
+def _sections(nav: Tree, pages: Mapping[str, str]) -> Tree:
+    """Return each entry with its title, without entries of no page."""
+    sections = []
+    for entries in nav:
+        for title, entry in entries.items():
+            if pages_of_entry := _filled(entry, pages):
+                sections.append({title: pages_of_entry})
+    return sections
 
 
 def _filled(entry: Any, pages: Mapping[str, str]) -> Any:
     if isinstance(entry, list):
-        found = [{title: _filled(inner, pages)} for each in entry for title, inner in each.items()]
-        return [each for each in found if all(each.values())]
+        return _sections(entry, pages)
     if entry.endswith("/"):
         return [{title_of(text): path} for path, text in pages.items() if path.startswith(entry)]
     return entry if entry in pages else None
@@ -109,21 +138,35 @@ def _filled(entry: Any, pages: Mapping[str, str]) -> Any:
 
 def _named(entry: Any, pages: Mapping[str, str]) -> set[str]:
     if isinstance(entry, str):
-        return {path for path in pages if path == entry or (entry.endswith("/") and path.startswith(entry))}
-    return {path for each in entry for inner in each.values() for path in _named(inner, pages)}
+        return {
+            path
+            for path in pages
+            if path == entry or (entry.endswith("/") and path.startswith(entry))
+        }
+    named = set()
+    for entries in entry:
+        for inner in entries.values():
+            named |= _named(inner, pages)
+    return named
 
 
 def _draw(
-    pages: Mapping[str, str], work: Path, target: Path, progress: Callable[[str], None], strict: bool
+    pages: Mapping[str, str],
+    work: Path,
+    target: Path,
+    progress: Callable[[str], None],
+    strict: bool,
 ) -> dict[Picture, str]:
     write_files(pages, work)
-    wanted = [picture for text in pages.values() for picture in pictures_of(text)]
-    return draw_pictures(wanted, work, target, progress, strict)
+    pictures = list(itertools.chain.from_iterable(map(pictures_of, pages.values())))
+    return draw_pictures(pictures, work, target, progress, strict)
 
 
 def _write_docs(pages: Mapping[str, str], drawn: Mapping[Picture, str], docs: Path) -> None:
     """Write the pages with their pictures, and the files of the guide that are no pages."""
-    shutil.copytree(GUIDE, docs, dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.md", "mkdocs.yml"))
+    shutil.copytree(
+        GUIDE, docs, dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.md", "mkdocs.yml")
+    )
     for path, text in pages.items():
         up = "../" * path.count("/")
         target = docs / path
@@ -135,9 +178,13 @@ def _write_docs(pages: Mapping[str, str], drawn: Mapping[Picture, str], docs: Pa
 def _run_mkdocs(settings: Path, strict: bool) -> None:
     words = ["build", "--quiet", *(["--strict"] if strict else []), "--config-file", str(settings)]
     environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
-    done = subprocess.run([sys.executable, "-m", "mkdocs", *words], env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", *words], env=environment, capture_output=True, text=True
+    )
     if done.returncode:
-        raise HandbookError(f"mkdocs could not build the pages: {(done.stderr or done.stdout).strip()[-2000:]}")
+        raise HandbookError(
+            f"mkdocs could not build the pages: {(done.stderr or done.stdout).strip()[-2000:]}"
+        )
 
 
 def _replace(out: Path, site: Path) -> None:

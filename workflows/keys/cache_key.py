@@ -1,32 +1,221 @@
-"""Cache keys: the key of a result is a digest of everything that determines the result, and of nothing else.
-
-A key depends on the node with its code, the versions of the packages that the code imports, the parameters, the content
-of input files, the keys of the inputs and the random stream. A key does not depend on tensors, the number of threads
-or, except for random nodes, the device.
-"""
+"""Cache key of a result: the digest of everything that determines the result."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import sys
-from collections.abc import Mapping
+import time
+from collections.abc import Iterable, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.keys.input_file_digest import file_digest
-from neusee.workflows.keys.written_params import written
+import xxhash
+
+from neusee.workflows.keys.sealed_files import opened
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Step, Wire
     from neusee.workflows.keys.code_digest import Code
 
+
+# --- usual settings -------------------------------------------------------------------------------
+
+# Settings of a new process, from which `loaded_state.settings` tells the differences; torch is
+# not needed.
+
+
+#: settings that only code of a user reads
+OWN_USUAL = {
+    "floating-point errors": "told",
+    "printed numbers": "as NumPy prints",
+    "encoding of texts": "utf-8",
+    "time zone": "UTC",
+    "code at the start of Python": "none",
+}
+#: settings of a new process
+USUAL = {
+    "default dtype": "torch.float32",
+    "default device": "cpu",
+    "matmul precision": "highest",
+    "TF32": "True",
+    "autocast": "off",
+    "numbers below 1e-308": "kept",
+    "assert statements": "run",
+    **OWN_USUAL,
+}
+
+
+# --- module owner ---------------------------------------------------------------------------------
+
+# Whose module is it: one of neusee, whose nodes its own tests prove, or one of the user?
+
+
+PROVEN = ("neusee.",)  #: packages whose nodes are not observed
+
+
+def is_own(module: str) -> bool:
+    """Return True for a module outside of neusee, whose nodes are proven by its own tests."""
+    return not f"{module}.".startswith(PROVEN)
+
+
+# --- written params -------------------------------------------------------------------------------
+
+# What the parameters of an own node say beside their values: names of files, and the order of
+# mappings.
+#
+# The nodes of neusee read the content of a file and the entries of a mapping, so equal ones share
+# results. A node of a user may also read an exposure in ``dark_20ms.npy``, or take the first entry
+# of a mapping.
+
+
+#: parameters of nodes of neusee whose entries count in their order: light meets the first surface
+#: of a lens first
+_ORDERED = frozenset({("flare.stray_light", "surfaces"), ("flare.stray_shares", "surfaces")})
+
+
+def written(step: Step) -> dict[str, Any]:
+    """Return the names of files and the order of mappings in the parameters of an own node, as JSON
+    by parameter.
+
+    Of a node of neusee only the order of a mapping counts, where the node says so.
+    """
+    notes: dict[str, Any] = {}
+    own = is_own(step.node.fn.__module__)
+    for name, value in step.params.items():
+        if not own and (step.node.path, name) not in _ORDERED:
+            continue
+        marks = [mark for mark in (step.param_marks.get(name), step.mark) if mark is not None]
+        said = _said(value, [os.path.abspath(mark.folder) for mark in marks])
+        if said is not None:
+            notes[name] = said
+    return notes
+
+
+def _said(value: Any, folders: list[str]) -> Any:
+    """Return what a value says beside its content, or None if it says nothing."""
+    if isinstance(value, Path):
+        return _name(value, folders)
+    if isinstance(value, Mapping):
+        return _said_in_order(value, folders)
+    if isinstance(value, tuple | list):
+        said = [_said(item, folders) for item in value]
+        return said if any(item is not None for item in said) else None
+    return None
+
+
+def _said_in_order(mapping: Mapping[Any, Any], folders: list[str]) -> Any:
+    """Return the keys of a mapping in their order with what their values say, or None for a single
+    key whose value says nothing.
+    """
+    parts = [[str(key), _said(item, folders)] for key, item in mapping.items()]
+    return parts if len(parts) > 1 or any(item is not None for _, item in parts) else None
+
+
+def _name(path: Path, folders: list[str]) -> list[str]:
+    """Return the path of a file as a recipe in one of some folders writes it, and the name that
+    links lead to.
+    """
+    full = os.path.abspath(path)
+    folder = next((candidate for candidate in folders if _is_in(full, candidate)), None)
+    real, top = os.path.realpath(full), folder and os.path.realpath(folder)
+    name = Path(os.path.relpath(full, folder) if folder else full).as_posix()
+    target = Path(
+        os.path.relpath(real, top) if top and _is_in(real, top) else os.path.basename(real)
+    ).as_posix()
+    plain = target == (name if top and _is_in(real, top) else os.path.basename(full))
+    return [name] if plain else [name, target]
+
+
+def _is_in(path: str, folder: str) -> bool:
+    return path.startswith(folder.rstrip(os.sep) + os.sep)
+
+
+# --- input file digest ----------------------------------------------------------------------------
+
+# Digest of the content of an input file, which is part of the cache key of each step that reads the
+# file.
+
+
+#: ns after a change of a file in which a second change may not change the time stamp
+_SETTLED = 2_000_000_000
+_TICK = 20_000_000  #: ns, longer than a tick of the clock of a file system
+_TRIES = 3  #: readings of a file that changes while it is read
+_files: dict[tuple[int, ...], str] = {}
+
+#: device, inode, size, and the times (ns) of the last change of content and of the entry
+Stamp = tuple[int, ...]
+
+
+def file_digest(path: Path) -> str:
+    """Return the xxh3 digest of a file; an unchanged file is read only once in a process.
+
+    A file that changed in the last two seconds is read each time, because its time stamp may not
+    show a second change. Raises `OSError` if the file changes each time while it is read.
+    """
+    for _ in range(_TRIES):
+        stamp = _stamp(path)
+        if stamp in _files:
+            return _files[stamp]
+        with opened(path) as file:
+            digits = hashlib.file_digest(file, xxhash.xxh3_128).hexdigest()
+        if _stamp(path) == stamp:
+            if time.time_ns() - max(stamp[-2:]) > _SETTLED:
+                _files[stamp] = digits
+            return digits
+    raise OSError(f"{path} changes while it is read: wait until it is written, and run again")
+
+
+def file_stamps(value: Any) -> list[Stamp]:
+    """Return a stamp of each file in a parameter or a collection of parameters.
+
+    Equal stamps before and after a reading say that the file was not replaced in between, not even
+    by a file that was taken away again. A file that changed in this moment is waited for, because
+    its next change could have its stamp.
+    """
+    stamps = [_stamp(path) for path in files_in(value)]
+    if stamps and time.time_ns() - max(max(stamp[-2:]) for stamp in stamps) < _TICK:
+        time.sleep(_TICK / 1e9)
+    return stamps
+
+
+def files_in(value: Any) -> Iterable[Path]:
+    """Return the files in a parameter or a collection of parameters."""
+    if isinstance(value, Path):
+        return [value]
+    if isinstance(value, Mapping):
+        return list(chain.from_iterable(map(files_in, value.values())))
+    return (
+        list(chain.from_iterable(map(files_in, value))) if isinstance(value, tuple | list) else []
+    )
+
+
+def _stamp(path: Path) -> Stamp:
+    stat = os.stat(path)
+    return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
+
+
+# --- cache key ------------------------------------------------------------------------------------
+
+# Cache keys: the key of a result is a digest of everything that determines the result, and of
+# nothing else.
+#
+# A key depends on the node with its code, the versions of the packages that the code imports, the
+# parameters, the content of input files, the keys of the inputs and the random stream. A key does
+# not depend on tensors, the number of threads or, except for random nodes, the device.
+
+
 Key = str
-PRIVATE = "private-"  #: first letters of the key of a result that holds for one process alone and is not stored
+#: first letters of the key of a result that holds for one process alone and is not stored
+PRIVATE = "private-"
 
 
 def digest(*parts: Any) -> str:
-    """Return the digest of the JSON values ``parts`` as 32 hexadecimal digits; every bit of a float affects it."""
+    """Return the digest of the JSON values ``parts`` as 32 hexadecimal digits; every bit of a
+    float affects it.
+    """
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
@@ -34,7 +223,8 @@ def digest(*parts: Any) -> str:
 def key_of(
     step: Step, keys: Mapping[str, Key], seed: int, code: Code, device: str = "cpu"
 ) -> tuple[Key, dict[str, Any]]:
-    """Return the cache key of ``step`` and the data from which the key is computed, such as parameters.
+    """Return the cache key of ``step`` and the data from which the key is computed, such as
+    parameters.
 
     ``keys`` are the cache keys of the steps whose results are inputs of ``step``.
     """
@@ -49,33 +239,51 @@ def key_of(
         parts["written"] = said
     if node.random:
         parts["stream"] = [seed, step.name, device_kind(device)]
-    private = not step.cached or any(map(is_private, [parts["code"], *(keys[name] for name in step.sources)]))
+    private = not step.cached or any(
+        map(is_private, [parts["code"], *(keys[name] for name in step.sources)])
+    )
     return (PRIVATE + digest(parts)[:24] if private else digest(parts)), parts
 
 
 def code_of(step: Step, code: Code) -> str:
-    """Return the digest of the code of a step: of its node, and of the network classes that its parameters name."""
-    return code.of(step.node, tuple(dict.fromkeys((each.__module__, each.__qualname__) for each in networks_of(step))))
+    """Return the digest of the code of a step: of its node, and of the network classes that its
+    parameters name.
+    """
+    return code.of(
+        step.node,
+        tuple(
+            dict.fromkeys(
+                (network.__module__, network.__qualname__) for network in networks_of(step)
+            )
+        ),
+    )
 
 
 def networks_of(step: Step) -> list[type[Any]]:
     """Return the network classes that the parameters of a step name."""
-    return [network for value in step.params.values() if (network := _network_of(value))]
+    networks = map(_network_of, step.params.values())
+    return [network for network in networks if network]
 
 
 def _network_of(value: Any) -> type[Any] | None:
-    """Return the network class that a parameter names, or None for another value, without an import of torch."""
-    module = sys.modules.get("neusee.nodes.network_classes")  # imported where there is such a value
+    """Return the network class that a parameter names, or None for another value, without an
+    import of torch.
+    """
+    module = sys.modules.get("neusee.nodes.own_modules")  # imported where there is such a value
     return value.network if module and isinstance(value, module.Architecture) else None
 
 
 def is_private(key: Key) -> bool:
-    """Return True for the key of a result that holds for one process alone, whose code may not be that of its file."""
+    """Return True for the key of a result that holds for one process alone, whose code may not
+    be that of its file.
+    """
     return key.startswith(PRIVATE)
 
 
 def stream_seed(seed: int, step: str) -> int:
-    """Return the seed of the random numbers of a step, which depends only on the recipe's seed and the step's name."""
+    """Return the seed of the random numbers of a step, which depends only on the recipe's seed
+    and the step's name.
+    """
     return int(digest(seed, step)[:15], 16)
 
 
@@ -91,7 +299,9 @@ def _keys_of(wire: Wire, keys: Mapping[str, Key]) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Return a step's parameter as JSON that is the same in every process; a file becomes the digest of its content."""
+    """Return a step's parameter as JSON that is the same in every process; a file becomes the
+    digest of its content.
+    """
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, float):
@@ -106,4 +316,6 @@ def plain(value: Any) -> Any:
         return {"class": f"{network.__module__}.{network.__qualname__}"}
     if isinstance(value, complex):
         return {"complex": [value.real, value.imag]}
-    raise TypeError(f"a parameter must be a number, a string, a file or a collection of these, not {value!r}")
+    raise TypeError(
+        f"a parameter must be a number, a string, a file or a collection of these, not {value!r}"
+    )

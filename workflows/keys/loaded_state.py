@@ -1,26 +1,32 @@
-"""State of a loaded module: the values of its constants, tables, defaults and closures, and the functions it names.
-
-The source of a module says how its names get their values. What a process computes with are the values themselves: a
-table that another module filled, a constant or function that was replaced, a default that an import computed.
-Values of classes of other packages count by their type alone, also where their own methods fail.
-"""
+"""State that decides what code computes: values in loaded modules, settings of the process."""
 
 from __future__ import annotations
 
+import codecs
 import functools
+import hashlib
 import inspect
 import io
+import locale
 import mmap
 import operator
 import random
 import re
 import sys
+import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from enum import Enum
 from fractions import Fraction
-from pathlib import PurePath
-from types import BuiltinFunctionType, CellType, FunctionType, MethodType, ModuleType, SimpleNamespace
+from pathlib import Path, PurePath
+from types import (
+    BuiltinFunctionType,
+    CellType,
+    FunctionType,
+    MethodType,
+    ModuleType,
+    SimpleNamespace,
+)
 from typing import Any
 
 import numpy as np
@@ -29,20 +35,48 @@ import xxhash
 from torch import nn
 
 from neusee.nodes import Node
-from neusee.workflows.keys.code_objects import function_code
-from neusee.workflows.keys.module_owner import is_own
-from neusee.workflows.keys.reachable_code import read_names, written_only
-from neusee.workflows.keys.source_summary import Summary
+from neusee.nodes.precision import tf32_setting
+from neusee.workflows.keys.cache_key import OWN_USUAL, USUAL, is_own
+from neusee.workflows.keys.sealed_files import bytes_of
+from neusee.workflows.keys.source_summary import Summary, function_code, read_names, written_only
+
+# --- loaded state ---------------------------------------------------------------------------------
+
+# State of a loaded module: the values of its constants, tables, defaults and closures, and the
+# functions it names.
+#
+# The source of a module says how its names get their values. What a process computes with are the
+# values themselves: a table that another module filled, a constant or function that was replaced, a
+# default that an import computed. Values of classes of other packages count by their type alone,
+# also where their own methods fail.
+
 
 _DISPATCH = getattr(
     functools.singledispatch(str), "__code__", None
 )  #: of a function that a type chooses, whose closure holds a cache
-_SKIPPED = re.compile(r"__\w+__|_abc_\w*|model_\w+|__pydantic\w*")  #: names of a class that its source decides
-_FORETELLING = frozenset({"shape", "work", "example"})  #: hooks that decide no result: size, cost, and a call to try
+#: names of a class that its source decides
+_SKIPPED = re.compile(r"__\w+__|_abc_\w*|model_\w+|__pydantic\w*")
+#: hooks that decide no result: size, cost, and a call to try
+_FORETELLING = frozenset({"shape", "work", "example"})
 _KINDS: tuple[tuple[str, tuple[type, ...]], ...] = (
     ("text", (str, PurePath)),
     ("object", (Enum,)),
-    ("plain", (bool, int, float, complex, bytes, type(None), type(...), range, slice, re.Pattern, Fraction)),
+    (
+        "plain",
+        (
+            bool,
+            int,
+            float,
+            complex,
+            bytes,
+            type(None),
+            type(...),
+            range,
+            slice,
+            re.Pattern,
+            Fraction,
+        ),
+    ),
     ("plain", (torch.dtype, torch.device, torch.Size, np.dtype, np.generic)),
     ("plain", (operator.itemgetter, operator.attrgetter, operator.methodcaller)),
     ("builtin", (BuiltinFunctionType,)),
@@ -50,7 +84,17 @@ _KINDS: tuple[tuple[str, tuple[type, ...]], ...] = (
     ("function", (FunctionType,)),
     ("class", (type,)),
     ("array", (torch.Tensor, np.ndarray)),
-    ("changing", (torch.Generator, np.random.Generator, np.random.RandomState, random.Random, io.IOBase, mmap.mmap)),
+    (
+        "changing",
+        (
+            torch.Generator,
+            np.random.Generator,
+            np.random.RandomState,
+            random.Random,
+            io.IOBase,
+            mmap.mmap,
+        ),
+    ),
     ("table", (Mapping,)),
     ("list", (list, tuple, deque)),
     ("set", (set, frozenset)),
@@ -68,7 +112,9 @@ class _Hows(dict[type, str]):
 
     def __missing__(self, kind: type) -> str:
         other = "changing" if hasattr(kind, "__next__") else "object"
-        self[kind] = next((how for how, kinds in _KINDS if issubclass(kind, kinds)), other)
+        self[kind] = next(
+            (description for description, kinds in _KINDS if issubclass(kind, kinds)), other
+        )
         return self[kind]
 
 
@@ -76,25 +122,39 @@ _HOW = _Hows()
 
 
 class LoadedState:
-    """The state of a loaded module, as a digest, with the modules of the functions and classes that it names."""
+    """The state of a loaded module, as a digest, with the modules of the functions and classes
+    that it names.
+    """
 
     def __init__(
-        self, module: ModuleType, functions: Collection[str], followed: Callable[[str], bool], lazy: bool = True
+        self,
+        module: ModuleType,
+        functions: Collection[str],
+        followed: Callable[[str], bool],
+        lazy: bool = True,
     ) -> None:
-        """Describe a module; without ``lazy`` not what a ``cached_property`` holds, which the rest decides."""
-        self.modules: dict[str, set[str]] = {}  #: names of functions and classes that the module holds, by module
-        self.replaced: list[str] = []  #: functions of the module's own file whose code is not that of the file
-        self.changing: dict[str, str] = {}  #: objects such as generators, and why, by the name that is or holds them
+        """Describe a module; without ``lazy`` not what a ``cached_property`` holds, which the
+        rest decides.
+        """
+        #: names of functions and classes that the module holds, by module
+        self.modules: dict[str, set[str]] = {}
+        #: functions of the module's own file whose code is not that of the file
+        self.replaced: list[str] = []
+        #: objects such as generators, and why, by the name that is or holds them
+        self.changing: dict[str, str] = {}
         self._changes: list[str] = []
         self._holds: dict[int, list[str]] = {}  # changes in repeated objects, by id
         self._name, self._file = module.__name__, getattr(module, "__file__", "") or ""
         self._folder = self._file.rpartition("/")[0] or "."
         self._functions, self._followed, self._lazy = frozenset(functions), followed, lazy
         self._seen: dict[int, int] = {}
-        self._kept: list[Any] = []  # objects whose id is in _seen, so that no other object gets the same id
+        # objects whose id is in _seen, so that no other object gets the same id
+        self._kept: list[Any] = []
 
     def digest(self, values: Mapping[str, Any]) -> str:
-        """Return the digest of named values of the module; names such as ``__file__`` do not count."""
+        """Return the digest of named values of the module; names such as ``__file__`` do not
+        count.
+        """
         state: list[Any] = []
         for name in sorted(values):
             if name == "__getattr__" or not (name.startswith("__") and name.endswith("__")):
@@ -105,37 +165,43 @@ class LoadedState:
         return xxhash.xxh3_128_hexdigest(repr(state).encode(errors="surrogatepass"))
 
     def _shallow(self, value: Any) -> Any:
-        """Return a value as text and tuples, or its type if it holds itself, or much, one in the other without end."""
+        """Return a value as text and tuples, or its type if it holds itself, or much, one in the
+        other without end.
+        """
         try:
             return self._of(value)
         except RecursionError:
             return self._unread(value, "is nested too deeply")
 
     def _of(self, value: Any) -> Any:
-        """Return a value as text and tuples that are the same in each process; a repeated object is its number."""
+        """Return a value as text and tuples that are the same in each process; a repeated object
+        is its number.
+        """
         if value is None:
             return _NOTHING
-        how = _HOW[type(value)]
-        seen, name, before = self._seen, id(value), len(self._changes)
+        kind = _HOW[type(value)]
+        numbers, name, before = self._seen, id(value), len(self._changes)
         try:
-            if how in _ATOMS:
-                return _DESCRIBED[how](self, value)
-            if name in seen:
+            if kind in _ATOMS:
+                return _DESCRIBED[kind](self, value)
+            if name in numbers:
                 self._changes += self._holds.get(name, ())
-                return "again", seen[name]
-            seen[name] = len(seen)
+                return "again", numbers[name]
+            numbers[name] = len(numbers)
             self._kept.append(value)
-            told = _DESCRIBED[how](self, value)
+            text = _DESCRIBED[kind](self, value)
         except RecursionError:
             raise  # where it ends depends on the calls around it
         except Exception as error:  # the methods of a class may do anything
-            told = self._unread(value, f"could not be read ({type(error).__name__}: {error})")
+            text = self._unread(value, f"could not be read ({type(error).__name__}: {error})")
         if len(self._changes) > before:
             self._holds[name] = self._changes[before:]
-        return told
+        return text
 
     def _unread(self, value: Any, why: str) -> str:
-        """Return the type of a value whose parts cannot be told; note it if the parts of such a value count."""
+        """Return the type of a value whose parts cannot be told; note it if the parts of such a
+        value count.
+        """
         kind = type(value)
         if kind.__module__ == "builtins" or self._followed(_home(kind)):
             self._changes.append(f"{kind.__name__}, which {why}")
@@ -160,21 +226,33 @@ class LoadedState:
         if plain.dtype.hasobject:
             return type(value).__name__, str(plain.dtype), plain.shape, self._of(plain.tolist())
         mask = np.ma.getmask(value) if isinstance(value, np.ma.MaskedArray) else np.ma.nomask
-        return type(value).__name__, *_array(plain), *(_array(mask) if isinstance(mask, np.ndarray) else ())
+        return (
+            type(value).__name__,
+            *_array(plain),
+            *(_array(mask) if isinstance(mask, np.ndarray) else ()),
+        )
 
     def _changing(self, value: Any) -> Any:
-        """Note an object that changes while a process runs, such as a generator or a file, and return its type."""
+        """Note an object that changes while a process runs, such as a generator or a file, and
+        return its type.
+        """
         self._changes.append(f"{type(value).__name__}, which changes while a process runs")
         return self._typed(value)
 
     def _table(self, value: Any) -> Any:
-        return self._typed(value), [(self._of(key), self._of(part)) for key, part in list(value.items())]
+        return self._typed(value), self._pairs(list(value.items()))
+
+    def _pairs(self, pairs: Iterable[tuple[Any, Any]]) -> list[tuple[Any, Any]]:
+        texts = []
+        for key, item in pairs:
+            texts.append((self._of(key), self._of(item)))
+        return texts
 
     def _list(self, value: Any) -> Any:
-        return self._typed(value), [self._of(part) for part in value]
+        return self._typed(value), [self._of(item) for item in value]
 
     def _set(self, value: Any) -> Any:
-        return self._typed(value), sorted((self._of(part) for part in value), key=repr)
+        return self._typed(value), sorted((self._of(item) for item in value), key=repr)
 
     def _node(self, value: Any) -> Any:
         return "node", self._of(value.fn), [self._of(hook) for hook in _hooks(value)]
@@ -192,41 +270,60 @@ class LoadedState:
         return "property", self._of(value.fget), self._of(value.fset)
 
     def _wrapped(self, value: Any) -> Any:
-        return type(value).__name__, self._of(getattr(value, "__func__", None) or getattr(value, "func", None))
+        return type(value).__name__, self._of(
+            getattr(value, "__func__", None) or getattr(value, "func", None)
+        )
 
     def _object(self, value: Any) -> Any:
-        """Return an object that is no container: by its parts if the source of its class is followed, else by type.
+        """Return an object that is no container: by its parts if the source of its class is
+        followed, else by type.
 
         A module of torch counts by its parts, whose weights others may have set.
         """
         kind = type(value)
         if kind is SimpleNamespace or issubclass(kind, nn.Module) or self._followed(_home(kind)):
-            parts = [(name, part) for name, part in _attributes(value) if self._lazy or not _is_lazy(kind, name)]
-            return self._typed(value), [(name, self._of(part)) for name, part in parts]
-        # a class that answers to each name answers to this one too
-        wraps = kind.__module__ != "typing" and inspect.getattr_static(value, "__wrapped__", None) is not None
-        inner = value.__wrapped__ if wraps else None
+            attributes = [
+                (name, attribute)
+                for name, attribute in _attributes(value)
+                if self._lazy or not _is_lazy(kind, name)
+            ]
+            return self._typed(value), [
+                (name, self._of(attribute)) for name, attribute in attributes
+            ]
+        inner = _wrapped(value, kind)
         return self._typed(value), self._of(inner) if callable(inner) else ""
 
     def _function(self, function: FunctionType) -> Any:
         """Return a function by module and name, with its defaults and closure if it is local."""
         home, code = str(function.__globals__.get("__name__")), function.__code__
         if code is _DISPATCH:
-            kinds: Mapping[type, Any] = function.registry  # type: ignore[attr-defined]
-            parts = sorted(kinds.items(), key=lambda item: f"{item[0].__module__}.{item[0].__qualname__}")
-            return "singledispatch", [(self._of(kind), self._of(part)) for kind, part in parts]
+            return "singledispatch", self._pairs(_implementations(function))
+        own = self._noted_function(function, home)
+        local = own or not _found(home, function)
+        held = (
+            (function.__defaults__, function.__kwdefaults__, function.__closure__) if local else ()
+        )
+        exact = function_code(code) if local and not own and self._followed(home) else ""
+        described = [item and self._of(item) for item in held]
+        if own and is_own(home):  # an attribute of a function may hold what a call left in it
+            described += [
+                (name, self._of(attribute))
+                for name, attribute in vars(function).items()
+                if name != "__wrapped__"
+            ]
+        return "function", home, code.co_qualname, exact, described
+
+    def _noted_function(self, function: FunctionType, home: str) -> bool:
+        """Note a function of another module, or one whose loaded code is not that of the file;
+        return True for a function of the file of this module.
+        """
+        code = function.__code__
         own = home == self._name and code.co_filename == self._file
         if home != self._name:
             self._noted(home, function.__qualname__)
         if own and self._functions and function_code(code) not in self._functions:
             self.replaced.append(function.__qualname__)
-        local = own or not _found(home, function)
-        held = (function.__defaults__, function.__kwdefaults__, function.__closure__) if local else ()
-        exact = function_code(code) if local and not own and self._followed(home) else ""
-        told = [part and self._of(part) for part in held]
-        if own and is_own(home):  # an attribute of a function may hold what a call left in it
-            told += [(name, self._of(part)) for name, part in vars(function).items() if name != "__wrapped__"]
-        return "function", home, code.co_qualname, exact, told
+        return own
 
     def _class(self, kind: type) -> Any:
         name = ("class", self._noted(_home(kind), kind.__qualname__), kind.__qualname__)
@@ -235,21 +332,29 @@ class LoadedState:
         bases = [(base.__module__, base.__qualname__) for base in kind.__mro__[1:]]
         for base in kind.__mro__[1:]:
             self._noted(base.__module__, base.__qualname__)
-        parts = [(name, part) for name, part in vars(kind).items() if not _SKIPPED.fullmatch(name) or _is_method(part)]
-        return name, bases, [(name, self._of(part)) for name, part in parts]
+        parts = [
+            (name, attribute)
+            for name, attribute in vars(kind).items()
+            if not _SKIPPED.fullmatch(name) or _is_method(attribute)
+        ]
+        return name, bases, [(name, self._of(attribute)) for name, attribute in parts]
 
     def _typed(self, value: Any) -> str:
         kind = type(value)
         return f"{self._noted(_home(kind), kind.__qualname__)}.{kind.__qualname__}"
 
     def _noted(self, module: str, name: str = "") -> str:
-        """Note a function or class that the state contains, or a whole module, if its source is followed."""
+        """Note a function or class that the state contains, or a whole module, if its source is
+        followed.
+        """
         if module != self._name and self._followed(module):
             self.modules.setdefault(module, set()).add(name.partition(".")[0])
         return module
 
     def _placed(self, text: str) -> str:
-        """Return a text without the folder of the module, so that it is the same for each place of installation."""
+        """Return a text without the folder of the module, so that it is the same for each place
+        of installation.
+        """
         return text.replace(self._folder, "<folder>") if self._folder in text else text
 
 
@@ -257,26 +362,40 @@ _NOTHING = ("NoneType", "None")
 _ATOMS = frozenset({"plain", "text", "builtin", "module"})
 #: the method that describes a value, by the kind of its type
 _DESCRIBED: dict[str, Callable[[LoadedState, Any], Any]] = {
-    how: getattr(LoadedState, f"_{how}") for how in ("object", *(how for how, _ in _KINDS))
+    kind: getattr(LoadedState, f"_{kind}") for kind in ("object", *(kind for kind, _ in _KINDS))
 }
 
 
-def counted_values(module: ModuleType, summary: Summary, free: Collection[str], root: bool) -> dict[str, Any]:
-    """Return the values of a loaded module that count: of a node's own module, those that its nodes reach."""
+def counted_values(
+    module: ModuleType, summary: Summary, free: Collection[str], root: bool
+) -> dict[str, Any]:
+    """Return the values of a loaded module that count: of a node's own module, those that its
+    nodes reach.
+    """
     values = {name: value for name, value in vars(module).items() if name not in free}
     nodes = [name for name, value in values.items() if root and issubclass(type(value), Node)]
     if nodes:
         classes = [name for name, value in values.items() if _is_network(value)]
-        names = read_names(summary.statements, [*nodes, *classes, "_"])
-        return {name: value for name, value in values.items() if name in names}
-    noted = written_only(summary.statements)
-    return {name: value for name, value in values.items() if name not in noted}
+        counted = values.keys() & read_names(summary.statements, [*nodes, *classes, "_"])
+    else:
+        counted = values.keys() - written_only(summary.statements)
+    return {name: value for name, value in values.items() if name in counted}
 
 
-def without_modules(package: str, values: Mapping[str, Any], left_out: Callable[[str], bool]) -> dict[str, Any]:
-    """Return the values of a package without those of its own modules whose names are ``left_out``."""
-    inside = {name for name, value in values.items() if value is sys.modules.get(f"{package}.{name}")}
-    return {name: value for name, value in values.items() if name not in inside or not left_out(f"{package}.{name}")}
+def without_modules(
+    package: str, values: Mapping[str, Any], left_out: Callable[[str], bool]
+) -> dict[str, Any]:
+    """Return the values of a package without those of its own modules whose names are
+    ``left_out``.
+    """
+    inside = {
+        name for name, value in values.items() if value is sys.modules.get(f"{package}.{name}")
+    }
+    return {
+        name: value
+        for name, value in values.items()
+        if name not in inside or not left_out(f"{package}.{name}")
+    }
 
 
 def _hooks(node: Node) -> Iterator[Any]:
@@ -292,7 +411,11 @@ def _array(value: Any) -> tuple[Any, ...]:
         if value.device.type == "meta" or value.layout != torch.strided:
             return str(value.dtype), tuple(value.shape)
         flat = value.detach().cpu().contiguous().reshape(-1)
-        raw: Any = flat.resolve_conj().resolve_neg().view(torch.uint8).numpy().data if flat.numel() else b""
+        raw: Any = (
+            flat.resolve_conj().resolve_neg().view(torch.uint8).numpy().data
+            if flat.numel()
+            else b""
+        )
     elif value.flags.c_contiguous and value.dtype.kind in "biufc":
         raw = value.data  # without a copy
     else:
@@ -302,9 +425,15 @@ def _array(value: Any) -> tuple[Any, ...]:
 
 def _attributes(value: Any) -> list[tuple[str, Any]]:
     """Return the attributes of an object, from its ``__dict__`` and its slots."""
-    slots = {slot for base in type(value).__mro__ for slot in _named(vars(base).get("__slots__", ()))}
-    found = {slot: getattr(value, slot) for slot in sorted(slots) if not slot.startswith("__") and hasattr(value, slot)}
-    return list({**found, **getattr(value, "__dict__", {})}.items())
+    slots = {
+        slot for base in type(value).__mro__ for slot in _named(vars(base).get("__slots__", ()))
+    }
+    in_slots = {
+        slot: getattr(value, slot)
+        for slot in sorted(slots)
+        if not slot.startswith("__") and hasattr(value, slot)
+    }
+    return list({**in_slots, **getattr(value, "__dict__", {})}.items())
 
 
 def _home(kind: type) -> str:
@@ -333,12 +462,167 @@ def _content(cell: CellType) -> Any:
 
 
 def _found(module: str, function: FunctionType) -> bool:
-    """Return True if a function is what its module has under its name, so that the source of the module decides it."""
-    found: Any = sys.modules.get(module)
+    """Return True if a function is what its module has under its name, so that the source of the
+    module decides it.
+    """
+    holder: Any = sys.modules.get(module)
     for name in function.__qualname__.split("."):
-        found = getattr(found, name, None)
-    return found is function
+        holder = getattr(holder, name, None)
+    return holder is function
 
 
-def _is_method(part: Any) -> bool:
-    return isinstance(part, FunctionType | staticmethod | classmethod | property)
+def _is_method(attribute: Any) -> bool:
+    return isinstance(attribute, FunctionType | staticmethod | classmethod | property)
+
+
+def _implementations(function: FunctionType) -> list[tuple[type, Any]]:
+    """Return the function for each type of a ``singledispatch``, by the name of the type."""
+    kinds: Mapping[type, Any] = function.registry  # type: ignore[attr-defined]
+    return sorted(kinds.items(), key=lambda item: f"{item[0].__module__}.{item[0].__qualname__}")
+
+
+def _wrapped(value: Any, kind: type) -> Any:
+    """Return what an object wraps, or None."""
+    # a class that answers to each name answers to this one too
+    if kind.__module__ == "typing" or inspect.getattr_static(value, "__wrapped__", None) is None:
+        return None
+    return value.__wrapped__
+
+
+# --- process settings -----------------------------------------------------------------------------
+
+# Settings of a process that decide what any code computes: number types of torch, and the code of
+# `neusee.workflows`.
+#
+# The number of threads and deterministic algorithms change results only within rounding and do not
+# count.
+
+
+_SETTING_KINDS, _is_cast = ("cpu", "cuda"), torch.is_autocast_enabled
+_HALF = float("0.5")
+#: how NumPy prints numbers in a new process
+_PRINTED = {
+    "precision": 8,
+    "threshold": 1000,
+    "edgeitems": 3,
+    "linewidth": 75,
+    "suppress": False,
+    "nanstr": "nan",
+} | {
+    "infstr": "inf",
+    "formatter": None,
+    "sign": "-",
+    "floatmode": "maxprec",
+}
+_SMALLEST = sys.float_info.min  #: its half is 0 where a process flushes small numbers to 0
+
+# imports what it needs now, because a process may lose the right to read files later
+torch.get_default_device()
+
+
+def settings() -> dict[str, str]:
+    """Return the settings of torch and Python that differ from those of a new process."""
+    now = {
+        "default dtype": str(torch.get_default_dtype()),
+        "default device": str(torch.get_default_device()),
+        "matmul precision": torch.get_float32_matmul_precision(),
+        "TF32": str(tf32_setting()),
+        "autocast": (
+            ", ".join(
+                f"{kind} {torch.get_autocast_dtype(kind)}"
+                for kind in _SETTING_KINDS
+                if _is_cast(kind)
+            )
+            or "off"
+        ),
+        "numbers below 1e-308": "kept" if _SMALLEST * _HALF else "0",
+        "assert statements": (
+            f"left out by -{'O' * sys.flags.optimize}" if sys.flags.optimize else "run"
+        ),
+    }
+    return {name: value for name, value in now.items() if value != USUAL[name]}
+
+
+def own_settings(reads_time: bool) -> dict[str, str]:
+    """Return the settings that code of a user may read, and neusee does not, where they are not the
+    usual ones.
+
+    With ``reads_time`` the code may read the time zone.
+    """
+    now = {
+        "floating-point errors": _errors(),
+        "printed numbers": _printing(),
+        "encoding of texts": _encoding(),
+    }
+    now["code at the start of Python"] = _code_at_start()
+    if reads_time:
+        now["time zone"] = _time_zone()
+    return {name: value for name, value in now.items() if value != USUAL[name]}
+
+
+def _errors() -> str:
+    """Return which floating-point errors of NumPy end a calculation or call a function; warnings
+    decide nothing.
+    """
+    kinds = [
+        f"{name} {does}" for name, does in np.geterr().items() if does in ("raise", "call", "log")
+    ]
+    return ", ".join(kinds) or OWN_USUAL["floating-point errors"]
+
+
+def _printing() -> str:
+    """Return how NumPy prints numbers, where it was told to.
+
+    The option ``legacy`` does not count: colour-science sets it, and whether it is loaded decides
+    no result.
+    """
+    now: Mapping[str, object] = {**np.get_printoptions()}
+    other = [
+        f"{name}={now[name]}" for name, value in _PRINTED.items() if now.get(name, value) != value
+    ]
+    return ", ".join(other) or OWN_USUAL["printed numbers"]
+
+
+def _encoding() -> str:
+    """Return the encoding of a text file that is opened without one."""
+    return codecs.lookup(locale.getpreferredencoding(False)).name
+
+
+def _code_at_start() -> str:
+    """Return a digest of the modules with which a user or a system changes Python when it
+    starts.
+    """
+    files = [
+        getattr(sys.modules.get(name), "__file__", None)
+        for name in ("sitecustomize", "usercustomize")
+    ]
+    texts = [bytes_of(file) for file in files if file is not None and Path(file).is_file()]
+    if not texts:
+        return OWN_USUAL["code at the start of Python"]
+    return hashlib.blake2b(b"\0".join(texts), digest_size=4).hexdigest()
+
+
+def _time_zone() -> str:
+    """Return the names of the time zone and a digest of its offsets from UTC in each week from
+    1970 to 2040.
+    """
+    weeks = range(0, 2_208_988_800, 7 * 86_400)
+    offsets = [time.localtime(week).tm_gmtoff for week in weeks]
+    if not any(offsets):
+        return OWN_USUAL["time zone"]
+    return (
+        f"{'/'.join(time.tzname)}"
+        f" {hashlib.blake2b(repr(offsets).encode(), digest_size=4).hexdigest()}"
+    )
+
+
+@functools.cache
+def workflows_digest() -> str:
+    """Return the digest of all source files of `neusee.workflows`, for a node that imports any
+    of them.
+    """
+    folder = Path(__file__).parents[1]
+    text = hashlib.blake2b(digest_size=16)
+    for path in sorted(folder.rglob("*.py")):
+        text.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
+    return text.hexdigest()

@@ -1,7 +1,8 @@
-"""Origin of an imported module: Python itself, an installed distribution with its version, or a source file.
+"""Origin of an imported module: Python itself, an installed distribution with its version, or a
+source file.
 
-A module of an installed distribution counts by the version of the distribution. A module of the user, of an editable
-install, or of a package that has nodes counts by its source.
+A module of an installed distribution counts by the version of the distribution. A module of the
+user, of an editable install, or of a package that has nodes counts by its source.
 """
 
 from __future__ import annotations
@@ -21,10 +22,13 @@ Kind = Literal["python", "distribution", "source", "binary", "folder", "absent",
 _STANDARD = tuple({sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")})
 _INSTALLED = frozenset({"site-packages", "dist-packages"})
 _fixed: dict[str, Origin] = {}  #: origins of packages that do not change while a process runs
-_listed: dict[str, frozenset[str]] = {}  #: names in the folders of packages, as they were at the last `look_again`
+#: names in the folders of packages, as they were at the last `look_again`
+_listed: dict[str, frozenset[str]] = {}
 _ENDS = (".py", *importlib.machinery.EXTENSION_SUFFIXES)
-distributions_of: dict[str, list[str]] = {}  #: names of distributions by module, where both names differ
-_BUILD_IN_VERSION = frozenset({"torch"})  #: its version ends with its build, such as ``+cu124``, which is a device
+#: names of distributions by module, where both names differ
+distributions_of: dict[str, list[str]] = {}
+#: its version ends with its build, such as ``+cu124``, which is a device
+_BUILD_IN_VERSION = frozenset({"torch"})
 
 
 class Origin(NamedTuple):
@@ -36,13 +40,19 @@ class Origin(NamedTuple):
 
 
 def origin_of(module: str, packages: frozenset[str]) -> Origin:
-    """Return the origin of a module without importing it; the source of each of ``packages`` counts if installed."""
+    """Return the origin of a module without importing it; the source of each of ``packages``
+    counts if installed.
+    """
     top = module.partition(".")[0]
     if top in _fixed and top not in packages:
         return _fixed[top]
     if top in ("builtins", "__future__") or (top in sys.stdlib_module_names and not _shadowed(top)):
         return _fixed.setdefault(top, Origin("python"))
-    if module != top and top not in packages and (above := origin_of(top, packages)).kind == "distribution":
+    if (
+        module != top
+        and top not in packages
+        and (above := origin_of(top, packages)).kind == "distribution"
+    ):
         return above
     file = getattr(sys.modules.get(module), "__file__", None) if module == top else None
     if file is None or not _is_installed(file):
@@ -56,10 +66,14 @@ def origin_of(module: str, packages: frozenset[str]) -> Origin:
 
 
 def _is_installed(file: str) -> bool:
-    """Return True if a file is in a folder of distributions, such as one that ``pip install --target`` filled."""
-    return any(_holds_distributions(str(folder)) for folder in Path(file).parents if str(folder) in sys.path) or (
-        not _INSTALLED.isdisjoint(Path(file).parts)
-    )
+    """Return True if a file is in a folder of distributions, such as one that ``pip install
+    --target`` filled.
+    """
+    return any(
+        _holds_distributions(str(folder))
+        for folder in Path(file).parents
+        if str(folder) in sys.path
+    ) or (not _INSTALLED.isdisjoint(Path(file).parts))
 
 
 @functools.cache
@@ -70,25 +84,34 @@ def _holds_distributions(folder: str) -> bool:
 
 
 def module_path(module: str) -> str | None:
-    """Return the file of a module, or None; a loaded module knows its file, and another one is searched."""
+    """Return the file of a module, or None; a loaded module knows its file, and another one is
+    searched.
+    """
     if module in sys.modules:
         file = getattr(sys.modules[module], "__file__", None)
         return file if file and os.path.isfile(file) else None
     parent, _, name = module.rpartition(".")
     if not parent:
         spec = _spec(module)
-        return spec.origin if spec is not None and spec.has_location and os.path.isfile(spec.origin or "") else None
+        return (
+            spec.origin
+            if spec is not None and spec.has_location and os.path.isfile(spec.origin or "")
+            else None
+        )
     return next(filter(None, (_file_in(folder, name) for folder in _folders_above(module))), None)
 
 
 def source_file(module: str) -> Path | None:
-    """Return the source file of a module without importing the module, or None if there is no source file."""
+    """Return the source file of a module without importing the module, or None if there is no
+    source file.
+    """
     path = module_path(module)
     return Path(path) if path else None
 
 
 def module_file(folder: str | Path, names: Sequence[str]) -> Path | None:
-    """Return the source file of a module or package below a folder, or None if there is no such file.
+    """Return the source file of a module or package below a folder, or None if there is no such
+    file.
 
     ``names`` are the parts of the module's name.
     """
@@ -98,7 +121,9 @@ def module_file(folder: str | Path, names: Sequence[str]) -> Path | None:
 
 
 def version_of(top: str) -> str:
-    """Return name and version of the distribution that contains a top-level module, or an empty text."""
+    """Return name and version of the distribution that contains a top-level module, or an empty
+    text.
+    """
     return ", ".join(map(released, distributions_with(top)))
 
 
@@ -114,7 +139,9 @@ def distributions_with(top: str) -> list[str]:
 def released(name: str) -> str:
     """Return name and version of an installed distribution, or an empty text."""
     version = _releases().get(plain(name), ("", ""))[0]
-    return version and f"{name} {version.partition('+')[0] if name in _BUILD_IN_VERSION else version}"
+    return (
+        version and f"{name} {version.partition('+')[0] if name in _BUILD_IN_VERSION else version}"
+    )
 
 
 def metadata_folder(name: str) -> str:
@@ -134,34 +161,46 @@ def plain(name: str) -> str:
 
 @functools.cache
 def _releases() -> dict[str, tuple[str, str]]:
-    """Return version and folder of metadata of each installed distribution, from the names of these folders."""
-    found: dict[str, tuple[str, str]] = {}
+    """Return version and folder of metadata of each installed distribution, from the names of
+    these folders.
+    """
+    releases: dict[str, tuple[str, str]] = {}
     for folder in _metadata():
         name, _, version = os.path.basename(folder).removesuffix(".dist-info").partition("-")
-        found.setdefault(plain(name), (version, folder))
-    return found
+        releases.setdefault(plain(name), (version, folder))
+    return releases
 
 
 def _metadata() -> Iterator[str]:
     """Yield the folder with the metadata of each installed distribution."""
     for folder in filter(os.path.isdir, sys.path):
         if _holds_distributions(folder):
-            yield from (os.path.join(folder, name) for name in os.listdir(folder) if name.endswith(".dist-info"))
+            yield from (
+                os.path.join(folder, name)
+                for name in os.listdir(folder)
+                if name.endswith(".dist-info")
+            )
 
 
 def _distributions(top: str) -> list[str]:
     """Return the names of the distributions that contain a top-level module."""
-    inside = re.compile(rb'^"?%s(/|\.py,|\.[^/,]*(so|pyd),)' % re.escape(top.encode()), re.MULTILINE)
-    found = [folder for folder in _metadata() if _contains(folder, top, inside)]
+    inside = re.compile(
+        rb'^"?%s(/|\.py,|\.[^/,]*(so|pyd),)' % re.escape(top.encode()), re.MULTILINE
+    )
+    folders = [folder for folder in _metadata() if _contains(folder, top, inside)]
     names = (
-        re.search(r"^Name: *(.*?)\s*$", _text(folder, "METADATA").decode(errors="replace"), re.MULTILINE)
-        for folder in found
+        re.search(
+            r"^Name: *(.*?)\s*$", _text(folder, "METADATA").decode(errors="replace"), re.MULTILINE
+        )
+        for folder in folders
     )
     return sorted({name[1] for name in names if name})
 
 
 def _contains(folder: str, top: str, inside: re.Pattern[bytes]) -> bool:
-    """Return True if a distribution names a top-level module, or if a file of it is in this module."""
+    """Return True if a distribution names a top-level module, or if a file of it is in this
+    module.
+    """
     names = _text(folder, "top_level.txt").decode(errors="replace").split()
     return top in names if names else inside.search(_text(folder, "RECORD")) is not None
 
@@ -175,12 +214,16 @@ def _text(folder: str, name: str) -> bytes:
 
 
 def contents(module: str) -> Mapping[str, Any]:
-    """Return what a loaded module holds, without asking the module; ``sys.modules`` may hold any object."""
+    """Return what a loaded module holds, without asking the module; ``sys.modules`` may hold any
+    object.
+    """
     return getattr(sys.modules[module], "__dict__", {})
 
 
 def _without_file(module: str, top: str, packages: frozenset[str]) -> Origin:
-    """Return the origin of a module without a file: a folder of modules, a built-in part, or a missing module."""
+    """Return the origin of a module without a file: a folder of modules, a built-in part, or a
+    missing module.
+    """
     if module in sys.modules:
         inside = contents(module)
         if inside.get("__path__") is not None and not inside.get("__file__"):
@@ -190,8 +233,8 @@ def _without_file(module: str, top: str, packages: frozenset[str]) -> Origin:
     if "." not in module:
         spec = _spec(module)
         return Origin("absent" if spec is None else "nowhere" if spec.has_location else "folder")
-    found = any(not os.path.isdir(folder) for folder in _folders_above(module))
-    return Origin("nowhere" if found else "absent")
+    not_a_folder = any(not os.path.isdir(folder) for folder in _folders_above(module))
+    return Origin("nowhere" if not_a_folder else "absent")
 
 
 def _folders_above(module: str) -> list[str]:
@@ -206,7 +249,11 @@ def _folders(package: str) -> list[str]:
     if not parent:
         spec = _spec(package)
         return list(spec.submodule_search_locations or ()) if spec is not None else []
-    return [path for folder in _folders_above(package) if os.path.isdir(path := os.path.join(folder, name))]
+    return [
+        path
+        for folder in _folders_above(package)
+        if os.path.isdir(path := os.path.join(folder, name))
+    ]
 
 
 def _spec(top: str) -> importlib.machinery.ModuleSpec | None:
@@ -221,10 +268,12 @@ def _file_in(folder: str, name: str) -> str | None:
     if folder not in _listed:
         _listed[folder] = frozenset(os.listdir(folder) if os.path.isdir(folder) else ())
     if name in _listed[folder]:
-        found = module_file(folder, [name])
-        if found is not None:
-            return str(found)
-    return next((os.path.join(folder, name + end) for end in _ENDS if name + end in _listed[folder]), None)
+        file = module_file(folder, [name])
+        if file is not None:
+            return str(file)
+    return next(
+        (os.path.join(folder, name + end) for end in _ENDS if name + end in _listed[folder]), None
+    )
 
 
 def look_again() -> None:
@@ -233,7 +282,9 @@ def look_again() -> None:
 
 
 def _shadowed(top: str) -> bool:
-    """Return True if a loaded module with a name of the standard library is a file of somebody else."""
+    """Return True if a loaded module with a name of the standard library is a file of somebody
+    else.
+    """
     file = getattr(sys.modules.get(top), "__file__", None)
     return bool(file) and (not str(file).startswith(_STANDARD) or _is_installed(str(file)))
 

@@ -1,36 +1,545 @@
-"""Summary of a source file: the digests of the file and of its definitions, its imports, and what is not followed."""
+"""Summary of a source file: digests of its definitions, its imports and what it changes."""
 
 from __future__ import annotations
 
 import ast
+import importlib.util
+import marshal
+import re
 import sys
 import threading
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import chain
+from types import CodeType
 from typing import NamedTuple
 
+import xxhash
+
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.keys.code_objects import functions_of
-from neusee.workflows.keys.facts_beside_content import facts
-from neusee.workflows.keys.facts_of_the_moment import moments
-from neusee.workflows.keys.hash_order import orders
-from neusee.workflows.keys.literal_texts import reads_attributes_unnamed, texts
 from neusee.workflows.keys.module_origin import module_file
-from neusee.workflows.keys.outward_code import NOWHERE, Reach, reach_of
-from neusee.workflows.keys.reachable_code import Statement, statements
-from neusee.workflows.keys.syntax_pass import Kinds, Syntax, each
-from neusee.workflows.keys.unfollowed_constructs import Construct, constructs, literal_import
+from neusee.workflows.keys.source_syntax import (
+    Block,
+    Kinds,
+    NameScope,
+    Syntax,
+    each,
+    last_name,
+    reads_attributes_unnamed,
+    roots,
+    texts,
+)
+from neusee.workflows.keys.unfollowed_constructs import (
+    Construct,
+    constructs,
+    facts,
+    literal_import,
+    moments,
+    orders,
+)
+
+# --- code objects ---------------------------------------------------------------------------------
+
+# Digests of compiled functions, which tell whether the code that a process runs is that of a source
+# file.
+#
+# Line numbers, file names and docstrings of modules and classes do not count.
+
+
+#: what the byte code of a source depends on beside the source
+PYTHON = (
+    f"{'{}.{}'.format(*sys.version_info)}-{importlib.util.MAGIC_NUMBER.hex()}-{sys.flags.optimize}"
+)
+_MOST = 20_000  #: number of code objects whose digests are kept
+_known: dict[int, tuple[CodeType, str]] = {}  #: code objects with their digests, by id
+_SHORT = 12  #: digits of the digest of a code object
+
+
+def functions_of(source: bytes) -> list[str]:
+    """Return the digest of each function in a source file, at any depth, in alphabetical order."""
+    code = compile(source, "source", "exec", dont_inherit=True)
+    return sorted({function_code(inner) for inner in _inner(code)})
+
+
+def function_code(code: CodeType) -> str:
+    """Return the digest of a code object, which never changes, with its name, its constants and
+    its inner functions.
+    """
+    digested = _known.get(id(code))
+    if digested is None or digested[0] is not code:
+        if len(_known) > _MOST:
+            _known.clear()
+        digested = _known[id(code)] = code, _digest_of(code)
+    return digested[1]
+
+
+def _digest_of(code: CodeType) -> str:
+    consts = tuple(
+        function_code(item) if isinstance(item, CodeType) else item for item in code.co_consts
+    )
+    names = (code.co_qualname, code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars)
+    sizes = (code.co_flags, code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount)
+    raw = marshal.dumps((code.co_code, consts, names, sizes, code.co_exceptiontable), 2)
+    return xxhash.xxh3_64_hexdigest(raw)[:_SHORT]
+
+
+def _inner(code: CodeType) -> Iterator[CodeType]:
+    todo = [code]
+    while todo:
+        for item in todo.pop().co_consts:
+            if isinstance(item, CodeType):
+                yield item
+                todo.append(item)
+
+
+# --- reachable code -------------------------------------------------------------------------------
+
+# Statements of a module that a node may run: what the module runs at import, and what the names in
+# use refer to.
+
+
+_QUIET = ("node", "pytest", "hypothesis", "functools", "staticmethod", "dataclass", "torch.no_grad")
+_WRITERS = frozenset({"append", "add", "extend", "update", "insert", "appendleft", "clear"})
+_DEFINITION = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
+
+
+class Statement(NamedTuple):
+    """A statement at the top level of a module."""
+
+    first: int
+    last: int  #: lines
+    binds: list[str]  #: names; empty for a statement that is run for its effect
+    refers: list[str]  #: names that it reads, at any depth
+    writes: list[str]  #: names whose object it changes, as in ``log.append(x)``
+
+
+def statements(blocks: Iterable[Block]) -> list[Statement]:
+    """Return the statements at the top level of a module."""
+    return [_statement(block.item, block.kinds) for block in blocks]
+
+
+def reached(parts: Sequence[Statement], names: Collection[str] | None) -> Iterator[range]:
+    """Yield the lines of the statements that the use of some names, or None for all names, may
+    run.
+    """
+    if names is None or "*" in names:
+        yield from (range(statement.first, statement.last + 1) for statement in parts)
+        return
+    wanted_names, reached_already = set(names), set[int]()
+    while True:
+        new = [
+            n
+            for n, statement in enumerate(parts)
+            if n not in reached_already
+            and (not statement.binds or wanted_names & {*statement.binds})
+        ]
+        if not new:
+            return
+        for n in new:
+            reached_already.add(n)
+            wanted_names |= {*parts[n].refers}
+            yield range(parts[n].first, parts[n].last + 1)
+
+
+def read_names(parts: Sequence[Statement], names: Collection[str]) -> set[str]:
+    """Return the names that the statements read which the use of some names, or of all if none
+    is given, may run.
+    """
+    read = set(names) or set(chain.from_iterable(statement.binds for statement in parts))
+    while True:
+        run = [statement for statement in parts if not statement.binds or read & {*statement.binds}]
+        longer = read.union(*(statement.refers for statement in run))
+        if longer == read:
+            return read
+        read = longer
+
+
+def written_only(parts: Sequence[Statement]) -> set[str]:
+    """Return the names whose objects a module changes and that none of its code reads, such as a
+    log.
+    """
+    writes = chain.from_iterable(statement.writes for statement in parts)
+    return set(writes).difference(*(statement.refers for statement in parts))
+
+
+def _statement(item: ast.stmt, kinds: Kinds) -> Statement:
+    marks = item.decorator_list if isinstance(item, _DEFINITION) else []
+    first = min([item.lineno, *(mark.lineno for mark in marks)])
+    written = {id(name) for name in _noted(kinds)}
+    loads = [name for name in each(kinds, ast.Name) if isinstance(name.ctx, ast.Load)]
+    refers = {name.id for name in loads if id(name) not in written}
+    writes = {name.id for name in loads if id(name) in written}
+    return Statement(
+        first, item.end_lineno or item.lineno, sorted(_binds(item)), sorted(refers), sorted(writes)
+    )
+
+
+def _noted(kinds: Kinds) -> Iterator[ast.AST]:
+    """Yield the name in ``name.append(x)`` and ``name[i] = x``, which write to an object and do
+    not read it.
+    """
+    for item in each(kinds, ast.Expr):
+        called = item.value.func if isinstance(item.value, ast.Call) else None
+        if isinstance(called, ast.Attribute) and called.attr in _WRITERS:
+            yield called.value
+    for item in each(kinds, ast.Assign):
+        yield from (target.value for target in item.targets if isinstance(target, ast.Subscript))
+
+
+def _binds(item: ast.stmt) -> Iterable[str]:
+    """Return the names that a statement defines; none if the statement also does something else."""
+    if isinstance(item, _DEFINITION):
+        quiet = all(ast.unparse(mark).startswith(_QUIET) for mark in item.decorator_list)
+        return {item.name} if quiet else set()
+    targets = item.targets if isinstance(item, ast.Assign) else [getattr(item, "target", None)]
+    names = {target.id for target in targets if isinstance(target, ast.Name)}
+    return names if len(names) == len(targets) else set()
+
+
+# --- outward code ---------------------------------------------------------------------------------
+
+# Code that changes, or looks for, what lies outside of its own module: patches, registries,
+# subclasses, settings.
+#
+# A key follows imports. Code beside them, in another file of the same recipe, may change what the
+# followed code computes: it sets an attribute of a module or a class, fills a registry, or derives
+# a class. Such code is found here by its form, and in doubt it is found: a call whose value nobody
+# uses is there to change something.
+
+
+#: packages whose functions change nothing that they are not given, except those with a name that
+#: says so
+CALM = frozenset(
+    {
+        *(
+            "torch",
+            "numpy",
+            "scipy",
+            "math",
+            "cmath",
+            "functools",
+            "itertools",
+            "operator",
+            "collections",
+            "typing",
+        ),
+        *(
+            "dataclasses",
+            "enum",
+            "abc",
+            "contextlib",
+            "re",
+            "json",
+            "copy",
+            "statistics",
+            "fractions",
+            "numbers",
+        ),
+        *(
+            "types",
+            "pathlib",
+            "typing_extensions",
+            "pydantic",
+            "neusee",
+            "__future__",
+            "builtins",
+            "string",
+            "os",
+        ),
+        *(
+            "datetime",
+            "textwrap",
+            "struct",
+            "heapq",
+            "bisect",
+            "inspect",
+            "traceback",
+            "kornia",
+            "einops",
+            "triton",
+        ),
+    }
+)
+#: functions that decide no result, or a setting that each key has by its value
+_QUIET_CALLS = (
+    *(
+        "warnings.warn",
+        "warnings.catch_warnings",
+        "logging",
+        "print",
+        "sys.path",
+        "time.sleep",
+        "matplotlib.use",
+    ),
+    *(
+        "torch.manual_seed",
+        "torch.set_num_threads",
+        "torch.set_num_interop_threads",
+        "torch.set_default_dtype",
+    ),
+    *("torch.set_default_device", "torch.set_float32_matmul_precision", "torch.set_flush_denormal"),
+    *("torch.use_deterministic_algorithms", "ctypes.Structure", "ctypes.Union"),
+)
+_QUIET_DECORATORS = (
+    *(
+        "functools",
+        "dataclasses",
+        "contextlib",
+        "typing",
+        "abc",
+        "enum",
+        "typing_extensions",
+        "pydantic",
+        "types",
+    ),
+    *(
+        "torch.no_grad",
+        "torch.inference_mode",
+        "torch.enable_grad",
+        "torch.jit",
+        "torch.compile",
+        "numba",
+        "triton",
+    ),
+    *("torch.autograd.function", "pytest", "warnings"),
+)
+_HOOK = re.compile(
+    r"reference|preflight|check|\w+_bound|skip_\w+|\w+_error|propagate_\w+|band_invariant|\w+_range"
+)
+_SETTER = re.compile(
+    r"(un|de)?register|(set|reset|enable|disable|patch|install|configure|use|seed|inject|override|add|define|impl)"
+    r"(_|[A-Z])|(set|reset|patch|install|configure|use|seed|inject|override|define|impl)$|seterr|setattr|load_library|"
+    r"putenv|unsetenv|chdir|umask"
+)
+_CHANGER = re.compile(r"(append|extend|insert|clear|pop|popitem|remove|discard|setdefault|update)$")
+#: methods that change their object, in packages that are not calm
+_MUTATOR = re.compile(
+    r"(add|push|train|eval|half|double|float|to|apply|load_state_dict|requires_grad|sort|reverse|fill|put|itemset|"
+    r"resize|start|step|send|write)$|.*[^_]_$"
+)
+_SEEKS = frozenset(
+    {
+        "__subclasses__",
+        "_getframe",
+        "currentframe",
+        "get_objects",
+        "get_referrers",
+        "registered_nodes",
+    }
+)
+_DEFINITIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Lambda)
+
+
+class Reach(NamedTuple):
+    """What the code of a module changes or looks for beyond itself."""
+
+    outward: list[str]  #: full names of what it changes in other modules; an empty one is unknown
+    #: names of other modules that it gives to functions, which may change their arguments
+    passed: list[str]
+    unused: list[str]  #: modules that it imports and does not name: for what their import does
+    inward: bool  #: True if its functions change what its own module holds
+    changes_arguments: bool
+    seeks: bool  #: True if it looks for classes and objects that no import names
+
+
+NOWHERE = Reach([], [], [], False, False, False)
+
+
+def reach_of(tree: ast.Module, bound: Mapping[str, str]) -> Reach:
+    """Return what a module reaches; ``bound`` has the full name of each imported name, relative
+    ones with a dot.
+    """
+    walk = _Pass(bound)
+    walk.visit_all(tree.body, NameScope(tree, None))
+    unused = {full for name, full in bound.items() if name not in walk.named and not is_calm(full)}
+    return Reach(
+        sorted(walk.outward),
+        sorted(walk.passed),
+        sorted(unused),
+        walk.inward,
+        walk.changes_arguments,
+        walk.seeks,
+    )
+
+
+def outward_names(reaches: Collection[Reach]) -> set[str]:
+    """Return the full names of what code may change in other modules, also by functions that it
+    calls.
+    """
+    names = set(chain.from_iterable(reach.outward for reach in reaches))
+    if any(reach.changes_arguments for reach in reaches):
+        names.update(*(reach.passed for reach in reaches))
+    return names
+
+
+class _Pass:
+    """One pass over the code of a module."""
+
+    def __init__(self, bound: Mapping[str, str]) -> None:
+        self._bound = bound
+        self.outward, self.passed, self.named = set[str](), set[str](), set[str]()
+        self.inward = self.changes_arguments = self.seeks = False
+
+    def visit_all(self, items: list[ast.stmt], scope: NameScope) -> None:
+        for item in items:
+            self._visit(item, scope)
+
+    def _visit(self, item: ast.AST, scope: NameScope) -> None:
+        if isinstance(item, _DEFINITIONS):
+            self._definition(item, scope)
+            scope = NameScope(item, scope)
+        elif isinstance(item, ast.Call):
+            self._call(item, scope, bare=False)
+        elif isinstance(item, ast.Expr) and isinstance(item.value, ast.Call):
+            self._call(item.value, scope, bare=True)
+        elif isinstance(item, ast.Global):
+            self.inward = True
+        elif isinstance(item, ast.Attribute | ast.Name | ast.Subscript):
+            self._name(item, scope)
+        for child in ast.iter_child_nodes(item):
+            self._visit(child, scope)
+
+    # --- stores -----------------------------------------------------------------------------------
+
+    def _name(self, item: ast.Attribute | ast.Name | ast.Subscript, scope: NameScope) -> None:
+        """Note a name or an attribute, and what it is a part of where it is set or deleted."""
+        self.seeks |= last_name(item) in _SEEKS
+        if isinstance(item, ast.Name):
+            self.named.add(item.id)
+        elif not isinstance(item.ctx, ast.Load):
+            self._changed(item, scope)
+
+    def _changed(self, item: ast.expr, scope: NameScope) -> None:
+        """Note that a part of an object, ``item``, is set or deleted."""
+        for root in roots(item, scope, self._bound):
+            if root.kind == "import":
+                self.outward.add(root.name)
+            elif root.kind == "argument":
+                self.changes_arguments = True
+            else:
+                self.inward |= root.kind == "class" or not scope.is_module
+
+    # --- calls ------------------------------------------------------------------------------------
+
+    def _call(self, call: ast.Call, scope: NameScope, bare: bool) -> None:
+        last = last_name(call.func)
+        if last in ("setattr", "delattr", "__setattr__", "__delattr__"):
+            for argument in call.args[:1]:
+                self._changed(argument, scope)
+        for root in roots(call.func, scope, self._bound):
+            if root.kind == "import":
+                self._imported_call(call, root.name, scope, bare)
+            elif isinstance(call.func, ast.Name):
+                self.passed |= self._given(call, scope)
+            elif root.kind in ("own", "class") and not scope.is_module:
+                self.inward |= bare or _changes(last)
+
+    def _imported_call(self, call: ast.Call, full: str, scope: NameScope, bare: bool) -> None:
+        """Note the call of a function of another module, if it may change something."""
+        last = last_name(call.func)
+        name = full if last in full.split(".") else f"{full}.{last}"
+        passed_names = self._given(call, scope)
+        if _is_quiet(name, call):
+            return
+        if not is_calm(full):
+            self.passed |= passed_names
+            if bare or _changes(last):
+                self.outward.add(name)
+            return
+        if name.startswith("torch.library.") or (bare and _is_setter(last)):
+            self.outward.add(name)
+        if bare or last.endswith("_"):
+            self.outward |= {held_name for held_name in passed_names if not is_calm(held_name)}
+
+    def _given(self, call: ast.Call, scope: NameScope) -> set[str]:
+        """Return the names of what other modules hold and a call is given, not of what their
+        functions return.
+        """
+        names = set[str]()
+        for argument in [*call.args, *(word.value for word in call.keywords)]:
+            if not isinstance(argument, ast.Call):
+                names |= self._imports(argument, scope)
+        return {name for name in names if "()" not in name}
+
+    def _imports(self, item: ast.expr, scope: NameScope) -> set[str]:
+        return {root.name for root in roots(item, scope, self._bound) if root.kind == "import"}
+
+    # --- definitions ------------------------------------------------------------------------------
+
+    def _definition(self, item: ast.AST, scope: NameScope) -> None:
+        """Note the decorators and base classes that another module has: both may register what
+        is defined.
+        """
+        for mark in getattr(item, "decorator_list", ()):
+            imports = self._imports(mark.func if isinstance(mark, ast.Call) else mark, scope)
+            self.outward |= {name for name in imports if not _is_quiet_decorator(name)}
+        if isinstance(item, ast.ClassDef):
+            for base in [*item.bases, *(word.value for word in item.keywords)]:
+                imports = self._imports(base, scope)
+                self.outward |= {
+                    name
+                    for name in imports
+                    if not is_calm(name) and not _starts(name, _QUIET_CALLS)
+                }
+
+
+def is_calm(name: str) -> bool:
+    """Return True for a name of a package whose functions change nothing that they are not
+    given.
+    """
+    return name.partition(".")[0] in CALM
+
+
+def _is_setter(method: str) -> bool:
+    return bool(_SETTER.match(method) or _CHANGER.match(method))
+
+
+def _changes(method: str) -> bool:
+    """Return True for the name of a method that changes its object."""
+    return any(words.match(method) for words in (_SETTER, _CHANGER, _MUTATOR))
+
+
+def _is_quiet_decorator(name: str) -> bool:
+    """Return True for a decorator that registers nothing; a hook of a node of neusee changes
+    that node.
+    """
+    if name.startswith("neusee."):
+        return not _HOOK.fullmatch(name.rpartition(".")[2])
+    return _starts(name, _QUIET_DECORATORS)
+
+
+def _is_quiet(name: str, call: ast.Call) -> bool:
+    """Return True for a function that decides no result, such as one that ignores warnings."""
+    if name in ("warnings.filterwarnings", "warnings.simplefilter"):
+        first = call.args[0] if call.args else None
+        return isinstance(first, ast.Constant) and first.value in ("ignore", "once", "default")
+    return _starts(name, _QUIET_CALLS)
+
+
+def _starts(name: str, entries: tuple[str, ...]) -> bool:
+    return any(f"{name}.".startswith(f"{entry}.") for entry in entries)
+
+
+# --- source summary -------------------------------------------------------------------------------
+
+# Summary of a source file: the digests of the file and of its definitions, its imports, and what is
+# not followed.
+
 
 __all__ = ["ROOT", "Import", "Summary", "Use", "module_file", "summarise", "syntax_outline"]
 
 ROOT = "neusee.nodes"
-_parsing = threading.Lock()  #: lock of the parser of Python 3.11, which miscounts the depth in two threads
+#: lock of the parser of Python 3.11, which miscounts the depth in two threads
+_parsing = threading.Lock()
 _READS = ("__doc__", "getdoc", "cleandoc", "getcomments")  #: names by which code reads docstrings
-_SHORT = 16  #: digits of the digest of a definition
-_LARGE = frozenset({"torch", "numpy", "scipy", *sys.stdlib_module_names})  #: packages of which no chain is noted
+_SHORT_DIGEST = 16  #: digits of the digest of a definition
+#: packages of which no chain is noted
+_LARGE = frozenset({"torch", "numpy", "scipy", *sys.stdlib_module_names})
 
-Import = tuple[int, str, str]  #: level of a relative import, module, name (empty for ``import module``)
-Use = tuple[int, str, str, str, int]  #: use of an imported name: its import, the attributes after the name, the line
+#: level of a relative import, module, name (empty for ``import module``)
+Import = tuple[int, str, str]
+#: use of an imported name: its import, the attributes after the name, the line
+Use = tuple[int, str, str, str, int]
 
 
 class Summary(NamedTuple):
@@ -42,7 +551,8 @@ class Summary(NamedTuple):
     imports: list[Import]
     binds: list[str]  #: names bound by the imports
     uses: list[Use]
-    definitions: dict[str, str]  #: digest by label: ``psf()``, ``class Psf``, ``constant _FALL``, ``imports``
+    #: digest by label: ``psf()``, ``class Psf``, ``constant _FALL``, ``imports``
+    definitions: dict[str, str]
     functions: list[str]  #: digests of the compiled functions
     constructs: list[Construct]
     statements: list[Statement]
@@ -51,7 +561,8 @@ class Summary(NamedTuple):
 
 
 def summarise(source: bytes, own: bool = False) -> Summary:
-    """Return the summary of a source file; comments, layout and docstrings do not affect the digests.
+    """Return the summary of a source file; comments, layout and docstrings do not affect the
+    digests.
 
     What only matters in code of a user is looked for if the file is the user's ``own``.
     """
@@ -59,44 +570,56 @@ def summarise(source: bytes, own: bool = False) -> Summary:
         parsed = ast.parse(source)
         functions = functions_of(source)
     tree = Syntax(parsed)
-    text = _digest_of(tree)
-    depends = [entry for item, _ in tree.texts for entry in _declared(item)]
+    text = _digest_of_syntax(tree)
     imports, bound = _imports(tree.all)
-    binds = sorted(name for name, ways in bound.items() if any(way[2] for way in ways))
-    names = {
-        name: ".".join(filter(None, way[1:])) for name, ways in bound.items() for way in sorted(ways) if not way[0]
-    }
-    imports += [way for call in each(tree.all, ast.Call) if (way := _by_literal(call, names)) is not None]
+    names = _full_names(bound)
+    by_literal = [_by_literal(call, names) for call in each(tree.all, ast.Call)]
     return Summary(
         text,
         digest(text, tree.documents),
         any(_reads_docstrings(kinds, own) for kinds in (tree.all, tree.not_run)),
-        imports,
-        binds,
-        _uses(tree.all, {name: {way for way in ways if _chained(way)} for name, ways in bound.items()}),
+        [*imports, *(way for way in by_literal if way is not None)],
+        sorted(name for name, ways in bound.items() if any(way[2] for way in ways)),
+        _uses(tree.all, {name: set(filter(_chained, ways)) for name, ways in bound.items()}),
         _definitions(tree.texts),
         functions,
         _all_constructs(parsed, tree, names) if own else constructs(tree, names),
         statements(tree.blocks),
-        depends,
+        [*chain.from_iterable(_declared(item) for item, _ in tree.texts)],
         reach_of(parsed, {name: _full(ways) for name, ways in bound.items()}) if own else NOWHERE,
     )
 
 
-def syntax_outline(source: bytes) -> tuple[str, list[tuple[str, list[str]]]]:
-    """Return the digest of the syntax tree of a source file, and the import statements at its top level.
+def _full_names(bound: Mapping[str, set[Import]]) -> dict[str, str]:
+    """Return the full name of each name that an import binds that is not relative."""
+    names: dict[str, str] = {}
+    for name, ways in bound.items():
+        for way in sorted(ways):
+            if not way[0]:
+                names[name] = ".".join(filter(None, way[1:]))
+    return names
 
-    No comment, layout or docstring affects the digest. An import statement is the module in ``from a import b, c`` with
-    the names, or an empty text with the modules of ``import a, b``.
+
+def syntax_outline(source: bytes) -> tuple[str, list[tuple[str, list[str]]]]:
+    """Return the digest of the syntax tree of a source file, and the import statements at its top
+    level.
+
+    No comment, layout or docstring affects the digest. An import statement is the module in ``from
+    a import b, c`` with the names, or an empty text with the modules of ``import a, b``.
     """
     with _parsing:
         tree = ast.parse(source)
-    found = [item for item in tree.body if isinstance(item, ast.Import | ast.ImportFrom)]
-    imports = [(getattr(item, "module", "") or "", [alias.name for alias in item.names]) for item in found]
-    return _digest_of(Syntax(tree)), imports
+    import_statements = [
+        item for item in tree.body if isinstance(item, ast.Import | ast.ImportFrom)
+    ]
+    imports = [
+        (getattr(item, "module", "") or "", [alias.name for alias in item.names])
+        for item in import_statements
+    ]
+    return _digest_of_syntax(Syntax(tree)), imports
 
 
-def _digest_of(tree: Syntax) -> str:
+def _digest_of_syntax(tree: Syntax) -> str:
     return digest([text for _, text in tree.texts])
 
 
@@ -107,7 +630,9 @@ def _imports(kinds: Kinds) -> tuple[list[Import], dict[str, set[Import]]]:
     for item in each(kinds, ast.Import):
         imports += [(0, alias.name, "") for alias in item.names]
         for alias in item.names:
-            bound[alias.asname or _top(alias.name)].add((0, alias.name if alias.asname else _top(alias.name), ""))
+            bound[alias.asname or _top(alias.name)].add(
+                (0, alias.name if alias.asname else _top(alias.name), "")
+            )
     for item in each(kinds, ast.ImportFrom):
         ways = [(item.level, item.module or "", alias.name) for alias in item.names]
         imports += ways
@@ -125,32 +650,49 @@ def _by_literal(call: ast.Call, names: Mapping[str, str]) -> Import | None:
 def _all_constructs(parsed: ast.Module, tree: Syntax, names: Mapping[str, str]) -> list[Construct]:
     """Return what is not followed, with what only matters in code of a user."""
     usual = constructs(tree, names)
-    known = {(item.line, item.text.rpartition(".")[2]) for item in usual}
-    more = [*facts(tree.all, names), *moments(tree.all, names)]
-    beside = [item for item in more if (item.line, item.text.rpartition(".")[2]) not in known]
+    usual_places = {(item.line, item.text.rpartition(".")[2]) for item in usual}
+    by_user = [*facts(tree.all, names), *moments(tree.all, names)]
+    beside = [
+        item for item in by_user if (item.line, item.text.rpartition(".")[2]) not in usual_places
+    ]
     return sorted({*usual, *orders(parsed), *beside}, key=lambda item: (item.line, item))
 
 
 def _reads_docstrings(kinds: Kinds, own: bool) -> bool:
-    """Return True for code that reads a docstring as data, or attributes that it does not name in code of a user."""
-    if own and (reads_attributes_unnamed(kinds) or any("__doc__" in text for text, _ in texts(kinds))):
+    """Return True for code that reads a docstring as data, or attributes that it does not name
+    in code of a user.
+    """
+    if own and (
+        reads_attributes_unnamed(kinds) or any("__doc__" in text for text, _ in texts(kinds))
+    ):
         return True
     by_attribute = any(item.attr in _READS for item in each(kinds, ast.Attribute))
-    by_name = any(item.id in _READS[:2] and isinstance(item.ctx, ast.Load) for item in each(kinds, ast.Name))
-    return by_attribute or by_name or any(item.value == "__doc__" for item in each(kinds, ast.Constant))
+    by_name = any(
+        item.id in _READS[:2] and isinstance(item.ctx, ast.Load) for item in each(kinds, ast.Name)
+    )
+    return (
+        by_attribute
+        or by_name
+        or any(item.value == "__doc__" for item in each(kinds, ast.Constant))
+    )
 
 
 def _declared(item: ast.stmt) -> list[str]:
     """Return the entries of ``__depends__ = ("table.csv", "env:NAME")``."""
-    if not isinstance(item, ast.Assign) or "__depends__" not in [getattr(name, "id", "") for name in item.targets]:
+    if not isinstance(item, ast.Assign) or "__depends__" not in [
+        getattr(name, "id", "") for name in item.targets
+    ]:
         return []
     try:
         entries = ast.literal_eval(item.value)
     except ValueError:
         entries = None
-    if not isinstance(entries, tuple | list) or not all(isinstance(entry, str) for entry in entries):
+    if not isinstance(entries, tuple | list) or not all(
+        isinstance(entry, str) for entry in entries
+    ):
         raise ValueError(
-            f"line {item.lineno}: __depends__ must be a tuple of texts, not {ast.unparse(item.value)[:60]}"
+            f"line {item.lineno}: __depends__ must be a tuple of texts, not"
+            f" {ast.unparse(item.value)[:60]}"
         )
     return list(entries)
 
@@ -162,7 +704,9 @@ def _full(ways: set[Import]) -> str:
 
 
 def _chained(way: Import) -> bool:
-    """Return True for an import of which the attributes may name a module that is followed by source."""
+    """Return True for an import of which the attributes may name a module that is followed by
+    source.
+    """
     return bool(way[0]) or _top(way[1]) not in _LARGE
 
 
@@ -171,7 +715,9 @@ def _top(module: str) -> str:
 
 
 def _uses(kinds: Kinds, bound: dict[str, set[Import]]) -> list[Use]:
-    """Return each use of an imported name in an expression such as ``a.b.c``, and each use of a whole package."""
+    """Return each use of an imported name in an expression such as ``a.b.c``, and each use of a
+    whole package.
+    """
     lines: dict[tuple[int, str, str, str], int] = {}
     for name, attributes, line in _chains(kinds):
         for way in bound.get(name, ()):
@@ -182,8 +728,11 @@ def _uses(kinds: Kinds, bound: dict[str, set[Import]]) -> list[Use]:
 
 
 def _chains(kinds: Kinds) -> Iterator[tuple[str, list[str], int]]:
-    """Yield the first name, the attributes and the line number of each expression such as ``a.b.c`` in a module."""
-    inner: set[int] = set()  # parts of earlier expressions, because an expression comes before its parts
+    """Yield the first name, the attributes and the line number of each expression such as
+    ``a.b.c`` in a module.
+    """
+    # parts of earlier expressions, because an expression comes before its parts
+    inner: set[int] = set()
     for item in each(kinds, ast.Attribute, ast.Name):
         if id(item) in inner:
             continue
@@ -198,33 +747,45 @@ def _chains(kinds: Kinds) -> Iterator[tuple[str, list[str], int]]:
 
 
 def _definitions(texts: Iterable[tuple[ast.stmt, str]]) -> dict[str, str]:
-    """Return the digest of each top-level definition of a module, by labels such as ``psf()`` or ``class Psf``.
+    """Return the digest of each top-level definition of a module, by labels such as ``psf()`` or
+    ``class Psf``.
 
     Definitions with the same label share one digest.
     """
-    found: dict[str, list[str]] = defaultdict(list)
+    texts_by_label: dict[str, list[str]] = defaultdict(list)
     for item, text in texts:
         for label in _labels(item):
-            found[label].append(text)
-    return {label: digest(parts)[:_SHORT] for label, parts in found.items()}
+            texts_by_label[label].append(text)
+    return {label: digest(parts)[:_SHORT_DIGEST] for label, parts in texts_by_label.items()}
 
 
 def _labels(item: ast.stmt) -> Iterable[str]:
-    """Return the labels of the definitions in a top-level statement, such as ``psf()`` or ``constant _FALL``."""
+    """Return the labels of the definitions in a top-level statement, such as ``psf()`` or
+    ``constant _FALL``.
+    """
     if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef):
         return [f"{_owner(item)}()"]
     if isinstance(item, ast.ClassDef):
         return [f"class {item.name}"]
     if isinstance(item, ast.Import | ast.ImportFrom):
         return ["imports"]
-    targets = item.targets if isinstance(item, ast.Assign) else [getattr(item, "target", None) or item]
-    names = [n.id for t in targets if not isinstance(t, ast.stmt) for n in ast.walk(t) if isinstance(n, ast.Name)]
+    targets = (
+        item.targets if isinstance(item, ast.Assign) else [getattr(item, "target", None) or item]
+    )
+    inside = chain.from_iterable(ast.walk(t) for t in targets if not isinstance(t, ast.stmt))
+    names = [part.id for part in inside if isinstance(part, ast.Name)]
     return [f"constant {name}" for name in names] or ["other statements"]
 
 
 def _owner(function: ast.FunctionDef | ast.AsyncFunctionDef) -> str:
-    """Return the name of a function, or ``psf.check`` for a function ``_`` with the decorator ``@psf.check``."""
+    """Return the name of a function, or ``psf.check`` for a function ``_`` with the decorator
+    ``@psf.check``.
+    """
     for mark in function.decorator_list:
-        if function.name == "_" and isinstance(mark, ast.Attribute) and isinstance(mark.value, ast.Name):
+        if (
+            function.name == "_"
+            and isinstance(mark, ast.Attribute)
+            and isinstance(mark.value, ast.Name)
+        ):
             return f"{mark.value.id}.{mark.attr}"
     return function.name

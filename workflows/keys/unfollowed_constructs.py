@@ -1,10 +1,4 @@
-"""Constructs of source code that read what no import shows: files, environment variables, names at run time, a clock.
-
-A digest of code does not cover what these constructs read, so a node declares it with ``depends=``. Code below
-``if __name__ == "__main__"`` and files that are written do not count. A file counts unless its path comes from an
-argument of the function that reads it, because the file of a parameter is part of the key, or is that of a temporary
-file or of an object in memory: what own code really opens is observed.
-"""
+"""Constructs of source code that read what no key covers: files, clocks, hash order."""
 
 from __future__ import annotations
 
@@ -13,9 +7,42 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
-from neusee.workflows.keys.local_names import arguments, assigned, dotted, read_by
-from neusee.workflows.keys.scratch_files import Scratch
-from neusee.workflows.keys.syntax_pass import Kinds, Scope, Syntax, each
+from neusee.workflows.keys.source_syntax import (
+    Kinds,
+    NameScope,
+    Scope,
+    Scratch,
+    Syntax,
+    arguments,
+    assigned,
+    dotted,
+    each,
+    last_name,
+    read_by,
+    text_of,
+    texts,
+)
+
+# --- unfollowed code ------------------------------------------------------------------------------
+
+# The error for code that rests on something that a cache key cannot cover.
+
+
+class UnfollowedCode(LookupError):
+    """A node has no cache key; the message has file, line, reason and what to write."""
+
+
+# --- unfollowed constructs ------------------------------------------------------------------------
+
+# Constructs of source code that read what no import shows: files, environment variables, names at
+# run time, a clock.
+#
+# A digest of code does not cover what these constructs read, so a node declares it with
+# ``depends=``. Code below ``if __name__ == "__main__"`` and files that are written do not count. A
+# file counts unless its path comes from an argument of the function that reads it, because the file
+# of a parameter is part of the key, or is that of a temporary file or of an object in memory: what
+# own code really opens is observed.
+
 
 _CLOCK = "a clock, a process or a machine decides"
 _DRAWN = "random numbers without a seed: draw them from a parameter rng"
@@ -33,42 +60,95 @@ _TIMES = ("time", "perf_counter", "monotonic", "process_time", "thread_time")
 
 #: What the names of Python and of libraries do, by their first parts.
 _NAMES: Mapping[str, tuple[str, str]] = {
-    **dict.fromkeys(("os.environ", "os.environb", "os.getenv", "os.getenvb", "os.path.expandvars"), ("env", _VARIABLE)),
-    **dict.fromkeys(("posix.environ", "nt.environ"), ("env", _VARIABLE)),
-    **dict.fromkeys(("importlib.import_module", "__import__", "importlib.__import__", "runpy"), ("import", _BY_NAME)),
-    **dict.fromkeys(("sys.modules", "importlib.util", "importlib.machinery"), ("import", _BY_NAME)),
-    **dict.fromkeys(("pkgutil.iter_modules", "pkgutil.walk_packages", "importlib.metadata"), ("import", _BY_NAME)),
-    **dict.fromkeys(("exec", "eval", "compile", "ctypes.CDLL", "ctypes.cdll", "types.FunctionType"), ("run", _RUN)),
-    **dict.fromkeys(("ctypes.PyDLL", "ctypes.pydll", "ctypes.pythonapi", "ctypes.util.find_library"), ("run", _RUN)),
-    **dict.fromkeys(("numpy.ctypeslib.load_library",), ("run", _RUN)),
-    **dict.fromkeys(("subprocess", "os.system", "os.popen", "multiprocessing", "types.CodeType"), ("run", _RUN)),
     **dict.fromkeys(
-        ("pickle.load", "pickle.loads", "marshal.loads", "cffi", "torch.utils.cpp_extension"), ("run", _RUN)
+        ("os.environ", "os.environb", "os.getenv", "os.getenvb", "os.path.expandvars"),
+        ("env", _VARIABLE),
     ),
-    **dict.fromkeys(("torch.ops.load_library", "torch.classes.load_library", "torch.hub"), ("run", _RUN)),
-    **dict.fromkeys(("importlib.resources", "pkgutil.get_data", "__file__", "__spec__", "__loader__"), ("file", _FILE)),
-    **dict.fromkeys(("inspect.getsource", "inspect.getsourcelines", "inspect.getfile", "linecache"), ("file", _FILE)),
+    **dict.fromkeys(("posix.environ", "nt.environ"), ("env", _VARIABLE)),
+    **dict.fromkeys(
+        ("importlib.import_module", "__import__", "importlib.__import__", "runpy"),
+        ("import", _BY_NAME),
+    ),
+    **dict.fromkeys(("sys.modules", "importlib.util", "importlib.machinery"), ("import", _BY_NAME)),
+    **dict.fromkeys(
+        ("pkgutil.iter_modules", "pkgutil.walk_packages", "importlib.metadata"),
+        ("import", _BY_NAME),
+    ),
+    **dict.fromkeys(
+        ("exec", "eval", "compile", "ctypes.CDLL", "ctypes.cdll", "types.FunctionType"),
+        ("run", _RUN),
+    ),
+    **dict.fromkeys(
+        ("ctypes.PyDLL", "ctypes.pydll", "ctypes.pythonapi", "ctypes.util.find_library"),
+        ("run", _RUN),
+    ),
+    **dict.fromkeys(("numpy.ctypeslib.load_library",), ("run", _RUN)),
+    **dict.fromkeys(
+        ("subprocess", "os.system", "os.popen", "multiprocessing", "types.CodeType"), ("run", _RUN)
+    ),
+    **dict.fromkeys(
+        ("pickle.load", "pickle.loads", "marshal.loads", "cffi", "torch.utils.cpp_extension"),
+        ("run", _RUN),
+    ),
+    **dict.fromkeys(
+        ("torch.ops.load_library", "torch.classes.load_library", "torch.hub"), ("run", _RUN)
+    ),
+    **dict.fromkeys(
+        ("importlib.resources", "pkgutil.get_data", "__file__", "__spec__", "__loader__"),
+        ("file", _FILE),
+    ),
+    **dict.fromkeys(
+        ("inspect.getsource", "inspect.getsourcelines", "inspect.getfile", "linecache"),
+        ("file", _FILE),
+    ),
     **dict.fromkeys(("urllib", "http", "requests", "httpx", "socket", "ftplib"), ("file", _FILE)),
     **dict.fromkeys(("os.getcwd", "pathlib.Path.cwd"), ("file", _FILE)),
     **dict.fromkeys(
-        ("pathlib.Path.home", "os.path.expanduser", "sys.path", "sys.argv", "sys.orig_argv"), ("state", _CLOCK)
+        ("pathlib.Path.home", "os.path.expanduser", "sys.path", "sys.argv", "sys.orig_argv"),
+        ("state", _CLOCK),
     ),
-    **dict.fromkeys(("os.cpu_count", "os.getpid", "os.uname", "platform", "getpass", "uuid"), ("state", _CLOCK)),
-    **{f"time.{name}{unit}": ("state", _CLOCK) for name in _TIMES for unit in ("", "_ns")},
-    **{f"time.{name}": ("state", _CLOCK) for name in ("localtime", "gmtime", "strftime", "ctime", "asctime")},
-    **{f"datetime.datetime.{name}": ("state", _CLOCK) for name in ("now", "utcnow", "today")},
-    **dict.fromkeys(("datetime.date.today", "threading.get_ident", "resource", "tracemalloc"), ("state", _CLOCK)),
-    **dict.fromkeys(("locale", "decimal", "numpy.geterr", "numpy.get_printoptions"), ("state", _SETTING)),
-    **dict.fromkeys(("sys.flags", "sys.warnoptions", "sys._xoptions"), ("state", _SETTING)),
-    **dict.fromkeys(("torch.get_num_threads", "torch.get_num_interop_threads", "psutil"), ("state", _CLOCK)),
     **dict.fromkeys(
-        ("torch.cuda.is_available", "torch.cuda.device_count", "torch.cuda.get_device_name"), ("state", _CLOCK)
+        ("os.cpu_count", "os.getpid", "os.uname", "platform", "getpass", "uuid"), ("state", _CLOCK)
+    ),
+    **{f"time.{name}{unit}": ("state", _CLOCK) for name in _TIMES for unit in ("", "_ns")},
+    **{
+        f"time.{name}": ("state", _CLOCK)
+        for name in ("localtime", "gmtime", "strftime", "ctime", "asctime")
+    },
+    **{f"datetime.datetime.{name}": ("state", _CLOCK) for name in ("now", "utcnow", "today")},
+    **dict.fromkeys(
+        ("datetime.date.today", "threading.get_ident", "resource", "tracemalloc"), ("state", _CLOCK)
+    ),
+    **dict.fromkeys(
+        ("locale", "decimal", "numpy.geterr", "numpy.get_printoptions"), ("state", _SETTING)
+    ),
+    **dict.fromkeys(("sys.flags", "sys.warnoptions", "sys._xoptions"), ("state", _SETTING)),
+    **dict.fromkeys(
+        ("torch.get_num_threads", "torch.get_num_interop_threads", "psutil"), ("state", _CLOCK)
+    ),
+    **dict.fromkeys(
+        ("torch.cuda.is_available", "torch.cuda.device_count", "torch.cuda.get_device_name"),
+        ("state", _CLOCK),
     ),
     **dict.fromkeys(_DRAWING, ("state", _DRAWN)),
 }
-_BUILTINS = frozenset({"exec", "eval", "compile", "__import__", "__file__", "__spec__", "__loader__"})
+_BUILTINS = frozenset(
+    {"exec", "eval", "compile", "__import__", "__file__", "__spec__", "__loader__"}
+)
 _METHODS = frozenset(
-    {"open", "read_text", "read_bytes", "iterdir", "glob", "rglob", "exists", "is_file", "is_dir", "stat", "lstat"}
+    {
+        "open",
+        "read_text",
+        "read_bytes",
+        "iterdir",
+        "glob",
+        "rglob",
+        "exists",
+        "is_file",
+        "is_dir",
+        "stat",
+        "lstat",
+    }
 )  #: of a path
 _READERS = re.compile(  #: functions of libraries that read a file
     r"(open|io\.open|codecs\.open|os\.open|glob\.i?glob|os\.(listdir|scandir|walk|stat|lstat|access|readlink)|"
@@ -80,14 +160,18 @@ _READERS = re.compile(  #: functions of libraries that read a file
 )
 #: a text that is the name of a file of data
 _FILE_NAME = re.compile(
-    r"[\w./~ -]*\w\.(json5?|jsonl|ya?ml|toml|ini|cfg|csv|tsv|txt|dat|bin|np[yz]|mat|h5|hdf5|pt|pth|pkl|pickle|"
+    r"[\w./~"
+    r" -]*\w\."
+    r"(json5?|jsonl|ya?ml|toml|ini|cfg|csv|tsv|txt|dat|bin|np[yz]|mat|h5|hdf5|pt|pth|pkl|pickle|"
     r"safetensors|png|jpe?g|tiff?|exr|bmp|gz|zip|xml|html?|j2|jinja2?|tmpl|cpp|cc|cu|c|hpp?|so|cl|glsl|db|sqlite|"
     r"parquet|fits|spd|tbl)"
 )
 
 
 class Construct(NamedTuple):
-    """A construct that is not followed: its kind, what it names (or nothing), its text, the reason, and the line."""
+    """A construct that is not followed: its kind, what it names (or nothing), its text, the
+    reason, and the line.
+    """
 
     kind: str  #: file, env, import, run, state, hash, stamp or source
     name: str
@@ -97,52 +181,75 @@ class Construct(NamedTuple):
 
 
 def constructs(tree: Syntax, bound: Mapping[str, str]) -> list[Construct]:
-    """Return each construct of a module that is not followed; ``bound`` has the full name of each imported name."""
+    """Return each construct of a module that is not followed; ``bound`` has the full name of
+    each imported name.
+    """
     own = _bound_here(tree.all)
     scratch = Scratch(bound, lambda full: _READERS.fullmatch(full) is not None)
-    found = [*_named(tree.all, bound, own), *_read(tree.calls, bound, own, scratch)]
-    found += _file_names(tree.all, scratch.texts(tree) if scratch else set())
-    return sorted(set(found), key=lambda item: (item.line, item))
+    unfollowed = [*_named(tree.all, bound, own), *_read(tree.calls, bound, own, scratch)]
+    unfollowed += _file_names(tree.all, scratch.texts(tree) if scratch else set())
+    return sorted(set(unfollowed), key=lambda item: (item.line, item))
 
 
 def literal_import(call: ast.expr, bound: Mapping[str, str]) -> str | None:
-    """Return the module in a call such as ``import_module("a.b")``, or None for any other expression."""
-    if not isinstance(call, ast.Call) or not call.args or dotted(call.func, bound) not in _IMPORTERS:
+    """Return the module in a call such as ``import_module("a.b")``, or None for any other
+    expression.
+    """
+    if (
+        not isinstance(call, ast.Call)
+        or not call.args
+        or dotted(call.func, bound) not in _IMPORTERS
+    ):
         return None
     first = call.args[0]
     return first.value if isinstance(first, ast.Constant) and isinstance(first.value, str) else None
 
 
-_IMPORTERS = ("importlib.import_module", "importlib.__import__", "__import__", "importlib.util.find_spec")
+_IMPORTERS = (
+    "importlib.import_module",
+    "importlib.__import__",
+    "__import__",
+    "importlib.util.find_spec",
+)
 
 
 def _bound_here(kinds: Kinds) -> set[str]:
-    """Return the names that statements and arguments bind, so that they hide a builtin of the same name."""
-    found = {item.name for item in each(kinds, ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)}
-    found |= {item.arg for item in each(kinds, ast.arg)}
-    return found | {item.id for item in each(kinds, ast.Name) if not isinstance(item.ctx, ast.Load)}
+    """Return the names that statements and arguments bind, so that they hide a builtin of the
+    same name.
+    """
+    names = {item.name for item in each(kinds, ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)}
+    names |= {item.arg for item in each(kinds, ast.arg)}
+    return names | {item.id for item in each(kinds, ast.Name) if not isinstance(item.ctx, ast.Load)}
 
 
 def _named(kinds: Kinds, bound: Mapping[str, str], own: set[str]) -> Iterator[Construct]:
     """Yield each use of a name that reads what no import shows, such as ``os.environ``."""
-    known = {id(call.func) for call in each(kinds, ast.Call) if literal_import(call, bound)}
-    known |= {id(use.value) for use in each(kinds, ast.Attribute)}
+    accounted = {id(call.func) for call in each(kinds, ast.Call) if literal_import(call, bound)}
+    accounted |= {id(use.value) for use in each(kinds, ast.Attribute)}
     names = {id(use): name for use, name in _variables(kinds, bound)}
     for item in each(kinds, ast.Attribute, ast.Name):
-        if id(item) in known or not isinstance(item.ctx, ast.Load):
+        if id(item) in accounted or not isinstance(item.ctx, ast.Load):
             continue
-        base = _first_name(item)
-        if base not in bound and (base in own or base not in _BUILTINS):
+        if not _is_imported_or_builtin(_first_name(item), bound, own):
             continue
         full = dotted(item, bound)
         if entry := entry_of(full):
-            yield Construct(entry[0], names.get(id(_environ(item)), ""), full, entry[1], item.lineno)
+            yield Construct(
+                entry[0], names.get(id(_environ(item)), ""), full, entry[1], item.lineno
+            )
+
+
+def _is_imported_or_builtin(base: str, bound: Mapping[str, str], own: set[str]) -> bool:
+    return base in bound or (base not in own and base in _BUILTINS)
 
 
 def entry_of(full: str) -> tuple[str, str] | None:
     """Return what a full name such as ``os.environ.get`` does, or None for any other name."""
     parts = full.split(".")
-    return next((_NAMES[name] for n in range(len(parts), 0, -1) if (name := ".".join(parts[:n])) in _NAMES), None)
+    return next(
+        (_NAMES[name] for n in range(len(parts), 0, -1) if (name := ".".join(parts[:n])) in _NAMES),
+        None,
+    )
 
 
 def _first_name(item: ast.expr) -> str:
@@ -152,11 +259,17 @@ def _first_name(item: ast.expr) -> str:
 
 
 def _environ(item: ast.expr) -> ast.expr:
-    return item.value if isinstance(item, ast.Attribute) and item.attr in ("get", "__getitem__", "pop") else item
+    return (
+        item.value
+        if isinstance(item, ast.Attribute) and item.attr in ("get", "__getitem__", "pop")
+        else item
+    )
 
 
 def _variables(kinds: Kinds, bound: Mapping[str, str]) -> Iterator[tuple[ast.expr, str]]:
-    """Yield the expression and the variable of each ``os.environ["X"]``, ``os.environ.get("X")`` and so on."""
+    """Yield the expression and the variable of each ``os.environ["X"]``, ``os.environ.get("X")``
+    and so on.
+    """
     pairs = [(item.value, item.slice) for item in each(kinds, ast.Subscript)]
     pairs += [(_environ(item.func), item.args[0]) for item in each(kinds, ast.Call) if item.args]
     for use, key in pairs:
@@ -165,23 +278,30 @@ def _variables(kinds: Kinds, bound: Mapping[str, str]) -> Iterator[tuple[ast.exp
 
 
 def _read(
-    calls: Iterable[tuple[Scope, ast.Call]], bound: Mapping[str, str], own: set[str], scratch: Scratch
+    calls: Iterable[tuple[Scope, ast.Call]],
+    bound: Mapping[str, str],
+    own: set[str],
+    scratch: Scratch,
 ) -> Iterator[Construct]:
-    """Yield each call that reads a file whose path does not come from an argument of the function around it."""
+    """Yield each call that reads a file whose path does not come from an argument of the
+    function around it.
+    """
     for scope, item in calls:
-        full = dotted(item.func, bound)
-        method = isinstance(item.func, ast.Attribute) and item.func.attr in _METHODS
-        known = _first_name(item.func) in bound or (full == "open" and full not in own)
-        if known and _READERS.fullmatch(full):
-            path = read_by(item)
-        elif method and isinstance(item.func, ast.Attribute) and _first_name(item.func) not in bound:
-            path = item.func.value
-        else:
-            continue
+        path = _path_read(item, bound, own)
         if path is None or _writes(item) or _given(path, scope, frozenset()):
             continue
         if not scratch.holds(path, scope):
             yield Construct("file", _literal(path), ast.unparse(item)[:60], _FILE, item.lineno)
+
+
+def _path_read(call: ast.Call, bound: Mapping[str, str], own: set[str]) -> ast.expr | None:
+    """Return the path of the file that a call reads, or None for a call that reads no file."""
+    full, is_imported = dotted(call.func, bound), _first_name(call.func) in bound
+    if (is_imported or (full == "open" and full not in own)) and _READERS.fullmatch(full):
+        return read_by(call)
+    if is_imported or not isinstance(call.func, ast.Attribute) or call.func.attr not in _METHODS:
+        return None
+    return call.func.value
 
 
 def _writes(call: ast.Call) -> bool:
@@ -196,30 +316,496 @@ def _literal(path: ast.AST) -> str:
     return path.value if isinstance(path, ast.Constant) and isinstance(path.value, str) else ""
 
 
-def _given(path: ast.expr, scope: Scope, seen: frozenset[str]) -> bool:
-    """Return True if a path comes from an argument of a function around it, through any local names."""
-    names = [part for part in ast.walk(path) if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Load)]
-    return any(_name_given(name.id, scope, seen) for name in names)
+def _given(path: ast.expr, scope: Scope, visited: frozenset[str]) -> bool:
+    """Return True if a path comes from an argument of a function around it, through any local
+    names.
+    """
+    names = [
+        variable
+        for variable in ast.walk(path)
+        if isinstance(variable, ast.Name) and isinstance(variable.ctx, ast.Load)
+    ]
+    return any(_name_given(name.id, scope, visited) for name in names)
 
 
-def _name_given(name: str, scope: Scope, seen: frozenset[str]) -> bool:
-    if name in seen:
+def _name_given(name: str, scope: Scope, visited: frozenset[str]) -> bool:
+    if name in visited:
         return False
     for function in reversed(scope):
         if name in arguments(function):
             return True
         values = [value for target, value in assigned(function) if target == name]
         if values:
-            return any(_given(value, scope, seen | {name}) for value in values)
+            return any(_given(value, scope, visited | {name}) for value in values)
     return False
 
 
 def _file_names(kinds: Kinds, scratch: set[int]) -> Iterator[Construct]:
-    """Yield each text that is the name of a file of data, where it may become a path: in a call or as a constant.
+    """Yield each text that is the name of a file of data, where it may become a path: in a call or
+    as a constant.
 
     ``scratch`` are the texts, by id, that name a file in a temporary folder.
     """
-    spoken = {id(part) for item in each(kinds, ast.Raise, ast.JoinedStr) for part in ast.walk(item)}
+    spoken = set[int]()
+    for item in each(kinds, ast.Raise, ast.JoinedStr):
+        spoken |= {id(piece) for piece in ast.walk(item)}
     for item in each(kinds, ast.Constant):
-        if _FILE_NAME.fullmatch(text := _literal(item)) and id(item) not in spoken | scratch:
+        text = _literal(item)
+        if _FILE_NAME.fullmatch(text) and id(item) not in spoken | scratch:
             yield Construct("file", text, repr(text), _FILE, item.lineno)
+
+
+# --- hash order -----------------------------------------------------------------------------------
+
+# Results that the hash seed of a process decides: the order of a set of texts, and ``hash()`` of
+# one.
+#
+# Python draws the seed anew for each process unless ``PYTHONHASHSEED`` gives it. A set is seen by
+# its form: ``{"a", b}``, ``set(x)``, a union of these, and a name that is one of them. Sets of
+# numbers have one order.
+
+
+_WHY = "the hash seed of a process decides"
+_ORDERED = frozenset(
+    {"list", "tuple", "iter", "enumerate", "zip", "map", "filter", "join", "fromkeys", "fromiter"}
+)
+#: functions to which the order is nothing, or no more than rounding
+_UNORDERED = frozenset(
+    {
+        "sorted",
+        "len",
+        "min",
+        "max",
+        "any",
+        "all",
+        "sum",
+        "fsum",
+        "prod",
+        "set",
+        "frozenset",
+        "bool",
+        "isdisjoint",
+    }
+)
+_SETS = ("set", "frozenset", "AbstractSet", "Set", "MutableSet")
+_OF_SETS = ("union", "intersection", "difference", "symmetric_difference", "copy")
+_SCOPES = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Lambda)
+_LISTED = (ast.ListComp, ast.DictComp, ast.GeneratorExp)
+
+
+def orders(tree: ast.Module) -> list[Construct]:
+    """Return each place where a module takes the order of a set, or a hash, that differs between
+    processes.
+    """
+    expressions = _found(tree, NameScope(tree, None))
+    return [
+        Construct("hash", "", ast.unparse(item)[:60], _WHY, item.lineno) for item in expressions
+    ]
+
+
+def _found(item: ast.AST, scope: NameScope) -> Iterator[ast.expr]:
+    if isinstance(item, _SCOPES):
+        scope = NameScope(item, scope)
+    yield from (taken for taken in _taken(item, scope) if _is_set(taken, scope))
+    if isinstance(item, ast.Call):
+        if _is_hash(item, scope) or _pops_of_set(item, scope):
+            yield item
+        if last_name(item.func) in _UNORDERED:
+            for argument in item.args:
+                yield from _below(argument, scope)
+            return
+    if not _defines_hash(item):
+        for child in ast.iter_child_nodes(item):
+            yield from _found(child, scope)
+
+
+def _defines_hash(item: ast.AST) -> bool:
+    return isinstance(item, ast.FunctionDef) and item.name == "__hash__"
+
+
+def _pops_of_set(call: ast.Call, scope: NameScope) -> bool:
+    """Return True for ``pop()`` of a set, which gives any of its elements."""
+    if last_name(call.func) != "pop" or call.args:
+        return False
+    return _of_set(call.func, scope, frozenset())
+
+
+def _below(argument: ast.expr, scope: NameScope) -> Iterator[ast.expr]:
+    """Yield what is found inside of an argument whose own order is nothing."""
+    if isinstance(argument, ast.Call) and last_name(argument.func) in _ORDERED:
+        for value in argument.args:
+            yield from _below(value, scope)
+    elif isinstance(argument, _LISTED):
+        for operand in _behind_first(argument):
+            yield from _found(operand, scope)
+    else:
+        for child in ast.iter_child_nodes(argument):
+            yield from _found(child, scope)
+
+
+def _behind_first(listed: ast.ListComp | ast.DictComp | ast.GeneratorExp) -> list[ast.expr]:
+    """Return the expressions of a comprehension but for what it goes through first."""
+    operands: list[ast.expr] = []
+    for clause in listed.generators:
+        operands += [clause.target, clause.iter, *clause.ifs]
+    operands.remove(listed.generators[0].iter)
+    values = [listed.key, listed.value] if isinstance(listed, ast.DictComp) else [listed.elt]
+    return [*operands, *values]
+
+
+def _taken(item: ast.AST, scope: NameScope) -> list[ast.expr]:
+    """Return the expressions whose order a statement or an expression takes."""
+    if isinstance(item, ast.For | ast.AsyncFor):
+        return [item.iter]
+    if isinstance(item, _LISTED):
+        return [clause.iter for clause in item.generators]
+    if isinstance(item, ast.Starred):
+        return [item.value]
+    return [*item.args] if isinstance(item, ast.Call) and last_name(item.func) in _ORDERED else []
+
+
+def _is_hash(call: ast.Call, scope: NameScope) -> bool:
+    """Return True for a call of the builtin ``hash``, or of the method behind it."""
+    if isinstance(call.func, ast.Attribute) and call.func.attr == "__hash__":
+        return True
+    return (
+        isinstance(call.func, ast.Name) and call.func.id == "hash" and scope.holder("hash") is None
+    )
+
+
+def _is_set(item: ast.expr, scope: NameScope, visited: frozenset[str] = frozenset()) -> bool:
+    """Return True for an expression that is a set, and not one of numbers."""
+    if isinstance(item, ast.Set):
+        return not all(map(_is_number, item.elts))
+    if isinstance(item, ast.BinOp) and isinstance(
+        item.op, ast.BitOr | ast.BitAnd | ast.Sub | ast.BitXor
+    ):
+        return _is_set(item.left, scope, visited) or _is_set(item.right, scope, visited)
+    if isinstance(item, ast.Call):
+        return _makes_set(item) or (
+            last_name(item.func) in _OF_SETS and _of_set(item.func, scope, visited)
+        )
+    if isinstance(item, ast.Name) and item.id not in visited:
+        return _names_set(item.id, scope, visited)
+    return isinstance(item, ast.SetComp)
+
+
+def _is_number(item: ast.expr) -> bool:
+    return isinstance(item, ast.Constant) and isinstance(item.value, int | float)
+
+
+def _makes_set(call: ast.Call) -> bool:
+    """Return True for ``set(…)``, but not of a range of numbers."""
+    if not isinstance(call.func, ast.Name) or call.func.id not in ("set", "frozenset"):
+        return False
+    first = call.args[0] if call.args else None
+    return not (isinstance(first, ast.Call) and last_name(first.func) == "range")
+
+
+def _names_set(name: str, scope: NameScope, visited: frozenset[str]) -> bool:
+    """Return True for a name to which a set is bound."""
+    holder = scope.holder(name)
+    if holder is None:
+        return False
+    values = [value for value in holder.values.get(name, []) if value is not None]
+    return any(_is_set(value, holder, visited | {name}) for value in values)
+
+
+def _of_set(function: ast.expr, scope: NameScope, visited: frozenset[str]) -> bool:
+    return isinstance(function, ast.Attribute) and _is_set(function.value, scope, visited)
+
+
+# --- facts beside content -------------------------------------------------------------------------
+
+# Facts that no key covers although it covers the file: when it was changed, who may read it, where
+# code stands.
+#
+# The key has the content of a parameter file, and source without its comments, layout and line
+# numbers. Own code that reads what lies beside these is found by the names it uses, also in a text
+# such as ``attrgetter("st_mtime")``.
+
+
+_STAMP = "times, rights and marks of a file are not its content"
+_SOURCE = "comments and numbers of lines of code are read"
+_TIMES_OF_FILES = ("mtime", "ctime", "atime", "birthtime")
+_FIELDS = ("mode", "uid", "gid", "ino", "dev", "nlink")
+_STAMPS = frozenset(
+    {
+        *(f"st_{name}{unit}" for name in _TIMES_OF_FILES for unit in ("", "_ns")),
+        *(f"st_{name}" for name in _FIELDS),
+        *(f"ST_{name.upper()}" for name in (*_TIMES_OF_FILES, *_FIELDS)),
+        *(
+            "getmtime",
+            "getctime",
+            "getatime",
+            "samefile",
+            "sameopenfile",
+            "samestat",
+            "getxattr",
+            "listxattr",
+        ),
+        *("mtime", "date_time", "gettarinfo"),
+        *("is_symlink", "islink", "readlink", "is_mount", "ismount", "is_junction", "isjunction"),
+    }
+)
+_SOURCES = frozenset(
+    {
+        *(
+            "getsource",
+            "getsourcelines",
+            "getsourcefile",
+            "getcomments",
+            "findsource",
+            "getframeinfo",
+        ),
+        *(
+            "getouterframes",
+            "getinnerframes",
+            "f_lineno",
+            "tb_lineno",
+            "co_firstlineno",
+            "co_positions",
+            "co_lines",
+        ),
+        *(
+            "co_linetable",
+            "co_lnotab",
+            "extract_stack",
+            "extract_tb",
+            "walk_stack",
+            "walk_tb",
+            "StackSummary",
+        ),
+        *("findlinestarts", "TracebackException"),
+    }
+)
+_WHY_BESIDE = {
+    **dict.fromkeys(_STAMPS, ("stamp", _STAMP)),
+    **dict.fromkeys(_SOURCES, ("source", _SOURCE)),
+}
+#: names that mean something else in other packages, in full
+_FULL = {
+    **dict.fromkeys(("os.access", "grp", "pwd"), ("stamp", _STAMP)),
+    **dict.fromkeys(
+        ("inspect.stack", "inspect.trace", "tokenize.open", "linecache", "dis"), ("source", _SOURCE)
+    ),
+}
+#: functions whose result has the size of a file, and more
+_STATING = frozenset({"stat", "lstat", "fstat"})
+_SIZE = 6  #: place of the size in such a result
+_TAKING = frozenset(
+    {"tuple", "list", "str", "repr", "hash", "sum", "max", "min", "iter", "map", "zip", "enumerate"}
+)
+
+
+def facts(kinds: Kinds, bound: Mapping[str, str]) -> list[Construct]:
+    """Return each use of a fact beside the content of a file; ``bound`` has the full name of
+    each imported name.
+    """
+    uses = [*_by_name(kinds, bound), *_by_text(kinds), *_by_place(kinds), *_of_paths(kinds)]
+    return [Construct(why[0], "", text, why[1], line) for text, why, line in uses]
+
+
+_Found = Iterator[tuple[str, tuple[str, str], int]]
+
+
+def _by_name(kinds: Kinds, bound: Mapping[str, str]) -> _Found:
+    for item in each(kinds, ast.Attribute, ast.Name):
+        if isinstance(item.ctx, ast.Load):
+            full = dotted(item, bound)
+            last = (
+                item.attr
+                if isinstance(item, ast.Attribute)
+                else full.rpartition(".")[2]
+                if item.id in bound
+                else ""
+            )
+            why = _WHY_BESIDE.get(last) or (_FULL.get(full) if _is_imported(item, bound) else None)
+            if why is not None:
+                yield last if last in _WHY_BESIDE else full, why, item.lineno
+
+
+def _is_imported(item: ast.expr, bound: Mapping[str, str]) -> bool:
+    while isinstance(item, ast.Attribute):
+        item = item.value
+    return isinstance(item, ast.Name) and item.id in bound
+
+
+def _by_text(kinds: Kinds) -> _Found:
+    """Yield each text that is such a name, or ends with one: ``"__code__.co_firstlineno"``."""
+    for text, line in texts(kinds):
+        last = text.rpartition(".")[2]
+        if last in _WHY_BESIDE:
+            yield last, _WHY_BESIDE[last], line
+
+
+def _by_place(kinds: Kinds) -> _Found:
+    """Yield each use of the result of ``os.stat`` as a row of numbers."""
+    targets: list[ast.expr] = []
+    for item in each(kinds, ast.Assign):
+        if _is_stat(item.value, frozenset()):
+            targets += item.targets
+    named = frozenset(target.id for target in targets if isinstance(target, ast.Name))
+    unpacked = [target for target in targets if isinstance(target, ast.Tuple | ast.List)]
+    rows = [*unpacked, *_rows_of_stat(kinds, named)]
+    yield from (("stat", ("stamp", _STAMP), row.lineno) for row in rows)
+
+
+def _rows_of_stat(kinds: Kinds, named: frozenset[str]) -> Iterator[ast.expr]:
+    """Yield each place that takes such a result as a row: by index, by ``*`` or in a text, and by
+    a call.
+    """
+    yield from (item for item in each(kinds, ast.Subscript) if _is_field_of_stat(item, named))
+    for item in each(kinds, ast.Starred, ast.FormattedValue):
+        if _is_stat(item.value, named):
+            yield item
+    for call in each(kinds, ast.Call):
+        if last_name(call.func) in _TAKING and any(_is_stat(item, named) for item in call.args):
+            yield call
+
+
+def _is_field_of_stat(item: ast.Subscript, named: frozenset[str]) -> bool:
+    """Return True for an entry of such a result by its place, but for the size."""
+    is_size = isinstance(item.slice, ast.Constant) and item.slice.value == _SIZE
+    return _is_stat(item.value, named) and not is_size
+
+
+def _is_stat(item: ast.expr, named: frozenset[str]) -> bool:
+    """Return True for a call of ``os.stat`` or ``Path.stat``, or for a name that has its result."""
+    if isinstance(item, ast.Name):
+        return item.id in named
+    return isinstance(item, ast.Call) and last_name(item.func) in _STATING
+
+
+def _of_paths(kinds: Kinds) -> _Found:
+    """Yield ``path.owner()`` and ``path.group()`` of arguments that are paths; a match of a
+    pattern has groups too.
+    """
+    annotated = [item for item in each(kinds, ast.arg) if item.annotation is not None]
+    paths = {
+        item.arg
+        for item in annotated
+        if any(word in ast.unparse(item.annotation) for word in ("Path", "DataFile"))
+    }
+    for item in each(kinds, ast.Attribute):
+        if (
+            item.attr in ("owner", "group")
+            and isinstance(item.value, ast.Name)
+            and item.value.id in paths
+        ):
+            yield item.attr, ("stamp", _STAMP), item.lineno
+
+
+# --- facts of the moment --------------------------------------------------------------------------
+
+# Facts that another moment or machine would change: clocks, addresses, numbers of threads,
+# processors, programs.
+#
+# The kernel hands most of them out without a call that can be watched, and each library has names
+# of its own for them. So own code is searched for the last part of a name, whatever library it is
+# of: ``pandas.Timestamp.now`` as well as ``datetime.now``. ``getattr(time, name)`` is no way around
+# it.
+
+
+_WHY_OF_MOMENT = "a clock, a process or a machine decides"
+_LOOKED_UP = "a name that only a run knows is looked up in a module of Python"
+_LAST = frozenset(
+    {
+        *(
+            "now",
+            "utcnow",
+            "today",
+            "formatdate",
+            "default_timer",
+            "Timer",
+            "timeit",
+            "relativeCreated",
+        ),
+        *(
+            "data_ptr",
+            "get_native_id",
+            "native_id",
+            "sched_getaffinity",
+            "process_cpu_count",
+            "getpriority",
+        ),
+        *("getloadavg", "get_terminal_size", "getswitchinterval", "gettempdir", "gettempdirb"),
+        *("isEnabledFor", "getEffectiveLevel", "makeLogRecord"),
+    }
+)
+_FULL_NAMES_OF_MOMENT = frozenset(
+    {"shutil.which", "os.nice", "os.times", "sys.getrefcount", "sys.getsizeof"}
+)
+#: modules of Python with such facts
+_HOLDING = frozenset(
+    {
+        *(
+            "os",
+            "posix",
+            "nt",
+            "time",
+            "datetime",
+            "sys",
+            "platform",
+            "socket",
+            "threading",
+            "resource",
+            "shutil",
+        ),
+        *("locale", "random", "uuid", "secrets", "getpass", "gc"),
+    }
+)
+#: take a text with a date
+_DATES = frozenset({"datetime64", "Timestamp", "to_datetime", "Time", "DatetimeIndex"})
+_PRESENT = frozenset({"now", "today"})  #: such a text
+
+
+def moments(kinds: Kinds, bound: Mapping[str, str]) -> list[Construct]:
+    """Return each use of a fact of the moment; ``bound`` has the full name of each imported
+    name.
+    """
+    uses = [
+        *_moment_by_name(kinds, bound),
+        *_by_date(kinds),
+        *_looked_up(kinds, bound),
+    ]
+    return [Construct("state", "", text, why, line) for text, why, line in uses]
+
+
+_MomentFact = Iterator[tuple[str, str, int]]
+
+
+def _moment_by_name(kinds: Kinds, bound: Mapping[str, str]) -> _MomentFact:
+    for item in each(kinds, ast.Attribute, ast.Name):
+        if isinstance(item.ctx, ast.Load) and (isinstance(item, ast.Attribute) or item.id in bound):
+            full = dotted(item, bound) or last_name(item)
+            if full.rpartition(".")[2] in _LAST or full in _FULL_NAMES_OF_MOMENT:
+                yield full, _WHY_OF_MOMENT, item.lineno
+
+
+def _by_date(kinds: Kinds) -> _MomentFact:
+    """Yield ``np.datetime64("now")`` and the like."""
+    for call in each(kinds, ast.Call):
+        if last_name(call.func) in _DATES and any(
+            text_of(argument) in _PRESENT for argument in call.args
+        ):
+            yield ast.unparse(call)[:60], _WHY_OF_MOMENT, call.lineno
+
+
+def _looked_up(kinds: Kinds, bound: Mapping[str, str]) -> _MomentFact:
+    """Yield ``getattr(os, name)``, and ``getattr(os, "envi" + "ron")`` with the reason why that
+    is refused.
+    """
+    for call in each(kinds, ast.Call):
+        if last_name(call.func) != "getattr" or len(call.args) < 2:
+            continue
+        base, name = dotted(call.args[0], bound), text_of(call.args[1])
+        if base.partition(".")[0] not in _HOLDING:
+            continue
+        entry = entry_of(f"{base}.{name}") if name else ("state", _LOOKED_UP)
+        if entry or name in _LAST:
+            yield (
+                ast.unparse(call)[:60],
+                entry[1] if entry else _WHY_OF_MOMENT,
+                call.lineno,
+            )

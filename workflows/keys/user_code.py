@@ -1,24 +1,323 @@
-"""The code of a step that is not of neusee: its modules, and the files that its key covers."""
+"""Code of the user behind a step: declared dependencies, taints and modules beside it."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from itertools import chain
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from neusee.workflows.keys.cache_key import networks_of
-from neusee.workflows.keys.declared_dependencies import FREE, VARIABLE
-from neusee.workflows.keys.input_file_digest import files_in
-from neusee.workflows.keys.module_owner import is_own
-from neusee.workflows.keys.outward_code import is_calm, outward_names
-from neusee.workflows.keys.reachable_code import written_only
+from neusee.nodes.import_times import import_time
+from neusee.nodes.own_modules import own_modules
+from neusee.workflows.keys.cache_key import digest, file_digest, files_in, is_own, networks_of
+from neusee.workflows.keys.module_digest import Look, Whole, edited_since
+from neusee.workflows.keys.module_origin import origin_of
+from neusee.workflows.keys.source_summary import (
+    Reach,
+    Summary,
+    is_calm,
+    outward_names,
+    written_only,
+)
+from neusee.workflows.keys.unfollowed_constructs import Construct, UnfollowedCode
 
 if TYPE_CHECKING:
     from neusee.nodes import Node
     from neusee.workflows.graph.recipe_graph import Step
     from neusee.workflows.keys.code_digest import Code
-    from neusee.workflows.keys.module_look import Look
+    from neusee.workflows.keys.module_digest import Look
+
+
+# --- declared dependencies ------------------------------------------------------------------------
+
+# Dependencies that a node declares with ``depends=`` or a module with ``__depends__``, and the
+# constructs they cover.
+#
+# An entry is a file or folder beside the module (``table.csv``), ``env:NAME``, the name of a
+# module, or ``unaffected:open``: the author states that no result depends on this construct.
+
+
+FREE = "unaffected:"
+VARIABLE = "env:"
+_FIX = {
+    "file": (
+        'give it as a parameter of type Path, or declare it: depends=["{name}"], beside the module'
+    ),
+    "env": 'make it a parameter, or declare it: depends=["env:{name}"]',
+    "import": 'write the import as a statement, or declare each module: depends=["package.module"]',
+    "run": 'declare the file or the module that it runs: depends=["kernel.cpp"]',
+    "state": "make it a parameter",
+    "stamp": "make it a parameter",
+    "source": 'declare the file of the code, with its comments and lines: depends=["helper.py"]',
+    "hash": "write sorted(...) around the set, or a digest of hashlib",
+}
+_NAME = {"file": "table.csv", "env": "NAME"}
+
+
+class Declared(NamedTuple):
+    """Declared dependencies: the digest of each, by its name, the modules among them, and the
+    changed files.
+    """
+
+    parts: dict[str, dict[str, str]]
+    modules: list[str]
+    changed: list[str]  #: files that were changed after the import of the module that declares them
+
+
+def resolve(
+    entries: Sequence[str],
+    module: str,
+    source: Path,
+    then: Mapping[str, str | None],
+    exists: Callable[[str], bool],
+) -> Declared:
+    """Return the dependencies that a module declares; ``then`` are the variables of the environment
+    at its import.
+
+    Raises `LookupError` for an entry that is neither a file nor a module.
+    """
+    declared = Declared({}, [], [])
+    for entry in entries:
+        if entry.startswith(VARIABLE):
+            name = entry.removeprefix(VARIABLE)
+            values = dict.fromkeys([then.get(name, os.environ.get(name)), os.environ.get(name)])
+            declared.parts[f"environment variable {name}"] = {"value": digest(*values)[:16]}
+        elif not entry.startswith(FREE):
+            path = source.parent / entry
+            if path.exists():
+                declared.parts[f"file {entry}"] = {"content": _content(path)}
+                declared.changed.extend([entry] if _changed(path, import_time(module)) else [])
+            elif all(word.isidentifier() for word in entry.split(".")) and exists(entry):
+                declared.modules.append(entry)
+            else:
+                text = (
+                    f"{source}: depends={entry!r} is no file in {source.parent} and no module:"
+                    " correct the name"
+                )
+                raise UnfollowedCode(text)
+    return declared
+
+
+def uncovered(met: Iterable[Construct], entries: Sequence[str]) -> Construct | None:
+    """Return the first construct that no entry covers, or None."""
+    return next((item for item in met if not any(_covers(entry, item) for entry in entries)), None)
+
+
+def refusal(item: Construct, source: Path) -> str:
+    """Return the message that refuses a construct: its place, its text, the reason and the fix."""
+    fix = _FIX[item.kind].format(name=item.name or _NAME.get(item.kind, ""))
+    free = (
+        "or, if no result depends on it,"
+        f' depends=["{FREE}{item.text if item.text.isidentifier() else item.kind}"]'
+    )
+    return (
+        f"{source}:{item.line}: {item.text}: {item.why}, and a cache key cannot see it: {fix};"
+        f" {free}"
+    )
+
+
+def changing_refusal(name: str, kind_of_object: str, source: Path) -> str:
+    """Return the message that refuses a name of a module whose object changes while a process
+    runs, or is not read.
+    """
+    return (
+        f"{source}: {name} is or holds a {kind_of_object}, and a cache key cannot see it: "
+        "make it inside of the function that uses it; or, if no result depends on it,"
+        f' depends=["{FREE}{name}"]'
+    )
+
+
+def _covers(entry: str, item: Construct) -> bool:
+    if entry.startswith(FREE):
+        free = entry.removeprefix(FREE)
+        named = (item.kind, item.name, PurePath(item.name).name, item.text)
+        return free in named or item.text.startswith((f"{free}.", f"{free}("))
+    if entry.startswith(VARIABLE):
+        return item.kind == "env" and item.name in ("", entry.removeprefix(VARIABLE))
+    if item.kind == "file":
+        return (
+            not item.name
+            or not PurePath(entry).suffix
+            or PurePath(entry).name == PurePath(item.name).name
+        )
+    if item.kind == "source":
+        return PurePath(entry).suffix == ".py"
+    return item.kind in ("run", "import")
+
+
+def _content(path: Path) -> str:
+    """Return the digest of a file, or of all files of a folder with their names."""
+    if not path.is_dir():
+        return file_digest(path)
+    files = sorted(
+        file for file in path.rglob("*") if file.is_file() and "__pycache__" not in file.parts
+    )
+    return digest([[file.relative_to(path).as_posix(), file_digest(file)] for file in files])
+
+
+def _changed(path: Path, since: int) -> bool:
+    """Return True if a file, or anything in a folder, was changed after a time (ns)."""
+    inside = path.rglob("*") if path.is_dir() else ()
+    return any(os.stat(file).st_ctime_ns > since for file in (path, *inside))
+
+
+# --- tainted code ---------------------------------------------------------------------------------
+
+# Own code that was seen to reach what its key does not cover: its results hold for this process
+# alone.
+#
+# What a module has read stays with it, in a memo or in a variable, where no later call can be seen
+# to read it again. Therefore a taint stays until the process ends, for all code that uses one of
+# the tainted modules.
+
+
+_taints: dict[str, tuple[Any, ...]] = {}  #: by module, what it reached: `observation.taints.Taint`
+#: modules whose taint the run may not know yet, since it looks at results one by one
+_held_back: set[str] = set()
+
+
+def hold_back(modules: Iterable[str]) -> None:
+    """Let no result of own modules be stored from now on: one of their steps was just seen to
+    reach too much.
+    """
+    _held_back.update(modules)
+
+
+def may_be_stored(modules: Iterable[str]) -> bool:
+    """Return True if no step that was seen to reach too much has ended while one of these
+    modules computed.
+    """
+    return _held_back.isdisjoint(modules)
+
+
+def taint_code(modules: Iterable[str], taints: tuple[Any, ...]) -> bool:
+    """Mark own modules as code whose results no other process may use; return True if one was
+    not marked before.
+    """
+    new = [module for module in modules if module not in _taints]
+    _taints.update(dict.fromkeys(new, taints))
+    return bool(new)
+
+
+def taints_of(modules: Iterable[str]) -> tuple[Any, ...]:
+    """Return what modules have reached in this process although their keys do not cover it."""
+    taints = chain.from_iterable(_taints.get(module, ()) for module in modules)
+    return tuple(dict.fromkeys(taints))
+
+
+def holds_here_alone(module: str) -> bool:
+    """Return True if no other process may use what a module computes: its file was edited, or it
+    is tainted.
+    """
+    return edited_since(module) or module in _taints
+
+
+# --- sibling modules ------------------------------------------------------------------------------
+
+# Modules of a user beside those of a node: which of them may change what the node computes?
+#
+# All files under ``nodes:`` of a recipe are loaded into one process. A file that patches a library
+# changes every result of the process, also those of neusee's own nodes; one that fills a registry
+# or derives a class changes results of other own nodes. Such a file joins their keys. A file that
+# changes nothing beyond itself joins no other key.
+
+
+Scope = Literal["nothing", "own", "all"]  #: nodes whose results a module may change
+_GETTER = re.compile(r"get|current|default|instance|global|regist|shared|root", re.IGNORECASE)
+_UNSEEN = ("run", "import")  #: kinds of constructs whose code nobody knows
+
+
+class Siblings:
+    """The own modules of this process, and which of them join the key of a node."""
+
+    def __init__(self, whole_of: Callable[[str], Whole]) -> None:
+        self._whole_of = whole_of
+        self._scopes: dict[str, Scope] = {}
+
+    def of(self, roots: Sequence[str]) -> list[str]:
+        """Return the own modules that may change what the code of ``roots`` computes, in the order
+        of their import.
+
+        Raises `LookupError` for a module that cannot be followed.
+        """
+        others = own_modules()
+        if not others:
+            return []
+        followed: dict[str, Look] = {}
+        for root in roots:
+            followed.update(self._whole_of(root).looks)
+        mine = _own(followed)
+        beside = [name for name in others if name not in followed]
+        return [name for name in beside if self._joins(name, mine, any(map(is_own, roots)))]
+
+    def _joins(self, module: str, mine: Mapping[str, Reach], own: bool) -> bool:
+        scope = self._scope_of(module)
+        if scope == "all" or not own:
+            return scope == "all"
+        shared = _own(self._whole_of(module).looks).keys() & mine.keys()
+        changed = any(mine[name].inward for name in shared)
+        return scope == "own" or changed or any(reach.seeks for reach in mine.values())
+
+    def _scope_of(self, module: str) -> Scope:
+        if module not in self._scopes:
+            self._scopes[module] = _scope(self._whole_of(module).looks)
+        return self._scopes[module]
+
+
+def _scope(looks: Mapping[str, Look]) -> Scope:
+    """Return whose results the code of a module and of its helpers may change."""
+    reaches = _own(looks).values()
+    names = outward_names(reaches)
+    for reach in reaches:
+        names |= {name for name in reach.unused if _kind(name) == "distribution"}
+    own = {name for name in names if _is_of_user(name)}
+    if _holds_unseen(looks) or any(_is_shared(name) for name in names - own):
+        return "all"
+    return "own" if own else "nothing"
+
+
+def _holds_unseen(looks: Mapping[str, Look]) -> bool:
+    """Return True if own code among some modules has a construct whose reach nobody can see."""
+    summaries = [look.summary for name, look in looks.items() if is_own(name) and look.summary]
+    constructs = chain.from_iterable(summary.constructs for summary in summaries)
+    return any(construct.kind in _UNSEEN for construct in constructs)
+
+
+def _own(looks: Mapping[str, Look]) -> dict[str, Reach]:
+    """Return what the modules of a user reach, by name."""
+    return {
+        name: look.summary.reach for name, look in looks.items() if is_own(name) and look.summary
+    }
+
+
+def _is_of_user(name: str) -> bool:
+    """Return True if a full name is that of something in a module of a user."""
+    return name.startswith(".") or (
+        _kind(name) in ("source", "folder") and is_own(name.partition(".")[0])
+    )
+
+
+def _is_shared(name: str) -> bool:
+    """Return True for something of a library that others see: not for the result of a call, such
+    as an open file.
+    """
+    called, separator, _ = name.rpartition("()")
+    return not separator or _GETTER.search(called.rpartition(".")[2]) is not None
+
+
+def _kind(name: str) -> str:
+    return (
+        origin_of(name.partition(".")[0], frozenset()).kind if name.partition(".")[0] else "nowhere"
+    )
+
+
+# --- user code ------------------------------------------------------------------------------------
+
+# The code of a step that is not of neusee: its modules, and the files that its key covers.
+
 
 _TIMED = frozenset({"datetime", "time", "calendar", "email", "zoneinfo", "sqlite3", "logging"})
 
@@ -31,53 +330,89 @@ class OwnCode:
     followed: frozenset[str]  #: all modules whose source counts
     files: frozenset[str]  #: real paths of parameter files, and of declared files and folders
     free: frozenset[str]  #: what the author states to decide no result: a kind, a name or a path
-    changed: frozenset[str] = frozenset()  #: full names of what the code may change in modules of others
-    unread: frozenset[str] = frozenset()  #: full names of logs: lists and dicts that their modules only write to
-    may_change: bool = False  #: True if the code may change what other code finds: its imports do more than compute
+    #: full names of what the code may change in modules of others
+    changed: frozenset[str] = frozenset()
+    #: full names of logs: lists and dicts that their modules only write to
+    unread: frozenset[str] = frozenset()
+    #: True if the code may change what other code finds: its imports do more than compute
+    may_change: bool = False
     variables: frozenset[str] = frozenset()  #: variables of the environment that the code declares
 
 
 def own_code(step: Step, code: Code) -> OwnCode | None:
     """Return the code of a step that is not of neusee, or None for a step of the package alone."""
-    return own_code_of(step.node, step.params, [each.__module__ for each in networks_of(step)], code)
-
-
-def own_code_of(node: Node, params: Mapping[str, Any], networks: Sequence[str], code: Code) -> OwnCode | None:
-    """Return the code of a call of a node, as `own_code` does; ``networks`` are the modules of its network classes."""
-    roots = [node.fn.__module__, *networks]
-    if not any(map(is_own, roots)):
-        return None
-    looks = {name: look for root in roots for name, look in code.looks(root).items()}
-    followed = {name: look for name, look in looks.items() if look.summary is not None}
-    modules = frozenset(filter(is_own, followed))
-    files = {os.path.realpath(file) for file in files_in(params)}
-    free, variables = set[str](), set[str]()
-    declared = [(look.path, look.summary.depends) for look in followed.values() if look.summary]
-    declared.append((looks[roots[0]].path, [*node.depends]))
-    for source, entries in declared:
-        free.update(entry.removeprefix(FREE) for entry in entries if entry.startswith(FREE))
-        variables.update(entry.removeprefix(VARIABLE) for entry in entries if entry.startswith(VARIABLE))
-        beside = [source.parent / entry for entry in entries] if source else []
-        files.update(os.path.realpath(path) for path in beside if path.exists())
-    summaries = {name: followed[name].summary for name in modules}
-    changed = outward_names([each.reach for each in summaries.values() if each])
-    unread = {f"{name}.{log}" for name, each in summaries.items() if each for log in written_only(each.statements)}
-    imports = {module for each in summaries.values() if each for level, module, _ in each.imports if not level}
-    may_change = bool(changed) or any(not is_calm(name) for name in imports - modules)
-    return OwnCode(
-        modules=modules,
-        followed=frozenset(looks),
-        files=frozenset(files),
-        free=frozenset(free),
-        changed=frozenset(changed),
-        unread=frozenset(unread),
-        may_change=may_change,
-        variables=frozenset(variables),
+    return own_code_of(
+        step.node, step.params, [network.__module__ for network in networks_of(step)], code
     )
 
 
+def own_code_of(
+    node: Node, params: Mapping[str, Any], networks: Sequence[str], code: Code
+) -> OwnCode | None:
+    """Return the code of a call of a node, as `own_code` does; ``networks`` are the modules of
+    its network classes.
+    """
+    roots = [node.fn.__module__, *networks]
+    if not any(map(is_own, roots)):
+        return None
+    looks: dict[str, Look] = {}
+    for root in roots:
+        looks.update(code.looks(root))
+    summaries = {name: look.summary for name, look in looks.items() if look.summary is not None}
+    own = {name: summary for name, summary in summaries.items() if is_own(name)}
+    declared = [(looks[name].path, summary.depends) for name, summary in summaries.items()]
+    declared.append((looks[roots[0]].path, [*node.depends]))
+    entries = [*chain.from_iterable(depends for _, depends in declared)]
+    files = {os.path.realpath(file) for file in files_in(params)}
+    for source, depends in declared:
+        files |= _declared_files(source, depends)
+    changed = outward_names([summary.reach for summary in own.values()])
+    return OwnCode(
+        modules=frozenset(own),
+        followed=frozenset(looks),
+        files=frozenset(files),
+        free=_after(FREE, entries),
+        changed=frozenset(changed),
+        unread=_unread_logs(own),
+        may_change=bool(changed) or _may_change_others(own),
+        variables=_after(VARIABLE, entries),
+    )
+
+
+def _declared_files(source: Path | None, entries: Sequence[str]) -> set[str]:
+    """Return the real paths of the files beside a source file that its entries name."""
+    beside = [source.parent / entry for entry in entries] if source else []
+    return {os.path.realpath(path) for path in beside if path.exists()}
+
+
+def _after(prefix: str, entries: Iterable[str]) -> frozenset[str]:
+    """Return the names that follow a prefix in the declared entries."""
+    return frozenset(entry.removeprefix(prefix) for entry in entries if entry.startswith(prefix))
+
+
+def _unread_logs(summaries: Mapping[str, Summary]) -> frozenset[str]:
+    """Return the full names of objects of modules that the modules write to and never read."""
+    logs = set[str]()
+    for name, summary in summaries.items():
+        logs |= {f"{name}.{log}" for log in written_only(summary.statements)}
+    return frozenset(logs)
+
+
+def _may_change_others(summaries: Mapping[str, Summary]) -> bool:
+    """Return True if own modules import, by full name, another one that is not calm."""
+    imports = set[str]()
+    for summary in summaries.values():
+        imports |= {module for level, module, _ in summary.imports if not level}
+    return any(not is_calm(name) for name in imports - summaries.keys())
+
+
 def reads_time(looks: Mapping[str, Look]) -> bool:
-    """Return True if code of a user may read the time zone: by the standard library, or by a package of its own."""
+    """Return True if code of a user may read the time zone: by the standard library, or by a
+    package of its own.
+    """
     own = [look for name, look in looks.items() if is_own(name)]
-    names = {imported.partition(".")[0] for look in own for imported in look.imports}
-    return not _TIMED.isdisjoint(names) or any("content" in part for look in own for part in look.parts.values())
+    imports = chain.from_iterable(look.imports for look in own)
+    if not _TIMED.isdisjoint(name.partition(".")[0] for name in imports):
+        return True
+    contents = chain.from_iterable(look.parts.values() for look in own)
+    return any("content" in content for content in contents)

@@ -1,4 +1,5 @@
-"""What a step may reach without a word: the program, Python with its packages, and the system below them.
+"""What a step may reach without a word: the program, Python with its packages, and the system below
+them.
 
 The key holds versions of packages, and the system is not an input: every entry has its reason here.
 """
@@ -15,9 +16,10 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import neusee.nodes
-from neusee.workflows.keys.regular_file import bytes_of
+from neusee.workflows.keys.sealed_files import bytes_of
 
-#: folders and files of the system that a library reads on its own, with the reason why no result depends on them
+#: folders and files of the system that a library reads on its own, with the reason why no result
+#: depends on them
 SYSTEM = {
     "/proc": "processes and memory, as the machine is now",
     "/sys": "processors and devices, as the machine is now",
@@ -31,8 +33,12 @@ SYSTEM = {
     "/dev/kfd": "the graphics processor",
     "/dev/dri": "the graphics processor",
     "/dev/infiniband": "links between graphics processors",
-    **dict.fromkeys(("/bin", "/sbin", "/lib*", "/usr/bin", "/usr/sbin"), "installed programs and libraries"),
-    **dict.fromkeys(("/usr/lib*", "/usr/include", "/usr/local/lib*", "/usr/local/bin"), "installed libraries"),
+    **dict.fromkeys(
+        ("/bin", "/sbin", "/lib*", "/usr/bin", "/usr/sbin"), "installed programs and libraries"
+    ),
+    **dict.fromkeys(
+        ("/usr/lib*", "/usr/include", "/usr/local/lib*", "/usr/local/bin"), "installed libraries"
+    ),
     "/usr/local/include": "installed libraries",
     **dict.fromkeys(("/usr/local/cuda*", "/System", "/Library/Frameworks"), "installed libraries"),
     "/usr/share": "time zones, languages, fonts and tables of installed programs",
@@ -42,37 +48,59 @@ SYSTEM = {
     "/etc/locale*": "the language",
     **dict.fromkeys(("/etc/nsswitch.conf", "/etc/passwd", "/etc/group"), "names of users"),
     **dict.fromkeys(("/run/nscd", "/run/systemd/userdb"), "names of users, asked of a process"),
-    **dict.fromkeys(("/etc/hosts", "/etc/host.conf", "/etc/resolv.conf", "/etc/gai.conf"), "a connection is a taint"),
-    **dict.fromkeys(("/etc/ssl", "/etc/pki", "/etc/crypto-policies"), "settings of ciphers, read with hashlib"),
+    **dict.fromkeys(
+        ("/etc/hosts", "/etc/host.conf", "/etc/resolv.conf", "/etc/gai.conf"),
+        "a connection is a taint",
+    ),
+    **dict.fromkeys(
+        ("/etc/ssl", "/etc/pki", "/etc/crypto-policies"), "settings of ciphers, read with hashlib"
+    ),
     "/etc/mime.types": "names of kinds of files",
     "/etc/fonts": "settings of fonts",
     "/etc/OpenCL": "where the driver of the graphics processor is",
     "/etc/nvidia*": "settings of the driver of the graphics processor",
     **dict.fromkeys(("/etc/os-release", "/etc/debian_version"), "the name of the system"),
-}  # fmt: skip
+}
 
 #: files in the folders above that give chance
 CHANCE = ("/dev/random", "/dev/urandom", "/dev/hwrng", "/proc/sys/kernel/random")
-_OF_PYTHON = ("lib", "lib64", "bin", "include", "share", "ssl", "conda-meta", "DLLs", "Library", "pyvenv.cfg")
+_OF_PYTHON = (
+    "lib",
+    "lib64",
+    "bin",
+    "include",
+    "share",
+    "ssl",
+    "conda-meta",
+    "DLLs",
+    "Library",
+    "pyvenv.cfg",
+)
 
 
 @functools.cache
 def program() -> tuple[str, ...]:
     """Return the real paths of the program, and of Python with its packages.
 
-    A virtual environment may be made in the folder of a project, so only its parts count, not its whole folder.
+    A virtual environment may be made in the folder of a project, so only its parts count, not its
+    whole folder.
     """
     prefixes = {sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix}
-    python = [os.path.join(prefix, part) for prefix in prefixes for part in _OF_PYTHON]
+    python = [os.path.join(prefix, folder) for prefix in prefixes for folder in _OF_PYTHON]
     paths = sysconfig.get_paths()
     installed = [paths[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")]
-    zipped = os.path.join(sys.base_prefix, "lib", f"python{sys.version_info[0]}{sys.version_info[1]}.zip")
+    zipped = os.path.join(
+        sys.base_prefix, "lib", f"python{sys.version_info[0]}{sys.version_info[1]}.zip"
+    )
     return (*_neusee(), *_real([*python, *installed, zipped, site.getusersitepackages()]))
 
 
 @functools.cache
 def _neusee() -> tuple[str, ...]:
-    packaged = [Path(neusee.__file__ or "").parent / name for name in ("__init__.py", "__main__.py", "__pycache__")]
+    packaged = [
+        Path(neusee.__file__ or "").parent / name
+        for name in ("__init__.py", "__main__.py", "__pycache__")
+    ]
     return _real([*map(Path, neusee.nodes.__path__), Path(__file__).parents[1], *packaged])
 
 
@@ -88,27 +116,45 @@ def _cache() -> Path:
 def decides(path: str) -> bool:
     """Return True for a file of settings that may decide what a library does when it is imported.
 
-    Not in the folder of caches, where libraries keep what they can make anew, such as a list of fonts, and not if all
-    of its lines are empty or comments, as in those that dask writes for its user.
+    Not in the folder of caches, where libraries keep what they can make anew, such as a list of
+    fonts, and not if all of its lines are empty or comments, as in those that dask writes for its
+    user.
     """
     if _is_below(path, _real([_cache()])):
         return False
     try:
-        return any(line.strip() and not line.lstrip().startswith(b"#") for line in bytes_of(path).splitlines())
+        return any(
+            line.strip() and not line.lstrip().startswith(b"#")
+            for line in bytes_of(path).splitlines()
+        )
     except OSError:
         return True
 
 
 def caches() -> tuple[str, ...]:
-    """Return the folders of code that libraries compile for this machine, and that no result depends on."""
+    """Return the folders of code that libraries compile for this machine, and that no result
+    depends on.
+    """
     home, cache = Path.home(), _cache()
-    named = [os.environ[name] for name in ("CUDA_CACHE_PATH", "TRITON_CACHE_DIR") if os.environ.get(name)]
+    named = [
+        os.environ[name] for name in ("CUDA_CACHE_PATH", "TRITON_CACHE_DIR") if os.environ.get(name)
+    ]
     # the first is `folder` of neusee.nodes._cpp_library
-    return _real([cache / "neusee" / "build", cache / "torch" / "kernels", home / ".nv", home / ".triton", *named])
+    return _real(
+        [
+            cache / "neusee" / "build",
+            cache / "torch" / "kernels",
+            home / ".nv",
+            home / ".triton",
+            *named,
+        ]
+    )
 
 
 def looked_at() -> tuple[str, ...]:
-    """Return folders that always exist: the working folder, that of temporary files, and the home folder."""
+    """Return folders that always exist: the working folder, that of temporary files, and the
+    home folder.
+    """
     return _real([os.getcwd(), tempfile.gettempdir(), Path.home()])
 
 
@@ -126,7 +172,9 @@ def is_installed(path: str) -> bool:
     if _is_below(path, program()):
         return True
     return any(
-        _is_below(path, [os.path.realpath(folder)]) for folder in sys.path if folder and _of_distributions(folder)
+        _is_below(path, [os.path.realpath(folder)])
+        for folder in sys.path
+        if folder and _of_distributions(folder)
     )
 
 
@@ -145,14 +193,20 @@ def is_chance(path: str) -> bool:
 
 
 def _is_searched_library(path: str) -> bool:
-    """Return True for a library, there or not, in a folder where the loader of the system was told to search."""
+    """Return True for a library, there or not, in a folder where the loader of the system was
+    told to search.
+    """
     folders = filter(None, os.environ.get("LD_LIBRARY_PATH", "").split(":"))
     return ".so" in os.path.basename(path) and _is_below(path, _real(folders))
 
 
 def is_searched_program(path: str) -> bool:
-    """Return True for a program, there or not, where programs are searched: to look is nothing, to run it a taint."""
-    return os.path.dirname(path) in _real(filter(None, os.environ.get("PATH", "").split(os.pathsep)))
+    """Return True for a program, there or not, where programs are searched: to look is nothing,
+    to run it a taint.
+    """
+    return os.path.dirname(path) in _real(
+        filter(None, os.environ.get("PATH", "").split(os.pathsep))
+    )
 
 
 @functools.cache

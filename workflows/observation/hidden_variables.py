@@ -1,8 +1,10 @@
-"""Variables of the environment that libraries do not have while own code runs, because no key counts them.
+"""Variables of the environment that libraries do not have while own code runs, because no key
+counts them.
 
-A key has the variables that own code names or declares. What a library reads on its own, such as a backend or a folder
-of settings, no key has: it finds the variable unset, whatever the environment says, unless the code declares it,
-``depends=["env:NAME"]``. Own code itself always finds the truth, and what it reads without a declaration is noted.
+A key has the variables that own code names or declares. What a library reads on its own, such as a
+backend or a folder of settings, no key has: it finds the variable unset, whatever the environment
+says, unless the code declares it, ``depends=["env:NAME"]``. Own code itself always finds the truth,
+and what it reads without a declaration is noted.
 """
 
 from __future__ import annotations
@@ -27,16 +29,25 @@ _IMPORT = "<frozen importlib"  #: begins the name of the file of Python's own im
 class Asked:
     """Variables that code asked for and no key has."""
 
-    of_libraries: dict[str, None] = field(default_factory=dict)  #: set, and hidden from the library that asked
+    #: set, and hidden from the library that asked
+    of_libraries: dict[str, None] = field(default_factory=dict)
     of_own_code: dict[str, None] = field(default_factory=dict)  #: set or not
 
 
 class _Shown(dict[bytes, bytes]):
     """The variables that libraries have; who asks for another one decides whether it is found."""
 
-    def __init__(self, whole: Mapping[bytes, bytes], declared: frozenset[str], asked: Asked) -> None:
-        super().__init__({name: value for name, value in whole.items() if is_shown(os.fsdecode(name), declared)})
-        self.hidden = {name: value for name, value in whole.items() if name not in self}
+    def __init__(
+        self, environment: Mapping[bytes, bytes], declared: frozenset[str], asked: Asked
+    ) -> None:
+        super().__init__(
+            {
+                name: value
+                for name, value in environment.items()
+                if is_shown(os.fsdecode(name), declared)
+            }
+        )
+        self.hidden = {name: value for name, value in environment.items() if name not in self}
         self._declared, self._asked = declared, asked
 
     def __missing__(self, name: bytes) -> bytes:
@@ -44,14 +55,20 @@ class _Shown(dict[bytes, bytes]):
         who, text = _who_asks(), os.fsdecode(name)
         if who == "library" and name in self.hidden and text not in OF_WINDOWS:
             self._asked.of_libraries[text] = None
-        if who == "own" and not is_shown(text, self._declared) and ALL not in self._asked.of_own_code:
+        if (
+            who == "own"
+            and not is_shown(text, self._declared)
+            and ALL not in self._asked.of_own_code
+        ):
             self._asked.of_own_code[text] = None
         if who == "library" or name not in self.hidden:
             raise KeyError(name)
         return self.hidden[name]
 
     def __iter__(self) -> Iterator[bytes]:
-        """Yield the names of all variables to own code and to neusee, and of those that are not hidden to a library."""
+        """Yield the names of all variables to own code and to neusee, and of those that are not
+        hidden to a library.
+        """
         who = _who_asks()
         if who == "own":
             self._asked.of_own_code[ALL] = None
@@ -64,7 +81,8 @@ def is_shown(name: str, declared: frozenset[str]) -> bool:
 
 
 def hide_for_good(declared: frozenset[str]) -> Asked:
-    """Hide variables from libraries in the rest of this process, a fork; return what will be asked for.
+    """Hide variables from libraries in the rest of this process, a fork; return what will be asked
+    for.
 
     Libraries of C do not find them either.
     """
@@ -86,7 +104,10 @@ def hidden_while_importing(declared: frozenset[str]) -> Iterator[Asked]:
     try:
         yield asked
     finally:
-        _set_data({**shown.hidden, **shown} | {name: value for name, value in before.items() if name in shown.hidden})
+        _set_data(
+            {**shown.hidden, **shown}
+            | {name: value for name, value in before.items() if name in shown.hidden}
+        )
 
 
 def _show_few(declared: frozenset[str], asked: Asked) -> _Shown:
@@ -104,11 +125,12 @@ def _set_data(data: dict[bytes, bytes]) -> None:
     os.environb._data = data  # type: ignore[attr-defined]
 
 
-# --- who asks ---------------------------------------------------------------------------------------------------------
+# --- who asks -------------------------------------------------------------------------------------
 
 
 def _who_asks() -> str:
-    """Return whose code asks: the nearest that is not of the standard library is ``own``, ``library`` or ``neusee``.
+    """Return whose code asks: the nearest that is not of the standard library is ``own``,
+    ``library`` or ``neusee``.
 
     A module of the standard library that asks while it is imported counts as a library.
     """

@@ -12,7 +12,18 @@ OF_LANGUAGES = ("LANG", "LANGUAGE", *(f"LC_{name}" for name in _OF_LOCALE))
 _WHO = ("HOME", "USER", "LOGNAME", "USERNAME")
 _PLACES = ("PATH", "VIRTUAL_ENV", "TMPDIR", "TZ", "TZDIR", "LOCPATH")
 _FEW = frozenset({*_PLACES, *OF_THREADS, *OF_LANGUAGES, *_WHO})
-_OF_PROGRAMS = ("LD_", "DYLD_", "PYTHON", "CONDA", "XDG_", "NEUSEE_", "GLIBC_", "MALLOC_", "TORCH", "PYTORCH")
+_OF_PROGRAMS = (
+    "LD_",
+    "DYLD_",
+    "PYTHON",
+    "CONDA",
+    "XDG_",
+    "NEUSEE_",
+    "GLIBC_",
+    "MALLOC_",
+    "TORCH",
+    "PYTORCH",
+)
 _OF_DEVICES = ("CUDA", "NVIDIA", "HIP", "ROCM", "OMP_", "GOMP_", "KMP_", "MKL_", "OPENBLAS_")
 #: of terminals and windows, for which many libraries ask
 _TERMINALS = ("COLUMNS", "LINES", "TERM", "COLORTERM", "NO_COLOR", "FORCE_COLOR", "CI", "PWD")

@@ -1,11 +1,14 @@
-"""Small process that answers the stopped system calls of observed steps and remembers what they reached.
+"""Small process that answers the stopped system calls of observed steps and remembers what they
+reached.
 
-It is a process of its own, because a native reader may hold the lock of the interpreter while it waits for the answer.
-It imports the standard library and a few files of this room alone, so it starts fast. It ends when its parent and all
-that its parent observed have ended: a process that a step left behind would wait at its next call for ever.
+It is a process of its own, because a native reader may hold the lock of the interpreter while it
+waits for the answer. It imports the standard library and a few files of this room alone, so it
+starts fast. It ends when its parent and all that its parent observed have ended: a process that a
+step left behind would wait at its next call for ever.
 
-Messages of the parent: ``O`` with its number: this process is observed now, a fork of the parent or the parent itself,
-``P``: can you read this memory, ``L`` with a listener: a new observation begins, ``R``: report.
+Messages of the parent: ``O`` with its number: this process is observed now, a fork of the parent or
+the parent itself, ``P``: can you read this memory, ``L`` with a listener: a new observation begins,
+``R``: report.
 """
 
 from __future__ import annotations
@@ -19,15 +22,24 @@ import select
 import signal
 import socket
 
-from neusee.workflows.observation.recorded_call import Record, recorded, without_reading
-from neusee.workflows.observation.stopped_task import Task
-from neusee.workflows.observation.system_calls import Call, audit_arch, machine, numbers
-from neusee.workflows.observation.trusted_tasks import MARKS, TrustedTasks
+from neusee.workflows.observation.system_calls import (
+    MARKS,
+    Call,
+    Record,
+    Task,
+    TrustedTasks,
+    audit_arch,
+    machine,
+    numbers,
+    recorded,
+    without_reading,
+)
 
 SECCOMP_USER_NOTIF_FLAG_CONTINUE = 1
 SECCOMP_IOCTL_NOTIF_RECV, SECCOMP_IOCTL_NOTIF_SEND = 0xC0502100, 0xC0182101
 SECCOMP_IOCTL_NOTIF_SET_FLAGS = 0x40082104
-SECCOMP_USER_NOTIF_FD_SYNC_WAKE_UP = 1  #: from Linux 6.6: the answer wakes the thread on the same processor, at once
+#: from Linux 6.6: the answer wakes the thread on the same processor, at once
+SECCOMP_USER_NOTIF_FD_SYNC_WAKE_UP = 1
 HEADER = 9  #: bytes that open a message of the parent: its kind, and a number
 
 
@@ -83,11 +95,11 @@ class Observation:
             self._tasks.mark(task.thread, arguments[call.number])
             return
         try:
-            kept = self._kept(task, call, arguments)
+            record = self._kept(task, call, arguments)
         except (OSError, StopIteration, ValueError) as error:
-            kept = Record("unseen", f"{call.name}: {error}")
-        if kept is not None:
-            self.records[kept] = None
+            record = Record("unseen", f"{call.name}: {error}")
+        if record is not None:
+            self.records[record] = None
 
     def _kept(self, task: Task, call: Call, arguments: tuple[int, ...]) -> Record | None:
         if not self._tasks.holds(task):
@@ -105,7 +117,8 @@ class Server:
         self._parent, self._process = parent, process
         self._poll = select.poll()
         self._open: set[int] = set()
-        self._current = -1  #: listener of the last observation; older ones belong to threads that were left over
+        #: listener of the last observation; older ones belong to threads that were left over
+        self._current = -1
         self._observation = Observation(process)
         self._add(parent.fileno())
 
@@ -169,5 +182,6 @@ class Server:
 def serve(descriptor: int, process: int) -> None:
     """Serve the process at the other end of a socket until it has ended."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # meant for the parent, whose calls must still be answered
+        # meant for the parent, whose calls must still be answered
+        signal.signal(number, signal.SIG_IGN)
     Server(socket.socket(fileno=descriptor), process).serve()

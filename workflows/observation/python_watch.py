@@ -1,14 +1,101 @@
-"""What this process itself sees of the observed call under way: its threads, its imports, and what its hooks record."""
+"""What Python itself sees of an observed call: audit events, imports and threads."""
 
 from __future__ import annotations
 
+import _imp
+import _thread
+import builtins
+import functools
+import importlib
 import os
+import pickle
+import random
+import sys
 import threading
-from typing import Protocol
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, Protocol
 
-from neusee.workflows.observation.kept_generators import KeptGenerators
-from neusee.workflows.observation.recorded_call import Record
-from neusee.workflows.observation.trusted_tasks import CHILD, TRUSTED, UNTRUSTED
+import numpy as np
+
+from neusee.workflows.observation.covered_paths import is_installed
+from neusee.workflows.observation.system_calls import CHILD, TRUSTED, UNTRUSTED, Does, Record
+
+# --- kept generators ------------------------------------------------------------------------------
+
+# Generators that installed packages make for themselves when they are imported.
+#
+# No result depends on an import that makes one. A step that draws from one later depends on chance,
+# or on the steps that drew before it.
+
+
+_kept: dict[int, tuple[str, Any]] = {}  #: module and generator, by id
+
+
+class KeptGenerators:
+    """The generators that packages keep, with their states before an observed call, or after
+    their import in it.
+    """
+
+    def __init__(self) -> None:
+        self.drew = False  #: an installed package has asked for chance when it was imported
+        self._modules = set(sys.modules)
+        self._states = {number: _state(generator) for number, (_, generator) in _kept.items()}
+        self._drawn: list[str] = []  #: modules with a generator that drew while they were imported
+
+    def keep(self, generator: Any, module: str) -> None:
+        """Remember the bits of NumPy, or a generator of Python, that a module of an installed
+        package makes.
+        """
+        _kept[id(generator)] = module, generator
+
+    def note(self) -> None:
+        """Take note of the states of what packages have made, at the end of an import."""
+        if self.drew:
+            self.drew = False
+            self._keep_of_modules()
+        for number in _kept.keys() - self._states.keys():
+            module, generator = _kept[number]
+            self._states[number] = _state(generator)
+            if getattr(generator, "has_drawn_by_chance", bool)():
+                self._drawn.append(module)
+
+    def changed(self) -> list[str]:
+        """Return what has drawn since."""
+        drawn = [
+            _kept[number][0]
+            for number, state in self._states.items()
+            if _state(_kept[number][1]) != state
+        ]
+        return [
+            f"a generator that {module} keeps" for module in dict.fromkeys([*self._drawn, *drawn])
+        ]
+
+    def _keep_of_modules(self) -> None:
+        """Remember the generators that stand in modules of installed packages that were not
+        loaded before.
+        """
+        for name, module in sys.modules.copy().items():
+            values = getattr(module, "__dict__", {})
+            if name not in self._modules and is_installed(str(values.get("__file__"))):
+                for value in values.copy().values():
+                    if type(value) in (np.random.Generator, np.random.RandomState):
+                        self.keep(value._bit_generator, name)
+                    elif type(value) is random.Random:
+                        self.keep(value, name)
+
+
+def _state(generator: Any) -> bytes:
+    return pickle.dumps(
+        generator.getstate() if isinstance(generator, random.Random) else generator.state
+    )
+
+
+# --- python watch ---------------------------------------------------------------------------------
+
+# What this process itself sees of the observed call under way: its threads, its imports, and what
+# its hooks record.
 
 
 class Seedable(Protocol):
@@ -22,14 +109,18 @@ class Watch:
     """One observed call."""
 
     def __init__(self, kernel: bool) -> None:
-        self.kernel = kernel  #: True if the kernel watches too: then it sees all that is opened, and more
+        #: True if the kernel watches too: then it sees all that is opened, and more
+        self.kernel = kernel
         self.records: list[Record] = []
         self.draws: set[str] = set()  #: sources of chance that were asked
         self.kept = KeptGenerators()  #: generators of installed packages
         self.generators: list[Seedable] = []  #: that were made before their seed, if any, was known
-        self.bodies: dict[str, str] = {}  #: file of each module of the user that was executed, by name
-        self.quiet: dict[str, bool] = {}  #: files, and whether all who asked for their source or marks need no record
-        self.settings: set[str] = set()  #: files that installed packages read while they were imported
+        #: file of each module of the user that was executed, by name
+        self.bodies: dict[str, str] = {}
+        #: files, and whether all who asked for their source or marks need no record
+        self.quiet: dict[str, bool] = {}
+        #: files that installed packages read while they were imported
+        self.settings: set[str] = set()
         self.temporary: set[str] = set()  #: files and folders with names that chance gave
         self._threads: set[threading.Thread] = set()
         self._local = threading.local()
@@ -44,11 +135,13 @@ class Watch:
 
     def chance(self) -> set[str]:
         """Return the sources of chance that the call has asked, up to now."""
-        unseeded = any(not each.is_seeded() for each in self.generators)
+        unseeded = any(not generator.is_seeded() for generator in self.generators)
         return self.draws | ({"numpy.random.RandomState without a seed"} if unseeded else set())
 
     def trusted(self) -> bool:
-        """Return True if the current thread imports an installed package, or searches for a module."""
+        """Return True if the current thread imports an installed package, or searches for a
+        module.
+        """
         return bool(getattr(self._local, "trusted", False))
 
     def trust(self, trusted: bool) -> bool:
@@ -89,3 +182,428 @@ def end() -> None:
 def watch_here() -> Watch | None:
     """Return the observed call that the current thread belongs to, or None."""
     return _current[0] if _current and _current[0].is_here() else None
+
+
+# --- watched imports ------------------------------------------------------------------------------
+
+# Imports in an observed call: which reads belong to an installed package, and which to a module of
+# the user.
+#
+# Python searches folders and reads byte code, and packages read their own tables: none of this is
+# an input. The body of a module of the user is watched like the step itself. Two functions of
+# importlib tell both apart; a Python without them counts every import as the step's own reading.
+
+
+_BOOTSTRAP: Any = importlib._bootstrap
+_SEARCH, _EXECUTE = "_find_and_load", "_call_with_frames_removed"
+_NATIVE = {getattr(_imp, name, None) for name in ("create_dynamic", "exec_dynamic")} - {None}
+
+
+class WatchedImports:
+    """The two functions of importlib, wrapped while a call is observed."""
+
+    def __init__(self) -> None:
+        self._before = {name: getattr(_BOOTSTRAP, name, None) for name in (_SEARCH, _EXECUTE)}
+
+    def __enter__(self) -> None:
+        for name, wrap in ((_SEARCH, _searching), (_EXECUTE, _executing)):
+            function = self._before[name]
+            if function is not None:
+                setattr(_BOOTSTRAP, name, wrap(function))
+
+    def __exit__(self, *_: object) -> None:
+        for name, function in self._before.items():
+            if function is not None:
+                setattr(_BOOTSTRAP, name, function)
+
+
+def _searching(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the search for a module, with a thread that is trusted meanwhile."""
+
+    def search(name: str, import_: Callable[..., Any]) -> Any:
+        watch = watch_here()
+        if watch is None:
+            return function(name, import_)
+        before = watch.trust(True)
+        try:
+            return function(name, import_)
+        finally:
+            if not before:
+                watch.kept.note()
+            watch.trust(before)
+
+    return search
+
+
+def _executing(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the execution of a module, with a thread that is not trusted if the module is one
+    of the user.
+    """
+
+    def execute(called: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+        watch = watch_here()
+        module = _module(called, arguments) if watch is not None else None
+        if watch is None or module is None:
+            return function(called, *arguments, **named)
+        watch.bodies[module[0]] = module[1]
+        before = watch.trust(False)
+        try:
+            return function(called, *arguments, **named)
+        finally:
+            watch.trust(before)
+
+    return execute
+
+
+def _module(called: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[str, str] | None:
+    """Return name and file of the module of the user that a call executes, or None."""
+    if called is builtins.exec:
+        name, file = arguments[1].get("__name__"), arguments[1].get("__file__")
+    elif called in _NATIVE:
+        spec = getattr(arguments[0], "__spec__", arguments[0])
+        name, file = getattr(spec, "name", None), getattr(spec, "origin", None)
+    else:
+        return None
+    path = os.path.realpath(file) if file else ""
+    return (str(name), path) if path and not is_installed(path) else None
+
+
+# --- watched threads ------------------------------------------------------------------------------
+
+# Threads that an observed call starts: their calls are the call's, and those of other threads are
+# not.
+
+
+class WatchedThreads:
+    """The two functions that start a thread, wrapped while a call is observed; audit events tell
+    from Python 3.12.
+    """
+
+    def __init__(self) -> None:
+        places: list[tuple[Any, str]] = [(threading.Thread, "start"), (_thread, "start_new_thread")]
+        self._before = [(place, name, getattr(place, name)) for place, name in places]
+
+    def __enter__(self) -> None:
+        for place, name, function in self._before:
+            setattr(
+                place,
+                name,
+                _starting(function) if place is threading.Thread else _starting_nameless(function),
+            )
+
+    def __exit__(self, *_: object) -> None:
+        for place, name, function in self._before:
+            setattr(place, name, function)
+
+
+def _starting(function: Callable[[threading.Thread], None]) -> Callable[[threading.Thread], None]:
+    def start(self: threading.Thread) -> None:
+        if (watch := watch_here()) is not None:
+            watch.add(self)
+        function(self)
+
+    return start
+
+
+def _starting_nameless(function: Callable[..., int]) -> Callable[..., int]:
+    def start_new_thread(*arguments: Any) -> int:
+        watch = watch_here()
+        if watch is not None and not watch.kernel:  # nobody knows whose calls are its
+            watch.records.append(Record("unseen", "a thread that _thread started"))
+        return function(*arguments)
+
+    return start_new_thread
+
+
+# --- quoted source --------------------------------------------------------------------------------
+
+# Who opens a source file of the user: a message that quotes a line, an import or a compiler, or
+# code that reads it?
+#
+# The key follows source without its comments, its layout and its docstrings. A warning or a
+# traceback quotes a line for a reader, and a compiler leaves comments out, so neither makes a
+# result depend on them. Any other reader may.
+
+
+SOURCES = (".py", ".pyc", ".pyw")
+#: modules that quote source in a message, import it, or compile it
+_QUIET = (
+    *(
+        "warnings",
+        "traceback",
+        "logging",
+        "importlib._bootstrap",
+        "importlib._bootstrap_external",
+        "zipimport",
+    ),
+    *("torch", "numba", "triton", "neusee"),
+)
+
+
+def quotes_source(frame: FrameType | None) -> bool:
+    """Return True if the code that opens a source file, down to the code of the user, needs no
+    record.
+    """
+    while frame is not None:
+        name = str(frame.f_globals.get("__name__", ""))
+        if f"{name}.".startswith(_QUIET_STARTS):
+            return True
+        if _is_own(frame.f_code.co_filename):
+            return False
+        frame = frame.f_back
+    return True
+
+
+_QUIET_STARTS = tuple(f"{name}." for name in _QUIET)
+
+
+@functools.lru_cache(1000)
+def _is_own(file: str) -> bool:
+    """Return True for a file of code that is not installed; code without a file is that of those
+    who call it.
+    """
+    return not file.startswith("<") and not is_installed(os.path.realpath(file))
+
+
+# --- audit events ---------------------------------------------------------------------------------
+
+# What Python's own audit events say of an observed call.
+#
+# Where the kernel watches, they add only what it cannot know: that a child process is one of the
+# program. Elsewhere they are the layer that sees files, processes and sockets, as far as Python
+# code asks for them.
+
+
+_installed: list[bool] = []
+_OF_CODE = (*SOURCES, ".pyc", ".so", ".pyd", ".zip", ".egg")  #: files that an import looks for
+
+
+def listen() -> None:
+    """Listen to the events of this process; a hook cannot be taken away, and returns at once
+    between the calls.
+    """
+    if not _installed:
+        _installed.append(True)
+        sys.addaudithook(_heard)
+
+
+def _heard(event: str, arguments: tuple[Any, ...]) -> None:
+    if event not in _EVENTS or (watch := watch_here()) is None:
+        return
+    if event in _FOR_BOTH and not watch.trusted():
+        _FOR_BOTH[event](watch, arguments)
+    if event == "open" and watch.trusted():
+        _settings(watch, arguments)
+    if event == "subprocess.Popen":
+        _program(watch, arguments)
+    elif event in _HANDLERS and not watch.kernel and not watch.trusted():
+        _HANDLERS[event](watch, arguments)
+
+
+def _program(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    """Take note of a child process; the program itself compiles its C++ when it is first used."""
+    if _called_by_program():
+        watch.trust_child()
+    elif not watch.kernel and not watch.trusted():
+        command = arguments[0] or arguments[1]
+        words = (
+            command if isinstance(command, str | bytes | os.PathLike) else next(iter(command), "")
+        )
+        watch.records.append(Record("exec", os.fsdecode(words)))
+
+
+def _called_by_program() -> bool:
+    """Return True if the function that starts a process is one of the nodes of the program."""
+    frame = sys._getframe()
+    while frame.f_back is not None:
+        frame = frame.f_back
+        name = str(frame.f_globals.get("__name__", ""))
+        if name.startswith("neusee.nodes."):
+            return True
+        if not name.startswith((__package__, "subprocess")):
+            return False
+    return False
+
+
+@contextmanager
+def _unwatched(watch: Watch) -> Iterator[None]:
+    """Trust the current thread while this hook itself looks at folders."""
+    before = watch.trust(True)
+    try:
+        yield
+    finally:
+        watch.trust(before)
+
+
+def _source(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    """Take note of a source file that is opened, and of whether a message or a compiler asked
+    for it.
+    """
+    path = arguments[0]
+    if isinstance(path, str | bytes | os.PathLike) and os.fsdecode(path).endswith(SOURCES):
+        frame = sys._getframe(2)
+        with _unwatched(watch):
+            watch.heard(os.path.realpath(os.fsdecode(path)), quotes_source(frame))
+
+
+def _settings(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    """Take note of a file that an installed package reads while it is imported, such as settings in
+    the home folder.
+
+    Its code, its tables and caches are installed: the judgement leaves them out.
+    """
+    path, _, flags = arguments
+    if (
+        isinstance(path, int)
+        or flags & (os.O_CREAT | os.O_TRUNC)
+        or os.fsdecode(path).endswith(_OF_CODE)
+    ):
+        return
+    real = os.path.realpath(os.fsdecode(path))
+    if os.path.isfile(real):
+        watch.settings.add(real)
+
+
+def _copied(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    """Take note of whether the attributes of a file are asked for in order to copy it."""
+    path = arguments[0]
+    if not isinstance(path, int):
+        copies = sys._getframe(2).f_globals.get("__name__") == "shutil"
+        with _unwatched(watch):
+            watch.heard(os.path.realpath(os.fsdecode(path)), copies)
+
+
+def _named_by_chance(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    """Take note of a temporary file, whose name no other process expects."""
+    above, name = os.path.split(os.path.abspath(os.fsdecode(arguments[0])))
+    with _unwatched(watch):
+        watch.temporary.add(os.path.join(os.path.realpath(above), name))
+
+
+def _file(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    path, mode, flags = arguments
+    if isinstance(path, int):
+        return
+    text = os.fsdecode(path)
+    real = os.path.realpath(text)
+    if mode is None and not os.path.isabs(text) and not os.path.lexists(real):
+        real = text  # below an open folder, which the event of ``os.open`` does not name
+    watch.records.append(Record("open", real, "", flags & 0x7FFFFFFF, os.path.lexists(real)))
+
+
+def _of_path(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
+    """Return what takes note of an event whose first argument is a path."""
+
+    def note(watch: Watch, arguments: tuple[Any, ...]) -> None:
+        path = "." if arguments[0] is None else arguments[0]
+        if not isinstance(path, int):
+            real = os.path.realpath(os.fsdecode(path))
+            watch.records.append(Record(does, real, there=os.path.lexists(real)))
+
+    return note
+
+
+def _of_named_path(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
+    """Return what takes note of an event whose first argument is a path, where a link at its end
+    is meant itself.
+    """
+
+    def note(watch: Watch, arguments: tuple[Any, ...]) -> None:
+        text, folder = os.fsdecode(arguments[0]), arguments[-1]
+        if not os.path.isabs(text) and folder != -1:
+            return  # below an open folder that the event does not name
+        above, name = os.path.split(os.path.abspath(text))
+        path = os.path.join(os.path.realpath(above), name)
+        watch.records.append(Record(does, path, there=os.path.lexists(path)))
+
+    return note
+
+
+def _of_two_paths(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
+    def note(watch: Watch, arguments: tuple[Any, ...]) -> None:
+        first, second = (os.path.abspath(os.fsdecode(path)) for path in arguments[:2])
+        watch.records.append(Record(does, first, second, there=os.path.lexists(first)))
+
+    return note
+
+
+def _library(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    name = os.fsdecode(arguments[0] or "")
+    if "/" in name:
+        watch.records.append(Record("open", os.path.realpath(name), flags=os.O_RDONLY))
+
+
+def _database(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    name = os.fsdecode(arguments[0])
+    if name and name != ":memory:":
+        real = os.path.realpath(name)
+        watch.records.append(
+            Record("open", real, "", os.O_RDWR | os.O_CREAT, os.path.lexists(real))
+        )
+
+
+def _of_address(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
+    """Return what takes note of an event with a socket and an address."""
+
+    def note(watch: Watch, arguments: tuple[Any, ...]) -> None:
+        address = arguments[1]
+        unix = isinstance(address, str | bytes)
+        where = os.path.realpath(os.fsdecode(address)) if unix else ":".join(map(str, address))
+        watch.records.append(Record(does, where, "unix" if unix else "internet"))
+
+    return note
+
+
+def _named(does: Does, path: str) -> Callable[[Watch, tuple[Any, ...]], None]:
+    """Return what takes note of an event without its arguments."""
+    return lambda watch, arguments: watch.records.append(Record(does, path))
+
+
+def _command(watch: Watch, arguments: tuple[Any, ...]) -> None:
+    watch.records.append(Record("exec", os.fsdecode(arguments[0])))
+
+
+_Handler = Callable[[Watch, tuple[Any, ...]], None]
+_HANDLERS: dict[str, _Handler] = {
+    "open": _file,
+    "os.listdir": _of_path("list"),
+    "os.scandir": _of_path("list"),
+    "os.mkdir": _of_named_path("make"),
+    "os.remove": _of_named_path("remove"),
+    "os.rmdir": _of_named_path("remove"),
+    "os.symlink": lambda watch, arguments: _of_named_path("make")(
+        watch, (arguments[1], arguments[2])
+    ),
+    "os.rename": _of_two_paths("move"),
+    "os.link": _of_two_paths("link"),
+    "os.truncate": _of_path("check"),
+    "os.chmod": _of_path("check"),
+    "os.utime": _of_path("check"),
+    "os.getxattr": _of_path("xattr"),
+    "os.listxattr": _of_path("xattr"),
+    "os.system": _command,
+    "os.posix_spawn": _command,
+    "os.exec": _command,
+    "os.spawn": lambda watch, arguments: _command(watch, arguments[1:]),
+    "os.startfile": _command,
+    "os.fork": _named("fork", "fork"),
+    "os.forkpty": _named("fork", "fork"),
+    "pty.spawn": lambda watch, arguments: watch.records.append(Record("exec", str(arguments[0]))),
+    "socket.connect": _of_address("connect"),
+    "socket.sendto": _of_address("connect"),
+    "socket.bind": _of_address("bind"),
+    "socket.getaddrinfo": lambda watch, arguments: watch.records.append(
+        Record("connect", str(arguments[0]), "internet")
+    ),
+    "sqlite3.connect": _database,
+    "ctypes.dlopen": _library,
+    "builtins.input": _named("input", "the terminal"),
+}
+_FOR_BOTH: dict[str, _Handler] = {
+    "open": _source,
+    "os.getxattr": _copied,
+    "os.listxattr": _copied,
+    "tempfile.mkstemp": _named_by_chance,
+    "tempfile.mkdtemp": _named_by_chance,
+}  #: what only the interpreter knows of a call: who makes it
+_EVENTS = frozenset({"subprocess.Popen", *_HANDLERS, *_FOR_BOTH})

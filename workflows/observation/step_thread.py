@@ -1,4 +1,5 @@
-"""A fresh thread that runs a function as its caller would: with its context, its modes of torch, its exceptions.
+"""A fresh thread that runs a function as its caller would: with its context, its modes of torch,
+its exceptions.
 
 The thread is fresh because the filter of the kernel stays with a thread for ever.
 """
@@ -17,7 +18,9 @@ import torch
 
 T = TypeVar("T")
 #: names of the threads of this program, and of a worker of dask that computes its steps
-_OWN = re.compile(r"(MainThread|neusee|\d+-Dask-|Dask-Offload|Nanny stop queue|Thread-\d+ \(monitor_parent\)).*")
+_OWN = re.compile(
+    r"(MainThread|neusee|\d+-Dask-|Dask-Offload|Nanny stop queue|Thread-\d+ \(monitor_parent\)).*"
+)
 _LOOK = 0.05  #: s after which a waiting caller sees an exception that another thread raises in it
 _raise_in = ctypes.pythonapi.PyThreadState_SetAsyncExc
 
@@ -36,7 +39,8 @@ class StepThread(Generic[T]):
         self._modes = _modes()
         self._value: T
         self._error: BaseException | None = None
-        self.unprepared: Exception | None = None  #: the error of ``prepare``; the function did not run
+        #: the error of ``prepare``; the function did not run
+        self.unprepared: Exception | None = None
         self._ended = False
         self._begin, self._end = threading.Lock(), threading.Lock()
         self._begin.acquire()
@@ -46,13 +50,16 @@ class StepThread(Generic[T]):
     def run(self) -> None:
         """Run the function in the thread, and wait until it has ended.
 
-        An exception that is raised in the waiting thread is raised in the step too. A Ctrl-C does not wait for the step
-        to end, any other one does: the memory of a step that was stopped must be free.
+        An exception that is raised in the waiting thread is raised in the step too. A Ctrl-C does
+        not wait for the step to end, any other one does: the memory of a step that was stopped must
+        be free.
         """
         try:
             try:
                 self.thread.start()
-            finally:  # the step waits for it: an exception in the middle of `Thread.start` would leave half a thread
+            # the step waits for it: an exception in the middle of `Thread.start` would leave half a
+            # thread
+            finally:
                 self._begin.release()
             self._join()
         except KeyboardInterrupt:
@@ -73,7 +80,9 @@ class StepThread(Generic[T]):
         return self._value
 
     def _join(self) -> None:
-        """Wait for the end; an exception in the middle of `Thread.join` would leave a thread that only seems to end."""
+        """Wait for the end; an exception in the middle of `Thread.join` would leave a thread
+        that only seems to end.
+        """
         while not self._ended:
             self._end.acquire(timeout=_LOOK)
 
@@ -94,7 +103,8 @@ class StepThread(Generic[T]):
 
     def _is_prepared(self) -> bool:
         with_garbage = gc.isenabled()
-        gc.disable()  # a finalizer could make a call that is stopped before there is anybody to answer it
+        # a finalizer could make a call that is stopped before there is anybody to answer it
+        gc.disable()
         try:
             self._prepare()
         except Exception as error:
@@ -115,6 +125,13 @@ class StepThread(Generic[T]):
 
 
 def _modes() -> tuple[bool, bool, int, Any]:
-    """Return what torch keeps for each thread: gradients, inference, number of threads, current device."""
+    """Return what torch keeps for each thread: gradients, inference, number of threads, current
+    device.
+    """
     device = torch.cuda.current_device() if torch.cuda.is_initialized() else None  # type: ignore[no-untyped-call]
-    return torch.is_grad_enabled(), torch.is_inference_mode_enabled(), torch.get_num_threads(), device
+    return (
+        torch.is_grad_enabled(),
+        torch.is_inference_mode_enabled(),
+        torch.get_num_threads(),
+        device,
+    )

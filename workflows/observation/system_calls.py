@@ -1,20 +1,47 @@
-"""Table of the system calls that a step is stopped at: numbers, what each does, and where its arguments stand.
-
-A call that is not in the table passes at full speed. A row that changes what counts as reached is a row of this table;
-the filter and the process that serves it are made from it.
-"""
+"""System calls that a step is stopped at: their table, the filter, and what each one did."""
 
 from __future__ import annotations
 
+import ctypes
+import errno
+import os
 import platform
+import socket
+import struct
 import sys
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
+
+# --- system calls ---------------------------------------------------------------------------------
+
+# Table of the system calls that a step is stopped at: numbers, what each does, and where its
+# arguments stand.
+#
+# A call that is not in the table passes at full speed. A row that changes what counts as reached is
+# a row of this table; the filter and the process that serves it are made from it.
+
 
 #: what a call does, for the process that records it and for the judgement of the records
 Does = Literal[
-    "open", "openat2", "creat", "check", "xattr", "xattr_open", "list", "input", "make", "remove", "move", "link",
-    "exec", "fork", "connect", "bind", "entropy", "unseen",
-]  # fmt: skip
+    "open",
+    "openat2",
+    "creat",
+    "check",
+    "xattr",
+    "xattr_open",
+    "list",
+    "input",
+    "make",
+    "remove",
+    "move",
+    "link",
+    "exec",
+    "fork",
+    "connect",
+    "bind",
+    "entropy",
+    "unseen",
+]
 Test = Literal["without", "nonzero", "zero"]
 
 AT_EMPTY_PATH = 0x1000  #: the call asks about an open file, not about a path
@@ -24,7 +51,9 @@ AUDIT_ARCH_I386 = 0x40000003
 
 
 class Condition(NamedTuple):
-    """What an argument must be for the call to count: ``without`` the bits of a mask, ``nonzero`` or ``zero``."""
+    """What an argument must be for the call to count: ``without`` the bits of a mask,
+    ``nonzero`` or ``zero``.
+    """
 
     argument: int
     test: Test
@@ -32,14 +61,18 @@ class Condition(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Where the arguments of a path stand: the pointer, and the folder that a relative path begins at (-1: of work)."""
+    """Where the arguments of a path stand: the pointer, and the folder that a relative path
+    begins at (-1: of work).
+    """
 
     pointer: int
     folder: int = -1
 
 
 class Call(NamedTuple):
-    """One system call: its number on each processor (-1 where it is missing), and where its arguments stand."""
+    """One system call: its number on each processor (-1 where it is missing), and where its
+    arguments stand.
+    """
 
     name: str
     does: Does
@@ -85,7 +118,8 @@ CALLS = (
     Call("chmod", "check", 90, -1, Path(0)),
     Call("fchmodat", "check", 268, 53, Path(1, 0)),
     Call("utimensat", "check", 280, 88, Path(1, 0), when=Condition(1, "nonzero")),
-    # what the step makes itself, and may therefore read; whether it could be made or removed says what was there before
+    # what the step makes itself, and may therefore read; whether it could be made or removed says
+    # what was there before
     Call("mkdir", "make", 83, -1, Path(0)),
     Call("mkdirat", "make", 258, 34, Path(1, 0)),
     Call("mknod", "make", 133, -1, Path(0)),
@@ -121,17 +155,31 @@ CALLS = (
     Call("getrandom", "entropy", 318, 278, number=1),
 )  # fmt: skip
 
-#: calls of 32 bits that open, look or start something; a 64-bit process that makes one is out of the ordinary
+#: calls of 32 bits that open, look or start something; a 64-bit process that makes one is out of
+#: the ordinary
 CALLS_OF_32_BITS = {
-    "open": 5, "creat": 8, "execve": 11, "stat": 106, "socketcall": 102, "stat64": 195, "openat": 295,
-    "getrandom": 355, "execveat": 358, "connect": 362, "openat2": 437,
-}  # fmt: skip
+    "open": 5,
+    "creat": 8,
+    "execve": 11,
+    "stat": 106,
+    "socketcall": 102,
+    "stat64": 195,
+    "openat": 295,
+    "getrandom": 355,
+    "execveat": 358,
+    "connect": 362,
+    "openat2": 437,
+}
 
 
 def machine() -> str:
-    """Return the processor if the table has its numbers: ``x86_64`` or ``aarch64``, of 64 bits, else an empty text."""
+    """Return the processor if the table has its numbers: ``x86_64`` or ``aarch64``, of 64 bits,
+    else an empty text.
+    """
     name = platform.machine()
-    return name if sys.platform == "linux" and name in _ARCHITECTURES and sys.maxsize > 2**32 else ""
+    return (
+        name if sys.platform == "linux" and name in _ARCHITECTURES and sys.maxsize > 2**32 else ""
+    )
 
 
 def audit_arch(name: str) -> int:
@@ -141,5 +189,378 @@ def audit_arch(name: str) -> int:
 
 def numbers(name: str) -> dict[int, Call]:
     """Return the calls of a processor by their numbers."""
-    found = {call.x86_64 if name == "x86_64" else call.aarch64: call for call in CALLS}
-    return {number: call for number, call in found.items() if number >= 0}
+    calls = {call.x86_64 if name == "x86_64" else call.aarch64: call for call in CALLS}
+    return {number: call for number, call in calls.items() if number >= 0}
+
+
+# --- seccomp filter -------------------------------------------------------------------------------
+
+# Filter of the kernel that stops a thread, and what the thread starts, at the system calls of the
+# table.
+#
+# The filter belongs to the thread that installs it and cannot be taken away: install it in a thread
+# made for it. Its threads and child processes inherit it. A stopped call waits until the listener,
+# a file descriptor, is answered.
+
+
+PR_SET_NO_NEW_PRIVS = 38
+SECCOMP_SET_MODE_FILTER, SECCOMP_GET_ACTION_AVAIL = 1, 2
+SECCOMP_FILTER_FLAG_NEW_LISTENER = 1 << 3
+#: from Linux 5.19: a signal does not cut a stopped call short
+SECCOMP_FILTER_FLAG_WAIT_KILLABLE_RECV = 1 << 5
+SECCOMP_RET_USER_NOTIF, SECCOMP_RET_ALLOW = 0x7FC00000, 0x7FFF0000
+_SECCOMP = {"x86_64": 317, "aarch64": 277}  #: number of the call that installs a filter
+_X32 = 0x40000000  #: bit of the number of a call of the x32 convention, which no table has
+
+#: instructions of linux/bpf_common.h
+BPF_LD_W_ABS, BPF_JEQ, BPF_JGE, BPF_JSET, BPF_RET = 0x20, 0x15, 0x35, 0x45, 0x06
+#: places in ``struct seccomp_data``; both processors keep the lower half of an argument first
+_NUMBER, _ARCH, _ARGUMENTS = 0, 4, 16
+
+
+class sock_filter(ctypes.Structure):
+    """One instruction, as in linux/filter.h."""
+
+    _fields_ = (
+        ("code", ctypes.c_uint16),
+        ("jt", ctypes.c_uint8),
+        ("jf", ctypes.c_uint8),
+        ("k", ctypes.c_uint32),
+    )
+
+
+class sock_fprog(ctypes.Structure):
+    """A program of instructions, as in linux/filter.h."""
+
+    _fields_ = (("len", ctypes.c_uint16), ("filter", ctypes.POINTER(sock_filter)))
+
+
+class Step(NamedTuple):
+    """One instruction: its code, how many to skip where its test holds and where not, and its
+    operand.
+    """
+
+    code: int
+    then: int
+    otherwise: int
+    operand: int
+
+
+_STOP, _PASS = Step(BPF_RET, 0, 0, SECCOMP_RET_USER_NOTIF), Step(BPF_RET, 0, 0, SECCOMP_RET_ALLOW)
+
+
+def program(name: str) -> list[Step]:
+    """Return the instructions of the filter for a processor."""
+    of_32_bits = _calls_of_32_bits() if name == "x86_64" else []
+    x32 = [Step(BPF_JGE, 0, 1, _X32), _STOP] if name == "x86_64" else []
+    calls = [step for number, call in numbers(name).items() for step in _call(number, call.when)]
+    usual = [_load(_NUMBER), *x32, *calls, _PASS]
+    return [
+        _load(_ARCH),
+        Step(BPF_JEQ, len(of_32_bits) + 1, 0, audit_arch(name)),
+        *of_32_bits,
+        _PASS,
+        *usual,
+    ]
+
+
+def _calls_of_32_bits() -> list[Step]:
+    stops = [
+        step
+        for number in CALLS_OF_32_BITS.values()
+        for step in (Step(BPF_JEQ, 0, 1, number), _STOP)
+    ]
+    return [Step(BPF_JEQ, 0, len(stops) + 1, AUDIT_ARCH_I386), _load(_NUMBER), *stops]
+
+
+def _call(number: int, when: Condition | None) -> list[Step]:
+    inside = [*_test(when), _STOP]
+    return [Step(BPF_JEQ, 0, len(inside), number), *inside]
+
+
+def _test(when: Condition | None) -> list[Step]:
+    """Return instructions that let a call pass unless its argument is what the table says."""
+    if when is None:
+        return []
+    low, high = _load(_ARGUMENTS + 8 * when.argument), _load(_ARGUMENTS + 8 * when.argument + 4)
+    if when.test == "without":
+        return [low, Step(BPF_JSET, 0, 1, when.mask), _PASS]
+    if when.test == "zero":
+        return [low, Step(BPF_JEQ, 1, 0, 0), _PASS]
+    return [low, Step(BPF_JEQ, 0, 3, 0), high, Step(BPF_JEQ, 0, 1, 0), _PASS]
+
+
+def _load(place: int) -> Step:
+    return Step(BPF_LD_W_ABS, 0, 0, place)
+
+
+class Filter:
+    """The filter of this processor, made once and installed in each observed thread."""
+
+    def __init__(self) -> None:
+        steps = program(machine())
+        self._steps = (sock_filter * len(steps))(*(sock_filter(*step) for step in steps))
+        self._program = sock_fprog(len(steps), self._steps)
+        self._libc = ctypes.CDLL(None, use_errno=True)
+        self._call = _SECCOMP[machine()]
+        self._flags = SECCOMP_FILTER_FLAG_NEW_LISTENER | SECCOMP_FILTER_FLAG_WAIT_KILLABLE_RECV
+
+    def install(self) -> int:
+        """Install the filter in the current thread and return its listener; raise `OSError` where
+        that fails.
+
+        From here the thread waits at the calls of the table until somebody serves the listener.
+        """
+        if self._libc.prctl(PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0):
+            raise OSError(ctypes.get_errno(), "the thread may not give up new rights")
+        listener = self._seccomp(SECCOMP_SET_MODE_FILTER, self._flags, ctypes.byref(self._program))
+        if listener < 0 and ctypes.get_errno() == errno.EINVAL:  # before Linux 5.19
+            self._flags = SECCOMP_FILTER_FLAG_NEW_LISTENER
+            listener = self._seccomp(
+                SECCOMP_SET_MODE_FILTER, self._flags, ctypes.byref(self._program)
+            )
+        if listener < 0:
+            raise OSError(ctypes.get_errno(), f"no filter: {os.strerror(ctypes.get_errno())}")
+        return listener
+
+    def offered(self) -> bool:
+        """Return True if the kernel hands stopped calls to a listener."""
+        action = ctypes.c_uint32(SECCOMP_RET_USER_NOTIF)
+        return self._seccomp(SECCOMP_GET_ACTION_AVAIL, 0, ctypes.byref(action)) == 0
+
+    def _seccomp(self, operation: int, flags: int, argument: object) -> int:
+        return int(self._libc.syscall(self._call, operation, flags, argument))
+
+
+# --- stopped task ---------------------------------------------------------------------------------
+
+# Thread that the kernel has stopped at a system call: its memory, its open files and its folders.
+#
+# The thread waits, so what it handed to the call is read from the outside, from the files of
+# ``/proc``.
+
+
+AT_FDCWD = -100  #: in place of an open folder: the folder of work
+_LONGEST = 4096  #: bytes of a path: PATH_MAX
+
+
+class Task:
+    """One thread, by its number."""
+
+    def __init__(self, thread: int) -> None:
+        self.thread = thread
+
+    def memory(self, address: int, length: int) -> bytes:
+        """Return bytes of the memory of the thread, fewer where its memory ends."""
+        file = os.open(f"/proc/{self.thread}/mem", os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            return os.pread(file, length, address)
+        finally:
+            os.close(file)
+
+    def text(self, address: int) -> str:
+        """Return the path at an address."""
+        return os.fsdecode(self.memory(address, _LONGEST).partition(b"\0")[0])
+
+    def link(self, name: str) -> str:
+        """Return the path of an open file, ``fd/3``, or of the folder of work, ``cwd``."""
+        return os.readlink(f"/proc/{self.thread}/{name}")
+
+    def status(self, word: str) -> int:
+        """Return a number of the status of the thread, such as ``Tgid``."""
+        with open(f"/proc/{self.thread}/status", encoding="ascii", errors="replace") as lines:
+            return next(int(line.split()[1]) for line in lines if line.startswith(f"{word}:"))
+
+    def path(self, text: str, folder: int, follow: bool = True) -> str:
+        """Return the real path of a text, which begins at the open folder ``folder`` if it is
+        relative.
+
+        Without ``follow``, a link at the end of the path stays.
+        """
+        if not text.startswith("/"):
+            text = os.path.join(self.link("cwd" if folder == AT_FDCWD else f"fd/{folder}"), text)
+        # of the thread, not of the process that reads this
+        for own in ("/proc/self", "/proc/thread-self"):
+            if f"{text}/".startswith(f"{own}/"):
+                text = f"/proc/{self.thread}{text.removeprefix(own)}"
+        if follow:
+            return os.path.realpath(text)
+        above, name = os.path.split(text.rstrip("/"))
+        return os.path.join(os.path.realpath(above), name)
+
+
+# --- recorded call --------------------------------------------------------------------------------
+
+# Record of one thing that a step reached, made from a stopped system call: what was done, with real
+# paths.
+
+
+class Record(NamedTuple):
+    """One thing that was reached."""
+
+    does: Does
+    path: str  #: real path, or an address
+    second: str = ""  #: the other path of a call with two, or the family of an address
+    flags: int = 0  #: of ``open``
+    there: bool = True  #: the path existed before the call
+    trusted: bool = False  #: an import of an installed package, or the program, did it
+
+
+def recorded(task: Task, call: Call, arguments: Sequence[int]) -> Record:
+    """Return the record of a stopped call; raise `OSError` if what the task handed over cannot
+    be read.
+    """
+    return _READ[call.does](task, call, arguments)
+
+
+def without_reading(record: Record) -> Record | None:
+    """Return what remains of a call of a trusted task: the step may read what was made, and
+    nothing else counts.
+    """
+    if record.does == "open" and record.flags & (os.O_CREAT | os.O_TRUNC):
+        return record._replace(flags=(record.flags & ~os.O_ACCMODE) | os.O_WRONLY, trusted=True)
+    return record._replace(trusted=True) if record.does in ("make", "move") else None
+
+
+def _number(call: Call, arguments: Sequence[int]) -> int:
+    return arguments[call.number] & 0x7FFFFFFF
+
+
+def _path(task: Task, place: Path | None, arguments: Sequence[int], follow: bool = True) -> str:
+    assert place is not None
+    folder = AT_FDCWD if place.folder < 0 else _signed(arguments[place.folder])
+    return task.path(task.text(arguments[place.pointer]), folder, follow)
+
+
+def _signed(argument: int) -> int:
+    """Return an argument of 32 bits with its sign."""
+    low = argument & 0xFFFFFFFF
+    return low - (low >> 31 << 32)
+
+
+def _opened(task: Task, call: Call, arguments: Sequence[int]) -> Record:
+    if call.does == "creat":
+        flags = os.O_CREAT | os.O_WRONLY | os.O_TRUNC
+    elif (
+        call.does == "openat2"
+    ):  # the pointer to a ``struct open_how``, whose first field are the flags
+        flags = int(struct.unpack("Q", task.memory(arguments[call.number], 8))[0])
+    else:
+        flags = _number(call, arguments)
+    path = _path(task, call.path, arguments)
+    return Record("open", path, "", flags, os.path.lexists(path))
+
+
+def _at_path(task: Task, call: Call, arguments: Sequence[int]) -> Record:
+    itself = call.does in ("make", "remove")  # a link at the end of the path is meant itself
+    path = _path(task, call.path, arguments, follow=not itself)
+    return Record(call.does, path, there=os.path.lexists(path))
+
+
+def _two_paths(task: Task, call: Call, arguments: Sequence[int]) -> Record:
+    first, second = (
+        _path(task, place, arguments, follow=False) for place in (call.path, call.second)
+    )
+    return Record(call.does, first, second, there=os.path.lexists(first))
+
+
+def _descriptor(task: Task, call: Call, arguments: Sequence[int]) -> Record:
+    does: Does = "xattr" if call.does == "xattr_open" else call.does
+    return Record(does, task.link(f"fd/{_number(call, arguments)}"))
+
+
+def _address(task: Task, call: Call, arguments: Sequence[int]) -> Record:
+    assert call.path is not None
+    data = task.memory(arguments[call.path.pointer], min(_number(call, arguments), 128))
+    family = struct.unpack_from("H", data)[0] if len(data) > 1 else socket.AF_UNSPEC
+    if family == socket.AF_UNIX:
+        name = os.fsdecode(data[2:].partition(b"\0")[0])
+        return Record(
+            call.does, task.path(name, AT_FDCWD) if name else f"@{os.fsdecode(data[3:])}", "unix"
+        )
+    if family in (socket.AF_INET, socket.AF_INET6):
+        start, length = (4, 4) if family == socket.AF_INET else (8, 16)
+        host = socket.inet_ntop(family, data[start : start + length])
+        return Record(call.does, f"{host}:{struct.unpack_from('!H', data, 2)[0]}", "internet")
+    # the kernel itself answers a netlink socket, and a socket without a family is only let go
+    return Record(
+        call.does,
+        f"family {family}",
+        "" if family in (socket.AF_UNSPEC, socket.AF_NETLINK) else "other",
+    )
+
+
+def _named(task: Task, call: Call, arguments: Sequence[int]) -> Record:
+    return Record(call.does, call.name)
+
+
+def _entropy(task: Task, call: Call, arguments: Sequence[int]) -> Record:
+    length, flags = arguments[call.number], arguments[call.number + 1]
+    return Record(
+        "entropy", f"{call.name} of {length} bytes", flags=flags & 0xFF, there=length > _SMALL
+    )
+
+
+#: bytes of chance that Python and the library of C take for names of files and places in memory,
+#: and no result has
+_SMALL = 32
+_READ: dict[Does, Callable[[Task, Call, Sequence[int]], Record]] = {
+    **dict.fromkeys(("open", "openat2", "creat"), _opened),
+    **dict.fromkeys(("check", "xattr", "make", "remove", "exec"), _at_path),
+    **dict.fromkeys(("move", "link"), _two_paths),
+    **dict.fromkeys(("list", "input", "xattr_open"), _descriptor),
+    **dict.fromkeys(("connect", "bind"), _address),
+    **dict.fromkeys(("fork", "unseen"), _named),
+    "entropy": _entropy,
+}
+
+
+# --- trusted tasks --------------------------------------------------------------------------------
+
+# Threads and processes whose calls need no record, because the program, or an installed package,
+# makes them.
+#
+# The observed process says so itself, in order with its calls: it asks for rights to a file that
+# nobody can have, and the call stops.
+
+
+#: marks in place of the rights that ``access`` asks for: whose calls follow. The kernel refuses
+#: them.
+TRUSTED, UNTRUSTED, CHILD = 0x6E650001, 0x6E650002, 0x6E650003
+MARKS = (TRUSTED, UNTRUSTED, CHILD)
+
+
+class TrustedTasks:
+    """Threads that import an installed package, and child processes that the program or such a
+    thread starts.
+    """
+
+    def __init__(self, process: int) -> None:
+        self._process = process  #: that is observed
+        self._children = 0  #: child processes that the program is about to start
+        self._of_thread: dict[int, bool] = {}
+        self._of_process: dict[int, bool] = {}
+
+    def mark(self, thread: int, mark: int) -> None:
+        """Take note of a mark that the observed process made."""
+        if mark == CHILD:
+            self._children += 1
+        else:
+            self._of_thread[thread] = mark == TRUSTED
+
+    def holds(self, task: Task) -> bool:
+        """Return True if the calls of a task need no record."""
+        if task.thread not in self._of_thread:
+            process = task.status("Tgid")
+            self._of_thread[task.thread] = process != self._process and self._child(process)
+        return self._of_thread[task.thread]
+
+    def _child(self, process: int) -> bool:
+        if process not in self._of_process:
+            parent = Task(process).status("PPid")
+            trusted = self._of_process.get(parent, False)
+            if parent == self._process:
+                trusted = self._children > 0 or any(self._of_thread.values())
+                self._children -= self._children > 0
+            self._of_process[process] = trusted
+        return self._of_process[process]

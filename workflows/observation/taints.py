@@ -1,13 +1,42 @@
-"""What is covered by the key of a step, and what a step reached beyond it."""
+"""What the key of a step covers, and the judgement of what the step reached beyond it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator, Set
+from itertools import chain
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from neusee.workflows.observation.covered_paths import (
+    caches,
+    is_chance,
+    is_installed,
+    is_of_system,
+    is_searched_program,
+    looked_at,
+    program,
+)
+from neusee.workflows.observation.system_calls import Record
+
+# --- taints ---------------------------------------------------------------------------------------
+
+# What is covered by the key of a step, and what a step reached beyond it.
+
+
 Kind = Literal[
-    "file", "folder", "write", "attribute", "process", "network", "random", "import", "memory", "variable", "unknown"
+    "file",
+    "folder",
+    "write",
+    "attribute",
+    "process",
+    "network",
+    "random",
+    "import",
+    "memory",
+    "variable",
+    "unknown",
 ]
 
 
@@ -28,18 +57,36 @@ class Taint(NamedTuple):
 
 _OF_PATHS = ("file", "folder", "write", "attribute")
 _FIX: dict[Kind, str] = {
-    "file": 'declare it, depends=["{name}"], or make it a parameter of type DataFile; or write cache: false',
-    "folder": 'declare the folder, depends=["{name}"], or make its files a parameter of type DataFiles; or write '
-    "cache: false",
-    "write": 'empty the file where it is opened, mode "w", or write to a temporary one; or, if no result depends on '
-    'what was there before, depends=["unaffected:{name}"]; or write cache: false',
+    "file": (
+        'declare it, depends=["{name}"], or make it a parameter of type DataFile; or write cache:'
+        " false"
+    ),
+    "folder": (
+        'declare the folder, depends=["{name}"], or make its files a parameter of type DataFiles;'
+        " or write cache: false"
+    ),
+    "write": (
+        'empty the file where it is opened, mode "w", or write to a temporary one; or, if no result'
+        ' depends on what was there before, depends=["unaffected:{name}"]; or write cache: false'
+    ),
     "attribute": "give it as a parameter; or write cache: false",
-    "process": "compute it in the node, or run it before and give its output as a DataFile; or write cache: false",
+    "process": (
+        "compute it in the node, or run it before and give its output as a DataFile; or write"
+        " cache: false"
+    ),
     "network": "fetch it before and give the file as a DataFile; or write cache: false",
-    "random": "draw from an argument rng of the node, a generator that the engine seeds; or write cache: false",
-    "import": 'write the import as a statement, or declare the module: depends=["{name}"]; or write cache: false',
-    "memory": "return it as a value to the steps that read it, or, if no result depends on it, declare "
-    'depends=["unaffected:{name}"]; or write cache: false',
+    "random": (
+        "draw from an argument rng of the node, a generator that the engine seeds; or write cache:"
+        " false"
+    ),
+    "import": (
+        'write the import as a statement, or declare the module: depends=["{name}"]; or write'
+        " cache: false"
+    ),
+    "memory": (
+        "return it as a value to the steps that read it, or, if no result depends on it, declare "
+        'depends=["unaffected:{name}"]; or write cache: false'
+    ),
     "variable": 'make it a parameter, or declare it, depends=["env:{name}"]; or write cache: false',
     "unknown": "write cache: false",
 }
@@ -56,14 +103,273 @@ _OF_CHANCE = {
 }
 
 
-def taint(kind: Kind, what: str) -> Taint:
+def taint(kind: Kind, name: str) -> Taint:
     """Return a taint with what to write against it."""
-    fix = _FIX[kind].format(name=_short(kind, what))
-    return Taint(kind, what, f"{_OF_CHANCE[what]}; or {fix}" if kind == "random" and what in _OF_CHANCE else fix)
+    fix = _FIX[kind].format(name=_short(kind, name))
+    return Taint(
+        kind,
+        name,
+        f"{_OF_CHANCE[name]}; or {fix}" if kind == "random" and name in _OF_CHANCE else fix,
+    )
 
 
-def _short(kind: Kind, what: str) -> str:
+def _short(kind: Kind, name: str) -> str:
     """Return the last name of a file or of something in a module, by which it is declared."""
     if kind == "memory":
-        return what.rpartition(".")[2]
-    return Path(what).name if kind in _OF_PATHS else what
+        return name.rpartition(".")[2]
+    return Path(name).name if kind in _OF_PATHS else name
+
+
+# --- judgement ------------------------------------------------------------------------------------
+
+# Which of the things that a step reached are not covered by its key?
+
+
+_ACCESS = os.O_RDONLY | os.O_WRONLY | os.O_RDWR
+_PATH = getattr(os, "O_PATH", 0)
+_TMPFILE = getattr(os, "O_TMPFILE", 0)
+_GRND_NONBLOCK, _GRND_INSECURE = 1, 4
+
+
+class Judgement:
+    """The taints of one call, from its records in their order."""
+
+    def __init__(
+        self,
+        covered: Covered,
+        bodies: dict[str, str],
+        quiet: Set[str] = frozenset(),
+        temporary: Set[str] = frozenset(),
+    ) -> None:
+        """Judge by what the key covers, and by what the process knows: see `python_watch.Watch`."""
+        self._covered, self._bodies = covered, bodies
+        self._quiet, self._temporary = quiet, temporary
+        self._files = {str(path) for path in covered.files}
+        self._made: set[str] = set()  #: files and folders that the call itself made
+        self._caches = set(caches())
+        self._folders = _with_all_parents((*self._files, *program(), *self._caches, *looked_at()))
+        self._looks: dict[str, None] = {}  #: paths that were looked at and are not covered
+        self._taints: dict[Taint, None] = {}
+
+    def judge(self, records: Iterable[Record]) -> None:
+        """Add the taints of records."""
+        for record in records:
+            getattr(self, f"_{record.does}")(record)
+
+    def add(self, kind: Kind, name: str) -> None:
+        """Add a taint."""
+        self._taints[taint(kind, name)] = None
+
+    def judge_modules(self) -> None:
+        """Add a taint for each module of the user that was executed and that the key does not
+        follow.
+        """
+        for name in self._bodies:
+            if not self._covered.modules(name):
+                self.add("import", name)
+
+    def taints(self) -> tuple[Taint, ...]:
+        """Return the taints, each once; a look at a folder on the way to another one is none."""
+        reached = [
+            reached_item.what
+            for reached_item in self._taints
+            if reached_item.kind in ("file", "folder", "write")
+        ]
+        on_the_way = set[str]()
+        for path in (*reached, *self._looks):
+            on_the_way.update(_with_parents(path)[1:])
+        for path in self._looks:
+            if path not in on_the_way:
+                self._read(path)
+        return tuple(self._taints)
+
+    # --- what was done ----------------------------------------------------------------------------
+
+    def _open(self, record: Record) -> None:
+        """Judge a file that was opened: whoever does not empty it may learn its length, or that
+        it was there.
+        """
+        flags = record.flags
+        if _TMPFILE and flags & _TMPFILE == _TMPFILE:
+            return  # a new file without a name
+        if flags & os.O_CREAT and (flags & os.O_EXCL or not (record.there or flags & os.O_TRUNC)):
+            self._make(record)
+        elif flags & os.O_TRUNC and flags & _ACCESS != os.O_RDONLY:
+            self._add_made(record.path)
+        elif flags & _PATH or os.path.isdir(record.path):
+            self._check(record)
+        elif flags & _ACCESS == os.O_WRONLY:
+            self._meet(record)
+        else:
+            self._read(record.path)
+            self._read_source(record.path)
+
+    def _make(self, record: Record) -> None:
+        """Judge what is made if it is not there: that it could be made says that it was not
+        there before.
+        """
+        if record.there or os.path.lexists(record.path):  # the next run finds it
+            self._meet(record)
+        if not record.there:
+            self._add_made(record.path)
+
+    def _remove(self, record: Record) -> None:
+        self._meet(record)
+
+    def _meet(self, record: Record) -> None:
+        """Judge a path where the success of a call depends on what was there before."""
+        path, named_by_chance = (
+            record.path,
+            any(above in self._temporary for above in _with_parents(record.path)),
+        )
+        free = record.trusted or named_by_chance or path in self._folders
+        if not (free or self._is_covered(path) or is_searched_program(path)):
+            self.add("write", path)
+
+    def _move(self, record: Record) -> None:
+        """Follow a file of the step to its new name; any other file is read there, perhaps in a
+        folder of the step.
+        """
+        if os.path.isdir(record.second):  # one that is there stops a move
+            self._meet(record._replace(path=record.second))
+        if self._is_made(record.path):
+            self._add_made(record.second)
+        elif record.there or not record.trusted:
+            self._read(record.path)
+
+    def _link(self, record: Record) -> None:
+        if os.path.lexists(record.second):
+            self._meet(record._replace(path=record.second))
+        self._move(record)
+
+    def _xattr(self, record: Record) -> None:
+        """Judge marks beside a file: no key has them, also of a file that is covered."""
+        if record.path not in self._quiet and not (
+            self._is_made(record.path) or self._is_of_machine(record.path)
+        ):
+            self.add("attribute", record.path)
+
+    def _check(self, record: Record) -> None:
+        if not (
+            record.path in self._folders
+            or self._is_covered(record.path)
+            or is_searched_program(record.path)
+        ):
+            self._looks[record.path] = None
+
+    def _list(self, record: Record) -> None:
+        if not self._is_covered(record.path):
+            self.add("folder", record.path)
+
+    def _input(self, record: Record) -> None:
+        self._read(record.path)
+
+    def _exec(self, record: Record) -> None:
+        if record.there:
+            self.add("process", record.path)
+
+    def _fork(self, record: Record) -> None:
+        self.add("process", "a fork of this process")
+
+    def _connect(self, record: Record) -> None:
+        own = record.second == "unix" and (self._is_made(record.path) or is_of_system(record.path))
+        if record.second and not own:
+            self.add("network", record.path)
+
+    def _bind(self, record: Record) -> None:
+        if record.second == "unix":
+            self._add_made(record.path)
+        else:
+            self._connect(record)
+
+    def _entropy(self, record: Record) -> None:
+        if record.flags & _GRND_INSECURE:
+            return  # seeds of the hash tables of Rust, as in safetensors
+        if not record.flags & _GRND_NONBLOCK or record.there:
+            self.add("random", record.path)
+
+    def _unseen(self, record: Record) -> None:
+        self.add("unknown", record.path)
+
+    # --- what is covered --------------------------------------------------------------------------
+
+    def _read(self, path: str) -> None:
+        if is_chance(path):
+            self.add("random", path)
+        elif not self._is_covered(path):
+            self.add("folder" if os.path.isdir(path) else "file", path)
+
+    def _read_source(self, path: str) -> None:
+        """Judge source of a module that the key follows, which has neither its comments nor its
+        lines.
+        """
+        if (
+            path not in self._quiet
+            and not self._is_covered_as_a_whole(path)
+            and self._is_source(path)
+        ):
+            self.add("file", path)
+
+    def _is_covered(self, path: str) -> bool:
+        if "\n" in path and not os.path.lexists(path):
+            # a text of several lines, of which a library asks whether it is the name of a file
+            return True
+        return self._is_covered_as_a_whole(path) or self._is_source(path)
+
+    def _is_covered_as_a_whole(self, path: str) -> bool:
+        if self._is_made(path) or not self._files.isdisjoint(_with_parents(path)):
+            return True
+        return self._is_of_machine(path)
+
+    def _is_of_machine(self, path: str) -> bool:
+        return is_installed(path) or is_of_system(path) or self._is_cache(path)
+
+    def _is_cache(self, path: str) -> bool:
+        return not self._caches.isdisjoint(_with_parents(path))
+
+    def _is_source(self, path: str) -> bool:
+        """Return True for source or byte code of a module that the key follows; a traceback
+        reads the source again.
+        """
+        folder, name = os.path.split(path)
+        if os.path.basename(folder) == "__pycache__":
+            folder, name = os.path.dirname(folder), f"{name.partition('.')[0]}.py"
+        source = os.path.join(folder, name)
+        return any(self._covered.modules(module) for module in self._modules_of(source))
+
+    def _modules_of(self, source: str) -> Iterator[str]:
+        """Yield the modules that were made from a file."""
+        yield from (module for module, file in self._bodies.items() if file == source)
+        for module, loaded in sys.modules.copy().items():
+            # to ask a lazy module would import it
+            file = getattr(loaded, "__dict__", {}).get("__file__")
+            if (
+                isinstance(file, str)
+                and os.path.basename(file) == os.path.basename(source)
+                and os.path.realpath(file) == source
+            ):
+                yield module
+
+    def _is_made(self, path: str) -> bool:
+        if not os.path.isabs(path):  # below an open folder that nobody named
+            return any(made.endswith(f"/{path}") for made in self._made)
+        return not self._made.isdisjoint(_with_parents(path))
+
+    def _add_made(self, path: str) -> None:
+        self._made.add(path)
+        self._folders.update(_with_parents(path))
+
+
+def _with_parents(path: str) -> list[str]:
+    paths = [path]
+    while path not in ("/", "") and (above := os.path.dirname(path)) != path:
+        path = above
+        paths.append(path)
+    return paths
+
+
+def _with_all_parents(paths: Iterable[str]) -> set[str]:
+    """Return paths with the folders that they are in: to look at one says only that the way to
+    the end exists.
+    """
+    return set(chain.from_iterable(map(_with_parents, paths)))

@@ -1,36 +1,482 @@
-"""Scheduling of tasks on devices by the heuristic HEFT, with memory as a hard constraint.
-
-A schedule is a pure function of tasks, costs and devices, for this machine and for machines described in a file.
-A result leaves a device after its last use. HEFT inserts tasks into idle gaps between placed tasks. A task that
-does not fit into memory is cut into parts of bands, waits or runs elsewhere; a task that fits nowhere is refused
-with the number of bytes that it needs.
-
-Source: Topcuoglu, Hariri, Wu, IEEE Transactions on Parallel and Distributed Systems 13 (2002) 260.
-"""
+"""Schedule of tasks on devices by the heuristic HEFT, with memory as a hard limit."""
 
 from __future__ import annotations
 
 import heapq
 import math
-from bisect import bisect_left
-from collections.abc import Collection, Sequence
+from bisect import bisect_left, bisect_right
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
-from neusee.workflows.placement.partial_schedule import PartialSchedule
-from neusee.workflows.placement.task_priorities import Graph, frugal, ranked, upward
-from neusee.workflows.placement.tasks_and_devices import Cluster, Device, Link, Schedule, Slot, Task, TooLarge
+import numpy as np
+
+from neusee.workflows.placement.tasks_and_devices import (
+    Cluster,
+    Device,
+    Graph,
+    Link,
+    Move,
+    Schedule,
+    Slot,
+    Task,
+    TooLarge,
+    frugal,
+    ranked,
+    upward,
+)
+
+# --- memory profile -------------------------------------------------------------------------------
+
+# Memory profile of one device: the bytes in use by the scheduled tasks, as a function of time.
+
+
+#: memory reservation: start, end (infinity if not yet known), bytes
+Hold = tuple[float, float, float]
+
+
+class MemoryProfile:
+    """Memory in use (bytes) on a device, as a step function of time that never rises above
+    ``limit``.
+
+    The memory of a result is reserved without end until the last reader of the result is placed,
+    and then only until this reader ends. Reserved memory therefore only shrinks after `wait` has
+    checked it, and no later placement, not even a placement in an earlier gap, can break a
+    placement that fits.
+    """
+
+    def __init__(self, limit: float) -> None:
+        self.limit = limit
+        self.times = [-math.inf]
+        self.level = np.zeros(64)
+        self.kept = 0.0  # bytes that are reserved without end
+
+    def add(self, start: float, end: float, size: float) -> None:
+        """Reserve ``size`` bytes of memory from ``start`` until ``end``; a negative ``size``
+        frees reserved bytes.
+        """
+        if size and start < end:
+            first = self._cut(start)
+            self.level[first : self._cut(end) if end < math.inf else len(self.times)] += size
+            self.kept += size if end == math.inf else 0.0
+
+    def highest(self, start: float, end: float) -> float:
+        """Return the peak memory in use (bytes) in the time interval [start, end)."""
+        return float(self.level[self._within(start, end)].max())
+
+    def free(self) -> float:
+        """Return the number of bytes of memory that are free after all scheduled tasks have
+        ended.
+        """
+        return self.limit - self.kept
+
+    def wait(self, holds: Iterable[Hold]) -> float:
+        """Return the smallest delay (s) of the reservations ``holds`` that keeps the memory in
+        use within the limit.
+        """
+        shift = 0.0
+        for start, end, size in stacked(holds):
+            span = self._within(start, end)
+            level = self.level[span]
+            if level.max() > self.limit - size:
+                above = span.start + int(np.flatnonzero(level > self.limit - size)[-1]) + 1
+                shift = max(
+                    shift, (self.times[above] if above < len(self.times) else math.inf) - start
+                )
+        return shift
+
+    def _within(self, start: float, end: float) -> slice:
+        first = bisect_right(self.times, start) - 1
+        return slice(
+            first,
+            len(self.times) if end == math.inf else max(bisect_left(self.times, end), first + 1),
+        )
+
+    def _cut(self, time: float) -> int:
+        """Return the index of the time interval that begins at ``time``; split an interval at
+        ``time`` if necessary.
+        """
+        index, count = bisect_left(self.times, time), len(self.times)
+        if index < count and self.times[index] == time:
+            return index
+        if count == len(self.level):
+            self.level = np.concatenate([self.level, np.zeros(count)])
+        self.times.insert(index, time)
+        self.level[index + 1 : count + 1] = self.level[index:count].copy()
+        self.level[index] = self.level[index - 1]
+        return index
+
+
+def stacked(holds: Iterable[Hold]) -> Iterator[Hold]:
+    """Yield the total memory reserved by ``holds`` as consecutive time intervals with a constant
+    number of bytes.
+    """
+    steps = defaultdict[float, float](float)
+    for start, end, size in holds:
+        if start < end and size:
+            steps[start] += size
+            steps[end] -= size
+    times, now = sorted(steps), 0.0
+    for start, end in pairwise(times):
+        now += steps[start]
+        if now > 0:
+            yield start, end, now
+
+
+def without(
+    start: float, end: float, taken: Iterable[tuple[float, float]]
+) -> Iterator[tuple[float, float]]:
+    """Yield the parts of the time interval [start, end) outside the sorted, disjoint intervals
+    in ``taken``.
+    """
+    for first, last in taken:
+        if first < end and last > start:
+            if start < first:
+                yield start, first
+            start = max(start, last)
+    if start < end:
+        yield start, end
+
+
+# --- partial schedule -----------------------------------------------------------------------------
+
+# Partial schedule: the tasks placed so far, the idle times of each device, and the memory that each
+# task will use.
+
+
+Copy = tuple[float, float, float]  #: departure from the source, arrival, last use
+Of = tuple[int, float, int]  #: task of the result, bytes of the result, device
+
+
+class PartialSchedule:
+    """Unfinished schedule: a task is added after the tasks that compute its inputs, and keeps
+    its device and times.
+    """
+
+    def __init__(self, graph: Graph, bounded: bool = True) -> None:
+        self.graph, devices, count = graph, graph.cluster.devices, len(graph.tasks)
+        self.where, self.parts = [-1] * count, [1] * count
+        self.start, self.end = [0.0] * count, [0.0] * count
+        # time at which the last reader placed so far has its input
+        self.free_at: list[float] = [0.0] * count
+        self.left = [len(readers) for readers in graph.readers]
+        self.gaps: list[tuple[list[float], list[float]]] = [([0.0], [math.inf]) for _ in devices]
+        upper_bound = sum(graph.own) + max((graph.work(i, 1) for i in range(count)), default=0.0)
+        sent = sum(
+            max(0.0, math.ceil(s))
+            for t, sizes in enumerate(graph.sizes)
+            for s in sizes
+            if graph.tasks[t].takes
+        )
+        self.rooms = [
+            MemoryProfile(d.memory) if bounded and d.memory < upper_bound + sent else None
+            for d in devices
+        ]
+        # no delay to itself
+        self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]
+        self.least = [own + graph.work(i, graph.tasks[i].parts) for i, own in enumerate(graph.own)]
+        self.copies: dict[Of, list[Copy]] = {}
+        self.placed: list[int] = []
+        self.refused: list[tuple[int, int, float]] = []  # task, device, bytes needed there
+
+    # --- where and when ---------------------------------------------------------------------------
+
+    def place(self, i: int, among: Sequence[int]) -> bool:
+        """Place task ``i`` on the device that finishes it first; return False if no device has
+        enough memory.
+        """
+        best, on, begin = math.inf, -1, 0.0
+        for d in among:
+            room = self.rooms[d]
+            if room is not None and (room.free() < self.least[i] or self._needs(i, d) > room.limit):
+                continue
+            ready, seconds = self._ready(i, d), self.graph.seconds[i][d]
+            if ready + seconds >= best:
+                continue
+            start = self._slot(i, d, ready, seconds, best)
+            if start + seconds < best:
+                best, on, begin = start + seconds, d, start
+        if on >= 0:
+            self._commit(i, on, begin, best)
+        return on >= 0
+
+    def gave_back(self, i: int) -> bool:
+        """Return True if the placement of task ``i`` freed memory that waiting tasks may use."""
+        return any(not self.left[j] for j in self.graph.sources[i]) or bool(self.refused)
+
+    def force(self, i: int) -> None:
+        """Place task ``i`` as if a device had enough memory for this task, and record the bytes
+        that the task needs.
+        """
+        needs = {d: self._needs(i, d) for d in self.graph.able[i] if self.rooms[d] is not None}
+        d = min(needs, key=lambda d: (needs[d] - self.graph.cluster.devices[d].memory, d))
+        room = self.rooms[d]
+        assert room is not None
+        self.refused.append((i, d, needs[d]))
+        room.limit = needs[d]
+        self.place(i, [d])
+
+    def _ready(self, i: int, d: int) -> float:
+        """Return the earliest time at which all inputs of task ``i`` can be on device ``d``."""
+        end, where, links = self.end, self.where, self.links
+        return max(
+            (end[j] + links[where[j]][d].seconds(size) for j, size in self._inputs(i)), default=0.0
+        )
+
+    def _inputs(self, i: int) -> Iterator[tuple[int, float]]:
+        """Yield each task whose result task ``i`` reads, with the bytes to send if this result
+        is on another device.
+        """
+        return zip(self.graph.sources[i], self.graph.sizes[i], strict=True)
+
+    def _slot(self, i: int, d: int, ready: float, seconds: float, best: float) -> float:
+        """Return the earliest start of task ``i`` on device ``d``, or infinity if it cannot end
+        before ``best``.
+        """
+        starts, ends = self.gaps[d]
+        for gap in range(bisect_left(ends, ready + seconds), len(ends)):
+            start = max(starts[gap], ready)
+            if start + seconds >= best:
+                return math.inf
+            if start + seconds > ends[gap]:
+                continue
+            start = self._fitting(i, d, start, seconds, ends[gap])
+            if start + seconds <= ends[gap] and start < math.inf:
+                return start
+            ready = max(ready, start)
+        return math.inf
+
+    def _fitting(self, i: int, d: int, start: float, seconds: float, end: float) -> float:
+        """Return the earliest start at which device ``d`` has enough memory for task ``i``.
+
+        If the task cannot end before ``end``, where the idle gap ends, the returned start is too
+        late for the gap.
+        """
+        room, parts = self.rooms[d], self.graph.tasks[i].parts
+        if room is None:
+            return start
+        while start + seconds <= end and start < math.inf:
+            wait = room.wait(self._holds(i, d, start, start + seconds, parts))
+            if not wait:
+                return start
+            start = max(start + wait, math.nextafter(start, math.inf))
+        return start
+
+    def _holds(self, i: int, d: int, start: float, end: float, parts: int) -> list[Hold]:
+        """Return the memory reservations of task ``i`` on device ``d``: result, working memory
+        and copies of inputs.
+        """
+        graph = self.graph
+        holds = [
+            (start, math.inf if graph.held(i) else end, graph.own[i]),
+            (start, end, graph.work(i, parts)),
+        ]
+        for of, leaves in self._arriving(i, d, start):
+            spans = without(leaves, end, ((a, until) for a, _, until in self.copies.get(of, ())))
+            holds += [(a, b, float(math.ceil(of[1]))) for a, b in spans]
+        return holds
+
+    def _arriving(self, i: int, d: int, start: float) -> Iterator[tuple[Of, float]]:
+        """Yield each input of task ``i`` that is on another device, with the latest start of the
+        transfer.
+        """
+        for j, size in self._inputs(i):
+            if self.where[j] != d:
+                yield (
+                    (j, size, d),
+                    max(start - self.links[self.where[j]][d].seconds(size), self.end[j]),
+                )
+
+    def _needs(self, i: int, d: int) -> float:
+        """Return the memory (bytes) that device ``d`` needs to run task ``i`` after all tasks
+        scheduled so far.
+        """
+        room = self.rooms[d]
+        assert room is not None
+        copies = sum(math.ceil(size) for j, size in self._inputs(i) if self.where[j] != d)
+        return room.limit - room.free() + self.least[i] + copies
+
+    # --- records of a placement -------------------------------------------------------------------
+
+    def _commit(self, i: int, d: int, start: float, end: float) -> None:
+        graph, room = self.graph, self.rooms[d]
+        if room is not None:
+            self.parts[i] = self._fewest(i, d, start, end, room)
+            for hold in self._holds(i, d, start, end, self.parts[i]):
+                room.add(*hold)
+        self.put(i, d, start, end)
+        self._fill(d, start, end)
+        for of, leaves in self._arriving(i, d, start):
+            self.copies[of] = _joined([*self.copies.get(of, ()), (leaves, start, end)])
+        for j in graph.sources[i]:
+            self.free_at[j] = max(self.free_at[j], end if self.where[j] == d else start)
+            self.left[j] -= 1
+            home = self.rooms[self.where[j]]
+            if not self.left[j] and j not in graph.kept and home is not None:
+                home.add(self.free_at[j], math.inf, -graph.own[j])
+
+    def put(self, i: int, d: int, start: float, end: float) -> None:
+        self.where[i], self.start[i], self.end[i], self.free_at[i] = d, start, end, end
+        self.placed.append(i)
+
+    def _fewest(self, i: int, d: int, start: float, end: float, room: MemoryProfile) -> int:
+        """Return the smallest number of band slices with which task ``i`` fits into the memory of
+        device ``d``.
+
+        The largest allowed number always fits.
+        """
+
+        def fits(parts: int) -> bool:
+            return not room.wait(self._holds(i, d, start, end, parts))
+
+        return 1 + bisect_left(range(1, self.graph.tasks[i].parts), True, key=fits)
+
+    def _fill(self, d: int, start: float, end: float) -> None:
+        """Mark the time from ``start`` to ``end`` as busy on device ``d``."""
+        starts, ends = self.gaps[d]
+        gap = bisect_left(ends, end)
+        left = [(a, b) for a, b in ((starts[gap], start), (end, ends[gap])) if a < b]
+        starts[gap : gap + 1] = [a for a, _ in left]
+        ends[gap : gap + 1] = [b for _, b in left]
+
+    # --- the finished schedule --------------------------------------------------------------------
+
+    def too_large(self) -> TooLarge:
+        """Return the error for the first task that fits on no device, with the bytes of memory
+        that would suffice.
+        """
+        graph, (i, d, _) = self.graph, self.refused[0]
+        needed, device = max(n for _, on, n in self.refused if on == d), graph.cluster.devices[d]
+        return TooLarge(
+            graph.tasks[i].name, device.name, needed, device.memory, graph.tasks[i].parts
+        )
+
+    def schedule(self) -> Schedule:
+        """Return the finished schedule; all tasks must have been placed before."""
+        devices = self.graph.cluster.devices
+        self._bridge()
+        moves = sorted(self._moves(), key=lambda m: (m.start, m.task, m.device))
+        slots = sorted(self._slots(), key=lambda slot: (slot.start, slot.end))
+        holds = zip(devices, self._held(), strict=True)
+        peak = {
+            device.name: max((size for _, _, size in stacked(held)), default=0.0)
+            for device, held in holds
+        }
+        return Schedule(
+            tuple(slots),
+            max(self.end, default=0.0),
+            peak,
+            sum(m.bytes for m in moves),
+            tuple(moves),
+        )
+
+    def _bridge(self) -> None:
+        """Avoid a second transfer of a result to a device by keeping the first copy there, if
+        memory allows.
+        """
+        for (j, size, d), copies in self.copies.items():
+            room, joined = self.rooms[d], copies[:1]
+            for copy in copies[1:]:
+                until = joined[-1][2]
+                if room is None or room.highest(until, copy[0]) + math.ceil(size) <= room.limit:
+                    if room is not None:
+                        room.add(until, copy[0], math.ceil(size))
+                    joined[-1] = (*joined[-1][:2], max(until, copy[2]))
+                else:
+                    joined.append(copy)
+            self.copies[j, size, d] = joined
+
+    def _moves(self) -> Iterator[Move]:
+        devices = self.graph.cluster.devices
+        for (j, size, d), copies in self.copies.items():
+            task, source = self.graph.tasks[j].name, devices[self.where[j]].name
+            for leaves, arrives, until in copies:
+                yield Move(task, size, source, devices[d].name, leaves, arrives, until)
+
+    def _held(self) -> list[list[Hold]]:
+        """Return the memory reservations of the finished schedule, as one list for each device."""
+        graph, held = self.graph, list[list[Hold]]([] for _ in self.rooms)
+        until, over = list(self.end), max(self.end, default=0.0)
+        for (j, size, d), copies in self.copies.items():
+            held[d] += [(leaves, last, float(math.ceil(size))) for leaves, _, last in copies]
+            until[j] = max(until[j], copies[-1][1])
+        for i, sources in enumerate(graph.sources):
+            for j in sources:
+                if self.where[j] == self.where[i]:
+                    until[j] = max(until[j], self.end[i])
+        for i, d in enumerate(self.where):
+            held[d].append((self.start[i], over if i in graph.kept else until[i], graph.own[i]))
+            held[d].append((self.start[i], self.end[i], graph.work(i, self.parts[i])))
+        return held
+
+    def _slots(self) -> Iterator[Slot]:
+        """Yield the schedule entry of each task: device, start, end, and the task that delayed
+        the start.
+        """
+        tasks, devices = self.graph.tasks, self.graph.cluster.devices
+        before, ended = [-1] * len(devices), dict[float, int]()
+        for i in sorted(self.placed, key=self.start.__getitem__):
+            d, start = self.where[i], self.start[i]
+            after = self._waited(i, before[d], ended.get(start, -1))
+            name = tasks[after].name if after >= 0 else ""
+            yield Slot(tasks[i].name, devices[d].name, start, self.end[i], self.parts[i], name)
+            before[d] = i
+            ended[self.end[i]] = i
+
+    def _waited(self, i: int, before: int, other: int) -> int:
+        """Return the task that delayed task ``i``: an input, the previous task, or a task that
+        freed memory.
+        """
+        start, d = self.start[i], self.where[i]
+        for j, size in self._inputs(i):
+            if self.end[j] + self.links[self.where[j]][d].seconds(size) == start:
+                return j
+        if start == 0.0 or (before >= 0 and self.end[before] == start):
+            return before
+        candidates = [j for j in (before, *self.graph.sources[i]) if j >= 0]
+        return other if other >= 0 else max(candidates, key=self.end.__getitem__, default=-1)
+
+
+def _joined(copies: list[Copy]) -> list[Copy]:
+    """Merge copies of a result that overlap in time on a device, and return the copies in order
+    of time.
+    """
+    joined: list[Copy] = []
+    for copy in sorted(copies):
+        if joined and copy[0] <= joined[-1][2]:
+            joined[-1] = (*joined[-1][:2], max(joined[-1][2], copy[2]))
+        else:
+            joined.append(copy)
+    return joined
+
+
+# --- heft schedule --------------------------------------------------------------------------------
+
+# Scheduling of tasks on devices by the heuristic HEFT, with memory as a hard constraint.
+#
+# A schedule is a pure function of tasks, costs and devices, for this machine and for machines
+# described in a file. A result leaves a device after its last use. HEFT inserts tasks into idle
+# gaps between placed tasks. A task that does not fit into memory is cut into parts of bands, waits
+# or runs elsewhere; a task that fits nowhere is refused with the number of bytes that it needs.
+#
+# Source: Topcuoglu, Hariri, Wu, IEEE Transactions on Parallel and Distributed Systems 13 (2002)
+# 260.
+
 
 __all__ = ["Cluster", "Device", "Link", "Schedule", "Slot", "Task", "TooLarge", "heft"]
 
 
 def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> Schedule:
-    """Return the HEFT schedule: tasks by longest remaining path, each on the device with the earliest finish time.
+    """Return the HEFT schedule: tasks by longest remaining path, each on the device with the
+    earliest finish time.
 
-    ``keep`` names the results that stay in memory to the end. If memory is short, orders of the tasks that need less
-    memory are tried too. If one device alone would finish all tasks sooner, this device runs all tasks; tasks that one
-    device could run alone are never refused.
+    ``keep`` names the results that stay in memory to the end. If memory is short, orders of the
+    tasks that need less memory are tried too. If one device alone would finish all tasks sooner,
+    this device runs all tasks; tasks that one device could run alone are never refused.
 
-    Raises: `TooLarge` if no schedule fits, with the memory that the closest schedule needs; ValueError for tasks that
+    Raises: `TooLarge` if no schedule fits, with the memory that the closest schedule needs;
+            ValueError for tasks that
     no device runs, and for cyclic dependencies.
     """
     graph = Graph(tasks, cluster, keep)
@@ -40,8 +486,13 @@ def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
     try:
         schedule = _best(graph, orders)
     except TooLarge as error:
-        return _alone(graph, _able(graph), error)  # reports the memory for one device, if this is less
-    sooner = {d: took for d in _able(graph) if (took := sum(row[d] for row in graph.seconds)) < schedule.makespan}
+        # reports the memory for one device, if this is less
+        return _alone(graph, _able(graph), error)
+    sooner = {
+        d: took
+        for d in _able(graph)
+        if (took := sum(row[d] for row in graph.seconds)) < schedule.makespan
+    }
     try:
         return _alone(graph, sorted(sooner, key=sooner.__getitem__)) if sooner else schedule
     except TooLarge:
@@ -49,7 +500,9 @@ def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
 
 
 def _best(graph: Graph, orders: Sequence[Sequence[int]]) -> Schedule:
-    """Return the schedule of the first task order if the memory suffices, else the shortest schedule that fits."""
+    """Return the schedule of the first task order if the memory suffices, else the shortest
+    schedule that fits.
+    """
     memory = {device.name: device.memory for device in graph.cluster.devices}
     schedule = _placed(PartialSchedule(graph, bounded=False), orders[0]).schedule()
     if all(peak <= memory[name] for name, peak in schedule.peak.items()):
@@ -67,11 +520,13 @@ def _best(graph: Graph, orders: Sequence[Sequence[int]]) -> Schedule:
     return best
 
 
-def _placed(board: PartialSchedule, order: Sequence[int], below: float = math.inf) -> PartialSchedule:
+def _placed(
+    board: PartialSchedule, order: Sequence[int], below: float = math.inf
+) -> PartialSchedule:
     """Add the tasks to the partial schedule ``board`` in the order ``order``, and return ``board``.
 
-    A task that does not fit into memory waits until later tasks free memory. The placement stops early if it cannot
-    end before ``below``.
+    A task that does not fit into memory waits until later tasks free memory. The placement stops
+    early if it cannot end before ``below``.
     """
     graph = board.graph
     missing, turn = [len(sources) for sources in graph.sources], {i: n for n, i in enumerate(order)}
@@ -100,7 +555,7 @@ def _placed(board: PartialSchedule, order: Sequence[int], below: float = math.in
     return board
 
 
-# --- one device -----------------------------------------------------------------------------------------------------
+# --- one device -----------------------------------------------------------------------------------
 
 
 def _able(graph: Graph) -> list[int]:
@@ -111,7 +566,9 @@ def _able(graph: Graph) -> list[int]:
 
 
 def _alone(graph: Graph, devices: Sequence[int], *refused: TooLarge) -> Schedule:
-    """Try each device alone, with two task orders each, and return the first schedule that fits into memory."""
+    """Try each device alone, with two task orders each, and return the first schedule that fits
+    into memory.
+    """
     for d in devices:
         for order in (graph.by(range(len(graph.tasks))), frugal(graph)):
             try:
@@ -122,21 +579,25 @@ def _alone(graph: Graph, devices: Sequence[int], *refused: TooLarge) -> Schedule
 
 
 def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
-    """Return the schedule of all tasks in ``order`` on device ``d``; raise `TooLarge` if the device lacks memory."""
+    """Return the schedule of all tasks in ``order`` on device ``d``; raise `TooLarge` if the
+    device lacks memory.
+    """
     board, device = PartialSchedule(graph, bounded=False), graph.cluster.devices[d]
-    left, held, peak, at = [len(readers) for readers in graph.readers], 0.0, 0.0, 0.0
+    left, held, peak, now = [len(readers) for readers in graph.readers], 0.0, 0.0, 0.0
     needed, largest = 0.0, 0
     for i in order:
         held += graph.own[i]
         board.parts[i] = _fewest(graph, i, device.memory - held)
         peak = max(peak, held + graph.work(i, board.parts[i]))
-        least = held + graph.work(i, graph.tasks[i].parts)
-        needed, largest = (least, i) if least > needed else (needed, largest)
-        began, at = at, at + graph.seconds[i][d]
-        board.put(i, d, began, at)
+        smallest = held + graph.work(i, graph.tasks[i].parts)
+        needed, largest = (smallest, i) if smallest > needed else (needed, largest)
+        began, now = now, now + graph.seconds[i][d]
+        board.put(i, d, began, now)
         for j in graph.sources[i]:
             left[j] -= 1
-        held -= sum(graph.own[j] for j in (*graph.sources[i], i) if not left[j] and j not in graph.kept)
+        held -= sum(
+            graph.own[j] for j in (*graph.sources[i], i) if not left[j] and j not in graph.kept
+        )
     if graph.tasks and needed > device.memory:
         task = graph.tasks[largest]
         raise TooLarge(task.name, device.name, needed, device.memory, task.parts)
@@ -145,9 +606,10 @@ def _sequence(graph: Graph, d: int, order: Sequence[int]) -> Schedule:
 
 
 def _fewest(graph: Graph, i: int, room: float) -> int:
-    """Return the smallest number of band slices with which task ``i`` fits into ``room`` bytes of memory.
+    """Return the smallest number of band slices with which task ``i`` fits into ``room`` bytes of
+    memory.
 
     If no allowed number suffices, return the largest allowed number.
     """
-    most = graph.tasks[i].parts
-    return 1 + bisect_left(range(1, most), True, key=lambda parts: graph.work(i, parts) <= room)
+    limit = graph.tasks[i].parts
+    return 1 + bisect_left(range(1, limit), True, key=lambda parts: graph.work(i, parts) <= room)

@@ -7,8 +7,9 @@
       cuda-cuda: {bandwidth: 300 GB/s, latency: 5 us}
     network: {bandwidth: 25 GB/s, latency: 5 us}
 
-``speed`` is the ratio to the machine on which the costs were measured, for all nodes or by family of nodes.
-``node: [a, b]`` puts a group of devices on each of the machines ``a`` and ``b``; the network links the machines.
+``speed`` is the ratio to the machine on which the costs were measured, for all nodes or by family
+of nodes. ``node: [a, b]`` puts a group of devices on each of the machines ``a`` and ``b``; the
+network links the machines.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from typing import Any
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, nearest
 from neusee.workflows.placement.tasks_and_devices import BUS, Cluster, Device, Link
 from neusee.workflows.recipe.text.yaml_values import Value, kind, read
-from neusee.workflows.store.byte_sizes import UNITS
+from neusee.workflows.store.cache_settings import UNITS
 
 _KINDS = ("cpu", "cuda", "mps")
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
@@ -40,11 +41,14 @@ _Reader = Callable[[Value, "list[Diagnostic]"], Any]
 
 @dataclass(frozen=True)
 class Machines:
-    """Cluster of devices, with the speed of each device relative to the machine on which run times were measured."""
+    """Cluster of devices, with the speed of each device relative to the machine on which run
+    times were measured.
+    """
 
     title: str
     cluster: Cluster
-    speeds: Mapping[str, Mapping[str, float]] = field(repr=False)  #: by device, then by family of nodes or ``default``
+    #: by device, then by family of nodes or ``default``
+    speeds: Mapping[str, Mapping[str, float]] = field(repr=False)
 
     @property
     def devices(self) -> tuple[Device, ...]:
@@ -57,13 +61,22 @@ class Machines:
 
 
 def read_machines(path: Path | str) -> Machines:
-    """Read a machine file or a packaged example; raise one `RecipeError` that lists all mistakes in the file."""
+    """Read a machine file or a packaged example; raise one `RecipeError` that lists all mistakes
+    in the file.
+    """
     document = read(_path(path), str(path))
     diagnostics: list[Diagnostic] = []
-    root = _fields(document.root, {"devices": _groups, "links": _links, "network": _link}, ("devices",), diagnostics)
+    root = _fields(
+        document.root,
+        {"devices": _groups, "links": _links, "network": _link},
+        ("devices",),
+        diagnostics,
+    )
     groups, links = root.get("devices") or [], root.get("links") or {}
     if not diagnostics:
-        diagnostics += _absent(document.root.items.get("links"), {group["kind"] for group in groups})
+        diagnostics += _absent(
+            document.root.items.get("links"), {group["kind"] for group in groups}
+        )
     if diagnostics:
         raise RecipeError(diagnostics)
     devices = _devices(groups)
@@ -96,59 +109,93 @@ def _devices(groups: list[dict[str, Any]]) -> dict[Device, dict[str, Any]]:
 
     A device has a name such as ``cpu``, or ``a/cuda:0`` for GPU 0 of the machine ``a``.
     """
-    rows = [(machine, group) for group in groups for machine in group["node"] for _ in range(group["count"])]
-    total, seen = Counter((machine, group["kind"]) for machine, group in rows), Counter[tuple[str, str]]()
+    rows = [
+        (machine, group)
+        for group in groups
+        for machine in group["node"]
+        for _ in range(group["count"])
+    ]
+    total, numbers = (
+        Counter((machine, group["kind"]) for machine, group in rows),
+        Counter[tuple[str, str]](),
+    )
     devices = {}
     for machine, group in rows:
         of = (machine, group["kind"])
-        name = "cpu" if of[1] == "cpu" and total[of] == 1 else f"{of[1]}:{seen[of]}"
-        seen[of] += 1
+        name = "cpu" if of[1] == "cpu" and total[of] == 1 else f"{of[1]}:{numbers[of]}"
+        numbers[of] += 1
         devices[Device(f"{machine}/{name}" if machine else name, of[1], group["memory"])] = group
     return devices
 
 
-# --- values ---------------------------------------------------------------------------------------------------------
+# --- values ---------------------------------------------------------------------------------------
 
 
 def _groups(value: Value, diagnostics: list[Diagnostic]) -> list[dict[str, Any]]:
     if not isinstance(value.data, dict) or not value.data:
         diagnostics.append(
-            _problem(value, "must be a mapping of device groups, such as `a100: {kind: cuda, memory: 80 GB}`")
+            _problem(
+                value,
+                "must be a mapping of device groups, such as `a100: {kind: cuda, memory: 80 GB}`",
+            )
         )
         return []
-    readers: dict[str, _Reader] = {"kind": _kind, "count": _count, "memory": _size, "speed": _speed, "node": _names}
+    readers: dict[str, _Reader] = {
+        "kind": _kind,
+        "count": _count,
+        "memory": _size,
+        "speed": _speed,
+        "node": _names,
+    }
     usual: dict[str, Any] = {"count": 1, "speed": {"default": 1.0}, "node": [""]}
-    return [usual | _fields(group, readers, ("kind", "memory"), diagnostics) for group in value.data.values()]
+    return [
+        usual | _fields(group, readers, ("kind", "memory"), diagnostics)
+        for group in value.data.values()
+    ]
 
 
 def _links(value: Value, diagnostics: list[Diagnostic]) -> dict[tuple[str, str], Link]:
     if not isinstance(value.data, dict):
-        diagnostics.append(_problem(value, "must be a mapping of links, such as `cuda-cuda: {bandwidth: 300 GB/s}`"))
+        diagnostics.append(
+            _problem(
+                value, "must be a mapping of links, such as `cuda-cuda: {bandwidth: 300 GB/s}`"
+            )
+        )
         return {}
     links = {}
     for name, link in value.data.items():
-        one, dash, other = str(name).partition("-")
+        first, dash, other = str(name).partition("-")
         if not dash:
-            diagnostics.append(_problem(link, "must name two kinds, such as cuda-cuda or cpu-cuda", link.key))
-        if (other, one) in links:
-            diagnostics.append(_problem(link, f"is the same as {other}-{one}", link.key))
-        links[one, other or one] = _link(link, diagnostics)
+            diagnostics.append(
+                _problem(link, "must name two kinds, such as cuda-cuda or cpu-cuda", link.key)
+            )
+        if (other, first) in links:
+            diagnostics.append(_problem(link, f"is the same as {other}-{first}", link.key))
+        links[first, other or first] = _link(link, diagnostics)
     return links
 
 
 def _link(value: Value, diagnostics: list[Diagnostic]) -> Link:
-    return Link(**_fields(value, {"bandwidth": _rate, "latency": _time}, ("bandwidth",), diagnostics))
+    return Link(
+        **_fields(value, {"bandwidth": _rate, "latency": _time}, ("bandwidth",), diagnostics)
+    )
 
 
 def _fields(
-    value: Value, readers: Mapping[str, _Reader], required: tuple[str, ...], diagnostics: list[Diagnostic]
+    value: Value,
+    readers: Mapping[str, _Reader],
+    required: tuple[str, ...],
+    diagnostics: list[Diagnostic],
 ) -> dict[str, Any]:
-    """Convert the fields of a YAML mapping and return the values; report unknown and missing fields.
+    """Convert the fields of a YAML mapping and return the values; report unknown and missing
+    fields.
 
     ``readers`` holds a conversion function for each allowed field.
     """
     if not isinstance(value.data, dict):
-        diagnostics.append(_problem(value, f"must be a mapping with {', '.join(readers)}, not {kind(value)}"))
+        diagnostics.append(
+            _problem(value, f"must be a mapping with {', '.join(readers)}, not {kind(value)}")
+        )
         return {}
     fields = {}
     for name, item in value.data.items():
@@ -156,18 +203,26 @@ def _fields(
             fields[name] = readers[name](item, diagnostics)
         else:
             diagnostics.append(_problem(item, f"unknown; {nearest(name, readers)}", item.key))
-    diagnostics += [_problem(value, f"needs {name}", value.key) for name in required if name not in value.data]
+    diagnostics += [
+        _problem(value, f"needs {name}", value.key) for name in required if name not in value.data
+    ]
     return fields
 
 
 def _kind(value: Value, diagnostics: list[Diagnostic]) -> str:
     if value.data not in _KINDS:
-        diagnostics.append(_problem(value, f"unknown kind of device; {nearest(str(value.data), _KINDS)}"))
+        diagnostics.append(
+            _problem(value, f"unknown kind of device; {nearest(str(value.data), _KINDS)}")
+        )
     return str(value.data)
 
 
 def _count(value: Value, diagnostics: list[Diagnostic]) -> int:
-    if isinstance(value.data, bool) or not isinstance(value.data, int) or not 1 <= value.data <= _MOST:
+    if (
+        isinstance(value.data, bool)
+        or not isinstance(value.data, int)
+        or not 1 <= value.data <= _MOST
+    ):
         diagnostics.append(_problem(value, f"must be a whole number of devices from 1 to {_MOST}"))
         return 1
     return value.data
@@ -177,7 +232,9 @@ def _names(value: Value, diagnostics: list[Diagnostic]) -> list[str]:
     names = value.data if isinstance(value.data, list) else [value]
     for name in names:
         if not isinstance(name.data, str) or not re.fullmatch(r"[\w.-]+", name.data):
-            diagnostics.append(_problem(name, "must be the name of a machine, or a list of such names"))
+            diagnostics.append(
+                _problem(name, "must be the name of a machine, or a list of such names")
+            )
     plain = [str(name.data) for name in names]
     if len(set(plain)) < len(plain) or not plain:
         diagnostics.append(_problem(value, "must name at least one machine, and no machine twice"))
@@ -196,19 +253,27 @@ def _speed(value: Value, diagnostics: list[Diagnostic]) -> dict[str, float]:
 def _factor(value: Value, diagnostics: list[Diagnostic]) -> float:
     good = isinstance(value.data, int | float) and not isinstance(value.data, bool)
     if not good or not 0 < value.data < math.inf:
-        diagnostics.append(_problem(value, "must be a number above 0: the ratio to the measured speed"))
+        diagnostics.append(
+            _problem(value, "must be a number above 0: the ratio to the measured speed")
+        )
         return 1.0
     return float(value.data)
 
 
-def _quantity(value: Value, diagnostics: list[Diagnostic], units: Mapping[str, float], such: str) -> float:
-    """Convert a quantity such as ``80 GB`` to SI units; report a wrong unit, or a value that is out of range."""
+def _quantity(
+    value: Value, diagnostics: list[Diagnostic], units: Mapping[str, float], such: str
+) -> float:
+    """Convert a quantity such as ``80 GB`` to SI units; report a wrong unit, or a value that is
+    out of range.
+    """
     match = _QUANTITY.fullmatch(str(value.data).strip())
     if isinstance(value.data, bool) or match is None:
         diagnostics.append(_problem(value, f"must be a number and a unit, such as {such}"))
     elif match[2] not in units:
         mistake = f"has the wrong unit {match[2]!r}" if match[2] else "needs a unit"
-        diagnostics.append(_problem(value, f"{mistake}: write a number and one of {', '.join(units)}"))
+        diagnostics.append(
+            _problem(value, f"{mistake}: write a number and one of {', '.join(units)}")
+        )
     elif units is not _SECONDS and not 0 < float(match[1]) < math.inf:
         diagnostics.append(_problem(value, f"must be above 0, such as {such}"))
     else:
@@ -222,7 +287,9 @@ _time = partial(_quantity, units=_SECONDS, such="10 us")
 
 
 def _absent(links: Value | None, kinds: set[str]) -> list[Diagnostic]:
-    """Return a diagnostic for each kind of device, such as ``cuda``, that has a link but is not in the cluster."""
+    """Return a diagnostic for each kind of device, such as ``cuda``, that has a link but is not
+    in the cluster.
+    """
     return [
         _problem(link, f"there is no device of kind {name}; {nearest(name, kinds)}", link.key)
         for pair, link in (links.items.items() if links else ())

@@ -1,19 +1,29 @@
-"""Data types of a schedule: devices with their links, tasks with their costs, and the device and times of each task.
-
-All times are in s and all sizes in bytes. No code here runs a task or reads a tensor.
-"""
+"""Tasks, devices and links of a schedule, and the order in which tasks are placed."""
 
 from __future__ import annotations
 
+import heapq
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
+
+from neusee.workflows.graph.diagnostics import nearest
+
+# --- tasks and devices ----------------------------------------------------------------------------
+
+# Data types of a schedule: devices with their links, tasks with their costs, and the device and
+# times of each task.
+#
+# All times are in s and all sizes in bytes. No code here runs a task or reads a tensor.
 
 
 @dataclass(frozen=True, slots=True)
 class Device:
-    """A device that runs one task at a time, such as ``cuda:1``, or ``node2/cuda:1`` on the machine ``node2``."""
+    """A device that runs one task at a time, such as ``cuda:1``, or ``node2/cuda:1`` on the
+    machine ``node2``.
+    """
 
     name: str
     kind: str = "cpu"
@@ -44,23 +54,26 @@ class Cluster:
     """The devices of one or more machines, with the links between the devices."""
 
     devices: tuple[Device, ...]
-    links: Mapping[tuple[str, str], Link] = field(default_factory=dict)  #: by kinds in either order, within one machine
+    #: by kinds in either order, within one machine
+    links: Mapping[tuple[str, str], Link] = field(default_factory=dict)
     bus: Link = BUS  #: for kinds of one machine that ``links`` does not name
     network: Link = Link(12.5e9, 10e-6)  #: between machines
 
     def __post_init__(self) -> None:
         if not self.devices or len(self._by_name) < len(self.devices):
             names = ", ".join(d.name for d in self.devices)
-            raise ValueError(f"a cluster needs one or more devices with different names, not: {names or 'none'}")
+            raise ValueError(
+                f"a cluster needs one or more devices with different names, not: {names or 'none'}"
+            )
 
     def link(self, a: str, b: str) -> Link:
         """Return the link between two devices; from a device to itself, the link has no delay."""
         if a == b:
             return Link()
-        one, other = self._by_name[a], self._by_name[b]
-        if one.machine != other.machine:
+        device, other = self._by_name[a], self._by_name[b]
+        if device.machine != other.machine:
             return self.network
-        pair = (one.kind, other.kind)
+        pair = (device.kind, other.kind)
         return self.links.get(pair) or self.links.get((pair[1], pair[0])) or self.bus
 
     @cached_property
@@ -76,9 +89,11 @@ class Task:
     sources: tuple[str, ...]
     seconds: Mapping[str, float]  #: by device name; a device without an entry cannot run the task
     bytes: float = 0.0  #: size of the result
-    work: float = 0.0  #: memory during the run beside inputs and result, in bytes; 0 for a task of 0 s
+    #: memory during the run beside inputs and result, in bytes; 0 for a task of 0 s
+    work: float = 0.0
     parts: int = 1  #: upper bound on the number of band slices, among which ``work`` is divided
-    takes: Mapping[str, float] = field(default_factory=dict)  #: bytes that a source sends, if not its whole result
+    #: bytes that a source sends, if not its whole result
+    takes: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,12 +105,15 @@ class Slot:
     start: float
     end: float
     parts: int = 1
-    after: str = ""  #: the task that delayed the start, by its data, device or memory; empty if none
+    #: the task that delayed the start, by its data, device or memory; empty if none
+    after: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """Transfer of a result to another device, and the time until which this device keeps the copy."""
+    """Transfer of a result to another device, and the time until which this device keeps the
+    copy.
+    """
 
     task: str
     bytes: float
@@ -108,7 +126,9 @@ class Move:
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """A schedule: the device and times of each task, in order of time, with makespan, peak memory and transfers."""
+    """A schedule: the device and times of each task, in order of time, with makespan, peak
+    memory and transfers.
+    """
 
     slots: tuple[Slot, ...]
     makespan: float
@@ -117,44 +137,62 @@ class Schedule:
     moves: tuple[Move, ...] = ()
 
     def utilisation(self) -> dict[str, float]:
-        """Return the fraction of the makespan during which each device works, by the name of the device."""
+        """Return the fraction of the makespan during which each device works, by the name of the
+        device.
+        """
         busy = dict.fromkeys(self.peak, 0.0)
         for slot in self.slots:
             busy[slot.device] += slot.end - slot.start
         return {name: time / self.makespan if self.makespan else 0.0 for name, time in busy.items()}
 
     def critical_path(self) -> tuple[Slot, ...]:
-        """Return the critical path: a chain of tasks, each of which delays the next, up to the task that ends last."""
+        """Return the critical path: a chain of tasks, each of which delays the next, up to the
+        task that ends last.
+        """
         by_name = {slot.task: slot for slot in self.slots}
-        at = max(self.slots, key=lambda slot: slot.end, default=None)
+        last = max(self.slots, key=lambda slot: slot.end, default=None)
         path = []
-        while at is not None:
-            path.append(at)
-            at = by_name.get(at.after)
+        while last is not None:
+            path.append(last)
+            last = by_name.get(last.after)
         return tuple(path[::-1])
 
 
 class TooLarge(ValueError):
-    """Error for a task that fits on no device, with the bytes that the task needs and the bytes that a device has."""
+    """Error for a task that fits on no device, with the bytes that the task needs and the bytes
+    that a device has.
+    """
 
-    def __init__(self, task: str, device: str, needed: float, memory: float, parts: int = 1) -> None:
-        self.task, self.device, self.needed, self.memory, self.parts = task, device, needed, memory, parts
+    def __init__(
+        self, task: str, device: str, needed: float, memory: float, parts: int = 1
+    ) -> None:
+        self.task, self.device, self.needed, self.memory, self.parts = (
+            task,
+            device,
+            needed,
+            memory,
+            parts,
+        )
         cut = f" in {parts} parts" if parts > 1 else ""
         super().__init__(
-            f"{task} does not fit: its inputs, result and results kept there need {_size(needed)} on {device}{cut}, "
-            f"which has {_size(memory)}"
+            f"{task} does not fit: its inputs, result and results kept there need {_size(needed)}"
+            f" on {device}{cut}, which has {_size(memory)}"
         )
 
     def with_program(self, held: float) -> TooLarge:
-        """Return the error with the memory that the program itself holds on the device, as part of need and limit."""
-        more = TooLarge(self.task, self.device, self.needed, self.memory, self.parts)
+        """Return the error with the memory that the program itself holds on the device, as part
+        of need and limit.
+        """
+        error = TooLarge(self.task, self.device, self.needed, self.memory, self.parts)
         cut = f" in {self.parts} parts" if self.parts > 1 else ""
-        more.args = (
-            f"{self.task} needs {_size(self.needed + held)}{cut}, of which the program itself holds {_size(held)}, and "
-            f"the limit is {_size(self.memory + held)}: give more memory, or choose a smaller picture, pupil or number "
-            "of bands",
+        error.args = (
+            (
+                f"{self.task} needs {_size(self.needed + held)}{cut}, of which the program itself"
+                f" holds {_size(held)}, and the limit is {_size(self.memory + held)}: give more"
+                " memory, or choose a smaller picture, pupil or number of bands"
+            ),
         )
-        return more
+        return error
 
     @property
     def short(self) -> float:
@@ -167,3 +205,167 @@ def _size(count: float) -> str:
         return "more bytes than a machine can address"
     exact = f"{count:,.0f} B"
     return exact if count < 1e6 else f"{exact} ({count / 1e9:.3g} GB)"
+
+
+# --- task priorities ------------------------------------------------------------------------------
+
+# Priorities of tasks: orders in which a scheduler places tasks, by rank or for the least use of
+# memory.
+
+
+class Graph:
+    """A graph of numbered tasks: sources and readers of each task, bytes to send, and devices
+    that can run the task.
+    """
+
+    def __init__(self, tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> None:
+        self.tasks, self.cluster = tuple(tasks), cluster
+        index = {task.name: i for i, task in enumerate(self.tasks)}
+        if len(index) < len(self.tasks):
+            twice = next(t.name for i, t in enumerate(self.tasks) if index[t.name] != i)
+            raise ValueError(f"two tasks have the name {twice}")
+        for name in (*(s for task in self.tasks for s in task.sources), *keep):
+            if name not in index:
+                raise ValueError(f"there is no task {name}; {nearest(name, index)}")
+        self.sources = [[index[s] for s in dict.fromkeys(task.sources)] for task in self.tasks]
+        self.readers: list[list[int]] = [[] for _ in self.tasks]
+        for i, sources in enumerate(self.sources):
+            for j in sources:
+                self.readers[j].append(i)
+        self.kept = {index[name] for name in keep}
+        self.sizes = [
+            [task.takes.get(self.tasks[j].name, self.tasks[j].bytes) for j in sources]
+            for task, sources in zip(self.tasks, self.sources, strict=True)
+        ]
+        # whole bytes add up without round-off
+        self.own = [float(math.ceil(task.bytes)) for task in self.tasks]
+        self.able = [
+            [d for d, device in enumerate(cluster.devices) if device.name in t.seconds]
+            for t in self.tasks
+        ]
+        self.seconds = [
+            [t.seconds.get(device.name, math.inf) for device in cluster.devices] for t in self.tasks
+        ]
+        self._check()
+
+    def held(self, i: int) -> bool:
+        """Return True if a later task reads the result of task ``i``, or if the run keeps the
+        result to the end.
+        """
+        return bool(self.readers[i]) or i in self.kept
+
+    def work(self, i: int, parts: int) -> float:
+        return float(math.ceil(self.tasks[i].work / parts))
+
+    def by(self, keys: Sequence[Any]) -> list[int]:
+        """Return the tasks in order, each after its inputs; the ready task with the smallest key
+        comes next.
+        """
+        missing = [len(sources) for sources in self.sources]
+        ready = [(keys[i], i) for i, count in enumerate(missing) if not count]
+        heapq.heapify(ready)
+        order = []
+        while ready:
+            i = heapq.heappop(ready)[1]
+            order.append(i)
+            for reader in self.readers[i]:
+                missing[reader] -= 1
+                if not missing[reader]:
+                    heapq.heappush(ready, (keys[reader], reader))
+        return order
+
+    def _check(self) -> None:
+        names = ", ".join(device.name for device in self.cluster.devices)
+        for task, able in zip(self.tasks, self.able, strict=True):
+            if not able:
+                raise ValueError(
+                    f"{task.name} needs {', '.join(task.seconds) or 'a device'}; the cluster has"
+                    f" {names}"
+                )
+            if not all(0 <= seconds < math.inf for seconds in task.seconds.values()):
+                raise ValueError(
+                    f"{task.name} must take a finite time of 0 s or more, not"
+                    f" {dict(task.seconds)} s"
+                )
+        if len(self.by(range(len(self.tasks)))) < len(self.tasks):
+            raise ValueError("the tasks depend on each other in a cycle")
+
+
+def ranked(graph: Graph, ranks: Sequence[float]) -> list[int]:
+    """Return the tasks in order of decreasing rank; ranks that differ only by round-off count as
+    equal.
+    """
+    return graph.by([(-float(f"{rank:.9g}"), graph.tasks[i].name) for i, rank in enumerate(ranks)])
+
+
+def upward(graph: Graph) -> list[float]:
+    """Return the upward rank of each task: the longest time (s) from its start to the end of the
+    graph, at mean costs.
+
+    Source: Topcuoglu, Hariri, Wu, IEEE TPDS 13 (2002) 260, eq. 8.
+    """
+    ranks, wait, cost = [0.0] * len(graph.tasks), _mean_transfer(graph), _mean_seconds(graph)
+    onward = [0.0] * len(graph.tasks)
+    for i in reversed(graph.by(range(len(graph.tasks)))):
+        ranks[i] = cost[i] + onward[i]
+        for j, size in zip(graph.sources[i], graph.sizes[i], strict=True):
+            onward[j] = max(onward[j], wait[0] + wait[1] * size + ranks[i])
+    return ranks
+
+
+def frugal(graph: Graph) -> list[int]:
+    """Return a depth-first order of the tasks that keeps the peak memory low.
+
+    Of the inputs of a task, the input that frees most of its peak memory comes first. Of all
+    depth-first orders of a tree this order has the smallest peak memory (Liu, ACM TOMS 12 (1986)
+    249).
+    """
+    need, befores = _needs(graph)
+    left = {
+        i: graph.own[i] if i in graph.kept else 0.0 for i, r in enumerate(graph.readers) if not r
+    }
+    place: dict[int, int] = {}
+    stack = sorted(left, key=lambda i: (left[i] - need[i], i), reverse=True)
+    while stack:
+        i = stack[-1]
+        missing = [j for j in befores[i] if j not in place]
+        if missing:
+            stack += reversed(missing)
+            continue
+        place.setdefault(stack.pop(), len(place))
+    return list(place)
+
+
+def _needs(graph: Graph) -> tuple[list[float], list[list[int]]]:
+    """Return for each task the peak memory of a run up to this task, and the order of inputs
+    with the lowest peak.
+    """
+    need, befores = [0.0] * len(graph.tasks), list[list[int]]([] for _ in graph.tasks)
+    for i in graph.by(range(len(graph.tasks))):
+        befores[i] = sorted(graph.sources[i], key=lambda j: (graph.own[j] - need[j], j))
+        held = 0.0
+        for j in befores[i]:
+            need[i] = max(need[i], held + need[j])
+            held += graph.own[j]
+        need[i] = max(need[i], held + graph.own[i] + graph.work(i, graph.tasks[i].parts))
+    return need, befores
+
+
+def _mean_seconds(graph: Graph) -> list[float]:
+    return [
+        sum(row[d] for d in able) / len(able)
+        for row, able in zip(graph.seconds, graph.able, strict=True)
+    ]
+
+
+def _mean_transfer(graph: Graph) -> tuple[float, float]:
+    """Return the mean latency (s) and the mean transfer time per byte (s) over all pairs of
+    devices.
+    """
+    names = [device.name for device in graph.cluster.devices]
+    links = [graph.cluster.link(a, b) for a in names for b in names if a != b]
+    count = max(len(links), 1)
+    return (
+        sum(link.latency for link in links) / count,
+        sum(1.0 / link.bandwidth for link in links) / count,
+    )

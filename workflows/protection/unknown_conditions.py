@@ -1,8 +1,10 @@
-"""What nobody knows of an attack before it comes, as probability distributions, and one sampler of all of them.
+"""What nobody knows of an attack before it comes, as probability distributions, and one sampler of
+all of them.
 
-Studies and trainings draw the same conditions for the same seed: the wavelength and the direction of the laser, the
-defocus of the lens, the grease on the window, and the light that the lens scatters. A study draws a list, and a
-training draws by the same `draw_laws` how the camera of one picture differs from what its restorer is told.
+Studies and trainings draw the same conditions for the same seed: the wavelength and the direction
+of the laser, the defocus of the lens, the grease on the window, and the light that the lens
+scatters. A study draws a list, and a training draws by the same `draw_laws` how the camera of one
+picture differs from what its restorer is told.
 """
 
 from __future__ import annotations
@@ -11,20 +13,23 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
 from neusee.workflows.recipe.distributions.law_text import read_law
-from neusee.workflows.recipe.distributions.scalar import draw_laws
+from neusee.workflows.recipe.distributions.shapes import draw_laws
 
 _MOST_SCATTER = 0.99  #: share of the light; a lens that scatters all light has no picture
 
 
 @dataclass(frozen=True)
 class UnknownLaws:
-    """The distributions of the unknown conditions, each as text such as ``normal(0 waves, 0.25 waves)``."""
+    """The distributions of the unknown conditions, each as text such as ``normal(0 waves, 0.25
+    waves)``.
+    """
 
     wavelength: str = "uniform(400 nm, 700 nm)"  #: of the laser
     direction_y: str = "uniform(-0.25, 0.25)"  #: of the laser, in fields from the middle
     direction_x: str = "uniform(-0.25, 0.25)"
     defocus: str = "normal(0 waves, 0.25 waves)"  #: of the lens, peak to valley at 550 nm
-    grease: str = "loguniform(0.005 waves, 0.05 waves)"  #: on the window, root mean square at 550 nm
+    #: on the window, root mean square at 550 nm
+    grease: str = "loguniform(0.005 waves, 0.05 waves)"
     scatter: str = "lognormal(0.005, 2)"  #: share of the light that the lens scatters
 
 
@@ -41,7 +46,9 @@ class Condition:
 
     @property
     def surfaces(self) -> dict[str, dict[str, float]]:
-        """Return the parameter ``surfaces`` of `flare.stray_light` for a lens that scatters this share of the light."""
+        """Return the parameter ``surfaces`` of `flare.stray_light` for a lens that scatters this
+        share of the light.
+        """
         from neusee.nodes.flare import surface_of
 
         return {"lens": surface_of(self.scatter)}
@@ -52,13 +59,18 @@ class Condition:
         return {**asdict(self), "direction": list(self.direction)}
 
 
-def draw_conditions(count: int, seed: int, laws: UnknownLaws | None = None, first: int = 0) -> list[Condition]:
+def draw_conditions(
+    count: int, seed: int, laws: UnknownLaws | None = None, first: int = 0
+) -> list[Condition]:
     """Return ``count`` independent draws of the conditions, from the number ``first`` on.
 
-    The draw of a number depends only on the seed and the laws, so that a larger ``count`` begins with the same draws.
+    The draw of a number depends only on the seed and the laws, so that a larger ``count`` begins
+    with the same draws.
     """
-    given: Mapping[str, str] = asdict(laws or UnknownLaws())
-    columns = draw_laws({name: read_law(text) for name, text in given.items()}, count, [seed, 4], first)
+    texts: Mapping[str, str] = asdict(laws or UnknownLaws())
+    columns = draw_laws(
+        {name: read_law(text) for name, text in texts.items()}, count, [seed, 4], first
+    )
     return [
         Condition(
             wavelength=columns["wavelength"][i],
@@ -74,6 +86,6 @@ def draw_conditions(count: int, seed: int, laws: UnknownLaws | None = None, firs
 
 def usual_condition(laws: UnknownLaws | None = None) -> Condition:
     """Return the condition with every value at its median, and a clean window."""
-    given: Mapping[str, str] = asdict(laws or UnknownLaws())
-    middle = {name: read_law(text).median for name, text in given.items()}
+    texts: Mapping[str, str] = asdict(laws or UnknownLaws())
+    middle = {name: read_law(text).median for name, text in texts.items()}
     return Condition(middle["wavelength"], (0.0, 0.0), 0.0, 0.0, middle["scatter"], 0)

@@ -1,104 +1,244 @@
-"""Global settings of a recipe: outputs, seed, tolerance, and the numbers that a run is expected to give."""
+"""Global settings of a recipe: outputs, seed, tolerance, exports, expected numbers."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from difflib import get_close_matches
 from typing import Any
 
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
-from neusee.workflows.graph.recipe_graph import Expectation
+from neusee.workflows.graph.recipe_graph import Expectation, Recipe, needed
+from neusee.workflows.recipe.steps import Wiring
 from neusee.workflows.recipe.text.references import BROKEN, References, Scope
 from neusee.workflows.recipe.text.yaml_values import Value, kind
-from neusee.workflows.recipe.wiring import Wiring
+
+# --- expected numbers -----------------------------------------------------------------------------
+
+# Selection of the expected numbers of a recipe that remain valid after the user's changes.
+
+
+def unaffected_expectations(recipe: Recipe, written: Recipe | None) -> Recipe:
+    """Return a recipe without the expected numbers that are affected by the user's changes to
+    ``written``.
+
+    None for ``written`` means that the recipe is not valid without the changes, so that the changes
+    affect everything.
+    """
+    same = _unchanged_steps(recipe, written) if written else set[str]()
+    lost = [
+        e for e in recipe.expect if (written is None or e in written.expect) and e.step not in same
+    ]
+    if not lost:
+        return recipe
+    note = (
+        "not compared, because your changes affect these numbers:"
+        f" {', '.join(e.name for e in lost)}"
+    )
+    comparable = tuple(e for e in recipe.expect if e not in lost)
+    return replace(recipe, expect=comparable, notes=(*recipe.notes, note))
+
+
+def _unchanged_steps(recipe: Recipe, written: Recipe) -> set[str]:
+    """Return the steps that are the same in two recipes, with all that they depend on."""
+    same: set[str] = set()
+    for name in needed(recipe, recipe.steps):
+        if same.issuperset(recipe.steps[name].sources) and _alike(recipe, written, name):
+            same.add(name)
+    return same
+
+
+def _alike(recipe: Recipe, written: Recipe, name: str) -> bool:
+    step, other = recipe.steps[name], written.steps.get(name)
+    if other is None or (step.node.random and recipe.seed != written.seed):
+        return False
+    return (step.node, step.params, step.wires) == (other.node, other.params, other.wires)
+
+
+# --- exported files -------------------------------------------------------------------------------
+
+# Data files that a run writes: the key ``exports`` of a recipe, with the names of the files.
+
+
+KEY, ALL, NONE, HALF = "exports", "all", "none", "@half"
+#: files of the folder ``data`` of a run; `report.contents` says what each of them has
+NAMES = (
+    "radiance.exr",
+    "psf_plain.exr",
+    "psf_mask.exr",
+    "raw_plain.png",
+    "raw_mask.png",
+    "raw_plain.exr",
+    "raw_mask.exr",
+    "restored.exr",
+    "restored.png",
+    "restored_spread.exr",
+    "invented.png",
+    "outputs.safetensors",
+)
+
+
+def exports_of(root: Value, wiring: Wiring) -> dict[str, bool] | None:
+    """Return the names of the data files that a run writes, with True for half floats; None for
+    all files.
+    """
+    block = root.items.get(KEY)
+    if block is None:
+        return None
+    values = block.data if isinstance(block.data, list) else [block]
+    words = [wiring.references.resolve(value, Scope({}, KEY)) for value in values]
+    if not isinstance(block.data, list) and words[0].data in (None, ALL, NONE):
+        return {} if words[0].data == NONE else None
+    return dict(_named(words, wiring))
+
+
+def _named(words: list[Value], wiring: Wiring) -> Iterator[tuple[str, bool]]:
+    for word in words:
+        name = str(word.data).removesuffix(HALF)
+        half = str(word.data) != name
+        if word.data is BROKEN:
+            continue
+        if name not in NAMES:
+            text = (
+                f"no file of a run; {nearest(name, NAMES)}: write {ALL}, {NONE} or a list of names"
+            )
+            wiring.refuse(word, f"{KEY} = {word.data}", text)
+        elif half and not name.endswith(".exr"):
+            wiring.refuse(word, f"{KEY} = {word.data}", "only an .exr file can have half floats")
+        else:
+            yield name, half
+
+
+# --- global settings ------------------------------------------------------------------------------
+
+# Global settings of a recipe: outputs, seed, tolerance, and the numbers that a run is expected to
+# give.
+
 
 _EXPECTED = ("step", "at", "value", "rtol")
-ESTIMATES = "estimates"  #: key of a recipe, false if only proved errors may count towards the tolerance
-_NUMBERS = {"seed": "must be a whole number of 0 or more", "tolerance": "must be a number of 0 or more"}
+#: key of a recipe, false if only proved errors may count towards the tolerance
+ESTIMATES = "estimates"
+_NUMBERS = {
+    "seed": "must be a whole number of 0 or more",
+    "tolerance": "must be a number of 0 or more",
+}
 
 
-def seed_and_tolerance(root: Value, references: References, diagnostics: list[Diagnostic]) -> tuple[int, float]:
-    """Return the random seed and the error tolerance of a recipe; each is 0 if the recipe does not set it."""
+def seed_and_tolerance(
+    root: Value, references: References, diagnostics: list[Diagnostic]
+) -> tuple[int, float]:
+    """Return the random seed and the error tolerance of a recipe; each is 0 if the recipe does
+    not set it.
+    """
     numbers = dict.fromkeys(_NUMBERS, 0)
     for key in (key for key in _NUMBERS if key in root.items):
         value = references.resolve(root.items[key], Scope({}, key))
         if value.data is not BROKEN:
             numbers[key] = value.data
-            if not _is_number(value.data, whole=key == "seed") or value.data < 0:
+            if not _is_number(value.data, is_integer=key == "seed") or value.data < 0:
                 diagnostics.append(Diagnostic(value.mark, f"{key} = {value.data}", _NUMBERS[key]))
     return numbers["seed"], numbers["tolerance"]
 
 
 def estimates_of(root: Value, references: References, diagnostics: list[Diagnostic]) -> bool:
-    """Return True if a run may use cheaper steps whose error is estimated and not proved, as by default."""
+    """Return True if a run may use cheaper steps whose error is estimated and not proved, as by
+    default.
+    """
     if ESTIMATES not in root.items:
         return True
     value = references.resolve(root.items[ESTIMATES], Scope({}, ESTIMATES))
     if value.data is BROKEN or isinstance(value.data, bool):
         return bool(value.data)
-    diagnostics.append(Diagnostic(value.mark, f"{ESTIMATES} = {value.plain}", "must be true or false"))
+    diagnostics.append(
+        Diagnostic(value.mark, f"{ESTIMATES} = {value.plain}", "must be true or false")
+    )
     return True
 
 
 def outputs_of(root: Value, wiring: Wiring) -> tuple[str, ...]:
-    """Return the names of all copies, such as ``psf[mask]``, of the steps in the recipe key ``outputs``."""
-    given = root.items.get("outputs")
-    if given is None or given.data in (None, "", [], {}):
-        if given is not None or not get_close_matches("outputs", map(str, root.items)):  # else reported as unknown
-            wiring.refuse(given or root, "outputs", "no output is requested: write outputs: [STEP, …]")
+    """Return the names of all copies, such as ``psf[mask]``, of the steps in the recipe key
+    ``outputs``.
+    """
+    block = root.items.get("outputs")
+    if block is None or block.data in (None, "", [], {}):
+        # else reported as unknown
+        if block is not None or not get_close_matches("outputs", map(str, root.items)):
+            wiring.refuse(
+                block or root, "outputs", "no output is requested: write outputs: [STEP, …]"
+            )
         return ()
-    if isinstance(given.data, dict):
-        wiring.refuse(given, "outputs", "must be a list of steps, not a mapping")
+    if isinstance(block.data, dict):
+        wiring.refuse(block, "outputs", "must be a list of steps, not a mapping")
         return ()
-    values = given.data if isinstance(given.data, list) else [given]
+    values = block.data if isinstance(block.data, list) else [block]
     resolved = [wiring.references.resolve(value, Scope({}, "outputs")) for value in values]
-    names = (name for value in resolved if value.data is not BROKEN for name in wiring.outputs(value, value.name))
+    names: list[str] = []
+    for value in resolved:
+        if value.data is not BROKEN:
+            names += wiring.outputs(value, value.name)
     return tuple(dict.fromkeys(names))
 
 
 def expectations(root: Value, wiring: Wiring) -> tuple[Expectation, ...]:
     """Return the expected numbers in the key ``expect`` of a recipe."""
-    given = root.items.get("expect")
-    if given is None or given.data is None:
+    block = root.items.get("expect")
+    if block is None or block.data is None:
         return ()
-    given = wiring.references.resolve(given, Scope({}, "expect"))
-    if not isinstance(given.data, dict):
-        wiring.refuse(given, "expect", f"must be a mapping of names, not {kind(given)}")
+    block = wiring.references.resolve(block, Scope({}, "expect"))
+    if not isinstance(block.data, dict):
+        wiring.refuse(block, "expect", f"must be a mapping of names, not {kind(block)}")
         return ()
-    expected = (_expectation(str(name), value, wiring) for name, value in given.data.items())
+    expected = (_expectation(str(name), value, wiring) for name, value in block.data.items())
     return tuple(e for e in expected if e is not None)
 
 
-def _expectation(name: str, given: Value, wiring: Wiring) -> Expectation | None:
+def _expectation(name: str, block: Value, wiring: Wiring) -> Expectation | None:
     before = len(wiring.diagnostics)
-    values: dict[str, Value] = given.items if isinstance(given.data, dict) else {}
-    unknown = {value: nearest(str(key), _EXPECTED) for key, value in values.items() if key not in _EXPECTED}
-    wiring.diagnostics.extend(Diagnostic(v.key, v.name, f"unknown; {hint}") for v, hint in unknown.items())
+    values: dict[str, Value] = block.items if isinstance(block.data, dict) else {}
+    _refuse_keys(block, values, wiring)
+    _refuse_numbers(values, wiring)
+    steps = wiring.outputs(values["step"], values["step"].name) if "step" in values else ()
+    if len(steps) > 1:
+        wiring.refuse(values["step"], values["step"].name, f"must be one step, such as {steps[0]}")
+    indices = _indices(values["at"], wiring) if "at" in values else ()
+    if len(wiring.diagnostics) > before or not steps:
+        return None
+    return Expectation(
+        name, steps[0], indices, float(values["value"].data), float(values["rtol"].data), block.key
+    )
+
+
+def _refuse_keys(block: Value, values: Mapping[str, Value], wiring: Wiring) -> None:
+    """Report the unknown and the missing keys of an expected number."""
+    unknown = {
+        value: nearest(str(key), _EXPECTED) for key, value in values.items() if key not in _EXPECTED
+    }
+    wiring.diagnostics.extend(
+        Diagnostic(v.key, v.name, f"unknown; {hint}") for v, hint in unknown.items()
+    )
     for key in ("step", "value", "rtol"):
         if key not in values and f"did you mean {key}?" not in unknown.values():
             message = f"needs {key}: {{step, value, rtol}} and perhaps at"
-            wiring.diagnostics.append(Diagnostic(given.key, given.name, message))
+            wiring.diagnostics.append(Diagnostic(block.key, block.name, message))
+
+
+def _refuse_numbers(values: Mapping[str, Value], wiring: Wiring) -> None:
+    """Report a value or a relative tolerance that is no number."""
     for key in ("value", "rtol"):
         number = values.get(key)
         if number and not (_is_number(number.data) and (key == "value" or number.data >= 0)):
             wiring.refuse(number, f"{number.name} = {number.plain}", "must be a number")
-    steps = wiring.outputs(values["step"], values["step"].name) if "step" in values else ()
-    if len(steps) > 1:
-        wiring.refuse(values["step"], values["step"].name, f"must be one step, such as {steps[0]}")
-    at = _indices(values["at"], wiring) if "at" in values else ()
-    if len(wiring.diagnostics) > before or not steps:
-        return None
-    return Expectation(name, steps[0], at, float(values["value"].data), float(values["rtol"].data), given.key)
 
 
-def _indices(given: Value, wiring: Wiring) -> tuple[int | str, ...]:
-    at = given.plain if isinstance(given.data, list) else [given.plain]
-    if not all(isinstance(part, int | str) and not isinstance(part, bool) for part in at):
-        wiring.refuse(given, given.name, "must be a list of indices or names of fields")
-    return tuple(at)
+def _indices(value: Value, wiring: Wiring) -> tuple[int | str, ...]:
+    indices = value.plain if isinstance(value.data, list) else [value.plain]
+    if not all(isinstance(index, int | str) and not isinstance(index, bool) for index in indices):
+        wiring.refuse(value, value.name, "must be a list of indices or names of fields")
+    return tuple(indices)
 
 
-def _is_number(data: Any, whole: bool = False) -> bool:
-    if isinstance(data, bool) or not isinstance(data, int if whole else int | float):
+def _is_number(data: Any, is_integer: bool = False) -> bool:
+    if isinstance(data, bool) or not isinstance(data, int if is_integer else int | float):
         return False
-    return whole or math.isfinite(data)
+    return is_integer or math.isfinite(data)

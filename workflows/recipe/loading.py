@@ -1,39 +1,59 @@
-"""Loading of a recipe from its name or file and from arguments, with a check that reports all mistakes at once."""
+"""Loading of a recipe from its name or file and arguments; all mistakes are told at once."""
 
 from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError, visible
-from neusee.workflows.graph.final_values import Config
-from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.keys.regular_file import head_of
-from neusee.workflows.recipe.bound_steps import Attempt
-from neusee.workflows.recipe.distributions.mismatch_laws import read_mismatch
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, visible
+from neusee.workflows.graph.final_values import Config, Setting, changes
+from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
+from neusee.workflows.keys.sealed_files import head_of
+from neusee.workflows.recipe.distributions.law_text import read_mismatch
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
-from neusee.workflows.recipe.expected_numbers import unaffected_expectations
-from neusee.workflows.recipe.exported_files import exports_of
-from neusee.workflows.recipe.global_settings import estimates_of, expectations, outputs_of, seed_and_tolerance
-from neusee.workflows.recipe.graph_cache import CachedGraph, cache_graph, cached_graph
-from neusee.workflows.recipe.known_before_run import CheckedStep, check_steps, refuse_indices
-from neusee.workflows.recipe.node_families import NO_FAMILY, Own, class_context
-from neusee.workflows.recipe.other_cameras import with_cameras
-from neusee.workflows.recipe.own_families import KEY, OwnFamilies, read_own_families
-from neusee.workflows.recipe.parameters import Checker
-from neusee.workflows.recipe.recipe_settings import final_values, settings_of
-from neusee.workflows.recipe.step_declarations import Declared, cached_of, declare, device_of
-from neusee.workflows.recipe.text.composition import Composed, compose
-from neusee.workflows.recipe.text.option_groups import groups_of, shared_folders
-from neusee.workflows.recipe.text.overrides import Override
-from neusee.workflows.recipe.text.python_overrides import overrides_of
+from neusee.workflows.recipe.global_settings import (
+    estimates_of,
+    expectations,
+    exports_of,
+    outputs_of,
+    seed_and_tolerance,
+    unaffected_expectations,
+)
+from neusee.workflows.recipe.node_families import (
+    KEY,
+    NO_FAMILY,
+    Own,
+    OwnFamilies,
+    class_context,
+    read_own_families,
+)
+from neusee.workflows.recipe.step_checks import (
+    Attempt,
+    CachedGraph,
+    CheckedStep,
+    Checker,
+    GraphMemory,
+    cache_graph,
+    cached_graph,
+    check_steps,
+    refuse_indices,
+)
+from neusee.workflows.recipe.steps import Declared, Wiring, cached_of, cycles, declare, device_of
+from neusee.workflows.recipe.text.composition import Composed, compose, groups_of, shared_folders
+from neusee.workflows.recipe.text.overrides import (
+    Override,
+    arguments_in,
+    overrides_of,
+    read_override,
+)
 from neusee.workflows.recipe.text.references import References
 from neusee.workflows.recipe.text.yaml_values import Value, Where
-from neusee.workflows.recipe.wiring import Wiring, cycles
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -41,8 +61,128 @@ if TYPE_CHECKING:
     from neusee.nodes.calibrate import Traceability
     from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
     from neusee.workflows.recipe.blocks.safety_block import Safety
-    from neusee.workflows.recipe.blocks.train_block import Training
-    from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
+    from neusee.workflows.recipe.blocks.train_block import LiftTraining, Training
+
+
+# --- other cameras --------------------------------------------------------------------------------
+
+# The other cameras of a training: the same recipe, each time with other overrides.
+
+
+_TRAIN, _CAMERAS = "train", "train.cameras"
+
+
+def with_cameras(
+    recipe: Recipe, composed: Composed, made: Callable[[Sequence[Override]], Recipe]
+) -> Recipe:
+    """Return a recipe with the recipes of `train.cameras`, which ``made`` loads with the overrides
+    of each.
+
+    The final values state each camera by the values that differ, so that their text needs no groups
+    of options. Raises `RecipeError` with the location of an override, also for one that changes the
+    training.
+    """
+    block = composed.root.items[_TRAIN].items["cameras"]
+    cameras = tuple(
+        made([_override("train.cameras=[]", block), *_overrides(camera)])
+        for camera in block.items.values()
+    )
+    settings = dict(recipe.config.settings)
+    stated = [changes(recipe.config, camera.config, _TRAIN) for camera in cameras]
+    settings[_CAMERAS] = replace(settings[_CAMERAS], value=stated)
+    return replace(recipe, cameras=cameras, config=Config(settings))
+
+
+def _overrides(camera: Value) -> list[Override]:
+    overrides = [_override(str(value.plain), value) for value in camera.items.values()]
+    if wrong := [o for o in overrides if o.path[0] == _TRAIN]:
+        raise RecipeError(
+            Diagnostic(o.mark, camera.name, f"{o.text} is no setting of a camera") for o in wrong
+        )
+    return overrides
+
+
+def _override(text: str, value: Value) -> Override:
+    return read_override(text, Location(str(value.mark), folder=value.mark.folder))
+
+
+# --- recipe settings ------------------------------------------------------------------------------
+
+# Final values of a checked recipe: those that it writes, and the default values of the nodes of its
+# steps.
+
+
+def final_values(
+    wiring: Wiring,
+    bound: dict[str, Step],
+    checker: Checker,
+    uncertain: Uncertain | None,
+    memory: GraphMemory | None,
+) -> dict[str, Setting]:
+    """Return the final values of a recipe by path: the written values and the default values of
+    the steps' nodes.
+    """
+    settings: dict[str, Setting] = {}
+    spare = wiring.references.spare
+    for key, block in wiring.root.items.items():
+        if key != "steps":
+            of_block = _block_settings(block, checker, memory)
+            settings |= {name: value for name, value in of_block.items() if value.path not in spare}
+            continue
+        for name, step in block.items.items():
+            settings |= _block_settings(step, checker, memory)
+            if str(name) in wiring.steps:
+                settings |= _defaults(wiring.steps[str(name)], bound)
+    for name, law in uncertain.laws.items() if uncertain else ():
+        if name in settings:
+            settings[name] = replace(settings[name], value=law.full_text)
+    return settings
+
+
+def _block_settings(
+    block: Value, checker: Checker, memory: GraphMemory | None
+) -> dict[str, Setting]:
+    """Return the final values of a block by path, those of an earlier check if the block is the
+    same object.
+    """
+    remembered = memory.settings.get(block.path) if memory else None
+    same = remembered is not None and remembered[0] is block
+    settings = remembered[1] if remembered and same else dict(settings_of([block], checker))
+    # paths of files may differ
+    if any(setting.path in checker.files for setting in settings.values()):
+        return dict(settings_of([block], checker))
+    if memory and not same:
+        memory.settings[block.path] = block, settings
+    return settings
+
+
+def settings_of(blocks: Iterable[Value], checker: Checker) -> Iterator[tuple[str, Setting]]:
+    """Yield the values that blocks of a recipe write, each with its path."""
+    for leaf in chain.from_iterable(block.leaves() for block in blocks):
+        value: Any = checker.files.get(leaf.path, leaf.plain)
+        sources = dict.fromkeys(map(str, (leaf.mark, *arguments_in(leaf))))
+        yield leaf.name, Setting(value, ", ".join(sources), leaf.path)
+
+
+def _defaults(step: Declared, bound: dict[str, Step]) -> Iterator[tuple[str, Setting]]:
+    """Yield the parameters of a step that the recipe does not set, with the default values in
+    SI.
+    """
+    first = bound.get(step.instances[0]) if step.instances else None
+    for name, value in (first.params if first else {}).items():
+        if first and name not in first.param_marks:
+            path = (*step.value.path, "with", name)
+            yield (
+                ".".join(map(str, path)),
+                Setting(value, f"default of {first.node.path}", path, True),
+            )
+
+
+# --- loading --------------------------------------------------------------------------------------
+
+# Loading of a recipe from its name or file and from arguments, with a check that reports all
+# mistakes at once.
+
 
 TRACED = "traceability"  #: key of the block in which a laboratory states its light and temperature
 BLOCKS = ("train", "train_lift", "evaluate", TRACED)  #: keys of the blocks of settings in a recipe
@@ -51,7 +191,9 @@ SAFETY = "safety"  #: key of the block that an estimate of damage and dazzle rea
 
 @dataclass(frozen=True, slots=True)
 class Titled:
-    """Name of a packaged recipe or of an option of a group, with the title from the first line of its file."""
+    """Name of a packaged recipe or of an option of a group, with the title from the first line
+    of its file.
+    """
 
     name: str
     title: str
@@ -65,23 +207,27 @@ def load(
     first: int = 1,
     **values: Any,
 ) -> Recipe:
-    """Return a packaged recipe, or the recipe in a file whose name ends in ``.yaml``, after a check of all its values.
+    """Return a packaged recipe, or the recipe in a file whose name ends in ``.yaml``, after a check
+    of all its values.
 
         load("first_light", ["sensor.read_noise=20 e-"])
-        load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}, lasers={"green": {"strength": 1e4}})
-        load("first_light", **{"sensor.read_noise": "20 e-", "+lasers.red": {"wavelength": "638 nm", …}})
+        load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}, lasers={"green":
+        {"strength": 1e4}}) load("first_light", **{"sensor.read_noise": "20 e-", "+lasers.red":
+        {"wavelength": "638 nm", …}})
 
-    ``values`` are overrides as Python values, which are applied after ``overrides``; a mapping changes only the values
-    that it names. Paths are relative to ``folder`` (default: the working folder). Messages number ``overrides`` from
-    ``first``. A note names the expected numbers that overrides affect, because these are not compared.
-    Raises `RecipeError` with all mistakes.
+    ``values`` are overrides as Python values, which are applied after ``overrides``; a mapping
+    changes only the values that it names. Paths are relative to ``folder`` (default: the working
+    folder). Messages number ``overrides`` from ``first``. A note names the expected numbers that
+    overrides affect, because these are not compared. Raises `RecipeError` with all mistakes.
     """
     name, beside = os.fspath(name_or_path), Path(folder or ".").absolute()
     changes: tuple[str | Override, ...] = (*overrides, *overrides_of(values, beside))
     composed = compose(name, changes, beside, first)
     recipe = check(composed)
     if recipe.training and recipe.training.cameras:
-        recipe = with_cameras(recipe, composed, lambda words: check(compose(name, [*changes, *words], beside, first)))
+        recipe = with_cameras(
+            recipe, composed, lambda words: check(compose(name, [*changes, *words], beside, first))
+        )
     if recipe.expect and changes:
         recipe = unaffected_expectations(recipe, _as_written(name, beside))
     if recipe.expect and (problems := list(refuse_indices(recipe))):
@@ -90,7 +236,8 @@ def load(
 
 
 def _as_written(name: str, folder: Path) -> Recipe | None:
-    """Return a recipe without the user's overrides, or None if the recipe is not valid without the overrides.
+    """Return a recipe without the user's overrides, or None if the recipe is not valid without the
+    overrides.
 
     The result is cached while the files and nodes of the recipe are unchanged.
     """
@@ -104,17 +251,22 @@ def _as_written(name: str, folder: Path) -> Recipe | None:
 
 @functools.lru_cache(maxsize=16)
 def _checked(composed: Composed, graph: CachedGraph) -> Recipe:
-    """Return a composed recipe after a check of its values; the result is cached by recipe and step graph."""
+    """Return a composed recipe after a check of its values; the result is cached by recipe and
+    step graph.
+    """
     return check(composed)
 
 
 def _settings_blocks(
     composed: Composed, modules: Mapping[str, ModuleType]
-) -> tuple[Composed, Training | None, LiftTraining | None, EvaluateSettings | None, Traceability | None]:
-    """Return a recipe without its blocks of settings, and these; few recipes need the import of their models."""
+) -> tuple[
+    Composed, Training | None, LiftTraining | None, EvaluateSettings | None, Traceability | None
+]:
+    """Return a recipe without its blocks of settings, and these; few recipes need the import of
+    their models.
+    """
     from neusee.workflows.recipe.blocks.evaluate_block import read_evaluate
-    from neusee.workflows.recipe.blocks.train_block import read_training
-    from neusee.workflows.recipe.blocks.train_lift_block import read_lift_training
+    from neusee.workflows.recipe.blocks.train_block import read_lift_training, read_training
 
     composed, training = read_training(composed, class_context(modules))
     composed, lifting = read_lift_training(composed)
@@ -124,12 +276,16 @@ def _settings_blocks(
     from neusee.nodes.calibrate import Traceability
     from neusee.workflows.recipe.blocks.settings_block import read_block
 
-    composed, traceability = read_block(composed, TRACED, Traceability, composed.root.items[TRACED].plain)
+    composed, traceability = read_block(
+        composed, TRACED, Traceability, composed.root.items[TRACED].plain
+    )
     return composed, training, lifting, evaluation, traceability
 
 
 def check(composed: Composed) -> Recipe:
-    """Return a composed recipe after a check of all its values; raise `RecipeError` with all mistakes."""
+    """Return a composed recipe after a check of all its values; raise `RecipeError` with all
+    mistakes.
+    """
     blocks = [composed.root.items[key] for key in BLOCKS if key in composed.root.items]
     mistakes: list[Diagnostic] = []
     own = read_own_families(composed.root, mistakes)
@@ -139,38 +295,77 @@ def check(composed: Composed) -> Recipe:
     composed, uncertain = settle(composed)
     diagnostics = list(composed.diagnostics)
     uncertain = _with_mismatch(composed, uncertain, blocks[0] if training else None, diagnostics)
-    root, references = composed.root, References(composed.root, diagnostics, dict(composed.replaced))
+    root = composed.root
+    references = References(root, diagnostics, dict(composed.replaced))
     checker = Checker([], own=own.modules)
     checker.files[(KEY,)] = own.places
     graph = cached_graph(root, own.modules)
-    steps, absent = (graph.steps, graph.absent) if graph else declare(root, references, diagnostics, own)
+    memory = graph.memory if graph else None
+    steps, absent = (
+        (graph.steps, graph.absent) if graph else declare(root, references, diagnostics, own)
+    )
     wiring, checked = Wiring(root, steps, absent, references, diagnostics), list[CheckedStep]()
     bound = {step.name: step for step in _bind(wiring, checker, graph, checked)}
     loops = _cycles(bound, steps, graph)
     diagnostics += loops
     seed, tolerance = seed_and_tolerance(root, references, checker.diagnostics)
-    estimates, outputs = estimates_of(root, references, checker.diagnostics), outputs_of(root, wiring)
-    check_steps(checked, checker, None if loops else outputs, graph.memory.forms if graph else None)
+    estimates = estimates_of(root, references, checker.diagnostics)
+    outputs = outputs_of(root, wiring)
+    check_steps(checked, checker, None if loops else outputs, memory.forms if memory else None)
     expect, exports = expectations(root, wiring), exports_of(root, wiring)
     safety = _safety(root, references, diagnostics, checker.files)
     references.finish()
+    _refuse_mistakes(composed, diagnostics, checker, own)
+    if graph is None:
+        cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
+    settings = final_values(wiring, bound, checker, uncertain, memory)
+    said_before_run = (composed.notes, own.notes, checker.notes, references.notes)
+    return Recipe(
+        name=composed.name,
+        title=composed.title,
+        seed=seed,
+        tolerance=tolerance,
+        outputs=outputs,
+        steps=bound,
+        expect=expect,
+        config=Config(settings | dict(settings_of(blocks, checker))),
+        notes=(*chain.from_iterable(said_before_run), *_notes_of(uncertain)),
+        absent=_places_of_null(absent),
+        estimates=estimates,
+        uncertain=uncertain,
+        training=training,
+        lifting=lifting,
+        safety=safety,
+        evaluation=evaluation,
+        traceability=traceability,
+        exports=exports,
+    )
+
+
+def _refuse_mistakes(
+    composed: Composed, diagnostics: list[Diagnostic], checker: Checker, own: OwnFamilies
+) -> None:
+    """Raise `RecipeError` with the mistakes of a recipe, if it has any."""
     if not composed.whole:  # a missing group causes further errors
         diagnostics = list(composed.diagnostics)
     if problems := _causes([*diagnostics, *checker.diagnostics], own):
         raise RecipeError(problems)
-    if graph is None:
-        cache_graph(root, steps, absent, {name: step.wires for name, step in bound.items()})
-    memory = graph.memory if graph else None
-    config = Config(final_values(wiring, bound, checker, uncertain, memory) | dict(settings_of(blocks, checker)))
-    gone = {name: f"null ({value.mark})" for name, value in absent.items()}
-    notes = (*composed.notes, *own.notes, *checker.notes, *references.notes, *(uncertain.notes if uncertain else ()))
-    args = composed.name, composed.title, seed, tolerance, outputs, bound, expect, config, notes, gone, False, estimates
-    recipe = Recipe(*args, uncertain=uncertain, safety=safety, traceability=traceability, exports=exports)
-    return replace(recipe, training=training, lifting=lifting, evaluation=evaluation)
 
 
-def _cycles(bound: Mapping[str, Step], steps: Mapping[str, Declared], graph: CachedGraph | None) -> list[Diagnostic]:
-    """Return a diagnostic for each cycle of steps; a graph that was found to have none is not searched again."""
+def _notes_of(uncertain: Uncertain | None) -> tuple[str, ...]:
+    return uncertain.notes if uncertain else ()
+
+
+def _places_of_null(absent: Mapping[str, Value]) -> dict[str, str]:
+    return {name: f"null ({value.mark})" for name, value in absent.items()}
+
+
+def _cycles(
+    bound: Mapping[str, Step], steps: Mapping[str, Declared], graph: CachedGraph | None
+) -> list[Diagnostic]:
+    """Return a diagnostic for each cycle of steps; a graph that was found to have none is not
+    searched again.
+    """
     sources = tuple(step.sources for step in bound.values())
     if graph and sources in graph.memory.sources:
         return []
@@ -181,19 +376,28 @@ def _cycles(bound: Mapping[str, Step], steps: Mapping[str, Declared], graph: Cac
 
 
 def _with_mismatch(
-    composed: Composed, uncertain: Uncertain | None, block: Value | None, diagnostics: list[Diagnostic]
+    composed: Composed,
+    uncertain: Uncertain | None,
+    block: Value | None,
+    diagnostics: list[Diagnostic],
 ) -> Uncertain | None:
-    """Return the uncertain values of a recipe with the differences that ``train.mismatch`` states, if any."""
-    given = block.child("mismatch") if block else None
-    if given is None or not (mismatch := read_mismatch(given, composed.root, diagnostics)):
+    """Return the uncertain values of a recipe with the differences that ``train.mismatch``
+    states, if any.
+    """
+    stated = block.child("mismatch") if block else None
+    if stated is None or not (mismatch := read_mismatch(stated, composed.root, diagnostics)):
         return uncertain
-    return replace(uncertain or Uncertain(replace(composed, diagnostics=()), {}, None), mismatch=mismatch)
+    return replace(
+        uncertain or Uncertain(replace(composed, diagnostics=()), {}, None), mismatch=mismatch
+    )
 
 
 def _safety(
     root: Value, references: References, diagnostics: list[Diagnostic], files: dict[Where, Any]
 ) -> Safety | None:
-    """Return the settings in the block ``safety`` of a recipe, or None; few recipes need the import of these."""
+    """Return the settings in the block ``safety`` of a recipe, or None; few recipes need the
+    import of these.
+    """
     if SAFETY not in root.items:
         return None
     from neusee.workflows.recipe.blocks.safety_block import read_safety
@@ -203,43 +407,73 @@ def _safety(
 
 def _causes(problems: list[Diagnostic], own: OwnFamilies) -> list[Diagnostic]:
     """Return the mistakes without those that follow from a family that could not be read."""
-    return [each for each in problems if own.is_whole or not each.message.startswith(NO_FAMILY)]
+    return [
+        problem for problem in problems if own.is_whole or not problem.message.startswith(NO_FAMILY)
+    ]
 
 
-def _bind(wiring: Wiring, checker: Checker, graph: CachedGraph | None, checked: list[CheckedStep]) -> Iterator[Step]:
-    """Yield every copy of every step with its parameters and inputs, and add each valid copy to ``checked``.
+def _bind(
+    wiring: Wiring, checker: Checker, graph: CachedGraph | None, checked: list[CheckedStep]
+) -> Iterator[Step]:
+    """Yield every copy of every step with its parameters and inputs, and add each valid copy to
+    ``checked``.
 
-    ``graph`` has the inputs of each copy, and the copies that were checked with the same values before.
+    ``graph`` has the inputs of each copy, and the copies that were checked with the same values
+    before.
     """
-    known, memory = (graph.wires, graph.memory) if graph else ({}, None)
+    known_wires, memory = (graph.wires, graph.memory) if graph else ({}, None)
     for step in wiring.steps.values():
         if not step.items:
-            for part in ("from", "with", "device", "cache"):
-                wiring.references.touch(step.part(part), step.dims)
+            for key in ("from", "with", "device", "cache"):
+                wiring.references.touch(step.part(key), step.dims)
         for items in step.items:
             name = step.instance(items)
             if memory and (same := memory.find(name, wiring.references)):
                 checked.append(same)
                 yield same.step
                 continue
-            attempt, scope = Attempt(wiring.references, checker), step.scope(wiring.root, items)
-            given = wiring.references.resolve(step.part("with"), scope)
-            wires = known[name] if name in known else wiring.wires(step, items)
-            device = device_of(step, wiring.references, scope, checker.diagnostics)
-            cached = cached_of(step, wiring.references, scope, checker.diagnostics)
-            if step.node is None:
+            attempt = Attempt(wiring.references, checker)
+            bound = _bound_copy(wiring, checker, step, items, known_wires)
+            if bound is None:
                 continue
-            params = checker.read(step.node, given, step.value.key)
-            marks = {str(name): value.mark for name, value in given.items.items()}
-            found = Step(name, step.node, params or {}, wires, step.value.key, marks, device, cached)
-            if params is not None:
-                checked.append(CheckedStep(found, given, step.value))
+            if bound.is_valid:
+                checked.append(CheckedStep(bound.step, bound.parameters, step.value))
                 attempt.remember(name, checked[-1], memory)
-            yield found
+            yield bound.step
+
+
+class _BoundCopy(NamedTuple):
+    """One copy of a step, with the parameters that the recipe writes."""
+
+    step: Step
+    parameters: Value
+    is_valid: bool  #: whether the parameters are right
+
+
+def _bound_copy(
+    wiring: Wiring,
+    checker: Checker,
+    step: Declared,
+    items: tuple[str, ...],
+    known_wires: Mapping[str, Mapping[str, Wire]],
+) -> _BoundCopy | None:
+    """Return one copy of a step with its parameters and inputs, or None without its node."""
+    name, scope = step.instance(items), step.scope(wiring.root, items)
+    parameters = wiring.references.resolve(step.part("with"), scope)
+    wires = known_wires[name] if name in known_wires else wiring.wires(step, items)
+    device = device_of(step, wiring.references, scope, checker.diagnostics)
+    cached = cached_of(step, wiring.references, scope, checker.diagnostics)
+    if step.node is None:
+        return None
+    params = checker.read(step.node, parameters, step.value.key)
+    marks = {str(name): value.mark for name, value in parameters.items.items()}
+    step_copy = Step(name, step.node, params or {}, wires, step.value.key, marks, device, cached)
+    return _BoundCopy(step_copy, parameters, params is not None)
 
 
 def families_of(name: str, folder: Path | None = None) -> Own:
-    """Return the modules of the families of nodes that a recipe names, by family, without a check of the recipe.
+    """Return the modules of the families of nodes that a recipe names, by family, without a check
+    of the recipe.
 
     Raises `RecipeError` if a family cannot be read.
     """
@@ -250,23 +484,30 @@ def families_of(name: str, folder: Path | None = None) -> Own:
     return own.modules
 
 
-# --- lists of recipes and groups ------------------------------------------------------------------------------------
+# --- lists of recipes and groups ------------------------------------------------------------------
 
 
 def recipes() -> list[Titled]:
-    """Return names and titles of all recipes that a name finds: those of the user, and the packaged recipes."""
-    found: dict[str, Path] = {}
+    """Return names and titles of all recipes that a name finds: those of the user, and the
+    packaged recipes.
+    """
+    paths: dict[str, Path] = {}
     for folder in shared_folders():
         for path in sorted(folder.glob("*.yaml")):
-            found.setdefault(path.stem, path)
-    return [_titled(path) for _, path in sorted(found.items())]
+            paths.setdefault(path.stem, path)
+    return [_titled(path) for _, path in sorted(paths.items())]
 
 
 def groups(beside: Path | None = None) -> dict[str, list[Titled]]:
-    """Return the options of all groups: those in ``beside``, those of the user, and the packaged options."""
+    """Return the options of all groups: those in ``beside``, those of the user, and the packaged
+    options.
+    """
     folders = [folder for folder in (beside, *shared_folders()) if folder]
     return {
-        group: [_titled(next(p for f in folders if (p := f / group / f"{name}.yaml").is_file())) for name in names]
+        group: [
+            _titled(next(p for f in folders if (p := f / group / f"{name}.yaml").is_file()))
+            for name in names
+        ]
         for group, names in groups_of(*folders).items()
     }
 
@@ -277,3 +518,33 @@ _TITLE = 4096  #: bytes of the first line of a recipe, at most
 def _titled(path: Path) -> Titled:
     first = head_of(path, _TITLE).decode("utf-8", "replace").partition("\n")[0].strip()
     return Titled(path.stem, visible(first.lstrip("# ")) if first.startswith("#") else "")
+
+
+# --- changed recipe -------------------------------------------------------------------------------
+
+# Changes of a loaded recipe: its final values are written to a file, changed by overrides and
+# checked again.
+
+
+def changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
+    """Return a loaded recipe with values changed by ``overrides``; raise `RecipeError` for an
+    invalid value.
+    """
+    with TemporaryDirectory(prefix="neusee-") as folder:
+        path = Path(folder) / "recipe.yaml"
+        path.write_text(recipe.config.to_yaml(), encoding="utf-8")
+        loaded = load(path, overrides)
+    loaded = replace(
+        loaded,
+        name=recipe.name,
+        title=recipe.title,
+        seed=recipe.seed,
+        outputs=recipe.outputs,
+        expect=(),
+    )
+    return replace(
+        loaded,
+        tolerance=recipe.tolerance,
+        exact=recipe.exact,
+        estimates=recipe.estimates and loaded.estimates,
+    )

@@ -1,8 +1,4 @@
-"""Families of nodes, such as ``optics``: those of neusee, of installed packages, and of files that a recipe names.
-
-A package installs a family by an entry point of the group ``neusee.nodes``. A family of a package is imported when a
-recipe uses it or when all are listed, so that a broken package breaks no other recipe.
-"""
+"""Families of nodes, such as optics: of neusee, of packages, and of files a recipe names."""
 
 from __future__ import annotations
 
@@ -10,11 +6,13 @@ import functools
 import importlib
 import importlib.util
 import inspect
+import os
 import pkgutil
 import re
 import sys
 import traceback
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -22,21 +20,35 @@ from typing import Any
 
 import neusee.nodes
 from neusee.nodes import Node
-from neusee.nodes.network_classes import FAMILY, network_classes
-from neusee.nodes.own_modules import import_file, note_module
-from neusee.workflows.graph.diagnostics import nearest
+from neusee.nodes.own_modules import FAMILY, import_file, network_classes, note_module
+from neusee.workflows.graph.diagnostics import Diagnostic, nearest
+from neusee.workflows.recipe.text.composition import NO_CODE_VARIABLE, is_strange
 from neusee.workflows.recipe.text.renamed_keys import instead
+from neusee.workflows.recipe.text.yaml_values import Value, kind
+
+# --- node families --------------------------------------------------------------------------------
+
+# Families of nodes, such as ``optics``: those of neusee, of installed packages, and of files that a
+# recipe names.
+#
+# A package installs a family by an entry point of the group ``neusee.nodes``. A family of a package
+# is imported when a recipe uses it or when all are listed, so that a broken package breaks no other
+# recipe.
+
 
 GROUP = "neusee.nodes"  #: group of the entry points by which packages install families of nodes
 
 NO_FAMILY = "no family of your own is called"  #: first words of a mistake
 Own = Mapping[str, ModuleType]  #: modules of the families that a recipe names, by family
 _NO_OWN: Own = {}
-_family_of: dict[str, str] = {}  #: family of each module of a user, because a node has one name in a process
+#: family of each module of a user, because a node has one name in a process
+_family_of: dict[str, str] = {}
 
 
 def find_node(name: str, own: Own = _NO_OWN) -> Node:
-    """Return the node with a name such as ``sensor.digitize``; raise `LookupError` with the most similar name."""
+    """Return the node with a name such as ``sensor.digitize``; raise `LookupError` with the most
+    similar name.
+    """
     family, _, attribute = name.partition(".")
     nodes = nodes_of(family, own) if _exists(family, own) else {}
     if attribute not in nodes and (now := instead(name)):
@@ -53,19 +65,33 @@ def find_node(name: str, own: Own = _NO_OWN) -> Node:
 def families(own: Own = _NO_OWN) -> list[str]:
     """Return the names of the families of nodes, such as ``optics``, without importing a family."""
     packages = {info.name for info in pkgutil.iter_modules(neusee.nodes.__path__) if info.ispkg}
-    loaded = (re.fullmatch(rf"{neusee.nodes.__name__}\.([a-z]\w*)", module) for module in list(sys.modules))
-    return sorted({*packages, *(match[1] for match in loaded if match and _ours(match[1])), *_installed(), *own})
+    loaded = (
+        re.fullmatch(rf"{neusee.nodes.__name__}\.([a-z]\w*)", module)
+        for module in list(sys.modules)
+    )
+    return sorted(
+        {
+            *packages,
+            *(match[1] for match in loaded if match and _ours(match[1])),
+            *_installed(),
+            *own,
+        }
+    )
 
 
 def nodes_of(family: str, own: Own = _NO_OWN) -> dict[str, Node]:
-    """Return the nodes of a family such as ``optics`` by name; raise `LookupError` for an installed one that fails."""
+    """Return the nodes of a family such as ``optics`` by name; raise `LookupError` for an
+    installed one that fails.
+    """
     if family in own:
         return own_nodes(family, own[family])
     return _ours(family) if _is_ours(family) else own_nodes(family, _load(family))
 
 
 def all_nodes(own: Own = _NO_OWN) -> Iterator[tuple[str, Node]]:
-    """Yield each node of all families that work with the name that recipes use, such as ``sensor.digitize``."""
+    """Yield each node of all families that work with the name that recipes use, such as
+    ``sensor.digitize``.
+    """
     for family in families(own):
         try:
             nodes = nodes_of(family, own)
@@ -92,7 +118,9 @@ def is_known(family: str) -> bool:
 
 
 def module_of(family: str, own: Own = _NO_OWN) -> ModuleType:
-    """Return the module of a family of the user or of an installed package; raise `LookupError` for any other name."""
+    """Return the module of a family of the user or of an installed package; raise `LookupError`
+    for any other name.
+    """
     if family in own:
         return own[family]
     if family in _installed():
@@ -106,12 +134,18 @@ def class_context(own: Own) -> dict[str, Any]:
 
 
 def installed_as(module: str) -> str | None:
-    """Return the family that an installed package makes of a module; None if no package makes one."""
-    return next((family for family, points in _installed().items() if points[0].value == module), None)
+    """Return the family that an installed package makes of a module; None if no package makes
+    one.
+    """
+    return next(
+        (family for family, points in _installed().items() if points[0].value == module), None
+    )
 
 
 def family_title(family: str, own: Own = _NO_OWN) -> str:
-    """Return the first line of the docstring of a family's module; raise `LookupError` as `nodes_of` does."""
+    """Return the first line of the docstring of a family's module; raise `LookupError` as
+    `nodes_of` does.
+    """
     if family in own:
         module = own[family]
     elif _is_ours(family):
@@ -124,37 +158,45 @@ def family_title(family: str, own: Own = _NO_OWN) -> str:
 def own_nodes(family: str, module: ModuleType) -> dict[str, Node]:
     """Return the nodes that a module or package of a user defines, each named after the family.
 
-    Raises `LookupError` if the module defines neither a node nor a network, or belongs to a family of another name.
+    Raises `LookupError` if the module defines neither a node nor a network, or belongs to a family
+    of another name.
     """
     name = module.__name__
-    found = {
+    nodes = {
         key: value
         for key, value in vars(module).items()
         if isinstance(value, Node) and f"{value.fn.__module__}.".startswith(f"{name}.")
     }
-    if not found and not network_classes(module):
+    if not nodes and not network_classes(module):
         raise LookupError(
-            f"{name} defines no node: decorate a function with @node() of neusee.nodes, or write a network class"
+            f"{name} defines no node: decorate a function with @node() of neusee.nodes, or write a"
+            " network class"
         )
     if _family_of.setdefault(name, family) != family:
-        raise LookupError(f"{name} is the family {_family_of[name]} in this process: use that name, or a new process")
-    for key, node in found.items():
+        raise LookupError(
+            f"{name} is the family {_family_of[name]} in this process: use that name, or a new"
+            " process"
+        )
+    for key, node in nodes.items():
         node.path = f"{family}.{key}"
-    return found
+    return nodes
 
 
 def import_own(where: str, folder: Path) -> ModuleType:
-    """Import a module that a recipe names: a file or folder relative to ``folder``, or the name of a module.
+    """Import a module that a recipe names: a file or folder relative to ``folder``, or the name of
+    a module.
 
     Raises `LookupError` with place and cause.
     """
-    from neusee.workflows.observation.own_import import import_observed  # imports torch
+    from neusee.workflows.observation.observed_call import import_observed  # imports torch
 
     is_path = where.endswith(".py") or "/" in where or "\\" in where or where in (".", "..")
     path = Path(folder, where).expanduser()
     try:
         if is_path:
-            return import_file(path.absolute() if where not in (".", "..") else path.resolve(), import_observed)
+            return import_file(
+                path.absolute() if where not in (".", "..") else path.resolve(), import_observed
+            )
         module = import_observed(where)
         note_module(where)
         return module
@@ -168,14 +210,16 @@ def import_own(where: str, folder: Path) -> ModuleType:
 
 
 def _with_parameters(node: Node) -> Node:
-    """Return a node of a user; raise `LookupError` with the place of one whose parameters cannot be validated."""
+    """Return a node of a user; raise `LookupError` with the place of one whose parameters cannot
+    be validated.
+    """
     code = inspect.unwrap(node.fn).__code__
     place, name = f"{Path(code.co_filename).name}:{code.co_firstlineno}", node.fn.__name__
     try:
         if bare := unannotated(node):
             raise LookupError(
-                f"{place}: {name} does not say what {bare[0]} is: write a type such as `{bare[0]}: float`, or a unit "
-                f"of neusee.nodes.units"
+                f"{place}: {name} does not say what {bare[0]} is: write a type such as `{bare[0]}:"
+                " float`, or a unit of neusee.nodes.units"
             )
         assert node.params
     except LookupError:
@@ -188,14 +232,26 @@ def _with_parameters(node: Node) -> Node:
 
 def unannotated(node: Node) -> list[str]:
     """Return the names of the parameters of a node that have no annotation."""
-    given = inspect.signature(node.fn).parameters.values()
-    return [p.name for p in given if p.kind is p.KEYWORD_ONLY and p.name != "rng" and p.name not in node.hints]
+    parameters = inspect.signature(node.fn).parameters.values()
+    return [
+        p.name
+        for p in parameters
+        if p.kind is p.KEYWORD_ONLY and p.name != "rng" and p.name not in node.hints
+    ]
 
 
 def _failure(where: str, error: BaseException) -> str:
     """Return why the import of a module failed, with the last line of the user's code that ran."""
-    lines = [frame for frame in traceback.extract_tb(error.__traceback__) if "importlib" not in frame.filename]
-    inner = [frame for frame in lines if not frame.filename.startswith(str(Path(neusee.nodes.__file__).parents[1]))]
+    lines = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if "importlib" not in frame.filename
+    ]
+    inner = [
+        frame
+        for frame in lines
+        if not frame.filename.startswith(str(Path(neusee.nodes.__file__).parents[1]))
+    ]
     line = f"{Path(inner[-1].filename).name}:{inner[-1].lineno}: " if inner else ""
     if isinstance(error, SyntaxError) and error.filename:
         line = f"{Path(error.filename).name}:{error.lineno}: "
@@ -211,7 +267,9 @@ def _exists(family: str, own: Own) -> bool:
 def _is_ours(family: str) -> bool:
     """Return True if neusee has a family of this name."""
     module = f"{neusee.nodes.__name__}.{family}"
-    return family.isidentifier() and (module in sys.modules or importlib.util.find_spec(module) is not None)
+    return family.isidentifier() and (
+        module in sys.modules or importlib.util.find_spec(module) is not None
+    )
 
 
 def _ours(family: str) -> dict[str, Node]:
@@ -221,19 +279,25 @@ def _ours(family: str) -> dict[str, Node]:
 
 @functools.cache
 def _installed() -> dict[str, tuple[EntryPoint, ...]]:
-    """Return the entry points of each family of an installed package; a name of a family of neusee does not count."""
-    found = dict[str, tuple[EntryPoint, ...]]()
+    """Return the entry points of each family of an installed package; a name of a family of
+    neusee does not count.
+    """
+    points = dict[str, tuple[EntryPoint, ...]]()
     for point in entry_points(group=GROUP):
         if not _is_ours(point.name):
-            found[point.name] = (*found.get(point.name, ()), point)
-    return found
+            points[point.name] = (*points.get(point.name, ()), point)
+    return points
 
 
 def _load(family: str) -> ModuleType:
-    """Import an installed family; raise `LookupError` with the distribution and the cause if that fails."""
+    """Import an installed family; raise `LookupError` with the distribution and the cause if
+    that fails.
+    """
     points = _installed()[family]
     if len(points) > 1:
-        names = " and ".join(sorted({point.dist.name if point.dist else point.value for point in points}))
+        names = " and ".join(
+            sorted({point.dist.name if point.dist else point.value for point in points})
+        )
         raise LookupError(f"{names} both install a family of nodes {family}: uninstall one")
     module, place = points[0].value, points[0].dist.name if points[0].dist else points[0].value
     try:
@@ -241,10 +305,105 @@ def _load(family: str) -> ModuleType:
         note_module(module)
         return loaded
     except (Exception, SystemExit) as error:
-        raise LookupError(f"{family} of the installed package {place} fails: {_failure(module, error)}") from None
+        raise LookupError(
+            f"{family} of the installed package {place} fails: {_failure(module, error)}"
+        ) from None
 
 
 def _elsewhere(attribute: str, own: Own) -> str:
     """Return a hint with the nodes of other families that have the name of an unknown node."""
     names = [name for name, _ in all_nodes(own) if name.partition(".")[2] == attribute]
     return f"did you mean {' or '.join(names)}?" if names else ""
+
+
+# --- own families ---------------------------------------------------------------------------------
+
+# The list ``nodes`` of a recipe: the files, folders and packages with the user's own families of
+# nodes.
+
+
+KEY = "nodes"
+_FORM = "must be a file, a folder or a module, such as bloom.py, or `family: module`"
+
+
+@dataclass
+class OwnFamilies:
+    """The families of nodes that a recipe names."""
+
+    modules: dict[str, ModuleType] = field(default_factory=dict)  #: by family
+    places: list[Any] = field(default_factory=list)  #: the entries, with the full path of each file
+    notes: list[str] = field(default_factory=list)
+    is_whole: bool = True  #: whether every family could be read
+
+
+def read_own_families(root: Value, diagnostics: list[Diagnostic]) -> OwnFamilies:
+    """Import what the list ``nodes`` of a recipe names, and return the families; report each
+    mistake at its entry.
+
+    Importing runs the code. The variable ``NEUSEE_NO_CODE`` refuses that.
+    """
+    own = OwnFamilies()
+    entries = root.items.get(KEY)
+    if entries is None or entries.data is None:
+        return own
+    if not isinstance(entries.data, list):
+        diagnostics.append(
+            Diagnostic(
+                entries.mark, KEY, f"must be a list of files and modules, not {kind(entries)}"
+            )
+        )
+        own.is_whole = False
+        return own
+    before = len(diagnostics)
+    for entry in entries.data:
+        pair = _pair(entry)
+        if pair is None:
+            diagnostics.append(Diagnostic(entry.mark, entry.name, _FORM))
+            continue
+        if is_strange():
+            message = f"names code, which {NO_CODE_VARIABLE} or --no-code refuses to run"
+            diagnostics.append(Diagnostic(entry.mark, f"{entry.name} = {pair[1].data}", message))
+            continue
+        try:
+            _add(own, *pair)
+        except LookupError as error:
+            diagnostics.append(
+                Diagnostic(entry.mark, f"{entry.name} = {pair[1].data}", str(error.args[0]))
+            )
+    own.is_whole = len(diagnostics) == before
+    if own.modules:
+        names = ", ".join(
+            str(getattr(module, "__file__", module)) for module in own.modules.values()
+        )
+        own.notes.append(f"reading this recipe ran code: {names}")
+    return own
+
+
+def _pair(entry: Value) -> tuple[str, Value] | None:
+    """Return the family, or an empty text, and the place of an entry, or None for another form."""
+    if isinstance(entry.data, str):
+        return "", entry
+    pair = list(entry.items.items()) if isinstance(entry.data, dict) else []
+    if len(pair) == 1 and isinstance(pair[0][1].data, str) and str(pair[0][0]).isidentifier():
+        return str(pair[0][0]), pair[0][1]
+    return None
+
+
+def _add(own: OwnFamilies, family: str, where: Value) -> None:
+    """Import one entry; raise `LookupError` if that fails or if its family has the name of
+    another one.
+    """
+    folder = Path(where.mark.folder)
+    module = import_own(str(where.data), folder)
+    name = family or module.__name__.rpartition(".")[2]
+    if own.modules.get(name) is module:
+        return
+    if name in own.modules or is_known(name):
+        other = getattr(own.modules.get(name), "__file__", "neusee or an installed package")
+        text = f"a family of nodes {name} is there already, of {other}"
+        raise LookupError(f"{text}: name yours, as in `nodes: [my_{name}: {where.data}]`")
+    own_nodes(name, module)
+    own.modules[name] = module
+    full = folder / str(where.data)
+    place = os.path.abspath(full) if full.exists() else str(where.data)
+    own.places.append({family: place} if family else place)

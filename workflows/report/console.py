@@ -1,7 +1,8 @@
-"""Screen output of a run: a table of the steps, updated during the run if stdout is a terminal, and the result table.
+"""Screen output of a run: a table of the steps, updated during the run if stdout is a terminal, and
+the result table.
 
-Copies of a step, such as ``spot[mask,green]`` and ``spot[mask,red]``, share a line. All steps whose results no other
-step had to load share one line.
+Copies of a step, such as ``spot[mask,green]`` and ``spot[mask,red]``, share a line. All steps whose
+results no other step had to load share one line.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from neusee.workflows.graph.step_record import Event, StepRecord
-from neusee.workflows.report.mask_story import SENTENCES
+from neusee.workflows.graph.recipe_graph import Event, StepRecord
 from neusee.workflows.report.paper_readings import consequences
 from neusee.workflows.report.run_page import shape_of, unchecked_lines, unit_of
-from neusee.workflows.report.text_table import by_family, indented, lasts, wrapped
+from neusee.workflows.report.run_summary import SENTENCES
+from neusee.workflows.report.terminal_text import by_family, indented, lasts, wrapped
 from neusee.workflows.report.tolerance_spent import said_of_economies, said_of_errors
 
 if TYPE_CHECKING:
@@ -34,7 +35,9 @@ _WIDTHS = (5, 19, 9, 28, 0)  #: of the columns after the first
 
 @dataclass
 class Family:
-    """All copies of one step, such as ``psf[plain]`` and ``psf[mask]``, and the records of the finished copies."""
+    """All copies of one step, such as ``psf[plain]`` and ``psf[mask]``, and the records of the
+    finished copies.
+    """
 
     name: str
     members: list[str]
@@ -44,7 +47,9 @@ class Family:
 
     @property
     def needed(self) -> list[StepRecord]:
-        """Return the records of the copies of the step that the run computed, loaded or left out."""
+        """Return the records of the copies of the step that the run computed, loaded or left
+        out.
+        """
         return [d for d in self.done if d.state != "not needed"]
 
     def cells(self) -> tuple[str, ...]:
@@ -55,22 +60,38 @@ class Family:
             return name, "", "…" if self.begun else "", "", "", ""
         ran = sum(d.seconds for d in done if d.state == "run")
         last = max(done, key=lambda d: (d.facts is not None, self.members.index(d.step)))
-        shown = next((d for d in done if any(not c.ok for c in d.checks)), last)
+        shown = next((d for d in done if not all(c.ok for c in d.checks)), last)
+        seconds = f"{ran:.3f}" if ran else ""
+        return name, shown.device, self.state(), seconds, self._output(last), self._check(shown)
+
+    def _output(self, last: StepRecord) -> str:
+        """Return the shape of a result with its unit, or an empty text."""
         shape = shape_of(last)
-        check = "; ".join(("" if c.ok else "LOOK: ") + c.text for c in shown.checks)
-        why = next((d.why for d in done if d.state in ("run", "left out") and d.why), "")
-        check = f"{check}  ({why})" if check and why else check or why
-        output = f"{shape} {self.unit}".strip() if shape else ""
-        return name, shown.device, self.state(), f"{ran:.3f}" if ran else "", output, check
+        return f"{shape} {self.unit}".strip() if shape else ""
+
+    def _check(self, shown: StepRecord) -> str:
+        """Return the texts of the checks of a copy, and why the first copy ran or was left out."""
+        texts = "; ".join(("" if c.ok else "LOOK: ") + c.text for c in shown.checks)
+        reasons = (d.why for d in self.needed if d.state in ("run", "left out") and d.why)
+        why = next(reasons, "")
+        return f"{texts}  ({why})" if texts and why else texts or why
 
     def state(self) -> str:
-        """Return the common state of all copies of a step, such as ``run``, or the number of copies in each state."""
+        """Return the common state of all copies of a step, such as ``run``, or the number of
+        copies in each state.
+        """
         states = Counter(str(d.state) for d in self.done)
-        return "".join(states) if len(states) == 1 else ", ".join(f"{n} {s}" for s, n in states.items())
+        return (
+            "".join(states)
+            if len(states) == 1
+            else ", ".join(f"{n} {s}" for s, n in states.items())
+        )
 
 
 def mode_for(silent: bool) -> Mode:
-    """Return how a table is printed: ``silent`` on request, ``live`` (updated) on a terminal, else ``plain`` lines."""
+    """Return how a table is printed: ``silent`` on request, ``live`` (updated) on a terminal,
+    else ``plain`` lines.
+    """
     return "silent" if silent else "live" if sys.stdout.isatty() else "plain"
 
 
@@ -107,11 +128,15 @@ class ProgressTable(ABC):
             self._live.stop()
 
     def show_row(self, cells: Sequence[str]) -> None:
-        """Print a finished row as a line of text; do nothing if the table is updated on a terminal."""
+        """Print a finished row as a line of text; do nothing if the table is updated on a
+        terminal.
+        """
         if self.mode != "plain":
             return
         columns = zip(self.header, cells, self.widths, strict=True)
-        padded = [f"{cell:{'>' if name in self.numbers else '<'}{width}}" for name, cell, width in columns]
+        padded = [
+            f"{cell:{'>' if name in self.numbers else '<'}{width}}" for name, cell, width in columns
+        ]
         self._print("  " + "  ".join(padded).rstrip())
 
     def _print(self, line: str) -> None:
@@ -124,12 +149,16 @@ class ProgressTable(ABC):
             return self._lines
         from rich.console import Console
 
-        text, seen = StringIO(), self._live.console
-        Console(file=text, force_terminal=True, width=seen.width, height=seen.height).print(self)
+        text, screen = StringIO(), self._live.console
+        Console(file=text, force_terminal=True, width=screen.width, height=screen.height).print(
+            self
+        )
         return text.getvalue().removesuffix("\n").split("\n")
 
     def show_error(self, plain: Iterable[str], live: str) -> None:
-        """Print an error: the lines ``plain`` to a file or pipe, or the text ``live`` above a table on a terminal."""
+        """Print an error: the lines ``plain`` to a file or pipe, or the text ``live`` above a
+        table on a terminal.
+        """
         if self.mode == "plain":
             print(*plain, sep="\n", flush=True)
         elif self.mode == "live":
@@ -139,27 +168,42 @@ class ProgressTable(ABC):
         from rich import box
         from rich.table import Table
 
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold", caption=self.caption() or None)
+        table = Table(
+            box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold", caption=self.caption() or None
+        )
         for name in self.header:
-            table.add_column(name, justify="right" if name in self.numbers else "left", overflow="fold")
+            table.add_column(
+                name, justify="right" if name in self.numbers else "left", overflow="fold"
+            )
         for cells, state in self.live_rows():
             table.add_row(*cells, style=_STYLES.get(state, ""))
         return table
 
 
 class RunTable(ProgressTable):
-    """Table of the steps of a run; outside a terminal, a step is printed when all its copies are finished."""
+    """Table of the steps of a run; outside a terminal, a step is printed when all its copies are
+    finished.
+    """
 
     header, numbers = HEADER, ("seconds",)
 
     def __init__(
-        self, recipe: Recipe, names: Iterable[str], mode: Mode, predicted: Mapping[str, float] | None = None
+        self,
+        recipe: Recipe,
+        names: Iterable[str],
+        mode: Mode,
+        predicted: Mapping[str, float] | None = None,
     ) -> None:
-        """Make the table of the steps ``names``; ``predicted`` has the seconds of steps as earlier runs took."""
+        """Make the table of the steps ``names``; ``predicted`` has the seconds of steps as
+        earlier runs took.
+        """
         super().__init__(mode)
         self._left = dict(predicted or {})
         self.families = families(recipe, names)
-        self.widths = (max((len(f.cells()[0]) for f in self.families.values()), default=0), *_WIDTHS)
+        self.widths = (
+            max((len(f.cells()[0]) for f in self.families.values()), default=0),
+            *_WIDTHS,
+        )
 
     def __exit__(self, *error: object) -> None:
         super().__exit__(*error)
@@ -184,19 +228,27 @@ class RunTable(ProgressTable):
     @property
     def finished(self) -> int:
         """Return the number of steps that the run has computed or loaded so far."""
-        return sum(d.state in ("run", "cached") for family in self.families.values() for d in family.done)
+        return sum(d.state in ("run", "cached") for d in self._done())
+
+    def _done(self) -> Iterator[StepRecord]:
+        for family in self.families.values():
+            yield from family.done
 
     def caption(self) -> str:
-        """Return the time that is left, or how many steps were neither computed nor loaded in the end."""
+        """Return the time that is left, or how many steps were neither computed nor loaded in
+        the end.
+        """
         if (left := sum(self._left.values())) >= 1:
             return f"about {lasts(left)} left, as earlier runs took"
-        count = sum(d.state == "not needed" for f in self.families.values() for d in f.done)
+        count = sum(d.state == "not needed" for d in self._done())
         steps = "1 step was" if count == 1 else f"{count} steps were"
         return f"{steps} not needed: the results that need them are in the cache" if count else ""
 
 
 def families(recipe: Recipe, names: Iterable[str]) -> dict[str, Family]:
-    """Group the steps of a run by the name before the bracket, in running order: ``psf[mask]`` belongs to ``psf``."""
+    """Group the steps of a run by the name before the bracket, in running order: ``psf[mask]``
+    belongs to ``psf``.
+    """
     return {
         short: Family(short, members, unit_of(recipe.steps[members[0]].node.__doc__ or ""))
         for short, members in by_family(names).items()
@@ -204,7 +256,8 @@ def families(recipe: Recipe, names: Iterable[str]) -> dict[str, Family]:
 
 
 def note(families: dict[str, Family], event: Event) -> Family:
-    """Add the start or the end of one copy of a step to the group of all copies, and return this group.
+    """Add the start or the end of one copy of a step to the group of all copies, and return this
+    group.
 
     A second attempt of a run may have steps that the first attempt did not have.
     """
@@ -220,46 +273,57 @@ def note(families: dict[str, Family], event: Event) -> Family:
 
 
 def contents_of(recipe: Recipe) -> dict[str, Any]:
-    """Return the title of a recipe, its numbers of steps, nodes and parameters, its outputs and its notes."""
+    """Return the title of a recipe, its numbers of steps, nodes and parameters, its outputs and
+    its notes.
+    """
     nodes = {step.node.path for step in recipe.steps.values()}
     values = sum(len(step.params) for step in recipe.steps.values())
     sizes = {"steps": len(recipe.steps), "nodes": len(nodes), "parameters": values}
-    return {"recipe": recipe.name, "title": recipe.title, **sizes, "outputs": recipe.outputs, "notes": recipe.notes}
+    return {
+        "recipe": recipe.name,
+        "title": recipe.title,
+        **sizes,
+        "outputs": recipe.outputs,
+        "notes": recipe.notes,
+    }
 
 
 def opening(recipe: Recipe, command: str) -> list[str]:
-    """Return the lines to print before a run: recipe title, numbers of checked steps and parameters, and notes."""
-    found = contents_of(recipe)
-    sizes = f"{found['steps']} steps of {found['nodes']} nodes, {found['parameters']} parameters"
+    """Return the lines to print before a run: recipe title, numbers of checked steps and
+    parameters, and notes.
+    """
+    counts = contents_of(recipe)
+    sizes = f"{counts['steps']} steps of {counts['nodes']} nodes, {counts['parameters']} parameters"
     notes = [f"note     {line}" for line in (*recipe.notes, *consequences(recipe.config.values))]
-    return [f"neusee {command}: {recipe.title or recipe.name}", f"checked  {sizes}: all right", *notes]
+    return [
+        f"neusee {command}: {recipe.title or recipe.name}",
+        f"checked  {sizes}: all right",
+        *notes,
+    ]
 
 
 def forecast_line(seconds: float, steps: int, unknown: int) -> str:
-    """Return the time that ``steps`` steps will take, of which ``unknown`` never ran; empty for less than a second."""
+    """Return the time that ``steps`` steps will take, of which ``unknown`` never ran; empty for
+    less than a second.
+    """
     if seconds < 1 or unknown == steps:
         return ""
-    rest = f"; {unknown} of {steps} steps never ran before" if unknown else ""
-    return f"time     about {lasts(seconds)}, as earlier runs took{rest}"
+    new_steps = f"; {unknown} of {steps} steps never ran before" if unknown else ""
+    return f"time     about {lasts(seconds)}, as earlier runs took{new_steps}"
 
 
 def closing(doc: Mapping[str, Any], path: str, again: Sequence[str], took: str = "") -> list[str]:
-    """Return the lines to print after a run: steps left out, result table, gain by the mask, verdict, next commands.
+    """Return the lines to print after a run: steps left out, result table, gain by the mask,
+    verdict, next commands.
 
     ``took`` stands in place of the seconds of the document.
     """
     took = took or f"{doc['seconds']:.2f}"
-    lines = [said_of_economies(doc["spent"])] if doc["spent"]["economies"] else []
-    lines += [left_out_line(doc)] if doc["left_out"] else []
-    lines += [said_of_errors(doc["spent"])] if lines else []
-    lines += [doc["spectral"]["said"]] if doc.get("spectral") else []
-    rows = [[row["name"], *row["cells"]] for row in doc["table"]["rows"]]
-    lines += ["", *indented([["", *doc["table"]["columns"]], *rows])] if rows else []
-    lines += [line for text in doc["table"]["legend"] for line in wrapped(text)]
-    lines += story_lines(doc)
+    lines = [*_error_lines(doc), *_table_lines(doc["table"]), *story_lines(doc)]
     lines += ["", f"{doc['verdict']}  ({doc['counts']}, {took} s)"]
     lines += [
-        f"  missed: {e['name']} = {e['found']:.5g}, expected {e['wanted']:.5g} ± {100 * e['rtol']:.2g} %"
+        f"  missed: {e['name']} = {e['found']:.5g}, expected {e['wanted']:.5g} ±"
+        f" {100 * e['rtol']:.2g} %"
         for e in doc["expected"]
         if not e["ok"]
     ]
@@ -270,18 +334,48 @@ def closing(doc: Mapping[str, Any], path: str, again: Sequence[str], took: str =
     return [*lines, f"report   {path}", "", "next", *[f"  {line}" for line in again]]
 
 
+def _error_lines(doc: Mapping[str, Any]) -> list[str]:
+    """Return the lines on cheaper steps, steps left out, and the errors of outputs and of bands."""
+    lines = [said_of_economies(doc["spent"])] if doc["spent"]["economies"] else []
+    lines += [left_out_line(doc)] if doc["left_out"] else []
+    lines += [said_of_errors(doc["spent"])] if lines else []
+    lines += [doc["spectral"]["said"]] if doc.get("spectral") else []
+    return lines
+
+
+def _table_lines(results: Mapping[str, Any]) -> list[str]:
+    """Return the result table with its legend, after an empty line."""
+    rows = [[row["name"], *row["cells"]] for row in results["rows"]]
+    lines = ["", *indented([["", *results["columns"]], *rows])] if rows else []
+    for text in results["legend"]:
+        lines += wrapped(text)
+    return lines
+
+
 def story_lines(doc: Mapping[str, Any]) -> list[str]:
-    """Return the sentences on what the mask buys and costs, after an empty line and no wider than the terminal."""
-    lines = [line for name in SENTENCES if name in doc["story"] for line in wrapped(doc["story"][name])]
+    """Return the sentences on what the mask buys and costs, after an empty line and no wider
+    than the terminal.
+    """
+    lines: list[str] = []
+    for name in SENTENCES:
+        if name in doc["story"]:
+            lines += wrapped(doc["story"][name])
     return ["", *lines] if lines else []
 
 
 def left_out_line(doc: Mapping[str, Any]) -> str:
-    """Return one line with the steps that a run left out, and the bounds or estimates of what each changes."""
+    """Return one line with the steps that a run left out, and the bounds or estimates of what
+    each changes.
+    """
     named: dict[str, float] = {}
-    estimated = {row["step"].partition("[")[0] for row in doc["spent"]["left_out"] if row["estimated"]}
+    estimated = {
+        row["step"].partition("[")[0] for row in doc["spent"]["left_out"] if row["estimated"]
+    }
     for row in doc["left_out"]:
         short = row["step"].partition("[")[0]
         named[short] = max(named.get(short, 0.0), row["bound"] or 0.0)
-    steps = [f"{name} ({'estimated' if name in estimated else 'at most'} {bound:.1e})" for name, bound in named.items()]
+    steps = [
+        f"{name} ({'estimated' if name in estimated else 'at most'} {bound:.1e})"
+        for name, bound in named.items()
+    ]
     return f"left out {', '.join(steps)}; tolerance {doc['tolerance']:g}"

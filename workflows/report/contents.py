@@ -1,55 +1,82 @@
-"""Contents of the report of a run: figures, result table and data files, and the steps whose results they show.
-
-The report shows what the outputs of the recipe need; no step runs for the report alone.
-
-Only this file and ``contents.toml`` name the steps of the camera graph. A text names the source of one argument of a
-drawing function:
-
-    psf[mask]                    the value of a step
-    spot[mask,*]                 a dictionary with the value of each copy of a step
-    psf[mask].pixel_pitch        a parameter of a step
-    line[*].file                 a dictionary with a parameter of each copy of a step
-    variants of psf              errors and run times of variants of a step, from the last study of accuracy
-    psf[mask]()                  a function: the node of a step with the parameters of the step
-
-A leading ``?`` marks an optional argument: if the recipe lacks the step, the figure is drawn without this argument.
-"""
+"""Contents of a report: figures, result table, data files, and the results that they show."""
 
 from __future__ import annotations
 
+import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import resources
+from pathlib import Path
+from typing import Any
 
-from neusee.workflows.graph.recipe_graph import Expectation, Recipe, needed
+from neusee.workflows.engine.provenance import machine, timestamp
+from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step, needed
+from neusee.workflows.keys.cache_key import code_of, digest, plain
+from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+
+# --- contents -------------------------------------------------------------------------------------
+
+# Contents of the report of a run: figures, result table and data files, and the steps whose results
+# they show.
+#
+# The report shows what the outputs of the recipe need; no step runs for the report alone.
+#
+# Only this file and ``contents.toml`` name the steps of the camera graph. A text names the source
+# of one argument of a drawing function:
+#
+#     psf[mask]                    the value of a step
+#     spot[mask,*]                 a dictionary with the value of each copy of a step
+#     psf[mask].pixel_pitch        a parameter of a step
+#     line[*].file                 a dictionary with a parameter of each copy of a step
+#     variants of psf              errors and run times of its variants, from a study of accuracy
+#     psf[mask]()                  a function: the node of a step with the parameters of the step
+#
+# A leading ``?`` marks an optional argument: if the recipe lacks the step, the figure is drawn
+# without this argument.
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A figure of the report: title, caption, drawing function, and the steps that supply the function's arguments."""
+    """A figure of the report: title, caption, drawing function, and the steps that supply the
+    function's arguments.
+    """
 
     name: str
     title: str
     caption: str
     draw: str  #: the drawing function, as ``module:function`` below neusee.workflows
     needs: Mapping[str, str]
-    only_tables: bool = False  #: True for a figure that is drawn only if an argument is a table of the user
+    #: True for a figure that is drawn only if an argument is a table of the user
+    only_tables: bool = False
 
 
-_TABLES = tomllib.loads(resources.files(__package__).joinpath("contents.toml").read_text(encoding="utf-8"))
+_TABLES = tomllib.loads(
+    resources.files(__package__).joinpath("contents.toml").read_text(encoding="utf-8")
+)
 FIGURES = tuple(Figure(**figure) for figure in _TABLES["figure"])
 
 
 def _row(arm: str) -> dict[str, str]:
-    """Return the step whose result each column of the result table shows, for the ``plain`` lens or the ``mask``."""
-    steps = {"peak/I_sat": "peak", "LSR": "lsr", "BSR": "bsr", "outside": "outside", "quality": "developed_quality",
-             "saturated": "saturated"}  # fmt: skip
+    """Return the step whose result each column of the result table shows, for the ``plain`` lens
+    or the ``mask``.
+    """
+    steps = {
+        "peak/I_sat": "peak",
+        "LSR": "lsr",
+        "BSR": "bsr",
+        "outside": "outside",
+        "quality": "developed_quality",
+        "saturated": "saturated",
+    }
     return {column: f"{step}[{arm}]" for column, step in steps.items()}
 
 
-#: Rows of the result table: the step that each column reads. `LSR` is taken at the wavelength of the first laser.
+#: Rows of the result table: the step that each column reads. `LSR` is taken at the wavelength of
+#: the first laser.
 TABLE: Mapping[str, Mapping[str, str]] = {
     "plain lens": _row("plain"),
     "with mask": _row("mask"),
@@ -59,7 +86,10 @@ TABLE: Mapping[str, Mapping[str, str]] = {
 RIVAL = "grey filter, restored"
 
 #: Steps that give the error by the number of bands, by what they are the error of.
-SPECTRAL: Mapping[str, str] = {"spectral": "of the PSF of a white point", "laser_spectral": "of a laser spot"}
+SPECTRAL: Mapping[str, str] = {
+    "spectral": "of the PSF of a white point",
+    "laser_spectral": "of a laser spot",
+}
 
 BANDS = "bands"
 LINES = "line[*]"
@@ -76,26 +106,36 @@ OUTPUTS = "outputs.safetensors"
 def files_of(recipe: Recipe) -> dict[str, tuple[str, Mapping[str, str]]]:
     """Return format and needs of the data files that a recipe asks for, by name."""
     files = {**FILES, OUTPUTS: ("safetensors", {step: step for step in recipe.outputs})}
-    return {name: file for name, file in files.items() if recipe.exports is None or name in recipe.exports}
+    return {
+        name: file
+        for name, file in files.items()
+        if recipe.exports is None or name in recipe.exports
+    }
 
 
 def wanted(recipe: Recipe) -> tuple[str, ...]:
-    """Return the steps that a run must give: outputs, steps of expected numbers, spectral errors, and a mask's rival.
+    """Return the steps that a run must give: outputs, steps of expected numbers, spectral errors,
+    and a mask's rival.
 
-    An expected number counts if an output needs its step, and a spectral error if the outputs need all its inputs. The
-    rival of a mask counts if the outputs tell how the mask protects and how the restored picture looks.
+    An expected number counts if an output needs its step, and a spectral error if the outputs need
+    all its inputs. The rival of a mask counts if the outputs tell how the mask protects and how the
+    restored picture looks.
     """
     asked = _asked(recipe)
-    errors = (name for name in spectral_steps(recipe) if asked.issuperset(recipe.steps[name].sources))
+    errors = (
+        name for name in spectral_steps(recipe) if asked.issuperset(recipe.steps[name].sources)
+    )
     numbers = (e.step for e in compared(recipe)[0])
     return tuple(dict.fromkeys([*recipe.outputs, *numbers, *errors, *_rival(recipe, asked)]))
 
 
 def _rival(recipe: Recipe, asked: set[str]) -> Iterable[str]:
-    """Return the steps of the grey filter that is the rival of a mask; none if the recipe has a filter of its own."""
+    """Return the steps of the grey filter that is the rival of a mask; none if the recipe has a
+    filter of its own.
+    """
     steps = TABLE[RIVAL].values()
-    told = asked.issuperset((TABLE["with mask"]["LSR"], *TABLE["restored"].values()))
-    return steps if told and not shade_of(recipe) and recipe.steps.keys() >= set(steps) else ()
+    has_mask = asked.issuperset((TABLE["with mask"]["LSR"], *TABLE["restored"].values()))
+    return steps if has_mask and not shade_of(recipe) and recipe.steps.keys() >= set(steps) else ()
 
 
 def shade_of(recipe: Recipe) -> str | None:
@@ -106,12 +146,14 @@ def shade_of(recipe: Recipe) -> str | None:
 
 
 def compared(recipe: Recipe) -> tuple[list[Expectation], list[Expectation]]:
-    """Return the expected numbers that a run compares, and the others, whose steps no output of the recipe needs."""
+    """Return the expected numbers that a run compares, and the others, whose steps no output of
+    the recipe needs.
+    """
     asked = _asked(recipe)
-    found: tuple[list[Expectation], list[Expectation]] = ([], [])
+    numbers: tuple[list[Expectation], list[Expectation]] = ([], [])
     for number in recipe.expect:
-        found[number.step not in asked].append(number)
-    return found
+        numbers[number.step not in asked].append(number)
+    return numbers
 
 
 def _asked(recipe: Recipe) -> set[str]:
@@ -124,5 +166,179 @@ def spectral_steps(recipe: Recipe) -> list[str]:
 
 
 def steps_of(recipe: Recipe) -> list[str]:
-    """Return every step that a run of ``recipe`` computes or loads from the cache, in running order."""
+    """Return every step that a run of ``recipe`` computes or loads from the cache, in running
+    order.
+    """
     return needed(with_substitutions(recipe, wanted(recipe)), wanted(recipe))
+
+
+# --- measured variants ----------------------------------------------------------------------------
+
+# Errors and run times of variants of a step, as the accuracy study measured them, for the pictures
+# of later runs.
+
+
+Row = tuple[Any, ...]  #: property that is changed, new value, error, seconds
+
+
+def keep_variants(recipe: Recipe, step: str, rows: Sequence[Row], store: Store) -> None:
+    """Keep the errors and run times of the variants of a step, for recipes with this step, its
+    inputs and machine.
+    """
+    if rows:
+        about = {"step": f"variants of {step}", "date": timestamp(), "seconds": 0.0}
+        store.put(_key(recipe, step, Code(store.code_memo)), [list(row) for row in rows], about)
+
+
+def variants_of(recipe: Recipe, family: str, store: Store, code: Code) -> list[Row]:
+    """Return the errors and run times of the variants of a step such as ``psf``, of any item;
+    none if not measured.
+    """
+    for name in recipe.steps:
+        if name.partition("[")[0] == family:
+            with suppress(KeyError):
+                rows = store.get(_key(recipe, name, code), list)
+                return [
+                    (str(line), str(label), float(error), float(took))
+                    for line, label, error, took in rows
+                ]
+    return []
+
+
+def _key(recipe: Recipe, step: str, code: Code) -> str:
+    """Return the key of the variants of a step: its code, and the parameters of the step and of
+    all steps before it.
+    """
+    before = [recipe.steps[name] for name in needed(recipe, (step,))]
+    params = [
+        [s.node.path, {name: plain(value) for name, value in s.params.items()}] for s in before
+    ]
+    return digest("variants of a step", step, code_of(recipe.steps[step], code), params, machine())
+
+
+# --- requirements ---------------------------------------------------------------------------------
+
+# Lookup of the results, parameters and functions of a recipe from which a figure or a data file is
+# made.
+
+
+_MEASURED = "variants of "
+_PARAMETER = re.compile(r"(?P<step>[^.]+)\.(?P<name>\w+)")
+
+
+class Missing(LookupError):
+    """Error for a step that a figure or data file reads, if the recipe lacks the step or the run
+    does not need it.
+    """
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """A function that applies the node of a step, with the parameters of this step, to other
+    inputs.
+    """
+
+    step: Step
+
+    def __call__(self, *inputs: Any, **changes: Any) -> Any:
+        return self.step.node(*inputs, **{**self.step.params, **changes})
+
+    def reference(self, *inputs: Any, **changes: Any) -> Any:
+        """Call the float64 reference implementation of the node; raise `Missing` if the node has
+        none.
+        """
+        if self.step.node.hooks.reference is None:
+            raise Missing(
+                f"the node {self.step.node.path} has no reference implementation in float64"
+            )
+        return self.step.node.hooks.reference(*inputs, **{**self.step.params, **changes})
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The source of an argument of a drawing function: steps to read, function of their results,
+    and part of a key.
+    """
+
+    steps: tuple[str, ...]
+    make: Any  #: a function of the values by step, which returns the argument
+    identity: Any  #: plain JSON
+
+
+def find(need: str, recipe: Recipe, keys: Mapping[str, str], code: Code, store: Store) -> Found:
+    """Find the source of an argument of a drawing function in a recipe, from a text such as
+    ``psf[mask]``.
+
+    The module `contents` lists all forms of this text. ``store`` has what studies measured.
+    """
+    if need.startswith(_MEASURED):
+        return _variants(need.removeprefix(_MEASURED), recipe, code, store)
+    if need.endswith("()"):
+        step = _step(need[:-2], recipe)
+        params = [[name, plain(value)] for name, value in step.params.items()]
+        return Found((), lambda values: Bound(step), [step.node.path, code_of(step, code), params])
+    if match := _PARAMETER.fullmatch(need):
+        value = _parameter(match["step"], match["name"], recipe)
+        return Found((), lambda values: value, plain(value))
+    if need.endswith("*]"):
+        return _items(need[:-2], recipe, keys)
+    _step(need, recipe)
+    if need not in keys:
+        raise Missing(f"no output of this run needs the step {need}")
+    return Found((need,), lambda values: values[need], keys[need])
+
+
+def _variants(family: str, recipe: Recipe, code: Code, store: Store) -> Found:
+    """Find the errors and run times of the variants of a step, which a study of accuracy has
+    measured.
+    """
+    if not any(name.partition("[")[0] == family for name in recipe.steps):
+        raise Missing(f"the recipe has no step {family}")
+    rows = variants_of(recipe, family, store, code)
+    if not rows:
+        raise Missing(
+            f"`neusee study accuracy {recipe.name}` measures it, and the next run shows it"
+        )
+    return Found((), lambda values: rows, rows)
+
+
+def _parameter(step: str, name: str, recipe: Recipe) -> Any:
+    """Return a parameter of a step, or a dictionary with the parameter of each copy of a step
+    such as ``line[*]``.
+    """
+    if not step.endswith("*]"):
+        return _step(step, recipe).params.get(name)
+    prefix = step[:-2]
+    return {
+        n[len(prefix) : -1]: s.params.get(name)
+        for n, s in recipe.steps.items()
+        if n.startswith(prefix)
+    }
+
+
+def is_table(value: Any) -> bool:
+    """Return True for a parameter that is a file or coefficients, or a dictionary with such a
+    parameter.
+    """
+    if isinstance(value, Mapping):
+        return any(isinstance(item, Path | tuple) for item in value.values())
+    return isinstance(value, Path)
+
+
+def _step(name: str, recipe: Recipe) -> Step:
+    if name not in recipe.steps:
+        raise Missing(f"the recipe has no step {name}")
+    return recipe.steps[name]
+
+
+def _items(prefix: str, recipe: Recipe, keys: Mapping[str, str]) -> Found:
+    """Find all copies of a step from the beginning of their names, such as ``spot[mask,``."""
+    names = {n[len(prefix) : -1]: n for n in recipe.steps if n.startswith(prefix) and n in keys}
+    if not names:
+        raise Missing(f"the recipe has no step {prefix}…]")
+    identity = [[item, keys[name]] for item, name in names.items()]
+    return Found(
+        tuple(names.values()),
+        lambda values: {item: values[name] for item, name in names.items()},
+        identity,
+    )

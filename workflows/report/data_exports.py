@@ -1,7 +1,7 @@
 """Data files of a run: spectral OpenEXR, RGB OpenEXR, PNG of 16 bits and safetensors.
 
-Each file is written once, straight to where it stays, piece by piece. Stacks of planes are not compressed, because they
-are noise and tails of PSFs, which do not compress.
+Each file is written once, straight to where it stays, piece by piece. Stacks of planes are not
+compressed, because they are noise and tails of PSFs, which do not compress.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neusee.nodes.scene import write_spectral
 from neusee.nodes.values import Bands, Psf
 from neusee.workflows.engine.runner import Result
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.report import contents
+from neusee.workflows.report.figures.style import encoded
 from neusee.workflows.report.run_pictures import DerivedFile, files_of
 from neusee.workflows.store.band_files import bytes_of
 from neusee.workflows.store.derived_files import DerivedFiles
@@ -32,7 +34,9 @@ _AT_ONCE = 1 << 22  #: values of an image that are encoded together
 
 
 def exports(result: Result, shelf: DerivedFiles) -> tuple[dict[str, Path], dict[str, str]]:
-    """Write the data files of a run; return the paths of the files, and the reason for each file that is missing."""
+    """Write the data files of a run; return the paths of the files, and the reason for each file
+    that is missing.
+    """
     return files_of(data_files(result.recipe), result, shelf)
 
 
@@ -46,21 +50,31 @@ def data_files(recipe: Recipe) -> Iterator[DerivedFile]:
 
 
 def spectral(path: Path, /, *, cube: Tensor | Psf, bands: Bands, half: bool = False) -> None:
-    """Write a spectral cube as OpenEXR in the layout of Fichet et al., JCGT 2021, with ``half`` in 16 bits a value."""
-    from neusee.nodes.scene import write_spectral
-
-    write_spectral(path, cube.intensity if isinstance(cube, Psf) else cube, bands.centres, half=half)
+    """Write a spectral cube as OpenEXR in the layout of Fichet et al., JCGT 2021, with ``half``
+    in 16 bits a value.
+    """
+    write_spectral(
+        path, cube.intensity if isinstance(cube, Psf) else cube, bands.centres, half=half
+    )
 
 
 def safetensors(path: Path, /, **values: Any) -> None:
-    """Write the tensors of each step as safetensors; the name of a tensor is ``step`` or ``step.field``."""
+    """Write the tensors of each step as safetensors; the name of a tensor is ``step`` or
+    ``step.field``.
+    """
     tensors: dict[str, Tensor] = {}
     for name, value in values.items():
         fields = value._asdict() if hasattr(value, "_asdict") else {"": value}
-        tensors |= {f"{name}.{k}".rstrip("."): v for k, v in fields.items() if isinstance(v, Tensor)}
+        tensors |= {
+            f"{name}.{k}".rstrip("."): v for k, v in fields.items() if isinstance(v, Tensor)
+        }
     header, end = dict[str, Any](), 0
     for name, x in tensors.items():
-        header[name] = {"dtype": tensor_kind(x), "shape": list(x.shape), "data_offsets": [end, end + x.nbytes]}
+        header[name] = {
+            "dtype": tensor_kind(x),
+            "shape": list(x.shape),
+            "data_offsets": [end, end + x.nbytes],
+        }
         end += x.nbytes
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
@@ -71,15 +85,24 @@ def safetensors(path: Path, /, **values: Any) -> None:
 
 
 def exr(path: Path, /, *, image: Tensor, half: bool = False) -> None:
-    """Write an RGB image (3, y, x) as an OpenEXR file, or a grey image (1, y, x) with the one channel Y.
+    """Write an RGB image (3, y, x) as an OpenEXR file, or a grey image (1, y, x) with the one
+    channel Y.
 
-    Pixels are float32, or with ``half`` float16. Raises: ValueError for ``half`` and a value beyond float16.
+    Pixels are float32, or with ``half`` float16. Raises: ValueError for ``half`` and a value beyond
+    float16.
     """
     import OpenEXR
 
     if half and float(image.detach().abs().max()) > torch.finfo(torch.float16).max:
         raise ValueError("values beyond 65504 cannot be written as half floats: write float32")
-    values = image.detach().cpu().to(torch.float16 if half else torch.float32).permute(1, 2, 0).contiguous().numpy()
+    values = (
+        image.detach()
+        .cpu()
+        .to(torch.float16 if half else torch.float32)
+        .permute(1, 2, 0)
+        .contiguous()
+        .numpy()
+    )
     pixels = {"Y": values[..., 0].copy()} if len(image) == 1 else {"RGB": values}
     header = {"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage}
     try:
@@ -89,7 +112,9 @@ def exr(path: Path, /, *, image: Tensor, half: bool = False) -> None:
 
 
 def png16(path: Path, /, *, image: Tensor) -> None:
-    """Write an image of integers in [0, 65535] as a lossless 16-bit PNG: RGB for (3, y, x), grey for (1, y, x)."""
+    """Write an image of integers in [0, 65535] as a lossless 16-bit PNG: RGB for (3, y, x), grey
+    for (1, y, x).
+    """
     path.write_bytes(_png16(image))
 
 
@@ -97,24 +122,33 @@ def _png16(image: Tensor) -> bytes:
     low, high = (float(x) for x in image.aminmax()) if image.numel() else (0.0, 0.0)
     if image.ndim != 3 or image.shape[0] not in (1, 3) or not (low >= 0 and round(high) <= 65535):
         raise ValueError(
-            "a 16-bit PNG needs shape (3, y, x) or (1, y, x) and values in [0, 65535]; this image has shape "
-            f"{tuple(image.shape)}"
+            "a 16-bit PNG needs shape (3, y, x) or (1, y, x) and values in [0, 65535]; this image"
+            f" has shape {tuple(image.shape)}"
         )
     height, width = image.shape[1:]
     head = struct.pack(">IIBBBBB", width, height, 16, 2 if len(image) == 3 else 0, 0, 0, 0)
-    chunks = ((b"IHDR", head), (b"IDAT", b"".join(_compressed(image.detach().cpu()))), (b"IEND", b""))
+    chunks = (
+        (b"IHDR", head),
+        (b"IDAT", b"".join(_compressed(image.detach().cpu()))),
+        (b"IEND", b""),
+    )
     return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(*c) for c in chunks)
 
 
 def _compressed(image: Tensor) -> Iterator[bytes]:
-    """Yield the compressed lines of a PNG of 16 bits, each as differences from the pixel at the left.
+    """Yield the compressed lines of a PNG of 16 bits, each as differences from the pixel at the
+    left.
 
-    Of a picture with noise the differences take less room than the pixels, and runs and the lengths of codes are all
-    that is worth looking for: a third of the time of a full search, and no more bytes.
+    Of a picture with noise the differences take less room than the pixels, and runs and the lengths
+    of codes are all that is worth looking for: a third of the time of a full search, and no more
+    bytes.
     """
     import numpy as np
 
-    pack, (planes, height, width) = zlib.compressobj(6, zlib.DEFLATED, 15, 9, zlib.Z_RLE), image.shape
+    pack, (planes, height, width) = (
+        zlib.compressobj(6, zlib.DEFLATED, 15, 9, zlib.Z_RLE),
+        image.shape,
+    )
     rows = max(1, _AT_ONCE // (planes * width))
     for top in range(0, height, rows):
         words = (
@@ -128,16 +162,17 @@ def _compressed(image: Tensor) -> Iterator[bytes]:
             .astype(">u2")
         )
         pixels = words.view(np.uint8).reshape(len(words), width, 2 * planes)
-        lines = np.ones((len(words), 1 + 2 * planes * width), np.uint8)  # 1: difference from the left
+        # 1: difference from the left
+        lines = np.ones((len(words), 1 + 2 * planes * width), np.uint8)
         lines[:, 1:] = np.diff(pixels, axis=1, prepend=np.uint8(0)).reshape(len(words), -1)
         yield pack.compress(lines.data)
     yield pack.flush()
 
 
 def srgb(path: Path, /, *, image: Tensor, source: Path, draws: int) -> None:
-    """Write a restored picture in linear sRGB, white 1, as an sRGB PNG of 16 bits that names the frame."""
-    from neusee.workflows.report.figures.style import encoded
-
+    """Write a restored picture in linear sRGB, white 1, as an sRGB PNG of 16 bits that names the
+    frame.
+    """
     codes = torch.from_numpy(encoded(image)).permute(2, 0, 1) * 65535.0
     path.write_bytes(_named(_png16(codes), source, draws, _chunk(b"sRGB", b"\0")))
 
@@ -148,13 +183,20 @@ def marked(path: Path, /, *, marked: Tensor, source: Path, draws: int) -> None:
 
 
 def _named(png: bytes, source: Path, draws: int, coding: bytes = b"") -> bytes:
-    """Return a PNG with text chunks that name the frame, and the number of draws of the interval beside it.
+    """Return a PNG with text chunks that name the frame, and the number of draws of the interval
+    beside it.
 
     ``coding`` is a chunk that says how the numbers are encoded.
     """
     header = 8 + 12 + 13
-    texts = {b"Source": source.name, b"Comment": f"restored by neusee; interval of each pixel from {draws} draws"}
-    chunks = (_chunk(b"tEXt", name + b"\0" + text.encode("latin-1", "replace")) for name, text in texts.items())
+    texts = {
+        b"Source": source.name,
+        b"Comment": f"restored by neusee; interval of each pixel from {draws} draws",
+    }
+    chunks = (
+        _chunk(b"tEXt", name + b"\0" + text.encode("latin-1", "replace"))
+        for name, text in texts.items()
+    )
     return png[:header] + coding + b"".join(chunks) + png[header:]
 
 

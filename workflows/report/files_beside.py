@@ -1,33 +1,202 @@
-"""Pictures and data files of a run, made while later steps compute.
-
-A file is made as soon as the last of its results is there. One thread writes data files, and another leaves pictures
-to the process that draws, so that neither waits for the other. What is made so is found by its key when the report is
-written, and the report makes what is missing; an error is met there again. So nothing of the report depends on this
-module but its time.
-"""
+"""Pictures and data files of a run, made beside it while later steps compute."""
 
 from __future__ import annotations
 
+import gc
+import itertools
+import multiprocessing
+import os
+import pickle
+import signal
 import sys
-from collections.abc import Callable, Iterable, Mapping
+import threading
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Self
 
-from neusee.workflows.engine.memory_use import process_memory
-from neusee.workflows.engine.memory_watch import MemoryLimit
-from neusee.workflows.graph.recipe_graph import Recipe, needed
+import torch
+
+from neusee.workflows.engine.machine_resources import process_memory
+from neusee.workflows.engine.memory_limits import MemoryLimit
+from neusee.workflows.engine.worker_processes import deaf_fork, ignore_interrupts
+from neusee.workflows.graph.recipe_graph import Recipe, StepRecord, needed
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.report import drawing_process
-from neusee.workflows.report.contents import wanted
-from neusee.workflows.report.drawing_process import DrawingProcess
-from neusee.workflows.report.requirements import Missing
-from neusee.workflows.report.run_pictures import DerivedFile, Drawing, arguments_of, key_of_file
+from neusee.workflows.report.contents import Missing, wanted
+from neusee.workflows.report.figures import style
+from neusee.workflows.report.run_pictures import (
+    GRAPH_DRAWING,
+    DerivedFile,
+    Drawing,
+    arguments_of,
+    graphs,
+    key_of_file,
+    states_of,
+    steps_of,
+)
 from neusee.workflows.store.derived_files import DerivedFiles
-from neusee.workflows.store.serialization import tensors_in
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.serialization import pack, tensors_in, unpack
+
+# --- drawing process ------------------------------------------------------------------------------
+
+# A process beside that of the run, which draws pictures and encodes images while the steps of the
+# run compute.
+#
+# matplotlib holds the lock of the interpreter, so that a thread that draws would stop the steps.
+# The process is a fork of the run at its start, with one thread, so that it imports nothing again;
+# it reads its jobs from a pipe, and ends when the run does. Where a fork is not safe, or for
+# another reason no process answers, the run draws its pictures itself.
+
+
+MOST = 1 << 27  #: bytes of the arguments of a picture that go through the pipe
+_PATIENCE = 120.0  #: s for one picture, after which the process counts as lost
+_WORDS = (str, int, float, Path, type(None))
+
+
+class NotDrawn(RuntimeError):
+    """Error for a picture that the process did not draw; the run then draws the picture itself."""
+
+
+def possible() -> bool:
+    """Return True if this process may fork, and has a second processor for the fork."""
+    return sys.platform == "linux" and len(os.sched_getaffinity(0)) > 1
+
+
+class DrawingProcess:
+    """A forked process that writes one picture at a time; `close` ends the process."""
+
+    def __init__(self) -> None:
+        # a second thread waits until the file of the first is written
+        self._turn = threading.Lock()
+        self._next = threading.Lock()  # and is the next then, before the first thread asks again
+        context = multiprocessing.get_context("fork")
+        self._pipe, far_end = context.Pipe()
+        # Python 3.12 warns of every fork beside a thread
+        with warnings.catch_warnings(), deaf_fork():
+            warnings.simplefilter("ignore", DeprecationWarning)
+            self._process = context.Process(
+                target=_serve, args=(far_end, self._pipe), name="neusee draws", daemon=True
+            )
+            self._process.start()
+        far_end.close()
+
+    def make(self, path: Path, make: Callable[..., None], arguments: Mapping[str, Any]) -> None:
+        """Let the process call ``make(path, **arguments)``; raise `NotDrawn` if the call failed
+        or was not made.
+        """
+        with self._next:
+            self._turn.acquire()
+        try:
+            self._ask(_sent(path, make, arguments))
+        finally:
+            self._turn.release()
+
+    def _ask(self, job: bytes) -> None:
+        """Send a job and wait until it is done."""
+        try:
+            self._pipe.send_bytes(job)
+            if not self._pipe.poll(_PATIENCE):
+                self.close()
+                raise NotDrawn(f"no answer within {_PATIENCE:.0f} s")
+            failed = self._pipe.recv_bytes().decode()
+        except (OSError, EOFError) as error:
+            self.close()
+            raise NotDrawn(f"the process that draws has ended: {error}") from error
+        if failed:
+            raise NotDrawn(failed)
+
+    def close(self) -> None:
+        """End the process, at once if it does not end when its pipe closes."""
+        self._pipe.close()
+        self._process.join(0.5)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+
+
+def _sent(path: Path, make: Callable[..., None], arguments: Mapping[str, Any]) -> bytes:
+    """Return a job as bytes; raise `NotDrawn` for arguments that are large or that are no data."""
+    if sum(x.nbytes for x in tensors_in(list(arguments.values()))) > MOST:
+        raise NotDrawn("the arguments are large")
+    try:
+        packed = {name: _packed(value) for name, value in arguments.items()}
+        return pickle.dumps((path, make, packed), protocol=5)
+    except (TypeError, pickle.PicklingError, AttributeError) as error:
+        raise NotDrawn(str(error)) from error
+
+
+def _packed(value: Any) -> tuple[Any, list[Any], Any]:
+    """Return the layout and the arrays of a value, and None; or a value without tensors at the end,
+    as it is.
+
+    A function that applies the node of a step is such a value; the process that draws has all
+    modules of the run.
+    """
+    if not isinstance(value, _WORDS):
+        try:
+            layout, tensors = pack(value)
+            return layout, [x.cpu().numpy() for x in tensors], None
+        except TypeError:
+            if tensors_in(value):
+                raise
+    return pack(None)[0], [], value
+
+
+def _serve(pipe: Connection, other_end: Connection) -> None:
+    """Make the files that the pipe asks for, until its other end closes."""
+    other_end.close()  # else the pipe stays open when the run is killed
+    _close_all_but(pipe.fileno())
+    gc.freeze()  # a search for garbage among the objects of the run would copy their memory
+    ignore_interrupts()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    torch.set_num_threads(1)  # the threads of the run are not in a fork of it
+    with suppress(Exception):  # the first picture meets the error again
+        style.warm()
+    with suppress(EOFError, OSError), torch.no_grad():
+        while True:
+            job = pipe.recv_bytes()
+            pipe.send_bytes(_made(job).encode())
+
+
+def _close_all_but(mine: int) -> None:
+    """Close every file but those of the terminal and ``mine``: a lock of the store ends when its
+    last copy closes.
+    """
+    for name in os.listdir("/proc/self/fd"):
+        if int(name) > 2 and int(name) != mine:
+            with suppress(OSError):
+                os.close(int(name))
+
+
+def _made(job: bytes) -> str:
+    """Write the file of a job; return an empty text, or why this failed."""
+    try:
+        path, make, packed = pickle.loads(job)
+        values = {
+            name: unpack(layout, [torch.from_numpy(x) for x in arrays]) if word is None else word
+            for name, (layout, arrays, word) in packed.items()
+        }
+        make(path, **values)
+    except Exception as error:  # the run meets the error again when it draws the picture itself
+        return f"{type(error).__name__}: {error}"
+    return ""
+
+
+# --- files beside ---------------------------------------------------------------------------------
+
+# Pictures and data files of a run, made while later steps compute.
+#
+# A file is made as soon as the last of its results is there. One thread writes data files, and
+# another leaves pictures to the process that draws, so that neither waits for the other. What is
+# made so is found by its key when the report is written, and the report makes what is missing; an
+# error is met there again. So nothing of the report depends on this module but its time.
+
 
 LARGE = 1 << 26  #: bytes; a larger result is held only for files that need nothing else any more
 _SMALL = 1 << 22  #: bytes of a result that is held in any case
@@ -37,18 +206,22 @@ ROOM = 1 << 27  #: bytes of smaller results that are held for files
 class FilesBeside:
     """Files that are made beside a run; call the object with each result of the run.
 
-    Args: files: the files of a recipe. limit: bytes of memory that the process may use; of these, an eighth at most is
-    held for files, no more than `ROOM` beside one large result, and nothing once half of the limit is in use. With 0
-    no file is made beside the run.
+    Args: files: the files of a recipe. limit: bytes of memory that the process may use; of these,
+            an eighth at most is
+    held for files, no more than `ROOM` beside one large result, and nothing once half of the limit
+    is in use. With 0 no file is made beside the run.
     """
 
-    def __init__(self, files: Callable[[Recipe], Iterable[DerivedFile]], shelf: DerivedFiles, limit: float) -> None:
+    def __init__(
+        self, files: Callable[[Recipe], Iterable[DerivedFile]], shelf: DerivedFiles, limit: float
+    ) -> None:
         self._files, self._shelf = files, shelf
         self._large, self._room = min(LARGE, limit / 32), min(ROOM, limit / 16)
         self._limit = limit
         self._recipe: Recipe | None = None
         self._code = Code(shelf.store.code_memo)
-        self._open: list[tuple[DerivedFile, frozenset[str]]] = []  # files to make, and the steps that they show
+        # files to make, and the steps that they show
+        self._open: list[tuple[DerivedFile, frozenset[str]]] = []
         self._held: dict[str, Any] = {}
         self._busy: set[str] = set()  # files of large results that are being written
         self._writes = ThreadPoolExecutor(1, "neusee files")
@@ -66,39 +239,63 @@ class FilesBeside:
             self._drawer.close()
 
     def __call__(self, recipe: Recipe, keys: Mapping[str, Key], step: str, value: Any) -> None:
-        """Hold the result of a step as long as files need it, and begin the files that need no other result."""
+        """Hold the result of a step as long as files need it, and begin the files that need no
+        other result.
+        """
         if self._limit <= 0:
             return
-        if recipe is not self._recipe:  # the first result, or a run that begins again with a smaller tolerance
+        # the first result, or a run that begins again with a smaller tolerance
+        if recipe is not self._recipe:
             self._begin(recipe)
-        shown = {name for _, steps in self._open for name in steps}
-        names = [name for name in shown if keys.get(name) == keys[step]]
+        names = [name for name in self._shown() if keys.get(name) == keys[step]]
         size = _bytes_of(value)
-        if not names or (size > self._large and (self._busy or size > self._limit / 16)):
+        if not names or self._is_too_large(size):
             return  # the report makes the files of this result
-        if size > _SMALL and process_memory() > self._limit / 2:
-            return
         self._held.update(dict.fromkeys(names, value))
+        self._submit_complete(recipe, keys)
+        no_room = size > self._large or _bytes_of(list(self._held.values())) > self._room
+        self._let_go(names if no_room else ())
+
+    def _submit_complete(self, recipe: Recipe, keys: Mapping[str, Key]) -> None:
+        """Begin the files of which all results are held."""
         for file, steps in [job for job in self._open if job[1] <= self._held.keys()]:
             self._open.remove((file, steps))
             self._submit(file, recipe, {name: keys[name] for name in steps})
-        self._let_go(names if size > self._large or _bytes_of(list(self._held.values())) > self._room else ())
 
-    def add(self, name: str, key: str, make: Callable[..., None], arguments: Mapping[str, Any]) -> None:
+    def _shown(self) -> set[str]:
+        """Return the steps that files which are still to be made show."""
+        return set(itertools.chain.from_iterable(steps for _, steps in self._open))
+
+    def _is_too_large(self, size: int) -> bool:
+        """Return True for a result of so many bytes that none of it may be held now."""
+        if size > self._large and (self._busy or size > self._limit / 16):
+            return True
+        return size > _SMALL and process_memory() > self._limit / 2
+
+    def add(
+        self, name: str, key: str, make: Callable[..., None], arguments: Mapping[str, Any]
+    ) -> None:
         """Begin a picture that shows no result of a step."""
         if self._drawer is not None:
             self._start(_Job(name, key, ".png", make, arguments), self._draws)
 
-    def draw(self, path: Path, make: Callable[..., None], arguments: Mapping[str, Any]) -> Callable[[], None]:
+    def draw(
+        self, path: Path, make: Callable[..., None], arguments: Mapping[str, Any]
+    ) -> Callable[[], None]:
         """Begin a picture that is not stored; return a function that waits for the picture.
 
-        That function draws the picture itself if the process that draws is missing, is busy with another, or failed.
+        That function draws the picture itself if the process that draws is missing, is busy with
+        another, or failed.
         """
         drawer = self._drawer
         begun = None if drawer is None else self._draws.submit(drawer.make, path, make, arguments)
 
         def wait() -> None:
-            if begun is None or (_draws_at_once() and begun.cancel()) or begun.exception() is not None:
+            if (
+                begun is None
+                or (_draws_at_once() and begun.cancel())
+                or begun.exception() is not None
+            ):
                 make(path, **arguments)
 
         return wait
@@ -123,30 +320,37 @@ class FilesBeside:
 
     def _begin(self, recipe: Recipe) -> None:
         self._recipe, self._held, self._open = recipe, {}, []
-        known = dict.fromkeys(needed(recipe, wanted(recipe)), "")
+        no_keys = dict.fromkeys(needed(recipe, wanted(recipe)), "")
         for file in self._files(recipe):
             with suppress(Missing):
-                found = arguments_of(file.needs, recipe, known, self._code, self._shelf.store)
-                steps = frozenset(step for each in found.values() for step in each.steps)
+                sources = arguments_of(file.needs, recipe, no_keys, self._code, self._shelf.store)
+                steps = steps_of(sources)
                 if steps and not file.only_tables:
                     self._open.append((file, steps))
-        if self._open and self._drawer is None and drawing_process.possible():
+        if self._open and self._drawer is None and possible():
             with suppress(OSError):  # no memory or no permission for a fork
                 self._drawer = DrawingProcess()
 
     def _let_go(self, names: Iterable[str]) -> None:
         """Hold no result longer that no file needs, and none of the steps ``names``."""
-        still = {name for _, steps in self._open for name in steps} - set(names)
+        still = self._shown() - set(names)
         self._held = {name: value for name, value in self._held.items() if name in still}
 
     def _submit(self, file: DerivedFile, recipe: Recipe, keys: Mapping[str, Key]) -> None:
-        found = arguments_of(file.needs, recipe, keys, self._code, self._shelf.store)
-        arguments = {name: each.make(self._held) for name, each in found.items()}
-        large = _bytes_of(list(arguments.values())) > drawing_process.MOST
+        sources = arguments_of(file.needs, recipe, keys, self._code, self._shelf.store)
+        arguments = {name: source.make(self._held) for name, source in sources.items()}
+        large = _bytes_of(list(arguments.values())) > MOST
         drawing = isinstance(file.make, Drawing)
         if drawing and (large or self._drawer is None):
             return
-        job = _Job(file.name, key_of_file(file, found), file.suffix, file.make, arguments, large or file.copied)
+        job = _Job(
+            file.name,
+            key_of_file(file, sources),
+            file.suffix,
+            file.make,
+            arguments,
+            large or file.copied,
+        )
         begun = self._start(job, self._draws if drawing else self._writes)
         if large:
             self._busy.add(file.name)
@@ -159,7 +363,8 @@ class FilesBeside:
 
     def _make(self, job: _Job, drawer: DrawingProcess | None) -> None:
         """Write a file here, or let a process write it."""
-        arguments, job.arguments = job.arguments, {}  # so that this object does not hold them until the end
+        # so that this object does not hold them until the end
+        arguments, job.arguments = job.arguments, {}
         if self._shelf.find(job.key, job.suffix) is not None:
             return
 
@@ -185,9 +390,55 @@ class _Job:
 
 
 def _draws_at_once() -> bool:
-    """Return True if this process has imported what drawing needs; the import takes longer than a picture."""
+    """Return True if this process has imported what drawing needs; the import takes longer than
+    a picture.
+    """
     return "matplotlib.figure" in sys.modules
 
 
 def _bytes_of(value: Any) -> int:
     return sum(x.nbytes for x in tensors_in(value))
+
+
+# --- graph ahead ----------------------------------------------------------------------------------
+
+# The picture of the graph of a run, begun as soon as the state of each step at the end can be
+# foreseen.
+#
+# Where a state is another one in the end, the report draws the graph again, under another key.
+
+
+class GraphAhead:
+    """A function of each result of a run, which begins the graph when the keys of all steps are
+    known.
+
+    Args: beside: draws the graph. done: the records of the steps that have finished, which the run
+            fills.
+    """
+
+    def __init__(self, beside: FilesBeside, store: Store, done: Mapping[str, StepRecord]) -> None:
+        self._beside, self._store, self._done = beside, store, done
+        self._recipe: Recipe | None = None
+        self._order: Sequence[str] = ()
+
+    def __call__(self, recipe: Recipe, keys: Mapping[str, Key], step: str, value: Any) -> None:
+        """Take note of a result; begin the graph, once for each recipe."""
+        # the first result, or a run that begins again with a smaller tolerance
+        if recipe is not self._recipe:
+            self._recipe, self._order = recipe, needed(recipe, wanted(recipe))
+        if self._order and len(keys) >= len(self._order):
+            for key, arguments in graphs(recipe, self._foreseen(keys)):
+                self._beside.add("graph", key, GRAPH_DRAWING, arguments)
+            self._order = ()
+
+    def _foreseen(self, keys: Mapping[str, Key]) -> dict[str, str]:
+        """Return the state of each step at the end: what is not stored runs, and equal results
+        are computed once.
+        """
+        ended = states_of({name: self._done[name] for name in self._order if name in self._done})
+        earlier_keys, states = set[Key](), dict[str, str]()
+        for name in self._order:
+            stored = keys[name] in earlier_keys or self._store.has(keys[name])
+            states[name] = ended.get(name) or ("cached" if stored else "run")
+            earlier_keys.add(keys[name])
+        return states

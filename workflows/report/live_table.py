@@ -1,6 +1,8 @@
-"""A table on a terminal that is drawn again several times a second and is never taller than the screen.
+"""A table on a terminal that is drawn again several times a second and is never taller than the
+screen.
 
-A terminal cannot draw over lines that have left the screen, so a taller table would be printed at each refresh.
+A terminal cannot draw over lines that have left the screen, so a taller table would be printed at
+each refresh.
 """
 
 from __future__ import annotations
@@ -13,7 +15,9 @@ _HEAD = 3  #: lines above the first row: a blank line, the names of the columns 
 
 
 class LiveTable(Live):
-    """A table that is drawn again eight times a second: its last rows while it changes, all of its rows at the end."""
+    """A table that is drawn again eight times a second: its last rows while it changes, all of
+    its rows at the end.
+    """
 
     def __init__(self, table: RenderableType) -> None:
         super().__init__(
@@ -30,7 +34,9 @@ class LiveTable(Live):
 
 
 class LastRows:
-    """The names of the columns of a table, and as many of its last lines as the screen has room for."""
+    """The names of the columns of a table, and as many of its last lines as the screen has room
+    for.
+    """
 
     def __init__(self, table: RenderableType) -> None:
         self.table = table

@@ -1,6 +1,8 @@
-"""Contradictions in the paper of Peng et al., the interpretation that the recipes choose for each, and the reason.
+"""Contradictions in the paper of Peng et al., the interpretation that the recipes choose for each,
+and the reason.
 
-Source: Peng et al., "Learning to See Through Flare", ICCV 2025 workshops. The groups ``reading`` and ``train`` make
+Source: Peng et al., "Learning to See Through Flare", ICCV 2025 workshops. The groups ``reading``
+        and ``train`` make
 each choice.
 """
 
@@ -14,7 +16,9 @@ from typing import NamedTuple
 
 
 class Reading(NamedTuple):
-    """A contradiction in the paper: the recipe key, its coherent and printed value, and the reason for the choice."""
+    """A contradiction in the paper: the recipe key, its coherent and printed value, and the
+    reason for the choice.
+    """
 
     path: str  #: of the recipe key
     number: str
@@ -28,20 +32,26 @@ class Reading(NamedTuple):
     def argument(self) -> str:
         """Return the argument of a command that sets the printed value of the recipe key."""
         group = self.path.partition(".")[0]
-        return {"reading": "reading=as_printed", "sensor": "reading=as_printed", "train": "train=as_printed"}.get(
-            group, f'{self.path}="{self.as_printed}"'
-        )
+        return {
+            "reading": "reading=as_printed",
+            "sensor": "reading=as_printed",
+            "train": "train=as_printed",
+        }.get(group, f'{self.path}="{self.as_printed}"')
 
 
 class Settled(NamedTuple):
-    """A contradiction in the paper that no recipe key resolves, and the reason why no key is needed."""
+    """A contradiction in the paper that no recipe key resolves, and the reason why no key is
+    needed.
+    """
 
     number: str
     matter: str
     why: str
 
 
-_TABLE = tomllib.loads(resources.files(__package__).joinpath("paper_contradictions.toml").read_text(encoding="utf-8"))
+_TABLE = tomllib.loads(
+    resources.files(__package__).joinpath("paper_contradictions.toml").read_text(encoding="utf-8")
+)
 READINGS = tuple(Reading(**row) for row in _TABLE["reading"])
 SETTLED = tuple(Settled(**row) for row in _TABLE["settled"])
 
@@ -49,19 +59,28 @@ SETTLED = tuple(Settled(**row) for row in _TABLE["settled"])
 def in_force(values: Mapping[str, object]) -> Iterable[tuple[Reading, str]]:
     """Yield each contradiction in the paper that a recipe resolves, with the recipe's choice.
 
-    The choice is ``coherent``, ``as printed`` or the recipe's own value. ``values`` are the recipe's values by key.
+    The choice is ``coherent``, ``as printed`` or the recipe's own value. ``values`` are the
+    recipe's values by key.
     """
     for row in READINGS:
         if row.path in values:
             value = values[row.path]
-            known = {str(row.coherent): "coherent", str(row.as_printed): "as printed"}
-            yield row, known.get(str(value), str(value))
+            choices = {str(row.coherent): "coherent", str(row.as_printed): "as printed"}
+            yield row, choices.get(str(value), str(value))
 
 
 def consequences(values: Mapping[str, object]) -> list[str]:
-    """Return a sentence on the visible effect of each printed value that is in force in a recipe."""
-    seen = ((row, row.consequence) for row, state in in_force(values) if state == "as printed" and row.consequence)
-    return [f"{row.path} as printed ({row.number}): {_filled(text, values)}" for row, text in seen]
+    """Return a sentence on the visible effect of each printed value that is in force in a
+    recipe.
+    """
+    visible = (
+        (row, row.consequence)
+        for row, state in in_force(values)
+        if state == "as printed" and row.consequence
+    )
+    return [
+        f"{row.path} as printed ({row.number}): {_filled(text, values)}" for row, text in visible
+    ]
 
 
 def _filled(text: str, values: Mapping[str, object]) -> str:

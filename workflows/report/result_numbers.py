@@ -1,4 +1,6 @@
-"""Numbers of a run: the expected numbers of the recipe, the result table, and the rows of ``metrics.csv``."""
+"""Numbers of a run: the expected numbers of the recipe, the result table, and the rows of
+``metrics.csv``.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,8 @@ from neusee.workflows.report.contents import BANDS, LINES, TABLE, compared
 from neusee.workflows.report.figures.style import nearest
 
 Value = Callable[[str], Any]  #: a function from the name of a step to the value of the step
-#: Columns of the result table: the result in `TABLE`, its field, the number of this field and a band, and the format
+#: Columns of the result table: the result in `TABLE`, its field, the number of this field and a
+#: band, and the format
 _COLUMNS: Mapping[str, tuple[str, str, Callable[[Tensor, int], Any], str]] = {
     "peak/I_sat": ("peak/I_sat", "", lambda x, band: x.max(), "{:.4g}"),
     "LSR": ("LSR", "", lambda x, band: x.flatten()[min(band, x.numel() - 1)], "{:.3g}"),
@@ -26,78 +29,119 @@ _COLUMNS: Mapping[str, tuple[str, str, Callable[[Tensor, int], Any], str]] = {
 _LEGEND = {
     "LSR": "LSR at {band}",
     "BSR": "BSR, the mean over the bands: the share of the scene's light that stays in the field",
-    "outside": "outside, the mean over the bands: the share of a point's light that falls outside the PSF window",
+    "outside": (
+        "outside, the mean over the bands: the share of a point's light that falls outside the PSF"
+        " window"
+    ),
 }
 _DESIGN_WAVELENGTH = 550e-9  #: m, for the LSR in the result table of a recipe without a laser
 _MOST = 4096  #: elements, at most, of a result whose numbers become rows
 
 
 def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
-    """Compare the numbers that a recipe expects with the numbers from the run, and return one row for each."""
+    """Compare the numbers that a recipe expects with the numbers from the run, and return one
+    row for each.
+    """
     rows = []
     for e in compared(recipe)[0]:
-        found: Any = value(e.step)
-        for part in e.at:
-            found = getattr(found, part) if isinstance(part, str) and not isinstance(found, dict) else found[part]
-        number = float(found)
+        result: Any = value(e.step)
+        for key in e.at:
+            result = (
+                getattr(result, key)
+                if isinstance(key, str) and not isinstance(result, dict)
+                else result[key]
+            )
+        number = float(result)
         ok = abs(number - e.value) <= e.rtol * abs(e.value)
-        rows.append({"name": e.name, "step": e.step, "wanted": e.value, "found": number, "rtol": e.rtol, "ok": ok})
+        rows.append(
+            {
+                "name": e.name,
+                "step": e.step,
+                "wanted": e.value,
+                "found": number,
+                "rtol": e.rtol,
+                "ok": ok,
+            }
+        )
     return rows
 
 
 def table(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, Any]:
-    """Return the table for plain lens, mask and restored picture, with the rows and columns that have numbers."""
+    """Return the table for plain lens, mask and restored picture, with the rows and columns that
+    have numbers.
+    """
     _, where = _band(recipe, keys, value)
     numbers = arms(recipe, keys, value)
     columns = [column for column in _COLUMNS if any(column in cells for cells in numbers.values())]
-    rows = [{"name": name, "cells": [_text(cells, c) for c in columns]} for name, cells in numbers.items() if cells]
+    rows = [
+        {"name": name, "cells": [_text(cells, c) for c in columns]}
+        for name, cells in numbers.items()
+        if cells
+    ]
     legend = [text.format(band=where) for column, text in _LEGEND.items() if column in columns]
     return {"columns": columns, "rows": rows, "legend": legend}
 
 
 def arms(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, dict[str, float]]:
-    """Return the numbers of the plain lens, of the mask and of the restored picture, by column of the result table."""
+    """Return the numbers of the plain lens, of the mask and of the restored picture, by column
+    of the result table.
+    """
     band, _ = _band(recipe, keys, value)
     numbers: dict[str, dict[str, float]] = {}
     for name, cells in TABLE.items():
-        known = {column: value(step) for column, step in cells.items() if step in keys}
-        numbers[name] = {
-            column: float(number(found, band))
-            for column, (x, field, number, _) in _COLUMNS.items()
-            if (found := _field(known.get(x), field)) is not None
-        }
+        results = {column: value(step) for column, step in cells.items() if step in keys}
+        numbers[name] = {}
+        for column, (source, field, number, _) in _COLUMNS.items():
+            result = _field(results.get(source), field)
+            if result is not None:
+                numbers[name][column] = float(number(result, band))
     return numbers
 
 
 def lines_of(recipe: Recipe, keys: Container[str]) -> list[str]:
-    """Return the steps among ``keys`` that give the spectral line of a laser whose strength is not 0."""
-    strengths = {name: recipe.config.values.get(f"lasers.{name[5:-1]}.strength") for name in _lines(recipe, keys)}
+    """Return the steps among ``keys`` that give the spectral line of a laser whose strength is
+    not 0.
+    """
+    strengths = {
+        name: recipe.config.values.get(f"lasers.{name[5:-1]}.strength")
+        for name in _lines(recipe, keys)
+    }
     return [name for name, strength in strengths.items() if strength != 0]
 
 
 def suppressed(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, float]:
-    """Return the LSR of the mask at the wavelength of each laser that shines, by wavelength in nm as text."""
+    """Return the LSR of the mask at the wavelength of each laser that shines, by wavelength in
+    nm as text.
+    """
     step = TABLE["with mask"]["LSR"]
     if step not in keys or BANDS not in keys:
         return {}
     lsr, centres = value(step).flatten(), value(BANDS).centres
-    at = (nearest(centres, mean_wavelength(value(line))) for line in lines_of(recipe, keys))
-    return {name: float(lsr[min(band, lsr.numel() - 1)]) for band, name in at}
+    bands_of_lasers = (
+        nearest(centres, mean_wavelength(value(line))) for line in lines_of(recipe, keys)
+    )
+    return {name: float(lsr[min(band, lsr.numel() - 1)]) for band, name in bands_of_lasers}
 
 
-def _field(found: Any, field: str) -> Tensor | None:
-    """Return the field ``field`` of a result, or its first field for an empty name, or None if the field is missing."""
-    fields = {} if found is None else dict(_fields(found))
+def _field(result: Any, field: str) -> Tensor | None:
+    """Return the field ``field`` of a result, or its first field for an empty name, or None if
+    the field is missing.
+    """
+    fields = {} if result is None else dict(_fields(result))
     return fields.get(field) if field else next(iter(fields.values()), None)
 
 
 def _text(cells: Mapping[str, float], column: str) -> str:
-    """Return a number of the result table as text, or an empty text if the table has no number there."""
+    """Return a number of the result table as text, or an empty text if the table has no number
+    there.
+    """
     return _COLUMNS[column][3].format(cells[column]) if column in cells else ""
 
 
 def _band(recipe: Recipe, keys: Mapping[str, str], value: Value) -> tuple[int, str]:
-    """Return index and name of the spectral band nearest to the first laser, or to 550 nm if there is no laser."""
+    """Return index and name of the spectral band nearest to the first laser, or to 550 nm if
+    there is no laser.
+    """
     if BANDS not in keys:
         return 0, "the first band"
     lines = _lines(recipe, keys)
@@ -116,28 +160,39 @@ def _lines(recipe: Recipe, keys: Container[str]) -> list[str]:
 
 
 def metrics(recipe: Recipe, keys: Mapping[str, str], value: Value) -> list[list[Any]]:
-    """Return the rows (step, field, index, value) of ``metrics.csv``, one for each number that a metric gave."""
-    return [row for name in metrics_of(recipe, keys) for row in numbers_of(name, value(name))]
+    """Return the rows (step, field, index, value) of ``metrics.csv``, one for each number that a
+    metric gave.
+    """
+    rows: list[list[Any]] = []
+    for name in metrics_of(recipe, keys):
+        rows += numbers_of(name, value(name))
+    return rows
 
 
 def metrics_of(recipe: Recipe, among: Container[str]) -> list[str]:
     """Return the steps in ``among`` whose nodes are metrics, in the order of the recipe."""
-    return [name for name, step in recipe.steps.items() if name in among and step.node.path.startswith("metrics.")]
+    return [
+        name
+        for name, step in recipe.steps.items()
+        if name in among and step.node.path.startswith("metrics.")
+    ]
 
 
-def numbers_of(step: str, found: Any) -> list[list[Any]]:
-    """Return a row (step, field, index, value) for each number in a result of at most 4096 elements."""
+def numbers_of(step: str, result: Any) -> list[list[Any]]:
+    """Return a row (step, field, index, value) for each number in a result of at most 4096
+    elements.
+    """
     rows: list[list[Any]] = []
-    for field, tensor in _fields(found):
+    for field, tensor in _fields(result):
         if tensor.numel() <= _MOST and not tensor.is_complex():
             numbers = tensor.detach().double().flatten().tolist()
             rows += [[step, field, i if len(numbers) > 1 else "", n] for i, n in enumerate(numbers)]
     return rows
 
 
-def _fields(found: Any) -> list[tuple[str, Tensor]]:
-    if isinstance(found, Tensor):
-        return [("", found)]
-    if hasattr(found, "_asdict"):
-        return [(k, v) for k, v in found._asdict().items() if isinstance(v, Tensor)]
+def _fields(result: Any) -> list[tuple[str, Tensor]]:
+    if isinstance(result, Tensor):
+        return [("", result)]
+    if hasattr(result, "_asdict"):
+        return [(k, v) for k, v in result._asdict().items() if isinstance(v, Tensor)]
     return []

@@ -1,21 +1,35 @@
-"""The folder of a run, which gets its final name when all files are written, and the link ``latest`` to this folder."""
+"""The folder of a run: its final name, ``latest``, ``code.json``, and the HTML page."""
 
 from __future__ import annotations
 
+import base64
 import csv
+import json
 import os
 import shutil
+import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from datetime import date
+from datetime import date, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.keys.regular_file import head_of
-from neusee.workflows.report.run_crate import write_crate
+from neusee.workflows.keys.sealed_files import bytes_of, head_of, text_of
+from neusee.workflows.report.run_crate import remove_crate, restore_crate, write_crate
+from neusee.workflows.report.study_page import compiled, filled
+
+if TYPE_CHECKING:
+    from neusee.workflows.engine.runner import Result
+
+
+# --- run folder -----------------------------------------------------------------------------------
+
+# The folder of a run, which gets its final name when all files are written, and the link ``latest``
+# to this folder.
+
 
 _NAME = 4096  #: bytes of the name of a folder, at most
 _OTHER_FOLDER = "name another folder with --out"
@@ -28,14 +42,20 @@ class NotWritten(OSError):
 
 @dataclass
 class RunFolder:
-    """The folder of a run, which has a temporary path until all files are written, and then its final path."""
+    """The folder of a run, which has a temporary path until all files are written, and then its
+    final path.
+    """
 
     path: Path
-    said: dict[str, Any] = field(default_factory=dict)  #: for the crate: command, recipe, inputs, versions, seconds
-    taken: dict[str, Path] = field(default_factory=dict)  #: by name: the stored file that was added to the folder
+    #: for the crate: command, recipe, inputs, versions, seconds
+    said: dict[str, Any] = field(default_factory=dict)
+    #: by name: the stored file that was added to the folder
+    taken: dict[str, Path] = field(default_factory=dict)
 
     def place(self, name: str) -> Path:
-        """Return the path of a file that is to be written into the folder of a run, and make the folder above it."""
+        """Return the path of a file that is to be written into the folder of a run, and make the
+        folder above it.
+        """
         path = self.path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
@@ -54,7 +74,9 @@ class RunFolder:
             writer.writerows([_plain(cell) for cell in row] for row in rows)
 
     def take(self, name: str, source: Path) -> None:
-        """Add a stored file to the folder of a run as a hard link, or as a copy if the file system refuses the link."""
+        """Add a stored file to the folder of a run as a hard link, or as a copy if the file
+        system refuses the link.
+        """
         path = self.place(name)
         self.taken[name] = source
         try:
@@ -64,27 +86,36 @@ class RunFolder:
 
 
 def writable_folder(out: str | os.PathLike[str]) -> Path:
-    """Return the folder in which a command makes its folder of results; raise ValueError if nothing can be written.
+    """Return the folder in which a command makes its folder of results; raise ValueError if nothing
+    can be written.
 
-    A folder that does not exist yet is not made: the nearest existing folder above it must be writable.
+    A folder that does not exist yet is not made: the nearest existing folder above it must be
+    writable.
     """
     root = existing = Path(out)
     try:
-        existing = next(path for path in (root, *root.absolute().parents) if path.exists() or path.is_symlink())
-        if root.is_symlink() and os.environ.get("NEUSEE_NO_CODE"):  # a stranger's folder may have put it there
+        existing = next(
+            path for path in (root, *root.absolute().parents) if path.exists() or path.is_symlink()
+        )
+        # a stranger's folder may have put it there
+        if root.is_symlink() and os.environ.get("NEUSEE_NO_CODE"):
             raise ValueError(f"{root} is a link, which --no-code does not follow: {_OTHER_FOLDER}")
         if existing.is_dir():
             os.rmdir(tempfile.mkdtemp(prefix=".neusee.", dir=existing))
             return root
         text = f"{existing} is not a folder, so that no results can be written to {root}"
     except OSError as error:
-        text = f"the folder {existing} cannot be written ({error.strerror}), so that {root} cannot hold results"
+        text = (
+            f"the folder {existing} cannot be written ({error.strerror}), so that {root} cannot"
+            " hold results"
+        )
     raise ValueError(f"{text}: {_OTHER_FOLDER}")
 
 
 @contextmanager
 def new_run(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
-    """Create a run folder with a temporary name; rename it after the ``with`` block, or remove it after an error.
+    """Create a run folder with a temporary name; rename it after the ``with`` block, or remove it
+    after an error.
 
     Raises `NotWritten` for an error of a file.
     """
@@ -92,7 +123,10 @@ def new_run(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
         with _folder(root, recipe, key) as run:
             yield run
     except OSError as error:
-        text = f"the folder of results in {root} cannot be written ({error}), and no part of it is left"
+        text = (
+            f"the folder of results in {root} cannot be written ({error}), and no part of it is"
+            " left"
+        )
         raise NotWritten(text) from error
 
 
@@ -116,19 +150,24 @@ def _folder(root: Path, recipe: str, key: str) -> Iterator[RunFolder]:
 
 def _sweep(root: Path) -> None:
     """Remove the unfinished folders of killed runs, in which no file has changed for an hour."""
-    for part in root.glob(".*.part"):
+    for unfinished in root.glob(".*.part"):
         try:
-            if _is_being_written(part):
+            if _is_being_written(unfinished):
                 continue
-            if time.time() - max(p.stat().st_mtime for p in (part, *part.rglob("*"))) > _ABANDONED:
-                shutil.rmtree(part, ignore_errors=True)
+            if (
+                time.time() - max(p.stat().st_mtime for p in (unfinished, *unfinished.rglob("*")))
+                > _ABANDONED
+            ):
+                shutil.rmtree(unfinished, ignore_errors=True)
         except OSError:  # another process has already removed the folder
             continue
 
 
-def _is_being_written(part: Path) -> bool:
-    """Return True if the process that made an unfinished folder runs on this machine, whatever the clock says."""
-    number = part.suffixes[-2].removeprefix(".") if len(part.suffixes) > 1 else ""
+def _is_being_written(unfinished: Path) -> bool:
+    """Return True if the process that made an unfinished folder runs on this machine, whatever
+    the clock says.
+    """
+    number = unfinished.suffixes[-2].removeprefix(".") if len(unfinished.suffixes) > 1 else ""
     try:
         os.kill(int(number), 0)
     except (ValueError, OverflowError, ProcessLookupError):
@@ -138,44 +177,140 @@ def _is_being_written(part: Path) -> bool:
     return True
 
 
-def _rename(part: Path, target: Path) -> Path:
-    """Rename the complete folder of a run to the first free name: ``name``, ``name_2``, ``name_3`` …"""
+def _rename(unfinished: Path, target: Path) -> Path:
+    """Rename the complete folder of a run to the first free name: ``name``, ``name_2``,
+    ``name_3`` …
+    """
     number = 1
     while True:
         path = target if number == 1 else target.with_name(f"{target.name}_{number}")
         if not path.exists():
             try:
-                return part.rename(path)
+                return unfinished.rename(path)
             except OSError:
-                if not path.exists():  # no other run took the name: the file system refused the rename
+                # no other run took the name: the file system refused the rename
+                if not path.exists():
                     raise
         number += 1
 
 
 def _point(root: Path, name: str) -> None:
-    """Make ``latest`` a symbolic link to the folder of a run, or a file with its name if links are not possible."""
-    part = root / f".latest.{os.getpid()}"
+    """Make ``latest`` a symbolic link to the folder of a run, or a file with its name if links
+    are not possible.
+    """
+    link = root / f".latest.{os.getpid()}"
     try:
-        part.symlink_to(name, target_is_directory=True)
+        link.symlink_to(name, target_is_directory=True)
     except OSError:
-        part.write_text(name + "\n", encoding="utf-8")
+        link.write_text(name + "\n", encoding="utf-8")
     try:
-        part.replace(root / "latest")
+        link.replace(root / "latest")
     except OSError:
-        part.unlink(missing_ok=True)
+        link.unlink(missing_ok=True)
         raise
 
 
 def find_run(where: str, root: Path) -> Path:
-    """Return the folder of a run; ``where`` is ``latest``, the name of a folder in ``root`` or a path."""
+    """Return the folder of a run; ``where`` is ``latest``, the name of a folder in ``root`` or a
+    path.
+    """
     for path in (root / where, Path(where)):
         if path.is_file():
             path = path.with_name(head_of(path, _NAME).decode("utf-8", "replace").strip())
         if (path / "provenance.json").is_file():
             return path
-    raise FileNotFoundError(f"no run at {where}: give the name of a folder in {root}, a path, or `latest`")
+    raise FileNotFoundError(
+        f"no run at {where}: give the name of a folder in {root}, a path, or `latest`"
+    )
 
 
 def _plain(cell: Any) -> Any:
-    """Return a cell with a number of Python in place of one of NumPy, whose text its print options decide."""
+    """Return a cell with a number of Python in place of one of NumPy, whose text its print
+    options decide.
+    """
     return cell.item() if hasattr(cell, "dtype") and not cell.ndim else cell
+
+
+# --- run code -------------------------------------------------------------------------------------
+
+# The file ``code.json`` in the folder of a run: digests of the code of each node, and of all that
+# the code uses.
+
+
+CODE = "code.json"
+
+
+def code_text(result: Result) -> str:
+    """Return the digests of code of a run as JSON text with one line for each node and each module.
+
+    ``nodes`` has the digest of each node with all that it uses; ``parts`` has, for each module, the
+    digest of every function, class and constant, and for each package its version.
+    """
+    origins = [result.origins[key] for key in result.keys.values() if key in result.origins]
+    nodes = {origin["node"]: origin["code"] for origin in origins}
+    parts: dict[str, Any] = {}
+    for code in dict.fromkeys(nodes.values()):
+        parts |= result.code.get(code, {})
+    return f'{{"nodes": {_lines(nodes)},\n"parts": {_lines(parts)}}}\n'
+
+
+def _lines(values: object) -> str:
+    assert isinstance(values, dict)
+    return (
+        "{\n"
+        + ",\n".join(f"{json.dumps(k)}: {json.dumps(v)}" for k, v in sorted(values.items()))
+        + "\n}"
+    )
+
+
+# --- run html -------------------------------------------------------------------------------------
+
+# The HTML page of a run, from its document and its pictures alone, and the page of an earlier run
+# written again.
+#
+# Neither torch nor a recipe is needed.
+
+
+_TEMPLATE = "run_page.html.j2"
+
+
+def prepare() -> None:
+    """Read and compile the template of the page, which takes longer than to fill it."""
+    compiled(_TEMPLATE)
+
+
+def document_text(doc: Mapping[str, Any]) -> str:
+    """Return the document of a run as the text of its file ``provenance.json``."""
+    return json.dumps(doc, indent=1, ensure_ascii=False, allow_nan=True)
+
+
+def present_time() -> str:
+    """Return the present time as the page of a run shows it."""
+    return datetime.now().astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
+
+
+def page(doc: Mapping[str, Any], pictures: Mapping[str, bytes]) -> str:
+    """Return the report of a run, from its document and pictures, as one HTML page that loads no
+    other file.
+    """
+    inline = {name: base64.b64encode(content).decode() for name, content in pictures.items()}
+    shown = {**doc, "figures": [f for f in doc["figures"] if f["name"] in inline]}
+    return filled(_TEMPLATE, doc=shown, pictures=inline)
+
+
+def rebuild(folder: Path) -> Path:
+    """Write ``report.html`` of a run again, from the document and the pictures in ``folder``,
+    and return its path.
+    """
+    doc = json.loads(text_of(folder / "provenance.json"))
+    pictures = {
+        p.stem: bytes_of(p, sys.maxsize) for p in sorted((folder / "figures").glob("*.png"))
+    }
+    target = folder / "report.html"
+    unfinished = folder / ".report.html.part"
+    unfinished.write_text(page(doc, pictures), encoding="utf-8")
+    crate = remove_crate(folder)
+    unfinished.replace(target)
+    if crate is not None:
+        restore_crate(folder, crate)
+    return target

@@ -1,8 +1,4 @@
-"""The report of a run as JSON document: numbers, steps, pictures and provenance.
-
-`document` returns JSON values, which a run stores beside the pictures as ``provenance.json``.
-`run_html.page` needs this document and the pictures only.
-"""
+"""The report of a run as JSON document: numbers, steps, times, pictures and provenance."""
 
 from __future__ import annotations
 
@@ -18,22 +14,155 @@ from pathlib import Path
 from typing import Any
 
 from neusee.nodes import Check
-from neusee.workflows.engine.finished_step import facts_in
-from neusee.workflows.engine.provenance import version_of
+from neusee.workflows.engine.provenance import facts_in, version_of
 from neusee.workflows.engine.runner import Result
-from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.graph.step_record import StepRecord
+from neusee.workflows.graph.recipe_graph import Recipe, StepRecord
+from neusee.workflows.keys.cache_key import file_digest
 from neusee.workflows.recipe.distributions.nominal_values import told
 from neusee.workflows.report.contents import FIGURES, compared
-from neusee.workflows.report.frame_story import said_of_frame
-from neusee.workflows.report.mask_story import story
 from neusee.workflows.report.paper_readings import consequences, in_force
 from neusee.workflows.report.result_numbers import expected, metrics, table
-from neusee.workflows.report.run_html import present_time
-from neusee.workflows.report.run_timing import said_of, timing
-from neusee.workflows.report.spectral_sampling import spectral_error
-from neusee.workflows.report.tolerance_spent import spent
-from neusee.workflows.store.byte_sizes import format_size
+from neusee.workflows.report.run_folder import present_time
+from neusee.workflows.report.run_pictures import GRAPH, TIMELINE
+from neusee.workflows.report.run_summary import said_of_frame, story
+from neusee.workflows.report.tolerance_spent import spectral_error, spent
+from neusee.workflows.store.cache_settings import format_size
+
+# --- run timing -----------------------------------------------------------------------------------
+
+# Times of a run: computing time, time that the cache saved, and predicted time.
+
+
+StepRow = Mapping[str, Any]  #: a step in the document of a run
+
+#: of the file ``timing.csv``, which has a line for each step
+COLUMNS = (
+    "step",
+    "node",
+    "device",
+    "lane",
+    "state",
+    "began",
+    "seconds",
+    "predicted",
+    "peak",
+    "predicted_peak",
+    "bytes",
+    "key",
+)
+
+
+def rows(steps: Iterable[StepRow]) -> list[list[Any]]:
+    """Return the rows of ``timing.csv``, one for each step of a run, with the values of
+    `COLUMNS`.
+    """
+    return [[step[column] for column in COLUMNS] for step in steps]
+
+
+def timing(steps: Sequence[StepRow], planned: float | None = None) -> dict[str, Any]:
+    """Return the total times of a run (predicted, actual, saved by the cache), and the bytes read
+    and written.
+
+    Steps with the same result count once.
+    """
+    ran, loaded = _in_state(steps, "run"), _in_state(steps, "cached", "not needed")
+    own = {step["key"] for step in ran}
+    served = _once(step for step in loaded if step["key"] not in own)
+    predicted = [step for step in ran if step["predicted"] is not None]
+    took, saved = _total(ran, "seconds"), _total(served, "made_in")
+    return {
+        "ran": len(ran),
+        "served": len(loaded),
+        "steps": len(steps),
+        "seconds": took,
+        "span": _span(ran),
+        "planned": planned if ran else None,
+        "told": len(predicted),
+        "predicted": _total(predicted, "predicted"),
+        "actual": _total(predicted, "seconds"),
+        "saved": saved,
+        "share": saved / (saved + took) if saved + took else 0.0,
+        "read": _total(_in_state(served, "cached"), "bytes"),
+        "written": _total([step for step in ran if step["kept"]], "bytes"),
+    }
+
+
+def _in_state(steps: Iterable[StepRow], *states: str) -> list[StepRow]:
+    return [step for step in steps if step["state"] in states]
+
+
+def _total(steps: Iterable[StepRow], column: str) -> Any:
+    return sum(step[column] for step in steps)
+
+
+def _span(ran: Sequence[StepRow]) -> Any:
+    """Return the time in s from the begin of the first step that ran to the end of the last."""
+    if not ran:
+        return 0.0
+    end = max(step["began"] + step["seconds"] for step in ran)
+    return end - min(step["began"] for step in ran)
+
+
+def _once(steps: Iterable[StepRow]) -> list[StepRow]:
+    """Return one step for each distinct result, with preference for a step whose result was read
+    from the cache.
+    """
+    steps_by_key: dict[str, StepRow] = {}
+    for step in steps:
+        if step["key"] not in steps_by_key or step["state"] == "cached":
+            steps_by_key[step["key"]] = step
+    return list(steps_by_key.values())
+
+
+def said_of(times: Mapping[str, Any]) -> list[str]:
+    """Return the times and the sizes in bytes of a run, which `timing` computed, as sentences."""
+    lines = []
+    if times["ran"]:
+        lines.append(
+            f"{times['ran']} of {times['steps']} steps ran: {_seconds(times['seconds'])} of"
+            " computing time."
+        )
+    if times["told"]:
+        steps = (
+            "these steps"
+            if times["told"] == times["ran"]
+            else f"the {times['told']} whose time was no guess"
+        )
+        predicted, actual = _seconds(times["predicted"]), _seconds(times["actual"])
+        lines.append(f"Predicted for {steps}: {predicted}; actual: {actual}.")
+    if times["planned"] is not None:
+        planned, span = _seconds(times["planned"]), _seconds(times["span"])
+        lines.append(f"Planned duration, with parallel branches: {planned}; actual: {span}.")
+    if times["ran"] and times.get("peak", [None])[0]:
+        predicted, actual = (format_size(size) for size in times["peak"])
+        lines.append(
+            f"Predicted peak memory of the program while the steps ran: {predicted}; actual:"
+            f" {actual}."
+        )
+    if times["served"]:
+        share = f"{100 * times['share']:.3g} % of all computing time"
+        lines.append(
+            f"The cache served {times['served']} steps and saved {_seconds(times['saved'])},"
+            f" {share}."
+        )
+    lines.append(
+        f"Read from the cache: {format_size(times['read'])}; written to it:"
+        f" {format_size(times['written'])}."
+    )
+    return lines
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.3g} s" if value < 100 else f"{value:.0f} s"
+
+
+# --- run page -------------------------------------------------------------------------------------
+
+# The report of a run as JSON document: numbers, steps, pictures and provenance.
+#
+# `document` returns JSON values, which a run stores beside the pictures as ``provenance.json``.
+# `run_folder.page` needs this document and the pictures only.
+
 
 _LIBRARIES = ("torch", "numpy", "kornia", "colour-science", "OpenEXR", "pydantic", "safetensors")
 _COPIED = (
@@ -56,12 +185,13 @@ _SAMPLING = "The PSF is sampled at the pixel centres; one pixel centre lies on t
 def document(result: Result, command: Sequence[str]) -> dict[str, Any]:
     """Return the report of a run, apart from its pictures, as a document of JSON values.
 
-    It can be made while the last pictures are drawn; `with_pictures` adds what is known only afterwards.
+    It can be made while the last pictures are drawn; `with_pictures` adds what is known only
+    afterwards.
     """
     recipe, done = result.recipe, list(result.done.values())
-    found, unchecked = expected(recipe, result.value), _unchecked(recipe)
+    expectations, unchecked = expected(recipe, result.value), _unchecked(recipe)
     steps = [_step(d, result) for d in done]
-    failed = [f"{s['step']}: {c['text']}" for s in steps for c in s["checks"] if not c["ok"]]
+    failed = _failed_checks(steps)
     time = timing(steps, _planned(result)) | {"peak": [result.predicted_peak, result.peak_memory]}
     return {
         "recipe": recipe.name,
@@ -74,8 +204,11 @@ def document(result: Result, command: Sequence[str]) -> dict[str, Any]:
         "tolerance": recipe.tolerance,
         "seed": recipe.seed,
         "counts": state_counts(done),
-        **_judgement(found, failed, unchecked),
-        "story": {**story(recipe, result.keys, result.value), **said_of_frame(recipe, result.keys, result.value)},
+        **_judgement(expectations, failed, unchecked),
+        "story": {
+            **story(recipe, result.keys, result.value),
+            **said_of_frame(recipe, result.keys, result.value),
+        },
         "table": table(recipe, result.keys, result.value),
         "metrics": metrics(recipe, result.keys, result.value),
         "notes": [*_sampling(recipe), *recipe.notes, *unchecked_lines(unchecked)],
@@ -83,7 +216,9 @@ def document(result: Result, command: Sequence[str]) -> dict[str, Any]:
         "posterior": told(recipe.uncertain.standings) if recipe.uncertain else [],
         "readings": _readings(recipe),
         "consequences": consequences(recipe.config.values),
-        "left_out": [{"step": d.step, "bound": d.bound, "why": d.why} for d in done if d.state == "left out"],
+        "left_out": [
+            {"step": d.step, "bound": d.bound, "why": d.why} for d in done if d.state == "left out"
+        ],
         "spent": spent(result),
         "spectral": spectral_error(recipe, result.keys, result.value),
         "absent": [{"step": step, "where": where} for step, where in recipe.absent.items()],
@@ -103,56 +238,76 @@ def with_pictures(
     refused: Mapping[str, str],
     warnings: Iterable[str],
 ) -> dict[str, Any]:
-    """Return the document of a run with its pictures, its data files, what is missing of both, and all warnings.
+    """Return the document of a run with its pictures, its data files, what is missing of both, and
+    all warnings.
 
-    ``missing`` and ``refused`` have the reason for each missing picture and data file; a picture without a reason has
-    nothing to show in this recipe.
+    ``missing`` and ``refused`` have the reason for each missing picture and data file; a picture
+    without a reason has nothing to show in this recipe.
     """
     warned = list(dict.fromkeys(warnings))
-    lacking = [{"name": n, "title": _TITLES.get(n, n), "why": why} for n, why in missing.items() if why]
+    lacking = [
+        {"name": n, "title": _TITLES.get(n, n), "why": why} for n, why in missing.items() if why
+    ]
     return {
         **doc,
         "notes": [*doc["notes"], *warned],
         "warnings": warned,
         "figures": _figures(missing, bool(doc["timing"]["ran"])),
-        "missing": [*lacking, *({"name": n, "title": f"data/{n}", "why": why} for n, why in refused.items())],
+        "missing": [
+            *lacking,
+            *({"name": n, "title": f"data/{n}", "why": why} for n, why in refused.items()),
+        ],
         "files": sorted(files),
     }
 
 
+def _failed_checks(steps: Iterable[StepRow]) -> list[str]:
+    failed = []
+    for step in steps:
+        failed += [f"{step['step']}: {c['text']}" for c in step["checks"] if not c["ok"]]
+    return failed
+
+
 def _judgement(
-    found: Sequence[Mapping[str, Any]], failed: Sequence[str], unchecked: Sequence[Mapping[str, str]]
+    expectations: Sequence[Mapping[str, Any]],
+    failed: Sequence[str],
+    unchecked: Sequence[Mapping[str, str]],
 ) -> dict[str, Any]:
-    """Return which expected numbers and checks a run met, and which it missed."""
+    """Return the expected numbers of a run, compared and not compared, the checks that failed,
+    and a verdict.
+    """
     return {
-        **_comparisons(found, failed, unchecked),
-    }
-
-
-def _comparisons(
-    found: Sequence[Mapping[str, Any]], failed: Sequence[str], unchecked: Sequence[Mapping[str, str]]
-) -> dict[str, Any]:
-    """Return the expected numbers of a run, compared and not compared, the checks that failed, and a verdict."""
-    return {
-        "verdict": verdict(found, failed, len(unchecked)),
-        "missed": [e["name"] for e in found if not e["ok"]],
+        "verdict": verdict(expectations, failed, len(unchecked)),
+        "missed": [e["name"] for e in expectations if not e["ok"]],
         "failed": failed,
-        "expected": found,
+        "expected": expectations,
         "unchecked": unchecked,
     }
 
 
-def verdict(found: Sequence[Mapping[str, Any]], failed: Sequence[str], unchecked: int = 0) -> str:
-    """Return a sentence that counts the expected numbers that the run reproduced, and the checks that failed.
+def verdict(
+    expectations: Sequence[Mapping[str, Any]], failed: Sequence[str], unchecked: int = 0
+) -> str:
+    """Return a sentence that counts the expected numbers that the run reproduced, and the checks
+    that failed.
 
-    ``unchecked`` is the number of expected numbers whose steps no output needs, so that the run has not compared them.
+    ``unchecked`` is the number of expected numbers whose steps no output needs, so that the run has
+    not compared them.
     """
-    met = sum(e["ok"] for e in found)
-    some = f"{met} of {len(found)} expected numbers within tolerance"
+    met = sum(e["ok"] for e in expectations)
+    some = f"{met} of {len(expectations)} expected numbers within tolerance"
     some += f", {unchecked} more not checked" if unchecked else ""
-    none = f"None of {unchecked} expected numbers checked" if unchecked else "No expected numbers in this recipe"
-    numbers = some if found else none
-    checks = "every check held" if not failed else f"{len(failed)} check{'s' * (len(failed) > 1)} to look at"
+    none = (
+        f"None of {unchecked} expected numbers checked"
+        if unchecked
+        else "No expected numbers in this recipe"
+    )
+    numbers = some if expectations else none
+    checks = (
+        "every check held"
+        if not failed
+        else f"{len(failed)} check{'s' * (len(failed) > 1)} to look at"
+    )
     return f"{numbers}; {checks}."
 
 
@@ -161,15 +316,21 @@ def state_counts(records: Iterable[StepRecord]) -> str:
 
     A step whose result no other step had to load counts as cached.
     """
-    counts = Counter("cached" if done.state == "not needed" else str(done.state) for done in records)
+    counts = Counter(
+        "cached" if done.state == "not needed" else str(done.state) for done in records
+    )
     return (
-        ", ".join(f"{counts[state]} {state}" for state in ("run", "cached", "left out") if counts[state])
+        ", ".join(
+            f"{counts[state]} {state}" for state in ("run", "cached", "left out") if counts[state]
+        )
         or "nothing to do"
     )
 
 
 def shape_of(done: StepRecord) -> str:
-    """Return the shape of a result as ``31 × 512 × 512``, or an empty string if the shape is unknown."""
+    """Return the shape of a result as ``31 × 512 × 512``, or an empty string if the shape is
+    unknown.
+    """
     return " × ".join(map(str, done.facts.shape)) or "number" if done.facts else ""
 
 
@@ -193,7 +354,9 @@ def _step(done: StepRecord, result: Result) -> dict[str, Any]:
 
 
 def _planned(result: Result) -> float | None:
-    """Return the predicted duration of a run in s, or None if the time of a step that ran was not predicted."""
+    """Return the predicted duration of a run in s, or None if the time of a step that ran was
+    not predicted.
+    """
     ran = [done for done in result.done.values() if done.state == "run"]
     if result.schedule is None or any(done.predicted is None for done in ran):
         return None
@@ -202,7 +365,9 @@ def _planned(result: Result) -> float | None:
 
 
 def _remembered(done: StepRecord, about: Mapping[str, Any]) -> StepRecord:
-    """Complete the record of a step that was not computed in this run with the metadata of its stored result."""
+    """Complete the record of a step that was not computed in this run with the metadata of its
+    stored result.
+    """
     checks = tuple(Check(text, ok) for text, ok in about.get("checks", ()))
     why = f"made {about['date'][:16].replace('T', ' ')} UTC"
     return replace(done, why=why, facts=facts_in(about), checks=checks, bytes=about["bytes"])
@@ -211,15 +376,23 @@ def _remembered(done: StepRecord, about: Mapping[str, Any]) -> StepRecord:
 def unit_of(docstring: str) -> str:
     """Return the unit of a node's result from the ``Units:`` line of the docstring of the node."""
     lines = (line.strip() for line in docstring.splitlines())
-    units = next((line for line in lines if line.startswith("Units:")), "Units:").removeprefix("Units:").strip()
-    before, found, after = units.partition("result ")
-    word = re.split(r"[\s,;:]|\.(?:\s|$)", after if found else before, maxsplit=1)[0]
+    units = (
+        next((line for line in lines if line.startswith("Units:")), "Units:")
+        .removeprefix("Units:")
+        .strip()
+    )
+    before, mark, after = units.partition("result ")
+    word = re.split(r"[\s,;:]|\.(?:\s|$)", after if mark else before, maxsplit=1)[0]
     return word if word in _UNITS else ""
 
 
 def _sampling(recipe: Recipe) -> list[str]:
     """Return a note on the sampling of the PSF, because every LSR depends on the sampling."""
-    kinds = {step.params.get("sensor") for step in recipe.steps.values() if step.node.path == "optics.psf"}
+    kinds = {
+        step.params.get("sensor")
+        for step in recipe.steps.values()
+        if step.node.path == "optics.psf"
+    }
     if kinds & {"point", "point_as_printed"}:
         return [_SAMPLING]
     return ["The PSF is averaged over each pixel."] if kinds else []
@@ -230,19 +403,28 @@ def _unchecked(recipe: Recipe) -> list[dict[str, str]]:
 
 
 def unchecked_lines(numbers: Sequence[Mapping[str, str]]) -> list[str]:
-    """Return a line that names the expected numbers that a run has not compared, or no line if there are none."""
+    """Return a line that names the expected numbers that a run has not compared, or no line if
+    there are none.
+    """
     names = ", ".join(number["name"] for number in numbers)
-    return [f"not checked, because no output of this run needs their steps: {names}"] if numbers else []
+    return (
+        [f"not checked, because no output of this run needs their steps: {names}"]
+        if numbers
+        else []
+    )
 
 
 def _readings(recipe: Recipe) -> list[dict[str, str]]:
-    """Return a table row for each contradiction in the paper, with the interpretation that the recipe uses."""
+    """Return a table row for each contradiction in the paper, with the interpretation that the
+    recipe uses.
+    """
     values = recipe.config.values
     if not any(path.startswith("reading.") for path in values):
         return []
     texts = ("path", "number", "matter", "reason")
     return [
-        {name: str(getattr(row, name)) for name in texts} | {"value": _written(values[row.path]), "state": state}
+        {name: str(getattr(row, name)) for name in texts}
+        | {"value": _written(values[row.path]), "state": state}
         for row, state in in_force(values)
     ]
 
@@ -253,9 +435,11 @@ def _written(value: Any) -> str:
 
 
 def _figures(missing: Mapping[str, str], ran: bool) -> list[dict[str, str]]:
-    from neusee.workflows.report.run_pictures import GRAPH, TIMELINE
-
-    shown = [(f.name, f.title, f.caption) for f in FIGURES if f.name not in missing] + [GRAPH] + [TIMELINE] * ran
+    shown = (
+        [(f.name, f.title, f.caption) for f in FIGURES if f.name not in missing]
+        + [GRAPH]
+        + [TIMELINE] * ran
+    )
     return [{"name": n, "title": t, "caption": c, "file": f"figures/{n}.png"} for n, t, c in shown]
 
 
@@ -281,11 +465,11 @@ def _facts(result: Result) -> list[list[str]]:
 
 def _inputs(recipe: Recipe) -> list[dict[str, str]]:
     """Return parameter, name and digest of every input file of a recipe."""
-    from neusee.workflows.keys.input_file_digest import file_digest
-
-    return [
-        {"parameter": f"{step.name}.{name}", "file": value.name, "digest": file_digest(value)}
-        for step in recipe.steps.values()
-        for name, value in step.params.items()
-        if isinstance(value, Path)
-    ]
+    rows = []
+    for step in recipe.steps.values():
+        files = {name: value for name, value in step.params.items() if isinstance(value, Path)}
+        rows += [
+            {"parameter": f"{step.name}.{name}", "file": file.name, "digest": file_digest(file)}
+            for name, file in files.items()
+        ]
+    return rows

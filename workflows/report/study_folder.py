@@ -1,4 +1,5 @@
-"""The folder with the results of a study, a calibration or an evaluation: page, pictures, tables and provenance.
+"""The folder with the results of a study, a calibration or an evaluation: page, pictures, tables
+and provenance.
 
 run = StudyRun("stability", recipe, command)            # starts the clock
 document = run.document({"failed": 3})                  # the content of provenance.json
@@ -24,8 +25,10 @@ from neusee.workflows.store.result_store import Store
 
 Progress = Callable[[str], None]  #: receives a line after each part of a study
 CsvTable = tuple[Sequence[str], Iterable[Sequence[Any]]]  #: the names of the columns, and the rows
-Content = str | bytes | Callable[[Path], Any]  #: of a file, or a function that writes the file at a path
-SHOWN = ("command", "date", "seconds", "versions")  #: values of the document that the page of a study shows
+#: of a file, or a function that writes the file at a path
+Content = str | bytes | Callable[[Path], Any]
+#: values of the document that the page of a study shows
+SHOWN = ("command", "date", "seconds", "versions")
 
 
 def silent(line: str) -> None:
@@ -34,19 +37,24 @@ def silent(line: str) -> None:
 
 @dataclass(frozen=True)
 class StudyReport:
-    """The report of a study: title, summary and sections of its page, and pictures, tables and other files by name."""
+    """The report of a study: title, summary and sections of its page, and pictures, tables and
+    other files by name.
+    """
 
     title: str
     lead: str
     sections: Sequence[Section]
-    pictures: Mapping[str, bytes | None] = field(default_factory=dict)  #: by name, without folder and suffix
+    #: by name, without folder and suffix
+    pictures: Mapping[str, bytes | None] = field(default_factory=dict)
     tables: Mapping[str, CsvTable] = field(default_factory=dict)  #: by file name
     files: Mapping[str, Content] = field(default_factory=dict)  #: by file name
     shown: Sequence[str] = SHOWN  #: the values of the document that the page shows
     banner: str = ""  #: reason why the result must not be used
 
     def write(self, folder: RunFolder, document: Mapping[str, Any]) -> None:
-        """Write the files of a study into a folder: page, pictures, tables, other files and ``provenance.json``."""
+        """Write the files of a study into a folder: page, pictures, tables, other files and
+        ``provenance.json``.
+        """
         for name, picture in self.pictures.items():
             if picture:
                 folder.write(f"figures/{name}.png", picture)
@@ -68,7 +76,9 @@ class StudyRun:
         self._began, self._failures = time.perf_counter(), len(Store.failures)
 
     def document(self, content: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the provenance of a study as a document: command, date, run time, ``content``, versions and recipe."""
+        """Return the provenance of a study as a document: command, date, run time, ``content``,
+        versions and recipe.
+        """
         return {
             "study": self.kind,
             "recipe": self.recipe.name,
@@ -81,12 +91,17 @@ class StudyRun:
             "config": self.recipe.config.to_yaml(),
         }
 
-    def write(self, runs: Path, key: str, document: Mapping[str, Any], report: StudyReport, name: str = "") -> Path:
-        """Write the results of a study into the folder ``runs/<date>_<recipe>_<name>_<key>``, and return its path.
+    def write(
+        self, runs: Path, key: str, document: Mapping[str, Any], report: StudyReport, name: str = ""
+    ) -> Path:
+        """Write the results of a study into the folder ``runs/<date>_<recipe>_<name>_<key>``, and
+        return its path.
 
         Without ``name``, the folder has the kind of the study in its name.
         """
-        with new_run(runs, f"{self.recipe.name}_{name or self.kind.replace('-', '_')}", key) as folder:
+        with new_run(
+            runs, f"{self.recipe.name}_{name or self.kind.replace('-', '_')}", key
+        ) as folder:
             folder.said = dict(document)
             folder.write("recipe.yaml", document["config"])
             report.write(folder, document)

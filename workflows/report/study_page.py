@@ -1,6 +1,8 @@
-"""The HTML page of a study, with paragraphs, pictures and tables, as one file that loads no other file.
+"""The HTML page of a study, with paragraphs, pictures and tables, as one file that loads no other
+file.
 
-The page has a light mode, a dark mode and a print mode. A sign in each coloured cell repeats the meaning of the colour.
+The page has a light mode, a dark mode and a print mode. A sign in each coloured cell repeats the
+meaning of the colour.
 """
 
 from __future__ import annotations
@@ -38,20 +40,31 @@ class Section:
     marks: Mapping[tuple[int, int], Mark] = field(default_factory=dict)  #: (row, column), from 0
 
 
-def page(title: str, lead: str, sections: Sequence[Section], provenance: Mapping[str, Any], banner: str = "") -> str:
-    """Return the HTML page of a study; a red ``banner`` gives the reason why the result must not be used."""
+def page(
+    title: str,
+    lead: str,
+    sections: Sequence[Section],
+    provenance: Mapping[str, Any],
+    banner: str = "",
+) -> str:
+    """Return the HTML page of a study; a red ``banner`` gives the reason why the result must not
+    be used.
+    """
+    texts = {name: _plain(value) for name, value in provenance.items()}
     return filled(
         "study_page.html.j2",
         title=title,
         banner=banner,
         lead=_paragraphs(lead),
         sections=[_section(f"s{i}", s) for i, s in enumerate(sections)],
-        provenance=[(name, text) for name, value in provenance.items() if (text := _plain(value))],
+        provenance=[(name, text) for name, text in texts.items() if text],
     )
 
 
 def filled(template: str, **values: Any) -> str:
-    """Return the HTML that an HTML template of the folder ``templates`` gives for the given ``values``."""
+    """Return the HTML that an HTML template of the folder ``templates`` gives for the given
+    ``values``.
+    """
     return str(compiled(template).render(**values))
 
 
@@ -73,24 +86,33 @@ def _with_code(text: str) -> str:
 
 
 def _with_breaks(text: str) -> str:
-    """Return text as HTML in which a long word such as ``developed_quality[mask]`` may go on in a new line."""
-    return " ".join(_BREAK.sub("<wbr>", escape(w)) if len(w) > _SHORT else escape(w) for w in text.split(" "))
+    """Return text as HTML in which a long word such as ``developed_quality[mask]`` may go on in
+    a new line.
+    """
+    return " ".join(
+        _BREAK.sub("<wbr>", escape(w)) if len(w) > _SHORT else escape(w) for w in text.split(" ")
+    )
 
 
 def said(value: Any) -> str:
-    """Return the value of a table cell as text, with three digits of a real number and a dash for None."""
+    """Return the value of a table cell as text, with three digits of a real number and a dash
+    for None.
+    """
     if value is None:
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, numbers.Real) and not isinstance(value, numbers.Integral):
         text = f"{float(value):.3g}"
-        return f"{float(text):.0f}" if _LARGE <= abs(float(value)) < _LARGEST else text  # 3720 in place of 3.72e+03
+        # 3720 in place of 3.72e+03
+        return f"{float(text):.0f}" if _LARGE <= abs(float(value)) < _LARGEST else text
     return str(value)
 
 
 def with_uncertainty(mean: float, sd: float) -> str:
-    """Return mean ± standard deviation as text, rounded to two significant digits of the standard deviation."""
+    """Return mean ± standard deviation as text, rounded to two significant digits of the
+    standard deviation.
+    """
     if not 0 < sd < math.inf:
         return f"{mean:.6g} ± {sd:g}"
     digits = 1 - math.floor(math.log10(sd))
@@ -101,7 +123,9 @@ def with_uncertainty(mean: float, sd: float) -> str:
 
 def _section(anchor: str, section: Section) -> dict[str, Any]:
     _refuse_stray_marks(section)
-    numeric = {i for i in range(len(section.columns)) if _holds_numbers([row[i] for row in section.rows])}
+    numeric = {
+        i for i in range(len(section.columns)) if _holds_numbers([row[i] for row in section.rows])
+    }
     return {
         "anchor": anchor,
         "heading": section.heading,
@@ -118,18 +142,24 @@ def _section(anchor: str, section: Section) -> dict[str, Any]:
 
 
 def _alternative(section: Section) -> str:
-    """Return the alternative text of the picture of a section: the heading, and the first sentence of the text."""
-    sentences = [re.split(r"(?<=[.!?]) ", paragraph)[0] for paragraph in _paragraphs(section.text)[:1]]
+    """Return the alternative text of the picture of a section: the heading, and the first
+    sentence of the text.
+    """
+    sentences = [
+        re.split(r"(?<=[.!?]) ", paragraph)[0] for paragraph in _paragraphs(section.text)[:1]
+    ]
     return " ".join([f"Figure: {section.heading}.", *sentences])
 
 
 def _refuse_stray_marks(section: Section) -> None:
-    """Raise ValueError if a pass, warn or fail mark belongs to a cell outside the table of its section."""
+    """Raise ValueError if a pass, warn or fail mark belongs to a cell outside the table of its
+    section.
+    """
     for row, column in section.marks:
         if not (0 <= row < len(section.rows) and 0 <= column < len(section.rows[row])):
             raise ValueError(
-                f"{section.heading}: the pass, warn or fail mark at row {row}, column {column} is outside the table: "
-                "mark a cell of the table"
+                f"{section.heading}: the pass, warn or fail mark at row {row}, column {column} is"
+                " outside the table: mark a cell of the table"
             )
 
 
@@ -140,7 +170,9 @@ def _cell(value: Any, mark: Mark | None, numeric: bool) -> dict[str, str]:
 
 
 def _is_short_word(text: str) -> bool:
-    """Return True for a short text without a space, such as 2.6e-05, which must not break at its hyphen."""
+    """Return True for a short text without a space, such as 2.6e-05, which must not break at its
+    hyphen.
+    """
     return len(text) <= _SHORT and "-" in text and not any(map(str.isspace, text))
 
 
@@ -149,17 +181,21 @@ def _is_number(value: Any) -> bool:
 
 
 def _holds_numbers(cells: Sequence[Any]) -> bool:
-    """Return True if a table column contains at least one number and otherwise only numbers and empty cells."""
+    """Return True if a table column contains at least one number and otherwise only numbers and
+    empty cells.
+    """
     filled_cells = [c for c in cells if c is not None]
     return bool(filled_cells) and all(map(_is_number, filled_cells))
 
 
 def _paragraphs(text: str) -> list[str]:
-    return [" ".join(part.split()) for part in text.split("\n\n") if part.strip()]
+    return [" ".join(paragraph.split()) for paragraph in text.split("\n\n") if paragraph.strip()]
 
 
 def _plain(value: Any) -> str:
-    """Return a value as text: a list with commas, and a mapping as names and values; inner ones stand in brackets."""
+    """Return a value as text: a list with commas, and a mapping as names and values; inner ones
+    stand in brackets.
+    """
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {_inner(item)}" for name, item in value.items())
     return ", ".join(map(_inner, value)) if isinstance(value, list | tuple) else said(value)

@@ -1,67 +1,90 @@
-"""Account of the numerical errors that a run accepts within its tolerance: omitted and cheaper steps, error bounds."""
+"""Account of the numerical errors of a run: within its tolerance, and by its bands."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
-from neusee.workflows.engine.cost_laws import sizes_of
-from neusee.workflows.engine.cost_model import Costs
+from neusee.workflows.engine.cost_model import Costs, sizes_of
 from neusee.workflows.engine.placement_inputs import past_costs
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.runner import Result
-from neusee.workflows.graph.recipe_graph import Recipe, Substitution, dependents, needed
+from neusee.workflows.graph.recipe_graph import Recipe, StepRecord, Substitution, dependents, needed
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.graph.step_record import StepRecord
+from neusee.workflows.report.contents import SPECTRAL, spectral_steps
 from neusee.workflows.tolerance.error_norm import error_of
 from neusee.workflows.tolerance.error_propagation import COVERAGE
+
+# --- tolerance spent ------------------------------------------------------------------------------
+
+# Account of the numerical errors that a run accepts within its tolerance: omitted and cheaper
+# steps, error bounds.
+
 
 NORM = "root mean square over the largest element"
 
 
 def spent(result: Result) -> dict[str, Any]:
-    """Return the tolerance of a run, with the omitted and the cheaper steps and their errors, as JSON values.
+    """Return the tolerance of a run, with the omitted and the cheaper steps and their errors, as
+    JSON values.
 
-    ``outputs`` has the error that the run states for each output, its kind (proved, estimated, exact or unknown), and
-    the error measured against a run with ``--exact``, if the store has the results of this run: the numbers of the
-    terminal, of the page and of ``study leave-out``. ``bounds`` has the errors that the tolerance limits: of each
-    output, and of each input of a step without an error bound, before one draw of the noise and rounding add to them.
-    ``estimated`` names those of them that count errors which are estimated and not proved.
+    ``outputs`` has the error that the run states for each output, its kind (proved, estimated,
+    exact or unknown), and the error measured against a run with ``--exact``, if the store has the
+    results of this run: the numbers of the terminal, of the page and of ``study leave-out``.
+    ``bounds`` has the errors that the tolerance limits: of each output, and of each input of a step
+    without an error bound, before one draw of the noise and rounding add to them. ``estimated``
+    names those of them that count errors which are estimated and not proved.
     """
-    recipe, measured = result.recipe, _measured(result)
+    recipe, measured, costs = result.recipe, _measured(result), _costs(result)
     estimated = dependents(recipe, _estimated_roots(result), needed(recipe, recipe.outputs))
-    costs = (
-        past_costs(result.store, sizes_of(result.recipe, needed(result.recipe, result.recipe.steps)))
-        if result.recipe.substitutions or _left_out(result)
-        else Costs([])
-    )
+    bounds = {name: share for name, share in result.proof.held.items() if share > 0}
     return {
-        "tolerance": result.recipe.tolerance,
+        "tolerance": recipe.tolerance,
         "norm": NORM,
-        "held": min(map(result.recipe.limit, result.proof.held), default=result.recipe.tolerance),
-        "strict": result.recipe.tolerance_scale,
-        "exact": result.recipe.exact,
-        "bounds": {name: share for name, share in result.proof.held.items() if share > 0},
-        "estimated": [name for name, share in result.proof.held.items() if share > 0 and name in estimated],
+        "held": min(map(recipe.limit, result.proof.held), default=recipe.tolerance),
+        "strict": recipe.tolerance_scale,
+        "exact": recipe.exact,
+        "bounds": bounds,
+        "estimated": [name for name in bounds if name in estimated],
         "outputs": [_output(result, name, measured.get(name)) for name in recipe.outputs],
         "coverage": COVERAGE,
-        "economies": [_economy(result, costs, each, each.instead in estimated) for each in result.recipe.substitutions],
-        "left_out": [
-            {
-                "step": done.step,
-                "bound": done.bound,
-                "estimated": bool(done.bound) and result.recipe.steps[done.step].node.hooks.skip_estimated,
-                "why": done.why,
-                "full_seconds": _seconds(result, costs, done.step),
-            }
-            for done in _left_out(result)
+        "economies": [
+            _economy(result, costs, substitution, substitution.instead in estimated)
+            for substitution in recipe.substitutions
         ],
+        "left_out": [_omission(result, costs, done) for done in _left_out(result)],
     }
 
 
+def _costs(result: Result) -> Costs:
+    """Return the costs of earlier runs, where this run left steps out or replaced them."""
+    recipe = result.recipe
+    if recipe.substitutions or _left_out(result):
+        return past_costs(result.store, sizes_of(recipe, needed(recipe, recipe.steps)))
+    return Costs([])
+
+
+def _omission(result: Result, costs: Costs, done: StepRecord) -> dict[str, Any]:
+    return {
+        "step": done.step,
+        "bound": done.bound,
+        "estimated": _is_estimated(result, done),
+        "why": done.why,
+        "full_seconds": _seconds(result, costs, done.step),
+    }
+
+
+def _is_estimated(result: Result, done: StepRecord) -> bool:
+    """Return True for a step that was left out by a bound which is an estimate."""
+    return bool(done.bound) and result.recipe.steps[done.step].node.hooks.skip_estimated
+
+
 def said_of_economies(account: Mapping[str, Any]) -> str:
-    """Return one line of text with the steps that a run replaced or omitted to save time, and the resulting errors."""
+    """Return one line of text with the steps that a run replaced or omitted to save time, and
+    the resulting errors.
+    """
     summed = [
         f"{e['step']} ({_within(e['bound'], e['estimated'])})"
         for e in account["economies"]
@@ -73,24 +96,32 @@ def said_of_economies(account: Mapping[str, Any]) -> str:
 
 
 def said_of_errors(account: Mapping[str, Any]) -> str:
-    """Return one line of text with the errors that a run states for its outputs, by kind, and the measured errors."""
+    """Return one line of text with the errors that a run states for its outputs, by kind, and
+    the measured errors.
+    """
     rows = account["outputs"]
+    of_kind: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        of_kind.setdefault(row["kind"], []).append(row)
     parts = []
-    if proved := [row for row in rows if row["kind"] == "proved"]:
-        parts.append(f"{_worst(proved, 'error')} at most, proved")
-    if estimated := [row for row in rows if row["kind"] == "estimated"]:
+    if "proved" in of_kind:
+        parts.append(f"{_worst(of_kind['proved'], 'error')} at most, proved")
+    if "estimated" in of_kind:
         parts.append(
-            f"{_worst(estimated, 'error')}, an estimate that {account['coverage']:.0%} of errors do not exceed"
+            f"{_worst(of_kind['estimated'], 'error')}, an estimate that"
+            f" {account['coverage']:.0%} of errors do not exceed"
         )
-    if unknown := [row["output"] for row in rows if row["kind"] == "unknown"]:
-        parts.append(f"unknown in {', '.join(unknown)}")
+    if "unknown" in of_kind:
+        parts.append(f"unknown in {', '.join(row['output'] for row in of_kind['unknown'])}")
     if not parts:
         return "error    none in the outputs"
     return f"error    {'; '.join(parts)}{_said_of_measured(rows)}"
 
 
 def _said_of_measured(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the largest error that was measured beside ``--exact``, and in which outputs, if not in all."""
+    """Return the largest error that was measured beside ``--exact``, and in which outputs, if
+    not in all.
+    """
     measured = [row for row in rows if row["measured"] is not None]
     if not measured:
         return ""
@@ -110,47 +141,61 @@ def _output(result: Result, name: str, measured: float | None) -> dict[str, Any]
 
 
 def _within(bound: float | None, estimated: bool) -> str:
-    return "error unknown" if bound is None else f"{'estimated' if estimated else 'at most'} {bound:.1e}"
+    return (
+        "error unknown"
+        if bound is None
+        else f"{'estimated' if estimated else 'at most'} {bound:.1e}"
+    )
 
 
 def _estimated_roots(result: Result) -> list[str]:
     """Return the steps that add an error which is estimated, and not proved."""
     recipe = result.recipe
-    found = []
+    roots = []
     for name in needed(recipe, recipe.outputs):
         hooks, record = recipe.steps[name].node.hooks, result.done.get(name)
         omitted = record is not None and record.state == "left out" and bool(record.bound)
-        if (hooks.skip_estimated and omitted) or (hooks.estimated and result.proof.shares.get(name)):
-            found.append(name)
-    return found
+        if (hooks.skip_estimated and omitted) or (
+            hooks.estimated and result.proof.shares.get(name)
+        ):
+            roots.append(name)
+    return roots
 
 
 def _left_out(result: Result) -> list[StepRecord]:
     return [done for done in result.done.values() if done.state == "left out"]
 
 
-def _economy(result: Result, costs: Costs, each: Substitution, estimated: bool) -> dict[str, Any]:
-    done = result.done.get(each.instead) if each.instead else None
+def _economy(
+    result: Result, costs: Costs, substitution: Substitution, estimated: bool
+) -> dict[str, Any]:
+    done = result.done.get(substitution.instead) if substitution.instead else None
     return {
-        "step": each.step,
-        "instead": each.instead,
-        "why": each.why,
-        "seconds": _spent_on(result, each) if done else None,
+        "step": substitution.step,
+        "instead": substitution.instead,
+        "why": substitution.why,
+        "seconds": _spent_on(result, substitution) if done else None,
         "estimated": estimated,
-        "full_seconds": _seconds(result, costs, each.step),
+        "full_seconds": _seconds(result, costs, substitution.step),
         "bound": done.error[0] if done and done.error else None,
         "what": "; ".join(check.text for check in done.checks) if done else "",
     }
 
 
-def _spent_on(result: Result, each: Substitution) -> float | None:
-    """Return the time in s of all steps that replace a step: the cheaper one, and those that choose and check it.
+def _spent_on(result: Result, substitution: Substitution) -> float | None:
+    """Return the time in s of all steps that replace a step: the cheaper one, and those that choose
+    and check it.
 
-    A stored result counts with the time in which it was computed; None if the store no longer knows that.
+    A stored result counts with the time in which it was computed; None if the store no longer knows
+    that.
     """
-    seconds = [_made_in(result, done) for name, done in result.done.items() if name.startswith(f"{each.step}.")]
-    known = [each for each in seconds if each is not None]
-    return sum(known) if len(known) == len(seconds) else None
+    seconds = [
+        _made_in(result, done)
+        for name, done in result.done.items()
+        if name.startswith(f"{substitution.step}.")
+    ]
+    known_seconds = [time for time in seconds if time is not None]
+    return sum(known_seconds) if len(known_seconds) == len(seconds) else None
 
 
 def _made_in(result: Result, done: StepRecord) -> float | None:
@@ -161,30 +206,79 @@ def _made_in(result: Result, done: StepRecord) -> float | None:
 
 
 def _seconds(result: Result, costs: Costs, step: str) -> float | None:
-    """Return the predicted time in s of a step that this run replaced or left out, or None if the step never ran."""
+    """Return the predicted time in s of a step that this run replaced or left out, or None if
+    the step never ran.
+    """
     estimate = costs.of(result.recipe.steps[step], ["cpu"])
     return estimate.seconds["cpu"] if estimate.known else None
 
 
 def _measured(result: Result) -> dict[str, float]:
-    """Return the error of each output of a run relative to an exact run, if the store has results of an exact run."""
+    """Return the error of each output of a run relative to an exact run, if the store has
+    results of an exact run.
+    """
     recipe = result.recipe
     if recipe.exact or not (recipe.substitutions or _left_out(result)):
         return {}
-    full, found = _full_keys(result), {}
+    full = _full_keys(result)
+    errors: dict[str, float] = {}
+    compared = False
     for name in recipe.outputs:
-        if name in full and full[name] != result.keys[name] and result.store.has(full[name]):
-            try:
-                found[name] = error_of(result.value(name), result.store.get(full[name]))
-            except (KeyError, ValueError):
-                continue  # another process has removed the result
-    same = {name: 0.0 for name in recipe.outputs if full.get(name) == result.keys[name]} if found else {}
-    return {name: {**same, **found}[name] for name in recipe.outputs if name in same or name in found}
+        if name not in full:
+            continue
+        if full[name] == result.keys[name]:
+            errors[name] = 0.0
+        elif result.store.has(full[name]):
+            with suppress(KeyError, ValueError):  # another process has removed the result
+                errors[name] = error_of(result.value(name), result.store.get(full[name]))
+                compared = True
+    return errors if compared else {}
 
 
 def _full_keys(result: Result) -> dict[str, str]:
-    whole: Recipe = replace(result.recipe.unsubstituted or result.recipe, exact=True, substitutions=())
+    exact_recipe: Recipe = replace(
+        result.recipe.unsubstituted or result.recipe, exact=True, substitutions=()
+    )
     try:
-        return resolve(whole, needed(whole, whole.outputs), result.store, result.device).keys
+        return resolve(
+            exact_recipe, needed(exact_recipe, exact_recipe.outputs), result.store, result.device
+        ).keys
     except (OSError, LookupError, RunError):
         return {}
+
+
+# --- spectral sampling ----------------------------------------------------------------------------
+
+# Account of the error by the number of spectral bands, which the tolerance of a run does not
+# include.
+
+
+def spectral_error(
+    recipe: Recipe, keys: Mapping[str, str], value: Callable[[str], Any]
+) -> dict[str, Any]:
+    """Return the largest error by the number of bands, over channels, by what it is the error
+    of; empty if unknown.
+    """
+    errors: dict[str, float] = {}
+    for name in spectral_steps(recipe):
+        if name in keys:
+            cause = SPECTRAL[name.partition("[")[0]]
+            errors[cause] = max(errors.get(cause, 0.0), float(value(name).max()))
+    if not errors:
+        return {}
+    larger = max(errors.values()) > recipe.tolerance
+    return {"errors": errors, "larger": larger, "said": _said(errors, recipe.tolerance, larger)}
+
+
+def _said(errors: Mapping[str, float], tolerance: float, larger: bool) -> str:
+    """Return one sentence with the errors by the number of bands, and a warning if one exceeds
+    the tolerance.
+    """
+    listed = ", ".join(f"{error:.1e} {cause}" for cause, error in errors.items())
+    beside = f"tolerance {tolerance:g}, which is relative to the bands of the recipe"
+    if not larger:
+        return f"bands    error by the number of bands: {listed}; {beside}"
+    return (
+        f"bands    LOOK: error by the number of bands: {listed}, larger than the {beside}: set more"
+        " bands"
+    )

@@ -1,81 +1,155 @@
-"""The recipe that restores a frame: the camera of another recipe or of a sensor file, and the frame as its picture."""
+"""The recipe that restores a frame: a camera, and the frames that a user names."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from neusee.nodes.sensor import FRAME_SUFFIXES
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.recipe.text.composition import compose, locate
-from neusee.workflows.recipe.text.option_groups import choices_of, shown
+from neusee.workflows.recipe.text.composition import choices_of, compose, locate, shown
 from neusee.workflows.recipe.text.overrides import Override, read_override
-from neusee.workflows.recipe.text.yaml_values import read
-from neusee.workflows.restoration.frame_files import named_frames
+from neusee.workflows.recipe.text.yaml_values import Value, read
+
+# --- frame files ----------------------------------------------------------------------------------
+
+# The files of the frames that a user names: single files, or all frames of a folder.
+
+
+def named_frames(words: Iterable[str], folder: Path) -> list[Path]:
+    """Return the absolute paths of frames; a folder stands for its frames, sorted by name.
+
+    Raises `RecipeError` with every word that is no file, no folder, or a folder without frames.
+    """
+    paths, problems = list[Path](), list[Diagnostic]()
+    for number, word in enumerate(words, 1):
+        files = list(_named(folder / Path(word).expanduser()))
+        if not files:
+            problems.append(
+                Diagnostic(Location(f"argument {number}"), word, _absent(folder / word))
+            )
+        paths += files
+    if problems:
+        raise RecipeError(problems)
+    return list(dict.fromkeys(paths))
+
+
+def _named(path: Path) -> Iterator[Path]:
+    if path.is_file():
+        yield path
+    elif path.is_dir():
+        inside = (
+            file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")
+        )
+        yield from sorted(file for file in inside if file.suffix.lower() in FRAME_SUFFIXES)
+
+
+def _absent(path: Path) -> str:
+    if path.is_dir():
+        return f"the folder has no frames: give files that end in {', '.join(FRAME_SUFFIXES)}"
+    return "no such file or folder: give the path of a frame, or of a folder of frames"
+
+
+# --- frame recipes --------------------------------------------------------------------------------
+
+# The recipe that restores a frame: the camera of another recipe or of a sensor file, and the frame
+# as its picture.
+
 
 OUTPUTS = ("raw[mask]", "developed[mask]", "clipped[mask]", "restored", "restored_spread")
 PLAIN_CAMERA = "first_light"  #: recipe around a sensor file, with a plain lens
 _SCENE = ("scene", "cube")  #: steps of the groups `scene` and `lift`, which a frame does not need
 _DROPPED = ("rival", "damage", "safety")  #: groups that compare or judge a simulated laser
 _SHADING = "shading=estimated"  #: an option of which all frames together tell
-_WITH_PSF = {"restore=measured": "measured", "restore=search": "measured_search"}  #: restorers for a measured PSF
+#: restorers for a measured PSF
+_WITH_PSF = {"restore=measured": "measured", "restore=search": "measured_search"}
 _STEM = re.compile(r"[^\w-]+")
 
 
 def recipes_of(
-    frames: Iterable[Path], camera: str, mask: str, changes: Sequence[str], folder: Path, first: int, psf: str = ""
+    frames: Iterable[Path],
+    camera: str,
+    mask: str,
+    changes: Sequence[str],
+    folder: Path,
+    first: int,
+    psf: str = "",
 ) -> list[Recipe]:
     """Return a checked recipe for each frame.
 
-    ``camera`` is a recipe or the file of a sensor group, ``mask`` an option of the group `doe`, a file of a height map,
-    or empty; ``changes`` are the overrides of the user, numbered from ``first``; ``psf`` is a folder of frames of point
-    sources, from which the PSF is measured, or empty.
-    Raises `RecipeError` with the mistakes of all frames, each mistake once.
+    ``camera`` is a recipe or the file of a sensor group, ``mask`` an option of the group `doe`, a
+    file of a height map, or empty; ``changes`` are the overrides of the user, numbered from
+    ``first``; ``psf`` is a folder of frames of point sources, from which the PSF is measured, or
+    empty. Raises `RecipeError` with the mistakes of all frames, each mistake once.
     """
     name, base, words = _camera(camera, folder)
     words += _mask(mask, folder) + _psf(psf, changes, folder, first)
-    frames, found, problems = list(frames), list[Recipe](), dict[Diagnostic, None]()
+    frames, recipes, problems = list(frames), list[Recipe](), dict[Diagnostic, None]()
     if any(change.lstrip("+") == _SHADING for change in changes):
         quoted = ", ".join(map(_quoted, frames))
-        words = [*words, _said("frames", f"shading.frames=[{quoted}]", folder, shown_as=f"{len(frames)} frames")]
+        words = [
+            *words,
+            _said("frames", f"shading.frames=[{quoted}]", folder, shown_as=f"{len(frames)} frames"),
+        ]
     own = [(n, text) for n, text in enumerate(changes, first) if not psf or text not in _WITH_PSF]
     for frame in frames:
         try:
-            found.append(_one(frame, (name, base, words), own, folder))
+            recipes.append(_one(frame, (name, base, words), own, folder))
         except RecipeError as error:
             problems |= dict.fromkeys(error.diagnostics)
     if problems:
         raise RecipeError(problems)
-    return found
+    return recipes
 
 
 def _one(
-    frame: Path, camera: tuple[str, Path, Sequence[Override]], changes: Sequence[tuple[int, str]], folder: Path
+    frame: Path,
+    camera: tuple[str, Path, Sequence[Override]],
+    changes: Sequence[tuple[int, str]],
+    folder: Path,
 ) -> Recipe:
     name, base, words = camera
-    own = [read_override(text, Location(f"argument {n}", folder=str(folder))) for n, text in changes]
-    file = _said("frame", f"frame.file={_quoted(frame)}", folder, shown_as=str(_near(frame, folder)))
+    own = [
+        read_override(text, Location(f"argument {n}", folder=str(folder))) for n, text in changes
+    ]
+    file = _said(
+        "frame", f"frame.file={_quoted(frame)}", folder, shown_as=str(_near(frame, folder))
+    )
     recipe = load(name, [*_prepared(name, base, own), *words, file, *own], base)
     title = f"The frame {frame.name}, restored with the camera {name}"
     return replace(recipe, name=f"restore_{_STEM.sub('_', frame.stem)}", title=title)
 
 
 def _camera(camera: str, folder: Path) -> tuple[str, Path, list[Override]]:
-    """Return the recipe of a camera, the folder to which its paths are relative, and the words that choose a sensor."""
+    """Return the recipe of a camera, the folder to which its paths are relative, and the words
+    that choose a sensor.
+    """
     path = folder / Path(camera).expanduser()
-    if not camera.endswith((".yaml", ".yml")) or not path.is_file() or "steps" in (items := _items(path)):
+    if (
+        not camera.endswith((".yaml", ".yml"))
+        or not path.is_file()
+        or "steps" in (items := _items(path))
+    ):
         return camera, folder, []
     if "sensor" not in items or ("defaults" in items and path.parent.name != "sensor"):
         return camera, folder, []
     if path.parent.name != "sensor" or path.suffix != ".yaml":
-        message = "the file has only a sensor: put it into a folder called sensor, as neusee new sensor does"
+        message = (
+            "the file has only a sensor: put it into a folder called sensor, as neusee new sensor"
+            " does"
+        )
         raise RecipeError([Diagnostic(Location("--camera"), camera, message)])
     words = [f"sensor={path.stem}", "doe=flat"]
-    return PLAIN_CAMERA, path.absolute().parent.parent, [_said("--camera", word, folder) for word in words]
+    return (
+        PLAIN_CAMERA,
+        path.absolute().parent.parent,
+        [_said("--camera", word, folder) for word in words],
+    )
 
 
 def _items(path: Path) -> set[str]:
@@ -83,12 +157,16 @@ def _items(path: Path) -> set[str]:
 
 
 def _mask(mask: str, folder: Path) -> list[Override]:
-    """Return the words that put a mask, an option of the group `doe` or the file of a height map, into the pupil."""
+    """Return the words that put a mask, an option of the group `doe` or the file of a height
+    map, into the pupil.
+    """
     if not mask:
         return []
     path = folder / Path(mask).expanduser()
     if path.is_file():
-        return [_said("--mask", word, folder) for word in ("doe=pixelwise", f"doe.file={_quoted(path)}")]
+        return [
+            _said("--mask", word, folder) for word in ("doe=pixelwise", f"doe.file={_quoted(path)}")
+        ]
     if path.suffix or "/" in mask:
         message = "no such file: give a height map, or the name of an option of the group doe"
         raise RecipeError([Diagnostic(Location("--mask"), mask, message)])
@@ -96,7 +174,9 @@ def _mask(mask: str, folder: Path) -> list[Override]:
 
 
 def _psf(psf: str, changes: Sequence[str], folder: Path, first: int) -> list[Override]:
-    """Return the words that measure the PSF from the frames of a folder, in place of the PSF of the recipe."""
+    """Return the words that measure the PSF from the frames of a folder, in place of the PSF of
+    the recipe.
+    """
     if not psf:
         return []
     restorer = "measured"
@@ -104,36 +184,60 @@ def _psf(psf: str, changes: Sequence[str], folder: Path, first: int) -> list[Ove
         if text.startswith("restore="):
             restorer = _WITH_PSF.get(text, "")
         if not restorer:
-            message = "a measured PSF has a filter of its own, or restore=search: leave out --psf, or this restorer"
+            message = (
+                "a measured PSF has a filter of its own, or restore=search: leave out --psf, or"
+                " this restorer"
+            )
             raise RecipeError([Diagnostic(Location(f"argument {number}"), text, message)])
     try:
         files = named_frames([psf], folder)
     except RecipeError as error:
-        raise RecipeError([replace(each, mark=Location("--psf")) for each in error.diagnostics]) from None
+        raise RecipeError(
+            [replace(problem, mark=Location("--psf")) for problem in error.diagnostics]
+        ) from None
     listed = "points.files=[" + ", ".join(map(_quoted, files)) + "]"
     words = [(f"restore={restorer}", ""), ("steps.level.from.psf=measured", ""), (listed, psf)]
     return [_said("--psf", word, folder, shown_as) for word, shown_as in words]
 
 
 def _prepared(name: str, base: Path, own: Sequence[Override]) -> list[Override]:
-    """Return the words that turn a recipe of a camera into one that restores: no scene, no laser, other outputs."""
+    """Return the words that turn a recipe of a camera into one that restores: no scene, no
+    laser, other outputs.
+    """
     path = locate(name, base)
     document = read(path, shown(path, base)).root
     groups = {choice.group for choice in choices_of(document, [])}
     root = compose(name, (), base).root
-    steps = root.items["steps"].items if "steps" in root.items else {}
-    chosen = {override.path[0] for override in own}
-    words = ["camera=frame"] if "camera" in groups else []
-    words += [f"~{group}" for group in _DROPPED if group in groups]
-    if not chosen & {"laser", "lasers"}:
-        words += ["laser=none"] if "laser" in groups else []
-        words += ["lasers={}"] if "lasers" in document.items else []
-    if "restore" not in chosen:
-        words += ["restore=wiener_blind"] if "restore" in groups else ["+restore=wiener_blind"]
-    words += [f"+steps.{step}.each=simulated" for step in _SCENE if step in steps]
-    words += ["~expect"] if "expect" in root.items.keys() - chosen else []
-    words += ["outputs=" + json.dumps(OUTPUTS)] if "outputs" not in chosen else []
+    overridden = {override.path[0] for override in own}
+    words = _without_scene(groups)
+    if not overridden & {"laser", "lasers"}:
+        words += _no_laser(groups, document.items)
+    if "restore" not in overridden:
+        words.append("restore=wiener_blind" if "restore" in groups else "+restore=wiener_blind")
+    words += _simulated_steps(root)
+    if "expect" in root.items.keys() - overridden:
+        words.append("~expect")
+    if "outputs" not in overridden:
+        words.append("outputs=" + json.dumps(OUTPUTS))
     return [_said("neusee restore", word, base) for word in words]
+
+
+def _simulated_steps(root: Value) -> list[str]:
+    """Return the words that keep the steps of the scene to the simulated arm."""
+    steps = root.items["steps"].items if "steps" in root.items else {}
+    return [f"+steps.{step}.each=simulated" for step in _SCENE if step in steps]
+
+
+def _without_scene(groups: Container[str]) -> list[str]:
+    """Return the words that put frames in the place of the camera, and drop the other groups."""
+    words = ["camera=frame"] if "camera" in groups else []
+    return [*words, *(f"~{group}" for group in _DROPPED if group in groups)]
+
+
+def _no_laser(groups: Container[str], blocks: Container[str]) -> list[str]:
+    """Return the words that take the lasers out of a recipe."""
+    words = ["laser=none"] if "laser" in groups else []
+    return [*words, "lasers={}"] if "lasers" in blocks else words
 
 
 def _said(where: str, text: str, folder: Path, shown_as: str = "") -> Override:

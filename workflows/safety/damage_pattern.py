@@ -1,7 +1,8 @@
-"""Pattern of damage on the sensor: the spot of a laser over the limit of damage, behind lens and mask."""
+"""Pattern of damage on the sensor: the spot over the limit, and the dead pixels."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -9,20 +10,29 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from neusee.nodes.laser import heated_spot
+from neusee.nodes.laser import KINDS, SpotDamage, damaged_pixels, heated_spot
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, unknown_step
 from neusee.workflows.recipe.blocks.safety_block import Safety
 from neusee.workflows.recipe.distributions.shapes import FloatArray
-from neusee.workflows.safety.exposures import Option
+from neusee.workflows.safety.exposures import Exposures, Option
 from neusee.workflows.store.result_store import Store
 
 if TYPE_CHECKING:
     from neusee.workflows.safety.safety_estimate import Finding
 
-OPTIONS = {"plain": "plain lens", "mask": "mask"}  #: protection by the name of its spot in the settings
-_FAINT, _DIM = 1e-4, 0.03  #: of the peak; a picture ends where the spot is fainter everywhere, by how strong it is
+
+# --- damage pattern -------------------------------------------------------------------------------
+
+# Pattern of damage on the sensor: the spot of a laser over the limit of damage, behind lens and
+# mask.
+
+
+#: protection by the name of its spot in the settings
+OPTIONS = {"plain": "plain lens", "mask": "mask"}
+#: of the peak; a picture ends where the spot is fainter everywhere, by how strong it is
+_FAINT, _DIM = 1e-4, 0.03
 _LEAST = 12  #: samples from the peak to each edge of a picture, at least
 
 
@@ -49,23 +59,34 @@ class DamagePattern:
 
 
 def spots_of(recipe: Recipe, safety: Safety, store: Store | None) -> tuple[Spot, ...]:
-    """Return the spots that the settings name; raise `RecipeError` for a step that does not exist."""
+    """Return the spots that the settings name; raise `RecipeError` for a step that does not
+    exist.
+    """
     named = {name: step for name, step in safety.settings.protection.spots if step is not None}
-    steps = {name: step_of(recipe, safety, f"protection.spots.{name}", step, name) for name, step in named.items()}
-    found: Any = run(recipe, store, list(steps.values())) if steps else {}
-    return tuple(_spot(OPTIONS[name], found[step].intensity, recipe.steps[step].params) for name, step in steps.items())
+    steps = {
+        name: step_of(recipe, safety, f"protection.spots.{name}", step, name)
+        for name, step in named.items()
+    }
+    results: Any = run(recipe, store, list(steps.values())) if steps else {}
+    return tuple(
+        _spot(OPTIONS[name], results[step].intensity, recipe.steps[step].params)
+        for name, step in steps.items()
+    )
 
 
 def step_of(recipe: Recipe, safety: Safety, setting: str, step: str, arm: str) -> str:
-    """Return the name of a step, completed by the arm and the laser if the step has copies for these.
+    """Return the name of a step, completed by the arm and the laser if the step has copies for
+    these.
 
     Raises `RecipeError` at the setting for a step that does not exist.
     """
-    found = next((name for name in (step, f"{step}[{arm},{safety.name}]") if name in recipe.steps), None)
-    if found is None:
+    full_name = next(
+        (name for name in (step, f"{step}[{arm},{safety.name}]") if name in recipe.steps), None
+    )
+    if full_name is None:
         value = safety.values[setting]
         raise RecipeError([Diagnostic(value.mark, value.name, unknown_step(step, recipe.steps))])
-    return found
+    return full_name
 
 
 def _spot(option: str, intensity: FloatArray, params: Mapping[str, float]) -> Spot:
@@ -75,32 +96,261 @@ def _spot(option: str, intensity: FloatArray, params: Mapping[str, float]) -> Sp
 
 
 def with_heated_spots(options: Sequence[Option], spots: Sequence[Spot]) -> tuple[Option, ...]:
-    """Return the options, of which masked ones know how much wider their heated spot is than that of the clear lens."""
+    """Return the options, of which masked ones know how much wider their heated spot is than
+    that of the clear lens.
+    """
     heated = {spot.option: spot.heated for spot in spots}
     plain, mask = heated.get(OPTIONS["plain"]), heated.get(OPTIONS["mask"])
     if not plain or not mask:
         return tuple(options)
-    return tuple(replace(option, heated=mask / plain) if option.masked else option for option in options)
+    return tuple(
+        replace(option, heated=mask / plain) if option.masked else option for option in options
+    )
 
 
 def damage_patterns(spots: Sequence[Spot], findings: Sequence[Finding]) -> Iterator[DamagePattern]:
-    """Yield the pattern of the most sensitive kind of damage behind each protection whose spot is known."""
+    """Yield the pattern of the most sensitive kind of damage behind each protection whose spot
+    is known.
+    """
     for spot in spots:
-        known = [each for each in findings if each.option == spot.option and each.limit.effect == "damage"]
-        if not known:
+        judged = [
+            finding
+            for finding in findings
+            if finding.option == spot.option and finding.limit.effect == "damage"
+        ]
+        if not judged:
             continue
-        worst = max(known, key=lambda each: each.ratio)
+        worst = max(judged, key=lambda finding: finding.ratio)
         ratio = spot.light * worst.ratio
         area = float((ratio >= 1).sum()) * (spot.pitch * 1e6) ** 2
         cut = _cut(spot.light, max(_FAINT, min(_DIM, 0.1 / worst.ratio)))
         width = cut.shape[0] * spot.pitch
-        yield DamagePattern(spot.option, worst.limit.name, cut * worst.ratio, width, worst.ratio, area)
+        yield DamagePattern(
+            spot.option, worst.limit.name, cut * worst.ratio, width, worst.ratio, area
+        )
 
 
 def _cut(light: FloatArray, faint: float) -> FloatArray:
-    """Return the square around the middle of the window that holds everything brighter than ``faint``."""
+    """Return the square around the middle of the window that holds everything brighter than
+    ``faint``.
+    """
     middle = np.array(light.shape) // 2
     bright = np.argwhere(light >= faint)
     reach = int(np.clip(np.abs(bright - middle).max(), _LEAST, min(middle) - 1))
     y, x = middle
     return light[y - reach : y + reach + 1, x - reach : x + reach + 1]
+
+
+# --- dead pixels ----------------------------------------------------------------------------------
+
+# An example of the dead pixels in a raw frame of the median device: points, lines, crosses and lost
+# frames.
+
+
+_HALF, _MOST = 24, 200  #: pixels from the spot to each edge of a picture, at least and at most
+_WHITE, _GREY = 1000, 400  #: DN of a white pixel and of the evenly grey scene in the drawn frame
+
+
+@dataclass(frozen=True)
+class DeadPixels:
+    """A part of the raw frame after the laser has hit the median device, around the spot."""
+
+    option: str
+    distance: float  #: m
+    kinds: tuple[str, ...]  #: of damage that is reached
+    pixels: int  #: that the light itself damages, without the lines and frames that go with them
+    frame: FloatArray  #: (y, x) from 0 to 1; of a lost frame, what else is damaged, or all black
+
+
+def damaged_frames(
+    safety: Safety, spots: Sequence[Spot], findings: Sequence[Finding], exposures: Exposures
+) -> Iterator[DeadPixels]:
+    """Yield the frame behind each protection whose spot is known, at one distance for all; none if
+    nothing is damaged.
+
+    The distance is that of the recipe if the laser damages the median device there behind the plain
+    lens, else the largest at which it does.
+    """
+    damage = [finding for finding in findings if finding.limit.effect == "damage"]
+    reached = _reached(damage, exposures)
+    if safety.settings.damage is None or not reached:
+        return
+    here = exposures.at(safety.laser.distance)
+    index = here if here in reached else max(reached)
+    pitch = safety.settings.sensor.pixel_pitch
+    for spot in spots:
+        if spot.pitch > pitch:  # samples that miss pixels say nothing of them
+            continue
+        hit = _hit(spot, pitch, damage, exposures, index)
+        yield _frame(
+            spot.option,
+            float(exposures.distances[index]),
+            hit,
+            _half_width(hit),
+            safety.settings.damage.device,
+        )
+
+
+def _hit(
+    spot: Spot, pitch: float, damage: Sequence[Finding], exposures: Exposures, index: int
+) -> list[tuple[str, FloatArray]]:
+    """Return the kinds of damage that are reached behind one protection at a distance, with the
+    places of each.
+    """
+    behind = [finding for finding in damage if finding.option == spot.option]
+    places = [_above(spot, pitch, float(_ratio(finding, exposures)[index])) for finding in behind]
+    kinds = [finding.limit.kind for finding in behind]
+    return [(kind, pixels) for kind, pixels in zip(kinds, places, strict=True) if len(pixels)]
+
+
+def _half_width(hit: Sequence[tuple[str, FloatArray]]) -> int:
+    """Return the pixels from the spot to each edge of a picture that holds all damaged places."""
+    farthest = max((np.abs(places).max() for _, places in hit), default=0)
+    return int(np.clip(farthest * 3 // 2, _HALF, _MOST))
+
+
+def _reached(damage: Sequence[Finding], exposures: Exposures) -> set[int]:
+    """Return the indices of the distances at which a limit of damage is exceeded behind the
+    plain lens.
+    """
+    plain = [finding for finding in damage if finding.option == "plain lens"]
+    indices = [np.flatnonzero(_ratio(finding, exposures) >= 1) for finding in plain]
+    return set(np.concatenate(indices).tolist()) if indices else set()
+
+
+def _ratio(finding: Finding, exposures: Exposures) -> FloatArray:
+    """Return the nominal exposure over the limit of the median device (distance,)."""
+    emitted = exposures.emitted(finding.limit.quantity)[0]
+    ratio: FloatArray = emitted * exposures.lens[0] / finding.curve[0]
+    return ratio
+
+
+def _above(spot: Spot, pitch: float, ratio: float) -> FloatArray:
+    """Return the places (pixel, (y, x)) from the spot of the pixels in which a sample exceeds
+    the limit.
+    """
+    middle = np.array(spot.light.shape) // 2
+    samples = np.argwhere(spot.light * ratio >= 1) - middle
+    return np.unique(np.round(samples * spot.pitch / pitch).astype(int), axis=0)
+
+
+def _frame(
+    option: str, distance: float, hit: Sequence[tuple[str, FloatArray]], half: int, device: str
+) -> DeadPixels:
+    pattern = torch.zeros(2 * half + 1, 2 * half + 1, dtype=torch.uint8)
+    others = any(kind != "frame" for kind, _ in hit)
+    for kind, places in hit:
+        if kind == "frame" and others:  # a black picture would hide what else is damaged
+            continue
+        for y, x in places[(np.abs(places) <= half).all(1)] + half:
+            pattern[y, x] |= 1 << KINDS.index(kind)
+    none = torch.zeros(0, dtype=torch.float64)
+    raw = torch.full((1, *pattern.shape), float(_GREY))
+    damage = SpotDamage._make([*[none] * 8, pattern])
+    drawn = damaged_pixels(raw, [damage], full_well=float(_WHITE), gain=1.0, bits=10, device=device)
+    kinds = tuple(kind for kind in KINDS if kind in {kind for kind, _ in hit})
+    return DeadPixels(
+        option, distance, kinds, int((pattern > 0).sum()), drawn[0].double().numpy() / _WHITE
+    )
+
+
+# --- lens of recipe -------------------------------------------------------------------------------
+
+# The lens of an estimate against the lens of the recipe's steps: what masks and spots are computed
+# for.
+
+
+_SAME = 1e-6  #: relative difference of two lengths that counts as rounding
+
+
+def refuse_other_lens(recipe: Recipe, safety: Safety, store: Store | None) -> None:
+    """Raise `RecipeError` where the steps of the recipe have another lens than the estimate, or a
+    smaller stop.
+
+    The stop is the step that the settings name, and each stop on which a named step depends.
+    """
+    lens = safety.settings.lens
+    problems = [*_other_focal_length(recipe, safety)]
+    for name in dict.fromkeys(
+        [*_named_stop(recipe, safety), *_upstream(recipe, safety, "optics.stop")]
+    ):
+        stop = run(recipe, store, [name])[name]
+        span = float(stop.samples * stop.pitch)
+        passed = f"{min(float(stop.diameter), span) * 1e3:.4g} mm"
+        if float(stop.diameter) > span * (1 + _SAME):
+            text = (
+                f"the step {name} clips its disc to a square of {passed}, and an estimate is of a"
+                " round lens"
+            )
+            problems.append(
+                _problem(safety, "lens.diameter", f"{text}: choose reading.aperture=stretched")
+            )
+        elif not math.isclose(float(stop.diameter), lens.diameter, rel_tol=_SAME):
+            text = f"the stop of the recipe ({name}) has {passed}, and the lens of the estimate"
+            fix = "write one diameter in both; reading.aperture=stretched keeps that of the recipe"
+            problems.append(
+                _problem(safety, "lens.diameter", f"{text} {lens.diameter * 1e3:.4g} mm: {fix}")
+            )
+    stop_of_protection = safety.settings.protection.stop
+    if stop_of_protection is not None and stop_of_protection > lens.diameter * (1 + _SAME):
+        wider = (
+            f"a stop of {stop_of_protection * 1e3:.4g} mm is wider than the lens of"
+            f" {lens.diameter * 1e3:.4g} mm"
+        )
+        problems.append(
+            _problem(safety, "protection.stop", f"{wider} and stops nothing: give a smaller one")
+        )
+    if problems:
+        raise RecipeError(problems)
+
+
+def _named_stop(recipe: Recipe, safety: Safety) -> Iterator[str]:
+    """Yield the step of the stop that the settings name."""
+    if safety.settings.lens.stop is not None:
+        yield step_of(recipe, safety, "lens.stop", safety.settings.lens.stop, "")
+
+
+def _other_focal_length(recipe: Recipe, safety: Safety) -> Iterator[Diagnostic]:
+    """Yield the mistake of a named step whose PSF has another focal length than the lens of the
+    estimate.
+    """
+    focal_length = safety.settings.lens.focal_length
+    for name in _upstream(recipe, safety, "optics.psf"):
+        other = recipe.steps[name].params["focal_length"]
+        if not math.isclose(other, focal_length, rel_tol=_SAME):
+            text = (
+                f"the step {name} has {other * 1e3:.4g} mm, and the lens of the estimate"
+                f" {focal_length * 1e3:.4g} mm"
+            )
+            yield _problem(safety, "lens.focal_length", f"{text}: write one focal length in both")
+            return
+
+
+def _upstream(recipe: Recipe, safety: Safety, node: str) -> list[str]:
+    """Return the steps of a node on which the steps that the settings of the protection name
+    depend.
+    """
+    waiting, visited = list(_named_steps(recipe, safety)), set[str]()
+    while waiting:
+        name = waiting.pop()
+        if name not in visited:
+            visited.add(name)
+            waiting += recipe.steps[name].sources
+    return sorted(name for name in visited if recipe.steps[name].node.path == node)
+
+
+def _named_steps(recipe: Recipe, safety: Safety) -> Iterator[str]:
+    """Yield each step that the settings of the protection name."""
+    protection = safety.settings.protection
+    if protection.mask is not None:
+        yield step_of(recipe, safety, "protection.mask", protection.mask, "mask")
+    for block, spots in (("spots", protection.spots), ("pixels", protection.pixels)):
+        for arm, step in spots:
+            if step is not None and (arm, protection.mask) != ("mask", None):
+                yield step_of(recipe, safety, f"protection.{block}.{arm}", step, arm)
+
+
+def _problem(safety: Safety, setting: str, text: str) -> Diagnostic:
+    """Return a mistake at the place where a setting is written."""
+    value = safety.values[setting]
+    return Diagnostic(value.mark, value.name, text)

@@ -1,4 +1,6 @@
-"""The dazzled area behind each protection over the distance: a clear round lens by its integral, a mask by its PSFs."""
+"""The dazzled area behind each protection over the distance: a clear round lens by its integral,
+a mask by its PSFs.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +15,17 @@ import torch
 from neusee.nodes.laser import Beam, BrightPixels, defocus_at, round_pixels
 from neusee.workflows.recipe.blocks.safety_block import Safety
 from neusee.workflows.recipe.distributions.shapes import FloatArray
-from neusee.workflows.safety.distance_ladder import FOLLOWED_WAVES, as_wide, fill_at, focus_of, ladder
-from neusee.workflows.safety.exposures import Exposures, Option
-from neusee.workflows.safety.light_levels import Grid, Levels, Veil, levels_of, veil_of
-from neusee.workflows.safety.spots_along import Ranked
-from neusee.workflows.safety.uncertain_values import SettingDraws
+from neusee.workflows.safety.exposures import (
+    FOLLOWED_WAVES,
+    Exposures,
+    Option,
+    SettingDraws,
+    as_wide,
+    fill_at,
+    focus_of,
+    ladder,
+)
+from neusee.workflows.safety.laser_spots import Grid, Levels, Ranked, Veil, levels_of, veil_of
 
 _RANKS = 80  #: numbers of pixels at which levels are computed
 _STEP, _WAVES = 0.3, 0.25  #: of the ladder of a clear round lens
@@ -36,7 +44,9 @@ class Area:
 
     @property
     def ranks(self) -> FloatArray:
-        """Return the numbers of pixels at which levels are known, the one that the settings ask for among them."""
+        """Return the numbers of pixels at which levels are known, the one that the settings ask
+        for among them.
+        """
         rows, columns = self.safety.settings.sensor.shape
         return np.unique(np.append(np.geomspace(1, rows * columns, _RANKS), self.asked))
 
@@ -47,7 +57,8 @@ class Area:
         return max(1.0, (dazzle.share if dazzle else 1.0) * rows * columns)
 
     def level(self, exposures: Exposures, draws: SettingDraws, veiled: bool) -> FloatArray:
-        """Return the light (1 + draw or 1, distance) of the faintest of the pixels that may be lost.
+        """Return the light (1 + draw or 1, distance) of the faintest of the pixels that may be
+        lost.
 
         It is a share of the light that passes the lens.
         """
@@ -57,29 +68,37 @@ class Area:
         return level
 
     def beyond(self, exposures: Exposures, draws: SettingDraws) -> float:
-        """Return the largest share of the lost pixels that lie beyond the window of a PSF, over all distances."""
+        """Return the largest share of the lost pixels that lie beyond the window of a PSF, over
+        all distances.
+        """
         table, _, _ = self._table(exposures, draws, veiled=False)
         return float(table.beyond[..., int(np.searchsorted(self.ranks, self.asked))].max())
 
-    def saturated(self, exposures: Exposures, draws: SettingDraws, at: int, light: FloatArray) -> FloatArray:
+    def saturated(
+        self, exposures: Exposures, draws: SettingDraws, index: int, light: FloatArray
+    ) -> FloatArray:
         """Return the number of pixels with at least each light at one distance.
 
         ``light`` (1 + draw or 1, any) is the share of the light that passes the lens.
         """
         table, place, others = self._table(exposures, draws, veiled=False)
         columns = [place, *others]
-        columns = [each[:, at : at + 1] if each.shape[1] > 1 else each for each in columns]
-        known = table.at(columns[0], columns[1:], slice(None))[:, 0]
-        known = np.broadcast_to(known, (max(len(known), len(light)), known.shape[1]))
-        light = np.broadcast_to(light, (len(known), light.shape[1]))
+        columns = [
+            column[:, index : index + 1] if column.shape[1] > 1 else column for column in columns
+        ]
+        levels = table.at(columns[0], columns[1:], slice(None))[:, 0]
+        levels = np.broadcast_to(levels, (max(len(levels), len(light)), levels.shape[1]))
+        light = np.broadcast_to(light, (len(levels), light.shape[1]))
         ranks = self.ranks
-        rows = [_number(row, ranks, needed) for row, needed in zip(known, light, strict=True)]
+        rows = [_number(row, ranks, needed) for row, needed in zip(levels, light, strict=True)]
         return np.stack(rows)
 
     def _table(
         self, exposures: Exposures, draws: SettingDraws, veiled: bool
     ) -> tuple[Levels, FloatArray, list[FloatArray]]:
-        """Return the levels, and where draws and distances lie among them; both are kept with the exposures."""
+        """Return the levels, and where draws and distances lie among them; both are kept with
+        the exposures.
+        """
         name = self._diameter, self.ranked.arm if self.ranked else "", veiled
         if name not in exposures.tables:
             if "veil" not in exposures.tables:
@@ -91,12 +110,14 @@ class Area:
                 levels, place = _of_clear(self, spots, veil, share, veiled), spots.place
                 others = [*spots.others, share]
             else:
-                widths = self.safety.settings.lens.diameter / (2 * np.sqrt(exposures.fill[self.option.name]))
+                widths = self.safety.settings.lens.diameter / (
+                    2 * np.sqrt(exposures.fill[self.option.name])
+                )
                 place = np.log(as_wide(exposures.beams[0], widths))
                 levels, others = _of_spots(self, veil, share, veiled), [share]
             exposures.tables[name] = levels, place, others
-        kept: tuple[Levels, FloatArray, list[FloatArray]] = exposures.tables[name]
-        return kept
+        table: tuple[Levels, FloatArray, list[FloatArray]] = exposures.tables[name]
+        return table
 
     @property
     def _diameter(self) -> float:
@@ -104,7 +125,9 @@ class Area:
         return min(self.option.diameter or math.inf, self.safety.settings.lens.diameter)
 
     def _round_spots(self, exposures: Exposures, draws: SettingDraws) -> _RoundSpots:
-        """Return the spots of a clear round lens; they are kept with the exposures, for each diameter."""
+        """Return the spots of a clear round lens; they are kept with the exposures, for each
+        diameter.
+        """
         name = "round spots", self._diameter
         if name not in exposures.tables:
             exposures.tables[name] = _round_spots(self, exposures, draws)
@@ -114,19 +137,31 @@ class Area:
 
 @dataclass(frozen=True)
 class _RoundSpots:
-    """The spots of a clear round lens over distance, defocus and size, and where draws and distances lie among them."""
+    """The spots of a clear round lens over distance, defocus and size, and where draws and
+    distances lie among them.
+    """
 
     rungs: FloatArray  #: (rung,) m
-    grids: tuple[Grid, Grid]  #: of the defocus beside the nominal one, and of the logarithm of the size in pixels
-    #: at each rung and each point of the grids, the last of which runs fastest: spots of one phase, or of several
+    #: of the defocus beside the nominal one, and of the logarithm of the size in pixels
+    grids: tuple[Grid, Grid]
+    #: at each rung and each point of the grids, the last of which runs fastest: spots of one phase,
+    #: or of several
     groups: tuple[tuple[BrightPixels, ...], ...]
-    place: FloatArray  #: (1 + draw or 1, distance) logarithm of the distance at which the nominal beam is as wide
-    others: tuple[FloatArray, FloatArray]  #: the defocus and the size there, in the scales of the grids
+    #: (1 + draw or 1, distance) logarithm of the distance at which the nominal beam is as wide
+    place: FloatArray
+    #: the defocus and the size there, in the scales of the grids
+    others: tuple[FloatArray, FloatArray]
 
 
 def _round_spots(area: Area, exposures: Exposures, draws: SettingDraws) -> _RoundSpots:
-    """Return the spots of a clear round lens, by the integral over its pupil at each rung and each point."""
-    lens, sensor, dazzle = area.safety.settings.lens, area.safety.settings.sensor, area.safety.settings.dazzle
+    """Return the spots of a clear round lens, by the integral over its pupil at each rung and
+    each point.
+    """
+    lens, sensor, dazzle = (
+        area.safety.settings.lens,
+        area.safety.settings.sensor,
+        area.safety.settings.dazzle,
+    )
     name, diameter = area.option.name, area._diameter
     widths = diameter / (2 * np.sqrt(exposures.fill[name]))
     waist = min(*(beam.waist for beam in exposures.beams), float(widths.min()))
@@ -145,15 +180,19 @@ def _round_spots(area: Area, exposures: Exposures, draws: SettingDraws) -> _Roun
         for offset, size in itertools.product(bends.points.tolist(), spreads.points.tolist()):
             waves = _SOFT * math.sinh(nominal + offset)
             feature = dazzle.feature if dazzle else 1.0
-            phases = [round_pixels(fill, w, math.exp(size), sensor.shape, feature) for w in _phases(waves)]
+            phases = [
+                round_pixels(fill, w, math.exp(size), sensor.shape, feature) for w in _phases(waves)
+            ]
             groups.append(tuple(phases))
     return _RoundSpots(rungs, (bends, spreads), tuple(groups), place, (bend, spread))
 
 
 def _phases(waves: float) -> list[float]:
-    """Return the defoci whose brightest pixels bound those of a spot: itself, or one wave of them where it oscillates.
+    """Return the defoci whose brightest pixels bound those of a spot: itself, or one wave of them
+    where it oscillates.
 
-    With each wave of defocus the middle of a wide spot turns from bright to dark, faster than the rungs follow.
+    With each wave of defocus the middle of a wide spot turns from bright to dark, faster than the
+    rungs follow.
     """
     if abs(waves) <= FOLLOWED_WAVES:
         return [waves]
@@ -161,7 +200,9 @@ def _phases(waves: float) -> list[float]:
 
 
 def _number(levels: FloatArray, ranks: FloatArray, light: FloatArray) -> FloatArray:
-    """Return the number of pixels with at least each light, from the logarithms of the levels of rising ranks."""
+    """Return the number of pixels with at least each light, from the logarithms of the levels of
+    rising ranks.
+    """
     needed = np.log(np.maximum(light, 1e-300))
     number = np.exp(np.interp(needed, levels[::-1], np.log(ranks)[::-1]))
     return np.where(needed > levels[0], 0.0, number)
@@ -175,14 +216,18 @@ def _defocus(safety: Safety, beam: Beam, diameter: float) -> Callable[[FloatArra
     path = lens.defocus * _DEFOCUS * (diameter / lens.diameter) ** 2
 
     def waves(distance: FloatArray) -> FloatArray:
-        at: torch.Tensor = torch.from_numpy(distance)
-        return np.asarray(defocus_at(beam, at, torch.tensor(diameter), focus_of(lens), path), np.float64)
+        distances: torch.Tensor = torch.from_numpy(distance)
+        return np.asarray(
+            defocus_at(beam, distances, torch.tensor(diameter), focus_of(lens), path), np.float64
+        )
 
     return waves
 
 
 def _spreads(safety: Safety, draws: SettingDraws, diameter: float) -> FloatArray:
-    """Return wavelength times f-number over pixel pitch (1 + draw or 1, 1), nominal and of each draw."""
+    """Return wavelength times f-number over pixel pitch (1 + draw or 1, 1), nominal and of each
+    draw.
+    """
     lens, laser, pitch = safety.settings.lens, safety.laser, safety.settings.sensor.pixel_pitch
     aperture = np.minimum(draws.column("lens.diameter", lens.diameter), diameter)
     focal = draws.column("lens.focal_length", lens.focal_length)
@@ -191,19 +236,30 @@ def _spreads(safety: Safety, draws: SettingDraws, diameter: float) -> FloatArray
     return (spread if np.ptp(spread) else spread[:1])[:, None]
 
 
-def _of_clear(area: Area, spots: _RoundSpots, veil: Veil | None, share: FloatArray, veiled: bool) -> Levels:
+def _of_clear(
+    area: Area, spots: _RoundSpots, veil: Veil | None, share: FloatArray, veiled: bool
+) -> Levels:
     """Return the levels of a clear round lens, from its spots."""
     shares, shape = Grid.around(share, 2), area.safety.settings.sensor.shape
 
     def brightest(phases: Sequence[BrightPixels]) -> tuple[FloatArray, FloatArray]:
-        each = [levels_of(groups, shape, area.ranks, veil, np.exp(shares.points), veiled) for groups in phases]
-        values, beyond = each[0]
-        return np.where(area.ranks <= _MIDDLE, np.max([value for value, _ in each], axis=0), values), beyond
+        phase_levels = [
+            levels_of(groups, shape, area.ranks, veil, np.exp(shares.points), veiled)
+            for groups in phases
+        ]
+        values, beyond = phase_levels[0]
+        return (
+            np.where(
+                area.ranks <= _MIDDLE, np.max([value for value, _ in phase_levels], axis=0), values
+            ),
+            beyond,
+        )
 
     levels = list(map(brightest, spots.groups))
     points = [len(grid.points) for grid in (*spots.grids, shares)]
     values, beyond = (
-        np.stack(part).reshape(len(spots.rungs), *points, len(area.ranks)) for part in zip(*levels, strict=True)
+        np.stack(arrays).reshape(len(spots.rungs), *points, len(area.ranks))
+        for arrays in zip(*levels, strict=True)
     )
     return Levels(np.log(spots.rungs), (*spots.grids, shares), values, beyond)
 
@@ -212,8 +268,11 @@ def _of_spots(area: Area, veil: Veil | None, share: FloatArray, veiled: bool) ->
     """Return the levels behind lens or mask, from the pixels of their PSFs at several distances."""
     assert area.ranked is not None
     shares, shape = Grid.around(share, 3), area.safety.settings.sensor.shape
-    found = [levels_of(each, shape, area.ranks, veil, np.exp(shares.points), veiled) for each in area.ranked.groups]
-    values, beyond = (np.stack(part) for part in zip(*found, strict=True))
+    spot_levels = [
+        levels_of(groups, shape, area.ranks, veil, np.exp(shares.points), veiled)
+        for groups in area.ranked.groups
+    ]
+    values, beyond = (np.stack(arrays) for arrays in zip(*spot_levels, strict=True))
     rungs = np.log(np.array(area.ranked.distances))
     misses = area.ranked.misses
     return Levels(
@@ -223,17 +282,23 @@ def _of_spots(area: Area, veil: Veil | None, share: FloatArray, veiled: bool) ->
 
 def area_of(safety: Safety, option: Option, ranked: Sequence[Ranked]) -> Area | str:
     """Return the dazzled area behind an option, or the reason why it is not known."""
-    arms = {each.arm: each for each in ranked}
+    arms = {spot.arm: spot for spot in ranked}
     if option.masked:
         if "mask" not in arms:
             return (
-                "the recipe does not compute it. Add `- safety: masked_dazzle` to its defaults, or name a step of "
-                "laser.bright_pixels in safety.protection.pixels.mask"
+                "the recipe does not compute it. Add `- safety: masked_dazzle` to its defaults, or"
+                " name a step of laser.bright_pixels in safety.protection.pixels.mask"
             )
         if not math.isfinite(arms["mask"].error):
-            return "the pupil of safety.protection.pixels.mask has no wavefront, so that its spot is of one distance"
+            return (
+                "the pupil of safety.protection.pixels.mask has no wavefront, so that its spot is"
+                " of one distance"
+            )
         return Area(option, safety, arms["mask"])
     plain = arms.get("plain") if option.diameter is None else None
     if plain is not None and not math.isfinite(plain.error):
-        return "the pupil of safety.protection.pixels.plain has no wavefront, so that its spot is of one distance"
+        return (
+            "the pupil of safety.protection.pixels.plain has no wavefront, so that its spot is of"
+            " one distance"
+        )
     return Area(option, safety, plain)

@@ -1,14 +1,15 @@
-"""Exposure at the lens and on the sensor over the distance, for nominal values and for draws of uncertain ones."""
+"""Exposure at lens and sensor over the distance, and the distances where it exceeds a limit."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from neusee.nodes import ParameterError
 from neusee.nodes.laser import (
@@ -27,16 +28,360 @@ from neusee.nodes.laser import (
     widest_heated_diameter,
 )
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
+from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.blocks.safety_block import BEAM, Lens, Safety
+from neusee.workflows.recipe.distributions.nominal_values import Uncertain
 from neusee.workflows.recipe.distributions.shapes import FloatArray
-from neusee.workflows.safety.distance_ladder import as_wide, interpolated, miss_between
-from neusee.workflows.safety.distance_zones import sampled
-from neusee.workflows.safety.uncertain_values import SettingDraws
+from neusee.workflows.recipe.distributions.uncertain_inputs import (
+    NEGLIGIBLE,
+    only_values,
+    within_allowed,
+)
+
+# --- uncertain values -----------------------------------------------------------------------------
+
+# Random draws of the settings of an estimate that a recipe gives as distributions or by a
+# posterior.
+
+
+_ROWS = 3  #: stream of random numbers that selects rows of a table of samples
+
+
+@dataclass(frozen=True)
+class SettingDraws:
+    """Draws of the uncertain settings of an estimate."""
+
+    count: int
+    values: Mapping[str, FloatArray]  #: (draw,) in SI by setting, such as ``laser.power``
+    laws: Mapping[str, str]  #: distribution as written, by setting
+    seed: int
+
+    def column(self, name: str, nominal: float) -> FloatArray:
+        """Return the nominal value of a setting and its draws (1 + draw,)."""
+        drawn = self.values.get(name, np.full(self.count, nominal))
+        return np.concatenate([[nominal], drawn])
+
+    def normal(self, stream: int) -> FloatArray:
+        """Return a standard normal number for each draw; another ``stream`` has independent
+        numbers.
+        """
+        return np.random.default_rng([self.seed, 2, stream]).standard_normal(self.count)
+
+
+def draw_settings(recipe: Recipe, safety: Safety) -> SettingDraws:
+    """Return draws of each setting whose value in the recipe is a distribution or belongs to a
+    posterior.
+
+    A negligible part of a distribution outside the values that the recipe allows is cut off, and
+    its text says so. Raises `RecipeError` for a distribution with more outside.
+    """
+    uncertain, count = recipe.uncertain, safety.settings.draws
+    if uncertain is None:
+        return SettingDraws(count, {}, {}, recipe.seed)
+    paths = {
+        setting: value.name
+        for setting, value in safety.values.items()
+        if value.name in uncertain.names
+    }
+    allowed, notes = within_allowed(only_values(uncertain, paths.values()), NEGLIGIBLE)
+    drawn = _draws(allowed, count, recipe.seed)
+    texts = {path: uncertain.said(path) for path in drawn}
+    texts |= {path: f"{texts[path]} ({note})" for path, note in notes.items()}
+    order = sorted(paths, key=lambda setting: list(drawn).index(paths[setting]))
+    values = {setting: drawn[paths[setting]] for setting in order}
+    return SettingDraws(
+        count, values, {setting: texts[paths[setting]] for setting in order}, recipe.seed
+    )
+
+
+def _draws(uncertain: Uncertain, count: int, seed: int) -> dict[str, FloatArray]:
+    """Return ``count`` draws of each uncertain value; those of a table of samples are whole rows
+    of the table.
+    """
+    z = np.random.default_rng([seed, 1]).standard_normal((count, len(uncertain.names)))
+    drawn = {name: law.at(z[:, i]) for i, (name, law) in enumerate(uncertain.laws.items())}
+    joint = uncertain.joint
+    if joint is None:
+        return drawn
+    if joint.draws is None:
+        rows = joint.at(z[:, len(drawn) :])
+    else:
+        rows = joint.draws[
+            np.random.default_rng([seed, _ROWS]).integers(0, len(joint.draws), count)
+        ]
+    return drawn | dict(zip(joint.names, rows.T, strict=True))
+
+
+# --- distance ladder ------------------------------------------------------------------------------
+
+# Distances at which the spot of a laser is computed anew: dense where its shape changes, none where
+# it does not.
+
+
+#: largest fill and defocus of a spot that is taken as that of a distant laser
+FAR_FILL, FAR_WAVES = 0.02, 0.03
+#: the same for a lens that is out of focus far away, where each wave counts at first order
+UNFOCUSED_WAVES = 0.002
+#: defocus up to which rungs follow how the middle of a spot turns bright and dark
+FOLLOWED_WAVES = 2.0
+_DEFOCUS = 550e-9  #: m; the wavelength in which waves of defocus are counted
+
+
+def far_distance(beam: Beam, diameter: float, waves: float = FAR_WAVES) -> float:
+    """Return the distance in m from which the beam overfills a lens and its wavefront is plane.
+
+    The fill (D / (2 w))^2 is then at most 0.02, which lowers the spot by 2 %, and the curvature at
+    most 0.03 waves, which lowers the spot of a lens in focus by 0.3 %; the power into the lens is
+    exact at every distance.
+    """
+    width = diameter / (2 * math.sqrt(FAR_FILL))
+    filled = 2 * math.sqrt(max(width**2 - beam.waist**2, 0.0)) / beam.divergence
+    plane = diameter**2 / (8 * beam.wavelength * waves)
+    return max(filled, plane)
+
+
+def focus_of(lens: Lens) -> float:
+    """Return the distance in m on which a lens is focused; infinity for a lens that follows the
+    laser.
+    """
+    return math.inf if isinstance(lens.focus, str) else lens.focus
+
+
+def ladder(
+    beam: Beam, lens: Lens, diameter: float, ends: tuple[float, float], step: float, waves: float
+) -> FloatArray:
+    """Return rising distances from the nearest to the furthest of ``ends``, or to that of a distant
+    laser.
+
+    Between two of them the distance grows by the factor 1 + ``step`` at most, and the defocus
+    changes by ``waves`` or, from `FOLLOWED_WAVES`, by the share ``step`` of itself at most.
+    """
+    nearest, furthest = ends
+    follows = lens.focus == "laser"
+    focused = follows or (lens.focus == "infinity" and not lens.defocus)
+    last = min(furthest, far_distance(beam, diameter, FAR_WAVES if focused else UNFOCUSED_WAVES))
+
+    def defocus(distance: float) -> float:
+        defocused = defocus_at(beam, distance, diameter, focus_of(lens), lens.defocus * _DEFOCUS)
+        return 0.0 if follows else float(defocused)
+
+    rungs = [last]
+    while rungs[-1] > nearest:
+        here, factor = rungs[-1], 1 + step
+        allowed = (
+            waves if abs(defocus(here)) < FOLLOWED_WAVES else max(waves, step * abs(defocus(here)))
+        )
+        while abs(defocus(here / factor) - defocus(here)) > allowed and factor > 1.002:
+            factor = math.sqrt(factor)
+        rungs.append(max(here / factor, nearest))
+    return np.array(rungs[::-1])
+
+
+def miss_between(rungs: FloatArray, misses: Sequence[float], place: FloatArray) -> FloatArray:
+    """Return by how much an interpolation may miss at places: nothing at a rung, the whole miss in
+    the middle of a gap.
+
+    ``misses`` has one number for each gap between two rungs; without any nothing is missed.
+    """
+    if not len(misses):
+        return np.zeros_like(place)
+    gap = np.clip(np.searchsorted(rungs, place, side="right") - 1, 0, len(rungs) - 2)
+    position = np.clip((place - rungs[gap]) / (rungs[gap + 1] - rungs[gap]), 0, 1)
+    missed: FloatArray = np.asarray(misses, np.float64)[gap] * 4 * position * (1 - position)
+    return missed
+
+
+def interpolated(rungs: FloatArray, values: FloatArray, place: FloatArray) -> FloatArray:
+    """Return values (rung, ...) at places (any, ...), without overshoot between rungs; one rung
+    holds everywhere.
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    if len(rungs) == 1:
+        return np.broadcast_to(values[0], (*np.shape(place), *values.shape[1:]))
+    between: FloatArray = PchipInterpolator(rungs, values)(place)
+    return between
+
+
+def as_wide(beam: Beam, radius: FloatArray) -> FloatArray:
+    """Return the distance in m at which a beam has a 1/e2 radius; 1 mm where it is wider
+    everywhere.
+    """
+    square = np.maximum(radius**2 - beam.waist**2, (5e-4 * beam.divergence) ** 2)
+    distance: FloatArray = 2 * np.sqrt(square) / beam.divergence
+    return distance
+
+
+def fill_at(beam: Beam, diameter: float, distance: float) -> float:
+    """Return (D / (2 w))^2 at a distance."""
+    return diameter**2 / (4 * beam_radius(beam, distance) ** 2)
+
+
+# --- distance zones -------------------------------------------------------------------------------
+
+# Intervals of distance in which an exposure exceeds a limit, for nominal values and for random
+# draws of them.
+
+
+QUANTILES = (0.05, 0.95)  #: ends of the interval that contains 90 % of the draws
+_ROUNDED = 1e-9  #: relative rounding of the logarithm of a distance
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A number with the interval that contains 90 % of its draws; all three are equal if nothing
+    is uncertain.
+    """
+
+    value: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, value: float, draws: FloatArray) -> Spread:
+        """Return a number with the interval of its draws; NaN in a draw is left out."""
+        finite = draws[~np.isnan(draws)]
+        if not finite.size:
+            return cls(value, value, value)
+        low, high = np.quantile(finite, QUANTILES)
+        return cls(value, float(low), float(high))
+
+
+@dataclass(frozen=True)
+class Zone:
+    """An interval of distance in m, whose ends have intervals of their own."""
+
+    near: Spread
+    far: Spread
+    begins_before: bool  #: whether the zone reaches below the shortest distance that is asked for
+    ends_beyond: bool  #: whether the zone reaches beyond the longest distance that is asked for
+
+
+@dataclass(frozen=True)
+class Zones:
+    """The intervals of distance in which a limit is exceeded, none or several, and how sure each
+    statement is.
+    """
+
+    zones: tuple[Zone, ...]  #: at the nominal values
+    none: float  #: share of the draws without any zone
+    #: share of the draws with as many zones as the nominal values; ends between zones are from
+    #: these
+    alike: float
+    #: largest distance of any zone, over the draws that have one; None without such a draw
+    reach: Spread | None
+    #: share of the draws in which the limit is exceeded at the distance of the recipe
+    inside: float
+
+
+def crossings(distances: FloatArray, ratio: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the near and the far ends (draw, zone) of the intervals in which ``ratio`` (draw,
+    distance) is at least 1.
+
+    Ends between two distances are interpolated in the logarithms. Rows with fewer zones than others
+    end with NaN. A zone that begins before the first distance, or ends beyond the last, has this
+    distance as its end.
+    """
+    with np.errstate(divide="ignore"):
+        height = np.log(np.maximum(ratio, 1e-300))
+    place, inside = np.log(distances), height >= 0
+    edge = np.zeros((len(inside), 1), bool)
+    begins = inside & ~np.concatenate([edge, inside[:, :-1]], 1)
+    ends = inside & ~np.concatenate([inside[:, 1:], edge], 1)
+    return _placed(place, height, begins, -1), _placed(place, height, ends, 1)
+
+
+def _placed(
+    place: FloatArray, height: FloatArray, marks: NDArray[np.bool_], step: int
+) -> FloatArray:
+    """Return the distance (draw, zone) where the height crosses 0 beside each marked sample, on
+    the side ``step``.
+    """
+    row, column = np.nonzero(marks)
+    other = np.clip(column + step, 0, len(place) - 1)
+    inner, outer = height[row, column], height[row, other]
+    share = np.where(other == column, 0.0, inner / np.where(other == column, 1.0, inner - outer))
+    distances = np.exp(place[column] + share * (place[other] - place[column]))
+    count = marks.sum(1)
+    placed = np.full((len(marks), int(count.max(initial=0))), np.nan)
+    placed[row, np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)] = distances
+    return placed
+
+
+def zones_of(
+    distances: FloatArray,
+    nominal: FloatArray,
+    drawn: FloatArray,
+    distance: float,
+    asked: tuple[float, float] | None = None,
+) -> Zones:
+    """Return the zones of a limit from the ratio of exposure to limit: nominal (distance,), drawn
+    (draw, distance).
+
+    Zones lie between the two distances ``asked``, whether or not the ``distance`` of the recipe
+    does. The outer ends, such as the farthest distance, have the interval of all draws that have a
+    zone; ends between two zones have that of the draws with as many zones as the nominal values.
+    """
+    within = _at(distances, drawn, distance) >= 1
+    if asked is not None:
+        shown = (distances >= asked[0] * (1 - _ROUNDED)) & (distances <= asked[1] * (1 + _ROUNDED))
+        distances, nominal, drawn = distances[shown], nominal[shown], drawn[:, shown]
+    near, far = (ends[0] for ends in crossings(distances, nominal[None]))
+    starts, stops = crossings(distances, drawn)
+    count = (~np.isnan(starts)).sum(1)
+    alike = count == len(near)
+    furthest = np.nanmax(stops[count > 0], 1) if (count > 0).any() else np.zeros(0)
+    # outer ends are those of every draw with a zone
+    first, last = starts[count > 0, :1].ravel(), len(near) - 1
+    zones = tuple(
+        Zone(
+            Spread.of(float(near[i]), _column(starts[alike], i) if i else first),
+            Spread.of(float(far[i]), _column(stops[alike], i) if i < last else furthest),
+            bool(near[i] <= distances[0] * (1 + _ROUNDED)),
+            bool(far[i] >= distances[-1] * (1 - _ROUNDED)),
+        )
+        for i in range(len(near))
+    )
+    reach = (
+        Spread.of(float(far.max()) if len(far) else float(np.median(furthest)), furthest)
+        if furthest.size
+        else None
+    )
+    return Zones(
+        zones, float((count == 0).mean()), float(alike.mean()), reach, float(within.mean())
+    )
+
+
+def _column(ends: FloatArray, zone: int) -> FloatArray:
+    """Return the ends (draw,) of one of several zones; none without a draw."""
+    return ends[:, zone] if len(ends) else np.zeros(0)
+
+
+def _at(distances: FloatArray, ratio: FloatArray, distance: float) -> FloatArray:
+    """Return the ratio (draw,) at a distance, which is one of the distances."""
+    column: FloatArray = ratio[:, int(np.argmin(np.abs(distances - distance)))]
+    return column
+
+
+def sampled(first: float, last: float, also: Sequence[float] = (), count: int = 600) -> FloatArray:
+    """Return distances from ``first`` to ``last`` at equal ratios, with the distances ``also``
+    among them.
+    """
+    return np.unique(
+        np.concatenate([np.geomspace(first, last, count), np.asarray(also, np.float64)])
+    )
+
+
+# --- exposures ------------------------------------------------------------------------------------
+
+# Exposure at the lens and on the sensor over the distance, for nominal values and for draws of
+# uncertain ones.
+
 
 Emission = Literal["continuous", "single pulse", "pulse train"]
-WITHIN = 0.01  #: relative change of the defocus over which the largest peak counts: that of half a step of distance
-_ROUNDED = 1e-9  #: rounding of the logarithm of a distance
-_DEFOCUS = 550e-9  #: m; the wavelength in which waves of defocus are counted
+#: relative change of the defocus over which the largest peak counts: that of half a step of
+#: distance
+WITHIN = 0.01
 
 
 @dataclass(frozen=True)
@@ -48,26 +393,34 @@ class Option:
     passing: float = 1.0  #: transmittance of a filter
     peak: float = 1.0  #: peak of the PSF over that of the clear lens, at the distance of the recipe
     masked: bool = False  #: whether the mask is in front of the lens
-    heated: float | None = None  #: diameter of the heated spot over that of the clear lens; None: not known
-    scene: float | None = None  #: share of the scene's light that a filter passes; None: as much as of the laser's
+    #: diameter of the heated spot over that of the clear lens; None: not known
+    heated: float | None = None
+    #: share of the scene's light that a filter passes; None: as much as of the laser's
+    scene: float | None = None
 
     def scene_share(self, diameter: float) -> float:
-        """Return the share of the scene's light that reaches the sensor, for a lens of ``diameter`` m."""
+        """Return the share of the scene's light that reaches the sensor, for a lens of
+        ``diameter`` m.
+        """
         filtered = self.passing if self.scene is None else self.scene
         return filtered * stopped_share(diameter, self.diameter or diameter)
 
-    peaks: tuple[tuple[float, float], ...] = ()  #: distance in m, and the peak there over that of the lens in focus
-    misses: tuple[float, ...] = ()  #: of the logarithm of the peak between two of these distances, counted upward
+    #: distance in m, and the peak there over that of the lens in focus
+    peaks: tuple[tuple[float, float], ...] = ()
+    #: of the logarithm of the peak between two of these distances, counted upward
+    misses: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
 class Exposures:
-    """Shares of the laser's power per m2 over the distance; times power or pulse energy they are exposures.
+    """Shares of the laser's power per m2 over the distance; times power or pulse energy they are
+    exposures.
 
     Every array is (1 + draw or 1, distance), and row 0 has the nominal values.
     """
 
-    distances: FloatArray  #: (distance,) m, at equal ratios; the distance of the recipe is one of them
+    #: (distance,) m, at equal ratios; the distance of the recipe is one of them
+    distances: FloatArray
     lens: FloatArray  #: on the axis at the lens
     sensor: Mapping[str, FloatArray]  #: by option, at the peak on the sensor
     spot: Mapping[str, FloatArray]  #: m, by option, diameter of the spot that heats the sensor
@@ -75,14 +428,17 @@ class Exposures:
     through: Mapping[str, FloatArray]  #: by option, share of the power that reaches the sensor
     fill: Mapping[str, FloatArray]  #: by option, (D / (2 w))^2
     waves: Mapping[str, FloatArray]  #: by option, defocus at the rim of the lens
-    tables: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)  #: of `Area`, made when asked
+    #: of `Area`, made when asked
+    tables: dict[Any, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def at(self, distance: float) -> int:
         """Return the index of one of the distances."""
         return int(np.argmin(np.abs(self.distances - distance)))
 
     def emitted(self, quantity: Literal["irradiance", "fluence"]) -> FloatArray:
-        """Return the mean power in W, or the energy of a pulse in J, of the nominal values and of each draw."""
+        """Return the mean power in W, or the energy of a pulse in J, of the nominal values and
+        of each draw.
+        """
         field = "power" if quantity == "irradiance" else "pulse_energy"
         return np.array([getattr(beam, field) for beam in self.beams], np.float64)[:, None]
 
@@ -95,31 +451,44 @@ def emission_of(beam: Beam) -> Emission:
 
 
 def compute_exposures(
-    safety: Safety, draws: SettingDraws, options: tuple[Option, ...], distances: FloatArray | None = None
+    safety: Safety,
+    draws: SettingDraws,
+    options: tuple[Option, ...],
+    distances: FloatArray | None = None,
 ) -> Exposures:
-    """Return the exposures at the lens and behind each option; raise `RecipeError` for a draw that is no beam.
+    """Return the exposures at the lens and behind each option; raise `RecipeError` for a draw that
+    is no beam.
 
     Without ``distances`` they are those of the settings and of the recipe.
     """
-    at = asked_distances(safety) if distances is None else np.asarray(distances, np.float64)
+    places = asked_distances(safety) if distances is None else np.asarray(distances, np.float64)
     beams = tuple(_beams(safety, draws))
-    beam, where = _stacked(beams), torch.from_numpy(at)
-    air: Any = torch.from_numpy(_air(safety, draws, at) * _uneven(safety, draws, at))
-    lens = _column(draws, "lens.transmittance", safety.settings.lens.transmittance)
-    focal_length = _column(draws, "lens.focal_length", safety.settings.lens.focal_length)
-    diameter = _column(draws, "lens.diameter", safety.settings.lens.diameter)
-    columns: dict[str, dict[str, FloatArray]] = {name: {} for name in ("sensor", "spot", "through", "fill", "waves")}
+    beam, where = _stacked(beams), torch.from_numpy(places)
+    air: Any = torch.from_numpy(_air(safety, draws, places) * _uneven(safety, draws, places))
+    lens = _exposure_column(draws, "lens.transmittance", safety.settings.lens.transmittance)
+    focal_length = _exposure_column(draws, "lens.focal_length", safety.settings.lens.focal_length)
+    diameter = _exposure_column(draws, "lens.diameter", safety.settings.lens.diameter)
+    columns: dict[str, dict[str, FloatArray]] = {
+        name: {} for name in ("sensor", "spot", "through", "fill", "waves")
+    }
     for option in options:
-        aperture: Any = diameter if option.diameter is None else torch.minimum(diameter, torch.tensor(option.diameter))
+        aperture: Any = (
+            diameter
+            if option.diameter is None
+            else torch.minimum(diameter, torch.tensor(option.diameter))
+        )
         waves = _waves(safety.settings.lens, beam, where, aperture)
         passing = lens * option.passing * air
         focused: Any = sensor_density(beam, where, aperture, focal_length, 1.0)
-        density = focused * _at_width(option, beams[0], beam_radius(beam, where)) if option.masked else (
-            density_in_spot(beam, where, aperture, focal_length, waves, WITHIN)
-        )  # fmt: skip
+        density = (
+            focused * _at_width(option, beams[0], beam_radius(beam, where))
+            if option.masked
+            else (density_in_spot(beam, where, aperture, focal_length, waves, WITHIN))
+        )
         columns["sensor"][option.name] = (density * passing).numpy()
         heated: Any = (
-            heated_diameter(beam, where, aperture, focal_length) * _widened(option, density / focused)
+            heated_diameter(beam, where, aperture, focal_length)
+            * _widened(option, density / focused)
             if option.masked
             else heated_in_spot(beam, where, aperture, focal_length, waves, density)
         )
@@ -129,7 +498,7 @@ def compute_exposures(
         columns["waves"][option.name] = waves.numpy()
     at_lens = axis_density(beam, where, air).numpy()
     return Exposures(
-        at,
+        places,
         at_lens,
         columns["sensor"],
         columns["spot"],
@@ -141,9 +510,11 @@ def compute_exposures(
 
 
 def _widened(option: Option, peak: Any) -> Any:
-    """Return the heated spot over that of the clear lens in focus, an upper bound, from the peak over that lens's.
+    """Return the heated spot over that of the clear lens in focus, an upper bound, from the peak
+    over that lens's.
 
-    The width behind a mask at the distance of the recipe is `Option.heated`, so that the rest counts here alone.
+    The width behind a mask at the distance of the recipe is `Option.heated`, so that the rest
+    counts here alone.
     """
     defocused = (peak / option.peak).clamp_max(1.0)
     widest = widest_heated_diameter(torch.ones_like(defocused), defocused)
@@ -166,22 +537,27 @@ def _waves(lens: Lens, beam: Beam, where: Any, aperture: Any) -> Any:
 
 
 def _at_width(option: Option, nominal: Beam, radius: Any) -> Any:
-    """Return the peak behind a mask over that of the clear lens in focus, for beams of a 1/e2 radius at the lens.
+    """Return the peak behind a mask over that of the clear lens in focus, for beams of a 1/e2
+    radius at the lens.
 
-    A beam that is drawn has the peak of the nominal beam at the distance where the nominal beam is as wide. Nearer than
-    the first peak the ratio is 1, which no mask exceeds.
+    A beam that is drawn has the peak of the nominal beam at the distance where the nominal beam is
+    as wide. Nearer than the first peak the ratio is 1, which no mask exceeds.
     """
     if not option.peaks:
         return option.peak
-    at, ratio = np.log(np.array(option.peaks)).T
+    rungs, ratio = np.log(np.array(option.peaks)).T
     place = np.log(as_wide(nominal, np.asarray(radius, np.float64)))
-    inside = np.clip(place, at[0], at[-1])
-    between = np.exp(interpolated(at, ratio, inside) + miss_between(at, option.misses, inside))
-    return torch.from_numpy(np.where(place < at[0] - _ROUNDED, 1.0, np.minimum(between, 1.0)))
+    inside = np.clip(place, rungs[0], rungs[-1])
+    between = np.exp(
+        interpolated(rungs, ratio, inside) + miss_between(rungs, option.misses, inside)
+    )
+    return torch.from_numpy(np.where(place < rungs[0] - _ROUNDED, 1.0, np.minimum(between, 1.0)))
 
 
-def _uneven(safety: Safety, draws: SettingDraws, at: FloatArray) -> FloatArray:
-    """Return the factor (1 + draw or 1, distance) of hot spots and of turbulent air on every irradiance."""
+def _uneven(safety: Safety, draws: SettingDraws, distances: FloatArray) -> FloatArray:
+    """Return the factor (1 + draw or 1, distance) of hot spots and of turbulent air on every
+    irradiance.
+    """
     beam = safety.settings.beam
     factor = draws.column("beam.hot_spots", beam.hot_spots)[:, None]
     if not np.ptp(factor):
@@ -189,25 +565,36 @@ def _uneven(safety: Safety, draws: SettingDraws, at: FloatArray) -> FloatArray:
     if beam.cn2 is None:
         return factor
     turbulence = torch.from_numpy(draws.column("beam.cn2", beam.cn2)[:, None])
-    moments: Any = scintillation(safety.laser.wavelength, torch.from_numpy(at), turbulence, beam.worst)
+    moments: Any = scintillation(
+        safety.laser.wavelength, torch.from_numpy(distances), turbulence, beam.worst
+    )
     return np.asarray(factor * moments.numpy(), np.float64)
 
 
 def _beams(safety: Safety, draws: SettingDraws) -> list[Beam]:
     """Return the beam of the nominal values and of each draw."""
-    drawn = {name: draws.values[f"laser.{name}"] for name in BEAM if f"laser.{name}" in draws.values}
-    found = [safety.laser.beam()]
+    drawn = {
+        name: draws.values[f"laser.{name}"] for name in BEAM if f"laser.{name}" in draws.values
+    }
+    beams = [safety.laser.beam()]
     try:
         for i in range(draws.count):
-            found.append(safety.laser.beam({name: float(x[i]) for name, x in drawn.items()}) if drawn else found[0])
+            beams.append(
+                safety.laser.beam({name: float(x[i]) for name, x in drawn.items()})
+                if drawn
+                else beams[0]
+            )
     except ParameterError as error:
         value = safety.values.get(f"laser.{error.parameter}", next(iter(safety.values.values())))
-        raise RecipeError([Diagnostic(value.mark, value.name, f"the value is drawn, but {error}")]) from None
-    return found
+        raise RecipeError(
+            [Diagnostic(value.mark, value.name, f"the value is drawn, but {error}")]
+        ) from None
+    return beams
 
 
 def _stacked(beams: tuple[Beam, ...]) -> Beam:
-    """Return one beam whose quantities are columns (1 + draw, 1), with which the formulas of a beam compute as well.
+    """Return one beam whose quantities are columns (1 + draw, 1), with which the formulas of a beam
+    compute as well.
 
     A column of equal values has one row.
     """
@@ -221,22 +608,28 @@ def _short(values: FloatArray) -> Any:
     return torch.from_numpy((values if np.ptp(values) else values[:1])[:, None])
 
 
-def _column(draws: SettingDraws, name: str, nominal: float) -> Any:
-    """Return the nominal value and the draws of a setting as a column (1 + draw, 1), or as one row if all are equal."""
+def _exposure_column(draws: SettingDraws, name: str, nominal: float) -> Any:
+    """Return the nominal value and the draws of a setting as a column (1 + draw, 1), or as one
+    row if all are equal.
+    """
     return _short(draws.column(name, nominal))
 
 
-def _air(safety: Safety, draws: SettingDraws, at: FloatArray) -> FloatArray:
-    """Return the transmittance of the air (1 + draw, distance), from that of one metre: even air has equal metres."""
+def _air(safety: Safety, draws: SettingDraws, distances: FloatArray) -> FloatArray:
+    """Return the transmittance of the air (1 + draw, distance), from that of one metre: even air
+    has equal metres.
+    """
     laser = safety.laser
     if laser.air_transmittance is not None:
-        whole = draws.column("laser.air_transmittance", laser.air_transmittance)[:, None]
-        return np.asarray(np.power(whole, at / laser.distance), np.float64)
+        transmittance = draws.column("laser.air_transmittance", laser.air_transmittance)[:, None]
+        return np.asarray(np.power(transmittance, distances / laser.distance), np.float64)
     if laser.visibility is None:
         return np.ones((1, 1))
     visible = draws.column("laser.visibility", laser.visibility).tolist()
-    known = {v: air_transmittance(1.0, v, laser.wavelength, laser.haze) for v in set(visible)}
-    return np.asarray(np.power(np.array([known[v] for v in visible])[:, None], at), np.float64)
+    per_metre = {v: air_transmittance(1.0, v, laser.wavelength, laser.haze) for v in set(visible)}
+    return np.asarray(
+        np.power(np.array([per_metre[v] for v in visible])[:, None], distances), np.float64
+    )
 
 
 def options_of(
@@ -247,17 +640,18 @@ def options_of(
 ) -> tuple[Option, ...]:
     """Return the plain lens and the protections that the settings name.
 
-    ``mask`` is the peak behind the mask at the distance of the recipe, ``peaks`` are those over the distance, and
-    ``misses`` how much the logarithm of a peak between two distances may be higher than interpolated.
+    ``mask`` is the peak behind the mask at the distance of the recipe, ``peaks`` are those over the
+    distance, and ``misses`` how much the logarithm of a peak between two distances may be higher
+    than interpolated.
     """
     protection = safety.settings.protection
-    found = [Option("plain lens")]
+    options = [Option("plain lens")]
     if mask is not None:
-        found.append(Option("mask", peak=mask, masked=True, peaks=peaks, misses=misses))
+        options.append(Option("mask", peak=mask, masked=True, peaks=peaks, misses=misses))
     if protection.filter is not None:
-        found.append(Option(f"grey filter {protection.filter:g}", passing=protection.filter))
+        options.append(Option(f"grey filter {protection.filter:g}", passing=protection.filter))
     if protection.stop is not None:
-        found.append(Option(f"stop {protection.stop * 1e3:g} mm", diameter=protection.stop))
+        options.append(Option(f"stop {protection.stop * 1e3:g} mm", diameter=protection.stop))
     if mask is not None and protection.filter is not None:
-        found.append(replace(found[1], name="mask and grey filter", passing=protection.filter))
-    return tuple(found)
+        options.append(replace(options[1], name="mask and grey filter", passing=protection.filter))
+    return tuple(options)

@@ -1,63 +1,493 @@
-"""Estimate of damage, dazzle and eye exposure by a laser: limits, exposures and intervals of distance."""
+"""Estimate of damage, dazzle and eye exposure by a laser, and what it counts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from neusee.nodes.laser import DamagePart, State, state_of, worst_state
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.recipe.blocks.safety_block import Safety
+from neusee.workflows.recipe.blocks.safety_block import SATURATION, Safety
 from neusee.workflows.recipe.distributions.shapes import FloatArray
-from neusee.workflows.safety.counted_parts import near_text
 from neusee.workflows.safety.damage_pattern import (
     DamagePattern,
+    DeadPixels,
     Spot,
     damage_patterns,
+    damaged_frames,
+    refuse_other_lens,
     spots_of,
     with_heated_spots,
 )
-from neusee.workflows.safety.damage_verdict import DamageVerdict, damage_verdicts
-from neusee.workflows.safety.dazzle_curves import Dazzled, dazzled
 from neusee.workflows.safety.dazzled_area import Area, area_of
-from neusee.workflows.safety.dead_pixels import DeadPixels, damaged_frames
-from neusee.workflows.safety.distance_zones import QUANTILES, Spread, Zones, zones_of
+from neusee.workflows.safety.exposure_limits import (
+    EyeDazzleFinding,
+    EyeFinding,
+    Limit,
+    emitted,
+    eye_dazzle_finding,
+    eye_finding,
+    limit_parts,
+    limit_ratio,
+    limits_behind,
+    mean_in_frame,
+    saturating,
+    sees,
+    veil_level,
+    with_channels,
+)
 from neusee.workflows.safety.exposures import (
+    FAR_FILL,
+    FAR_WAVES,
+    QUANTILES,
     Emission,
     Exposures,
     Option,
+    SettingDraws,
+    Spread,
+    Zones,
     compute_exposures,
+    draw_settings,
     emission_of,
     options_of,
+    zones_of,
 )
-from neusee.workflows.safety.eye_findings import EyeDazzleFinding, EyeFinding, eye_dazzle_finding, eye_finding
-from neusee.workflows.safety.first_channel import sees, with_channels
-from neusee.workflows.safety.lens_of_recipe import refuse_other_lens
-from neusee.workflows.safety.light_levels import Veil, veil_of
-from neusee.workflows.safety.limit_ratios import emitted, limit_ratio, limits_behind, mean_in_frame
-from neusee.workflows.safety.sensor_limits import Limit
-from neusee.workflows.safety.spots_along import Peaks, Ranked, peaks_of, ranked_of
-from neusee.workflows.safety.uncertain_values import SettingDraws, draw_settings
-from neusee.workflows.safety.unsaid_parts import beyond_window, unsaid_of_damage, unsaid_of_dazzle
+from neusee.workflows.safety.laser_spots import (
+    ASSUMED,
+    Peaks,
+    Ranked,
+    Veil,
+    peaks_of,
+    ranked_of,
+    veil_of,
+)
 from neusee.workflows.safety.what_helps import Remedy, remedies
 from neusee.workflows.store.result_store import Store
+
+# --- dazzle curves --------------------------------------------------------------------------------
+
+# How many pixels a laser fills behind each protection: at the distance of the recipe, and against
+# the irradiance.
+
+
+_SAMPLES = 300  #: irradiances of a curve
+#: ends of a curve, times the irradiance that loses the stated share behind the plain lens, or
+#: behind any protection
+_FAINT, _STRONG = 1e-6, 1e1
+
+
+@dataclass(frozen=True)
+class Dazzled:
+    """The pixels that the laser fills behind one protection."""
+
+    option: str
+    masked: bool
+    pixels: Spread  #: at the distance of the recipe
+    share: float  #: of the picture
+    times: float | None  #: pixels over those behind the plain lens; None where one of both is 0
+    at_lens: FloatArray  #: (irradiance,) mean over the exposure at the lens, W/m2
+    curve: FloatArray  #: (irradiance,) share of the picture
+
+
+def dazzled(
+    safety: Safety,
+    draws: SettingDraws,
+    exposures: Exposures,
+    areas: Sequence[Area],
+    mean: FloatArray,
+) -> tuple[Dazzled, ...]:
+    """Return the filled pixels behind each protection; ``mean`` (1 + draw, 1) is the mean power
+    in a frame in W.
+    """
+    if not areas:
+        return ()
+    full, index = saturating(safety, draws), exposures.at(safety.laser.distance)
+    pixel_count = safety.settings.sensor.shape[0] * safety.settings.sensor.shape[1]
+    pixel = safety.settings.sensor.pixel_pitch**2
+    here = float(mean[0, 0] * exposures.lens[0, index])
+    filled = [
+        full[:, None] * pixel / exposures.through[area.option.name][:, index : index + 1]
+        for area in areas
+    ]
+    levels = [float(area.level(exposures, draws, veiled=False)[0, index]) for area in areas]
+    limits = [
+        needed[0, 0] / level * exposures.lens[0, index]
+        for needed, level in zip(filled, levels, strict=True)
+    ]
+    lens = np.geomspace(_FAINT * limits[0], max(_STRONG * max(limits), 2 * here), _SAMPLES)
+    rows: list[Dazzled] = []
+    for area, needed in zip(areas, filled, strict=True):
+        count = np.minimum(
+            area.saturated(exposures, draws, index, needed / mean)[:, 0], pixel_count
+        )
+        pixels = Spread.of(float(count[0]), count[1:])
+        plain = rows[0].pixels if rows else pixels
+        times = pixels.value / plain.value if pixels.value > 0 and plain.value > 0 else None
+        light = needed[:1] * exposures.lens[0, index] / lens[None]
+        curve = np.minimum(area.saturated(exposures, draws, index, light)[0] / pixel_count, 1.0)
+        lost = pixels.value / pixel_count
+        rows.append(Dazzled(area.option.name, area.option.masked, pixels, lost, times, lens, curve))
+    return tuple(rows)
+
+
+# --- damage verdict -------------------------------------------------------------------------------
+
+# The verdict of damage behind each protection: one state, one sentence, and a row for each part of
+# the light.
+
+
+_ALIKE = 0.98  #: share of the largest ratio from which a simpler part is named in its place
+_CONTINUOUS = ("pulse", "mean", "accumulation")
+
+
+@dataclass(frozen=True)
+class DamageRow:
+    """What is said of one part of the light: where it is beside its threshold, or why no law
+    judges it.
+    """
+
+    part: str  #: pulse, mean, accumulation or incubation
+    kind: str  #: of damage
+    state: State
+    reason: str  #: why the part is not judged; empty for a part that is
+    finding: Finding | None  #: of the limit of this part; None: not judged
+
+    @property
+    def ratio(self) -> float:
+        """Return the exposure over the threshold; 0 for a part without a threshold."""
+        return 0.0 if self.finding is None else self.finding.ratio
+
+
+@dataclass(frozen=True)
+class DamageVerdict:
+    """Whether a laser damages the sensor behind one protection, at the distance of the recipe."""
+
+    option: str
+    state: State
+    rows: tuple[DamageRow, ...]
+
+    @property
+    def nearest(self) -> DamageRow | None:
+        """Return the row that the verdict names: of its state, the largest ratio; None if no law
+        judges any row.
+
+        A verdict that is not judged names the largest ratio of what is judged. Incubation is an
+        assumption: it is named only where no other part has the state of the verdict.
+        """
+        candidates = self._candidates()
+        largest = max((row.ratio for row in candidates), default=0.0)
+        return next((row for row in candidates if row.ratio >= _ALIKE * largest), None)
+
+    def _candidates(self) -> list[DamageRow]:
+        """Return the rows of which the verdict names one."""
+        rows = [row for row in self.with_limit if row.state == self.state]
+        if self.state == "not judged":
+            rows = [row for row in self.with_limit if row not in self.unjudged] or rows
+        return rows if self.state == "below" else _measured(rows) or rows
+
+    @property
+    def with_limit(self) -> tuple[DamageRow, ...]:
+        """Return the rows that have a limit."""
+        return tuple(row for row in self.rows if row.finding is not None)
+
+    @property
+    def unjudged(self) -> tuple[DamageRow, ...]:
+        """Return the rows that are not judged."""
+        return tuple(row for row in self.rows if row.state == "not judged")
+
+
+def _measured(rows: Sequence[DamageRow]) -> list[DamageRow]:
+    """Return the rows without those of the incubation, which is an assumption."""
+    return [row for row in rows if row.part != "incubation"]
+
+
+def damage_verdicts(
+    safety: Safety,
+    options: Sequence[Option],
+    exposures: Exposures,
+    draws: SettingDraws,
+    findings: Sequence[Finding],
+) -> Iterator[DamageVerdict]:
+    """Yield the verdict of damage behind each option; none if damage is not asked for."""
+    for option in options:
+        parts = limit_parts(safety, option, exposures, draws)
+        judged = [
+            finding
+            for finding in findings
+            if finding.option == option.name and finding.limit.effect == "damage"
+        ]
+        rows = tuple(_rows(parts, judged, continuous=not exposures.beams[0].is_pulsed))
+        if rows:
+            yield DamageVerdict(option.name, worst_state(row.state for row in rows), rows)
+
+
+def _rows(
+    parts: Sequence[DamagePart], findings: Sequence[Finding], continuous: bool
+) -> Iterator[DamageRow]:
+    """Yield the row of each part; the findings are those of the parts with a threshold, in their
+    order.
+    """
+    waiting = iter(findings)
+    for damage_part in parts:
+        finding = next(waiting) if damage_part.threshold is not None else None
+        state: State = "not judged" if finding is None else state_of_finding(finding)
+        reason = damage_part.reason if state == "not judged" else ""
+        for name in _CONTINUOUS if continuous else (damage_part.part,):
+            yield DamageRow(name, damage_part.kind, state, reason, finding)
+
+
+def state_of_finding(finding: Finding) -> State:
+    """Return where the exposure at the distance of the recipe is beside a limit of damage, with
+    what is uncertain.
+    """
+    assert finding.ratios is not None
+    return state_of(finding.ratios.low, finding.ratios.high, finding.limit.open_below)
+
+
+# --- counted parts --------------------------------------------------------------------------------
+
+# Sentences on what an estimate counts along the axis and what it does not: scatter, focus, air and
+# the beam itself.
+
+
+_ARMS = {"plain": "plain lens", "mask": "mask"}
+_MORE = "more optics.samples, and a step laser.wavefront, carry a nearer one"
+
+
+def scatter_text(veil: Veil | None) -> str:
+    """Return which share of the light the lens scatters, whether it is assumed, and what it
+    does.
+    """
+    if veil is None:
+        return (
+            "The lens scatters no light (safety.lens.scatter: null). A real lens scatters, and is"
+            " dazzled from farther away and from nearer by than is said here."
+        )
+    share = f"Lens scatter {100 * float(veil.share[0]):.2g} %"
+    source = "as the recipe says"
+    if veil.assumed:
+        source = (
+            f"assumed, within a factor of {ASSUMED:g} (one standard deviation): give"
+            " safety.lens.scatter of yours"
+        )
+    return (
+        f"{share}, {source}. It is a veil that falls beside the spot behind a mask as well as"
+        " behind the plain lens, and is counted in dazzle. It does not raise the peak, and so not"
+        " the damage."
+    )
+
+
+def focus_text(safety: Safety) -> str:
+    """Return on which distance the lens is focused, and what another focus does."""
+    focus = safety.settings.lens.focus
+    if focus == "laser":
+        return "The lens is focused on the laser at every distance, which gives the highest peak."
+    name = "infinity" if focus == "infinity" else f"{focus:g} m"
+    return (
+        f"The lens is focused at {name} (safety.lens.focus), and a laser elsewhere is out of focus."
+        " A camera that focuses on the laser has a higher peak: safety.lens.focus: laser."
+    )
+
+
+def counted(safety: Safety) -> Iterator[str]:
+    """Yield one sentence for each property of beam and air: counted with its value, or not
+    counted.
+    """
+    beam, quality = safety.settings.beam, safety.laser.beam().m_squared
+    if beam.hot_spots > 1 or "beam.hot_spots" in safety.values:
+        yield (
+            f"Hot spots of the beam: counted, factor {beam.hot_spots:g} on the irradiance of an"
+            " even Gaussian beam."
+        )
+    else:
+        yield "Hot spots of the beam: not counted (safety.beam.hot_spots is 1)."
+    if beam.cn2 is None:
+        yield "Turbulence of the air (scintillation): not counted (safety.beam.cn2 is not given)."
+    else:
+        yield (
+            f"Turbulence of the air: counted, Cn2 {beam.cn2:g} m^(-2/3); the exposure is the one"
+            f" that is exceeded for {100 * (1 - beam.worst):.2g} % of the time, by Rytov's variance"
+            " of a plane wave, an upper bound."
+        )
+    if quality > 1 + 1e-6:
+        yield (
+            f"M2 of {quality:.3g}: counted in the width of the beam. Its light is focused as one"
+            " Gaussian mode, an upper bound of the peak: a beam of many modes has a wider spot."
+        )
+    else:
+        yield (
+            "M2 is 1: a beam of many modes has a wider spot and a lower peak; its hot spots are"
+            " named above."
+        )
+
+
+def ladder_text(ranked: tuple[Ranked, ...], peaks: Peaks | None) -> str:
+    """Return at how many distances the spot is computed, and how exact it is between them."""
+    text = (
+        "The spot of the clear lens is computed at every distance; from where the beam fills the"
+        f" lens to (D / 2w)^2 = {FAR_FILL:g} with {FAR_WAVES:g} waves of curvature it is that of a"
+        " distant laser."
+    )
+    spots = [(spot.arm, len(spot.distances), spot.error) for spot in ranked]
+    if peaks and len(peaks.along) > 1:
+        spots.append(("peak behind the mask", len(peaks.along), peaks.error))
+    parts = [
+        f"{arm}: {count} distances, within {max(100 * error, 0.1):.2g} % between them, counted"
+        " upward"
+        for arm, count, error in spots
+        if math.isfinite(error)
+    ]
+    text += f" Point-spread functions, {'; '.join(parts)}." if parts else ""
+    return text
+
+
+def near_text(asked: float, ranked: tuple[Ranked, ...], peaks: Peaks | None) -> Iterator[str]:
+    """Yield one sentence for each point-spread function that is not computed at the nearest
+    distance asked (m).
+
+    Another one says at which distances light outside the window of the spot behind the mask counts
+    as its peak.
+    """
+    if peaks and peaks.along[0][0] > asked:
+        yield (
+            f"Nearer than {peaks.along[0][0]:.3g} m the beam in front of the mask is not computed"
+            f" ({_MORE}): its peak counts as that of the clear lens in focus there, which no mask"
+            " exceeds."
+        )
+    if peaks and peaks.outside:
+        lacking = max(share for _, share in peaks.outside)
+        places = (
+            f"{len(peaks.outside)} of {len(peaks.along)} distances, the farthest"
+            f" {peaks.outside[-1][0]:.3g} m"
+        )
+        yield (
+            f"At {places}, the window of the spot behind the mask lacks light (up to"
+            f" {100 * lacking:.2g} %) that may be brighter outside: it counts as one spot, as sharp"
+            " as that of the clear lens. Choose a larger window."
+        )
+    for spot in ranked:
+        if math.isfinite(spot.error) and spot.distances[0] > asked:
+            yield (
+                f"Nearer than {spot.distances[0]:.3g} m the pixels behind the {_ARMS[spot.arm]} are"
+                f" not computed ({_MORE}): all light counts in the pixels that may be lost, the"
+                " most that there can be."
+            )
+
+
+# --- unsaid parts ---------------------------------------------------------------------------------
+
+# Sentences on what an estimate does not say, each with its reason.
+
+
+_BEYOND = 0.2  #: share of the lost pixels beyond a window from which a sentence says so
+
+
+def unsaid_of_damage(safety: Safety, verdicts: Sequence[DamageVerdict]) -> Iterator[str]:
+    """Yield a sentence for each reason why a part of the light is not judged; or that damage is
+    not asked for.
+    """
+    if safety.settings.damage is None:
+        yield "Nothing is said of damage: the recipe does not ask for it (safety.damage)."
+        return
+    reasons: dict[str, dict[str, None]] = {}
+    for verdict in verdicts:
+        for row in verdict.unjudged:
+            reasons.setdefault(row.reason, {})[row.part] = None
+    for reason, parts in reasons.items():
+        yield (
+            f"Not judged for damage: the {' and the '.join(parts)}: {reason}. Give a table of your"
+            " own: safety.damage.file."
+        )
+
+
+def unsaid_of_dazzle(safety: Safety, areas: Mapping[str, Area | str]) -> Iterator[str]:
+    """Yield sentences on what is not said of dazzle; ``areas`` has the area behind each
+    protection, or a reason.
+    """
+    dazzle, sensor = safety.settings.dazzle, safety.settings.sensor
+    if dazzle is None:
+        lacking = [name.replace("_", " ") for name in SATURATION if getattr(sensor, name) is None]
+        reason = "the recipe does not ask for it (safety.dazzle)"
+        if lacking:
+            reason = f"the recipe gives no {', '.join(lacking)} of the sensor at this wavelength"
+        yield f"Nothing is said of dazzle: {reason}."
+        return
+    if not sees(safety.channels):
+        yield (
+            "Nothing is said of dazzle: no channel of the camera sees"
+            f" {safety.laser.wavelength * 1e9:.4g} nm, by the table of its responses. A sensor"
+            " without its filters may see it."
+        )
+        return
+    yield from _unsaid_areas(areas)
+    level = veil_level(dazzle)
+    if level <= 0:
+        yield "The feature of safety.dazzle is lost without any laser, so that no veil is stated."
+    elif level >= sensor.fills:
+        yield (
+            f"The feature of safety.dazzle is seen through {level:.3g} e- of veiling light a pixel,"
+            " more than the full well: a pixel is lost when it saturates, and no veil is stated."
+        )
+
+
+def _unsaid_areas(areas: Mapping[str, Area | str]) -> Iterator[str]:
+    """Yield one sentence for each reason why the dazzled area behind some protections is not
+    known.
+    """
+    reasons: dict[str, list[str]] = {}
+    for name, area in areas.items():
+        if isinstance(area, str):
+            reasons.setdefault(area, []).append(name)
+    for reason, names in reasons.items():
+        yield (
+            f"Nothing is said of dazzle behind {' and '.join(f'the {name}' for name in names)}:"
+            f" {reason}."
+        )
+
+
+def beyond_window(shares: Mapping[str, float]) -> Iterator[str]:
+    """Yield one sentence if many of the lost pixels lie beyond the window of a PSF; ``shares``
+    are by protection.
+    """
+    wide = {name: share for name, share in shares.items() if share > _BEYOND}
+    if wide:
+        parts = ", ".join(f"{100 * share:.2g} % behind the {name}" for name, share in wide.items())
+        yield (
+            "The window of the point-spread function does not hold the dazzled area at every"
+            f" distance: of its pixels up to {parts} have the light of a radial law (the third"
+            " power of the distance), and light that this law does not explain counts where it"
+            " dazzles most. Choose a larger window."
+        )
+
+
+# --- safety estimate ------------------------------------------------------------------------------
+
+# Estimate of damage, dazzle and eye exposure by a laser: limits, exposures and intervals of
+# distance.
+
 
 CERTIFICATE = "An estimate, no certificate: neusee decides nothing about eyes or sensors."
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What one limit says behind one option: the limit at the lens, the exposure, and the zones of distance."""
+    """What one limit says behind one option: the limit at the lens, the exposure, and the zones
+    of distance.
+    """
 
     option: str
     limit: Limit
     at_sensor: Spread  #: the limit at the peak on the sensor
     at_lens: Spread  #: the limit at the lens at the distance of the recipe: MPE_S or MDE_S
-    exposure: Spread  #: at the peak on the sensor at the distance of the recipe, in the quantity of the limit
+    #: at the peak on the sensor at the distance of the recipe, in the quantity of the limit
+    exposure: Spread
     ratio: float  #: nominal exposure over the nominal limit
-    probability: Spread | None  #: of damage to a device drawn from all; None where the spread of devices is unknown
+    #: of damage to a device drawn from all; None where the spread of devices is unknown
+    probability: Spread | None
     zones: Zones
     curve: FloatArray  #: (3, distance) of the limit at the lens: nominal, 5 % and 95 %
     ratios: Spread | None = None  #: ``ratio`` with its interval
@@ -81,8 +511,10 @@ class Estimate:
     dazzled: tuple[Dazzled, ...] = ()  #: behind each protection for which the dazzled area is known
     dead: tuple[DeadPixels, ...] = ()  #: examples of damage in a raw frame
     ranked: tuple[Ranked, ...] = ()
-    damage: tuple[DamageVerdict, ...] = ()  #: behind each protection; empty if damage is not asked for
-    helps: tuple[Remedy, ...] = ()  #: filter, notch, stop or exposure for each limit behind the plain lens
+    #: behind each protection; empty if damage is not asked for
+    damage: tuple[DamageVerdict, ...] = ()
+    #: filter, notch, stop or exposure for each limit behind the plain lens
+    helps: tuple[Remedy, ...] = ()
     peaks: Peaks | None = None
     veil: Veil | None = None
 
@@ -93,23 +525,29 @@ class Estimate:
 
     @property
     def mean_at_lens(self) -> float:
-        """Return the nominal irradiance at the lens at the distance of the recipe, the mean over one exposure, W/m2."""
+        """Return the nominal irradiance at the lens at the distance of the recipe, the mean over
+        one exposure, W/m2.
+        """
         mean = mean_in_frame(self.exposures, self.safety.settings.sensor.exposure or 1.0)
         return float(mean[0, 0] * self.exposures.lens[0, self.at])
 
 
 def estimate(recipe: Recipe, store: Store | None = None) -> Estimate:
-    """Return the estimate of a recipe with a block ``safety``; the peak behind the mask comes from the store if it can.
+    """Return the estimate of a recipe with a block ``safety``; the peak behind the mask comes from
+    the store if it can.
 
-    Raises `RecipeError` for a recipe without the block, for a distribution with values that are not allowed and for a
-    step that does not exist, all before anything is computed, and `RunError` if a step of the mask fails.
+    Raises `RecipeError` for a recipe without the block, for a distribution with values that are not
+    allowed and for a step that does not exist, all before anything is computed, and `RunError` if a
+    step of the mask fails.
     """
     return complete(recipe, prepare(recipe, store))
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """Everything that decides an estimate: settings, draws, and what the steps of the recipe say of lens and mask."""
+    """Everything that decides an estimate: settings, draws, and what the steps of the recipe say
+    of lens and mask.
+    """
 
     safety: Safety
     draws: SettingDraws
@@ -128,7 +566,11 @@ def prepare(recipe: Recipe, store: Store | None) -> Prepared:
     spots = spots_of(recipe, safety, store)
     ranked = ranked_of(recipe, safety, store)
     peaks = peaks_of(recipe, safety, store)
-    options = options_of(safety, peaks.here, peaks.along, peaks.misses) if peaks else options_of(safety, None)
+    options = (
+        options_of(safety, peaks.here, peaks.along, peaks.misses)
+        if peaks
+        else options_of(safety, None)
+    )
     return Prepared(safety, draws, with_heated_spots(options, spots), spots, ranked, peaks)
 
 
@@ -136,8 +578,12 @@ def complete(recipe: Recipe, prepared: Prepared) -> Estimate:
     """Return the estimate from everything that decides it."""
     safety, draws, options = prepared.safety, prepared.draws, prepared.options
     exposures = compute_exposures(safety, draws, options)
-    known = {option.name: area_of(safety, option, prepared.ranked) for option in options}
-    areas = tuple(area for area in known.values() if isinstance(area, Area)) if _dazzles(safety) else ()
+    area_behind = {option.name: area_of(safety, option, prepared.ranked) for option in options}
+    areas = (
+        tuple(area for area in area_behind.values() if isinstance(area, Area))
+        if _dazzles(safety)
+        else ()
+    )
     findings = tuple(_findings(safety, draws, options, exposures, areas))
     verdicts = tuple(damage_verdicts(safety, options, exposures, draws, findings))
     eye = eye_finding(safety, exposures)
@@ -145,7 +591,7 @@ def complete(recipe: Recipe, prepared: Prepared) -> Estimate:
     beyond = {area.option.name: area.beyond(exposures, draws) for area in areas}
     unsaid = (
         *unsaid_of_damage(safety, verdicts),
-        *unsaid_of_dazzle(safety, known),
+        *unsaid_of_dazzle(safety, area_behind),
         *beyond_window(beyond),
         *near_text(safety.settings.distances[0], prepared.ranked, prepared.peaks),
         *faults,
@@ -179,9 +625,14 @@ def _dazzles(safety: Safety) -> bool:
 
 
 def settings_of(recipe: Recipe) -> Safety:
-    """Return the settings of a recipe's block ``safety``; raise `RecipeError` for a recipe without them."""
+    """Return the settings of a recipe's block ``safety``; raise `RecipeError` for a recipe
+    without them.
+    """
     if recipe.safety is None:
-        text = "the recipe does not say what to estimate: add the block safety, as in the recipe safety_pointer"
+        text = (
+            "the recipe does not say what to estimate: add the block safety, as in the recipe"
+            " safety_pointer"
+        )
         raise RecipeError([Diagnostic(Location(recipe.name), "safety", text)])
     return recipe.safety
 
@@ -194,29 +645,38 @@ def _findings(
     areas: tuple[Area, ...],
 ) -> Iterator[Finding]:
     """Yield what each limit says behind each option."""
-    known = {area.option: area for area in areas}
+    area_behind = {area.option: area for area in areas}
     for option in options:
-        for limit in limits_behind(safety, draws, option, known.get(option), exposures):
+        for limit in limits_behind(safety, draws, option, area_behind.get(option), exposures):
             yield _finding(safety, option, limit, exposures)
 
 
 def _finding(safety: Safety, option: Option, limit: Limit, exposures: Exposures) -> Finding:
-    per_power, at = exposures.sensor[option.name], exposures.at(safety.laser.distance)
+    per_power, index = exposures.sensor[option.name], exposures.at(safety.laser.distance)
     light = emitted(safety, limit, exposures)
     limits = limit.values * limit.devices * np.ones((len(light), per_power.shape[1]))
-    ratio, at_lens = limit_ratio(safety, option.name, limit, exposures), limits * exposures.lens / per_power
-    here = light[:, 0] * per_power[:, at]
+    ratio, at_lens = (
+        limit_ratio(safety, option.name, limit, exposures),
+        limits * exposures.lens / per_power,
+    )
+    here = light[:, 0] * per_power[:, index]
     return Finding(
         option.name,
         limit,
-        _spread(limits[:, at]),
-        _spread(at_lens[:, at]),
+        _spread(limits[:, index]),
+        _spread(at_lens[:, index]),
         _spread(here),
-        float(ratio[0, at]),
-        _probability(limit, ratio[1:, at] * limit.devices[1:, 0]),
-        zones_of(exposures.distances, ratio[0], ratio[1:], safety.laser.distance, safety.settings.distances),
+        float(ratio[0, index]),
+        _probability(limit, ratio[1:, index] * limit.devices[1:, 0]),
+        zones_of(
+            exposures.distances,
+            ratio[0],
+            ratio[1:],
+            safety.laser.distance,
+            safety.settings.distances,
+        ),
         np.stack([at_lens[0], *np.quantile(at_lens[1:], QUANTILES, axis=0)]),
-        _spread(ratio[:, at]),
+        _spread(ratio[:, index]),
     )
 
 
@@ -226,7 +686,8 @@ def _spread(values: FloatArray) -> Spread:
 
 
 def _probability(limit: Limit, ratio: FloatArray) -> Spread | None:
-    """Return the share of devices that are damaged, with the interval from everything but the device.
+    """Return the share of devices that are damaged, with the interval from everything but the
+    device.
 
     ``ratio`` (draw,) is that of the exposure to the limit of the median device.
     """

@@ -1,110 +1,774 @@
-"""An estimate of safety as lines of text for a terminal."""
+"""Cells and sentences of an estimate, and the estimate as text for a terminal."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 
-from neusee.workflows.report.text_table import columns, wrapped
-from neusee.workflows.safety import counted_parts as parts_of
-from neusee.workflows.safety import eye_words, helps_words
-from neusee.workflows.safety import safety_words as words
-from neusee.workflows.safety.damage_words import damage_sentence, limit_rows, zone_rows
-from neusee.workflows.safety.safety_estimate import CERTIFICATE, Estimate, Finding
+from neusee.workflows.recipe.blocks.safety_block import EyeDazzle
+from neusee.workflows.report.terminal_text import columns, wrapped
+from neusee.workflows.safety import safety_estimate
+from neusee.workflows.safety.exposure_limits import EyeDazzleFinding, EyeDazzleRow, EyeFinding
+from neusee.workflows.safety.exposures import Spread, Zone, Zones
+from neusee.workflows.safety.safety_estimate import (
+    CERTIFICATE,
+    DamageRow,
+    DamageVerdict,
+    Dazzled,
+    Estimate,
+    Finding,
+    state_of_finding,
+)
+from neusee.workflows.safety.what_helps import MET, PictureCost, Remedy
 
-Paragraphs = Sequence[Sequence[str]]  #: lines that stay as they are, or a single text that is wrapped
+# --- safety words ---------------------------------------------------------------------------------
+
+# Cells and sentences of an estimate, which its page and the terminal share.
 
 
-def paragraphs(found: Estimate) -> list[list[str]]:
-    """Return the verdict, the tables of limits and distances, the eye, and the sources, before lines are wrapped."""
-    parts = [[f"{found.recipe.name}: {found.recipe.title}", CERTIFICATE, ""], [words.laser_text(found)]]
-    steps = (_damage, _limits, _dazzled_area, _helps, _eye, _unsaid, _counted, _intervals, _sources, _eye_sources)
+_PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
+_PER_CM2 = 1e-4  #: of a quantity per m2
+_SAME = 0.01  #: relative width of an interval that is not written
+_NEVER = 1e-4  #: smallest share that is written as a number
+UNITS = {"irradiance": "W", "fluence": "J"}
+
+LIMIT_COLUMNS = (
+    "protection",
+    "limit",
+    "on the sensor",
+    "of it now",
+    "limit at the lens",
+    "probability",
+)
+DAZZLE_COLUMNS = ("protection", "saturated pixels", "of the picture", "times the plain lens")
+ZONE_COLUMNS = (
+    "protection",
+    "limit",
+    "exceeded from … to …",
+    "probability of nowhere",
+    "probability here",
+)
+
+
+def scaled(value: float, unit: str) -> str:
+    """Return a positive number with three digits and a prefix of its unit, such as ``20.4 MW``."""
+    if not (math.isfinite(value) and value > 0):
+        return f"{value:g} {unit}"
+    power = min(max(3 * math.floor(math.log10(value) / 3 + 1e-12), -15), 12)
+    text = f"{value / 10.0**power:.3g}"
+    if float(text) >= 1000 and power < 12:
+        power, text = power + 3, f"{value / 10.0 ** (power + 3):.3g}"
+    return (
+        f"{float(text):g} {_PREFIXES[power]}{unit}"
+        if 0.1 <= float(text) < 1e4
+        else f"{value:.3g} {unit}"
+    )
+
+
+def with_ends(spread: Spread, unit: str, factor: float = 1.0) -> str:
+    """Return a number with the interval of its draws in brackets, or alone if nothing is
+    uncertain.
+    """
+    middle = scaled(factor * spread.value, unit)
+    if math.isclose(spread.low, spread.high, rel_tol=_SAME):
+        return middle
+    number, _, prefixed = middle.partition(" ")
+    prefix = factor * spread.value / float(number)
+    low, high = (f"{factor * x / prefix:.3g}" for x in (spread.low, spread.high))
+    return f"{number} ({plain(low)} to {plain(high)}) {prefixed}"
+
+
+def plain(number: str) -> str:
+    """Return a number of three digits without an exponent where this is short, such as 1020 for
+    1.02e+03.
+    """
+    return f"{float(number):.0f}" if "e+" in number and abs(float(number)) < 1e5 else number
+
+
+def metres(distance: float) -> str:
+    """Return a distance with three digits, in m or km."""
+    return f"{distance / 1e3:.3g} km" if distance >= 999.5 else f"{distance:.3g} m"
+
+
+def end(spread: Spread) -> str:
+    """Return a distance with the interval of its draws."""
+    if math.isclose(spread.low, spread.high, rel_tol=_SAME):
+        return metres(spread.value)
+    return f"{metres(spread.value)} ({metres(spread.low)} to {metres(spread.high)})"
+
+
+def zone_text(zone: Zone) -> str:
+    """Return the ends of a zone, with their intervals."""
+    near = f"below {metres(zone.near.value)}" if zone.begins_before else end(zone.near)
+    far = f"beyond {metres(zone.far.value)}" if zone.ends_beyond else end(zone.far)
+    return f"{near} to {far}"
+
+
+def zones_text(zones: Zones) -> str:
+    """Return the zones of a limit as text; without one at the nominal values, how far one
+    reaches in some draws.
+    """
+    if zones.zones:
+        return "; ".join(map(zone_text, zones.zones))
+    if zones.reach is None:
+        return "nowhere"
+    return f"nowhere at the nominal values; in some draws out to {end(zones.reach)}"
+
+
+def share(value: float) -> str:
+    """Return a probability as a percentage with two digits, and nothing more exact than 0.01 %."""
+    if value in (0.0, 1.0):
+        return f"{100 * value:.0f} %"
+    if value < _NEVER:
+        return "< 0.01 %"
+    if value > 1 - _NEVER:
+        return "> 99.99 %"
+    return f"{100 * value:.2g} %" if value < 0.995 else f"{100 * value:.2f} %"
+
+
+def probability(finding: Finding) -> str:
+    """Return the probability that a device is damaged, with its interval; a dash where no
+    probability is stated.
+    """
+    spread = finding.probability
+    if spread is None:
+        return "–" if finding.limit.effect == "dazzle" else "not known: no spread published"
+    middle, low, high = map(share, (spread.value, spread.low, spread.high))
+    return middle if low == high == middle else f"{middle} ({low} to {high})"
+
+
+def limit_cells(finding: Finding) -> list[str]:
+    """Return the row of a limit: protection, limit, limit on the sensor, its share that is
+    reached, at the lens.
+    """
+    unit = UNITS[finding.limit.quantity]
+    now = f"{plain(f'{finding.ratio:.2g}')} times" if finding.ratio >= 1 else f"{finding.ratio:.2g}"
+    sensor = with_ends(finding.at_sensor, f"{unit}/cm²", _PER_CM2)
+    return [
+        finding.option,
+        finding.limit.name,
+        sensor,
+        now,
+        with_ends(finding.at_lens, f"{unit}/m²"),
+        probability(finding),
+    ]
+
+
+def zone_cells(finding: Finding) -> list[str]:
+    """Return the row of a limit in the table of distances."""
+    zones = finding.zones
+    return [
+        finding.option,
+        finding.limit.name,
+        zones_text(zones),
+        share(zones.none),
+        share(zones.inside),
+    ]
+
+
+def eye_text(eye: EyeFinding) -> str:
+    """Return what is said of the eye in two sentences."""
+    unit = f"{UNITS[eye.quantity]}/m²"
+    per_pulse = " of each pulse" if eye.quantity == "fluence" else ""
+    now = "exceeds" if eye.exposure.value > eye.limit else "does not exceed"
+    return (
+        f"The eye may receive {scaled(eye.limit, unit)}{per_pulse} for {eye.duration:g} s (MPE);"
+        f" here it receives {with_ends(eye.exposure, unit)}, which {now} the limit. The nominal"
+        f" ocular hazard distance (NOHD) is {end(eye.distance)} in clear air. A distance that is"
+        " safe for a camera may blind people."
+    )
+
+
+def laser_text(estimate: Estimate) -> str:
+    """Return the laser, its distance and its exposure at the lens in one sentence."""
+    beam, index = estimate.exposures.beams[0], estimate.at
+    train = f" at {scaled(beam.repetition_rate, 'Hz')}" if beam.repetition_rate else ""
+    light = (
+        f"{scaled(beam.power, 'W')}"
+        if beam.power and not beam.pulse_energy
+        else (
+            f"pulses of {scaled(beam.pulse_energy or 0.0, 'J')} in "
+            f"{scaled(beam.pulse_duration or 0.0, 's')}{train}"
+        )
+    )
+    quantity = "fluence" if beam.is_pulsed else "irradiance"
+    here = (
+        estimate.exposures.emitted("fluence" if beam.is_pulsed else "irradiance")[:, 0]
+        * estimate.exposures.lens[:, index]
+    )
+    spread = Spread.of(float(here[0]), here[1:])
+    per_pulse = " a pulse" if beam.is_pulsed else ""
+    return (
+        f"{estimate.safety.name}: {estimate.emission}, {light}, {beam.wavelength * 1e9:.4g} nm,"
+        f" divergence {scaled(beam.divergence, 'rad')}, at"
+        f" {metres(estimate.safety.laser.distance)}:"
+        f" {with_ends(spread, UNITS[quantity] + '/m²')}{per_pulse} at the lens."
+    )
+
+
+def intervals_text(estimate: Estimate) -> str:
+    """Return what the numbers in brackets mean."""
+    laws = estimate.draws.laws
+    named = f" {', '.join(f'{name} {text}' for name, text in laws.items())};" if laws else ""
+    text = f"In brackets: the middle 90 % of {estimate.draws.count} draws of all that is uncertain"
+    if not estimate.damage:
+        return f"{text}:{named.removesuffix(';')}." if named else f"{text}; nothing is."
+    return (
+        f"{text}:{named} the thresholds of damage. A published threshold has a bracket and no"
+        " probability: a third of the draws each takes its lower end, its middle and its upper"
+        " end. A law with data of devices is drawn from its spread."
+    )
+
+
+def dazzled_cells(area: Dazzled) -> list[str]:
+    """Return the row of a protection in the table of the dazzled area."""
+    low, high = (_pixels(x) for x in (area.pixels.low, area.pixels.high))
+    number = _pixels(area.pixels.value)
+    text = number if low == high else f"{number} ({low} to {high})"
+    return [
+        area.option,
+        text,
+        share(area.share),
+        "–" if area.times is None else f"{area.times:.3g}",
+    ]
+
+
+def _pixels(number: float) -> str:
+    """Return a number of pixels with three digits, or a dash for one that is not known."""
+    if math.isnan(number):
+        return "–"
+    return f"{float(f'{number:.3g}'):.0f}"
+
+
+def enlarged_text(estimate: Estimate) -> str:
+    """Return whether the mask makes the dazzled area larger than the plain lens, and by how
+    much; empty: not known.
+    """
+    parts = [text for text in (_counted_text(estimate), _sooner_text(estimate)) if text]
+    mask = _both(estimate)[1]
+    larger = mask.times > 1 if mask and mask.times else any("less light" in text for text in parts)
+    return " ".join(["The mask enlarges the dazzled area.", *parts] if larger else parts)
+
+
+def _both(estimate: Estimate) -> tuple[Dazzled | None, Dazzled | None]:
+    """Return the dazzled area behind the plain lens and behind the mask."""
+    return next(iter(estimate.dazzled), None), next(
+        (area for area in estimate.dazzled if area.masked), None
+    )
+
+
+def _counted_text(estimate: Estimate) -> str:
+    """Return the filled pixels behind mask and plain lens at the distance of the recipe."""
+    plain, mask = _both(estimate)
+    if plain is None or mask is None:
+        return ""
+    counts = (
+        f"{_pixels(mask.pixels.value)} pixels behind the mask and {_pixels(plain.pixels.value)}"
+        " behind the plain lens"
+    )
+    times = "" if mask.times is None else f", {mask.times:.3g} times as many"
+    return f"At {metres(estimate.safety.laser.distance)} the laser fills {counts}{times}."
+
+
+def _sooner_text(estimate: Estimate) -> str:
+    """Return by how much less light at the lens the stated share of the picture is lost behind
+    the mask.
+    """
+    plain, mask = _both(estimate)
+    limits = [
+        next(
+            (
+                f
+                for f in estimate.findings
+                if area and f.option == area.option and f.limit.effect == "dazzle"
+            ),
+            None,
+        )
+        for area in (plain, mask)
+    ]
+    if limits[0] is None or limits[1] is None:
+        return ""
+    factor = limits[0].at_lens.value / limits[1].at_lens.value
+    compared = (
+        f"{factor:.3g} times less light" if factor > 1 else f"{1 / factor:.3g} times more light"
+    )
+    return (
+        f"Behind the mask {compared} at the lens than behind the plain lens gives:"
+        f" {limits[1].limit.name}."
+    )
+
+
+# --- damage words ---------------------------------------------------------------------------------
+
+# Sentences and cells on damage: one verdict, and what is said of each part of the light.
+
+_SUBJECTS = {
+    "pulse": "one pulse",
+    "mean": "the mean light",
+    "accumulation": "the accumulated heat of pulses",
+    "incubation": "the incubation by pulses",
+}
+STATES = {
+    "above": "above",
+    "within": "within the bracket",
+    "below": "below",
+    "not judged": "not judged",
+}
+
+
+def verdict(estimate: Estimate) -> list[str]:
+    """Return the verdict of damage behind the plain lens, and a sentence for each limit of
+    dazzle behind it.
+    """
+    lens = estimate.options[0].name
+    damage = [
+        damage_sentence(judged, estimate) for judged in estimate.damage if judged.option == lens
+    ]
+    dazzle = [
+        finding
+        for finding in estimate.findings
+        if finding.option == lens and finding.limit.effect != "damage"
+    ]
+    return damage + [
+        f"{finding.limit.name}: exceeded"
+        f" {'from ' if finding.zones.zones else ''}{zones_text(finding.zones)}."
+        for finding in dazzle
+    ]
+
+
+def damage_sentence(verdict: DamageVerdict, estimate: Estimate) -> str:
+    """Return the verdict of damage behind one protection in W/cm2 or J/cm2, with the distances
+    of the worst part.
+    """
+    where = f"at {metres(estimate.safety.laser.distance)} behind the {verdict.option}"
+    nearest = verdict.nearest
+    if nearest is None or nearest.finding is None:
+        return f"Damage is not judged {where}: {verdict.rows[0].reason}."
+    near, zones = _compared(nearest, estimate), _zones(verdict, nearest.finding)
+    if verdict.state == "above":
+        return f"Damage is expected {where}: {near} {zones}"
+    if verdict.state == "not judged":
+        parts = " and the ".join(dict.fromkeys(row.part for row in verdict.unjudged))
+        text = (
+            f"Damage is not judged {where}, because no law judges the {parts}:"
+            f" {verdict.unjudged[0].reason}."
+        )
+        if nearest.state == "not judged":
+            return text
+        return f"{text} Of what is judged, {near} {zones}".rstrip()
+    opening = "Damage cannot be excluded" if verdict.state == "within" else "No damage is expected"
+    return f"{opening} {where}: {near} {zones}"
+
+
+def _compared(row: DamageRow, estimate: Estimate) -> str:
+    """Return the exposure of one part of the light, and its ratio to the threshold."""
+    finding = row.finding
+    assert finding is not None
+    unit = f"{UNITS[finding.limit.quantity]}/cm²"
+    subject = (
+        _SUBJECTS[row.part] if estimate.exposures.beams[0].is_pulsed else "the continuous light"
+    )
+    exposure = scaled(finding.exposure.value * _PER_CM2, unit)
+    threshold = with_ends(finding.at_sensor, unit, _PER_CM2)
+    kind = "first damage" if finding.limit.kind == "point" else finding.limit.kind
+    return (
+        f"{subject} of {exposure} on the sensor is {times(finding)} the threshold of {kind},"
+        f" {threshold}."
+    )
+
+
+def times(finding: Finding) -> str:
+    """Return the ratio of exposure to limit with its interval, such as ``0.34 (0.1 to 1.1)
+    times``.
+    """
+    spread = finding.ratios
+    if spread is not None and finding.limit.open_below:
+        return f"at least {plain(f'{spread.low:.3g}')} times"
+    if spread is None or spread.high <= spread.low * (1 + _SAME):
+        return f"{plain(f'{finding.ratio:.3g}')} times"
+    ratio, low, high = (
+        plain(text) for text in (f"{finding.ratio:.3g}", f"{spread.low:.2g}", f"{spread.high:.2g}")
+    )
+    return f"{ratio} ({low} to {high}) times"
+
+
+def _zones(verdict: DamageVerdict, finding: Finding) -> str:
+    """Return where the worst part of the light exceeds its threshold; nothing where a part is
+    not judged.
+    """
+    if finding.zones.zones:
+        return f"It exceeds the threshold from {zones_text(finding.zones)}."
+    if verdict.unjudged or finding.limit.open_below:
+        return ""
+    if finding.zones.reach is None:
+        return "It exceeds the threshold nowhere."
+    return (
+        "It exceeds the threshold nowhere at the nominal values, but in some draws out to"
+        f" {end(finding.zones.reach)}."
+    )
+
+
+def is_bracket(finding: Finding) -> bool:
+    """Return True for a limit of damage without data of devices, which has no probability."""
+    return finding.limit.effect == "damage" and finding.limit.factor is None
+
+
+def limit_rows(estimate: Estimate) -> list[list[str]]:
+    """Return the table of limits, with the parts of the light that are not judged."""
+    rows = [_limit_cells(finding) for finding in estimate.findings]
+    for verdict in estimate.damage:
+        rows += [_unjudged_cells(verdict, row) for row in _without_limit(verdict)]
+    return rows
+
+
+def zone_rows(estimate: Estimate) -> list[list[str]]:
+    """Return the table of distances, with the parts of the light that are not judged."""
+    partial = {verdict.option for verdict in estimate.damage if verdict.unjudged}
+    rows = [_zone_cells(finding, finding.option in partial) for finding in estimate.findings]
+    for verdict in estimate.damage:
+        rows += [
+            [verdict.option, f"damage: {row.part}", "not judged", "–", "–"]
+            for row in _without_limit(verdict)
+        ]
+    return rows
+
+
+def _without_limit(verdict: DamageVerdict) -> list[DamageRow]:
+    """Return the rows without a limit."""
+    return [row for row in verdict.rows if row.finding is None]
+
+
+def _unjudged_cells(verdict: DamageVerdict, row: DamageRow) -> list[str]:
+    """Return the row of a part of the light without a law in the table of limits."""
+    return [verdict.option, f"damage: {row.part}", "no law", "not judged", "–", "–"]
+
+
+def _limit_cells(finding: Finding) -> list[str]:
+    """Return the row of a limit, for damage with the ratio's bracket and where the exposure is
+    beside the limit.
+    """
+    cells = limit_cells(finding)
+    if finding.limit.effect != "damage" or finding.ratios is None:
+        return cells
+    cells[3] = f"{times(finding)}: {STATES[state_of_finding(finding)]}"
+    if is_bracket(finding):
+        cells[5] = "none: no device data"
+    return cells
+
+
+def _zone_cells(finding: Finding, partial: bool) -> list[str]:
+    """Return the row of a limit in the table of distances; without device data it has no
+    probabilities.
+    """
+    zones = finding.zones
+    text = zones_text(zones)
+    if finding.limit.effect == "damage" and not zones.zones and partial:
+        text = "not by this part alone"
+    shares = ["–", "–"] if is_bracket(finding) else [share(zones.none), share(zones.inside)]
+    return [finding.option, finding.limit.name, text, *shares]
+
+
+# --- eye words ------------------------------------------------------------------------------------
+
+# Cells and sentences on the dazzle of the eye, which the page and the terminal share.
+
+
+EYE_DAZZLE_COLUMNS = (
+    "surroundings",
+    "from the laser",
+    "eye receives at most (MDE)",
+    "dazzled up to (NODD)",
+    "here",
+)
+
+
+def dazzle_cells(row: EyeDazzleRow) -> list[str]:
+    """Return the row of one light of the surroundings and one angle."""
+    start = [f"{row.background:g} cd/m²", f"{row.angle:.3g}°"]
+    if row.distance is None:
+        return [*start, "not seen without a laser", "–", "–"]
+    return [
+        *start,
+        scaled(row.limit, "W/m²"),
+        end(row.distance),
+        "dazzled" if row.dazzled else "seen",
+    ]
+
+
+def distance_table(rows: Sequence[EyeDazzleRow]) -> list[list[str]]:
+    """Return the dazzle distance for each light of the surroundings (row) and each angle
+    (column), the header first.
+    """
+    angles = list(dict.fromkeys(row.angle for row in rows))
+    table = [["surroundings", *(f"{angle:.3g}° from the laser" for angle in angles)]]
+    for background in dict.fromkeys(row.background for row in rows):
+        reach = [row.distance for row in rows if row.background == background]
+        table.append(
+            [
+                f"{background:g} cd/m²",
+                *("not seen" if x is None else metres(x.value) for x in reach),
+            ]
+        )
+    return table
+
+
+def dazzle_text(finding: EyeDazzleFinding, asked: EyeDazzle) -> str:
+    """Return what is asked of the eye, or why its dazzle is not judged."""
+    if finding.reason:
+        return f"Dazzle of the eye is not judged: {finding.reason}."
+    size = math.degrees(asked.size) * 60
+    return (
+        f"A target of {size:.3g} arc minutes and the contrast {asked.contrast:g} is hidden from a"
+        f" viewer of {asked.age:g} years by the light that the eye scatters, where the irradiance"
+        " exceeds the maximum dazzle exposure (MDE), up to the nominal ocular dazzle distance"
+        " (NODD) in clear air. Within the NOHD the eye may be injured as well."
+    )
+
+
+# --- helps words ----------------------------------------------------------------------------------
+
+# Cells and sentences on what helps, which the page and the terminal share.
+
+
+COLUMNS = (
+    "limit",
+    "means",
+    "at the limit",
+    "in 95 % of the draws",
+    "light of the scene",
+    "SNR of the feature",
+    "note",
+)
+_DENSITY = "OD "
+EXPLAINED = """Damage, saturation and contrast are three problems, and each is solved apart, for the
+    plain lens at the distance of the recipe. A density, a stop or an exposure is the one that
+    brings the laser to the limit; in brackets is the middle 90 % of the draws, and beside it the
+    value that holds in 95 % of them. The light of the scene is what is left of it in a pixel with
+    that value."""
+
+
+def table(remedies: Sequence[Remedy]) -> list[list[str]]:
+    """Return a row for each means against each limit, and a single row for a limit that is met
+    without any.
+    """
+    rows = []
+    for limit in dict.fromkeys(remedy.limit for remedy in remedies):
+        of_limit = [remedy for remedy in remedies if remedy.limit == limit]
+        if all(remedy.reason == MET for remedy in of_limit):
+            rows.append([limit, "none", MET, "–", "–", "–", ""])
+        else:
+            rows += [cells(remedy) for remedy in of_limit]
+    return rows
+
+
+def cells(remedy: Remedy) -> list[str]:
+    """Return the row of one means against one limit."""
+    cost = remedy.cost
+    left = "–" if cost is None else f"{100 * cost.scene:.3g} %"
+    return [
+        remedy.limit,
+        remedy.means,
+        _value(remedy),
+        "–" if remedy.safe is None or remedy.value is None else _number(remedy.means, remedy.safe),
+        left,
+        "–" if cost is None else _snr(cost),
+        _note(remedy),
+    ]
+
+
+def _value(remedy: Remedy) -> str:
+    """Return the value at the limit with its interval, or that there is none."""
+    if remedy.reason == MET:
+        return MET
+    if remedy.value is None:
+        return "not judged" if remedy.reason.startswith("not judged") else "none helps"
+    middle, low, high = (
+        _number(remedy.means, x) for x in (remedy.value.value, remedy.value.low, remedy.value.high)
+    )
+    low, high = low.removeprefix(_DENSITY), high.removeprefix(_DENSITY)
+    return middle if low == high == middle.removeprefix(_DENSITY) else f"{middle} ({low} to {high})"
+
+
+def _number(means: str, value: float) -> str:
+    """Return a density, a diameter or an exposure with its unit."""
+    if means in ("grey filter", "notch filter"):
+        return f"{_DENSITY}{value:.2f}"
+    return scaled(value, "m" if means == "stop" else "s")
+
+
+def _snr(cost: PictureCost) -> str:
+    """Return the signal-to-noise ratio of the stated feature before and after."""
+    if cost.snr_before is None or cost.snr_after is None:
+        return "–"
+    return f"{cost.snr_before:.3g} to {cost.snr_after:.3g}"
+
+
+def _note(remedy: Remedy) -> str:
+    """Return what has to be known with a value, or why there is none."""
+    if remedy.reason == MET:
+        return ""
+    if remedy.value is None:
+        return remedy.reason
+    notes = [remedy.reason, _notch_note(remedy), *_picture_notes(remedy)]
+    return "; ".join(note for note in notes if note)
+
+
+def _notch_note(remedy: Remedy) -> str:
+    """Return the band that a notch filter has to block."""
+    if remedy.band is None:
+        return ""
+    low, high = (f"{x * 1e9:.4g}" for x in remedy.band)
+    return f"blocks {low} to {high} nm; the colour of the laser has to be known"
+
+
+def _picture_notes(remedy: Remedy) -> Iterator[str]:
+    """Yield what a stop, a grey filter or an exposure does to white and to fine detail."""
+    cost = remedy.cost
+    if cost is None:
+        return
+    if cost.white is not None and remedy.means != "notch filter":
+        yield f"white falls to {scaled(cost.white, 'e-')}" if cost.scene < 1 else "white saturates"
+    if cost.cutoff_after < min(0.5, 0.999 * cost.cutoff_before):
+        yield f"diffraction leaves {cost.cutoff_after:.2g} cycles a pixel"
+
+
+def sentences(remedies: Sequence[Remedy]) -> Iterator[str]:
+    """Yield that an exposure never changes damage, and each limit against which no grey filter
+    and no stop helps.
+    """
+    if any(remedy.problem == "damage" for remedy in remedies):
+        yield "An exposure never changes damage."
+    for limit in dict.fromkeys(remedy.limit for remedy in remedies):
+        helpless = {
+            remedy.means for remedy in remedies if remedy.limit == limit and remedy.value is None
+        }
+        if {"grey filter", "stop"} <= helpless:
+            yield f"{limit}: no grey filter and no stop helps."
+
+
+# --- safety text ----------------------------------------------------------------------------------
+
+# An estimate of safety as lines of text for a terminal.
+
+
+#: lines that stay as they are, or a single text that is wrapped
+Paragraphs = Sequence[Sequence[str]]
+
+
+def paragraphs(estimate: Estimate) -> list[list[str]]:
+    """Return the verdict, the tables of limits and distances, the eye, and the sources, before
+    lines are wrapped.
+    """
+    parts = [
+        [f"{estimate.recipe.name}: {estimate.recipe.title}", CERTIFICATE, ""],
+        [laser_text(estimate)],
+    ]
+    steps = (
+        _damage,
+        _limits,
+        _dazzled_area,
+        _helps,
+        _eye,
+        _unsaid,
+        _counted,
+        _intervals,
+        _sources,
+        _eye_sources,
+    )
     for step in steps:
-        parts += step(found)
+        parts += step(estimate)
     return parts
 
 
-def _damage(found: Estimate) -> Iterator[list[str]]:
+def _damage(estimate: Estimate) -> Iterator[list[str]]:
     """Yield the verdict of damage behind the plain lens."""
-    if found.damage:
-        yield from (["", "damage"], [damage_sentence(found.damage[0], found)])
+    if estimate.damage:
+        yield from (["", "damage"], [damage_sentence(estimate.damage[0], estimate)])
 
 
-def _limits(found: Estimate) -> Iterator[list[str]]:
+def _limits(estimate: Estimate) -> Iterator[list[str]]:
     """Yield the tables of limits and of distances."""
-    rows = limit_rows(found)
+    rows = limit_rows(estimate)
     if rows:
-        yield _table("limits", words.LIMIT_COLUMNS, rows)
-        yield _table("distances", words.ZONE_COLUMNS, zone_rows(found))
+        yield _table("limits", LIMIT_COLUMNS, rows)
+        yield _table("distances", ZONE_COLUMNS, zone_rows(estimate))
 
 
-def _dazzled_area(found: Estimate) -> Iterator[list[str]]:
+def _dazzled_area(estimate: Estimate) -> Iterator[list[str]]:
     """Yield the table of the dazzled area, and whether the mask enlarges it."""
-    if not found.dazzled:
+    if not estimate.dazzled:
         return
-    here = words.metres(found.safety.laser.distance)
-    yield _table(f"dazzled area at {here}", words.DAZZLE_COLUMNS, [words.dazzled_cells(area) for area in found.dazzled])
-    text = words.enlarged_text(found)
+    here = metres(estimate.safety.laser.distance)
+    yield _table(
+        f"dazzled area at {here}",
+        DAZZLE_COLUMNS,
+        [dazzled_cells(area) for area in estimate.dazzled],
+    )
+    text = enlarged_text(estimate)
     if text:
         yield [text]
 
 
-def _unsaid(found: Estimate) -> Iterator[list[str]]:
+def _unsaid(estimate: Estimate) -> Iterator[list[str]]:
     """Yield what the estimate does not say."""
-    if found.unsaid:
+    if estimate.unsaid:
         yield ["", "not said"]
-        yield from ([text] for text in found.unsaid)
+        yield from ([text] for text in estimate.unsaid)
 
 
-def _counted(found: Estimate) -> Iterator[list[str]]:
+def _counted(estimate: Estimate) -> Iterator[list[str]]:
     """Yield what is counted along the axis."""
     yield from (
         ["", "counted along the axis"],
-        [parts_of.scatter_text(found.veil)],
-        [parts_of.focus_text(found.safety)],
+        [safety_estimate.scatter_text(estimate.veil)],
+        [safety_estimate.focus_text(estimate.safety)],
     )
-    yield from ([text] for text in parts_of.counted(found.safety))
+    yield from ([text] for text in safety_estimate.counted(estimate.safety))
 
 
-def _intervals(found: Estimate) -> Iterator[list[str]]:
+def _intervals(estimate: Estimate) -> Iterator[list[str]]:
     """Yield what the numbers in brackets mean."""
-    yield from (["", "intervals"], [words.intervals_text(found)])
+    yield from (["", "intervals"], [intervals_text(estimate)])
 
 
-def _sources(found: Estimate) -> Iterator[list[str]]:
+def _sources(estimate: Estimate) -> Iterator[list[str]]:
     """Yield the sources of the limits."""
     yield ["", "sources"]
-    yield from ([text] for text in dict.fromkeys(map(_source, found.findings)))
+    yield from ([text] for text in dict.fromkeys(map(_source, estimate.findings)))
 
 
-def _helps(found: Estimate) -> Iterator[list[str]]:
+def _helps(estimate: Estimate) -> Iterator[list[str]]:
     """Yield what helps, without the notes of the page."""
-    if found.helps:
-        cells = [row[:-1] for row in helps_words.table(found.helps)]
-        yield _table("what helps, behind the plain lens", helps_words.COLUMNS[:-1], cells)
-        yield from ([text] for text in helps_words.sentences(found.helps))
+    if estimate.helps:
+        cells = [row[:-1] for row in table(estimate.helps)]
+        yield _table("what helps, behind the plain lens", COLUMNS[:-1], cells)
+        yield from ([text] for text in sentences(estimate.helps))
 
 
-def _eye(found: Estimate) -> Iterator[list[str]]:
+def _eye(estimate: Estimate) -> Iterator[list[str]]:
     """Yield the limit of the eye and the distances of its dazzle."""
-    if found.eye:
-        yield from (["", "eye"], [words.eye_text(found.eye)])
-    if found.eye_dazzle.rows:
-        header, *cells = eye_words.distance_table(found.eye_dazzle.rows)
+    if estimate.eye:
+        yield from (["", "eye"], [eye_text(estimate.eye)])
+    if estimate.eye_dazzle.rows:
+        header, *cells = distance_table(estimate.eye_dazzle.rows)
         yield _table("dazzle of the eye (NODD)", tuple(header), cells)
-    yield [eye_words.dazzle_text(found.eye_dazzle, found.safety.settings.eye.dazzle)]
+    yield [dazzle_text(estimate.eye_dazzle, estimate.safety.settings.eye.dazzle)]
 
 
-def _eye_sources(found: Estimate) -> Iterator[list[str]]:
+def _eye_sources(estimate: Estimate) -> Iterator[list[str]]:
     """Yield the sources of what is said of the eye."""
-    if found.eye:
-        yield [f"eye: {found.eye.source}"]
-    if found.eye_dazzle.rows:
-        yield [f"dazzle of the eye: {found.eye_dazzle.source}"]
+    if estimate.eye:
+        yield [f"eye: {estimate.eye.source}"]
+    if estimate.eye_dazzle.rows:
+        yield [f"dazzle of the eye: {estimate.eye_dazzle.source}"]
 
 
 def lines(parts: Paragraphs) -> list[str]:
     """Return paragraphs as lines that are no wider than the terminal, but for tables."""
-    return [line for part in parts for line in (wrapped(part[0]) if len(part) == 1 else part)]
+    printed: list[str] = []
+    for paragraph in parts:
+        printed += wrapped(paragraph[0]) if len(paragraph) == 1 else paragraph
+    return printed
 
 
 def _source(finding: Finding) -> str:

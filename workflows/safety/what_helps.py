@@ -1,7 +1,9 @@
-"""What helps: the filter, the notch filter, the stop or the exposure that brings each limit down to its threshold.
+"""What helps: the filter, the notch filter, the stop or the exposure that brings each limit down to
+its threshold.
 
-Damage, saturation and contrast are three problems, and each is solved apart behind the plain lens at the distance of
-the recipe. A remedy is found by asking the functions that make the verdict, and it is put back into them.
+Damage, saturation and contrast are three problems, and each is solved apart behind the plain lens
+at the distance of the recipe. A remedy is found by asking the functions that make the verdict, and
+it is put back into them.
 """
 
 from __future__ import annotations
@@ -24,20 +26,20 @@ from neusee.nodes.laser import (
 from neusee.workflows.recipe.blocks.safety_block import Safety
 from neusee.workflows.recipe.distributions.shapes import FloatArray
 from neusee.workflows.safety.dazzled_area import Area, area_of
-from neusee.workflows.safety.distance_zones import Spread
-from neusee.workflows.safety.exposures import Option, compute_exposures
-from neusee.workflows.safety.limit_ratios import limit_ratio, limits_behind
-from neusee.workflows.safety.sensor_limits import veil_level
-from neusee.workflows.safety.spots_along import Ranked
-from neusee.workflows.safety.uncertain_values import SettingDraws
+from neusee.workflows.safety.exposure_limits import limit_ratio, limits_behind, veil_level
+from neusee.workflows.safety.exposures import Option, SettingDraws, Spread, compute_exposures
+from neusee.workflows.safety.laser_spots import Ranked
 
 Problem = Literal["damage", "saturation", "contrast"]
 Means = Literal["grey filter", "notch filter", "stop", "exposure"]
-Ratios = Mapping[str, FloatArray]  #: exposure over limit (1 + draw,) by the name of the limit; row 0 is nominal
+#: exposure over limit (1 + draw,) by the name of the limit; row 0 is nominal
+Ratios = Mapping[str, FloatArray]
 
-_FILTERS = tuple(10.0**-x for x in (0, 1, 2, 4, 8, 12))  #: transmittances that are tried, from none to the strongest
+#: transmittances that are tried, from none to the strongest
+_FILTERS = tuple(10.0**-x for x in (0, 1, 2, 4, 8, 12))
 _SLOWEST = 64.0  #: f-number of the smallest stop
-_HALF_STOP = 2.0**-0.25  #: diameter of a stop over that of the next larger one that is tried, at least
+#: diameter of a stop over that of the next larger one that is tried, at least
+_HALF_STOP = 2.0**-0.25
 _SHORTER = tuple(10.0**-x for x in (0, 0.5, 1, 2, 3, 4, 5, 6))  #: exposures over that of the recipe
 _LONGER = tuple(10.0 ** (x / 4) for x in range(13))
 _SAFE = 0.95  #: share of the draws in which a safe value holds
@@ -59,8 +61,10 @@ class PictureCost:
     scene: float  #: share of the scene's light that a pixel collects in one exposure
     cutoff_before: float  #: cycles a pixel, finest detail that diffraction leaves
     cutoff_after: float
-    white: float | None = None  #: e- of a white that filled the well before; None: the well is not known
-    background: float | None = None  #: e- behind the stated feature; None here and below: no feature is stated
+    #: e- of a white that filled the well before; None: the well is not known
+    white: float | None = None
+    #: e- behind the stated feature; None here and below: no feature is stated
+    background: float | None = None
     snr_before: float | None = None  #: signal-to-noise ratio of the stated feature
     snr_after: float | None = None
 
@@ -76,21 +80,30 @@ class Remedy:
     safe: float | None = None  #: value that holds in 95 % of the draws; None: there is none
     reason: str = ""  #: why it is not needed, does not help or is not judged
     put_back: float | None = None  #: nominal exposure over limit with the value, computed again
-    covered: float | None = None  #: share of the draws below the limit with the safe value, computed again
+    #: share of the draws below the limit with the safe value, computed again
+    covered: float | None = None
     band: tuple[float, float] | None = None  #: m at normal incidence, that a notch has to cover
-    cost: PictureCost | None = None  #: of the safe value, or of the nominal one where no value is safe
+    #: of the safe value, or of the nominal one where no value is safe
+    cost: PictureCost | None = None
 
 
 def remedies(safety: Safety, draws: SettingDraws, ranked: Sequence[Ranked]) -> tuple[Remedy, ...]:
-    """Return what each means does against each limit behind the plain lens at the distance of the recipe."""
+    """Return what each means does against each limit behind the plain lens at the distance of
+    the recipe.
+    """
     question = _Question(safety, draws, ranked)
     plain = question.ratios(_Trial(Option("plain lens")))
     ways = list(_ways(question)) if plain else []
-    return tuple(
-        replace(remedy, value=None, safe=None, cost=None, reason=OPEN) if limit in question.open else remedy
-        for limit in plain
-        for remedy in _remedies(limit, ways)
-    )
+    answers: list[Remedy] = []
+    for limit in plain:
+        for remedy in _remedies(limit, ways):  # which may find that the limit is open
+            answers.append(_open(remedy) if limit in question.open else remedy)
+    return tuple(answers)
+
+
+def _open(remedy: Remedy) -> Remedy:
+    """Return a means against a limit that is open below, with which nothing is safe."""
+    return replace(remedy, value=None, safe=None, cost=None, reason=OPEN)
 
 
 def problem_of(limit: str) -> Problem:
@@ -99,7 +112,7 @@ def problem_of(limit: str) -> Problem:
     return "saturation" if word == "saturated" else "contrast" if word == "veiled" else "damage"
 
 
-# --- the question: how often is each limit exceeded behind another protection? ----------------------------------------
+# --- the question: how often is each limit exceeded behind another protection? --------------------
 
 
 @dataclass(frozen=True)
@@ -117,27 +130,38 @@ class _Question:
     safety: Safety
     draws: SettingDraws
     ranked: Sequence[Ranked]
-    open: set[str] = field(default_factory=set)  #: limits below which nothing is known, once a question was asked
-    tables: Mapping[bool, dict[Any, Any]] = field(default_factory=lambda: {True: {}, False: {}})  #: `Exposures.tables`
+    #: limits below which nothing is known, once a question was asked
+    open: set[str] = field(default_factory=set)
+    #: `Exposures.tables`
+    tables: Mapping[bool, dict[Any, Any]] = field(default_factory=lambda: {True: {}, False: {}})
 
     def ratios(self, trial: _Trial, drawn: bool = True) -> Ratios:
         """Return the ratio (1 + draw,) of each limit that is judged, or (1,) without the draws."""
         safety, draws = _exposed(self.safety, self.draws, trial.exposure)
         if not drawn:
-            draws = replace(draws, count=0, values={name: x[:0] for name, x in draws.values.items()})
-        exposures = compute_exposures(safety, draws, (trial.option,), np.array([safety.laser.distance]))
-        exposures = replace(exposures, tables=self.tables[drawn])  # filter and exposure leave the spot as it is
+            draws = replace(
+                draws, count=0, values={name: x[:0] for name, x in draws.values.items()}
+            )
+        exposures = compute_exposures(
+            safety, draws, (trial.option,), np.array([safety.laser.distance])
+        )
+        # filter and exposure leave the spot as it is
+        exposures = replace(exposures, tables=self.tables[drawn])
         area = area_of(safety, trial.option, self.ranked) if safety.settings.dazzle else None
-        known = area if isinstance(area, Area) else None
-        limits = list(limits_behind(safety, draws, trial.option, known, exposures))
+        dazzled_area = area if isinstance(area, Area) else None
+        limits = list(limits_behind(safety, draws, trial.option, dazzled_area, exposures))
         self.open.update(limit.name for limit in limits if getattr(limit, "open_below", False))
-        return {limit.name: limit_ratio(safety, trial.option.name, limit, exposures)[:, 0] for limit in limits}
+        return {
+            limit.name: limit_ratio(safety, trial.option.name, limit, exposures)[:, 0]
+            for limit in limits
+        }
 
     def of(self, limit: str, asked: Ratios, trial: _Trial) -> FloatArray | None:
         """Return the ratio of one limit; None where it is not judged.
 
-        A veil is infinite where the scene alone fills the well and where the feature is lost without a laser. Without
-        a limit of its own it is that of saturation, which hides the feature first.
+        A veil is infinite where the scene alone fills the well and where the feature is lost
+        without a laser. Without a limit of its own it is that of saturation, which hides the
+        feature first.
         """
         if problem_of(limit) != "contrast":
             return asked.get(limit)
@@ -153,7 +177,9 @@ class _Question:
 
 
 def _exposed(safety: Safety, draws: SettingDraws, factor: float) -> tuple[Safety, SettingDraws]:
-    """Return settings and draws whose exposure, and with it the electrons of the scene, are larger by a factor."""
+    """Return settings and draws whose exposure, and with it the electrons of the scene, are
+    larger by a factor.
+    """
     settings = safety.settings
     if factor == 1.0 or settings.sensor.exposure is None:
         return safety, draws
@@ -161,17 +187,21 @@ def _exposed(safety: Safety, draws: SettingDraws, factor: float) -> tuple[Safety
     dazzle = settings.dazzle
     if dazzle is not None:
         dazzle = dazzle.model_copy(update={"background": dazzle.background * factor})
-    values = {name: x * factor if name == "sensor.exposure" else x for name, x in draws.values.items()}
+    values = {
+        name: x * factor if name == "sensor.exposure" else x for name, x in draws.values.items()
+    }
     changed = settings.model_copy(update={"sensor": sensor, "dazzle": dazzle})
     return replace(safety, settings=changed), replace(draws, values=values)
 
 
-# --- the means --------------------------------------------------------------------------------------------------------
+# --- the means ------------------------------------------------------------------------------------
 
 
 @dataclass
 class _Way:
-    """One means: factors from the present one, 1, to the strongest that is tried, and what each answers."""
+    """One means: factors from the present one, 1, to the strongest that is tried, and what each
+    answers.
+    """
 
     question: _Question
     means: Means
@@ -208,52 +238,82 @@ class _Way:
         white = None if sensor.full_well is None else sensor.full_well * min(1.0, scene)
         if dazzle is None:
             return PictureCost(scene, cutoffs[0], cutoffs[1], white)
-        feature = {"contrast": dazzle.contrast, "feature": dazzle.feature, "read_noise": dazzle.read_noise}
+        feature = {
+            "contrast": dazzle.contrast,
+            "feature": dazzle.feature,
+            "read_noise": dazzle.read_noise,
+        }
         ratios = [feature_snr(dazzle.background * share, 0.0, **feature) for share in (1.0, scene)]
-        return PictureCost(scene, cutoffs[0], cutoffs[1], white, dazzle.background * scene, ratios[0], ratios[1])
+        return PictureCost(
+            scene, cutoffs[0], cutoffs[1], white, dazzle.background * scene, ratios[0], ratios[1]
+        )
 
 
 def _ways(question: _Question) -> Iterator[_Way]:
     """Yield the means that are tried; the exposure is tried shorter and longer."""
-    diameter, exposure = question.safety.settings.lens.diameter, question.safety.settings.sensor.exposure
+    diameter, exposure = (
+        question.safety.settings.lens.diameter,
+        question.safety.settings.sensor.exposure,
+    )
     band = _notch(question)
     left = 1 - white_share(*band)
-    yield _Way(question, "grey filter", _FILTERS, lambda x: _Trial(Option("grey filter", passing=x)))
-    notch = _Way(question, "notch filter", _FILTERS, lambda x: _Trial(Option("notch filter", passing=x, scene=left)))
+    yield _Way(
+        question, "grey filter", _FILTERS, lambda x: _Trial(Option("grey filter", passing=x))
+    )
+    notch = _Way(
+        question,
+        "notch filter",
+        _FILTERS,
+        lambda x: _Trial(Option("notch filter", passing=x, scene=left)),
+    )
     yield replace(notch, band=band)
     stops = _stops(question.safety.settings.lens.focal_length / diameter)
-    yield _Way(question, "stop", stops, lambda x: _Trial(Option("stop", diameter=diameter * x)), diameter)
+    yield _Way(
+        question, "stop", stops, lambda x: _Trial(Option("stop", diameter=diameter * x)), diameter
+    )
     if exposure is not None:
         for factors in (_SHORTER, _LONGER):
-            yield _Way(question, "exposure", factors, lambda x: _Trial(Option("plain lens"), x), exposure)
+            yield _Way(
+                question, "exposure", factors, lambda x: _Trial(Option("plain lens"), x), exposure
+            )
 
 
 def _stops(f_number: float) -> tuple[float, ...]:
-    """Return diameters over that of a lens, from 1 down to f/64, or to half for a lens slower than f/32."""
-    least = min(0.5, f_number / _SLOWEST)
-    steps = max(4, math.ceil(math.log(least) / math.log(_HALF_STOP) / 2))
-    return tuple(least ** (x / steps) for x in range(steps + 1))
+    """Return diameters over that of a lens, from 1 down to f/64, or to half for a lens slower
+    than f/32.
+    """
+    smallest = min(0.5, f_number / _SLOWEST)
+    steps = max(4, math.ceil(math.log(smallest) / math.log(_HALF_STOP) / 2))
+    return tuple(smallest ** (x / steps) for x in range(steps + 1))
 
 
 def _notch(question: _Question) -> tuple[float, float]:
-    """Return the band at normal incidence of a notch that covers the laser, its draws too, over the whole field."""
+    """Return the band at normal incidence of a notch that covers the laser, its draws too, over
+    the whole field.
+    """
     settings = question.safety.settings
     wavelengths = question.draws.column("laser.wavelength", question.safety.laser.wavelength)
-    angle = field_angle(settings.sensor.shape, settings.sensor.pixel_pitch, settings.lens.focal_length)
-    return notch_band(float(wavelengths.min()), float(wavelengths.max()), angle, settings.protection.notch_index)
+    angle = field_angle(
+        settings.sensor.shape, settings.sensor.pixel_pitch, settings.lens.focal_length
+    )
+    return notch_band(
+        float(wavelengths.min()), float(wavelengths.max()), angle, settings.protection.notch_index
+    )
 
 
-# --- the answer -------------------------------------------------------------------------------------------------------
+# --- the answer -----------------------------------------------------------------------------------
 
 
 def _remedies(limit: str, ways: Sequence[_Way]) -> Iterator[Remedy]:
-    """Yield what each means does against one limit; of the two directions of the exposure the one that helps."""
+    """Yield what each means does against one limit; of the two directions of the exposure the
+    one that helps.
+    """
     yield from (_remedy(limit, way) for way in ways if way.means != "exposure")
     looks = [way for way in ways if way.means == "exposure"]
     if problem_of(limit) != "contrast":
         looks = looks[:1]  # a longer exposure can only help contrast
     answers = [_remedy(limit, way) for way in looks]
-    yield from [each for each in answers if each.value is not None][:1] or answers[:1]
+    yield from [answer for answer in answers if answer.value is not None][:1] or answers[:1]
 
 
 def _remedy(limit: str, way: _Way) -> Remedy:
@@ -261,11 +321,19 @@ def _remedy(limit: str, way: _Way) -> Remedy:
     problem, here = problem_of(limit), way.value(1.0)
     present = way.ratio(limit, 1.0)
     if present is not None and _is_met(present):
-        return Remedy(problem, limit, way.means, Spread(here, here, here), here, MET, float(present[0]), 1.0)
+        return Remedy(
+            problem, limit, way.means, Spread(here, here, here), here, MET, float(present[0]), 1.0
+        )
     rows = [way.ratio(limit, factor) for factor in way.factors]
     judged = [row for row in rows if row is not None]
     if len(judged) < len(rows):
-        return Remedy(problem, limit, way.means, None, reason="not judged: the dazzled area behind it is not known")
+        return Remedy(
+            problem,
+            limit,
+            way.means,
+            None,
+            reason="not judged: the dazzled area behind it is not known",
+        )
     table = np.stack(judged)
     factors = crossing(np.array(way.factors), table, problem)
     if np.isnan(factors[0]):
@@ -274,7 +342,9 @@ def _remedy(limit: str, way: _Way) -> Remedy:
 
 
 def _solved(limit: str, way: _Way, factors: FloatArray) -> Remedy:
-    """Return the remedy of factors (1 + draw,) that bring the laser to a limit, put back into the verdict."""
+    """Return the remedy of factors (1 + draw,) that bring the laser to a limit, put back into
+    the verdict.
+    """
     nominal = _refined(limit, way, float(factors[0]))
     safe, covered = _safe(limit, way, factors[1:]) if len(factors) > 1 else (nominal, None)
     drawn = np.array([way.value(factor) for factor in factors[1:] if factor > 0])
@@ -294,15 +364,20 @@ def _solved(limit: str, way: _Way, factors: FloatArray) -> Remedy:
 
 def _is_met(ratio: FloatArray) -> bool:
     """Return True if a limit is met at the nominal values and in 95 % of the draws."""
-    return bool(ratio[0] <= 1 and (ratio[1:] <= 1).mean() >= _SAFE) if len(ratio) > 1 else bool(ratio[0] <= 1)
+    return (
+        bool(ratio[0] <= 1 and (ratio[1:] <= 1).mean() >= _SAFE)
+        if len(ratio) > 1
+        else bool(ratio[0] <= 1)
+    )
 
 
 def crossing(factors: FloatArray, ratio: FloatArray, problem: Problem) -> FloatArray:
     """Return the factor (1 + draw,) at which the ratio (factor, 1 + draw) passes 1; NaN for none.
 
-    The factors run from the present one to the strongest. For damage and saturation every stronger factor has to stay
-    below 1 too. For contrast the first factor counts, since a stronger one dims the scene until nothing is seen.
-    Between two factors the logarithm of the ratio is linear in that of the factor.
+    The factors run from the present one to the strongest. For damage and saturation every stronger
+    factor has to stay below 1 too. For contrast the first factor counts, since a stronger one dims
+    the scene until nothing is seen. Between two factors the logarithm of the ratio is linear in
+    that of the factor.
     """
     below = ratio <= 1
     if problem != "contrast":
@@ -318,13 +393,16 @@ def crossing(factors: FloatArray, ratio: FloatArray, problem: Problem) -> FloatA
 
 
 def _refined(limit: str, way: _Way, factor: float) -> float:
-    """Return the nominal factor at which the ratio, computed again, is 1, near an interpolated factor.
+    """Return the nominal factor at which the ratio, computed again, is 1, near an interpolated
+    factor.
 
     False position in the logarithms, where the end that stays is drawn in (Illinois).
     """
     if factor in (way.factors[0], way.factors[-1]):
         return factor
-    index = next(i for i, x in enumerate(way.factors) if (x < factor) == (way.factors[-1] < 1) or x == factor)
+    index = next(
+        i for i, x in enumerate(way.factors) if (x < factor) == (way.factors[-1] < 1) or x == factor
+    )
     ends = [math.log(way.factors[index - 1]), math.log(way.factors[index])]
     heights = [_height(limit, way, end) for end in ends]
     place, last = math.log(factor), 0
@@ -346,10 +424,12 @@ def _height(limit: str, way: _Way, place: float) -> float:
 
 
 def _safe(limit: str, way: _Way, factors: FloatArray) -> tuple[float | None, float | None]:
-    """Return the factor that holds in 95 % of the draws, and the share of the draws below the limit with it."""
+    """Return the factor that holds in 95 % of the draws, and the share of the draws below the
+    limit with it.
+    """
     towards = -1 if way.factors[-1] < 1 else 1
-    known = np.sort(towards * np.where(np.isnan(factors), towards * math.inf, factors))
-    safe = towards * float(known[min(len(known) - 1, math.ceil(_SAFE * len(known)))])
+    ordered = np.sort(towards * np.where(np.isnan(factors), towards * math.inf, factors))
+    safe = towards * float(ordered[min(len(ordered) - 1, math.ceil(_SAFE * len(ordered)))])
     for _ in range(_REFINED):
         if not math.isfinite(safe) or safe <= 0:
             return None, None

@@ -1,4 +1,6 @@
-"""A worksheet to print: the inputs, each formula with its numbers put in, the limits, and what is assumed."""
+"""A worksheet to print: the inputs, each formula with its numbers put in, the limits, and what
+is assumed.
+"""
 
 from __future__ import annotations
 
@@ -24,10 +26,9 @@ from neusee.nodes.laser import (
     underfilled,
 )
 from neusee.workflows.report.study_page import filled
-from neusee.workflows.safety.eye_findings import EyeDazzleRow, EyeFinding
+from neusee.workflows.safety.exposure_limits import EyeDazzleRow, EyeFinding, saturating
 from neusee.workflows.safety.safety_estimate import CERTIFICATE, Estimate, Finding
-from neusee.workflows.safety.safety_words import UNITS, laser_text
-from neusee.workflows.safety.sensor_limits import saturating
+from neusee.workflows.safety.safety_text import UNITS, laser_text
 from neusee.workflows.safety.what_helps import Remedy
 
 _SYMBOL = re.compile(r"\b[A-Za-z]\w*\b")
@@ -35,7 +36,9 @@ _SYMBOL = re.compile(r"\b[A-Za-z]\w*\b")
 
 @dataclass(frozen=True)
 class Line:
-    """A quantity of the worksheet, with its formula and the numbers that are put into it, as text in SI units."""
+    """A quantity of the worksheet, with its formula and the numbers that are put into it, as
+    text in SI units.
+    """
 
     symbol: str
     quantity: str
@@ -58,11 +61,17 @@ class Sheet:
         self.values[symbol] = value
         self.lines.append(Line(symbol, quantity, put(value), unit))
 
-    def computed(self, symbol: str, quantity: str, value: float, unit: str, formula: str, numbers: str = "") -> None:
-        """Add a quantity with its formula; the numbers are put in for the symbols unless they are written out."""
+    def computed(
+        self, symbol: str, quantity: str, value: float, unit: str, formula: str, numbers: str = ""
+    ) -> None:
+        """Add a quantity with its formula; the numbers are put in for the symbols unless they
+        are written out.
+        """
         self.values[symbol] = value
-        with_numbers = numbers or _SYMBOL.sub(lambda found: self._number(found[0]), formula)
-        self.lines.append(Line(symbol, quantity, put(value), unit, _signs(formula), _signs(with_numbers)))
+        with_numbers = numbers or _SYMBOL.sub(lambda match: self._number(match[0]), formula)
+        self.lines.append(
+            Line(symbol, quantity, put(value), unit, _signs(formula), _signs(with_numbers))
+        )
 
     def end_part(self, heading: str, text: str = "") -> None:
         """Make the lines since the last part a part of their own."""
@@ -84,44 +93,56 @@ def _signs(formula: str) -> str:
     return formula.replace("**", "^").replace("*", "×")
 
 
-def worksheet_page(found: Estimate) -> str:
+def worksheet_page(estimate: Estimate) -> str:
     """Return the worksheet of an estimate as one HTML file, which loads no other file."""
     sheet = Sheet()
-    for add, heading, text in _contents(found):
-        add(sheet, found)
+    for add, heading, text in _contents(estimate):
+        add(sheet, estimate)
         sheet.end_part(heading, text)
     return filled(
         "worksheet.html.j2",
-        title=f"Worksheet: {found.recipe.name}",
+        title=f"Worksheet: {estimate.recipe.name}",
         certificate=CERTIFICATE,
-        lead=[found.recipe.title, laser_text(found)],
+        lead=[estimate.recipe.title, laser_text(estimate)],
         parts=sheet.parts,
     )
 
 
-def _contents(found: Estimate) -> list[tuple[Callable[[Sheet, Estimate], None], str, str]]:
-    """Return the parts of the worksheet: the function that adds its lines, its heading and its text."""
+def _contents(estimate: Estimate) -> list[tuple[Callable[[Sheet, Estimate], None], str, str]]:
+    """Return the parts of the worksheet: the function that adds its lines, its heading and its
+    text.
+    """
     return [
         (_inputs, "1 Inputs", ""),
         (_light, "2 At the lens and on the sensor", ""),
-        (_limits, "3 Limits of the sensor behind the plain lens", _limits_text(found)),
-        (_eye, "4 The eye", f"Source: {found.eye.source}." if found.eye else "The limit of the eye is not judged."),
-        (_dazzle, "5 Dazzle of the eye", _dazzle_text(found)),
-        (lambda sheet, estimate: None, "6 Assumed", _assumed(found)),
+        (_limits, "3 Limits of the sensor behind the plain lens", _limits_text(estimate)),
+        (
+            _eye,
+            "4 The eye",
+            f"Source: {estimate.eye.source}."
+            if estimate.eye
+            else "The limit of the eye is not judged.",
+        ),
+        (_dazzle, "5 Dazzle of the eye", _dazzle_text(estimate)),
+        (lambda sheet, estimate: None, "6 Assumed", _assumed(estimate)),
     ]
 
 
-# --- inputs -----------------------------------------------------------------------------------------------------------
+# --- inputs ---------------------------------------------------------------------------------------
 
 
-def _inputs(sheet: Sheet, found: Estimate) -> None:
-    beam, lens, sensor = found.exposures.beams[0], found.safety.settings.lens, found.safety.settings.sensor
+def _inputs(sheet: Sheet, estimate: Estimate) -> None:
+    beam, lens, sensor = (
+        estimate.exposures.beams[0],
+        estimate.safety.settings.lens,
+        estimate.safety.settings.sensor,
+    )
     _emission(sheet, beam)
     sheet.given("lambda", "wavelength", beam.wavelength, "m")
     sheet.given("w0", "radius of the beam at the laser, 1/e²", beam.waist, "m")
     sheet.given("theta", "full divergence, 1/e²", beam.divergence, "rad")
-    sheet.given("R", "distance", found.safety.laser.distance, "m")
-    sheet.given("T", "transmittance of the air over R", _air(found))
+    sheet.given("R", "distance", estimate.safety.laser.distance, "m")
+    sheet.given("T", "transmittance of the air over R", _air(estimate))
     sheet.given("D", "diameter of the lens", lens.diameter, "m")
     sheet.given("F", "focal length", lens.focal_length, "m")
     sheet.given("tau", "transmittance of the lens", lens.transmittance)
@@ -132,8 +153,8 @@ def _inputs(sheet: Sheet, found: Estimate) -> None:
         sheet.given("n", "full well", sensor.full_well, "e-")
     if sensor.exposure is not None:
         sheet.given("t", "exposure of a frame", sensor.exposure, "s")
-    if found.eye is not None:
-        sheet.given("te", "time for which an eye looks", found.eye.duration, "s")
+    if estimate.eye is not None:
+        sheet.given("te", "time for which an eye looks", estimate.eye.duration, "s")
 
 
 def _emission(sheet: Sheet, beam: Beam) -> None:
@@ -147,55 +168,74 @@ def _emission(sheet: Sheet, beam: Beam) -> None:
         sheet.given("f", "repetition rate", beam.repetition_rate, "Hz")
 
 
-def _air(found: Estimate) -> float:
+def _air(estimate: Estimate) -> float:
     """Return the nominal transmittance of the air at the distance of the recipe."""
-    clear = axis_density(found.exposures.beams[0], found.safety.laser.distance)
-    return float(found.exposures.lens[0, found.at] / clear)
+    clear = axis_density(estimate.exposures.beams[0], estimate.safety.laser.distance)
+    return float(estimate.exposures.lens[0, estimate.at] / clear)
 
 
-# --- light ------------------------------------------------------------------------------------------------------------
+# --- light ----------------------------------------------------------------------------------------
 
 
-def _light(sheet: Sheet, found: Estimate) -> None:
+def _light(sheet: Sheet, estimate: Estimate) -> None:
     """Add the beam at the lens, the light through the aperture, and the peak on the sensor."""
-    beam, lens, distance = found.exposures.beams[0], found.safety.settings.lens, found.safety.laser.distance
+    beam, lens, distance = (
+        estimate.exposures.beams[0],
+        estimate.safety.settings.lens,
+        estimate.safety.laser.distance,
+    )
     emitted, air, unit = sheet.values["X"], sheet.values["T"], "J" if beam.is_pulsed else "W"
     radius = beam_radius(beam, distance)
     filling = lens.diameter**2 / (4 * radius**2)
-    peak = emitted * sensor_density(beam, distance, lens.diameter, lens.focal_length, lens.transmittance, air)
-    judged = emitted * float(found.exposures.sensor[found.options[0].name][0, found.at])
-    sheet.computed("w", "radius of the beam at the lens, 1/e²", radius, "m", "sqrt(w0**2 + (theta * R / 2)**2)")
+    peak = emitted * sensor_density(
+        beam, distance, lens.diameter, lens.focal_length, lens.transmittance, air
+    )
+    judged = emitted * float(estimate.exposures.sensor[estimate.options[0].name][0, estimate.at])
+    sheet.computed(
+        "w", "radius of the beam at the lens, 1/e²", radius, "m", "sqrt(w0**2 + (theta * R / 2)**2)"
+    )
     at_lens = emitted * axis_density(beam, distance, air)
-    sheet.computed("El", "exposure at the lens, on the axis", at_lens, f"{unit}/m²", "2 * X * T / (pi * w**2)")
+    sheet.computed(
+        "El", "exposure at the lens, on the axis", at_lens, f"{unit}/m²", "2 * X * T / (pi * w**2)"
+    )
     through = emitted * share_through(beam, distance, lens.diameter, air)
-    sheet.computed("Xa", "through the aperture", through, unit, "X * T * (1 - exp(-D**2 / (2 * w**2)))")
+    sheet.computed(
+        "Xa", "through the aperture", through, unit, "X * T * (1 - exp(-D**2 / (2 * w**2)))"
+    )
     sheet.computed("x", "filling of the aperture", filling, "", "D**2 / (4 * w**2)")
-    sheet.computed("u", "of the peak that a narrow beam keeps", underfilled(filling), "", "2 / x * tanh(x / 2)")
+    sheet.computed(
+        "u", "of the peak that a narrow beam keeps", underfilled(filling), "", "2 / x * tanh(x / 2)"
+    )
     clear = "Xa * tau * u * pi * D**2 / 4 / (lambda * F)**2"
     sheet.computed("Ec", "peak of a clear lens in focus", peak, f"{unit}/m²", clear)
     sheet.given("q", "factor of focus and beam, computed by the estimate", judged / peak)
     sheet.computed("Es", "peak on the sensor", judged, f"{unit}/m²", "Ec * q")
 
 
-# --- limits of the sensor ---------------------------------------------------------------------------------------------
+# --- limits of the sensor -------------------------------------------------------------------------
 
 
-def _plain(found: Estimate) -> list[Finding]:
+def _plain(estimate: Estimate) -> list[Finding]:
     """Return what the limits say behind the plain lens."""
-    return [each for each in found.findings if each.option == found.options[0].name]
+    return [finding for finding in estimate.findings if finding.option == estimate.options[0].name]
 
 
-def _limits(sheet: Sheet, found: Estimate) -> None:
-    """Add the saturation of a pixel, and each limit with the exposure over it and the density that meets it."""
+def _limits(sheet: Sheet, estimate: Estimate) -> None:
+    """Add the saturation of a pixel, and each limit with the exposure over it and the density
+    that meets it.
+    """
     if {"eta", "n", "t"} <= set(sheet.values):
-        full = float(saturating(found.safety, found.draws)[0])
+        full = float(saturating(estimate.safety, estimate.draws)[0])
         sheet.given(
-            "k", "photons in a joule, lambda / (h c)", photons_in_joule(found.exposures.beams[0].wavelength), "1/J"
+            "k",
+            "photons in a joule, lambda / (h c)",
+            photons_in_joule(estimate.exposures.beams[0].wavelength),
+            "1/J",
         )
         formula = "n / (eta * k * t * p**2)"
         sheet.computed("S", "irradiance that fills a pixel", full, "W/m²", formula)
-    for number, finding in enumerate(_plain(found), 1):
-        _limit(sheet, number, finding, found.helps)
+    for number, finding in enumerate(_plain(estimate), 1):
+        _limit(sheet, number, finding, estimate.helps)
 
 
 def _limit(sheet: Sheet, number: int, finding: Finding, remedies: Sequence[Remedy]) -> None:
@@ -204,38 +244,48 @@ def _limit(sheet: Sheet, number: int, finding: Finding, remedies: Sequence[Remed
     limit, exposure = finding.at_sensor.value, finding.exposure.value
     sheet.given(f"L{number}", f"{name}: limit at the peak", limit, unit)
     sheet.given(f"E{number}", f"{name}: exposure at the peak", exposure, unit)
-    sheet.computed(f"r{number}", f"{name}: exposure over limit", exposure / limit, "", f"E{number} / L{number}")
+    sheet.computed(
+        f"r{number}", f"{name}: exposure over limit", exposure / limit, "", f"E{number} / L{number}"
+    )
     if exposure > limit:
         density = math.log10(exposure / limit)
-        sheet.computed(f"OD{number}", f"{name}: density that meets it", density, "", f"log10(r{number})")
+        sheet.computed(
+            f"OD{number}", f"{name}: density that meets it", density, "", f"log10(r{number})"
+        )
     safe = next((x.safe for x in remedies if x.limit == name and x.means == "grey filter"), None)
     if safe is not None:
         sheet.given(f"OS{number}", f"{name}: density that meets it in 95 % of the draws", safe)
 
 
-def _limits_text(found: Estimate) -> str:
+def _limits_text(estimate: Estimate) -> str:
     """Return where the limits are from."""
-    sources = dict.fromkeys(f"{each.limit.name}: {each.limit.source}." for each in _plain(found))
+    sources = dict.fromkeys(
+        f"{finding.limit.name}: {finding.limit.source}." for finding in _plain(estimate)
+    )
     return " ".join(sources) or "No limit of the sensor is judged."
 
 
-# --- the eye ----------------------------------------------------------------------------------------------------------
+# --- the eye --------------------------------------------------------------------------------------
 
 
-def _eye(sheet: Sheet, found: Estimate) -> None:
+def _eye(sheet: Sheet, estimate: Estimate) -> None:
     """Add the limit of the eye by the rule that decides it, and the hazard distance."""
-    eye, beam = found.eye, found.exposures.beams[0]
+    eye, beam = estimate.eye, estimate.exposures.beams[0]
     if eye is None:
         return
     unit = f"{UNITS[eye.quantity]}/m²"
-    _eye_limit(sheet, found, eye, unit)
+    _eye_limit(sheet, estimate, eye, unit)
     sheet.given("Ee", "exposure of the eye at R, on the axis", eye.exposure.value, unit)
     sheet.computed("re", "exposure over limit", eye.exposure.value / eye.limit, "", "Ee / M")
-    aperture = eye_aperture(beam.wavelength, eye.duration if beam.pulse_duration is None else beam.pulse_duration)
+    aperture = eye_aperture(
+        beam.wavelength, eye.duration if beam.pulse_duration is None else beam.pulse_duration
+    )
     share = eye_share(eye.limit, aperture, sheet.values["X"])
     sheet.given("a", "aperture of the eye", aperture, "m")
     sheet.computed("se", "share of X that the eye may receive", share, "", "pi * a**2 / 4 * M / X")
-    reach = nominal_ocular_hazard_distance(beam, eye.duration, rule=found.safety.settings.eye.rule)
+    reach = nominal_ocular_hazard_distance(
+        beam, eye.duration, rule=estimate.safety.settings.eye.rule
+    )
     if share >= 1:
         sheet.given("NOHD", "nominal ocular hazard distance, 0 since se is not below 1", reach, "m")
         return
@@ -243,42 +293,69 @@ def _eye(sheet: Sheet, found: Estimate) -> None:
     sheet.computed("NOHD", "nominal ocular hazard distance", reach, "m", formula)
 
 
-def _eye_limit(sheet: Sheet, found: Estimate, eye: EyeFinding, unit: str) -> None:
+def _eye_limit(sheet: Sheet, estimate: Estimate, eye: EyeFinding, unit: str) -> None:
     """Add the limit of the eye with its formula."""
-    beam, rule = found.exposures.beams[0], found.safety.settings.eye.rule
+    beam, rule = estimate.exposures.beams[0], estimate.safety.settings.eye.rule
     limit = eye_limit(beam, eye.duration, rule)
-    whole = eye_mpe_formula(beam.wavelength, eye.duration)
+    formula = eye_mpe_formula(beam.wavelength, eye.duration)
     if beam.pulse_energy is None or beam.pulse_duration is None:
-        sheet.computed("M", "limit of the eye (MPE)", limit, unit, "H(te) / te", f"{whole} / {put(eye.duration)}")
+        sheet.computed(
+            "M",
+            "limit of the eye (MPE)",
+            limit,
+            unit,
+            "H(te) / te",
+            f"{formula} / {put(eye.duration)}",
+        )
         return
     single = eye_mpe_formula(beam.wavelength, beam.pulse_duration)
-    sheet.computed("M1", "limit of one pulse", eye_mpe(beam.wavelength, beam.pulse_duration), unit, "H(tp)", single)
+    sheet.computed(
+        "M1",
+        "limit of one pulse",
+        eye_mpe(beam.wavelength, beam.pulse_duration),
+        unit,
+        "H(tp)",
+        single,
+    )
     if beam.repetition_rate is None or eye.duration * beam.repetition_rate <= 1:
         sheet.computed("M", "limit of the eye (MPE)", limit, unit, "M1")
         return
-    train = train_limit(beam.wavelength, beam.pulse_duration, beam.repetition_rate, eye.duration, rule)
-    by_mean = f"{whole} / ({put(eye.duration)} * {put(beam.repetition_rate)})"
-    sheet.computed("M2", "limit of a pulse by the mean of the train", train.mean, unit, "H(te) / (te * f)", by_mean)
-    least = "min(M1, M2)"
+    train = train_limit(
+        beam.wavelength, beam.pulse_duration, beam.repetition_rate, eye.duration, rule
+    )
+    by_mean = f"{formula} / ({put(eye.duration)} * {put(beam.repetition_rate)})"
+    sheet.computed(
+        "M2",
+        "limit of a pulse by the mean of the train",
+        train.mean,
+        unit,
+        "H(te) / (te * f)",
+        by_mean,
+    )
+    smallest = "min(M1, M2)"
     if math.isfinite(train.repeated):
-        least = "min(M1, M2, M3)"
+        smallest = "min(M1, M2, M3)"
         group = train.repeated * train.together / train.factor
         sheet.given("Hg", "limit of one pulse, or of a group that counts as one", group, unit)
         sheet.given("g", "pulses that count as one", train.together)
         sheet.given("N", "pulses or groups that are counted", train.groups)
         sheet.given("C5", f"factor of repeated pulses by the rule {rule}", train.factor)
-        sheet.computed("M3", "limit of a pulse among repeated pulses", train.repeated, unit, "Hg / g * C5")
-    sheet.computed("M", "limit of the eye (MPE)", limit, unit, least)
+        sheet.computed(
+            "M3", "limit of a pulse among repeated pulses", train.repeated, unit, "Hg / g * C5"
+        )
+    sheet.computed("M", "limit of the eye (MPE)", limit, unit, smallest)
 
 
-def _dazzle(sheet: Sheet, found: Estimate) -> None:
-    """Add the maximum dazzle exposure at the smallest angle, the least of all angles, and its distance."""
-    if not found.eye_dazzle.rows:
+def _dazzle(sheet: Sheet, estimate: Estimate) -> None:
+    """Add the maximum dazzle exposure at the smallest angle, the least of all angles, and its
+    distance.
+    """
+    if not estimate.eye_dazzle.rows:
         return
-    sheet.given("V", "V(lambda)", found.eye_dazzle.efficiency)
-    sheet.given("P", "mean power", found.exposures.beams[0].power or 0.0, "W")
-    nearest = min(row.angle for row in found.eye_dazzle.rows)
-    rows = [row for row in found.eye_dazzle.rows if row.angle == nearest]
+    sheet.given("V", "V(lambda)", estimate.eye_dazzle.efficiency)
+    sheet.given("P", "mean power", estimate.exposures.beams[0].power or 0.0, "W")
+    nearest = min(row.angle for row in estimate.eye_dazzle.rows)
+    rows = [row for row in estimate.eye_dazzle.rows if row.angle == nearest]
     for number, row in enumerate(rows, 1):
         _dazzle_row(sheet, number, row)
 
@@ -295,22 +372,22 @@ def _dazzle_row(sheet: Sheet, number: int, row: EyeDazzleRow) -> None:
     sheet.computed(f"NODD{number}", f"{where}: dazzle distance", row.distance.value, "m", reach)
 
 
-def _dazzle_text(found: Estimate) -> str:
-    dazzle, asked = found.eye_dazzle, found.safety.settings.eye.dazzle
+def _dazzle_text(estimate: Estimate) -> str:
+    dazzle, asked = estimate.eye_dazzle, estimate.safety.settings.eye.dazzle
     if dazzle.reason:
         return f"Not judged: {dazzle.reason}."
     size = math.degrees(asked.size) * 60
     return (
-        f"Target of {size:.3g} arc minutes and contrast {asked.contrast:g}, viewer of {asked.age:g} years, margin "
-        f"{asked.margin:g}. Source: {dazzle.source}."
+        f"Target of {size:.3g} arc minutes and contrast {asked.contrast:g}, viewer of {asked.age:g}"
+        f" years, margin {asked.margin:g}. Source: {dazzle.source}."
     )
 
 
-def _assumed(found: Estimate) -> str:
-    laws = "; ".join(f"{name} {text}" for name, text in found.draws.laws.items())
+def _assumed(estimate: Estimate) -> str:
+    laws = "; ".join(f"{name} {text}" for name, text in estimate.draws.laws.items())
     drawn = f"Uncertain: {laws}. The values above are the nominal ones. " if laws else ""
     return (
-        f"{drawn}The beam is Gaussian and hits the middle of the lens. Limits of the eye hold for the unaided eye and "
-        "a small source, in clear air; reflections, binoculars and beams that sweep are not in them. "
-        f"{CERTIFICATE}"
+        f"{drawn}The beam is Gaussian and hits the middle of the lens. Limits of the eye hold for"
+        " the unaided eye and a small source, in clear air; reflections, binoculars and beams that"
+        f" sweep are not in them. {CERTIFICATE}"
     )

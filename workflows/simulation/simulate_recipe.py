@@ -1,4 +1,6 @@
-"""Run of a recipe, and the folder of the run: page, pictures, numbers, data files and provenance."""
+"""Run of a recipe, and the folder of the run: page, pictures, numbers, data files and
+provenance.
+"""
 
 from __future__ import annotations
 
@@ -10,21 +12,19 @@ from pathlib import Path
 from typing import Any
 
 from neusee.workflows.engine.local_executor import memory_limit
-from neusee.workflows.engine.memory_watch import MemoryLimit, guarded, limited
+from neusee.workflows.engine.memory_limits import MemoryLimit, guarded, limited
 from neusee.workflows.engine.provenance import timestamp
 from neusee.workflows.engine.runner import Result, run
 from neusee.workflows.engine.step_job import Executor
 from neusee.workflows.explain.why_rerun import explained
-from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.graph.step_record import Event, StepRecord
+from neusee.workflows.graph.recipe_graph import Event, Recipe, StepRecord
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.report import run_html, run_page, run_timing
+from neusee.workflows.report import run_folder, run_page
+from neusee.workflows.report import run_page as run_timing
 from neusee.workflows.report.contents import wanted
 from neusee.workflows.report.data_exports import data_files, exports
-from neusee.workflows.report.files_beside import FilesBeside
-from neusee.workflows.report.graph_ahead import GraphAhead
-from neusee.workflows.report.run_code import code_text
-from neusee.workflows.report.run_folder import NotWritten, RunFolder, new_run
+from neusee.workflows.report.files_beside import FilesBeside, GraphAhead
+from neusee.workflows.report.run_folder import NotWritten, RunFolder, code_text, new_run
 from neusee.workflows.report.run_pictures import (
     GRAPH_DRAWING,
     TIMELINE_DRAWING,
@@ -42,7 +42,9 @@ from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 @dataclass(frozen=True)
 class Simulation:
-    """A finished run: the path of its folder, the content of its file ``provenance.json``, and its stored files."""
+    """A finished run: the path of its folder, the content of its file ``provenance.json``, and
+    its stored files.
+    """
 
     folder: Path
     document: dict[str, Any]
@@ -65,9 +67,11 @@ def simulate(
     memory: int | None = None,
     anew: Sequence[str] = (),
 ) -> Simulation:
-    """Run a recipe and write the folder ``runs/<date>_<recipe>_<key>/``; after an error no folder remains.
+    """Run a recipe and write the folder ``runs/<date>_<recipe>_<key>/``; after an error no folder
+    remains.
 
-    The steps ``anew``, and all that follow from them, are computed although their results are stored.
+    The steps ``anew``, and all that follow from them, are computed although their results are
+    stored.
     """
     finished: dict[str, StepRecord] = {}
     began = timestamp()
@@ -85,14 +89,18 @@ def simulate(
     ):
         warnings.simplefilter("default")
         recipe = with_substitutions(recipe, wanted(recipe))
-        told, graph = explained(recipe, store, note), GraphAhead(beside, store, finished)
+        explained_run, graph = explained(recipe, store, note), GraphAhead(beside, store, finished)
 
         def show(*result: Any) -> None:
             beside(*result)
             graph(*result)
 
-        result = run(recipe, store, wanted(recipe), told, device, executor, memory, show, anew=anew)
-        result = replace(result, done={name: finished.get(name, done) for name, done in result.done.items()})
+        result = run(
+            recipe, store, wanted(recipe), explained_run, device, executor, memory, show, anew=anew
+        )
+        result = replace(
+            result, done={name: finished.get(name, done) for name, done in result.done.items()}
+        )
         key = digest([[name, result.keys[name]] for name in wanted(result.recipe)])
         with limited(memory_limit(memory)), _watched(), new_run(runs, recipe.name, key) as folder:
             folder.said = {"began": began}
@@ -102,7 +110,9 @@ def simulate(
 
 @contextmanager
 def _watched() -> Iterator[None]:
-    """Raise `NotWritten` if the memory of the process exceeds its limit while the report is written."""
+    """Raise `NotWritten` if the memory of the process exceeds its limit while the report is
+    written.
+    """
     try:
         with guarded():
             yield
@@ -123,31 +133,40 @@ def _write(
     caught: Sequence[warnings.WarningMessage],
     beside: FilesBeside,
 ) -> dict[str, Any]:
-    """Write the folder of a run: all that shows no picture while the last pictures are drawn, and then the page."""
+    """Write the folder of a run: all that shows no picture while the last pictures are drawn,
+    and then the page.
+    """
     bars, finish = folder.path / "figures" / "timeline.png", _last_pictures(result, folder, beside)
     doc = run_page.document(result, command)
     folder.write("code.json", code_text(result))
     folder.write("recipe.yaml", recipe_text(result.recipe))
     folder.write_rows("metrics.csv", ("step", "field", "index", "value"), doc["metrics"])
     folder.write_rows("timing.csv", run_timing.COLUMNS, run_timing.rows(doc["steps"]))
-    run_html.prepare()
+    run_folder.prepare()
     finish()
     drawn, missing = pictures(result, shelf)
     files, refused = exports(result, shelf)
-    doc = run_page.with_pictures(doc, files, missing, refused, (str(warning.message) for warning in caught))
+    doc = run_page.with_pictures(
+        doc, files, missing, refused, (str(warning.message) for warning in caught)
+    )
     folder.said |= doc
     for name, path in drawn.items():
         folder.take(f"figures/{name}.png", path)
     for name, path in files.items():
         folder.take(f"data/{name}", path)
     shown = {**drawn, **({"timeline": bars} if bars.exists() else {})}
-    folder.write("provenance.json", run_html.document_text(doc))
-    folder.write("report.html", run_html.page(doc, {name: path.read_bytes() for name, path in shown.items()}))
+    folder.write("provenance.json", run_folder.document_text(doc))
+    folder.write(
+        "report.html",
+        run_folder.page(doc, {name: path.read_bytes() for name, path in shown.items()}),
+    )
     return doc
 
 
 def _last_pictures(result: Result, folder: RunFolder, beside: FilesBeside) -> Callable[[], None]:
-    """Begin the pictures that show no result of a step; return a function that waits for all pictures and files."""
+    """Begin the pictures that show no result of a step; return a function that waits for all
+    pictures and files.
+    """
     times = timeline(result)
     bars = folder.place("figures/timeline.png")
     wait = beside.draw(bars, TIMELINE_DRAWING, times) if times else None
@@ -163,6 +182,11 @@ def _last_pictures(result: Result, folder: RunFolder, beside: FilesBeside) -> Ca
 
 
 def recipe_text(recipe: Recipe) -> str:
-    """Return the recipe as YAML that can be run again: all final values, with the source of each as a comment."""
-    head = f"# {recipe.title or recipe.name}\n# Final values; the comment after each value names its source.\n"
+    """Return the recipe as YAML that can be run again: all final values, with the source of each
+    as a comment.
+    """
+    head = (
+        f"# {recipe.title or recipe.name}\n# Final values; the comment after each value names its"
+        " source.\n"
+    )
     return head + recipe.config.to_yaml()

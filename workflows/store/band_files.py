@@ -1,9 +1,10 @@
-"""Band files: files with one spectral band each, shared by all stored results that contain the band.
+"""Band files: files with one spectral band each, shared by all stored results that contain the
+band.
 
-A band file (a blob) holds the bytes of a slice and a trailer with type, shape, format version, name, signature,
-checksum and the trailer's length. The bytes begin at the start of the file, so that slices of whole memory pages are
-mapped side by side into one address range, which gives a contiguous tensor without a copy. The maps are private: a
-write to the tensor changes no file.
+A band file (a blob) holds the bytes of a slice and a trailer with type, shape, format version,
+name, signature, checksum and the trailer's length. The bytes begin at the start of the file, so
+that slices of whole memory pages are mapped side by side into one address range, which gives a
+contiguous tensor without a copy. The maps are private: a write to the tensor changes no file.
 """
 
 from __future__ import annotations
@@ -28,8 +29,16 @@ import torch
 import xxhash
 from torch import Tensor
 
-from neusee.workflows.keys.seal import FORMAT, NotRead, OtherFormat, check_signature, may_change, secrets, signature
-from neusee.workflows.store.layout_check import is_band, is_checksum, is_shape
+from neusee.workflows.keys.sealed_files import (
+    FORMAT,
+    NotRead,
+    OtherFormat,
+    check_signature,
+    may_change,
+    secrets,
+    signature,
+)
+from neusee.workflows.store.metadata import is_band, is_checksum, is_shape
 from neusee.workflows.store.shared_folder import Disk, open_now
 
 _SMALL = 4096  #: bytes up to which a blob is not synced to disk: a torn blob fails its checksum
@@ -39,7 +48,11 @@ _LIBC = ctypes.CDLL(None, use_errno=True) if sys.platform in ("linux", "darwin")
 _PIECE = 1 << 18  #: bytes of a file that are read at once
 _UNREADABLE = (FileNotFoundError, ValueError, LookupError, TypeError, AttributeError, RuntimeError)
 _TAIL = 1024  #: bytes at the end of a band file that contain its trailer
-_DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in vars(torch).values() if isinstance(dtype, torch.dtype)}
+_DTYPES = {
+    str(dtype).removeprefix("torch."): dtype
+    for dtype in vars(torch).values()
+    if isinstance(dtype, torch.dtype)
+}
 
 if _LIBC is not None:
     _LIBC.mmap.restype = ctypes.c_void_p
@@ -48,7 +61,9 @@ if _LIBC is not None:
 
 
 class Damaged(ValueError):
-    """Error for a band file that is missing or damaged, so that its spectral band must be computed again."""
+    """Error for a band file that is missing or damaged, so that its spectral band must be
+    computed again.
+    """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +75,9 @@ class Stacked:
 
 
 class Blob(NamedTuple):
-    """Type, shape, checksum and signature of a spectral band, as stored at the end of its band file."""
+    """Type, shape, checksum and signature of a spectral band, as stored at the end of its band
+    file.
+    """
 
     dtype: torch.dtype
     shape: tuple[int, ...]
@@ -90,7 +107,9 @@ class Blobs:
         return name not in self._lost and os.path.exists(self.path(name))
 
     def about(self, name: str) -> Blob:
-        """Return the type, shape and checksum of a stored band; raise `Damaged` if its file is missing or damaged."""
+        """Return the type, shape and checksum of a stored band; raise `Damaged` if its file is
+        missing or damaged.
+        """
         try:
             with open(self.path(name), "rb", opener=open_now) as file:
                 return _trailer(file.fileno(), name)[0]
@@ -98,7 +117,9 @@ class Blobs:
             raise self._damaged(name, error) from None
 
     def write(self, name: str, x: Tensor) -> str:
-        """Write the band ``x`` unless its file exists; return the checksum (xxh3) of the stored band."""
+        """Write the band ``x`` unless its file exists; return the checksum (xxh3) of the stored
+        band.
+        """
         if self.has(name):
             with suppress(Damaged):
                 blob = self.about(name)
@@ -108,27 +129,31 @@ class Blobs:
         data, kind = bytes_of(x), _kind(x.dtype, tuple(x.shape), name)
         kind = _signed(kind, signature("band", name, _sha256(data, kind)) if secrets() else "")
         xxh3 = _checksum(data, kind)
-        with self._disk.temporary(name) as (part, file):
+        with self._disk.temporary(name) as (temporary, file):
             for piece in (data, kind, xxh3.encode(), len(kind).to_bytes(4, "little")):
                 file.write(piece)
             file.flush()
             if len(data) > _SMALL:
                 os.fsync(file.fileno())
-            return self._named(name, part) or xxh3
+            return self._named(name, temporary) or xxh3
 
     def write_all(self, names: Sequence[str], slices: Sequence[Tensor]) -> list[str]:
-        """Write several bands in parallel, because a disk syncs many files in little more time than one file."""
+        """Write several bands in parallel, because a disk syncs many files in little more time
+        than one file.
+        """
         with ThreadPoolExecutor(_WRITERS) as pool:
             return list(pool.map(self.write, names, slices))
 
-    def _named(self, name: str, part: str) -> str | None:
-        """Rename a complete temporary file to the name of its band, or return the checksum of the file of that name."""
+    def _named(self, name: str, temporary: str) -> str | None:
+        """Rename a complete temporary file to the name of its band, or return the checksum of
+        the file of that name.
+        """
         self._disk.make_folder(self._folder)
-        if name in self._lost or not self._disk.link(part, self.path(name)):
+        if name in self._lost or not self._disk.link(temporary, self.path(name)):
             if name not in self._lost:
                 with suppress(Damaged):
                     return self.about(name).xxh3
-            self._disk.rename(part, self.path(name))
+            self._disk.rename(temporary, self.path(name))
             self._lost.discard(name)
         return None
 
@@ -140,40 +165,55 @@ class Blobs:
         verify: bool = True,
         xxh3: Sequence[str] | None = None,
     ) -> Tensor:
-        """Return one contiguous tensor whose slices along the first axis are the stored bands ``names``.
+        """Return one contiguous tensor whose slices along the first axis are the stored bands
+        ``names``.
 
-        The files are mapped if a slice consists of whole memory pages, otherwise copied. ``verify`` compares the
-        checksum of every byte; ``xxh3`` lists the expected checksums. Raises `Damaged` for a missing or damaged file,
-        which then counts as missing.
+        The files are mapped if a slice consists of whole memory pages, otherwise copied. ``verify``
+        compares the checksum of every byte; ``xxh3`` lists the expected checksums. Raises `Damaged`
+        for a missing or damaged file, which then counts as missing.
         """
         if bad := [name for name in names if not is_band(name)]:
             raise Damaged(f"{bad[0]!r} is not the name of a band")
-        expected = [Blob(dtype, tuple(shape[1:]), xxh3[i] if xxh3 else "", name) for i, name in enumerate(names)]
+        expected = [
+            Blob(dtype, tuple(shape[1:]), xxh3[i] if xxh3 else "", name)
+            for i, name in enumerate(names)
+        ]
         size = expected[0].nbytes if expected else 0
         if not size:
             return torch.empty(*shape, dtype=dtype)
         if (first := self.about(names[0]))[:2] != expected[0][:2]:  # before memory is reserved
-            error = ValueError(f"it holds {first.dtype} {first.shape}, not {dtype} {expected[0].shape}")
+            error = ValueError(
+                f"it holds {first.dtype} {first.shape}, not {dtype} {expected[0].shape}"
+            )
             raise self._damaged(names[0], error)
         if _LIBC is not None and size % mmap.PAGESIZE == 0:
             with suppress(OSError):  # a file system or a limit that allows no maps
                 space = _reserve(len(names) * size)
-                self._fill(names, expected, memoryview(space).cast("B"), ctypes.addressof(space), verify)
+                self._fill(
+                    names, expected, memoryview(space).cast("B"), ctypes.addressof(space), verify
+                )
                 return torch.frombuffer(space, dtype=dtype).reshape(*shape)
         x = torch.empty(*shape, dtype=dtype)
         self._fill(names, expected, bytes_of(x), None, verify)
         return x
 
     def _fill(
-        self, names: Sequence[str], expected: Sequence[Blob], into: memoryview, address: int | None, verify: bool
+        self,
+        names: Sequence[str],
+        expected: Sequence[Blob],
+        into: memoryview,
+        address: int | None,
+        verify: bool,
     ) -> None:
-        """Load stored bands side by side into memory; map the files if an ``address`` is given, else read the files."""
+        """Load stored bands side by side into memory; map the files if an ``address`` is given,
+        else read the files.
+        """
         size = expected[0].nbytes
         for i, (name, blob) in enumerate(zip(names, expected, strict=True)):
             try:
                 with open(self.path(name), "rb", opener=open_now) as file:
-                    at = address and address + i * size
-                    _load(file, blob, into[i * size : (i + 1) * size], at, verify)
+                    start = address and address + i * size
+                    _load(file, blob, into[i * size : (i + 1) * size], start, verify)
             except (OSError, *_UNREADABLE) as error:
                 if address is not None and not isinstance(error, _UNREADABLE):
                     raise
@@ -184,7 +224,9 @@ class Blobs:
         return f"{self._folder}/{name[:2]}/{name}"
 
     def _damaged(self, name: str, error: Exception) -> Damaged:
-        """Move a damaged band file to the folder ``bad/`` of the store for inspection; return the error to raise."""
+        """Move a damaged band file to the folder ``bad/`` of the store for inspection; return
+        the error to raise.
+        """
         self._lost.add(name)
         if not isinstance(error, OSError | NotRead) and is_band(name):
             self._disk.put_aside(self.path(name))
@@ -194,13 +236,16 @@ class Blobs:
 def bytes_of(x: Tensor) -> memoryview:
     """Return the bytes of a tensor, without a copy if the tensor is contiguous and on the CPU."""
     flat = x.detach().cpu().resolve_conj().resolve_neg().contiguous().reshape(-1)
-    if flat.stride() != (1,):  # a single element is contiguous whatever its stride, but cannot be viewed as bytes
+    # a single element is contiguous whatever its stride, but cannot be viewed as bytes
+    if flat.stride() != (1,):
         flat = flat.clone(memory_format=torch.contiguous_format)
     return flat.view(torch.uint8).numpy().data
 
 
 def dtype_of(name: str) -> torch.dtype:
-    """Return the torch dtype with a name such as ``float32``; raise `ValueError` for an unknown name."""
+    """Return the torch dtype with a name such as ``float32``; raise `ValueError` for an unknown
+    name.
+    """
     if name not in _DTYPES:
         raise ValueError(f"{name!r} is not a dtype of torch")
     return _DTYPES[name]
@@ -238,7 +283,8 @@ def _sha256(data: memoryview, kind: bytes) -> bytes:
 
 
 def _trailer(file: int, name: str) -> tuple[Blob, bytes]:
-    """Return what the end of the band file ``name`` says, and the part of it that the checksum covers.
+    """Return what the end of the band file ``name`` says, and the part of it that the checksum
+    covers.
 
     Raises `OtherFormat` for a file of another version, and `ValueError` for a wrong size or name.
     """
@@ -252,34 +298,49 @@ def _trailer(file: int, name: str) -> tuple[Blob, bytes]:
     if not isinstance(said, list) or len(said) < 2:
         raise ValueError("the trailer of the band file is not what was written")
     if said[2:3] != [FORMAT] or len(said) != 5:
-        raise OtherFormat(f"its format is version {said[2] if len(said) > 2 else 1!r}, not version {FORMAT}")
+        raise OtherFormat(
+            f"its format is version {said[2] if len(said) > 2 else 1!r}, not version {FORMAT}"
+        )
     (dtype, shape, _, own, sign), xxh3 = said, body[length:].decode(errors="replace")
     if own != name or not isinstance(sign, str) or not is_shape(shape) or not is_checksum(xxh3):
-        raise ValueError(f"the band file belongs to the band {own!r}, or its trailer is not what was written")
+        raise ValueError(
+            f"the band file belongs to the band {own!r}, or its trailer is not what was written"
+        )
     blob = Blob(dtype_of(str(dtype)), tuple(shape), xxh3, name, sign)
     if size != blob.nbytes + length + 36:
-        raise ValueError(f"the band file has {size} bytes instead of {blob.nbytes + length + 36} bytes")
+        raise ValueError(
+            f"the band file has {size} bytes instead of {blob.nbytes + length + 36} bytes"
+        )
     return blob, body[:length]
 
 
-def _load(file: BufferedReader, expected: Blob, into: memoryview, address: int | None, verify: bool) -> None:
-    """Load a band file into memory; raise `ValueError` if the file holds another band or damaged bytes.
+def _load(
+    file: BufferedReader, expected: Blob, into: memoryview, address: int | None, verify: bool
+) -> None:
+    """Load a band file into memory; raise `ValueError` if the file holds another band or damaged
+    bytes.
 
-    It is mapped to ``address``, if that is given and nobody else could change the file after its check.
+    It is mapped to ``address``, if that is given and nobody else could change the file after its
+    check.
     """
     blob, kind = _trailer(file.fileno(), expected.name)
     if blob[:2] != expected[:2]:
-        raise ValueError(f"the band file holds {blob.dtype} {blob.shape}, not {expected.dtype} {expected.shape}")
+        raise ValueError(
+            f"the band file holds {blob.dtype} {blob.shape}, not {expected.dtype} {expected.shape}"
+        )
     if expected.xxh3 and blob.xxh3 != expected.xxh3:
-        raise ValueError("the band file holds a different band than the band that was written with this result")
+        raise ValueError(
+            "the band file holds a different band than the band that was written with this result"
+        )
     copied = address is None or may_change(file.fileno())
-    # a map is looked into once the file was read: where a device fails, a read raises an error and ends no process
-    found = "" if copied or not verify else _checksum_read(file, blob.nbytes, kind)
+    # a map is looked into once the file was read: where a device fails, a read raises an error and
+    # ends no process
+    checksum = "" if copied or not verify else _checksum_read(file, blob.nbytes, kind)
     if address is not None:
         _map(None if copied else file.fileno(), address, blob.nbytes)
     if copied and file.readinto(into) != len(into):
         raise ValueError("the band file was truncated while it was read")
-    if verify and (found or _checksum(into, kind)) != blob.xxh3:
+    if verify and (checksum or _checksum(into, kind)) != blob.xxh3:
         raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
     if secrets():
         plain = _kind(blob.dtype, blob.shape, blob.name)
@@ -287,20 +348,28 @@ def _load(file: BufferedReader, expected: Blob, into: memoryview, address: int |
 
 
 def _reserve(size: int) -> Any:
-    """Reserve ``size`` bytes of the address space, which are released when the returned array is deleted."""
+    """Reserve ``size`` bytes of the address space, which are released when the returned array is
+    deleted.
+    """
     assert _LIBC is not None
     flags = mmap.MAP_PRIVATE | mmap.MAP_ANON
     address = _LIBC.mmap(None, size, 0, flags, -1, 0)
     if address in (None, ctypes.c_void_p(-1).value):
-        raise OSError(ctypes.get_errno(), "the address space has no free range for the band files of a tensor")
+        raise OSError(
+            ctypes.get_errno(), "the address space has no free range for the band files of a tensor"
+        )
     space = (ctypes.c_char * size).from_address(address)
-    weakref.finalize(space, _LIBC.munmap, address, size).atexit = False  # a thread may use it until the very end
+    # a thread may use it until the very end
+    weakref.finalize(space, _LIBC.munmap, address, size).atexit = False
     return space
 
 
 def _map(file: int | None, address: int, size: int) -> None:
     """Map a file, or empty memory if it is None, to an address."""
     assert _LIBC is not None
-    access, kind = mmap.PROT_READ | mmap.PROT_WRITE, mmap.MAP_PRIVATE | _FIXED | (mmap.MAP_ANON if file is None else 0)
+    access, kind = (
+        mmap.PROT_READ | mmap.PROT_WRITE,
+        mmap.MAP_PRIVATE | _FIXED | (mmap.MAP_ANON if file is None else 0),
+    )
     if _LIBC.mmap(address, size, access, kind, -1 if file is None else file, 0) != address:
         raise OSError(ctypes.get_errno(), "the band file cannot be mapped into memory")

@@ -1,4 +1,5 @@
-"""Files derived from results, such as pictures, stored by key so that a second run reuses the files.
+"""Files derived from results, such as pictures, stored by key so that a second run reuses the
+files.
 
 The files are in the folder ``files/`` of the store; their checksums are results of the store.
 """
@@ -19,8 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import xxhash
 
-from neusee.workflows.keys.inherited_modes import make_folders
-from neusee.workflows.keys.seal import secrets
+from neusee.workflows.keys.sealed_files import make_folders, secrets
 from neusee.workflows.store.metadata import is_kept
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.shared_folder import open_now
@@ -33,19 +33,24 @@ _FAST = xxhash.xxh3_128
 
 
 class DerivedFiles:
-    """Files derived from results, in the folder of a store, or in a temporary folder if the store cannot be written."""
+    """Files derived from results, in the folder of a store, or in a temporary folder if the
+    store cannot be written.
+    """
 
     def __init__(self, store: Store) -> None:
         self.store = store
         self.folder = store.root / "files"
         self._spare = ""  # a temporary folder, which goes with this object
         self._failing = threading.Lock()  # two threads make files
-        self._fresh: dict[Path, tuple[int, ...]] = {}  # what the system said of each file when it was right
+        # what the system said of each file when it was right
+        self._fresh: dict[Path, tuple[int, ...]] = {}
 
     def find(self, key: str, suffix: str) -> Path | None:
-        """Return the path of the derived file ``key``, or None if it is missing, or has a wrong name or checksum.
+        """Return the path of the derived file ``key``, or None if it is missing, or has a wrong
+        name or checksum.
 
-        A file that this object has written or compared is not compared again while it is the same to the system.
+        A file that this object has written or compared is not compared again while it is the same
+        to the system.
         """
         from torch import Tensor
 
@@ -60,14 +65,15 @@ class DerivedFiles:
                 return path
         return None
 
-    def keep(self, key: str, suffix: str, what: str, write: Callable[[Path], None]) -> Path:
-        """Let ``write`` write a file beside its final path, rename the file, and store its checksum; return its path.
+    def keep(self, key: str, suffix: str, step: str, write: Callable[[Path], None]) -> Path:
+        """Let ``write`` write a file beside its final path, rename the file, and store its
+        checksum; return its path.
 
-        The file is read-only. If the folder cannot be written, or the file not be read again, it is written into a
-        temporary folder.
+        The file is read-only. If the folder cannot be written, or the file not be read again, it is
+        written into a temporary folder.
         """
         try:
-            path, found = self._compared(key, suffix, write)
+            path, digest = self._compared(key, suffix, write)
         except OSError as error:
             self.store.report_failure(error)
             with self._failing:
@@ -75,36 +81,40 @@ class DerivedFiles:
                     self._spare = mkdtemp(prefix="neusee-")
                     weakref.finalize(self, _remove, self._spare, os.getpid())
                 self.folder = Path(self._spare)
-            path, found = self._compared(key, suffix, write)
+            path, digest = self._compared(key, suffix, write)
         about = {
-            "step": what,
+            "step": step,
             "seconds": 0.0,
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "file": path.name,
             "file_bytes": path.stat().st_size,
         }
-        self.store.put(key, found, about)
+        self.store.put(key, digest, about)
         self._fresh[path] = _state(path)
         return path
 
     def _path(self, key: str, suffix: str) -> Path:
         return self.folder / key[:2] / f"{key}{suffix}"
 
-    def _compared(self, key: str, suffix: str, write: Callable[[Path], None]) -> tuple[Path, Tensor]:
-        """Return the path of a file that is written now, and the digest of what the device gives back of it."""
+    def _compared(
+        self, key: str, suffix: str, write: Callable[[Path], None]
+    ) -> tuple[Path, Tensor]:
+        """Return the path of a file that is written now, and the digest of what the device gives
+        back of it.
+        """
         path = self._written(key, suffix, write)
         return path, _digest(path, "sha256" if secrets() else _FAST)
 
     def _written(self, key: str, suffix: str, write: Callable[[Path], None]) -> Path:
         path = self._path(key, suffix)
         make_folders(str(path.parent), str(self.store.root))
-        part = path.with_name(f".{key}.{os.getpid()}{suffix}")
+        temporary = path.with_name(f".{key}.{os.getpid()}{suffix}")
         try:
-            write(part)
-            part.chmod(0o444)
-            part.replace(path)
+            write(temporary)
+            temporary.chmod(0o444)
+            temporary.replace(path)
         finally:
-            part.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
         return path
 
 
@@ -119,17 +129,21 @@ def _state(path: Path) -> tuple[int, ...]:
     return about.st_ino, about.st_size, about.st_mtime_ns
 
 
-def _is_right(path: Path, kept: Tensor) -> bool:
-    """Return True if a file has the digest that was stored: SHA-256, or the faster xxh3 where nothing is signed."""
+def _is_right(path: Path, stored_digest: Tensor) -> bool:
+    """Return True if a file has the digest that was stored: SHA-256, or the faster xxh3 where
+    nothing is signed.
+    """
     import torch
 
-    signed = len(kept) == _SHA256
-    return (signed or not secrets()) and torch.equal(kept, _digest(path, "sha256" if signed else _FAST))
+    signed = len(stored_digest) == _SHA256
+    return (signed or not secrets()) and torch.equal(
+        stored_digest, _digest(path, "sha256" if signed else _FAST)
+    )
 
 
-def _digest(path: Path, how: Any) -> Tensor:
+def _digest(path: Path, algorithm: Any) -> Tensor:
     """Return a digest of a file as bytes."""
     import torch
 
     with open(path, "rb", opener=open_now) as file:
-        return torch.tensor(list(hashlib.file_digest(file, how).digest()), dtype=torch.uint8)
+        return torch.tensor(list(hashlib.file_digest(file, algorithm).digest()), dtype=torch.uint8)

@@ -1,7 +1,8 @@
-"""Journal of a store: one line for every finished result, so that a query reads one file instead of all results.
+"""Journal of a store: one line for every finished result, so that a query reads one file instead of
+all results.
 
-No result depends on the journal. Each line is one write and has its own seal; a line that is torn, damaged or out of
-range is skipped. A journal that is missing or
+No result depends on the journal. Each line is one write and has its own seal; a line that is torn,
+damaged or out of range is skipped. A journal that is missing or
 damaged is rebuilt from the metadata of the results.
 """
 
@@ -17,9 +18,9 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from typing import Any, BinaryIO
 
-from neusee.workflows.keys.seal import FORMAT, seal_record, unseal_record
+from neusee.workflows.keys.sealed_files import FORMAT, seal_record, unseal_record
 from neusee.workflows.store import metadata
-from neusee.workflows.store.metadata_fields import FIELDS, is_text
+from neusee.workflows.store.metadata import FIELDS, is_text
 from neusee.workflows.store.shared_folder import Disk, append, read_file
 
 Row = dict[str, Any]
@@ -37,14 +38,21 @@ _TOTALS = re.compile(rb'^%s([^"]+)".*?,"bytes":(\d*).*?,"kept":(true|false)' % _
 def row_of(key: str, about: Row) -> Row:
     """Return the journal line for the result ``key`` with the metadata ``about``."""
     node = (about.get("origin") or {}).get("node")
-    return {"key": key, **{f: about.get(f) for f in _FIELDS}, "node": node, "kept": metadata.is_kept(about)}
+    return {
+        "key": key,
+        **{f: about.get(f) for f in _FIELDS},
+        "node": node,
+        "kept": metadata.is_kept(about),
+    }
 
 
 class Journal:
     """Journal of one store: a file with one line for each finished result, the newest line last."""
 
     def __init__(self, disk: Disk, others: Callable[[], Iterable[tuple[str, Row]]] = tuple) -> None:
-        """Open the journal of a store; ``others`` yields key and metadata of each result without its own file."""
+        """Open the journal of a store; ``others`` yields key and metadata of each result without
+        its own file.
+        """
         self._disk, self._others, self._guard = disk, others, threading.RLock()
         self._path = f"{disk.folder}/journal.jsonl"
         self._rows: list[Row] = []
@@ -52,7 +60,9 @@ class Journal:
         self._forget()
 
     def append(self, key: str, about: Row) -> None:
-        """Append the line of a result to the journal; ignore a failure, because no result depends on the journal."""
+        """Append the line of a result to the journal; ignore a failure, because no result
+        depends on the journal.
+        """
         with suppress(OSError):
             try:
                 append(self._path, b"\n" + seal_record("journal", row_of(key, about)))
@@ -63,29 +73,32 @@ class Journal:
     def rows(self) -> list[Row]:
         """Return every line of the journal as a dict, which the caller must not change.
 
-        The fields of a line are key, step, recipe, node, seconds, bytes, device, peak, size, date and kept.
+        The fields of a line are key, step, recipe, node, seconds, bytes, device, peak, size, date
+        and kept.
         """
         self._read()
         return self._rows
 
     def latest(self) -> list[Row]:
-        """Return the newest lines of the journal: all of a short one, and some thousand of a long one.
+        """Return the newest lines of the journal: all of a short one, and some thousand of a long
+        one.
 
         The time that this takes does not grow with the number of results.
         """
-        self._read(whole=False)
+        self._read(all_lines=False)
         return self._rows
 
     def totals(self) -> tuple[int, int, int]:
-        """Return the number of stored results, their bytes, and the number of results without a stored value.
+        """Return the number of stored results, their bytes, and the number of results without a
+        stored value.
 
         The lines are counted without a check of their seals.
         """
         newest = dict[bytes, tuple[int, bool]]()
         with suppress(OSError), open(self._path, "rb", opener=_opened) as file:
-            for key, size, kept in _TOTALS.findall(file.read()):
-                newest[key] = int(size or 0), kept == b"true"
-        sizes = [size for size, kept in newest.values() if kept]
+            for key, size, mark in _TOTALS.findall(file.read()):
+                newest[key] = int(size or 0), mark == b"true"
+        sizes = [size for size, has_value in newest.values() if has_value]
         return len(sizes), sum(sizes), len(newest) - len(sizes)
 
     def is_long(self) -> bool:
@@ -102,10 +115,13 @@ class Journal:
         """Record in the journal that the values of ``keys`` are no longer stored."""
         with self._guard:
             self._read()
-            self._replace([{**row, "kept": False} if row["key"] in keys else row for row in self._rows])
+            self._replace(
+                [{**row, "kept": False} if row["key"] in keys else row for row in self._rows]
+            )
 
     def compact(self) -> None:
-        """Rewrite the journal with the newest line of each existing result, and mark the evicted values.
+        """Rewrite the journal with the newest line of each existing result, and mark the evicted
+        values.
 
         Lines are copied as they are, so that a long journal needs little memory.
         """
@@ -115,8 +131,8 @@ class Journal:
             lines = list[tuple[int, str, bytes]]()
             for key in metadata.names(self._disk):
                 with suppress(*metadata.UNREADABLE):
-                    kept = NO_VALUE not in read_file(self._disk.path(key, "json"))
-                    lines.append((place.get(key, -1), *self._line(key, newest.get(key), kept)))
+                    has_value = NO_VALUE not in read_file(self._disk.path(key, "json"))
+                    lines.append((place.get(key, -1), *self._line(key, newest.get(key), has_value)))
             for key, about in self._others():
                 raw = newest.get(key) or seal_record("journal", row_of(key, about))
                 lines.append((place.get(key, -1), str(about.get("date")), raw))
@@ -139,35 +155,40 @@ class Journal:
                     newest[key] = line
         return newest
 
-    def _line(self, key: str, line: bytes | None, kept: bool) -> tuple[str, bytes]:
+    def _line(self, key: str, line: bytes | None, has_value: bool) -> tuple[str, bytes]:
         """Return the date and the line of a result, which is ``line`` if that is right."""
-        if line is not None and kept == (NO_VALUE not in line):
+        if line is not None and has_value == (NO_VALUE not in line):
             return "", line
-        row = row_of(key, metadata.read(self._disk, key)) if line is None else unseal_record("journal", line)
-        return str(row["date"]), seal_record("journal", {**row, "kept": kept})
+        row = (
+            row_of(key, metadata.read(self._disk, key))
+            if line is None
+            else unseal_record("journal", line)
+        )
+        return str(row["date"]), seal_record("journal", {**row, "kept": has_value})
 
     def _forget(self) -> None:
         self._rows = []
         self._head, self._offset, self._fileless, self._whole = b"", 0, False, True
 
-    def _read(self, whole: bool = True) -> None:
+    def _read(self, all_lines: bool = True) -> None:
         with self._guard:
-            if whole and not self._whole:
+            if all_lines and not self._whole:
                 self._forget()
             if not self._fileless:
-                self._read_new_lines(whole)
+                self._read_new_lines(all_lines)
 
-    def _read_new_lines(self, whole: bool) -> None:
-        """Read the lines added to the journal file since the last call; rebuild a missing or damaged file.
+    def _read_new_lines(self, all_lines: bool) -> None:
+        """Read the lines added to the journal file since the last call; rebuild a missing or
+        damaged file.
 
-        If ``whole`` is False, the first call reads the end of the file alone.
+        If ``all_lines`` is False, the first call reads the end of the file alone.
         """
         try:
             with open(self._path, "rb", opener=_opened) as file:
                 head = file.readline(100).strip()
                 if head != self._head or os.fstat(file.fileno()).st_size < self._offset:
                     self._forget()
-                start = self._offset or self._first_byte(file, len(head), whole)
+                start = self._offset or self._first_byte(file, len(head), all_lines)
                 file.seek(start)
                 raw = file.read()
         except FileNotFoundError:
@@ -178,13 +199,19 @@ class Journal:
             return self._rebuild()
         self._head, self._offset = head, start + len(raw)
         self._rows += _parsed(raw)
-        if self._whole and len(self._rows) > _SPARE and len(self._rows) > 2 * len({row["key"] for row in self._rows}):
+        if (
+            self._whole
+            and len(self._rows) > _SPARE
+            and len(self._rows) > 2 * len({row["key"] for row in self._rows})
+        ):
             self._replace(list({row["key"]: row for row in self._rows}.values()))
 
-    def _first_byte(self, file: BinaryIO, head: int, whole: bool) -> int:
-        """Return where the first read begins: after the first line, or at the start of a line near the end."""
+    def _first_byte(self, file: BinaryIO, head: int, all_lines: bool) -> int:
+        """Return where the first read begins: after the first line, or at the start of a line
+        near the end.
+        """
         size = os.fstat(file.fileno()).st_size
-        if whole or size - head <= _LATEST:
+        if all_lines or size - head <= _LATEST:
             return head
         self._whole = False
         file.seek(size - _LATEST)
@@ -199,7 +226,9 @@ class Journal:
         self._replace(sorted(rows, key=lambda row: str(row["date"])))
 
     def _replace(self, rows: list[Row]) -> None:
-        """Replace the journal file by the lines ``rows``; a line that another process adds meanwhile may be lost."""
+        """Replace the journal file by the lines ``rows``; a line that another process adds
+        meanwhile may be lost.
+        """
         self._forget()
         self._replace_lines([seal_record("journal", row) for row in rows])
         self._rows = rows
@@ -229,12 +258,18 @@ def _is_row(row: Row) -> bool:
     if not row.keys() >= _NAMES:
         return False
     key, node = row["key"], row["node"]
-    known = isinstance(key, str) and key.isalnum() and (node is None or is_text(node)) and row["kept"] is not None
-    return known and all(row[name] is None or is_right(row[name]) for name, is_right in _CHECKED)
+    is_valid = (
+        isinstance(key, str)
+        and key.isalnum()
+        and (node is None or is_text(node))
+        and row["kept"] is not None
+    )
+    return is_valid and all(row[name] is None or is_right(row[name]) for name, is_right in _CHECKED)
 
 
 def _opened(path: str, flags: int) -> int:
-    """Open the journal, which is a regular file, without following a symbolic link; never wait for a pipe.
+    """Open the journal, which is a regular file, without following a symbolic link; never wait for
+    a pipe.
 
     Raises `OSError` for anything else, such as a device that never ends.
     """

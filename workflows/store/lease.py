@@ -1,10 +1,13 @@
-"""Leases: only the process that holds the lease of a cache key computes the result that belongs to the key.
+"""Leases: only the process that holds the lease of a cache key computes the result that belongs to
+the key.
 
-A lease is a second hard link to the badge of a process, a file that names the process: one atomic step takes a lease,
-and one heartbeat serves all leases of a process. On the same machine, an observer looks up the owner by process number
-and start time, so that the next process takes over at once after ``kill -9``. An owner on another machine must change
-its badge at intervals. The observer measures the intervals by its own monotonic clock, so that a jump of a clock never
-makes a live owner count as dead. Two processes with the same lease would compute a result twice and do no other harm.
+A lease is a second hard link to the badge of a process, a file that names the process: one atomic
+step takes a lease, and one heartbeat serves all leases of a process. On the same machine, an
+observer looks up the owner by process number and start time, so that the next process takes over at
+once after ``kill -9``. An owner on another machine must change its badge at intervals. The observer
+measures the intervals by its own monotonic clock, so that a jump of a clock never makes a live
+owner count as dead. Two processes with the same lease would compute a result twice and do no other
+harm.
 """
 
 from __future__ import annotations
@@ -15,19 +18,20 @@ import threading
 import time
 from contextlib import suppress
 
-from neusee.workflows.store.process_owner import me, owner_of
-from neusee.workflows.store.shared_folder import Disk, append, open_now
+from neusee.workflows.store.shared_folder import Disk, append, me, open_now, owner_of
 
 BEAT = 2.0  #: s between heartbeats
 WINDOW = 10.0  #: s without a heartbeat after which an owner on another machine counts as dead
 _guard = threading.Lock()
 _held: set[Lease] = set()
-_badges: dict[str, str] = {}  #: path of the badge of this process by folder; a badge is a file that names the process
+#: path of the badge of this process by folder; a badge is a file that names the process
+_badges: dict[str, str] = {}
 _thread: threading.Thread | None = None
 
 
 class Lease:
-    """The right of one process to compute the result of a cache key, until the process calls `release`.
+    """The right of one process to compute the result of a cache key, until the process calls
+    `release`.
 
     The argument ``path`` is the file of the lease, or None if no file can be written.
     """
@@ -39,7 +43,9 @@ class Lease:
         self._inode = os.stat(path).st_ino if path else 0
 
     def release(self) -> None:
-        """Delete the file of the lease, unless another process took the lease or this process is a forked child."""
+        """Delete the file of the lease, unless another process took the lease or this process is
+        a forked child.
+        """
         with _guard:
             if self not in _held:
                 return
@@ -61,10 +67,12 @@ class Leases:
 
     def __init__(self, disk: Disk) -> None:
         self._disk = disk
-        self._seen: dict[str, tuple[object, float]] = {}  #: by path: content, and the time of its first observation
+        #: by path: content, and the time of its first observation
+        self._seen: dict[str, tuple[object, float]] = {}
 
     def claim(self, key: str) -> Lease | None:
-        """Return the lease of ``key``, the right to compute its result, or None while a running process holds it.
+        """Return the lease of ``key``, the right to compute its result, or None while a running
+        process holds it.
 
         A caller that had to wait must look up the result again before it computes the result.
         """
@@ -77,16 +85,18 @@ class Leases:
         try:
             return self._taken(path)
         except FileExistsError:
-            seen = _look(path)
-        if seen is not None and not self._dead(path, seen):
+            look = _look(path)
+        if look is not None and not self._dead(path, look):
             return None
         try:
-            return self._taken_over(key, path, seen)
+            return self._taken_over(key, path, look)
         except FileExistsError:
             return None
 
     def _taken(self, path: str) -> Lease:
-        """Take a free lease; make the folder of leases and the file that identifies this process if needed."""
+        """Take a free lease; make the folder of leases and the file that identifies this process
+        if needed.
+        """
         with _guard:
             try:
                 os.link(_badge(self._disk), path)
@@ -96,24 +106,25 @@ class Leases:
                 os.link(_badge(self._disk), path)
         return self._kept(path)
 
-    def _taken_over(self, key: str, path: str, seen: tuple[object, ...] | None) -> Lease:
+    def _taken_over(self, key: str, path: str, look: tuple[object, ...] | None) -> Lease:
         """Take over the lease of a process that has ended, under the lock of the store.
 
         Raises `FileExistsError` if another process was first.
         """
-        part = f"{self._disk.folder}/tmp/{key}.{me()}.{threading.get_ident()}"
+        temporary = f"{self._disk.folder}/tmp/{key}.{me()}.{threading.get_ident()}"
         with self._disk.lock():
             now = _look(path)
-            if now is not None and (seen is None or now[:2] != seen[:2]):
+            if now is not None and (look is None or now[:2] != look[:2]):
                 raise FileExistsError(path)
             with _guard:
-                os.link(_badge(self._disk), path if now is None else part)  # fails for the later of two observers
+                # fails for the later of two observers
+                os.link(_badge(self._disk), path if now is None else temporary)
             try:
                 if now is not None:
-                    os.replace(part, path)
+                    os.replace(temporary, path)
             finally:
                 with suppress(OSError):
-                    os.unlink(part)
+                    os.unlink(temporary)
         self._disk.sweep()
         return self._kept(path)
 
@@ -128,19 +139,21 @@ class Leases:
                 _thread.start()
         return lease
 
-    def _dead(self, path: str, seen: tuple[object, ...]) -> bool:
-        owner = owner_of(str(seen[0]).partition(" ")[0])
+    def _dead(self, path: str, look: tuple[object, ...]) -> bool:
+        owner = owner_of(str(look[0]).partition(" ")[0])
         state = owner.state if owner else "foreign"
         if state != "foreign":
             return state == "dead"
         now = time.monotonic()
         before, since = self._seen.get(path, (None, now))
-        self._seen[path] = (seen, since if before == seen else now)
-        return before == seen and now - since > WINDOW
+        self._seen[path] = (look, since if before == look else now)
+        return before == look and now - since > WINDOW
 
 
 def _look(path: str) -> tuple[object, ...] | None:
-    """Return the content, inode, size and change time of the file of a lease, or None if the file does not exist."""
+    """Return the content, inode, size and change time of the file of a lease, or None if the
+    file does not exist.
+    """
     try:
         with open(path, "rb", opener=open_now) as file:
             stat, text = os.fstat(file.fileno()), file.readline(200).decode(errors="replace")
@@ -152,7 +165,9 @@ def _look(path: str) -> tuple[object, ...] | None:
 
 
 def _badge(disk: Disk) -> str:
-    """Return the path of the badge of this process, a file that names the process; the first call writes the file."""
+    """Return the path of the badge of this process, a file that names the process; the first
+    call writes the file.
+    """
     if disk.folder not in _badges:
         disk.prepare()
         path = f"{disk.folder}/tmp/badge.{me()}"
@@ -170,7 +185,9 @@ def _badge(disk: Disk) -> str:
 
 
 def _beat() -> None:
-    """Append to the files that identify this process at intervals, as a heartbeat while the process holds leases."""
+    """Append to the files that identify this process at intervals, as a heartbeat while the
+    process holds leases.
+    """
     global _thread
     while True:
         time.sleep(BEAT)
@@ -198,7 +215,9 @@ def retire() -> None:
 
 
 def _forked() -> None:
-    """Forget all leases in a forked child process, because the leases belong to the parent process."""
+    """Forget all leases in a forked child process, because the leases belong to the parent
+    process.
+    """
     global _guard, _thread
     _guard, _thread = threading.Lock(), None
     _held.clear()

@@ -1,53 +1,328 @@
-"""Metadata of a result: one line of JSON that describes the result and ends with its own checksum."""
+"""Metadata of a result: one line of JSON, with a check of its fields and of its layout."""
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from typing import Any, TypeGuard
 
-from neusee.workflows.keys.seal import Kind, NotRead, seal_record, unseal_record
-from neusee.workflows.store.metadata_fields import checked_fields
+from neusee.workflows.keys.sealed_files import (
+    Kind,
+    NotRead,
+    OtherFormat,
+    seal_record,
+    unseal_record,
+)
 from neusee.workflows.store.shared_folder import Disk, entries, read_file
+
+# --- layout check ---------------------------------------------------------------------------------
+
+# Check of the layout of a stored value, which is data that anybody may have written.
+#
+# A layout is a tree of small dicts, each with one kind: ``tensor``, ``bytes``, ``stacked``,
+# ``class``, ``tuple``, ``list``, ``dict`` or ``value``. The check knows no class and makes no
+# value.
+
+
+DEEPEST = 50  #: levels of a layout
+#: a name without a folder in it
+_BAND = re.compile(r"[0-9A-Za-z]{2}[0-9A-Za-z-]{0,100}(\.[0-9]{1,6})?")
+_DIGITS = re.compile(r"[0-9a-f]{32}")
+_KINDS = ("tensor", "bytes", "stacked", "class", "tuple", "list", "dict", "value")
+
+
+def checked_layout(layout: Any) -> dict[str, str]:
+    """Return the checksum (xxh3) of every band file that a layout names, by the name of the band.
+
+    Raises `OtherFormat` for a kind of layout that this program does not know, and `ValueError` for
+    any other mistake.
+    """
+    bands: dict[str, str] = {}
+    todo: list[tuple[Any, int]] = [(layout, 0)]
+    while todo:
+        item, depth = todo.pop()
+        if not isinstance(item, dict) or depth > DEEPEST:
+            raise ValueError("the layout of the value is not a tree of mappings, or is too deep")
+        kinds = [kind for kind in _KINDS if kind in item]
+        if len(kinds) != 1 or len(item) != 1 + ("class" in item):
+            raise OtherFormat(
+                f"its layout has a kind that is not known: {', '.join(map(str, item))[:80]}"
+            )
+        todo += [(inner, depth + 1) for inner in _inner(kinds[0], item, bands)]
+    return bands
+
+
+def _inner(kind: str, item: dict[str, Any], bands: dict[str, str]) -> Iterable[Any]:
+    """Check one level of a layout, add its bands to ``bands``, and return the layouts in it."""
+    body = item[kind]
+    if kind in ("tensor", "bytes"):
+        _expect(is_count(body), kind)
+        return ()
+    if kind == "value":
+        _expect(body is None or isinstance(body, bool | int | float | str), kind)
+        return ()
+    if kind == "stacked":
+        bands |= _stacked(body)
+        return ()
+    if kind == "dict":
+        _expect(isinstance(body, dict), kind)
+        return list(body.values())
+    items = item.get("items") if kind == "class" else body
+    _expect(isinstance(items, list) and (kind != "class" or isinstance(body, str)), kind)
+    assert isinstance(items, list)
+    return items
+
+
+def _stacked(body: Any) -> dict[str, str]:
+    _expect(
+        isinstance(body, dict) and body.keys() == {"names", "xxh3", "dtype", "shape"}, "stacked"
+    )
+    names, sums, shape = body["names"], body["xxh3"], body["shape"]
+    _expect(
+        isinstance(body["dtype"], str) and is_shape(shape) and isinstance(names, list), "stacked"
+    )
+    if bad := [name for name in names if not is_band(name)]:
+        raise ValueError(f"{str(bad[0])[:60]!r} is not the name of a band file")
+    _expect(isinstance(sums, list) and all(map(is_checksum, sums)), "stacked")
+    _expect(shape[:1] == [len(names)] and len(sums) == len(names), "stacked")
+    return dict(zip(names, sums, strict=True))
+
+
+def is_count(value: Any) -> bool:
+    """Return True for an integer from 0 to 2^62."""
+    return type(value) is int and 0 <= value <= 1 << 62
+
+
+def is_shape(value: Any) -> TypeGuard[list[int]]:
+    """Return True for the list of the sizes of a tensor along its axes."""
+    return isinstance(value, list) and len(value) <= 60 and all(map(is_count, value))
+
+
+def is_checksum(value: Any) -> TypeGuard[str]:
+    """Return True for the 32 hexadecimal digits of a checksum."""
+    return isinstance(value, str) and _DIGITS.fullmatch(value) is not None
+
+
+def is_band(value: Any) -> bool:
+    """Return True for the name of a band file, which names no folder."""
+    return isinstance(value, str) and _BAND.fullmatch(value) is not None
+
+
+def are_bands(value: Any) -> TypeGuard[list[str]]:
+    """Return True for a list of names of band files."""
+    return isinstance(value, list) and all(map(is_band, value))
+
+
+def _expect(condition: bool, kind: str) -> None:
+    if not condition:
+        raise ValueError(f"the part {kind} of the layout of the value is not what was written")
+
+
+# --- metadata fields ------------------------------------------------------------------------------
+
+# Check of the metadata of a result, which are data that anybody may have written: types and ranges
+# of the fields.
+
+
+LONGEST = 1e9  #: s; no step takes longer
+LARGEST = 1 << 50  #: bytes; no result or memory is larger
+_LONGEST_TEXT = 4096
+
+
+def is_text(value: Any) -> bool:
+    """Return True for a text of one line without control characters."""
+    return isinstance(value, str) and len(value) <= _LONGEST_TEXT and value.isprintable()
+
+
+def is_seconds(value: Any) -> bool:
+    """Return True for a finite time in s that a step may take."""
+    return is_number(value) and 0 <= value <= LONGEST
+
+
+def is_size(value: Any) -> bool:
+    """Return True for a number of bytes that a result or a memory may have."""
+    return is_number(value) and 0 <= value <= LARGEST
+
+
+def is_number(value: Any) -> bool:
+    """Return True for a finite number."""
+    return type(value) is int or (type(value) is float and math.isfinite(value))
+
+
+def _is_payload(value: Any) -> bool:
+    is_payload = (
+        isinstance(value, dict) and is_count(value.get("size")) and is_checksum(value.get("xxh3"))
+    )
+    sha256, stamp = (
+        (value.get("sha256", ""), value.get("stamp", [])) if is_payload else (None, None)
+    )
+    return is_payload and isinstance(sha256, str) and isinstance(stamp, list)
+
+
+def _is_inline(value: Any) -> bool:
+    return isinstance(value, list) and all(map(_is_tensor, value))
+
+
+def _is_tensor(value: Any) -> bool:
+    if not isinstance(value, list) or len(value) != 4:
+        return False
+    kind, shape, is_complex, text = value
+    return (
+        isinstance(kind, str)
+        and is_shape(shape)
+        and isinstance(is_complex, bool)
+        and isinstance(text, str)
+    )
+
+
+def _is_bands(value: Any) -> bool:
+    return (
+        isinstance(value, dict) and are_bands(value.get("names")) and is_count(value.get("newest"))
+    )
+
+
+def _is_origin(value: Any) -> bool:
+    return isinstance(value, dict) and all(
+        value.get(name) is None or is_text(value[name]) for name in ("node", "code")
+    )
+
+
+def _is_checks(value: Any) -> bool:
+    return isinstance(value, list) and all(
+        isinstance(c, list) and [*map(type, c)] == [str, bool] for c in value
+    )
+
+
+def _is_file(value: Any) -> bool:
+    return is_text(value) and "/" not in value and value not in ("", ".", "..")
+
+
+def _is_error(value: Any) -> bool:
+    return (
+        isinstance(value, list | tuple)
+        and len(value) == 2
+        and all(isinstance(x, int | float) for x in value)
+    )
+
+
+def _is_step_size(value: Any) -> bool:
+    return (
+        isinstance(value, list | tuple)
+        and len(value) == 4
+        and all(is_number(x) and x >= 0 for x in value)
+    )
+
+
+#: what each field must be, unless it is missing or null
+FIELDS: Mapping[str, Callable[[Any], bool]] = {
+    "step": is_text,
+    "recipe": is_text,
+    "date": is_text,
+    "device": is_text,
+    "seconds": is_seconds,
+    "bytes": is_size,
+    "peak": is_size,
+    "size": _is_step_size,
+    "file_bytes": is_size,
+    "kept": lambda value: isinstance(value, bool),
+    "origin": _is_origin,
+    "facts": lambda value: isinstance(value, dict),
+    "versions": lambda value: isinstance(value, dict),
+    "checks": _is_checks,
+    "error": _is_error,
+    "file": _is_file,
+    "payload": _is_payload,
+    "tensors": _is_inline,
+    "bands": _is_bands,
+}
+
+
+def checked_fields(about: dict[str, Any], key: str) -> dict[str, Any]:
+    """Return the metadata of the result ``key`` after a check of their fields.
+
+    Raises `OtherFormat` for a layout of an unknown kind, and `ValueError` for any other field that
+    cannot be right.
+    """
+    if (own := about.get("key")) != key:
+        raise ValueError(f"the metadata of {key} belong to the key {own if is_text(own) else '?'}")
+    for name, is_right in FIELDS.items():
+        value = about.get(name)
+        if value is not None and not is_right(value):
+            raise ValueError(
+                f"the field {name} of the metadata is not what was written: {str(value)[:60]!r}"
+            )
+    if about.get("kept", True):
+        named, bands = (
+            checked_layout(about.get("layout")),
+            (about.get("bands") or {}).get("names", []),
+        )
+        if named.keys() != set(bands) or "payload" not in about:
+            raise ValueError(
+                "the metadata do not name the files that the layout of the value needs"
+            )
+    return about
+
+
+# --- metadata -------------------------------------------------------------------------------------
+
+# Metadata of a result: one line of JSON that describes the result and ends with its own checksum.
+
 
 Metadata = dict[str, Any]
 INLINE = 4096  #: bytes of tensors up to which a result is stored inside its JSON
-UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, ArithmeticError, MemoryError)
+UNREADABLE = (
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    RuntimeError,
+    ArithmeticError,
+    MemoryError,
+)
 _USED = 3600.0  #: smallest time in s between two records of the use of a value
 _TOP = re.compile("[0-9a-f]{2}")
 _OF_THE_VALUE = ("layout", "payload", "tensors", "bands")
 
 
 def read(disk: Disk, key: str) -> Metadata:
-    """Return the metadata of ``key``; raise one of the errors in `UNREADABLE` if the file is missing or damaged.
+    """Return the metadata of ``key``; raise one of the errors in `UNREADABLE` if the file is
+    missing or damaged.
 
-    Raises `NotRead` for the metadata of another format version, or without the signature that is asked for.
+    Raises `NotRead` for the metadata of another format version, or without the signature that is
+    asked for.
     """
     return unseal_of("result", key, read_file(disk.path(key, "json")))
 
 
 def unseal_of(kind: Kind, key: str, raw: bytes) -> Metadata:
-    """Return the metadata that `seal_record` wrote for ``key``; raise `ValueError` for the metadata of another key."""
+    """Return the metadata that `seal_record` wrote for ``key``; raise `ValueError` for the
+    metadata of another key.
+    """
     return checked_fields(unseal_record(kind, raw), key)
 
 
 def write(disk: Disk, key: str, about: Metadata, over: bool) -> bool:
-    """Write the metadata of ``key``; if ``over`` is False, keep an existing file and return False."""
+    """Write the metadata of ``key``; if ``over`` is False, keep an existing file and return
+    False.
+    """
     path = disk.path(key, "json")
-    with disk.temporary(key) as (part, file):
+    with disk.temporary(key) as (temporary, file):
         file.write(seal_record("result", about))
         file.flush()  # without a sync to disk, because torn metadata fail their checksum
-        linked = disk.link(part, path)
+        linked = disk.link(temporary, path)
         if over and not linked:
-            disk.rename(part, path)
+            disk.rename(temporary, path)
     return over or linked
 
 
 def _read_whole(disk: Disk, key: str) -> Metadata:
-    """Return the metadata of the result ``key`` after a check that its file of tensors has the right size.
+    """Return the metadata of the result ``key`` after a check that its file of tensors has the
+    right size.
 
     Raises an error in `UNREADABLE` if a file is missing or damaged.
     """
@@ -66,10 +341,11 @@ def _read_whole(disk: Disk, key: str) -> Metadata:
 
 
 def find(disk: Disk, key: str) -> Metadata | None:
-    """Return the metadata of ``key``, or None if there are none; raise an error in `UNREADABLE` for damaged metadata.
+    """Return the metadata of ``key``, or None if there are none; raise an error in `UNREADABLE` for
+    damaged metadata.
 
-    Damaged metadata are read a second time before the result counts as damaged, because another process may be
-    renaming the file at that moment.
+    Damaged metadata are read a second time before the result counts as damaged, because another
+    process may be renaming the file at that moment.
     """
     for _ in range(2):
         try:
@@ -102,7 +378,9 @@ def record_use(disk: Disk, key: str) -> None:
 
 
 def is_kept(about: Metadata | None) -> TypeGuard[Metadata]:
-    """Return True if the metadata of a result describe a stored value, not an evicted or unsaved value."""
+    """Return True if the metadata of a result describe a stored value, not an evicted or unsaved
+    value.
+    """
     return about is not None and bool(about.get("kept", True))
 
 
@@ -117,19 +395,28 @@ def receipt(about: Metadata) -> Metadata:
 
 
 def names(disk: Disk) -> Iterator[str]:
-    """Yield the cache key of every result of a store in ascending order; follow no symbolic link."""
+    """Yield the cache key of every result of a store in ascending order; follow no symbolic
+    link.
+    """
     for folder in _folders(disk):
-        found = (entry.name.rpartition(".") for entry in entries(folder.path))
-        yield from sorted(key for key, _, suffix in found if suffix == "json" and key[:2] == folder.name)
+        files = (entry.name.rpartition(".") for entry in entries(folder.path))
+        yield from sorted(
+            key for key, _, suffix in files if suffix == "json" and key[:2] == folder.name
+        )
 
 
 def _folders(disk: Disk) -> list[os.DirEntry[str]]:
-    found = [entry for entry in entries(disk.folder) if _TOP.fullmatch(entry.name)]
-    return sorted((entry for entry in found if entry.is_dir(follow_symlinks=False)), key=lambda entry: entry.name)
+    matching = [entry for entry in entries(disk.folder) if _TOP.fullmatch(entry.name)]
+    return sorted(
+        (entry for entry in matching if entry.is_dir(follow_symlinks=False)),
+        key=lambda entry: entry.name,
+    )
 
 
 def each(disk: Disk) -> Iterator[tuple[str, Metadata]]:
-    """Yield the key and the metadata of every result of a store; skip metadata that cannot be read."""
+    """Yield the key and the metadata of every result of a store; skip metadata that cannot be
+    read.
+    """
     for key in names(disk):
         with suppress(*UNREADABLE):
             yield key, read(disk, key)

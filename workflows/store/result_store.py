@@ -1,11 +1,4 @@
-"""Store of results: a folder with the files ``<key>.json`` and ``<key>.safetensors`` of each result.
-
-The JSON holds the metadata of a result (the parts of its key, layout, statistics, checks, seconds, versions) and the
-whole value of a small result. Of an evicted or unsaved value only the metadata remain, called a receipt. A checksum
-covers every byte and is compared at each load. A result that fails the comparison is moved away with one warning and
-counts as missing. A result gets its final name when it is complete, so that a killed process leaves no incomplete
-result. If the folder cannot be written, a run issues one warning and continues.
-"""
+"""Store of results: a folder with the files of each result, its speed and its warnings."""
 
 from __future__ import annotations
 
@@ -15,28 +8,157 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import asdict, is_dataclass
+from datetime import UTC, datetime
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
-from neusee.workflows.keys.seal import NotRead
+from neusee.workflows.keys.sealed_files import NotRead, Unsigned, seal_record, unseal_record
 from neusee.workflows.store import metadata, payload
-from neusee.workflows.store.bandwidth import Speeds
-from neusee.workflows.store.budget_eviction import LOW, CacheBudget
-from neusee.workflows.store.environment import Verify, budget_bytes, default_root, verify_mode
+from neusee.workflows.store.cache_settings import Verify, budget_bytes, default_root, verify_mode
+from neusee.workflows.store.eviction import LOW, CacheBudget, Maintained
 from neusee.workflows.store.journal import Journal
 from neusee.workflows.store.lease import Lease, Leases
-from neusee.workflows.store.maintenance import Maintained
-from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept, record_use
-from neusee.workflows.store.receipts import Receipts
-from neusee.workflows.store.shared_folder import Disk
-from neusee.workflows.store.small_results import SmallResults
-from neusee.workflows.store.store_warnings import Warned
+from neusee.workflows.store.metadata import INLINE, UNREADABLE, Metadata, is_kept, record_use
+from neusee.workflows.store.payload import Receipts, SmallResults
+from neusee.workflows.store.shared_folder import Disk, read_file
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from neusee.workflows.store.band_files import Blobs
+
+
+# --- bandwidth ------------------------------------------------------------------------------------
+
+# Read and write speed of a store of results, measured in normal use and saved in a file of the
+# store.
+
+
+Direction = Literal["read", "write"]
+_FILE = "speeds.json"
+LARGE = 1_000_000  #: bytes from which a transfer updates the speed
+_USUAL: dict[Direction, float] = {"read": 8e9, "write": 0.4e9}  #: bytes / s
+#: s for each transfer, whatever its size; to write is to make a file, which takes 0.5 to 2 ms
+_SETUP: dict[Direction, float] = {"read": 5e-5, "write": 1e-3}
+_SYNC = 3e-3  #: s until the disk has a file, for each result that is written to a file of its own
+_LEARN = 0.3  #: weight of the newest transfer
+_NEWS = 1.25  #: factor by which a speed must differ from the stored speed to be written to the file
+
+
+class Speeds:
+    """Read and write speed of one store in bytes per second."""
+
+    def __init__(self, disk: Disk) -> None:
+        self._disk = disk
+        self._now: dict[Direction, float] = {}
+        self._written: dict[Direction, float] = {}
+
+    def seconds(self, way: Direction, size: float) -> float:
+        """Return the predicted time in seconds for reading or writing ``size`` bytes in the
+        store.
+        """
+        return _setup(way, size) + size / self._speed(way)
+
+    def learn(self, way: Direction, size: int, seconds: float) -> None:
+        """Update the estimated read or write speed of the store with the measured ``seconds`` of
+        one transfer.
+        """
+        if size < LARGE:
+            return
+        newest = size / max(seconds - _setup(way, size), 1e-6)
+        self._now[way] = self._speed(way) ** (1 - _LEARN) * newest**_LEARN
+        written = self._written.get(way, _USUAL[way])
+        if not written / _NEWS < self._now[way] < written * _NEWS:
+            self._written = dict(self._now)
+            with suppress(OSError):
+                self._disk.replace(
+                    _FILE,
+                    seal_record("speeds", {str(way): speed for way, speed in self._now.items()}),
+                )
+
+    def _speed(self, way: Direction) -> float:
+        if not self._now:
+            self._written = self._stored()
+            self._now = {**_USUAL, **self._written}
+        return self._now[way]
+
+    def _stored(self) -> dict[Direction, float]:
+        try:
+            speeds = unseal_record("speeds", read_file(f"{self._disk.folder}/{_FILE}"))
+            return {way: float(speeds[way]) for way in _USUAL if 1e3 < speeds[way] < 1e13}
+        except (OSError, ValueError, LookupError, TypeError):
+            return {}
+
+
+def _setup(way: Direction, size: float) -> float:
+    return _SETUP[way] + (_SYNC if way == "write" and size > INLINE else 0.0)
+
+
+# --- store warnings -------------------------------------------------------------------------------
+
+# Warnings of a store, each issued once: a folder that cannot be used, and results that are not
+# read.
+
+
+_CONSEQUENCE = (
+    "the run goes on, but results are not stored, so that the next run computes them again"
+)
+
+
+class Warned:
+    """Base class of `Store` with its warnings; `Store` defines the folder ``root``."""
+
+    root: Path
+    #: the warnings of all stores of this process, for the reports of studies
+    failures: ClassVar[list[str]] = []
+    failure = ""  #: the warning after the first write that failed
+    _told = False
+
+    def report_failure(self, error: Exception, use: str = "written") -> None:
+        """Warn that the folder cannot be written or read, once for each store; `failure` keeps
+        the text for reports.
+        """
+        if not self.failure:
+            self.pass_on(f"the cache {self.root} cannot be {use} ({error}): {_CONSEQUENCE}")
+            warnings.warn(self.failure, stacklevel=5)
+
+    def pass_on(self, failure: str) -> None:
+        """Keep for reports the warning ``failure``, which this store or that of a worker process
+        has issued.
+        """
+        if not self.failure:
+            self.failure = failure
+            self.failures.append(failure)
+
+    def leave(self, error: NotRead) -> None:
+        """Issue one warning for all results that are left alone, because they are of another
+        format or unsigned.
+        """
+        if not self._told:
+            reason = (
+                "without a signature by NEUSEE_CACHE_SECRET"
+                if isinstance(error, Unsigned)
+                else "of another version"
+            )
+            text = f"results {reason} in {self.root} are not read, and count as missing"
+            warnings.warn(
+                f"{text}: `neusee cache gc` removes those that nobody used for a week", stacklevel=4
+            )
+        self._told = True
+
+
+# --- result store ---------------------------------------------------------------------------------
+
+# Store of results: a folder with the files ``<key>.json`` and ``<key>.safetensors`` of each result.
+#
+# The JSON holds the metadata of a result (the parts of its key, layout, statistics, checks,
+# seconds, versions) and the whole value of a small result. Of an evicted or unsaved value only the
+# metadata remain, called a receipt. A checksum covers every byte and is compared at each load. A
+# result that fails the comparison is moved away with one warning and counts as missing. A result
+# gets its final name when it is complete, so that a killed process leaves no incomplete result. If
+# the folder cannot be written, a run issues one warning and continues.
 
 
 class Store(Warned, Maintained):
@@ -46,13 +168,19 @@ class Store(Warned, Maintained):
     """
 
     def __init__(
-        self, root: Path | str | None = None, *, verify: Verify | None = None, budget: int | None = None
+        self,
+        root: Path | str | None = None,
+        *,
+        verify: Verify | None = None,
+        budget: int | None = None,
     ) -> None:
-        """Open the store in the folder ``root``; environment variables such as $NEUSEE_CACHE replace missing arguments.
+        """Open the store in the folder ``root``; environment variables such as $NEUSEE_CACHE
+        replace missing arguments.
 
-        ``verify="always"`` compares the checksum of every payload that is loaded. ``"sampled"`` compares the checksum
-        of a file that was touched after its last write, and otherwise at one load in twenty. ``"never"`` compares no
-        such checksum. The checksum of the JSON and the size of every payload are always compared.
+        ``verify="always"`` compares the checksum of every payload that is loaded. ``"sampled"``
+        compares the checksum of a file that was touched after its last write, and otherwise at one
+        load in twenty. ``"never"`` compares no such checksum. The checksum of the JSON and the size
+        of every payload are always compared.
         """
         self.root = default_root() if root is None else Path(root)
         self.verify: Verify = verify_mode(verify)
@@ -70,7 +198,8 @@ class Store(Warned, Maintained):
         self._used: set[str] = set()
         self._missed: set[str] = set()
 
-    def __reduce__(self) -> tuple[Any, ...]:  # another process receives the path and opens the store
+    # another process receives the path and opens the store
+    def __reduce__(self) -> tuple[Any, ...]:
         return partial(type(self), self.root, verify=self.verify, budget=self.budget), ()
 
     @cached_property
@@ -85,7 +214,9 @@ class Store(Warned, Maintained):
         return is_kept(self.about(key))
 
     def about(self, key: str) -> Metadata | None:
-        """Return the metadata of a result, or None; the field ``kept`` tells whether the value is stored as well."""
+        """Return the metadata of a result, or None; the field ``kept`` tells whether the value
+        is stored as well.
+        """
         about = self._known.get(key)
         if is_kept(about):
             return about
@@ -106,7 +237,9 @@ class Store(Warned, Maintained):
         return about
 
     def asked(self) -> dict[str, Metadata | None]:
-        """Return the metadata of each result that this process asked for so far; None for one that is missing."""
+        """Return the metadata of each result that this process asked for so far; None for one
+        that is missing.
+        """
         return {**dict.fromkeys(self._missed | self._lost), **self._known}
 
     def loaded(self) -> set[str]:
@@ -133,19 +266,27 @@ class Store(Warned, Maintained):
         raise KeyError(key)
 
     def put(self, key: str, value: Any, about: Metadata) -> bool:
-        """Store a value and its metadata; return False if the folder is not writable or the budget is too small."""
+        """Store a value and its metadata; return False if the folder is not writable or the
+        budget is too small.
+        """
         return self._try(self._write, key, value, about)
 
     def put_receipt(self, key: str, about: Metadata) -> bool:
-        """Store the metadata of a result without its value, unless the value or its metadata are stored already."""
+        """Store the metadata of a result without its value, unless the value or its metadata are
+        stored already.
+        """
         return self._try(self._write_receipt, key, about)
 
     def put_small(self, key: str, value: Any, about: Metadata) -> bool:
-        """Store a small value in the common file of small values; for a larger value, store only the metadata."""
+        """Store a small value in the common file of small values; for a larger value, store only
+        the metadata.
+        """
         return self._try(self._write_small, key, value, about)
 
     def entries(self) -> Iterator[tuple[str, Metadata]]:
-        """Yield key and metadata of every result in the order of the keys, also of results without a stored value."""
+        """Yield key and metadata of every result in the order of the keys, also of results
+        without a stored value.
+        """
         small, before = self.brief.keys(), ""
         for key in heapq.merge(metadata.names(self.disk), sorted(small)):
             about = self._listed(key, key in small) if key != before else None
@@ -154,7 +295,8 @@ class Store(Warned, Maintained):
                 yield key, about
 
     def _listed(self, key: str, small: bool) -> Metadata | None:
-        """Return the metadata of a result as `about`, but remember nothing, so that a list of any length takes no room.
+        """Return the metadata of a result as `about`, but remember nothing, so that a list of any
+        length takes no room.
 
         ``small`` tells whether the common file of small results has a line of the result.
         """
@@ -168,28 +310,38 @@ class Store(Warned, Maintained):
             return self.about(key)  # missing meanwhile, damaged or not read
 
     def claim(self, key: str) -> Lease | None:
-        """Return the lease of ``key``, the right to compute its result, or None while a running process holds it."""
+        """Return the lease of ``key``, the right to compute its result, or None while a running
+        process holds it.
+        """
         return self._leases.claim(key)
 
     def read_seconds(self, size: float) -> float:
-        """Return the predicted time in seconds for loading ``size`` bytes, based on earlier loads from this store."""
+        """Return the predicted time in seconds for loading ``size`` bytes, based on earlier
+        loads from this store.
+        """
         return self._speeds.seconds("read", size)
 
     def write_seconds(self, size: float) -> float:
-        """Return the predicted time in seconds for storing ``size`` bytes, based on earlier writes to this store."""
+        """Return the predicted time in seconds for storing ``size`` bytes, based on earlier
+        writes to this store.
+        """
         return self._speeds.seconds("write", size)
 
     def _again(self, key: str) -> Metadata | None:
-        """Read the metadata of a result again; return None if the metadata were removed or cannot be read."""
+        """Read the metadata of a result again; return None if the metadata were removed or
+        cannot be read.
+        """
         self._known.pop(key, None)
         with suppress(*UNREADABLE):
             return metadata.read(self.disk, key)
         return None
 
     def load(self, about: Metadata, verify: str, kind: Any = Any) -> Any:
-        """Return the value that the metadata ``about`` describe; raise an error in `UNREADABLE` if it is damaged.
+        """Return the value that the metadata ``about`` describe; raise an error in `UNREADABLE` if
+        it is damaged.
 
-        For the ``kind`` None the named tuples in the value are plain tuples, so that no type need be known.
+        For the ``kind`` None the named tuples in the value are plain tuples, so that no type need
+        be known.
         """
         began = time.perf_counter()
         value, size = payload.load(self.disk, about, verify, self.blobs, kind is not None)
@@ -199,13 +351,17 @@ class Store(Warned, Maintained):
         return value
 
     def _use(self, key: str) -> None:
-        """Record the use of a value as the modification time of its JSON file, at most once an hour."""
+        """Record the use of a value as the modification time of its JSON file, at most once an
+        hour.
+        """
         if key not in self._used:
             self._used.add(key)
             record_use(self.disk, key)
 
     def _try(self, write: Callable[..., bool], key: str, *arguments: Any) -> bool:
-        """Return the result of ``write``, called again if a folder was removed; on failure, return False and warn."""
+        """Return the result of ``write``, called again if a folder was removed; on failure,
+        return False and warn.
+        """
         try:
             try:
                 return write(key, *arguments)
@@ -243,8 +399,10 @@ class Store(Warned, Maintained):
         return is_kept(entry)
 
     def _write_parts(self, key: str, entry: Metadata, tensors: list[Tensor], banded: Any) -> None:
-        """Write the large files of a value, then the metadata that name the files; keep a value stored earlier."""
-        with self.disk.temporary(key) as (part, file):
+        """Write the large files of a value, then the metadata that name the files; keep a value
+        stored earlier.
+        """
+        with self.disk.temporary(key) as (temporary, file):
             if tensors:
                 entry["payload"] = payload.written(file, tensors)
             with self.disk.lock():
@@ -255,7 +413,7 @@ class Store(Warned, Maintained):
                     entry["bands"] = {"names": names, "newest": payload.newest(self.blobs, names)}
                 if tensors:
                     path = self.disk.path(key, "safetensors")
-                    self.disk.rename(part, path)
+                    self.disk.rename(temporary, path)
                     entry["payload"]["stamp"] = payload.stamp_of(path)
                 self._write_about(key, entry)
 
@@ -264,7 +422,9 @@ class Store(Warned, Maintained):
         self._known[key] = entry
 
     def _write_receipt(self, key: str, about: Metadata) -> bool:
-        """Write the metadata of a result without its value, unless the store has metadata of the result."""
+        """Write the metadata of a result without its value, unless the store has metadata of the
+        result.
+        """
         entry = metadata.receipt({"key": key, **about})
         if self.about(key) is None and metadata.write(self.disk, key, entry, over=False):
             self._known[key] = entry
@@ -278,12 +438,19 @@ class Store(Warned, Maintained):
 
     def _put_aside(self, key: str, error: Exception) -> None:
         self.put_aside(key, error)
-        if isinstance(error, OSError) and not isinstance(error, FileNotFoundError | PermissionError):
-            return self.report_failure(error, "read")  # the device fails, of which one warning is enough
-        warnings.warn(f"the stored result {key} is damaged ({error}) and counts as missing", stacklevel=5)
+        if isinstance(error, OSError) and not isinstance(
+            error, FileNotFoundError | PermissionError
+        ):
+            # the device fails, of which one warning is enough
+            return self.report_failure(error, "read")
+        warnings.warn(
+            f"the stored result {key} is damaged ({error}) and counts as missing", stacklevel=5
+        )
 
     def put_aside(self, key: str, error: Exception) -> None:
-        """Move the files of a damaged result to ``bad/`` for inspection; a file of another user stays."""
+        """Move the files of a damaged result to ``bad/`` for inspection; a file of another user
+        stays.
+        """
         self._known.pop(key, None)
         self._lost.add(key)
         unreadable = isinstance(error, OSError) and not isinstance(error, FileNotFoundError)
@@ -295,3 +462,50 @@ class Store(Warned, Maintained):
                 self.brief.append(metadata.receipt(small))
             if not os.path.lexists(self.disk.path(key, "json")):
                 self._lost.discard(key)
+
+
+# --- memo -----------------------------------------------------------------------------------------
+
+# Values that are computed only once: a value is read from the store, or computed and then stored.
+
+
+T = TypeVar("T")
+
+
+def compute_once(
+    store: Store,
+    key: str,
+    kind: type[T],
+    compute: Callable[[], T],
+    about: Metadata,
+    *,
+    small: bool = False,
+) -> T:
+    """Return the value that ``store`` has under ``key``, or compute and store the value if it is
+    missing.
+
+    Args: kind: the type of the value. A dataclass is stored as the dict of its fields. about:
+            metadata of the value,
+    which get the date and the seconds that ``compute`` took. small: whether to store the value with
+    `Store.put_small`.
+    """
+    with suppress(KeyError):
+        stored = store.get(key, dict if is_dataclass(kind) else kind)
+        make: Callable[..., T] = kind
+        try:
+            return make(**stored) if is_dataclass(kind) else make(stored)
+        except (TypeError, ValueError) as error:  # a value with other fields
+            store.put_aside(key, error)
+    began = time.perf_counter()
+    value = compute()
+    spent: Metadata = {
+        "seconds": time.perf_counter() - began,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    keep = store.put_small if small else store.put
+    keep(
+        key,
+        asdict(value) if is_dataclass(value) and not isinstance(value, type) else value,
+        spent | about,
+    )
+    return value

@@ -1,34 +1,189 @@
-"""Format of a stored value: a layout in JSON, and the tensors in one safetensors file.
-
-The file is written from the memory of the tensors and read through a memory map, so that neither writing nor reading
-makes a copy. Each tensor begins at a multiple of 64 bytes like a newly allocated tensor, so that a kernel uses the same
-code path for a stored value and a computed value. The layout of a `Stacked` tensor names one band file for each slice.
-"""
+"""Format of a stored value: a layout in JSON, types by name, tensors in safetensors."""
 
 from __future__ import annotations
 
 import base64
+import functools
 import hashlib
 import json
 import math
 import mmap
 import os
+import types
+import typing
 from collections.abc import Callable, Iterator
-from typing import IO, Any
+from typing import IO, Any, TypeGuard, get_args, get_origin, get_type_hints
 
 import torch
 import xxhash
 from torch import Tensor
 
-from neusee.workflows.keys.seal import may_change
+from neusee.nodes import Node, registered_nodes, values
+from neusee.workflows.keys.sealed_files import may_change
 from neusee.workflows.store.band_files import Blobs, Stacked, bytes_of, dtype_of
-from neusee.workflows.store.layout_check import checked_layout, is_count, is_shape
+from neusee.workflows.store.metadata import checked_layout, is_count, is_shape
 from neusee.workflows.store.shared_folder import open_now
-from neusee.workflows.store.stored_types import is_registered, made, stored_type, type_name
+
+# --- stored types ---------------------------------------------------------------------------------
+
+# Registry of the named tuples that a stored value may contain, by the name that a stored value
+# gives.
+#
+# The registry has the named tuples of `neusee.nodes.values`, and those in the annotations of the
+# inputs and the result of each node that this process has defined or imported. A name that a stored
+# value gives is only looked up here, so that no content of a store imports a module or chooses a
+# function. A recipe imports its nodes, hence also the types of the values that it makes and reads.
+
+
+NamedTupleType = type[tuple[Any, ...]]
+
+_types: dict[str, NamedTupleType] = {}
+_looked_at: dict[str, Node] = {}
+_all_nodes: list[tuple[Node, ...]] = [()]  #: those of the last look
+
+
+class UnknownType(ValueError):
+    """Error for a stored value that names a type outside the registry; the value counts as
+    missing.
+    """
+
+
+def type_name(kind: type) -> str:
+    """Return the name under which the registry has a named tuple: its module and its own name."""
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def stored_type(name: str) -> NamedTupleType:
+    """Return the named tuple with the name ``name`` in the registry; raise `UnknownType` for any
+    other name.
+    """
+    _update()
+    if name not in _types:
+        raise UnknownType(
+            f"{name!r} is not the type of an input or a result of a node that this process knows"
+        )
+    return _types[name]
+
+
+def is_registered(kind: type) -> bool:
+    """Return True if values of the named tuple ``kind`` can be stored."""
+    _update()
+    return _types.get(type_name(kind)) is kind
+
+
+def made(kind: NamedTupleType, items: list[Any]) -> Any:
+    """Return a named tuple with the fields ``items``, without a call of its class.
+
+    Raises `ValueError` for a wrong number of fields, or for a field that does not fit its
+    annotation.
+    """
+    names: tuple[str, ...] = kind._fields  # type: ignore[attr-defined]
+    if len(items) != len(names):
+        raise ValueError(f"{kind.__name__} has {len(names)} fields, not {len(items)}")
+    hints = _hints(kind)
+    for name, item in zip(names, items, strict=True):
+        if not fits(item, hints.get(name, Any)):
+            raise ValueError(f"the field {name} of {kind.__name__} cannot be {type(item).__name__}")
+    return tuple.__new__(kind, items)
+
+
+def fits(value: Any, kind: Any) -> bool:
+    """Return True if a value has the annotated type ``kind``; a type that no stored value has
+    allows every value.
+    """
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is typing.Annotated:
+        return fits(value, inner[0])
+    if origin in (typing.Union, types.UnionType):
+        return any(fits(value, alternative) for alternative in inner)
+    if origin in (list, dict) or (origin is tuple and not hasattr(value, "_fields")):
+        return isinstance(value, origin) and _items_fit(value, origin, inner)
+    if kind is None or kind is types.NoneType:
+        return value is None
+    if kind is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if kind is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    simple = (
+        isinstance(kind, type)
+        and origin is None
+        and (kind in (Tensor, bool, str, bytes, list, dict) or _is_named_tuple(kind))
+    )
+    return isinstance(value, kind) if simple else True
+
+
+def _items_fit(value: Any, origin: type, inner: tuple[Any, ...]) -> bool:
+    if origin is dict:
+        return len(inner) != 2 or all(fits(item, inner[1]) for item in value.values())
+    if origin is list or inner[1:] == (...,):
+        return not inner or all(fits(item, inner[0]) for item in value)
+    return len(value) == len(inner) and all(map(fits, value, inner))
+
+
+def _is_named_tuple(kind: Any) -> TypeGuard[NamedTupleType]:
+    return isinstance(kind, type) and issubclass(kind, tuple) and hasattr(kind, "_fields")
+
+
+def _update() -> None:
+    """Add the types of nodes that were defined or imported since the last call."""
+    if not _types:
+        for kind in vars(values).values():
+            _add(kind)
+    nodes = registered_nodes()
+    if nodes == _all_nodes[0]:  # the same objects, as almost always
+        return
+    _all_nodes[0] = nodes
+    for node in nodes:
+        if _looked_at.get(name := f"{node.fn.__module__}:{node.fn.__name__}") is not node:
+            _looked_at[name] = node
+            for kind in _annotated(node):
+                _add(kind)
+
+
+def _annotated(node: Node) -> Iterator[Any]:
+    try:
+        hints = node.hints
+    except Exception:  # an annotation may be any text; the check of a recipe reports it
+        return
+    yield from (hints.get(name) for name in (*node.inputs, "return"))
+
+
+def _add(kind: Any) -> None:
+    """Add a type and the types in its parts, if they are named tuples."""
+    todo, visited = [kind], set[int]()
+    while todo:
+        kind = todo.pop()
+        if id(kind) in visited:
+            continue
+        visited.add(id(kind))
+        todo += get_args(kind)
+        if _is_named_tuple(kind):
+            _types[type_name(kind)] = kind
+            todo += _hints(kind).values()
+
+
+@functools.lru_cache(256)
+def _hints(kind: type) -> dict[str, Any]:
+    try:
+        return get_type_hints(kind, include_extras=True)
+    except Exception:  # an annotation may be any text
+        return {}
+
+
+# --- serialization --------------------------------------------------------------------------------
+
+# Format of a stored value: a layout in JSON, and the tensors in one safetensors file.
+#
+# The file is written from the memory of the tensors and read through a memory map, so that neither
+# writing nor reading makes a copy. Each tensor begins at a multiple of 64 bytes like a newly
+# allocated tensor, so that a kernel uses the same code path for a stored value and a computed
+# value. The layout of a `Stacked` tensor names one band file for each slice.
+
 
 _PIECE = 1 << 18  #: bytes of a file that are read at once
 _ALIGN = 64
-_FILLER = "_"  #: first letter of the names of padding entries, which fill up to the next multiple of `_ALIGN`
+#: first letter of the names of padding entries, which fill up to the next multiple of `_ALIGN`
+_FILLER = "_"
 _DTYPES = {
     torch.float64: "F64",
     torch.float32: "F32",
@@ -50,12 +205,15 @@ _NAMES = {name: dtype for dtype, name in _DTYPES.items()}
 
 
 def each_tensor(change: Callable[[Tensor], Tensor], value: Any) -> Any:
-    """Return ``value`` with the function ``change`` applied once to every distinct tensor in ``value``."""
+    """Return ``value`` with the function ``change`` applied once to every distinct tensor in
+    ``value``.
+    """
     return _change(value, change, {})
 
 
 def _change(item: Any, change: Callable[[Tensor], Tensor], done: dict[int, Tensor]) -> Any:
-    """Return ``item`` with ``change`` applied to its tensors; ``done`` has the changed tensors by identity.
+    """Return ``item`` with ``change`` applied to its tensors; ``done`` has the changed tensors by
+    identity.
 
     A nested function would hold the tensors until garbage collection.
     """
@@ -68,7 +226,9 @@ def _change(item: Any, change: Callable[[Tensor], Tensor], done: dict[int, Tenso
         return item._make(items) if hasattr(item, "_make") else tuple(items)
     if isinstance(item, list):
         return [_change(i, change, done) for i in item]
-    return {k: _change(v, change, done) for k, v in item.items()} if isinstance(item, dict) else item
+    return (
+        {k: _change(v, change, done) for k, v in item.items()} if isinstance(item, dict) else item
+    )
 
 
 def tensors_in(value: Any) -> list[Tensor]:
@@ -79,9 +239,11 @@ def tensors_in(value: Any) -> list[Tensor]:
 
 
 def settle(value: Any) -> Any:
-    """Return ``value`` as if read from the store: contiguous tensors that hold no memory beyond their own elements.
+    """Return ``value`` as if read from the store: contiguous tensors that hold no memory beyond
+    their own elements.
 
-    They have no attributes and no class of a user, and want a gradient only where gradients are recorded.
+    They have no attributes and no class of a user, and want a gradient only where gradients are
+    recorded.
     """
     return each_tensor(_settled, value)
 
@@ -90,13 +252,17 @@ def _settled(x: Tensor) -> Tensor:
     x = _bare(x).resolve_conj().resolve_neg().contiguous()
     try:
         spare = x.untyped_storage().nbytes() > x.nbytes
-    except NotImplementedError:  # a tensor inside a transform of torch.func has no memory of its own
+    except (
+        NotImplementedError
+    ):  # a tensor inside a transform of torch.func has no memory of its own
         spare = False
     return x.clone(memory_format=torch.contiguous_format) if spare else x
 
 
 def forget_attributes(x: Tensor) -> None:
-    """Take from a tensor what was attached to it: a step that reads it from the store does not see that either."""
+    """Take from a tensor what was attached to it: a step that reads it from the store does not
+    see that either.
+    """
     if type(x) is Tensor and vars(x):
         vars(x).clear()
 
@@ -128,9 +294,11 @@ class _Listed:
 
 
 def pack(value: Any, blobs: Blobs | None = None) -> tuple[Any, list[Tensor]]:
-    """Return the JSON layout of ``value`` and its tensors; write `Stacked` tensors to the folder ``blobs`` if given.
+    """Return the JSON layout of ``value`` and its tensors; write `Stacked` tensors to the folder
+    ``blobs`` if given.
 
-    Raises `TypeError` for a value that cannot be stored, and `OSError` if ``blobs`` cannot be written.
+    Raises `TypeError` for a value that cannot be stored, and `OSError` if ``blobs`` cannot be
+    written.
     """
     listed = _Listed()
     return _layout(value, listed, blobs), listed.tensors
@@ -142,41 +310,73 @@ def _layout(item: Any, listed: _Listed, blobs: Blobs | None) -> dict[str, Any]:
     if isinstance(item, Tensor):
         return {"tensor": listed.add(item)}
     if isinstance(item, bytes):
-        return {"bytes": listed.add(torch.frombuffer(bytearray(item), dtype=torch.uint8) if item else torch.empty(0))}
+        return {
+            "bytes": listed.add(
+                torch.frombuffer(bytearray(item), dtype=torch.uint8) if item else torch.empty(0)
+            )
+        }
     if isinstance(item, tuple):
         items = [_layout(i, listed, blobs) for i in item]
-        return {"tuple": items} if type(item) is tuple else {"class": _class_name(item), "items": items}
+        return (
+            {"tuple": items}
+            if type(item) is tuple
+            else {"class": _class_name(item), "items": items}
+        )
     if isinstance(item, list):
         return {"list": [_layout(i, listed, blobs) for i in item]}
     if isinstance(item, dict) and all(isinstance(k, str) for k in item):
         return {"dict": {k: _layout(v, listed, blobs) for k, v in item.items()}}
     if item is None or isinstance(item, bool | int | float | str):
         return {"value": item}
-    raise TypeError(f"a step must return tensors, numbers, strings, bytes or collections of these, not {type(item)}")
+    raise TypeError(
+        "a step must return tensors, numbers, strings, bytes or collections of these, not"
+        f" {type(item)}"
+    )
 
 
 def _stack_layout(item: Stacked, blobs: Blobs) -> dict[str, Any]:
     written = blobs.write_all(item.names, item.tensor.unbind())
     kind = str(item.tensor.dtype).removeprefix("torch.")
-    return {"stacked": {"names": list(item.names), "xxh3": written, "dtype": kind, "shape": list(item.tensor.shape)}}
+    return {
+        "stacked": {
+            "names": list(item.names),
+            "xxh3": written,
+            "dtype": kind,
+            "shape": list(item.tensor.shape),
+        }
+    }
 
 
 def unpack(
-    layout: Any, tensors: list[Tensor], blobs: Blobs | None = None, verify: bool = True, typed: bool = True
+    layout: Any,
+    tensors: list[Tensor],
+    blobs: Blobs | None = None,
+    verify: bool = True,
+    typed: bool = True,
 ) -> Any:
-    """Return the value that `pack` turned into ``layout`` and ``tensors``; ``typed=False`` gives plain tuples.
+    """Return the value that `pack` turned into ``layout`` and ``tensors``; ``typed=False`` gives
+    plain tuples.
 
-    Raises `UnknownType` for a named tuple that is not in the registry of `stored_types`, and `ValueError` for a layout
-    that `pack` did not write or a damaged band.
+    Raises `UnknownType` for a named tuple that is not in the registry of `serialization`, and
+    `ValueError` for a layout that `pack` did not write or a damaged band.
     """
     checked_layout(layout)
     return _unpacked(layout, tensors, blobs, verify, typed)
 
 
-def _unpacked(layout: dict[str, Any], tensors: list[Tensor], blobs: Blobs | None, verify: bool, typed: bool) -> Any:
+def _unpacked(
+    layout: dict[str, Any], tensors: list[Tensor], blobs: Blobs | None, verify: bool, typed: bool
+) -> Any:
     if "class" in layout or "tuple" in layout:
-        items = [_unpacked(i, tensors, blobs, verify, typed) for i in layout["items" if "class" in layout else "tuple"]]
-        return made(stored_type(layout["class"]), items) if typed and "class" in layout else tuple(items)
+        items = [
+            _unpacked(i, tensors, blobs, verify, typed)
+            for i in layout["items" if "class" in layout else "tuple"]
+        ]
+        return (
+            made(stored_type(layout["class"]), items)
+            if typed and "class" in layout
+            else tuple(items)
+        )
     ((kind, body),) = layout.items()
     if kind in ("tensor", "bytes"):
         if body >= len(tensors):
@@ -184,11 +384,19 @@ def _unpacked(layout: dict[str, Any], tensors: list[Tensor], blobs: Blobs | None
         return tensors[body] if kind == "tensor" else _bytes(tensors[body])
     if kind == "stacked":
         if blobs is None:
-            raise ValueError("the value has band files: give the folder of the band files as ``blobs``")
-        return blobs.read(body["names"], body["shape"], dtype_of(body["dtype"]), verify, body["xxh3"])
+            raise ValueError(
+                "the value has band files: give the folder of the band files as ``blobs``"
+            )
+        return blobs.read(
+            body["names"], body["shape"], dtype_of(body["dtype"]), verify, body["xxh3"]
+        )
     if kind == "list":
         return [_unpacked(i, tensors, blobs, verify, typed) for i in body]
-    return {k: _unpacked(v, tensors, blobs, verify, typed) for k, v in body.items()} if kind == "dict" else body
+    return (
+        {k: _unpacked(v, tensors, blobs, verify, typed) for k, v in body.items()}
+        if kind == "dict"
+        else body
+    )
 
 
 def _bytes(x: Tensor) -> bytes:
@@ -198,21 +406,29 @@ def _bytes(x: Tensor) -> bytes:
 
 
 def blobs_in(layout: Any) -> dict[str, str]:
-    """Return the checksum (xxh3) of every band file that the layout of a value names, by the name of the band."""
+    """Return the checksum (xxh3) of every band file that the layout of a value names, by the
+    name of the band.
+    """
     return checked_layout(layout)
 
 
 def _class_name(item: tuple[Any, ...]) -> str:
-    """Return the name of the class of a named tuple in the registry; raise `TypeError` for any other class."""
+    """Return the name of the class of a named tuple in the registry; raise `TypeError` for any
+    other class.
+    """
     kind = type(item)
     if not is_registered(kind):
-        known = "annotate the node's result with it" if hasattr(item, "_fields") else "use a NamedTuple"
-        raise TypeError(f"{kind.__module__}.{kind.__qualname__} cannot be stored: {known}")
+        advice = (
+            "annotate the node's result with it" if hasattr(item, "_fields") else "use a NamedTuple"
+        )
+        raise TypeError(f"{kind.__module__}.{kind.__qualname__} cannot be stored: {advice}")
     return type_name(kind)
 
 
 def to_text(x: Tensor) -> list[Any]:
-    """Return a small tensor as four JSON values: type, shape, True for a complex tensor, and the bytes as text."""
+    """Return a small tensor as four JSON values: type, shape, True for a complex tensor, and the
+    bytes as text.
+    """
     return [*_kind(x), base64.b64encode(bytes_of(x)).decode()]
 
 
@@ -231,15 +447,17 @@ def write(file: IO[bytes], tensors: list[Tensor], also: Any = None) -> str:
     ``also`` is a hash object of `hashlib` that receives the same bytes.
     """
     digest = xxhash.xxh3_128()
-    for part in _parts(tensors):
-        file.write(part)
-        for each in (digest, also) if also is not None else (digest,):
-            each.update(part)
+    for piece in _parts(tensors):
+        file.write(piece)
+        for hasher in (digest, also) if also is not None else (digest,):
+            hasher.update(piece)
     return digest.hexdigest()
 
 
 def _parts(tensors: list[Tensor]) -> Iterator[bytes | memoryview]:
-    """Yield the bytes of a safetensors file: the length of the header, the header, and the padded tensors."""
+    """Yield the bytes of a safetensors file: the length of the header, the header, and the
+    padded tensors.
+    """
     header: dict[str, Any] = {"__metadata__": {}}
     end = 0
     for i, x in enumerate(tensors):
@@ -248,7 +466,11 @@ def _parts(tensors: list[Tensor]) -> Iterator[bytes | memoryview]:
         header[str(i)] = {"dtype": kind, "shape": shape, "data_offsets": [end, end + x.nbytes]}
         end += x.nbytes
         if pad := -end % _ALIGN:
-            header[f"{_FILLER}{i}"] = {"dtype": "U8", "shape": [pad], "data_offsets": [end, end + pad]}
+            header[f"{_FILLER}{i}"] = {
+                "dtype": "U8",
+                "shape": [pad],
+                "data_offsets": [end, end + pad],
+            }
             end += pad
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-(8 + len(text)) % _ALIGN)
@@ -260,26 +482,28 @@ def _parts(tensors: list[Tensor]) -> Iterator[bytes | memoryview]:
 
 
 def read(path: str, expected: str | None, sha256: str | None = None) -> list[Tensor]:
-    """Map the tensors in a safetensors file into memory, or copy them if another user could change them.
+    """Map the tensors in a safetensors file into memory, or copy them if another user could change
+    them.
 
-    Compare the file with the checksum ``expected`` and the digest ``sha256`` if given. Raises `ValueError` for a file
-    that differs, or that `write` did not write.
+    Compare the file with the checksum ``expected`` and the digest ``sha256`` if given. Raises
+    `ValueError` for a file that differs, or that `write` did not write.
     """
-    wanted: list[tuple[Any, str | None]] = [(xxhash.xxh3_128, expected), (hashlib.sha256, sha256)]
-    digests = [function() for function, text in wanted if text is not None]
+    checks: list[tuple[Any, str | None]] = [(xxhash.xxh3_128, expected), (hashlib.sha256, sha256)]
+    digests = [function() for function, text in checks if text is not None]
     with open(path, "rb", buffering=0, opener=open_now) as file:
         if may_change(file.fileno()):
             data = _copied(file)
             for digest in digests:
                 digest.update(data)
         else:
-            # read and not mapped: where a device fails, a read raises an error, and a look into a map ends the process
+            # read and not mapped: where a device fails, a read raises an error, and a look into a
+            # map ends the process
             digests_of(file, *digests)
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
-    found = [digest.hexdigest() for digest in digests]
-    if expected is not None and found[0] != expected:
+    hexdigests = [digest.hexdigest() for digest in digests]
+    if expected is not None and hexdigests[0] != expected:
         raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
-    if sha256 is not None and found[-1:] != [sha256]:
+    if sha256 is not None and hexdigests[-1:] != [sha256]:
         raise ValueError("the stored bytes are not those that were signed")
     start = 8 + int.from_bytes(data[:8], "little")
     header = json.loads(data[8:start]) if start <= len(data) else None
@@ -302,9 +526,9 @@ def digests_of(file: IO[bytes], *digests: Any) -> list[str]:
     """Return the digests of a file as texts, each of all its bytes, read piece by piece."""
     piece = memoryview(bytearray(_PIECE if digests else 0))
     while digests and (count := file.readinto(piece)):  # type: ignore[attr-defined]
-        for each in digests:
-            each.update(piece[:count])
-    return [each.hexdigest() for each in digests]
+        for digest in digests:
+            digest.update(piece[:count])
+    return [digest.hexdigest() for digest in digests]
 
 
 def _entry(data: Any, start: int, entry: Any, kind: Any) -> Tensor:
@@ -313,7 +537,9 @@ def _entry(data: Any, start: int, entry: Any, kind: Any) -> Tensor:
         raise ValueError("the header of the file of tensors is not what was written")
     x = _tensor(data, start + offsets[0], entry.get("dtype"), entry.get("shape"), kind == "complex")
     if offsets[1] - offsets[0] != x.nbytes:
-        raise ValueError(f"a tensor of {x.nbytes} bytes is stored as {offsets[1] - offsets[0]} bytes")
+        raise ValueError(
+            f"a tensor of {x.nbytes} bytes is stored as {offsets[1] - offsets[0]} bytes"
+        )
     return x
 
 
@@ -325,7 +551,9 @@ def _kind(x: Tensor) -> tuple[str, list[int], bool]:
 
 
 def tensor_kind(x: Tensor) -> str:
-    """Return the name that safetensors gives to the type of a tensor; raise ValueError for a type without a name."""
+    """Return the name that safetensors gives to the type of a tensor; raise ValueError for a
+    type without a name.
+    """
     name = "C64" if x.dtype == torch.complex64 else _DTYPES.get(x.dtype)
     if name is None:
         raise ValueError(f"safetensors has no name for {x.dtype}")
@@ -333,14 +561,22 @@ def tensor_kind(x: Tensor) -> str:
 
 
 def _tensor(data: Any, offset: int, kind: Any, shape: Any, is_complex: bool) -> Tensor:
-    """Return the tensor at an offset of ``data``; raise `ValueError` if type, shape or size cannot be right."""
+    """Return the tensor at an offset of ``data``; raise `ValueError` if type, shape or size
+    cannot be right.
+    """
     dtype = _NAMES.get(kind) if isinstance(kind, str) else None
     if dtype is None or not is_shape(shape) or not is_count(count := math.prod(shape)):
-        raise ValueError(f"a stored tensor has the type {str(kind)[:20]} and the shape {str(shape)[:60]}")
+        raise ValueError(
+            f"a stored tensor has the type {str(kind)[:20]} and the shape {str(shape)[:60]}"
+        )
     if is_complex and (shape[-1:] != [2] or not dtype.is_floating_point or dtype.itemsize < 2):
         raise ValueError(f"a complex tensor is stored as {kind} of the shape {shape}")
     if offset + count * dtype.itemsize > len(data):
         raise ValueError(f"a stored tensor of {count} elements is longer than its file")
-    flat = torch.frombuffer(data, dtype=dtype, count=count, offset=offset) if count else torch.empty(0, dtype=dtype)
+    flat = (
+        torch.frombuffer(data, dtype=dtype, count=count, offset=offset)
+        if count
+        else torch.empty(0, dtype=dtype)
+    )
     x = flat.reshape(shape)
     return torch.view_as_complex(x) if is_complex else x

@@ -1,14 +1,10 @@
-"""A folder to which many processes and many users write at the same time.
-
-A file is complete before it gets its final name; until then its temporary name contains the owner. The next writer
-removes the temporary files of killed processes without using the clock. Folders, and the few files to which all
-processes write, copy the permissions of the root.
-"""
+"""A folder to which many processes and users write, with the owners of their files."""
 
 from __future__ import annotations
 
 import errno
 import fcntl
+import hashlib
 import itertools
 import math
 import os
@@ -16,16 +12,126 @@ import stat
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import IO
+from typing import IO, Literal
 
-from neusee.workflows.keys.inherited_modes import inherit, make_folders
-from neusee.workflows.store.process_owner import me, owner_of
+from neusee.workflows.keys.sealed_files import inherit, make_folders
+
+# --- process owner --------------------------------------------------------------------------------
+
+# Owner of a file: a process on a machine, with a check that the process still runs. The check uses
+# no clock.
+
+
+State = Literal["alive", "dead", "foreign"]
+_IDLE = "ZTtXx"  #: states in /proc of a process that has ended or is stopped
+
+
+@dataclass(frozen=True, slots=True)
+class Owner:
+    """A process on a machine, identified by the machine, the process number and the start time."""
+
+    host: str  #: digest of the machine, its present boot and its namespace of process numbers
+    pid: int
+    #: start time in ticks since the machine's boot; empty if the system does not give the time
+    began: str
+
+    def __str__(self) -> str:
+        return f"{self.host}-{self.pid}-{self.began}"
+
+    @property
+    def state(self) -> State:
+        """Return the process state: ``alive``, ``dead`` (ended or stopped) or ``foreign`` (on
+        another machine).
+        """
+        if self.host != host():
+            return "foreign"
+        if self.pid == os.getpid():
+            return "alive" if self.began == me().began else "dead"
+        try:
+            status, began = _process(self.pid)
+        except FileNotFoundError:
+            return "dead" if os.path.exists("/proc/self/stat") else _signalled(self.pid)
+        except (OSError, ValueError):
+            return "dead"
+        return "alive" if began == self.began and status not in _IDLE else "dead"
+
+
+def owner_of(text: str) -> Owner | None:
+    """Return the process that a text such as ``<host>-<number>-<start time>`` names, or None for
+    any other text.
+    """
+    host, _, numbers = text.partition("-")
+    pid, _, began = numbers.partition("-")
+    return (
+        Owner(host, int(pid), began)
+        if len(host) == 12 and pid.isdecimal() and len(pid) < 12
+        else None
+    )
+
+
+def me() -> Owner:
+    """Return the running process as an `Owner`."""
+    return _me(os.getpid())
+
+
+@cache
+def _me(pid: int) -> Owner:
+    try:
+        return Owner(host(), pid, _process(pid)[1])
+    except (OSError, ValueError):
+        return Owner(host(), pid, "")
+
+
+@cache
+def host() -> str:
+    """Return a digest of this machine and its present boot; two containers of the same name have
+    different digests.
+    """
+    parts = [os.uname().nodename]
+    with suppress(OSError):  # a system without these files
+        with open("/proc/sys/kernel/random/boot_id") as file:
+            parts.append(file.read())
+        parts.append(str(os.stat("/proc/self/ns/pid").st_ino))
+    return hashlib.blake2b("\n".join(parts).encode(), digest_size=6).hexdigest()
+
+
+def _process(pid: int) -> tuple[str, str]:
+    """Return the state and the start time of a process from ``/proc``."""
+    with open(f"/proc/{pid}/stat", "rb") as file:
+        # behind the name, which may hold any character
+        fields = file.read().rpartition(b")")[2].split()
+    if len(fields) < 20:
+        raise ValueError(f"the file /proc/{pid}/stat is incomplete")
+    return fields[0].decode(), fields[19].decode()
+
+
+def _signalled(pid: int) -> State:
+    try:
+        with suppress(PermissionError):  # a process of another user
+            os.kill(pid, 0)
+    except ProcessLookupError:
+        return "dead"
+    return "alive"
+
+
+# --- shared folder --------------------------------------------------------------------------------
+
+# A folder to which many processes and many users write at the same time.
+#
+# A file is complete before it gets its final name; until then its temporary name contains the
+# owner. The next writer removes the temporary files of killed processes without using the clock.
+# Folders, and the few files to which all processes write, copy the permissions of the root.
+
 
 MOST_READ = 64 << 20  #: bytes of metadata that are read at once
 OLD = 3600.0  #: s after which a temporary file of another machine counts as abandoned
-_PATIENCE = 10.0  #: s to wait for the lock; its owner may be stopped, and a run without the lock may only repeat work
-_LINKLESS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)  #: errors of a file system without hard links
+#: s to wait for the lock; its owner may be stopped, and a run without the lock may only repeat work
+_PATIENCE = 10.0
+#: errors of a file system without hard links
+_LINKLESS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
 _count = itertools.count()
 
 
@@ -34,7 +140,8 @@ class Disk:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.folder = os.fspath(root)  # text, because building a path object takes as long as the look-up itself
+        # text, because building a path object takes as long as the look-up itself
+        self.folder = os.fspath(root)
         self._ready = False
 
     def path(self, key: str, suffix: str) -> str:
@@ -50,49 +157,57 @@ class Disk:
             self._ready = True
 
     def forget(self) -> None:
-        """Let the next write make the folder of temporary files again, after another process has removed it."""
+        """Let the next write make the folder of temporary files again, after another process has
+        removed it.
+        """
         self._ready = False
 
     @contextmanager
     def temporary(self, name: str) -> Iterator[tuple[str, IO[bytes]]]:
-        """Yield the path and handle of a new temporary file; delete the file later unless the caller renamed it."""
+        """Yield the path and handle of a new temporary file; delete the file later unless the
+        caller renamed it.
+        """
         self.prepare()
-        part = f"{self.folder}/tmp/{name}.{me()}.{next(_count)}"
+        path = f"{self.folder}/tmp/{name}.{me()}.{next(_count)}"
         try:
-            with open(part, "xb") as file:
-                self.share(part, 0o444)
-                yield part, file
+            with open(path, "xb") as file:
+                self.share(path, 0o444)
+                yield path, file
         finally:
             with suppress(OSError):
-                os.unlink(part)
+                os.unlink(path)
 
     def replace(self, name: str, raw: bytes) -> None:
-        """Replace the shared file ``name`` in the root folder of the store by a file with the content ``raw``."""
-        with self.temporary(name) as (part, file):
+        """Replace the shared file ``name`` in the root folder of the store by a file with the
+        content ``raw``.
+        """
+        with self.temporary(name) as (path, file):
             file.write(raw)
             file.flush()
-            self.share(part)
-            self.rename(part, f"{self.folder}/{name}")
+            self.share(path)
+            self.rename(path, f"{self.folder}/{name}")
 
-    def rename(self, part: str, path: str) -> None:
-        """Rename a complete file to its final name, and replace what has that name; a folder is put aside."""
+    def rename(self, temporary: str, path: str) -> None:
+        """Rename a complete file to its final name, and replace what has that name; a folder is
+        put aside.
+        """
         try:
-            os.replace(part, path)
+            os.replace(temporary, path)
         except FileNotFoundError:
             self.make_folder(os.path.dirname(path))
-            os.replace(part, path)
+            os.replace(temporary, path)
         except IsADirectoryError:
             self.put_aside(path)
-            os.replace(part, path)
+            os.replace(temporary, path)
 
-    def link(self, part: str, path: str) -> bool:
+    def link(self, temporary: str, path: str) -> bool:
         """Link a complete file to its final name; return False if a file of that name exists."""
         try:
             try:
-                os.link(part, path)
+                os.link(temporary, path)
             except FileNotFoundError:
                 self.make_folder(os.path.dirname(path))
-                os.link(part, path)
+                os.link(temporary, path)
         except FileExistsError:
             return False
         except OSError as error:
@@ -100,22 +215,27 @@ class Disk:
                 raise
             if os.path.lexists(path):
                 return False
-            os.replace(part, path)
+            os.replace(temporary, path)
         return True
 
     def make_folder(self, folder: str) -> None:
-        """Make a folder with write permission for every user who may write in the root folder of the store."""
+        """Make a folder with write permission for every user who may write in the root folder of
+        the store.
+        """
         make_folders(folder, self.folder)
 
     def share(self, path: str, mask: int = 0o666) -> None:
-        """Give other users the permissions on ``path`` that they have on the root folder of the store."""
+        """Give other users the permissions on ``path`` that they have on the root folder of the
+        store.
+        """
         inherit(path, self.folder, mask)
 
     @contextmanager
     def lock(self) -> Iterator[None]:
         """Hold the lock of the store during a ``with`` block.
 
-        The block runs without the lock if the file system has no locks or the wait exceeds `_PATIENCE` seconds.
+        The block runs without the lock if the file system has no locks or the wait exceeds
+        `_PATIENCE` seconds.
         """
         self.prepare()
         file = self._lock_file()
@@ -128,7 +248,9 @@ class Disk:
             os.close(file)
 
     def _lock_file(self) -> int:
-        """Open the file of the lock without waiting; what is no file is removed first, if this user may."""
+        """Open the file of the lock without waiting; what is no file is removed first, if this
+        user may.
+        """
         path, careful = f"{self.folder}/tmp/.lock", os.O_NOFOLLOW | os.O_NONBLOCK
         with suppress(OSError):
             if not stat.S_ISREG(os.lstat(path).st_mode):
@@ -147,41 +269,50 @@ class Disk:
 
         Leases and badges of other machines stay for ``patience`` seconds, because clocks may jump.
         """
-        gone = []
+        swept = []
         for entry in entries(f"{self.folder}/tmp"):
             with suppress(OSError):
                 if entry.name != ".lock" and _abandoned(entry, patience):
-                    gone.append((entry.path, entry.stat(follow_symlinks=False).st_size))
+                    swept.append((entry.path, entry.stat(follow_symlinks=False).st_size))
                     if not dry:
                         self.unlink(entry.path)
-        return gone
+        return swept
 
     def unlink(self, path: str) -> None:
-        """Delete a file below the root folder; raise `OSError` if a folder on the way there is a symbolic link."""
+        """Delete a file below the root folder; raise `OSError` if a folder on the way there is a
+        symbolic link.
+        """
         with self._opened_folder(path) as (folder, name):
             os.unlink(name, dir_fd=folder)
 
     def put_aside(self, path: str) -> None:
-        """Move a damaged file to the folder ``bad/`` for inspection, if this user may; follow no symbolic link."""
+        """Move a damaged file to the folder ``bad/`` for inspection, if this user may; follow no
+        symbolic link.
+        """
         with suppress(OSError):
             self.make_folder(f"{self.folder}/bad")
-            with self._opened_folder(path) as (folder, name), self._opened_folder(f"{self.folder}/bad/_") as (to, _):
+            with (
+                self._opened_folder(path) as (folder, name),
+                self._opened_folder(f"{self.folder}/bad/_") as (to, _),
+            ):
                 os.replace(name, name, src_dir_fd=folder, dst_dir_fd=to)
 
     @contextmanager
     def _opened_folder(self, path: str) -> Iterator[tuple[int, str]]:
         """Yield the opened folder of a file below the root, and the name of the file.
 
-        Each folder is opened in the one above it, so that no symbolic link leads out of the root, however late it is
-        put there. Raises `OSError` for a symbolic link.
+        Each folder is opened in the one above it, so that no symbolic link leads out of the root,
+        however late it is put there. Raises `OSError` for a symbolic link.
         """
         *folders, name = path.removeprefix(f"{self.folder}/").split("/")
         if {"", ".", ".."} & {*folders, name}:
             raise OSError(errno.EPERM, f"{path} is not below {self.folder}")
         opened = [os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY)]
         try:
-            for each in folders:
-                opened.append(os.open(each, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=opened[-1]))
+            for folder in folders:
+                opened.append(
+                    os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=opened[-1])
+                )
             yield opened[-1], name
         finally:
             for file in opened:
@@ -189,12 +320,15 @@ class Disk:
 
 
 def append(path: str, raw: bytes, flags: int = 0) -> int:
-    """Append bytes to a file in one write; return the number of written bytes. ``flags`` are flags of `os.open`.
+    """Append bytes to a file in one write; return the number of written bytes. ``flags`` are flags
+    of `os.open`.
 
     A symbolic link or a pipe is deleted, and counts as a missing file.
     """
     try:
-        file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | flags, 0o666)
+        file = os.open(
+            path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK | flags, 0o666
+        )
     except OSError as error:
         if error.errno not in (errno.ELOOP, errno.ENXIO):
             raise
@@ -206,19 +340,24 @@ def append(path: str, raw: bytes, flags: int = 0) -> int:
         os.close(file)
 
 
-def read_file(path: str, most: int = MOST_READ) -> bytes:
-    """Return the bytes of a file; raise `ValueError` for what is no file or has more than ``most`` bytes.
+def read_file(path: str, limit: int = MOST_READ) -> bytes:
+    """Return the bytes of a file; raise `ValueError` for what is no file or has more than ``limit``
+    bytes.
 
     A pipe or a device in place of the file never makes the caller wait.
     """
     file = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         about = os.fstat(file)
-        if not stat.S_ISREG(about.st_mode) or about.st_size > most:
-            raise ValueError(f"{path} is not a file of at most {most} bytes")
+        if not stat.S_ISREG(about.st_mode) or about.st_size > limit:
+            raise ValueError(f"{path} is not a file of at most {limit} bytes")
         raw = os.read(file, about.st_size)
-        while len(raw) != about.st_size and (more := os.read(file, most + 1 - len(raw))) and len(raw) <= most:
-            raw += more
+        while (
+            len(raw) != about.st_size
+            and (chunk := os.read(file, limit + 1 - len(raw)))
+            and len(raw) <= limit
+        ):
+            raw += chunk
         return raw
     finally:
         os.close(file)
@@ -230,7 +369,9 @@ def open_now(path: str, flags: int) -> int:
 
 
 def entries(folder: str) -> list[os.DirEntry[str]]:
-    """Return the files and folders in a folder, or an empty list for a symbolic link or an unreadable folder."""
+    """Return the files and folders in a folder, or an empty list for a symbolic link or an
+    unreadable folder.
+    """
     try:
         if os.path.islink(folder):
             return []
@@ -241,7 +382,9 @@ def entries(folder: str) -> list[os.DirEntry[str]]:
 
 
 def below(base: str) -> Iterator[os.DirEntry[str]]:
-    """Yield the files in those subfolders of ``base`` whose names have two letters; follow no symbolic link."""
+    """Yield the files in those subfolders of ``base`` whose names have two letters; follow no
+    symbolic link.
+    """
     for folder in sorted(entries(base), key=lambda entry: entry.name):
         if len(folder.name) == 2 and folder.is_dir(follow_symlinks=False):
             yield from entries(folder.path)
@@ -258,7 +401,9 @@ def _locked(file: int) -> bool:
 
 
 def _abandoned(entry: os.DirEntry[str], patience: float) -> bool:
-    """Return True if the owner of a temporary file is dead, or if the owner is unknown and the file is old."""
+    """Return True if the owner of a temporary file is dead, or if the owner is unknown and the
+    file is old.
+    """
     words = entry.name.split(".")
     shows_owner = words[-1] == "lease" or words[0] == "badge"
     if words[-1] == "lease" and entry.is_file(follow_symlinks=False):
@@ -267,5 +412,7 @@ def _abandoned(entry: os.DirEntry[str], patience: float) -> bool:
     owner = next(filter(None, map(owner_of, words)), None)
     state = owner.state if owner else "foreign"
     if state == "foreign":
-        return time.time() - entry.stat(follow_symlinks=False).st_mtime > (patience if shows_owner else OLD)
+        return time.time() - entry.stat(follow_symlinks=False).st_mtime > (
+            patience if shows_owner else OLD
+        )
     return state == "dead"

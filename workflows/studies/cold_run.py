@@ -1,4 +1,6 @@
-"""Cold runs of a recipe, which start with an empty store and compute every step that the outputs depend on."""
+"""Cold runs of a recipe, which start with an empty store and compute every step that the outputs
+depend on.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ from neusee.workflows.store.result_store import Store
 
 @contextmanager
 def cold(store: Store) -> Iterator[Store]:
-    """Yield a temporary store with the code digests of ``store`` and no results, and delete the temporary store."""
+    """Yield a temporary store with the code digests of ``store`` and no results, and delete the
+    temporary store.
+    """
     with TemporaryDirectory(prefix="neusee-") as folder:
         if os.path.isfile(store.code_memo):
             shutil.copyfile(store.code_memo, Path(folder) / store.code_memo.name)
@@ -27,14 +31,23 @@ def cold(store: Store) -> Iterator[Store]:
 
 
 def run_cold(recipe: Recipe, store: Store, device: str = "cpu") -> Result:
-    """Run ``recipe`` on ``device`` with a temporary store that has no results, and return the result."""
+    """Run ``recipe`` on ``device`` with a temporary store that has no results, and return the
+    result.
+    """
     with cold(store) as empty:
         return run(recipe, empty, device=device)
 
 
 def key_parts(recipe: Recipe, code: Code, device: str = "cpu") -> list[Any]:
-    """Return the parts of a store key that identify a run: output keys, tolerance, and True for a full computation."""
+    """Return the parts of a store key that identify a run: output keys, tolerance, and True for
+    a full computation.
+    """
     keys: dict[str, Key] = {}
     for name in needed(recipe, recipe.outputs):
         keys[name], _ = key_of(recipe.steps[name], keys, recipe.seed, code, device)
-    return [[keys[name] for name in recipe.outputs], recipe.tolerance, recipe.exact, recipe.estimates]
+    return [
+        [keys[name] for name in recipe.outputs],
+        recipe.tolerance,
+        recipe.exact,
+        recipe.estimates,
+    ]

@@ -1,13 +1,15 @@
-"""Studies of a recipe: accuracy, stability, left-out steps, calibration, uncertainty and equal protection.
+"""Studies of a recipe: accuracy, stability, left-out steps, calibration, uncertainty and equal
+protection.
 
-    study_recipe("accuracy", load("first_light"))       error against run time, over tolerances and settings
+    study_recipe("accuracy", load("first_light"))       error against run time
     study_recipe("stability", load("first_light"))      stiff and extreme cases against float64
     study_recipe("leave-out", load("first_light"))      each omission against the full computation
-    study_recipe("calibration", load("calibrate"))      the posterior of simulated sensors against the truth
-    study_recipe("uncertainty", load("first_light", ["sensor.read_noise=normal(10.5 e-, 0.5 e-)"]))  scatter of outputs
-    study_recipe("protection", load("five_half_rings"))  a mask against filters and stops of equal protection
+    study_recipe("calibration", load("calibrate"))      posterior of simulated sensors against truth
+    study_recipe("uncertainty", noisy)                  scatter of outputs
+    study_recipe("protection", load("five_half_rings"))  mask, filters and stops of equal protection
 
-Each study writes a folder with a page, a table and pictures, and continues after an interruption.
+where ``noisy = load("first_light", ["sensor.read_noise=normal(10.5 e-, 0.5 e-)"])``. Each study
+writes a folder with a page, a table and pictures, and continues after an interruption.
 """
 
 from __future__ import annotations
@@ -19,9 +21,26 @@ from pathlib import Path
 from typing import Any
 
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.regular_file import text_of
+from neusee.workflows.keys.sealed_files import text_of
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
+
+# --- study refused --------------------------------------------------------------------------------
+
+# Error for a study that has nothing to study, raised before anything long runs.
+
+
+class StudyRefused(ValueError):
+    """Error for a study whose recipe or options leave nothing to study; the message names the
+    remedy.
+    """
+
+
+# --- run study ------------------------------------------------------------------------------------
+
+# Studies of a recipe: accuracy, stability, left-out steps, calibration, uncertainty and equal
+# protection.
+
 
 KINDS = ("accuracy", "stability", "leave-out", "calibration", "uncertainty", "protection")
 
@@ -37,16 +56,20 @@ def study_recipe(
 ) -> Path:
     """Run a study of ``recipe`` and return the folder of the study; ``kind`` is one of `KINDS`.
 
-    Args: store: keeps finished parts, so that an interrupted study continues. runs: the parent of the study's folder.
-    progress: is called with a line of text for each finished part. options: arguments of the kind of study.
+    Args: store: keeps finished parts, so that an interrupted study continues. runs: the parent of
+            the study's folder.
+    progress: is called with a line of text for each finished part. options: arguments of the kind
+    of study.
     """
     room = kind.replace("-", "_")
     module = import_module(f"neusee.workflows.studies.{room}.{room}_study")
-    folder: Path = module.study(recipe, store or open_store(), runs, list(command), progress, **options)
+    folder: Path = module.study(
+        recipe, store or open_store(), runs, list(command), progress, **options
+    )
     return folder
 
 
 def count_failures(folder: Path) -> int:
     """Return the number of failed tests of a finished study, from its ``provenance.json``."""
-    found: dict[str, Any] = json.loads(text_of(folder / "provenance.json"))
-    return int(found.get("failed", 0))
+    document: dict[str, Any] = json.loads(text_of(folder / "provenance.json"))
+    return int(document.get("failed", 0))

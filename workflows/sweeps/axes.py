@@ -1,21 +1,201 @@
-"""Axes of a parameter sweep, written as in Hydra such as ``a=1,2,3``, and the combinations of their values."""
+"""Axes of a sweep, such as ``a=1,2,3`` and ranges, and the combinations of their values."""
 
 from __future__ import annotations
 
+import difflib
 import itertools
 import math
+import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Decimal, localcontext
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.final_values import flow
-from neusee.workflows.recipe.text.overrides import Override, read_override
-from neusee.workflows.recipe.text.python_overrides import overrides_of
-from neusee.workflows.sweeps.value_ranges import MOST, spans, values_of
+from neusee.workflows.recipe.text.overrides import Override, overrides_of, read_override
+
+# --- value ranges ---------------------------------------------------------------------------------
+
+# Lists and ranges that are written as text, such as ``1,2,3`` and ``linspace(450 nm, 650 nm, 5)``.
+#
+# Commas in quotes or brackets do not separate values, so that ``[1, 2]`` is one value. Numbers of a
+# range are computed exactly: ``range(0, 1, 0.1)`` has the value 0.3, not 0.30000000000000004.
+
+
+MOST = 100_000  #: values of one axis, and points of one sweep
+
+_QUOTED = r"""(?:^|(?<=[\s,:(\[{]))(?:"(?:[^"\\]|\\.)*"|'(?:[^']|'')*')"""
+_TOKEN = re.compile(rf"{_QUOTED}|.", re.DOTALL)
+_PAIRS = {"(": ")", "[": "]", "{": "}"}
+_CALL = re.compile(r"\s*([A-Za-z]\w*)\s*\((.*)\)\s*", re.DOTALL)
+_NUMBER = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\d\s.].*)?")
+_EXACT = 10**15  #: smaller whole numbers are written without a decimal point
+
+
+def split(text: str) -> list[str]:
+    """Split a text at the commas outside of quotes and brackets; raise `ValueError` for an
+    unclosed bracket.
+    """
+    parts, waiting = [""], list[str]()
+    for token in _TOKEN.findall(text):
+        if token == "," and not waiting:
+            parts.append("")
+            continue
+        parts[-1] += token
+        if token in _PAIRS:
+            waiting.append(_PAIRS[token])
+        elif waiting and token == waiting[-1]:
+            waiting.pop()
+    if waiting:
+        raise ValueError(f"a bracket is not closed: {waiting[-1]} is missing")
+    return parts
+
+
+def values_of(text: str) -> list[str]:
+    """Return the values of a list or a range as YAML texts; raise `ValueError` if the text is
+    malformed.
+    """
+    pieces = split(text)
+    if len(pieces) > 1 and not all(piece.strip() for piece in pieces):
+        raise ValueError("a value is missing before or after a comma")
+    values = []
+    for piece in pieces:
+        values += _spanned(piece)
+    return values
+
+
+def spans(text: str) -> bool:
+    """Return True if a text is a range, such as ``range(4)``."""
+    return _function(text) is not None
+
+
+def _spanned(text: str) -> list[str]:
+    """Return the values of a range such as ``range(4)``, or else the text itself as the only
+    value.
+    """
+    function = _function(text)
+    if function is None:
+        return [text.strip()]
+    name, arguments = function
+    try:
+        return _FUNCTIONS[name](
+            [piece.strip() for piece in split(arguments)] if arguments.strip() else []
+        )
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
+
+
+def _function(text: str) -> tuple[str, str] | None:
+    """Return the name and the arguments of a range such as ``range(4)``, or None if the text is not
+    a range.
+
+    Raises `ValueError` if the name is misspelt.
+    """
+    match = _CALL.fullmatch(text)
+    if match is None or match[1] in _FUNCTIONS:
+        return match and (match[1], match[2])
+    close = difflib.get_close_matches(match[1].lower(), _FUNCTIONS, 1, 0.7)
+    if close:
+        raise ValueError(f"there is no range function {match[1]}; did you mean {close[0]}?")
+    return None
+
+
+def _range(arguments: list[str]) -> list[str]:
+    if not 1 <= len(arguments) <= 3:
+        raise ValueError("write range(stop), range(start, stop) or range(start, stop, step)")
+    numbers, unit = _numbers(arguments)
+    start, stop = (Fraction(0), numbers[0]) if len(numbers) == 1 else (numbers[0], numbers[1])
+    step = numbers[2] if len(numbers) == 3 else Fraction(1)
+    if step == 0:
+        raise ValueError("the step of a range must not be 0")
+    count = _count(math.ceil((stop - start) / step))
+    return [_written(start + i * step, unit) for i in range(count)]
+
+
+def _linspace(arguments: list[str]) -> list[str]:
+    (start, stop), unit, count = _ends(arguments, "linspace(450 nm, 650 nm, 5)")
+    step = (stop - start) / max(count - 1, 1)
+    return [_written(start + i * step, unit) for i in range(count)]
+
+
+def _logspace(arguments: list[str]) -> list[str]:
+    (start, stop), unit, count = _ends(arguments, "logspace(1e2, 1e6, 5)")
+    if start <= 0 or stop <= 0:
+        raise ValueError("the first and the last value of a logarithmic range must be positive")
+    with localcontext(prec=50):
+        low, high = (Decimal(x.numerator) / Decimal(x.denominator) for x in (start, stop))
+        step = (high / low).ln() / max(count - 1, 1)
+        inner = [Fraction(low * (step * i).exp()) for i in range(count)]
+    ends = [start, *inner[1:-1], stop][:count]
+    return [_written(x, unit) for x in ends]
+
+
+_FUNCTIONS = {"range": _range, "linspace": _linspace, "logspace": _logspace}
+
+
+def _ends(arguments: list[str], example: str) -> tuple[list[Fraction], str, int]:
+    """Return the first and the last value of a range, their common unit, and the number of
+    values.
+    """
+    if len(arguments) != 3:
+        raise ValueError(
+            f"write the first value, the last value and the number of values: {example}"
+        )
+    numbers, unit = _numbers(arguments[:2])
+    if not re.fullmatch(r"\+?\d{1,9}", arguments[2]):
+        raise ValueError(
+            "the number of values must be a whole number of at least 1, not"
+            f" {arguments[2] or 'nothing'}"
+        )
+    return numbers, unit, _count(int(arguments[2]))
+
+
+def _count(count: int) -> int:
+    if count < 1:
+        raise ValueError(
+            "the range is empty: change its first value, its last value or the number of values"
+        )
+    if count > MOST:
+        raise ValueError(
+            f"the range has {count if count < _EXACT else 'too many'} values: an axis has at most"
+            f" {MOST}"
+        )
+    return count
+
+
+def _numbers(texts: list[str]) -> tuple[list[Fraction], str]:
+    """Return the numbers in ``texts`` as exact fractions, and their common unit."""
+    pairs = [_number(text) for text in texts]
+    units = list(dict.fromkeys(unit for _, unit in pairs))
+    if len(units) > 1:
+        several = ", ".join(unit or "none" for unit in units)
+        raise ValueError(f"write all numbers in the same unit instead of {several}")
+    return [number for number, _ in pairs], units[0]
+
+
+def _number(text: str) -> tuple[Fraction, str]:
+    """Return a number as an exact fraction, and its unit."""
+    match = _NUMBER.fullmatch(text)
+    if match is None or not math.isfinite(float(match[1])):
+        raise ValueError(f"{text or 'nothing'} is not a number")
+    return Fraction(repr(float(match[1]))), (match[2] or "").strip()
+
+
+def _written(number: Fraction, unit: str) -> str:
+    value = float(number)
+    is_whole = value.is_integer() and abs(value) < _EXACT
+    return f"{int(value) if is_whole else value!r} {unit}".strip()
+
+
+# --- axes -----------------------------------------------------------------------------------------
+
+# Axes of a parameter sweep, written as in Hydra such as ``a=1,2,3``, and the combinations of their
+# values.
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +209,9 @@ class Coordinate:
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """An axis of a sweep: a parameter or a group of a recipe, with the list of values for the sweep."""
+    """An axis of a sweep: a parameter or a group of a recipe, with the list of values for the
+    sweep.
+    """
 
     name: str
     coordinates: tuple[Coordinate, ...]
@@ -53,7 +235,9 @@ class Point:
     @property
     def shown(self) -> str:
         """Return the point of a sweep as text, such as ``sensor.read_noise=5 e-, doe=axicon``."""
-        return ", ".join(f"{name}={c.shown}" for name, c in zip(self.axes, self.coordinates, strict=True))
+        return ", ".join(
+            f"{name}={c.shown}" for name, c in zip(self.axes, self.coordinates, strict=True)
+        )
 
 
 def read_words(words: Sequence[str | Override], folder: Path, first: int = 1) -> list[Argument]:
@@ -63,16 +247,21 @@ def read_words(words: Sequence[str | Override], folder: Path, first: int = 1) ->
 
     Messages number the arguments from ``first``.
     """
-    return _every(partial(_read_word, word, number, folder) for number, word in enumerate(words, first))
+    return _every(
+        partial(_read_word, word, number, folder) for number, word in enumerate(words, first)
+    )
 
 
 def read_axes(axes: Mapping[str, str | Iterable[Any]], folder: Path) -> list[Argument]:
-    """Read the axes of a sweep, whose values are either Python lists or texts in the notation of the command line."""
+    """Read the axes of a sweep, whose values are either Python lists or texts in the notation of
+    the command line.
+    """
     return _every(partial(_read_axis, name, values, folder) for name, values in axes.items())
 
 
 def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
-    """Return the points of a sweep: all combinations of values, or, if ``paired``, the n-th values of all axes.
+    """Return the points of a sweep: all combinations of values, or, if ``paired``, the n-th values
+    of all axes.
 
     The last axis varies fastest.
     """
@@ -85,11 +274,13 @@ def points(arguments: Sequence[Argument], paired: bool = False) -> list[Point]:
     return [_point(number, place, arguments, axes) for number, place in enumerate(places, 1)]
 
 
-# --- arguments ------------------------------------------------------------------------------------------------------
+# --- arguments ------------------------------------------------------------------------------------
 
 
 def _every(readers: Iterable[Callable[[], _T]]) -> list[_T]:
-    """Call each function and return the results; raise one `RecipeError` that lists the mistakes from all calls."""
+    """Call each function and return the results; raise one `RecipeError` that lists the mistakes
+    from all calls.
+    """
     results: list[_T] = []
     diagnostics: list[Diagnostic] = []
     for read in readers:
@@ -126,10 +317,18 @@ def _read_axis(name: str, values: str | Iterable[Any], folder: Path) -> Axis:
         return _axis(name, _values(values, f"{name}={values}", mark), mark)
     listed = values.tolist() if hasattr(values, "tolist") else values
     if isinstance(listed, Mapping) or not isinstance(listed, Iterable):
-        raise RecipeError([Diagnostic(mark, name, f"give the axis a list of values, not {type(values).__name__}")])
+        raise RecipeError(
+            [Diagnostic(mark, name, f"give the axis a list of values, not {type(values).__name__}")]
+        )
     coordinates = tuple(_coordinate(name, value, folder) for value in listed)
     if not coordinates:
-        raise RecipeError([Diagnostic(mark, name, "the axis has an empty list of values: give at least one value")])
+        raise RecipeError(
+            [
+                Diagnostic(
+                    mark, name, "the axis has an empty list of values: give at least one value"
+                )
+            ]
+        )
     return Axis(name, coordinates, mark)
 
 
@@ -142,44 +341,80 @@ def _values(text: str, path: str, mark: Location) -> list[str]:
 
 def _coordinate(name: str, value: Any, folder: Path) -> Coordinate:
     changes = tuple(overrides_of({name: value}, folder))
-    alone = changes[0].value if len(changes) == 1 and changes[0].path == tuple(name.split(".")) else None
+    alone = (
+        changes[0].value
+        if len(changes) == 1 and changes[0].path == tuple(name.split("."))
+        else None
+    )
     plain = value if alone is None else alone.plain
     return Coordinate(plain if isinstance(plain, str) else flow(plain), plain, changes)
 
 
 def _axis(name: str, values: Sequence[str], mark: Location) -> Axis:
     coordinates = []
-    for text, change in zip(values, _every(partial(read_override, f"{name}={v}", mark) for v in values), strict=True):
+    for text, change in zip(
+        values, _every(partial(read_override, f"{name}={v}", mark) for v in values), strict=True
+    ):
         assert change.value is not None
         plain = change.value.plain
         coordinates.append(Coordinate(plain if isinstance(plain, str) else text, plain, (change,)))
     return Axis(name, tuple(coordinates), mark)
 
 
-# --- combinations ---------------------------------------------------------------------------------------------------
+# --- combinations ---------------------------------------------------------------------------------
 
 
 def _wrong(axes: Sequence[Axis], paired: bool) -> Iterable[Diagnostic]:
-    """Yield the mistakes in the axes of a sweep, such as a repeated name, a repeated value or too many points."""
+    """Yield the mistakes in the axes of a sweep, such as a repeated name, a repeated value or
+    too many points.
+    """
     if not axes:
-        yield Diagnostic(Location("sweep"), "", "the sweep has no axis: write a=1,2 or a='linspace(450 nm, 650 nm, 5)'")
+        yield Diagnostic(
+            Location("sweep"),
+            "",
+            "the sweep has no axis: write a=1,2 or a='linspace(450 nm, 650 nm, 5)'",
+        )
     first: dict[str, Axis] = {}
     for axis in axes:
         if first.setdefault(axis.name, axis) is not axis:
-            yield Diagnostic(axis.mark, axis.name, f"axis {axis.name} is also in {first[axis.name].mark}: remove one")
-        twice = [value for value, count in Counter(c.shown for c in axis.coordinates).items() if count > 1]
-        if twice:
-            yield Diagnostic(axis.mark, axis.name, f"the value {twice[0]} appears twice on the axis: remove one")
-        there, here = len(axes[0].coordinates), len(axis.coordinates)
-        if paired and there != here:
-            text = f"has {here} values, and {axes[0].name} ({axes[0].mark}) has {there}"
-            yield Diagnostic(axis.mark, axis.name, f"{text}: give paired axes the same number of values")
+            yield Diagnostic(
+                axis.mark,
+                axis.name,
+                f"axis {axis.name} is also in {first[axis.name].mark}: remove one",
+            )
+        yield from _repeated(axis)
+        if paired:
+            yield from _unequal(axis, axes[0])
     product = 1 if paired else math.prod(len(axis.coordinates) for axis in axes)
     if product > MOST:
-        yield Diagnostic(Location("sweep"), "", f"a sweep of {product} points is too long: at most {MOST} points")
+        yield Diagnostic(
+            Location("sweep"), "", f"a sweep of {product} points is too long: at most {MOST} points"
+        )
 
 
-def _point(number: int, place: tuple[int, ...], arguments: Sequence[Argument], axes: Sequence[Axis]) -> Point:
+def _repeated(axis: Axis) -> Iterator[Diagnostic]:
+    """Yield the first value that an axis has twice."""
+    counts = Counter(c.shown for c in axis.coordinates)
+    twice = [value for value, count in counts.items() if count > 1]
+    if twice:
+        yield Diagnostic(
+            axis.mark, axis.name, f"the value {twice[0]} appears twice on the axis: remove one"
+        )
+
+
+def _unequal(axis: Axis, first: Axis) -> Iterator[Diagnostic]:
+    """Yield that an axis has another number of values than the first of paired axes, if it has."""
+    expected, count = len(first.coordinates), len(axis.coordinates)
+    if expected != count:
+        text = f"has {count} values, and {first.name} ({first.mark}) has {expected}"
+        yield Diagnostic(
+            axis.mark, axis.name, f"{text}: give paired axes the same number of values"
+        )
+
+
+def _point(
+    number: int, place: tuple[int, ...], arguments: Sequence[Argument], axes: Sequence[Axis]
+) -> Point:
     coordinates = tuple(axis.coordinates[i] for axis, i in zip(axes, place, strict=True))
     here = iter(coordinates)
     changes = (next(here).overrides if isinstance(a, Axis) else (a,) for a in arguments)

@@ -1,7 +1,9 @@
-"""The order in which the points of a sweep run, the results that points share, and the computing time of each point.
+"""The order in which the points of a sweep run, the results that points share, and the computing
+time of each point.
 
-Two points share the result of a step if the step has the same key at both points. An axis that changes costly steps
-varies slowly, and only one axis changes from point to point: a costly result is computed once and released early.
+Two points share the result of a step if the step has the same key at both points. An axis that
+changes costly steps varies slowly, and only one axis changes from point to point: a costly result
+is computed once and released early.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ from neusee.workflows.keys.cache_key import Key
 
 @dataclass(frozen=True, slots=True)
 class PointJob:
-    """The steps that one point of a sweep needs, with the cache key and the input steps of each step."""
+    """The steps that one point of a sweep needs, with the cache key and the input steps of each
+    step.
+    """
 
     place: tuple[int, ...]  #: index of the value on each axis
     keys: Mapping[str, Key]  #: cache key of every step that the outputs need
@@ -28,13 +32,16 @@ class PointJob:
 
 @dataclass(frozen=True, slots=True)
 class Sharing:
-    """The number of results that the points of a sweep share, and the computing time that sharing saves."""
+    """The number of results that the points of a sweep share, and the computing time that
+    sharing saves.
+    """
 
     points: int
     distinct: Mapping[str, int]  #: number of different results of each step
     steps: int  #: number of steps of all points together
     made: int  #: number of different results of all steps
-    alone: float  #: work of all points without sharing, in seconds, or in steps if no step has run before
+    #: work of all points without sharing, in seconds, or in steps if no step has run before
+    alone: float
     together: float  #: work of the different results, each computed once
 
     @property
@@ -44,24 +51,30 @@ class Sharing:
 
 
 def filled(costs: Mapping[str, float], steps: Iterable[str]) -> dict[str, float]:
-    """Return the computing time of each step; a step of unknown time gets the median of the known times, or 1."""
+    """Return the computing time of each step; a step of unknown time gets the median of the
+    known times, or 1.
+    """
     steps = list(steps)
-    known = [costs[step] for step in steps if step in costs]
-    usual = median(known) if known else 1.0
+    times = [costs[step] for step in steps if step in costs]
+    usual = median(times) if times else 1.0
     return {step: costs.get(step, usual) for step in steps}
 
 
-def best_order(jobs: Sequence[PointJob], costs: Mapping[str, float], paired: bool = False) -> list[int]:
-    """Return the order of the points of a sweep in which costly shared steps run once and few results stay in memory.
+def best_order(
+    jobs: Sequence[PointJob], costs: Mapping[str, float], paired: bool = False
+) -> list[int]:
+    """Return the order of the points of a sweep in which costly shared steps run once and few
+    results stay in memory.
 
     The order is a list of indices of ``jobs``.
 
-    Args: jobs: one job for each point, in the order of the product of the axes, the last axis fastest.
+    Args: jobs: one job for each point, in the order of the product of the axes, the last axis
+            fastest.
     costs: known seconds by step. paired: the axes vary together like one axis.
 
     If each axis changes a fixed set of steps, no other order recomputes less from point to point.
     """
-    weights = filled(costs, {step for job in jobs for step in job.keys})
+    weights = filled(costs, _steps(jobs))
     if paired:
         return _grouped(jobs, weights)
     sizes = [1 + max(job.place[n] for job in jobs) for n in range(len(jobs[0].place))]
@@ -71,42 +84,62 @@ def best_order(jobs: Sequence[PointJob], costs: Mapping[str, float], paired: boo
     return [index[place] for place in _there_and_back(sizes, slowest_first)]
 
 
+def _steps(jobs: Iterable[PointJob]) -> set[str]:
+    """Return the names of all steps of jobs."""
+    return set[str]().union(*(job.keys for job in jobs))
+
+
 def sharing(jobs: Sequence[PointJob], costs: Mapping[str, float]) -> Sharing:
-    """Count the different results of every step in a sweep, and sum the computing time with and without sharing."""
-    weights = filled(costs, {step for job in jobs for step in job.keys})
+    """Count the different results of every step in a sweep, and sum the computing time with and
+    without sharing.
+    """
+    weights = filled(costs, _steps(jobs))
     different: dict[Key, float] = {}
     alone, steps = 0.0, 0
     for job in jobs:
         own = {key: weights[step] for step, key in job.keys.items()}
         different |= own
         alone, steps = alone + sum(own.values()), steps + len(own)
-    distinct = Counter(step for step, _ in {pair for job in jobs for pair in job.keys.items()})
+    pairs = set[tuple[str, Key]]().union(*(job.keys.items() for job in jobs))
+    distinct = Counter(step for step, _ in pairs)
     return Sharing(len(jobs), distinct, steps, len(different), alone, sum(different.values()))
 
 
-def work_left(jobs: Iterable[PointJob], costs: Mapping[str, float], stored: Callable[[Key], bool]) -> list[float]:
-    """Return the computing time of each point of a sweep, without results that are stored or computed earlier."""
+def work_left(
+    jobs: Iterable[PointJob], costs: Mapping[str, float], stored: Callable[[Key], bool]
+) -> list[float]:
+    """Return the computing time of each point of a sweep, without results that are stored or
+    computed earlier.
+    """
     computed: set[Key] = set()
     in_store = cache(stored)
     work = []
     for job in jobs:
-        weights, fresh, waiting = filled(costs, job.keys), list[float](), list(job.outputs)
+        weights, seconds, waiting = filled(costs, job.keys), list[float](), list(job.outputs)
         while waiting:
             name = waiting.pop()
             key = job.keys[name]
             if key not in computed and not in_store(key):
                 computed.add(key)
-                fresh.append(weights[name])
+                seconds.append(weights[name])
                 waiting += job.sources[name]
-        work.append(sum(fresh))
+        work.append(sum(seconds))
     return work
 
 
-def _reach(jobs: Sequence[PointJob], weights: Mapping[str, float], sizes: Sequence[int], axis: int) -> float:
-    """Return the mean computing time of the steps that must run again after a change to the next value of ``axis``."""
+def _reach(
+    jobs: Sequence[PointJob], weights: Mapping[str, float], sizes: Sequence[int], axis: int
+) -> float:
+    """Return the mean computing time of the steps that must run again after a change to the next
+    value of ``axis``.
+    """
     stride = math.prod(sizes[axis + 1 :])
     work = [
-        sum(weights[step] for step, key in job.keys.items() if jobs[i - stride].keys.get(step) != key)
+        sum(
+            weights[step]
+            for step, key in job.keys.items()
+            if jobs[i - stride].keys.get(step) != key
+        )
         for i, job in enumerate(jobs)
         if job.place[axis]
     ]
@@ -114,7 +147,9 @@ def _reach(jobs: Sequence[PointJob], weights: Mapping[str, float], sizes: Sequen
 
 
 def _there_and_back(sizes: Sequence[int], slowest_first: Sequence[int]) -> list[tuple[int, ...]]:
-    """Return all points of a sweep as index tuples in serpentine order: successive points differ by 1 in one index."""
+    """Return all points of a sweep as index tuples in serpentine order: successive points differ
+    by 1 in one index.
+    """
     rows: list[list[int]] = [[0] * len(sizes)]
     for axis in slowest_first:
         grown = []
@@ -126,11 +161,16 @@ def _there_and_back(sizes: Sequence[int], slowest_first: Sequence[int]) -> list[
 
 
 def _grouped(jobs: Sequence[PointJob], weights: Mapping[str, float]) -> list[int]:
-    """Return the indices of the points of a sweep, sorted so that points that share costly results are neighbours."""
+    """Return the indices of the points of a sweep, sorted so that points that share costly
+    results are neighbours.
+    """
     first: dict[str, dict[Key, int]] = defaultdict(dict)
     for i, job in enumerate(jobs):
         for step, key in job.keys.items():
             first[step].setdefault(key, i)
     shared = [step for step, keys in first.items() if 1 < len(keys) < len(jobs)]
     shared.sort(key=lambda step: -weights[step])
-    return sorted(range(len(jobs)), key=lambda i: [first[step].get(jobs[i].keys.get(step, ""), -1) for step in shared])
+    return sorted(
+        range(len(jobs)),
+        key=lambda i: [first[step].get(jobs[i].keys.get(step, ""), -1) for step in shared],
+    )

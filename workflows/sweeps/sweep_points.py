@@ -1,42 +1,133 @@
-"""The runs of a sweep: all points are checked first, and then run, in worker processes or one after another.
-
-Every point is composed and checked before the first point runs. A point keeps what differs from the first point.
-"""
+"""The points of a sweep: all are checked first, and then run."""
 
 from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any, Literal, NamedTuple
 
+from neusee.workflows.engine.execution import RunSeries
 from neusee.workflows.engine.local_executor import memory_limit
 from neusee.workflows.engine.node_call import place
-from neusee.workflows.engine.run_series import RunSeries
 from neusee.workflows.engine.runner import run
 from neusee.workflows.engine.worker_processes import shared
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
-from neusee.workflows.graph.recipe_graph import Recipe, needed
+from neusee.workflows.graph.final_values import Config
+from neusee.workflows.graph.recipe_graph import Event, Recipe, needed
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.graph.step_record import Event
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.recipe.loading import check
 from neusee.workflows.recipe.text.composition import Composer
 from neusee.workflows.report.result_numbers import numbers_of
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import Point
-from neusee.workflows.sweeps.kept_recipes import KeptRecipe, Same
 from neusee.workflows.sweeps.point_order import PointJob, best_order, work_left
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
+# --- kept recipes ---------------------------------------------------------------------------------
+
+# Recipes of the points of a sweep, each kept as its differences from the recipe of the first point.
+
+
+@dataclass(frozen=True, slots=True)
+class Same:
+    """The newest step and value of each name that was equal to that of the first recipe, though
+    another object.
+    """
+
+    steps: dict[str, Any] = field(default_factory=dict)
+    values: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class KeptRecipe:
+    """A checked recipe in little memory: the steps, values and fields that differ from those of
+    another recipe.
+    """
+
+    first: Recipe
+    steps: Mapping[str, Any]
+    values: Mapping[str, Any]
+    others: Mapping[str, Any]  #: by field of `Recipe`
+
+    @classmethod
+    def of(cls, recipe: Recipe, first: Recipe, same: Same | None = None) -> KeptRecipe:
+        """Keep ``recipe`` beside ``first``, with which it shares what is equal in both.
+
+        ``same`` is given to each call for one ``first``: values found equal are not compared again.
+        """
+        same = same or Same()
+        names = (f.name for f in fields(Recipe))
+        others = {
+            name: getattr(recipe, name)
+            for name in names
+            if getattr(recipe, name) is not getattr(first, name)
+        }
+        steps = _changed(recipe.steps, first.steps, same.steps)
+        values = _changed(recipe.config.settings, first.config.settings, same.values)
+        if steps is not None:
+            others.pop("steps", None)
+        if values is not None:
+            others.pop("config", None)
+        return cls(first, steps or {}, values or {}, others)
+
+    @property
+    def recipe(self) -> Recipe:
+        """Return the recipe, equal to the one that was kept."""
+        same = self.first
+        steps, values = {**same.steps, **self.steps}, {**same.config.settings, **self.values}
+        return replace(same, **{"steps": steps, "config": Config(values), **self.others})
+
+
+def _changed(
+    mapping: Mapping[str, Any], first: Mapping[str, Any], same: dict[str, Any]
+) -> dict[str, Any] | None:
+    """Return the entries of a mapping that are not equal to those of ``first``, or None if the keys
+    differ.
+
+    The entries ``same`` are known to be equal, and those found equal are added.
+    """
+    if list(mapping) != list(first):
+        return None
+    changed = {}
+    for key, value in mapping.items():
+        if value is first[key] or (key in same and value is same[key]):
+            continue
+        if _equal(value, first[key]):
+            same[key] = value
+        else:
+            changed[key] = value
+    return changed
+
+
+def _equal(left: Any, right: Any) -> bool:
+    """Return True for equal values that are also written alike, unlike 0.0 and -0.0, or 1, 1.0
+    and True.
+    """
+    with suppress(Exception):  # values such as arrays, whose comparison has no single answer
+        return bool(left == right) and repr(left) == repr(right)
+    return False
+
+
+# --- sweep points ---------------------------------------------------------------------------------
+
+# The runs of a sweep: all points are checked first, and then run, in worker processes or one after
+# another.
+#
+# Every point is composed and checked before the first point runs. A point keeps what differs from
+# the first point.
+
+
 PointState = Literal["run", "cached", "failed"]
 OnError = Literal["continue", "stop"]
-ResultNumber = tuple[str, str, int | str, float]  #: step, field, index (empty for a single number), value
+#: step, field, index (empty for a single number), value
+ResultNumber = tuple[str, str, int | str, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +141,9 @@ class CheckedPoint:
 
 @dataclass(frozen=True, slots=True)
 class PointOutcome:
-    """The outcome of one point of a sweep: the resulting numbers, or the error that stopped the run."""
+    """The outcome of one point of a sweep: the resulting numbers, or the error that stopped the
+    run.
+    """
 
     point: Point
     state: PointState  #: ``cached``: no step had to run
@@ -63,12 +156,15 @@ class PointOutcome:
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """The checked points of a sweep, in the order in which they run, with the known computing times."""
+    """The checked points of a sweep, in the order in which they run, with the known computing
+    times.
+    """
 
     recipe: Recipe  #: the recipe of the first point
     checked: tuple[CheckedPoint, ...]
     costs: dict[str, float]  #: seconds by step, of steps that ran before
-    work: tuple[float, ...]  #: work of each point without stored results, in seconds, or in steps if no step ran before
+    #: work of each point without stored results, in seconds, or in steps if no step ran before
+    work: tuple[float, ...]
     notes: tuple[str, ...]
     series: RunSeries  #: with the digests of the code of all nodes, the same for all points
 
@@ -78,7 +174,12 @@ class SweepPlan:
 
 
 def plan_sweep(
-    recipe: str, points: Sequence[Point], folder: Path, store: Store, paired: bool = False, device: str = "cpu"
+    recipe: str,
+    points: Sequence[Point],
+    folder: Path,
+    store: Store,
+    paired: bool = False,
+    device: str = "cpu",
 ) -> SweepPlan:
     """Check all points of a sweep and choose the order in which the points run.
 
@@ -91,7 +192,9 @@ def plan_sweep(
     costs = _costs(store)
     in_turn = [checked[i] for i in best_order([c.job for c in checked], costs, paired)]
     work = work_left([c.job for c in in_turn], costs, store.has)
-    return SweepPlan(checker.first, tuple(in_turn), costs, tuple(work), tuple(checker.notes), checker.series)
+    return SweepPlan(
+        checker.first, tuple(in_turn), costs, tuple(work), tuple(checker.notes), checker.series
+    )
 
 
 def outcomes(
@@ -105,9 +208,9 @@ def outcomes(
 ) -> Generator[PointOutcome, None, None]:
     """Run the points of a sweep, and yield the outcome of each point as it ends.
 
-    Several ``workers`` are processes with one thread each, and one worker is this process. A point that fails in a
-    worker runs again here. With ``on_error="stop"``, the first error is raised after the outcome of its point is
-    yielded.
+    Several ``workers`` are processes with one thread each, and one worker is this process. A point
+    that fails in a worker runs again here. With ``on_error="stop"``, the first error is raised
+    after the outcome of its point is yielded.
     """
     clock = _Clock(plan.work)
     memory = partial(memory_limit, None, workers)
@@ -116,12 +219,12 @@ def outcomes(
         return _found(plan, number, store, None, device, int(memory()))
 
     with closing(shared(alone, range(len(plan.checked)), workers, apart=True)) as ended:
-        for number, given in ended:
+        for number, returned in ended:
             checked, began = plan.checked[number], time.perf_counter()
-            if given is None:
+            if returned is None:
                 started(checked.point)
             try:
-                found = given[0] if given else _found(plan, number, store, watch, device)
+                outcome = returned[0] if returned else _found(plan, number, store, watch, device)
             except Exception as error:
                 seconds = time.perf_counter() - began
                 error.add_note(f"at point {checked.point.number}: {checked.point.shown}")
@@ -129,13 +232,15 @@ def outcomes(
                 if on_error == "stop":
                     raise
             else:
-                if found.failure:
-                    store.pass_on(found.failure)
-                yield PointOutcome(checked.point, *found[:3], left=clock.left(number))
+                if outcome.failure:
+                    store.pass_on(outcome.failure)
+                yield PointOutcome(checked.point, *outcome[:3], left=clock.left(number))
 
 
 class _Found(NamedTuple):
-    """What the run of one point of a sweep gave, and the warning of a store that cannot be written."""
+    """What the run of one point of a sweep gave, and the warning of a store that cannot be
+    written.
+    """
 
     state: PointState
     seconds: float
@@ -154,40 +259,56 @@ def _found(
     began = time.perf_counter()
     recipe = plan.checked[number].kept.recipe
     result = run(recipe, store, watch=watch, device=device, memory=memory, series=plan.series)
-    rows = (row for step, value in result.values.items() for row in numbers_of(step, value))
-    ran = any(step.state == "run" for step in result.done.values())
-    numbers = tuple((step, field, index, number) for step, field, index, number in rows)
-    return _Found("run" if ran else "cached", time.perf_counter() - began, numbers, store.failure)
+    numbers: list[ResultNumber] = []
+    for step, value in result.values.items():
+        rows = numbers_of(step, value)
+        numbers += [(name, field, index, number) for name, field, index, number in rows]
+    ran = any(done.state == "run" for done in result.done.values())
+    state: PointState = "run" if ran else "cached"
+    return _Found(state, time.perf_counter() - began, tuple(numbers), store.failure)
 
 
 def _failed(point: Point, error: Exception, seconds: float, left: float) -> PointOutcome:
     step = error.step if isinstance(error, RunError) else ""
-    message = str(error) if isinstance(error, RunError | RecipeError) else f"{type(error).__name__}: {error}"
+    message = (
+        str(error)
+        if isinstance(error, RunError | RecipeError)
+        else f"{type(error).__name__}: {error}"
+    )
     return PointOutcome(point, "failed", seconds, step=step, message=message, left=left)
 
 
 def _costs(store: Store) -> dict[str, float]:
-    known: dict[str, list[float]] = defaultdict(list)
+    times: dict[str, list[float]] = defaultdict(list)
     for row in store.journal.latest():
         if row["step"] and row["seconds"] is not None:
-            known[row["step"]].append(row["seconds"])
-    return {step: median(seconds) for step, seconds in known.items()}
+            times[row["step"]].append(row["seconds"])
+    return {step: median(seconds) for step, seconds in times.items()}
 
 
 class _Clock:
-    """Prediction of the remaining time of a sweep from the time that its finished points took, however many at once."""
+    """Prediction of the remaining time of a sweep from the time that its finished points took,
+    however many at once.
+    """
 
     def __init__(self, work: Sequence[float]) -> None:
-        least = sum(work) / 100 / len(work) or 1.0  # reading the numbers of a stored point also takes time
-        self.work = [max(one, least) for one in work]
+        # reading the numbers of a stored point also takes time
+        shortest = sum(work) / 100 / len(work) or 1.0
+        self.work = [max(seconds, shortest) for seconds in work]
         self.todo, self.done, self.points = sum(self.work), 0.0, len(self.work)
         self.began = time.perf_counter()
 
     def left(self, number: int) -> float:
-        """Record that a point of a sweep has ended, and return the predicted seconds of all remaining points."""
+        """Record that a point of a sweep has ended, and return the predicted seconds of all
+        remaining points.
+        """
         work, self.points = self.work[number], self.points - 1
         self.todo, self.done = self.todo - work, self.done + work
-        return max(self.todo, 0.0) * (time.perf_counter() - self.began) / self.done if self.points else 0.0
+        return (
+            max(self.todo, 0.0) * (time.perf_counter() - self.began) / self.done
+            if self.points
+            else 0.0
+        )
 
 
 class _Checker:
@@ -203,13 +324,17 @@ class _Checker:
         self._equal = Same()
 
     def every(self, points: Sequence[Point]) -> Iterator[CheckedPoint]:
-        """Yield each point that passes all checks, and add the mistakes of the other points to ``diagnostics``."""
+        """Yield each point that passes all checks, and add the mistakes of the other points to
+        ``diagnostics``.
+        """
         composer = Composer(self.recipe, self.folder)
         for point in points:
             try:
                 recipe = check(composer.compose(point.overrides))
                 self.first = self.first or recipe
-                yield CheckedPoint(point, KeptRecipe.of(recipe, self.first, self._equal), self._job(point, recipe))
+                yield CheckedPoint(
+                    point, KeptRecipe.of(recipe, self.first, self._equal), self._job(point, recipe)
+                )
             except RecipeError as error:
                 self.diagnostics += error.diagnostics
         self.series.known_keys.code.save()
@@ -221,8 +346,10 @@ class _Checker:
         for name in needed(recipe, recipe.outputs):
             step = recipe.steps[name]
             try:
-                found = self.series.known_keys.of(step, keys, recipe.seed, place(step, self.device))[0]
-                keys[name] = self._once(found)
+                key = self.series.known_keys.of(step, keys, recipe.seed, place(step, self.device))[
+                    0
+                ]
+                keys[name] = self._once(key)
             except (OSError, LookupError, TypeError) as error:
                 raise RecipeError([Diagnostic(step.mark, name, str(error))]) from error
         sources = tuple((name, recipe.steps[name].sources) for name in keys)
@@ -230,5 +357,7 @@ class _Checker:
         return PointJob(point.place, keys, graph, recipe.outputs)
 
     def _once(self, key: Key) -> Key:
-        """Return the same string object for equal cache keys, which saves memory because points share most keys."""
+        """Return the same string object for equal cache keys, which saves memory because points
+        share most keys.
+        """
         return str(self._same.setdefault(key, key))

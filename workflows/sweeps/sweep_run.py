@@ -1,9 +1,10 @@
-"""Parameter sweeps: runs of a recipe at every combination of the listed values, with all results in one table.
+"""Parameter sweeps: runs of a recipe at every combination of the listed values, with all results in
+one table.
 
     sweep("first_light", {"sensor.read_noise": ["5 e-", "10 e-"], "doe": ["axicon", "vortex"]})
 
-Results are stored by key: a stopped sweep continues when the same sweep runs again, and results that points share
-are computed once.
+Results are stored by key: a stopped sweep continues when the same sweep runs again, and results
+that points share are computed once.
 """
 
 from __future__ import annotations
@@ -22,21 +23,36 @@ from neusee.workflows.graph.final_values import flow
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.text.overrides import Override
 from neusee.workflows.report.run_folder import new_run
-from neusee.workflows.report.text_table import indented
+from neusee.workflows.report.terminal_text import indented
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import Argument, Axis, points, read_axes, read_words
 from neusee.workflows.sweeps.point_order import Sharing, sharing
-from neusee.workflows.sweeps.sweep_files import dataset, require_xarray
-from neusee.workflows.sweeps.sweep_points import OnError, PointOutcome, SweepPlan, outcomes, plan_sweep
-from neusee.workflows.sweeps.sweep_table import AxisColumn, column, header, rows_of, wide
+from neusee.workflows.sweeps.sweep_points import (
+    OnError,
+    PointOutcome,
+    SweepPlan,
+    outcomes,
+    plan_sweep,
+)
+from neusee.workflows.sweeps.sweep_table import (
+    AxisColumn,
+    column,
+    dataset,
+    header,
+    require_xarray,
+    rows_of,
+    wide,
+)
 
 SweepState = Literal["complete", "stopped", "interrupted"]
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """Result of a sweep: the outcomes of the points that ran, in the order of the axes, the last axis fastest."""
+    """Result of a sweep: the outcomes of the points that ran, in the order of the axes, the last
+    axis fastest.
+    """
 
     recipe: str
     title: str
@@ -54,29 +70,43 @@ class Sweep:
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """Return the results of the sweep in long format, with one table row for each number of each point."""
+        """Return the results of the sweep in long format, with one table row for each number of
+        each point.
+        """
         names = header(self.columns)
-        return [dict(zip(names, row, strict=True)) for o in self.outcomes for row in rows_of(o, self.columns)]
+        rows: list[dict[str, Any]] = []
+        for outcome in self.outcomes:
+            numbers = rows_of(outcome, self.columns)
+            rows += [dict(zip(names, row, strict=True)) for row in numbers]
+        return rows
 
     def table(self) -> str:
         """Return the results of the sweep as a text table, with one line for each point."""
         return "\n".join(indented(wide(self.outcomes, self.columns)))
 
     def to_xarray(self) -> Any:
-        """Return the results of the sweep as an `xarray.Dataset` in SI units, whose dimensions are the axes.
+        """Return the results of the sweep as an `xarray.Dataset` in SI units, whose dimensions are
+        the axes.
 
         The results of failed points are NaN.
 
         Raises: RecipeError if xarray is not installed.
         """
         require_xarray("to_xarray")
-        about = {"recipe": self.recipe, "title": self.title, "neusee": versions()["neusee"], "state": self.state}
+        about = {
+            "recipe": self.recipe,
+            "title": self.title,
+            "neusee": versions()["neusee"],
+            "state": self.state,
+        }
         return dataset(self.outcomes, self.columns, self.paired, about)
 
     def _repr_html_(self) -> str:
         names, *rows = wide(self.outcomes, self.columns)
         head = "".join(f"<th>{html.escape(name)}</th>" for name in names)
-        body = "".join("<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in rows)
+        body = "".join(
+            "<tr>" + "".join(f"<td>{html.escape(c)}</td>" for c in row) + "</tr>" for row in rows
+        )
         summary = html.escape(f"{self.title or self.recipe}: {counted(self)}")
         return f"<p>{summary}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
@@ -92,14 +122,15 @@ def sweep(
     folder: str | os.PathLike[str] | None = None,
     workers: int = 0,
 ) -> Sweep:
-    """Run ``recipe`` at every combination of axis values, or, with ``zip``, at the n-th values of all axes together.
+    """Run ``recipe`` at every combination of axis values, or, with ``zip``, at the n-th values of
+    all axes together.
 
     Args: axes: by parameter or group, a list of values, or a text as on the command line, such
     as ``"linspace(450 nm, 650 nm, 5)"``. overrides: changes that are the same at every point.
-    on_error: ``"stop"`` raises the error of the first failed point, ``"continue"`` writes each error into its row.
-    folder: the folder to which relative paths refer, by default the current folder. workers: the number of processes
-    that run points at the same time; 0 means one for each processor that other work leaves free, and none beside
-    threads of others, as in a notebook.
+    on_error: ``"stop"`` raises the error of the first failed point, ``"continue"`` writes each
+    error into its row. folder: the folder to which relative paths refer, by default the current
+    folder. workers: the number of processes that run points at the same time; 0 means one for each
+    processor that other work leaves free, and none beside threads of others, as in a notebook.
 
     Raises: RecipeError with every mistake of every point, before anything runs.
     """
@@ -114,32 +145,63 @@ class Sweeping:
     """A sweep whose points are checked and ready to run."""
 
     def __init__(
-        self, recipe: str, arguments: Sequence[Argument], folder: Path, store: Store, paired: bool, device: str
+        self,
+        recipe: str,
+        arguments: Sequence[Argument],
+        folder: Path,
+        store: Store,
+        paired: bool,
+        device: str,
     ) -> None:
         self.axes = [argument for argument in arguments if isinstance(argument, Axis)]
         self.fixed = [argument.text for argument in arguments if not isinstance(argument, Axis)]
         self.columns = tuple(map(column, self.axes))
         self.store, self.paired, self.device = store, paired, device
-        self.plan: SweepPlan = plan_sweep(recipe, points(arguments, paired), folder, store, paired, device)
+        self.plan: SweepPlan = plan_sweep(
+            recipe, points(arguments, paired), folder, store, paired, device
+        )
         self.sharing = sharing(self.plan.jobs, self.plan.costs)
 
     def workers(self, asked: int) -> int:
-        """Return how many processes run the points, of which ``asked`` is a wish and 0 none; one beside a GPU."""
+        """Return how many processes run the points, of which ``asked`` is a wish and 0 none; one
+        beside a GPU.
+        """
         return workers_for(len(self.plan.checked), asked) if self.device == "cpu" else 1
 
     def sweep(self, outcomes: Sequence[PointOutcome], state: SweepState) -> Sweep:
         """Return the result of the sweep, with the outcomes sorted by the number of the point."""
-        recipe, in_turn = self.plan.recipe, sorted(outcomes, key=lambda outcome: outcome.point.number)
+        recipe, in_turn = (
+            self.plan.recipe,
+            sorted(outcomes, key=lambda outcome: outcome.point.number),
+        )
         count = len(self.plan.checked)
-        return Sweep(recipe.name, recipe.title, self.columns, tuple(in_turn), count, self.sharing, self.paired, state)
+        return Sweep(
+            recipe.name,
+            recipe.title,
+            self.columns,
+            tuple(in_turn),
+            count,
+            self.sharing,
+            self.paired,
+            state,
+        )
 
 
-def write_sweep(work: Sweeping, result: Sweep, again: Sequence[str], out: Path, netcdf: bool, seconds: float) -> Path:
-    """Write the result folder of a sweep and return its path; the name of an unfinished sweep contains ``partial``."""
+def write_sweep(
+    work: Sweeping, result: Sweep, again: Sequence[str], out: Path, netcdf: bool, seconds: float
+) -> Path:
+    """Write the result folder of a sweep and return its path; the name of an unfinished sweep
+    contains ``partial``.
+    """
     name = f"{result.recipe}{'' if result.state == 'complete' else '_partial'}"
-    key = digest([checked.job.keys[name] for checked in work.plan.checked for name in checked.job.outputs])
+    keys: list[str] = []
+    for checked in work.plan.checked:
+        keys += [checked.job.keys[output] for output in checked.job.outputs]
+    key = digest(keys)
     with new_run(out / "sweeps", name, key) as folder:
-        folder.write_rows("sweep.csv", header(result.columns), (list(row.values()) for row in result.rows))
+        folder.write_rows(
+            "sweep.csv", header(result.columns), (list(row.values()) for row in result.rows)
+        )
         title = f"{(result.title or result.recipe).rstrip('.')}: {counted(result)}"
         account = folder.said = _account(work, result, again, seconds)
         lines = [f"# {title}\n", *(f"{key}: {flow(value)}\n" for key, value in account.items())]
@@ -169,9 +231,13 @@ def _account(work: Sweeping, result: Sweep, again: Sequence[str], seconds: float
 
 
 def counted(result: Sweep) -> str:
-    """Return the number of points of a sweep in each state, such as ``12 points: 8 run, 3 cached, 1 failed``."""
+    """Return the number of points of a sweep in each state, such as ``12 points: 8 run, 3
+    cached, 1 failed``.
+    """
     states = [outcome.state for outcome in result.outcomes]
-    parts = [f"{states.count(state)} {state}" for state in ("run", "cached", "failed") if state in states]
-    rest = result.points - len(states)
-    parts += [f"{rest} not run"] if rest else []
+    parts = [
+        f"{states.count(state)} {state}" for state in ("run", "cached", "failed") if state in states
+    ]
+    missing = result.points - len(states)
+    parts += [f"{missing} not run"] if missing else []
     return f"{result.points} point{'s' * (result.points > 1)}: {', '.join(parts)}"

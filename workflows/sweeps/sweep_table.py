@@ -1,23 +1,35 @@
-"""Table of the results of a sweep: its columns, its rows in a file, and the text of its cells."""
+"""Table of the results of a sweep, and the same results as an `xarray.Dataset`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import importlib.util
+import itertools
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from neusee.nodes import units
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 
 if TYPE_CHECKING:
     from neusee.workflows.sweeps.axes import Axis, Point
     from neusee.workflows.sweeps.sweep_points import PointOutcome, ResultNumber
 
-AFTER = ("status", "step", "field", "index", "value", "seconds", "cached", "message")  #: columns after the axes
+
+# --- sweep table ----------------------------------------------------------------------------------
+
+# Table of the results of a sweep: its columns, its rows in a file, and the text of its cells.
+
+
+#: columns after the axes
+AFTER = ("status", "step", "field", "index", "value", "seconds", "cached", "message")
 
 
 @dataclass(frozen=True, slots=True)
 class AxisColumn:
-    """Table column of one axis of a sweep; its header has a unit if all values have the same physical dimension."""
+    """Table column of one axis of a sweep; its header has a unit if all values have the same
+    physical dimension.
+    """
 
     name: str
     header: str
@@ -27,22 +39,36 @@ class AxisColumn:
 
 
 def column(axis: Axis) -> AxisColumn:
-    """Return the table column of an axis of a sweep: numbers in their common unit, or in SI units if units differ.
+    """Return the table column of an axis of a sweep: numbers in their common unit, or in SI units
+    if units differ.
 
     Words are unchanged.
     """
     values = [c.value for c in axis.coordinates]
-    quantities = [q for q in map(_quantity, values) if q is not None]
     header = f"{axis.name} (axis)" if axis.name in ("point", *AFTER) else axis.name
-    if len(quantities) == len(values) and len({q.si_unit for q in quantities}) == 1:
-        si, unit = tuple(q.si for q in quantities), quantities[0].si_unit
-        if len({q.unit for q in quantities}) > 1:
-            return AxisColumn(axis.name, f"{header} ({unit})", si, si, unit)
-        return AxisColumn(axis.name, f"{header} ({quantities[0].unit})", tuple(q.number for q in quantities), si, unit)
+    quantities = _alike(values)
+    if quantities:
+        return _of_quantities(axis.name, header, quantities)
     if all(isinstance(v, int | float) and not isinstance(v, bool) for v in values):
         return AxisColumn(axis.name, header, tuple(values), tuple(map(float, values)), "")
     words = tuple(c.shown for c in axis.coordinates)
     return AxisColumn(axis.name, header, words, words, "")
+
+
+def _alike(values: Sequence[Any]) -> list[_Quantity]:
+    """Return the values as quantities if all are quantities of one SI unit, and else none."""
+    quantities = [q for q in map(_quantity, values) if q is not None]
+    one_unit = len({q.si_unit for q in quantities}) == 1
+    return quantities if one_unit and len(quantities) == len(values) else []
+
+
+def _of_quantities(name: str, header: str, quantities: Sequence[_Quantity]) -> AxisColumn:
+    """Return the column of quantities of one SI unit, in their own unit if all have the same."""
+    si, unit = tuple(q.si for q in quantities), quantities[0].si_unit
+    if len({q.unit for q in quantities}) > 1:
+        return AxisColumn(name, f"{header} ({unit})", si, si, unit)
+    numbers = tuple(q.number for q in quantities)
+    return AxisColumn(name, f"{header} ({quantities[0].unit})", numbers, si, unit)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +83,13 @@ def _quantity(value: Any) -> _Quantity | None:
     match = units._NUMBER.fullmatch(value.strip()) if isinstance(value, str) else None
     for si_unit, scale in units._SCALE.items():
         if match and match[2].strip() in scale:
-            return _Quantity(float(match[1]), match[2].strip(), units.read_quantity(value, si_unit), si_unit)
+            return _Quantity(
+                float(match[1]), match[2].strip(), units.read_quantity(value, si_unit), si_unit
+            )
     return None
 
 
-# --- rows -----------------------------------------------------------------------------------------------------------
+# --- rows -----------------------------------------------------------------------------------------
 
 
 def header(columns: Sequence[AxisColumn]) -> list[str]:
@@ -70,7 +98,8 @@ def header(columns: Sequence[AxisColumn]) -> list[str]:
 
 
 def rows_of(outcome: PointOutcome, columns: Sequence[AxisColumn]) -> Iterator[list[Any]]:
-    """Yield the table rows of one point of a sweep: one row for each number, or a single row without a number.
+    """Yield the table rows of one point of a sweep: one row for each number, or a single row
+    without a number.
 
     A point has no numbers if it failed or if its results have none.
     """
@@ -82,25 +111,33 @@ def rows_of(outcome: PointOutcome, columns: Sequence[AxisColumn]) -> Iterator[li
 
 
 def headline(numbers: Sequence[ResultNumber]) -> dict[str, str]:
-    """Return each result of one point of a sweep as text: a single number, or the range of the numbers of an array.
+    """Return each result of one point of a sweep as text: a single number, or the range of the
+    numbers of an array.
 
     Single numbers come first.
     """
     results: dict[str, list[float]] = {}
-    for step, part, _, value in numbers:
-        results.setdefault(f"{step}.{part}".rstrip("."), []).append(value)
-    return {name: _range_of(values) for name, values in sorted(results.items(), key=lambda item: len(item[1]) > 1)}
+    for step, field, _, value in numbers:
+        results.setdefault(f"{step}.{field}".rstrip("."), []).append(value)
+    return {
+        name: _range_of(values)
+        for name, values in sorted(results.items(), key=lambda item: len(item[1]) > 1)
+    }
 
 
 def wide(outcomes: Sequence[PointOutcome], columns: Sequence[AxisColumn]) -> list[list[str]]:
-    """Return the rows of a text table of a sweep: a header, then one row for each point with its results."""
+    """Return the rows of a text table of a sweep: a header, then one row for each point with its
+    results.
+    """
     results = [headline(outcome.numbers) for outcome in outcomes]
-    names = list(dict.fromkeys(name for result in results for name in result))
+    names = list(dict.fromkeys(itertools.chain.from_iterable(results)))
     rows = [["point", *(c.header for c in columns), *names, "state", "seconds"]]
     for outcome, result in zip(outcomes, results, strict=True):
         cells = [cell_text(cell) for cell in point_cells(outcome.point, columns)]
         values = [result.get(name, "") for name in names]
-        rows.append([str(outcome.point.number), *cells, *values, outcome.state, f"{outcome.seconds:.3f}"])
+        rows.append(
+            [str(outcome.point.number), *cells, *values, outcome.state, f"{outcome.seconds:.3f}"]
+        )
     return rows
 
 
@@ -116,3 +153,96 @@ def _range_of(values: Sequence[float]) -> str:
 def cell_text(cell: Any) -> str:
     """Return a table cell as text; a float has at most six significant digits."""
     return f"{cell:.6g}" if isinstance(cell, float) else str(cell)
+
+
+# --- sweep files ----------------------------------------------------------------------------------
+
+# The results of a sweep as an `xarray.Dataset`, whose named dimensions are the axes of the sweep.
+
+
+_PACKAGES = ("xarray", "h5netcdf", "h5py")
+
+
+def require_xarray(asked_by: str) -> None:
+    """Raise `RecipeError` unless xarray, h5netcdf and h5py are installed."""
+    missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
+    if missing:
+        text = f'needs {" and ".join(missing)}: pip install "neusee[xarray]"'
+        raise RecipeError([Diagnostic(Location(asked_by), "", text)])
+
+
+def dataset(
+    outcomes: Sequence[PointOutcome],
+    columns: Sequence[AxisColumn],
+    paired: bool,
+    about: Mapping[str, str],
+) -> Any:
+    """Return the results of a sweep as an `xarray.Dataset` whose dimensions are the axes, with
+    coordinates in SI units.
+
+    Paired axes give the one dimension ``point``. A result of several numbers has the further
+    dimension ``<result> index``. A point that failed or did not run is NaN; ``ran`` is true at
+    points that have numbers.
+    """
+    import numpy
+    import xarray
+
+    shape, dims = _shape(columns, paired)
+    coords = {c.name: _coordinate(c, paired) for c in columns}
+    ran, seconds = numpy.zeros(shape, bool), numpy.full(shape, numpy.nan)
+    arrays: dict[str, Any] = {}
+    taken = {"ran", "seconds", *coords}
+    long = _lengths(outcomes, taken)
+    for outcome in outcomes:
+        place = outcome.point.place[:1] if paired else outcome.point.place
+        seconds[place], ran[place] = outcome.seconds, outcome.state != "failed"
+        for name, index, value in _named(outcome, taken):
+            if name not in arrays:
+                size = (*shape, long[name]) if name in long else shape
+                arrays[name] = numpy.full(size, numpy.nan)
+            arrays[name][(*place, index or 0) if name in long else place] = value
+    results = {name: (_dims(name, dims, long), array) for name, array in arrays.items()}
+    own = {"ran": (dims, ran), "seconds": (dims, seconds, {"units": "s"})}
+    return xarray.Dataset({**results, **own}, coords, dict(about))
+
+
+def _shape(columns: Sequence[AxisColumn], paired: bool) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Return the sizes and the names of the dimensions of the axes."""
+    if paired:
+        return (len(columns[0].si),), ("point",)
+    return tuple(len(c.si) for c in columns), tuple(c.name for c in columns)
+
+
+def _named(outcome: PointOutcome, taken: Collection[str]) -> Iterator[tuple[str, int | str, float]]:
+    """Yield name, index and value of each number of a point."""
+    for step, field, index, value in outcome.numbers:
+        yield _variable(step, field, taken), index, value
+
+
+def _coordinate(column: AxisColumn, paired: bool) -> tuple[str, list[Any], dict[str, str]]:
+    """Return the coordinate of an axis along its dimension."""
+    units = {"units": column.unit} if column.unit else {}
+    return "point" if paired else column.name, list(column.si), units
+
+
+def _dims(name: str, dims: tuple[str, ...], long: Container[str]) -> tuple[str, ...]:
+    """Return the dimensions of a result: those of the axes, and one of several numbers."""
+    return (*dims, f"{name} index") if name in long else dims
+
+
+def _lengths(outcomes: Sequence[PointOutcome], taken: Collection[str]) -> dict[str, int]:
+    """Return the largest length of each result that is an array, over all points of the sweep."""
+    long: dict[str, int] = {}
+    for outcome in outcomes:
+        for name, index, _ in _named(outcome, taken):
+            if index != "":
+                long[name] = max(long.get(name, 0), int(index) + 1)
+    return long
+
+
+def _variable(step: str, field: str, taken: Collection[str]) -> str:
+    """Return the name of a result in the `xarray.Dataset`, different from the names of all
+    coordinates.
+    """
+    name = f"{step}.{field}".rstrip(".").replace("/", "_")
+    return f"{name} (result)" if name in taken else name

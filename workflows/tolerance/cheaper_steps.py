@@ -1,8 +1,9 @@
 """Cheaper substitutes for steps, used where the error in the outputs stays below the tolerance.
 
-The sensor sums bands into a few channels before any random step. Where the steps after an image read only such sums,
-the sums are convolved instead of the bands. The substitutes are added beside the full steps, and only the inputs of
-the later steps change. A value requested by name is therefore always computed in full.
+The sensor sums bands into a few channels before any random step. Where the steps after an image
+read only such sums, the sums are convolved instead of the bands. The substitutes are added beside
+the full steps, and only the inputs of the later steps change. A value requested by name is
+therefore always computed in full.
 """
 
 from __future__ import annotations
@@ -13,51 +14,78 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from neusee.workflows.graph.recipe_graph import METRIC_TOLERANCE, Recipe, Step, Substitution, Wire, needed, ordered
-from neusee.workflows.tolerance.error_budget import CHANNELS
-from neusee.workflows.tolerance.error_propagation import unbounded_steps
-from neusee.workflows.tolerance.expected_errors import expected_excess
-from neusee.workflows.tolerance.zero_effect_steps import without_nothing
+from neusee.workflows.graph.recipe_graph import (
+    METRIC_TOLERANCE,
+    Recipe,
+    Step,
+    Substitution,
+    Wire,
+    needed,
+    ordered,
+)
+from neusee.workflows.tolerance.error_propagation import expected_excess, unbounded_steps
+from neusee.workflows.tolerance.skip_decision import CHANNELS, without_nothing
 
 if TYPE_CHECKING:
     from neusee.nodes import Node
 
 ESTIMATED = 0.22  #: share of the tolerance for the estimated error of PSFs of few bands
-BESIDE = 0.08  #: share of the tolerance for the channels of an image beside such an estimate, in place of `CHANNELS`
-_LEAST = 2e-5  #: tolerance below which sums over bands cannot be proved, because their round-off alone is 1.4e-6
-_SAFE = 0.8  #: tolerance scale after a failure, or one that is expected, relative to the largest that would suffice
+#: share of the tolerance for the channels of an image beside such an estimate, in place of
+#: `CHANNELS`
+BESIDE = 0.08
+#: tolerance below which sums over bands cannot be proved, because their round-off alone is 1.4e-6
+_LEAST = 2e-5
+#: tolerance scale after a failure, or one that is expected, relative to the largest that would
+#: suffice
+_SAFE = 0.8
 _USED = 0.5  #: share of its limit that the error of a cheaper step is expected to be
 _TRIES = 4  #: plans with ever smaller limits
-_MIXTURE = 0.1  #: share of the tolerance for a low-rank cube, rounded to a power of ten so that the cube seldom changes
+#: share of the tolerance for a low-rank cube, rounded to a power of ten so that the cube seldom
+#: changes
+_MIXTURE = 0.1
 
 
-def with_substitutions(recipe: Recipe, wanted: Iterable[str], pinned: Collection[str] = ()) -> Recipe:
-    """Return ``recipe`` with cheaper steps in place of full steps; an exact recipe is returned unchanged.
+def with_substitutions(
+    recipe: Recipe, outputs: Iterable[str], pinned: Collection[str] = ()
+) -> Recipe:
+    """Return ``recipe`` with cheaper steps in place of full steps; an exact recipe is returned
+    unchanged.
 
-    The errors of the outputs ``wanted`` stay within the tolerance. An image whose scene depends on a step in
-    ``pinned`` stays in full, because a cube that is being optimised has no low-rank form yet. Where well or converter
-    are expected to cut off so much light that the errors exceed the tolerance, the steps get smaller limits
-    (`Recipe.tolerance_scale`). A second call changes nothing.
+    The errors of ``outputs`` stay within the tolerance. An image whose scene depends on
+    a step in ``pinned`` stays in full, because a cube that is being optimised has no low-rank form
+    yet. Where well or converter are expected to cut off so much light that the errors exceed the
+    tolerance, the steps get smaller limits (`Recipe.tolerance_scale`). A second call changes
+    nothing.
     """
-    wanted = frozenset(wanted)
-    planned, again = _substituted(recipe, wanted, pinned), any(each.within for each in recipe.substitutions)
+    outputs = frozenset(outputs)
+    planned, again = (
+        _substituted(recipe, outputs, pinned),
+        any(substitution.within for substitution in recipe.substitutions),
+    )
     for _ in range(0 if again else _TRIES):
-        if not any(each.within for each in planned.substitutions):
+        if not any(substitution.within for substitution in planned.substitutions):
             break
-        if (excess := expected_excess(planned, sorted(wanted), _USED)) <= 1.0:
+        if (excess := expected_excess(planned, sorted(outputs), _USED)) <= 1.0:
             break
         scale = planned.tolerance_scale * _SAFE / excess if math.isfinite(excess) else 0.0
-        planned = _substituted(replace(planned.unsubstituted or recipe, tolerance_scale=scale), wanted, pinned)
+        planned = _substituted(
+            replace(planned.unsubstituted or recipe, tolerance_scale=scale), outputs, pinned
+        )
     return planned
 
 
 def stricter_scale(recipe: Recipe, over: float) -> float:
-    """Return the tolerance scale of a second attempt, after an error of ``recipe`` that was ``over`` times too large.
+    """Return the tolerance scale of a second attempt, after an error of ``recipe`` that was
+    ``over`` times too large.
 
-    The limits of low-rank cubes are powers of ten. The scale is so small that these limits become smaller too, because
-    a cube that stays the same may be what was too coarse.
+    The limits of low-rank cubes are powers of ten. The scale is so small that these limits become
+    smaller too, because a cube that stays the same may be what was too coarse.
     """
-    images = [each.step for each in recipe.substitutions if each.within and each.step in recipe.steps]
+    images = [
+        substitution.step
+        for substitution in recipe.substitutions
+        if substitution.within and substitution.step in recipe.steps
+    ]
     cubes = [recipe.allowed(name) * _MIXTURE for name in images if recipe.allowed(name) > 0]
     next_power = min((_power_of_ten(limit) / limit for limit in cubes), default=1.0)
     return recipe.tolerance_scale * min(_SAFE / over, 0.99 * next_power)
@@ -69,28 +97,36 @@ def _power_of_ten(limit: float) -> float:
     return power
 
 
-def _substituted(recipe: Recipe, wanted: frozenset[str], pinned: Collection[str]) -> Recipe:
+def _substituted(recipe: Recipe, outputs: frozenset[str], pinned: Collection[str]) -> Recipe:
     """Return ``recipe`` with cheaper steps that err by at most what `Recipe.allowed` says."""
     if recipe.exact:
         return recipe
-    recipe = without_nothing(recipe, needed(recipe, sorted(wanted)))
-    order = needed(recipe, sorted(wanted))
+    recipe = without_nothing(recipe, needed(recipe, sorted(outputs)))
+    order = needed(recipe, sorted(outputs))
     recipe = _limited(recipe, order)
-    images = [recipe.steps[n] for n in order if recipe.steps[n].node.channel_sum_form is not None and n not in wanted]
+    images = [
+        recipe.steps[n]
+        for n in order
+        if recipe.steps[n].node.channel_sum_form is not None and n not in outputs
+    ]
     if not images or recipe.tolerance * recipe.tolerance_scale <= _LEAST:
         return recipe
     dependent = _dependent(recipe, order, pinned)
-    draft = _Draft(recipe, wanted, _readers(recipe, order), frozenset(dependent))
+    draft = _Draft(recipe, outputs, _readers(recipe, order), frozenset(dependent))
     for image in images:
         if image.name not in pinned and image.wires.get("radiance") not in dependent:
             draft.collapse(image)
     recipe = draft.finished()
-    return _limited(recipe, needed(recipe, sorted(wanted)))
+    return _limited(recipe, needed(recipe, sorted(outputs)))
 
 
 def _limited(recipe: Recipe, order: Sequence[str]) -> Recipe:
-    """Mark in the recipe the steps whose errors have no bound, if the tolerance exceeds `METRIC_TOLERANCE`."""
-    steps = unbounded_steps(recipe, order) if recipe.tolerance > METRIC_TOLERANCE else frozenset[str]()
+    """Mark in the recipe the steps whose errors have no bound, if the tolerance exceeds
+    `METRIC_TOLERANCE`.
+    """
+    steps = (
+        unbounded_steps(recipe, order) if recipe.tolerance > METRIC_TOLERANCE else frozenset[str]()
+    )
     return recipe if steps == recipe.unbounded else replace(recipe, unbounded=steps)
 
 
@@ -114,7 +150,9 @@ def _readers(recipe: Recipe, order: Iterable[str]) -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class Asked:
-    """Sums over the wavelength bands of an image that later steps need, with the steps that read these sums."""
+    """Sums over the wavelength bands of an image that later steps need, with the steps that read
+    these sums.
+    """
 
     bands: str
     responses: str
@@ -122,11 +160,13 @@ class Asked:
     well: bool
 
 
-def asked_of(recipe: Recipe, image: str, wanted: Iterable[str]) -> Asked | None:
-    """Return the sums over wavelength bands of ``image`` that outputs need, or None if an output needs single bands."""
-    names = _readers(recipe, needed(recipe, wanted)).get(image, [])
+def asked_of(recipe: Recipe, image: str, outputs: Iterable[str]) -> Asked | None:
+    """Return the sums over wavelength bands of ``image`` that outputs need, or None if an output
+    needs single bands.
+    """
+    names = _readers(recipe, needed(recipe, outputs)).get(image, [])
     readers = [recipe.steps[name] for name in names]
-    weights = _Draft(recipe, frozenset(wanted), {}).spectral(image, readers)
+    weights = _Draft(recipe, frozenset(outputs), {}).spectral(image, readers)
     return weights and Asked(*weights, tuple(names), _well(readers))
 
 
@@ -143,8 +183,13 @@ class _Draft:
     substitutions: list[Substitution] = field(default_factory=list)
 
     def collapse(self, image: Step) -> None:
-        """Add a step that computes sums over the bands of an image, if no later step needs single bands."""
-        readers = [self.rewired.get(name, self.recipe.steps[name]) for name in self.readers.get(image.name, ())]
+        """Add a step that computes sums over the bands of an image, if no later step needs
+        single bands.
+        """
+        readers = [
+            self.rewired.get(name, self.recipe.steps[name])
+            for name in self.readers.get(image.name, ())
+        ]
         node, radiance = image.node.channel_sum_form, image.wires.get("radiance")
         weights = self.spectral(image.name, readers)
         if node is None or weights is None or not isinstance(radiance, str):
@@ -159,14 +204,21 @@ class _Draft:
         for reader in readers:
             changed = {i: _exchanged(wire, image.name, name) for i, wire in reader.wires.items()}
             self.rewired[reader.name] = replace(reader, wires=changed)
-        self.substitutions.append(Substitution(image.name, name, within, "only sums over its bands are needed"))
+        self.substitutions.append(
+            Substitution(image.name, name, within, "only sums over its bands are needed")
+        )
 
     def spectral(self, image: str, readers: Sequence[Step]) -> tuple[str, str] | None:
         """Return the steps that give all ``readers`` the wavelength bands and the camera responses.
 
-        Return None if a step in ``readers`` needs single bands, or if the steps read different bands or responses.
+        Return None if a step in ``readers`` needs single bands, or if the steps read different
+        bands or responses.
         """
-        pairs = {(r.wires.get("bands"), r.wires.get("responses")) for r in readers if "responses" in r.node.inputs}
+        pairs = {
+            (r.wires.get("bands"), r.wires.get("responses"))
+            for r in readers
+            if "responses" in r.node.inputs
+        }
         if len(pairs) != 1 or not all(self._sums(r, image) for r in readers):
             return None
         bands, responses = pairs.pop()
@@ -178,27 +230,44 @@ class _Draft:
             return self.recipe
         steps = {**self.recipe.steps, **self.added, **self.rewired}
         order = ordered({name: step.sources for name, step in steps.items()}, steps)
-        steps, whole = {name: steps[name] for name in order}, self.recipe.unsubstituted or self.recipe
+        steps, unsubstituted = (
+            {name: steps[name] for name in order},
+            self.recipe.unsubstituted or self.recipe,
+        )
         substitutions = (*self.recipe.substitutions, *self.substitutions)
-        return replace(self.recipe, steps=steps, substitutions=substitutions, unsubstituted=whole)
+        return replace(
+            self.recipe, steps=steps, substitutions=substitutions, unsubstituted=unsubstituted
+        )
 
     def _sums(self, reader: Step, image: str) -> bool:
         """Return True if the step ``reader`` needs only sums over wavelength bands of an image."""
         node, band_invariant = reader.node, reader.node.hooks.band_invariant
-        reads = {i for i, wire in reader.wires.items() if image == wire or (isinstance(wire, tuple) and image in wire)}
-        if not reads <= set(node.accepts_channel_sums) or (band_invariant and not band_invariant(reader.params)):
+        reads = {
+            i
+            for i, wire in reader.wires.items()
+            if image == wire or (isinstance(wire, tuple) and image in wire)
+        }
+        if not reads <= set(node.accepts_channel_sums) or (
+            band_invariant and not band_invariant(reader.params)
+        ):
             return False
         return all(self._even(reader.wires.get(i)) for i in node.needs_band_invariant)
 
     def _even(self, wire: Wire) -> bool:
-        """Return True if an input is unconnected, or if the connected node states that all bands are equal."""
+        """Return True if an input is unconnected, or if the connected node states that all bands
+        are equal.
+        """
         if not isinstance(wire, str):
             return wire is None
         step = self.recipe.steps[wire]
-        return step.node.hooks.band_invariant is not None and step.node.hooks.band_invariant(step.params)
+        return step.node.hooks.band_invariant is not None and step.node.hooks.band_invariant(
+            step.params
+        )
 
     def _few_bands(self, image: Step, cube: str, rows: str, largest: bool) -> dict[str, Wire]:
-        """Add steps that compute the PSF of an image for few bands, if nothing else reads it; return the wires."""
+        """Add steps that compute the PSF of an image for few bands, if nothing else reads it;
+        return the wires.
+        """
         from neusee.nodes import optics
 
         name = image.wires.get("psf")
@@ -206,19 +275,31 @@ class _Draft:
         if step is None or step.node is not optics.psf or not self._only(step.name, image.name):
             return {"psf": name}
         lens = {p: step.params[p] for p in ("focal_length", "pixel_pitch", "pixel", "sensor")}
-        given = {"pupil": step.wires["pupil"], "radiance": cube, "rows": rows}
+        inputs = {"pupil": step.wires["pupil"], "radiance": cube, "rows": rows}
         within = self.recipe.allowed(image.name) * ESTIMATED
         params = {**lens, "shape": step.params["shape"], "within": within, "largest": largest}
-        chosen = self._add(f"{name}.choice", optics.few_bands, given, params, step)
-        pupil = self._add(f"{name}.pupil", optics.pupil_of_bands, {"pupil": given["pupil"], "few": chosen}, {}, step)
+        choice = self._add(f"{name}.choice", optics.few_bands, inputs, params, step)
+        pupil = self._add(
+            f"{name}.pupil",
+            optics.pupil_of_bands,
+            {"pupil": inputs["pupil"], "few": choice},
+            {},
+            step,
+        )
         few = self._add(f"{name}.few", step.node, {"pupil": pupil}, step.params, step)
-        checked = {"few": chosen, "psf": few, **given}
-        found = self._add(f"{name}.checked", optics.few_bands_checked, checked, lens, step)
-        self.substitutions.append(Substitution(step.name, found, within, "PSFs of few bands are enough for the image"))
-        return {"psf": few, "few": found}
+        checked = {"few": choice, "psf": few, **inputs}
+        checked_name = self._add(f"{name}.checked", optics.few_bands_checked, checked, lens, step)
+        self.substitutions.append(
+            Substitution(
+                step.name, checked_name, within, "PSFs of few bands are enough for the image"
+            )
+        )
+        return {"psf": few, "few": checked_name}
 
     def _only(self, psf: str, image: str) -> bool:
-        """Return True if no step but ``image`` reads a PSF on the axis, and an estimate of its error is allowed."""
+        """Return True if no step but ``image`` reads a PSF on the axis, and an estimate of its
+        error is allowed.
+        """
         if not self.recipe.estimates or psf in self.wanted or psf in self.dependent:
             return False
         step = self.recipe.steps[psf]
@@ -226,38 +307,59 @@ class _Draft:
         return self.readers.get(psf) == [image] and not apart
 
     def _rows(self, bands: str, responses: str, readers: list[Step], image: Step) -> str:
-        """Add a step that computes the weight of each wavelength band in each channel sum; return the step's name."""
+        """Add a step that computes the weight of each wavelength band in each channel sum;
+        return the step's name.
+        """
         from neusee.nodes import spectra
 
         well = _well(readers)
-        name, wires = f"{responses}.{'wells' if well else 'rows'}", {"bands": bands, "responses": responses}
+        name, wires = (
+            f"{responses}.{'wells' if well else 'rows'}",
+            {"bands": bands, "responses": responses},
+        )
         return self._add(name, spectra.rows, wires, {"well": well}, image)
 
     def _mixture(self, name: str, image: Step) -> str:
-        """Add steps that compute the spectral cube ``name`` in low-rank form; return the name of the last added step.
+        """Add steps that compute the spectral cube ``name`` in low-rank form; return the name of
+        the last added step.
 
         The conversion to low rank comes as early as the nodes allow.
         """
         from neusee.nodes import spectra
 
         step, new = self.recipe.steps[name], f"{name}.mixture"
-        through = next((i for i in step.node.accepts_low_rank if isinstance(step.wires.get(i), str)), None)
+        through = next(
+            (i for i in step.node.accepts_low_rank if isinstance(step.wires.get(i), str)), None
+        )
         if through is not None and name not in self.wanted:
             wires = {**step.wires, through: self._mixture(str(step.wires[through]), image)}
             return self._add(new, step.node, wires, step.params, step)
         within = {"within": _power_of_ten(self.recipe.allowed(image.name) * _MIXTURE)}
         if step.node.low_rank_form is not None and name not in self.wanted:
-            return self._add(new, step.node.low_rank_form, step.wires, {**step.params, **within}, step)
+            return self._add(
+                new, step.node.low_rank_form, step.wires, {**step.params, **within}, step
+            )
         return self._add(new, spectra.compress, {"cube": name}, within, step)
 
-    def _add(self, name: str, node: Node, wires: Mapping[str, Wire], params: Mapping[str, Any], like: Step) -> str:
-        """Add a step with the recipe location and the device of the step ``like``; return the name of the new step."""
+    def _add(
+        self,
+        name: str,
+        node: Node,
+        wires: Mapping[str, Wire],
+        params: Mapping[str, Any],
+        like: Step,
+    ) -> str:
+        """Add a step with the recipe location and the device of the step ``like``; return the
+        name of the new step.
+        """
         self.added[name] = Step(name, node, params, wires, like.mark, {}, like.device)
         return name
 
 
 def _well(readers: Iterable[Step]) -> bool:
-    """Return True if a step reads bands but no responses, as a step that computes the electrons of a pixel does."""
+    """Return True if a step reads bands but no responses, as a step that computes the electrons
+    of a pixel does.
+    """
     return any("bands" in r.node.inputs and "responses" not in r.node.inputs for r in readers)
 
 

@@ -1,8 +1,8 @@
 """Error norm: the measure of the error of a result for all tolerances and studies.
 
-The norm is the root mean square of the difference between result and reference, divided by the largest element of the
-reference; 1e-3 is a peak signal-to-noise ratio of 60 dB. Every error bound of a node bounds the largest difference, and
-therefore also this norm.
+The norm is the root mean square of the difference between result and reference, divided by the
+largest element of the reference; 1e-3 is a peak signal-to-noise ratio of 60 dB. Every error bound
+of a node bounds the largest difference, and therefore also this norm.
 """
 
 from __future__ import annotations
@@ -19,9 +19,10 @@ _PART = 1 << 22  #: elements that are compared at once in float64
 def error_of(value: Any, reference: Any) -> float:
     """Return the root mean square of ``value - reference``, divided by the largest ``|reference|``.
 
-    For tuples, lists and mappings the largest error of a member counts. If the reference is 0 everywhere, the root mean
-    square itself is returned. Elements that are the same infinity, or both NaN, agree; an element that is not finite
-    makes the error infinite if the other element is finite. Raises `ValueError` if the values differ in kind or shape.
+    For tuples, lists and mappings the largest error of a member counts. If the reference is 0
+    everywhere, the root mean square itself is returned. Elements that are the same infinity, or
+    both NaN, agree; an element that is not finite makes the error infinite if the other element is
+    finite. Raises `ValueError` if the values differ in kind or shape.
     """
     return _errors(value, reference)[0]
 
@@ -32,7 +33,9 @@ def largest_error(value: Any, reference: Any) -> float:
 
 
 def _errors(value: Any, reference: Any) -> tuple[float, float]:
-    """Return the root mean square error and the largest error, each as the maximum over all pairs of tensors."""
+    """Return the root mean square error and the largest error, each as the maximum over all
+    pairs of tensors.
+    """
     pairs, mean, largest = [(value, reference)], 0.0, 0.0
     while pairs:
         a, b = pairs.pop()
@@ -55,8 +58,8 @@ def _tensor_errors(a: Tensor, b: Tensor) -> tuple[float, float]:
         return 0.0, 0.0
     top, squares, largest = 0.0, 0.0, 0.0
     wide = torch.complex128 if a.is_complex() or b.is_complex() else torch.float64
-    for one, other in zip(_parts(a), _parts(b), strict=True):
-        x, y = one.to(wide).cpu(), other.to(wide).cpu()
+    for piece, other in zip(_parts(a), _parts(b), strict=True):
+        x, y = piece.to(wide).cpu(), other.to(wide).cpu()
         same = (x == y) | (x.isnan() & y.isnan())
         off = (x - y).abs().where(~same, 0.0)
         if not bool(off.isfinite().all()):
@@ -69,7 +72,9 @@ def _tensor_errors(a: Tensor, b: Tensor) -> tuple[float, float]:
 
 
 def _kind(x: Any) -> str:
-    return f"a tensor of shape {tuple(x.shape)}" if isinstance(x, Tensor) else f"a {type(x).__name__}"
+    return (
+        f"a tensor of shape {tuple(x.shape)}" if isinstance(x, Tensor) else f"a {type(x).__name__}"
+    )
 
 
 def _parts(x: Tensor) -> tuple[Tensor, ...]:

@@ -1,16 +1,113 @@
-"""Decision whether a step is left out: the bound on the effect of the step is compared with the tolerance."""
+"""Decision whether a step is left out, and the part of the tolerance that this uses up."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torch import Tensor
 
 from neusee.nodes import TensorStats
-from neusee.workflows.graph.recipe_graph import Step
+from neusee.workflows.graph.recipe_graph import Recipe, Step, Substitution, Wire
 from neusee.workflows.graph.run_error import RunError
+
+# --- zero effect steps ----------------------------------------------------------------------------
+
+# Removal of steps with zero effect, such as a laser without power, ghosts without energy or a clean
+# window.
+#
+# Such steps are found from parameters alone, before the run: a step whose node bounds its result by
+# 0 (`Node.zero_bound`) is removed from the inputs to which it would add nothing.
+
+
+#: statistics of a result that is 0 everywhere
+_DARK = TensorStats((), "float32", 0.0, 0.0, 0.0, 0, True)
+
+
+class _Unknown:
+    """Statistics of a step that has not run yet: reading any attribute raises `LookupError`."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise LookupError(name)
+
+
+UNKNOWN = _Unknown()
+
+
+def without_nothing(recipe: Recipe, order: Iterable[str]) -> Recipe:
+    """Disconnect steps whose result must be 0 and return the recipe; ``order`` lists each step
+    after its inputs.
+    """
+    dark: dict[str, None] = {}
+    changed: dict[str, Step] = {}
+    for name in order:
+        step = recipe.steps[name]
+        if _nothing(step, dark):
+            dark[name] = None
+        elif step.node.additive_inputs and not dark.keys().isdisjoint(step.sources):
+            changed[name] = replace(step, wires=without(step, dark))
+    if not changed:
+        return recipe
+    already = {substitution.step for substitution in recipe.substitutions}
+    why = "its parameters make its result 0"
+    new = tuple(Substitution(name, "", 0.0, why) for name in dark if name not in already)
+    steps, unsubstituted = {**recipe.steps, **changed}, recipe.unsubstituted or recipe
+    return replace(
+        recipe,
+        steps=steps,
+        substitutions=(*recipe.substitutions, *new),
+        unsubstituted=unsubstituted,
+    )
+
+
+def _nothing(step: Step, dark: Mapping[str, None]) -> bool:
+    """Return True if the result of a step must be 0 when the results of the steps in ``dark``
+    are 0.
+    """
+    if step.node.hooks.zero_bound is None:
+        return False
+    inputs = [_known(step.wires.get(name), dark) for name in step.node.inputs]
+    try:
+        return float(step.node.hooks.zero_bound(*inputs, **step.params)) == 0.0
+    except LookupError:
+        return False
+
+
+def _known(wire: Wire, dark: Mapping[str, None]) -> Any:
+    if wire is None:
+        return None
+    if isinstance(wire, str):
+        return _DARK if wire in dark else UNKNOWN
+    return [_known(name, dark) for name in wire]
+
+
+def without(step: Step, dark: Mapping[str, None]) -> dict[str, Wire]:
+    """Return the inputs of a step without the inputs from the steps ``dark``, whose results are 0.
+
+    The other inputs of the same group are removed, too.
+    """
+    wires = dict(step.wires)
+    for group in step.node.additive_inputs:
+        wire = wires.get(group[0])
+        if isinstance(wire, str) and wire in dark:
+            wires |= dict.fromkeys(group)
+        elif isinstance(wire, tuple):
+            remaining = [i for i, name in enumerate(wire) if name not in dark]
+            for name in group:
+                listed = wires.get(name)
+                wires[name] = (
+                    tuple(listed[i] for i in remaining) if isinstance(listed, tuple) else listed
+                )
+    return wires
+
+
+# --- skip decision --------------------------------------------------------------------------------
+
+# Decision whether a step is left out: the bound on the effect of the step is compared with the
+# tolerance.
+
 
 FactsOf = Callable[[str], TensorStats | None]
 _NO_BOUND = float("inf")
@@ -18,7 +115,9 @@ _NO_BOUND = float("inf")
 
 @dataclass(frozen=True, slots=True)
 class SkipDecision:
-    """Decision whether a step is left out, with the bound on its effect, the reason, and the step to use instead."""
+    """Decision whether a step is left out, with the bound on its effect, the reason, and the
+    step to use instead.
+    """
 
     bound: float
     left_out: bool
@@ -27,12 +126,14 @@ class SkipDecision:
 
 
 class _Later:
-    """Statistics of a result, obtained only when the calculation of an error bound reads one of these statistics."""
+    """Statistics of a result, obtained only when the calculation of an error bound reads one of
+    these statistics.
+    """
 
     __slots__ = ("_find", "_seen")
 
-    def __init__(self, find: Callable[[], TensorStats | None], seen: list[TensorStats]) -> None:
-        self._find, self._seen = find, seen
+    def __init__(self, find: Callable[[], TensorStats | None], asked: list[TensorStats]) -> None:
+        self._find, self._seen = find, asked
 
     def __getattr__(self, name: str) -> Any:
         facts = self._find()
@@ -41,33 +142,137 @@ class _Later:
         return getattr(facts, name)
 
 
-def judge(step: Step, params: Mapping[str, Any], facts_of: FactsOf, tolerance: float) -> SkipDecision:
-    """Decide whether ``step`` may be left out; ``facts_of`` returns the statistics of the result of a named step."""
+def judge(
+    step: Step, params: Mapping[str, Any], facts_of: FactsOf, tolerance: float
+) -> SkipDecision:
+    """Decide whether ``step`` may be left out; ``facts_of`` returns the statistics of the result
+    of a named step.
+    """
     node, first = step.node, step.wires.get(step.node.inputs[0])
     if node.hooks.skip_bound is None or not isinstance(first, str):
-        return SkipDecision(_NO_BOUND, False, "the step has no input that could replace its result", "")
-    seen: list[TensorStats] = []
-    facts = [_facts(step.wires.get(name), facts_of, seen) for name in node.inputs]
+        return SkipDecision(
+            _NO_BOUND, False, "the step has no input that could replace its result", ""
+        )
+    asked: list[TensorStats] = []
+    facts = [_facts(step.wires.get(name), facts_of, asked) for name in node.inputs]
     try:
-        bound = float(node.hooks.skip_bound(*facts, **{name: _number(value) for name, value in params.items()}))
+        bound = float(
+            node.hooks.skip_bound(
+                *facts, **{name: _number(value) for name, value in params.items()}
+            )
+        )
     except RunError:
         raise
     except Exception as error:
         raise RunError(step, [], error) from error
-    if not all(f.finite for f in seen):
-        return SkipDecision(_NO_BOUND, False, "its input is not finite, so its effect has no bound", first)
-    known = bound < _NO_BOUND
-    why = f"changes at most {bound:.2g}, tolerance {tolerance:.2g}" if known else "its effect has no bound"
+    if not all(f.finite for f in asked):
+        return SkipDecision(
+            _NO_BOUND, False, "its input is not finite, so its effect has no bound", first
+        )
+    has_bound = bound < _NO_BOUND
+    why = (
+        f"changes at most {bound:.2g}, tolerance {tolerance:.2g}"
+        if has_bound
+        else "its effect has no bound"
+    )
     return SkipDecision(bound, bound <= tolerance, why, first)
 
 
-def _facts(wire: str | tuple[str, ...] | None, facts_of: FactsOf, seen: list[TensorStats]) -> Any:
+def _facts(wire: str | tuple[str, ...] | None, facts_of: FactsOf, asked: list[TensorStats]) -> Any:
     if wire is None:
         return None
     if isinstance(wire, str):
-        return _Later(lambda: facts_of(wire), seen)
-    return [_facts(name, facts_of, seen) for name in wire]
+        return _Later(lambda: facts_of(wire), asked)
+    return [_facts(name, facts_of, asked) for name in wire]
 
 
 def _number(value: Any) -> Any:
     return value.item() if isinstance(value, Tensor) and value.numel() == 1 else value
+
+
+# --- error budget ---------------------------------------------------------------------------------
+
+# Error budget: the part of the tolerance that omitted steps have used up, for each step of a
+# recipe.
+
+
+#: share of the tolerance for the channels of an image; the scene level may depend on a second image
+CHANNELS = 0.25
+
+
+def skip_share(recipe: Recipe) -> float:
+    """Return the share of the tolerance that omitted steps may use, beside the cheaper steps of
+    a recipe.
+    """
+    return (
+        1.0 - 2 * CHANNELS
+        if any(substitution.within for substitution in recipe.substitutions)
+        else 1.0
+    )
+
+
+class ErrorBudget:
+    """Error bounds of omitted steps, summed for each later step; the sum reduces the tolerance of
+    the later step.
+
+    Steps are added in running order, each with `pass_on` or `verdict`.
+    """
+
+    def __init__(self, recipe: Recipe) -> None:
+        self._recipe, self._share = recipe, skip_share(recipe)
+        # by step: bound by omitted step; equal dicts are one object
+        self._spent: dict[str, dict[str, float]] = {}
+
+    def copy(self) -> ErrorBudget:
+        """Return an independent copy of the error budget."""
+        twin = copy(self)
+        twin._spent = dict(self._spent)
+        return twin
+
+    def verdict(self, step: Step, params: Mapping[str, Any], facts_of: FactsOf) -> SkipDecision:
+        """Decide whether a step is left out of the run; with ``--exact`` no step is left out."""
+        spent = self.pass_on(step)
+        if self._recipe.exact:
+            return SkipDecision(float("inf"), False, "the recipe is exact", "")
+        if step.node.hooks.skip_estimated and not self._recipe.estimates:
+            return self._without_estimate(step, params, facts_of)
+        decision = judge(
+            step,
+            params,
+            facts_of,
+            self._recipe.allowed(step.name) * self._share - sum(spent.values()),
+        )
+        if decision.left_out:
+            self.leave_out(step, decision.bound)
+        return decision
+
+    def _without_estimate(
+        self, step: Step, params: Mapping[str, Any], facts_of: FactsOf
+    ) -> SkipDecision:
+        """Decide whether a step changes nothing; any other effect of the step is only estimated."""
+        decision = judge(step, params, facts_of, 0.0)
+        return (
+            decision
+            if decision.left_out
+            else replace(decision, why="its effect is estimated, and not proved")
+        )
+
+    def leave_out(self, step: Step, bound: float) -> None:
+        """Add the error bound of an omitted step to the error budget."""
+        if bound > 0:
+            self._spent[step.name] = {**self._spent.get(step.name, {}), step.name: bound}
+
+    def pass_on(self, step: Step) -> dict[str, float]:
+        """Return the error bound of each omitted step on which ``step`` depends, by the name of
+        the omitted step.
+        """
+        parts = [spent for name in dict.fromkeys(step.sources) if (spent := self._spent.get(name))]
+        if not parts:
+            return {}
+        first, *others = parts
+        if any(other is not first for other in others):
+            first = {}
+            for bounds in parts:
+                first.update(bounds)
+        self._spent[step.name] = first
+        return first

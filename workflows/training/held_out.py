@@ -1,10 +1,13 @@
-"""Photographs that a training never sees, and how well the network restores them while it is trained."""
+"""Photographs that a training never sees, and how well the network restores them while it is
+trained.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
@@ -15,24 +18,25 @@ from torch import Tensor, nn
 from neusee.nodes import metrics
 from neusee.nodes.scene import Photographs
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.input_file_digest import file_digest
+from neusee.workflows.keys.cache_key import file_digest
 from neusee.workflows.recipe.blocks.train_block import KEY, Training
+from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.loop.resumable_loop import Losses
-from neusee.workflows.training.parallel.process_mesh import Mesh
-from neusee.workflows.training.parallel.shared_graph import Shared
-from neusee.workflows.training.several_cameras import Samples
-from neusee.workflows.training.training_pictures import HELD_OUT, Sample
+from neusee.workflows.training.process_mesh import Mesh
+from neusee.workflows.training.training_pictures import HELD_OUT, Sample, Samples
 
 CONFIDENCE = 0.9  #: of the interval of a mean over photographs
 _METRICS = ("PSNR", "L1", "SSIM")
 _SCORE = "held_out_PSNR"  #: the number by which the best state is chosen
-#: columns of the loss table: network, input of the network, and the PSNR that the network adds to its input
-COLUMNS = tuple(
-    f"{who}_{metric}{end}"
-    for who, names in (("held_out", _METRICS), ("input", _METRICS), ("gain", _METRICS[:1]))
-    for metric in names
-    for end in (("", "_low", "_high") if who != "input" else ("",))
+#: columns of the loss table: network, input of the network, and the PSNR that the network adds to
+#: its input
+COLUMNS = (
+    *(f"held_out_{metric}{end}" for metric, end in product(_METRICS, ("", "_low", "_high"))),
+    *(f"input_{metric}" for metric in _METRICS),
+    *(f"gain_{_METRICS[0]}{end}" for end in ("", "_low", "_high")),
 )
+#: names of the metrics of the network and of its input, for one picture
+_OF_PICTURE = tuple(f"{who}_{metric}" for who, metric in product(("held_out", "input"), _METRICS))
 
 
 @dataclass(frozen=True)
@@ -45,39 +49,64 @@ class Split:
 
     def __str__(self) -> str:
         if not self.held_out:
-            return f"trains on {len(self.trained.paths)} photographs; none is held out, so that no state is the best"
+            return (
+                f"trains on {len(self.trained.paths)} photographs; none is held out, so that no"
+                " state is the best"
+            )
         text = f"trains on {len(self.trained.paths)} photographs; {len(self.held_out)} are held out"
-        return text if len(self.judged) == len(self.held_out) else f"{text}, of which {len(self.judged)} are restored"
+        return (
+            text
+            if len(self.judged) == len(self.held_out)
+            else f"{text}, of which {len(self.judged)} are restored"
+        )
 
 
 def split(recipe: Recipe, settings: Training, photographs: Photographs) -> Split:
-    """Set photographs aside by their content, so that every process, stage and later start has the same split.
+    """Set photographs aside by their content, so that every process, stage and later start has the
+    same split.
 
-    Equal files stay together, whatever their names. Without a folder of photographs nothing is held out.
+    Equal files stay together, whatever their names. Without a folder of photographs nothing is held
+    out.
 
-    Raises ValueError for a folder with fewer than two different photographs, unless ``train.held_out`` is null.
+    Raises ValueError for a folder with fewer than two different photographs, unless
+    ``train.held_out`` is null.
     """
     photographs = by_content(photographs)
     if not holds_out(settings):
         return Split(photographs)
-    alike: dict[str, list[Path]] = {}
-    for path in photographs.paths:
-        alike.setdefault(file_digest(path), []).append(path)
+    alike = _by_digest(photographs.paths)
     if len(alike) < 2:
         raise ValueError(_too_few(recipe, settings, len(photographs.paths)))
     assert settings.held_out is not None
     count = min(max(1, round(settings.held_out * len(alike))), len(alike) - 1)
-    chosen = [alike[digest] for digest in sorted(alike)[:count]]
-    away = {path for paths in chosen for path in paths}
-    trained = replace(photographs, paths=tuple(path for path in photographs.paths if path not in away))
-    one_each = [paths[0] for paths in chosen][: settings.held_out_pictures]
+    groups = [alike[digest] for digest in sorted(alike)[:count]]
+    held_out = tuple(chain.from_iterable(groups))
+    trained = _without(photographs, set(held_out))
+    one_each = [paths[0] for paths in groups][: settings.held_out_pictures]
     judged = tuple(path for path in one_each if _readable(path, trained))
-    return Split(trained, tuple(path for paths in chosen for path in paths), judged)
+    return Split(trained, held_out, judged)
+
+
+def _by_digest(paths: Iterable[Path]) -> dict[str, list[Path]]:
+    """Return the paths of equal files by the digest of their content."""
+    alike: dict[str, list[Path]] = {}
+    for path in paths:
+        alike.setdefault(file_digest(path), []).append(path)
+    return alike
+
+
+def _without(photographs: Photographs, away: Collection[Path]) -> Photographs:
+    return replace(photographs, paths=tuple(path for path in photographs.paths if path not in away))
 
 
 def by_content(photographs: Photographs) -> Photographs:
-    """Return the photographs in the order of their digests, so that the pictures drawn depend on no name."""
-    return replace(photographs, paths=tuple(sorted(photographs.paths, key=lambda path: (file_digest(path), path))))
+    """Return the photographs in the order of their digests, so that the pictures drawn depend on
+    no name.
+    """
+    return replace(
+        photographs,
+        paths=tuple(sorted(photographs.paths, key=lambda path: (file_digest(path), path))),
+    )
 
 
 def holds_out(settings: Training) -> bool:
@@ -86,7 +115,9 @@ def holds_out(settings: Training) -> bool:
 
 
 def _readable(path: Path, photographs: Photographs) -> bool:
-    """Return True if a photograph can be decoded; note the reason in ``photographs`` if it cannot."""
+    """Return True if a photograph can be decoded; note the reason in ``photographs`` if it
+    cannot.
+    """
     try:
         Photographs((path,)).crop((1, 1), 0, 0)
     except ValueError as error:
@@ -96,16 +127,16 @@ def _readable(path: Path, photographs: Photographs) -> bool:
 
 
 def _too_few(recipe: Recipe, settings: Training, count: int) -> str:
-    given = recipe.config.settings.get(f"{KEY}.photographs")
-    found = "1 photograph" if count == 1 else f"{count} photographs, all equal"
+    setting = recipe.config.settings.get(f"{KEY}.photographs")
+    holding = "1 photograph" if count == 1 else f"{count} photographs, all equal"
     return (
-        f"{given.source if given else recipe.name}   {KEY}.photographs   the folder {settings.photographs} holds "
-        f"{found}, and {KEY}.held_out: {settings.held_out} sets photographs aside for the validation: add photographs, "
-        f"or write {KEY}.held_out=null"
+        f"{setting.source if setting else recipe.name}   {KEY}.photographs   the folder"
+        f" {settings.photographs} holds {holding}, and {KEY}.held_out: {settings.held_out} sets"
+        f" photographs aside for the validation: add photographs, or write {KEY}.held_out=null"
     )
 
 
-# --- validation -------------------------------------------------------------------------------------------------------
+# --- validation -----------------------------------------------------------------------------------
 
 
 class Validation:
@@ -117,58 +148,75 @@ class Validation:
 
     @torch.no_grad()
     def __call__(self, net: nn.Module, samples: Samples, shared: Shared, fixed: bool) -> Losses:
-        """Return means over the held-out photographs with their intervals, by column of the loss table.
+        """Return means over the held-out photographs with their intervals, by column of the loss
+        table.
 
         Pictures behind a ``fixed`` mask are computed once and kept in the memory of the processor.
         """
         trains = net.training
         net.eval()
-        found: dict[str, float] = {}
+        numbers: dict[str, float] = {}
         for i, sample in self._pictures(samples, shared, fixed):
             picture = sample.picture.to(self.device)
             truth = sample.truth.to(self.device)
             for who, estimate in (("held_out", net(picture, *sample.given)), ("input", picture)):
-                found |= {f"{i} {who}_{name}": x for name, x in _quality(estimate, truth).items()}
+                numbers |= {f"{i} {who}_{name}": x for name, x in _quality(estimate, truth).items()}
         net.train(trains)
-        each, count = samples.repeats, len(self.photographs)
-        names = [f"{i} {who}_{n}" for i in range(count * each) for who in ("held_out", "input") for n in _METRICS]
-        return summary(_by_photograph(self.mesh.numbers(found, names, self.device), each), count)
+        repeats, count = samples.repeats, len(self.photographs)
+        names = [f"{i} {name}" for i, name in product(range(count * repeats), _OF_PICTURE)]
+        return summary(
+            _by_photograph(self.mesh.numbers(numbers, names, self.device), repeats), count
+        )
 
-    def _pictures(self, samples: Samples, shared: Shared, fixed: bool) -> Iterator[tuple[int, Sample]]:
-        if fixed and self._kept is not None:  # empty in a process without a picture, which must not wait for others
+    def _pictures(
+        self, samples: Samples, shared: Shared, fixed: bool
+    ) -> Iterator[tuple[int, Sample]]:
+        # empty in a process without a picture, which must not wait for others
+        if fixed and self._kept is not None:
             yield from self._kept.items()
             return
-        kept: dict[int, Sample] = {}
-        for i, sample in samples.batch(shared, HELD_OUT, 0, len(self.photographs) * samples.repeats):
+        pictures: dict[int, Sample] = {}
+        for i, sample in samples.batch(
+            shared, HELD_OUT, 0, len(self.photographs) * samples.repeats
+        ):
             if fixed:
-                kept[i] = replace(sample, picture=sample.picture.cpu(), truth=sample.truth.cpu())
+                pictures[i] = replace(
+                    sample, picture=sample.picture.cpu(), truth=sample.truth.cpu()
+                )
             yield i, sample
-        self._kept = kept if fixed else None
+        self._kept = pictures if fixed else None
 
 
-def _by_photograph(found: Mapping[str, float], each: int) -> dict[str, float]:
-    """Return the means over the ``each`` pictures of a photograph, from numbers named such as ``0 held_out_PSNR``."""
+def _by_photograph(numbers: Mapping[str, float], repeats: int) -> dict[str, float]:
+    """Return the means over the ``repeats`` pictures of a photograph, from numbers named such as
+    ``0 held_out_PSNR``.
+    """
     means: dict[str, float] = {}
-    for name, value in found.items():
-        number, _, what = name.partition(" ")
-        at = f"{int(number) // each} {what}"
-        means[at] = means.get(at, 0.0) + value / each
+    for name, value in numbers.items():
+        number, _, column = name.partition(" ")
+        key = f"{int(number) // repeats} {column}"
+        means[key] = means.get(key, 0.0) + value / repeats
     return means
 
 
 def _quality(estimate: Tensor, truth: Tensor) -> dict[str, float]:
-    """Return PSNR, L1 and SSIM of the pictures (n, 3, y, x) of one photograph, each a mean over the pictures."""
-    each = [metrics.quality(e.float(), t.float()) for e, t in zip(estimate, truth, strict=True)]
-    return {name: sum(float(getattr(q, name.lower())) for q in each) / len(each) for name in _METRICS}
-
-
-def summary(found: Mapping[str, float], count: int) -> Losses:
-    """Return means and intervals over ``count`` photographs from numbers named such as ``0 held_out_PSNR``."""
-    columns = {
-        f"{who}_{name}": [found[f"{i} {who}_{name}"] for i in range(count)]
-        for who in ("held_out", "input")
+    """Return PSNR, L1 and SSIM of the pictures (n, 3, y, x) of one photograph, each a mean over
+    the pictures.
+    """
+    qualities = [
+        metrics.quality(e.float(), t.float()) for e, t in zip(estimate, truth, strict=True)
+    ]
+    return {
+        name: sum(float(getattr(q, name.lower())) for q in qualities) / len(qualities)
         for name in _METRICS
     }
+
+
+def summary(numbers: Mapping[str, float], count: int) -> Losses:
+    """Return means and intervals over ``count`` photographs from numbers named such as ``0
+    held_out_PSNR``.
+    """
+    columns = {name: [numbers[f"{i} {name}"] for i in range(count)] for name in _OF_PICTURE}
     pairs = zip(columns["held_out_PSNR"], columns["input_PSNR"], strict=True)
     columns["gain_PSNR"] = [own - other for own, other in pairs]
     result: Losses = {}
@@ -181,7 +229,9 @@ def summary(found: Mapping[str, float], count: int) -> Losses:
 
 
 def interval(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the mean of independent numbers, and its 90 % interval from Student's t distribution (NaN for one)."""
+    """Return the mean of independent numbers, and its 90 % interval from Student's t
+    distribution (NaN for one).
+    """
     x = np.asarray(values, dtype=np.float64)
     if len(x) < 2:
         return float(x.mean()), math.nan, math.nan
@@ -191,7 +241,7 @@ def interval(values: Sequence[float]) -> tuple[float, float, float]:
     return float(x.mean()), float(x.mean()) - half, float(x.mean()) + half
 
 
-# --- the best state ---------------------------------------------------------------------------------------------------
+# --- the best state -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -219,7 +269,9 @@ class Best:
 
 
 def facts(parts: Split, rows: Sequence[Mapping[str, str]], patience: int | None) -> dict[str, Any]:
-    """Return what `training.json` says of the held-out photographs, the best state and the end of stage 2."""
+    """Return what `training.json` says of the held-out photographs, the best state and the end
+    of stage 2.
+    """
     names = {"held_out": [str(path) for path in parts.held_out], "judged": len(parts.judged)}
     best = Best.of(rows, 2)
     if not best.iterations:
@@ -230,17 +282,26 @@ def facts(parts: Split, rows: Sequence[Mapping[str, str]], patience: int | None)
     return {**names, "best": {"iterations": best.iterations, **numbers}, "stopped_early": early}
 
 
-def score_of(found: Losses) -> float:
-    """Return the number by which the best state is chosen, with the digits that the loss table keeps."""
-    return float(f"{found[_SCORE]:.6g}")
+def score_of(losses: Losses) -> float:
+    """Return the number by which the best state is chosen, with the digits that the loss table
+    keeps.
+    """
+    return float(f"{losses[_SCORE]:.6g}")
 
 
-def said(found: Losses, better: bool) -> str:
+def said(losses: Losses, better: bool) -> str:
     """Return one line of text about a validation."""
 
     def shown(name: str) -> str:
-        both = f" ({found[f'{name}_low']:.2f} to {found[f'{name}_high']:.2f})" if f"{name}_low" in found else ""
-        return f"{found[name]:.2f} dB{both}"
+        both = (
+            f" ({losses[f'{name}_low']:.2f} to {losses[f'{name}_high']:.2f})"
+            if f"{name}_low" in losses
+            else ""
+        )
+        return f"{losses[name]:.2f} dB{both}"
 
-    text = f"held-out PSNR {shown('held_out_PSNR')}, input {found['input_PSNR']:.2f} dB, gain {shown('gain_PSNR')}"
+    text = (
+        f"held-out PSNR {shown('held_out_PSNR')}, input {losses['input_PSNR']:.2f} dB, gain"
+        f" {shown('gain_PSNR')}"
+    )
     return f"{text}, the best so far" if better else text

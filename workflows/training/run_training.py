@@ -1,45 +1,168 @@
-"""The training of a mask and of the network that restores the pictures behind the mask, in two stages."""
+"""The training of a mask and of the network behind it, in two stages, with its files."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import copy
+import importlib
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from neusee.nodes import doe
+from neusee.nodes import ParameterError, doe
+from neusee.nodes.file_headers import safetensors_need
 from neusee.nodes.network_weights import file_metadata
+from neusee.nodes.restore import Restorer, export_network, require_exportable
 from neusee.nodes.scene import Photographs
 from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.keys.cache_key import Stamp, file_digest, file_stamps
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.input_file_digest import file_digest
 from neusee.workflows.recipe.blocks.train_block import KEY, Stage, Training
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training import held_out
 from neusee.workflows.training.camera_mismatch import CameraMismatch
-from neusee.workflows.training.exported_files import require_exports, write_exports
 from neusee.workflows.training.held_out import Best, Split, Validation
-from neusee.workflows.training.loop.changed_inputs import prepare_folder
-from neusee.workflows.training.loop.checkpoint import export
-from neusee.workflows.training.loop.recorded_inputs import RecordedInputs, folder_of
-from neusee.workflows.training.loop.resumable_loop import Losses, Progress, ResumableLoop, Watch
+from neusee.workflows.training.loop.recorded_inputs import RecordedInputs, folder_of, prepare_folder
+from neusee.workflows.training.loop.resumable_loop import (
+    Losses,
+    Progress,
+    ResumableLoop,
+    Watch,
+    export,
+)
 from neusee.workflows.training.mask_design.design_run import MASK, design_in, designed
-from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh, MeshError
-from neusee.workflows.training.several_cameras import require_alone, samples_of
-from neusee.workflows.training.tensorboard_log import open_board
-from neusee.workflows.training.training_figures import curves, png, strip
+from neusee.workflows.training.process_mesh import ALONE, Mesh, MeshError
 from neusee.workflows.training.training_inputs import inputs_of
-from neusee.workflows.training.training_iteration import Learner
-from neusee.workflows.training.training_page import write_page
-from neusee.workflows.training.unchanged_files import UnchangedFiles
-from neusee.workflows.training.warm_start import WarmStart
+from neusee.workflows.training.training_iteration import Learner, WarmStart
+from neusee.workflows.training.training_page import curves, png, strip, write_page
+from neusee.workflows.training.training_pictures import require_alone, samples_of
+
+# --- unchanged files ------------------------------------------------------------------------------
+
+# Files that must stay as they are while a training runs: its photographs, which are read again and
+# again.
+
+
+@dataclass
+class UnchangedFiles:
+    """Files with the digests that their training recorded before its first iteration."""
+
+    contents: Mapping[Path, str]
+    _stamps: dict[Path, Stamp] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, paths: Iterable[Path]) -> UnchangedFiles:
+        """Note the content of files."""
+        return cls({path: file_digest(path) for path in paths})
+
+    def require(self) -> None:
+        """Raise ValueError if a file is gone or has another content; a file that was only
+        touched is the same.
+        """
+        for path, content in self.contents.items():
+            try:
+                stamp = file_stamps(path)[0]
+                if self._stamps.get(path) == stamp:
+                    continue
+                same = file_digest(path) == content
+            except OSError as error:
+                raise ValueError(
+                    self._said(path, f"cannot be read any more ({error.strerror})")
+                ) from error
+            if not same:
+                raise ValueError(self._said(path, "has another content now"))
+            self._stamps[path] = stamp
+
+    @staticmethod
+    def _said(path: Path, change: str) -> str:
+        return (
+            f"the photograph {path} {change}, after this training began with it; the checkpoint"
+            " before is kept: put the file back and give the command again to go on, or give the"
+            " command as it is to begin anew"
+        )
+
+
+# --- tensorboard log ------------------------------------------------------------------------------
+
+# The TensorBoard log of a training, with its losses and pictures by iteration.
+
+
+def open_board(folder: Path, first: int) -> Any:
+    """Return a TensorBoard writer for a training, which hides older events from iteration ``first``
+    on.
+
+    Raises ValueError if TensorBoard is not installed.
+    """
+    try:
+        module = importlib.import_module("torch.utils.tensorboard")
+    except ImportError as error:
+        text = (
+            f'TensorBoard is not installed ({error}): pip install -e ".[tensorboard]", or leave'
+            " tensorboard false"
+        )
+        raise ValueError(f"train.tensorboard: {text}") from error
+    return module.SummaryWriter(str(folder / "tensorboard"), purge_step=first)
+
+
+# --- exported files -------------------------------------------------------------------------------
+
+# The trained network as a file that other programs run, beside its weights.
+
+
+def require_exports(net: Restorer, settings: Training) -> None:
+    """Raise ValueError before a training whose network cannot be exported as ``train.export``
+    asks.
+    """
+    for kind in settings.export:
+        try:
+            require_exportable(net, f".{kind}")
+        except ParameterError as error:
+            raise ValueError(f"{KEY}.export: {error}") from error
+
+
+def write_exports(folder: Path, net: Restorer, settings: Training) -> None:
+    """Write the best network of a training, or the last one if no state is the best, as
+    ``train.export`` asks.
+    """
+    if not settings.export:
+        return
+    from safetensors.torch import load_file
+
+    name = "best" if (folder / "best.safetensors").is_file() else "network"
+    file = folder / f"{name}.safetensors"
+    safetensors_need(file, 2.0)
+    network = copy.deepcopy(net).cpu().float()
+    network.stored.load_state_dict(load_file(file))
+    for kind in settings.export:
+        export_network(network, folder / f"{name}.{kind}")
+
+
+# --- run training ---------------------------------------------------------------------------------
+
+# The training of a mask and of the network that restores the pictures behind the mask, in two
+# stages.
+
 
 MASK_FILE = "mask.safetensors"  #: of a folder of results: the mask that was learnt or designed
-_COLUMNS = ("stage", "iteration", "LSR", "BSR", "L1", "reconstruction", "decibels", "adversarial", "critics", "penalty",
-            "slope", "rate", *held_out.COLUMNS, "seconds")  # fmt: skip
+_COLUMNS = (
+    "stage",
+    "iteration",
+    "LSR",
+    "BSR",
+    "L1",
+    "reconstruction",
+    "decibels",
+    "adversarial",
+    "critics",
+    "penalty",
+    "slope",
+    "rate",
+    *held_out.COLUMNS,
+    "seconds",
+)
 
 
 def train(
@@ -53,20 +176,25 @@ def train(
     watch: Watch | None = None,
     mesh: Mesh = ALONE,
 ) -> Path:
-    """Train mask and restoration network in stages, or continue a stopped training, and return the result folder.
+    """Train mask and restoration network in stages, or continue a stopped training, and return the
+    result folder.
 
     Stage 0 designs the mask without images and replaces stage 1.
 
-    Every process of a mesh calls this function with the same arguments and a folder that all processes see; only the
-    first process writes, and an error in one process ends all processes. The mesh changes results by rounding only.
+    Every process of a mesh calls this function with the same arguments and a folder that all
+    processes see; only the first process writes, and an error in one process ends all processes.
+    The mesh changes results by rounding only.
 
-    Raises ValueError for a recipe without the block ``train``, a folder without photographs, stage 2 without a mask,
-    stage 1 after the mask was designed, or a mesh that does not fit; ArithmeticError for a loss that is NaN or
-    infinite, after the weights and picture numbers that led to the loss are written to a file.
+    Raises ValueError for a recipe without the block ``train``, a folder without photographs, stage
+    2 without a mask, stage 1 after the mask was designed, or a mesh that does not fit;
+    ArithmeticError for a loss that is NaN or infinite, after the weights and picture numbers that
+    led to the loss are written to a file.
     """
     settings = recipe.training
     if settings is None:
-        raise ValueError(f"{recipe.name} has no block `train`: add `train: recommended` to its defaults")
+        raise ValueError(
+            f"{recipe.name} has no block `train`: add `train: recommended` to its defaults"
+        )
     with_pictures = [number for number in stages if number != MASK]
     _require_fitting_mesh(recipe, settings, stages, mesh)
     CameraMismatch.of(recipe, settings)  # raises its mistakes before any work
@@ -87,7 +215,9 @@ def train(
 
 @dataclass(frozen=True)
 class BegunTraining:
-    """What a training is before its first iteration: its photographs, first weights, inputs and folder."""
+    """What a training is before its first iteration: its photographs, first weights, inputs and
+    folder.
+    """
 
     parts: Split
     start: WarmStart | None
@@ -95,8 +225,12 @@ class BegunTraining:
     folder: Path
 
     @classmethod
-    def of(cls, recipe: Recipe, settings: Training, store: Store, runs: Path, pictures: bool = True) -> BegunTraining:
-        """Find the inputs of a training, and the folder of results with equal inputs, or a new one."""
+    def of(
+        cls, recipe: Recipe, settings: Training, store: Store, runs: Path, pictures: bool = True
+    ) -> BegunTraining:
+        """Find the inputs of a training, and the folder of results with equal inputs, or a new
+        one.
+        """
         parts = held_out.split(recipe, settings, _photographs(recipe, settings, pictures))
         start = WarmStart.of(recipe, settings)
         code = Code(store.code_memo)
@@ -105,10 +239,14 @@ class BegunTraining:
         return cls(parts, start, inputs, folder_of(runs, f"{recipe.name}_train", inputs))
 
 
-def _require_fitting_mesh(recipe: Recipe, settings: Training, stages: Sequence[int], mesh: Mesh) -> None:
+def _require_fitting_mesh(
+    recipe: Recipe, settings: Training, stages: Sequence[int], mesh: Mesh
+) -> None:
     """Raise `MeshError` for a training that several processes cannot share."""
     if MASK in stages and mesh.size > 1:
-        raise MeshError("--stage mask runs in a single process: start the training without torchrun")
+        raise MeshError(
+            "--stage mask runs in a single process: start the training without torchrun"
+        )
     _require_equal_shares(recipe, settings, mesh)
     require_alone(recipe, mesh)
 
@@ -119,15 +257,18 @@ def _require_equal_shares(recipe: Recipe, settings: Training, mesh: Mesh) -> Non
             path = f"{KEY}.stages.{number}.batch"
             setting = recipe.config.settings.get(path)
             raise MeshError(
-                f"{setting.source if setting else recipe.name}   {path}   {stage.batch} pictures cannot be divided "
-                f"equally among {mesh.data} processes: --mesh {mesh} needs a multiple of {mesh.data}"
+                f"{setting.source if setting else recipe.name}   {path}   {stage.batch} pictures"
+                f" cannot be divided equally among {mesh.data} processes: --mesh {mesh} needs a"
+                f" multiple of {mesh.data}"
             )
 
 
 def _photographs(recipe: Recipe, settings: Training, needed: bool) -> Photographs:
     if settings.photographs is not None:
         return Photographs.under(settings.photographs)
-    file = recipe.steps[settings.scene].params.get("file") if settings.scene in recipe.steps else None
+    file = (
+        recipe.steps[settings.scene].params.get("file") if settings.scene in recipe.steps else None
+    )
     if not isinstance(file, Path) and needed:
         raise ValueError("train.photographs is missing: write the path of a folder of photographs")
     return Photographs((file,) if isinstance(file, Path) else ())
@@ -135,45 +276,86 @@ def _photographs(recipe: Recipe, settings: Training, needed: bool) -> Photograph
 
 class _TrainingLoop(ResumableLoop[Learner]):
     def __init__(
-        self, recipe: Recipe, settings: Training, begun: BegunTraining, store: Store,
-        progress: Progress, device: str, watch: Watch | None, mesh: Mesh,
-    ) -> None:  # fmt: skip
+        self,
+        recipe: Recipe,
+        settings: Training,
+        begun: BegunTraining,
+        store: Store,
+        progress: Progress,
+        device: str,
+        watch: Watch | None,
+        mesh: Mesh,
+    ) -> None:
         folder, parts, start = begun.folder, begun.parts, begun.start
         self.designed = designed(folder)
         learner = Learner(recipe, settings, device, self.designed, mesh, start)
         require_exports(learner.net, settings)
-        super().__init__(folder, settings, learner, _COLUMNS, progress, device, watch, mesh.first,
-                         begun.inputs.digest)  # fmt: skip
+        super().__init__(
+            folder,
+            settings,
+            learner,
+            _COLUMNS,
+            progress,
+            device,
+            watch,
+            mesh.first,
+            begun.inputs.digest,
+        )
         self.recipe, self.settings, self.split, self.store = recipe, settings, parts, store
         self.photographs, self.validation = parts.trained, Validation(parts, mesh, device)
-        self.mesh, self.stage, self.best = mesh, 2 if self.designed else min(settings.learnt), Best()
+        self.mesh, self.stage, self.best = (
+            mesh,
+            2 if self.designed else min(settings.learnt),
+            Best(),
+        )
         self.start = start
         self.read_again = UnchangedFiles.of([*parts.trained.paths, *parts.judged])
         self.mask_content = ""  #: digest of the mask behind which stage 2 trains
         progress(str(parts))
         if settings.augment.pooled != "none":
-            progress("pooled pictures are turned with their true pictures, as behind a mask and a sensor that turn")
+            progress(
+                "pooled pictures are turned with their true pictures, as behind a mask and a sensor"
+                " that turn"
+            )
         if start is not None and not self.state.path.exists():
             progress(f"begins with the weights of {start.file}")
         self.resume()
         mesh.agree(f"{folder.name} in stage {self.stage} after {self.iteration} iterations")
-        self.board = open_board(folder, self._iterations_of_all_stages) if settings.tensorboard and mesh.first else None
+        self.board = (
+            open_board(folder, self._iterations_of_all_stages)
+            if settings.tensorboard and mesh.first
+            else None
+        )
 
     def begin_stage(self) -> None:
         """Prepare new optimisers for the present stage of the training."""
-        self.learner.begin(self.settings.stages.get(self.stage, Stage(iterations=0)), self.stage == 1)
+        self.learner.begin(
+            self.settings.stages.get(self.stage, Stage(iterations=0)), self.stage == 1
+        )
 
     def run_stages(self, stages: Sequence[int], command: Sequence[str]) -> None:
-        """Run the given stages of the training (1: mask and network, 2: network alone), and write the results."""
+        """Run the given stages of the training (1: mask and network, 2: network alone), and
+        write the results.
+        """
         if self.designed and 1 in stages:
-            raise ValueError(f"the mask in {self.folder} was designed without images: continue with --stage 2")
+            raise ValueError(
+                f"the mask in {self.folder} was designed without images: continue with --stage 2"
+            )
         for number in stages:
             if number not in self.settings.learnt:
                 stages_left = self.settings.learnt
-                raise ValueError(f"there is no stage {number}: train.stages and train.learn define only {stages_left}")
+                raise ValueError(
+                    f"there is no stage {number}: train.stages and train.learn define only"
+                    f" {stages_left}"
+                )
             if number > self.stage:
-                first = f"run the {self._length} iterations of stage {self.stage} first, or --stage mask"
-                raise ValueError(f"stage {number} cannot begin before the end of stage {self.stage}: {first}")
+                first = (
+                    f"run the {self._length} iterations of stage {self.stage} first, or --stage"
+                    " mask"
+                )
+                raise ValueError(
+                    f"stage {number} cannot begin before the end of stage {self.stage}: {first}"
+                )
             if number == self.stage:
                 self._run_stage()
         if self.rows.rows and self.writes:
@@ -181,14 +363,18 @@ class _TrainingLoop(ResumableLoop[Learner]):
 
     @property
     def _iterations_of_all_stages(self) -> int:
-        return self.iteration + sum(s.iterations for number, s in self.settings.stages.items() if number < self.stage)
+        return self.iteration + sum(
+            s.iterations for number, s in self.settings.stages.items() if number < self.stage
+        )
 
     @property
     def _length(self) -> int:
         return self.settings.stages[self.stage].iterations
 
     def _run_stage(self) -> None:
-        """Train to the end of the present stage, and write the checkpoint with which the next stage begins."""
+        """Train to the end of the present stage, and write the checkpoint with which the next
+        stage begins.
+        """
         fixed = None if self.stage == 1 else frozen(self.recipe, self.settings, self.folder)
         if fixed is not None:
             self._require_same_mask()
@@ -198,7 +384,9 @@ class _TrainingLoop(ResumableLoop[Learner]):
         self.run(self._length, self.settings.stages[self.stage].batch)
         if counts := self.samples.pool_counts:
             read, made = counts["from_store"], counts["simulated"]
-            self.progress(f"pictures of the pool: {read} came from the cache, {made} were simulated")
+            self.progress(
+                f"pictures of the pool: {read} came from the cache, {made} were simulated"
+            )
         if self.writes:
             self._export()
         self.stage, self.iteration = self.stage + 1, 0
@@ -209,18 +397,24 @@ class _TrainingLoop(ResumableLoop[Learner]):
         self.mesh.wait()  # until the first process has written the mask
 
     def _require_same_mask(self) -> None:
-        """Note the learnt mask behind which stage 2 trains; raise ValueError if it is not that of the checkpoint."""
+        """Note the learnt mask behind which stage 2 trains; raise ValueError if it is not that
+        of the checkpoint.
+        """
         if self.settings.learn is None:
             return
         file = self.folder / MASK_FILE
         content = file_digest(file)
         if self.mask_content not in ("", content):
             text = "has another content than the mask behind which stage 2 began"
-            raise ValueError(f"{file} {text}: put that mask back, or remove {self.folder} to start again")
+            raise ValueError(
+                f"{file} {text}: put that mask back, or remove {self.folder} to start again"
+            )
         self.mask_content = content
 
     def facts(self) -> dict[str, Any]:
-        """Return what the checkpoint keeps beside the learner: the digest of the mask of stage 2."""
+        """Return what the checkpoint keeps beside the learner: the digest of the mask of stage
+        2.
+        """
         return {"mask": self.mask_content}
 
     def recall(self, facts: Mapping[str, Any]) -> None:
@@ -228,27 +422,36 @@ class _TrainingLoop(ResumableLoop[Learner]):
         self.mask_content = str(facts.get("mask", ""))
 
     def iterate(self) -> Losses:
-        """Train on one batch of pictures; return the losses, and the learning rate relative to its initial value."""
+        """Train on one batch of pictures; return the losses, and the learning rate relative to
+        its initial value.
+        """
         rate = self.learner.set_rates(self.iteration)
         losses, self.seen = self.learner.iterate(self.samples, self.stage, self.iteration)
         return losses | {"rate": rate}
 
     def validate(self, iterations: int) -> Losses:
-        """Restore the held-out pictures at intervals and at the end of a stage, and write the network if it is best.
+        """Restore the held-out pictures at intervals and at the end of a stage, and write the
+        network if it is best.
 
-        In stage 1 no state is the best, because the PSNR does not measure the suppression of the laser: a flat mask has
-        the best pictures.
+        In stage 1 no state is the best, because the PSNR does not measure the suppression of the
+        laser: a flat mask has the best pictures.
         """
-        if not self.split.judged or (iterations % self.settings.validate_every and iterations != self._length):
+        if not self.split.judged or (
+            iterations % self.settings.validate_every and iterations != self._length
+        ):
             return {}
         net: Any = self.learner.average.module if self.learner.average else self.learner.net
-        found = self.validation(net, self.samples, self.learner.shared(self.samples), self.stage == 2)
-        self.best = self.best.after(held_out.score_of(found), iterations)
+        losses = self.validation(
+            net, self.samples, self.learner.shared(self.samples), self.stage == 2
+        )
+        self.best = self.best.after(held_out.score_of(losses), iterations)
         better = self.stage == 2 and self.best.iterations == iterations
         if better and self.writes:
             export(self.folder, "best", net.stored.state_dict(), file_metadata(self.learner.net))
-        self.progress(f"stage {self.stage}, iteration {iterations}: {held_out.said(found, better)}")
-        return found
+        self.progress(
+            f"stage {self.stage}, iteration {iterations}: {held_out.said(losses, better)}"
+        )
+        return losses
 
     @property
     def stops_early(self) -> bool:
@@ -257,7 +460,9 @@ class _TrainingLoop(ResumableLoop[Learner]):
         return self.stage == 2 and patience is not None and self.best.since >= patience
 
     def note(self, losses: Losses) -> None:
-        """Write the losses of the last training iteration to TensorBoard, and pass them to the callback ``watch``."""
+        """Write the losses of the last training iteration to TensorBoard, and pass them to the
+        callback ``watch``.
+        """
         if self.board:
             for name, value in losses.items():
                 self.board.add_scalar(name, value, self._iterations_of_all_stages - 1)
@@ -266,7 +471,8 @@ class _TrainingLoop(ResumableLoop[Learner]):
     def keep(self) -> None:
         """Write TensorBoard events, loss table and checkpoint of a training to disk.
 
-        Raises ValueError if a photograph has changed, so that no checkpoint is of other photographs than it says.
+        Raises ValueError if a photograph has changed, so that no checkpoint is of other photographs
+        than it says.
         """
         self.read_again.require()
         if self.board:
@@ -274,7 +480,9 @@ class _TrainingLoop(ResumableLoop[Learner]):
         super().keep()
 
     def show(self) -> None:
-        """Write a PNG file with a picture of the last batch, its restoration and the true picture side by side."""
+        """Write a PNG file with a picture of the last batch, its restoration and the true
+        picture side by side.
+        """
         sample = self.seen[0]
         self.learner.net.eval()
         with torch.no_grad():
@@ -282,7 +490,9 @@ class _TrainingLoop(ResumableLoop[Learner]):
         self.learner.net.train()
         shown = strip([sample.picture[0].detach(), restored, sample.truth[0]])
         if self.board:
-            self.board.add_image(f"stage {self.stage}", shown, self._iterations_of_all_stages - 1, dataformats="HWC")
+            self.board.add_image(
+                f"stage {self.stage}", shown, self._iterations_of_all_stages - 1, dataformats="HWC"
+            )
         self.write_picture(f"stage{self.stage}_{self.iteration:06d}", png(shown))
 
     def _export(self) -> None:
@@ -310,7 +520,10 @@ class _TrainingLoop(ResumableLoop[Learner]):
             "mesh": str(self.mesh),
             **({"start": self.start.facts} if self.start else {}),
             "broken": {str(path): reason for path, reason in self.photographs.broken.items()},
-            "iterations": {str(stage): sum(int(r["stage"]) == stage for r in rows) for stage in self.settings.stages},
+            "iterations": {
+                str(stage): sum(int(r["stage"]) == stage for r in rows)
+                for stage in self.settings.stages
+            },
             "last": rows[-1],
         }
         write_exports(self.folder, self.learner.net, self.settings)
@@ -319,12 +532,16 @@ class _TrainingLoop(ResumableLoop[Learner]):
 
 
 def frozen(recipe: Recipe, settings: Training, folder: Path) -> Recipe:
-    """Return the recipe with the trained mask from the file ``mask.safetensors`` as a fixed mask."""
+    """Return the recipe with the trained mask from the file ``mask.safetensors`` as a fixed
+    mask.
+    """
     if settings.learn is None:
         return recipe
     file = folder / MASK_FILE
     if not file.is_file():
-        raise ValueError(f"{file} does not exist: run --stage 1 or --stage mask first to write this file")
+        raise ValueError(
+            f"{file} does not exist: run --stage 1 or --stage mask first to write this file"
+        )
     step = recipe.steps[settings.learn]
     params, wires = {"file": file, "depth": 1e-6, "scale": 0.1}, {"stop": step.wires["stop"]}
     learnt = replace(step, node=doe.pixelwise, params=params, wires=wires)

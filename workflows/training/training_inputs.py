@@ -1,4 +1,6 @@
-"""The inputs of a training: photographs, files, code and settings, whose digest is a part of the name of its folder."""
+"""The inputs of a training: photographs, files, code and settings, whose digest is a part of the
+name of its folder.
+"""
 
 from __future__ import annotations
 
@@ -6,35 +8,40 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neusee.nodes.network_classes import Architecture
+from neusee.nodes.own_modules import Architecture
 from neusee.nodes.restore import network as network_node
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.engine_digest import outline
+from neusee.workflows.keys.code_digest import Code, outline
 from neusee.workflows.recipe.blocks.train_block import KEY, Network, Training
 from neusee.workflows.training.held_out import Split
-from neusee.workflows.training.loop.changed_inputs import CAMERA
-from neusee.workflows.training.loop.recorded_inputs import CameraInputs, RecordedFile, RecordedInputs
+from neusee.workflows.training.loop.recorded_inputs import (
+    CAMERA,
+    CameraInputs,
+    RecordedFile,
+    RecordedInputs,
+)
 from neusee.workflows.training.mask_design.design_run import design_inputs
-from neusee.workflows.training.warm_start import WarmStart
+from neusee.workflows.training.training_iteration import WarmStart
 
-_WITHOUT_EFFECT = {"tensorboard", "keep_pool", "export", "keep", "show"}  #: settings that change no weight
-_BY_CONTENT = {"photographs", "start", "cameras", "mismatch", "network", "mask"}  #: recorded by what they name
+#: settings that change no weight
+_WITHOUT_EFFECT = {"tensorboard", "keep_pool", "export", "keep", "show"}
+#: recorded by what they name
+_BY_CONTENT = {"photographs", "start", "cameras", "mismatch", "network", "mask"}
 _OF_VALIDATION = {"held_out", "held_out_pictures", "validate_every", "patience"}
-_COMPUTE = ("losses", "metrics", "restore", "doe", "scene", "bicubic_resize")  #: nodes that an iteration calls itself
+#: nodes that an iteration calls itself
+_COMPUTE = ("losses", "metrics", "restore", "doe", "scene", "resampling")
 _LOOPS = (
     "training_iteration",
     "training_pictures",
-    "posed_pictures",
-    "picture_batches",
-    "several_cameras",
     "camera_mismatch",
     "held_out",
     "loop/resumable_loop",
 )  #: files of the program that decide the pictures and the steps of the optimisers
 
 
-def inputs_of(recipe: Recipe, settings: Training, parts: Split, start: WarmStart | None, code: Code) -> RecordedInputs:
+def inputs_of(
+    recipe: Recipe, settings: Training, parts: Split, start: WarmStart | None, code: Code
+) -> RecordedInputs:
     """Return everything that can change a trained network or mask.
 
     Raises ValueError with place and fix for code of the user that reads what cannot be followed.
@@ -47,7 +54,11 @@ def inputs_of(recipe: Recipe, settings: Training, parts: Split, start: WarmStart
     return RecordedInputs(
         kind="training",
         recipe=recipe.name,
-        settings={**camera.settings, **_settings(settings, parts), **(design.settings if design else {})},
+        settings={
+            **camera.settings,
+            **_settings(settings, parts),
+            **(design.settings if design else {}),
+        },
         steps={**camera.steps, **(design.steps if design else {})},
         laws={**camera.laws, **(design.laws if design else {})},
         code={**_code(settings.network, code), **(design.code if design else {})},
@@ -73,10 +84,12 @@ def _cameras(recipe: Recipe, settings: Training, code: Code) -> CameraInputs:
 def _camera(recipe: Recipe, settings: Training, code: Code) -> CameraInputs:
     named = (settings.picture, settings.truth, settings.psf, settings.light, settings.learn)
     outputs = [name for name in named if name is not None and name in recipe.steps]
-    camera = CameraInputs.of(recipe, outputs, code, given=(settings.scene,))
+    camera = CameraInputs.of(recipe, outputs, code, computed=(settings.scene,))
     scene = recipe.steps.get(settings.scene)
     shape = list(scene.params.get("shape") or ()) if scene else []
-    return CameraInputs({**camera.settings, f"{settings.scene}.shape": shape}, camera.steps, camera.laws)
+    return CameraInputs(
+        {**camera.settings, f"{settings.scene}.shape": shape}, camera.steps, camera.laws
+    )
 
 
 def _settings(settings: Training, parts: Split) -> dict[str, Any]:
@@ -91,7 +104,10 @@ def network_settings(network: Network) -> dict[str, Any]:
     """Return the settings of a network; a class of the user is its name, with its arguments."""
     if network.architecture is None:
         return {"kind": network.kind, "width": network.width, **network.options}
-    return {"class": str(network.architecture), **network.model_dump(include={"parameters", "multiple"})}
+    return {
+        "class": str(network.architecture),
+        **network.model_dump(include={"parameters", "multiple"}),
+    }
 
 
 def _flat(block: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
@@ -103,18 +119,24 @@ def _flat(block: Mapping[str, Any], path: str) -> list[tuple[str, Any]]:
 
 
 def _code(network: Network, code: Code) -> dict[str, str]:
-    """Return digests of the code that no step of the recipe names: losses, networks, and the loop itself."""
-    found = {f"neusee.nodes.{name}": code.digest(f"neusee.nodes.{name}") for name in _COMPUTE}
+    """Return digests of the code that no step of the recipe names: losses, networks, and the
+    loop itself.
+    """
+    digests = {f"neusee.nodes.{name}": code.digest(f"neusee.nodes.{name}") for name in _COMPUTE}
     folder = Path(__file__).parent
     for name in _LOOPS:
-        found[f"neusee/workflows/training/{name}.py"] = outline((folder / f"{name}.py").read_bytes()).digest
+        digests[f"neusee/workflows/training/{name}.py"] = outline(
+            (folder / f"{name}.py").read_bytes()
+        ).digest
     if network.architecture is not None:
-        found[f"the network {network.architecture}"] = code_of_class(network.architecture, code)
-    return found
+        digests[f"the network {network.architecture}"] = code_of_class(network.architecture, code)
+    return digests
 
 
 def code_of_class(architecture: Architecture, code: Code) -> str:
-    """Return the digest of the code of a network class and of what it imports; refuse what cannot be followed."""
+    """Return the digest of the code of a network class and of what it imports; refuse what
+    cannot be followed.
+    """
     network = architecture.network
     try:
         return code.of(network_node, ((network.__module__, network.__qualname__),))

@@ -1,19 +1,25 @@
-"""The trainable parts of a training (mask, restoration network, critics), and one training iteration."""
+"""One iteration of a training: mask, network and critics, and the weights they begin with."""
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from neusee.nodes import losses, metrics
-from neusee.nodes.bicubic_resize import resize
+from neusee.nodes import ParameterError, losses, metrics
 from neusee.nodes.doe import PARAMETRISATIONS
+from neusee.nodes.file_headers import safetensors_need
+from neusee.nodes.input_files import bytes_of
+from neusee.nodes.network_weights import fits
+from neusee.nodes.resampling import resize
 from neusee.nodes.restore import (
     FFTMamba,
     Informed,
@@ -30,19 +36,144 @@ from neusee.nodes.restore import (
     start_network,
     try_network,
 )
-from neusee.nodes.values import Psf, Stop
+from neusee.nodes.values import FilterFacts, Psf, Stop
 from neusee.workflows.engine.node_call import call
 from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import device_kind, stream_seed
-from neusee.workflows.recipe.blocks.train_block import Network, Stage, Training
+from neusee.workflows.recipe.blocks.train_block import KEY, Network, Stage, Training
+from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.loop.resumable_loop import Losses, averaged, require_finite
-from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
-from neusee.workflows.training.parallel.shared_graph import Shared
-from neusee.workflows.training.picture_batches import noted, together
-from neusee.workflows.training.several_cameras import Samples
-from neusee.workflows.training.training_pictures import Sample
-from neusee.workflows.training.warm_start import WarmStart
+from neusee.workflows.training.process_mesh import ALONE, Mesh
+from neusee.workflows.training.training_pictures import Sample, Samples
+
+# --- picture batches ------------------------------------------------------------------------------
+
+# Pictures of a training batch that go through the network together, and their results one by one.
+
+
+def together(
+    pictures: Iterable[tuple[int, Sample]], by_shape: bool
+) -> Iterator[tuple[list[int], Sample]]:
+    """Yield the pictures of a batch with their numbers: each alone, or if ``by_shape`` those of one
+    size as one sample.
+
+    A small picture leaves most of a GPU idle, so that sixteen take little longer there than one. On
+    a processor each picture goes alone, so that one picture is in memory at a time.
+    """
+    if not by_shape:
+        yield from (([number], sample) for number, sample in pictures)
+        return
+    alike: dict[object, dict[int, Sample]] = {}
+    for number, sample in pictures:
+        facts = sample.given[0] if sample.given else None
+        free = facts is None or isinstance(facts, FilterFacts)
+        shapes = tuple((name, x.shape) for name, x in sample.tensors.items()) if free else number
+        alike.setdefault(shapes, {})[number] = sample
+    for group in alike.values():
+        yield list(group), joined(list(group.values()))
+
+
+def joined(samples: list[Sample]) -> Sample:
+    """Return pictures of one size as one sample, whose maps beside the pictures have one axis
+    more, the first.
+    """
+    first = samples[0]
+    if len(samples) == 1:
+        return first
+    pictures, truths = (
+        torch.cat([getattr(s, name) for s in samples]) for name in ("picture", "truth")
+    )
+    light = torch.stack([s.light for s in samples])
+    if not first.given:
+        return Sample(pictures, truths, light, first.drawn)
+    facts = FilterFacts._make(
+        map(torch.stack, zip(*(s.given[0] for s in samples if s.given), strict=True))
+    )
+    return Sample(
+        pictures,
+        truths,
+        light,
+        first.drawn,
+        (facts, torch.stack([s.given[1] for s in samples if s.given])),
+    )
+
+
+def noted(
+    pictures: Iterable[tuple[int, Sample]], record: list[Sample]
+) -> Iterator[tuple[int, Sample]]:
+    """Yield numbered pictures as they come, and add each to ``record``."""
+    for number, sample in pictures:
+        record.append(sample)
+        yield number, sample
+
+
+# --- warm start -----------------------------------------------------------------------------------
+
+# The weights with which the network of a new training begins: those of an earlier training, in
+# place of drawn ones.
+
+
+#: of a folder of results, the first that is there
+_FILES = ("best.safetensors", "network.safetensors")
+
+
+@dataclass(frozen=True)
+class WarmStart:
+    """A file of weights, and the digest of its content."""
+
+    file: Path
+    digest: str
+    source: str  #: place in the recipe that names the file
+
+    @classmethod
+    def of(cls, recipe: Recipe, settings: Training) -> WarmStart | None:
+        """Return the file of weights that ``train.start`` names, or None; raise ValueError if
+        there is no such file.
+        """
+        if settings.start is None:
+            return None
+        setting = recipe.config.settings.get(f"{KEY}.start")
+        source = setting.source if setting else recipe.name
+        file = settings.start
+        if file.is_dir():
+            file = next(
+                (file / name for name in _FILES if (file / name).is_file()), file / _FILES[-1]
+            )
+        if file.suffix != ".safetensors" or not file.is_file():
+            text = (
+                f"{file} is no file of weights: give a .safetensors file, or the folder of a"
+                " training that ended"
+            )
+            raise ValueError(f"{source}   {KEY}.start   {text}")
+        return cls(
+            file, hashlib.sha256(bytes_of(file, parameter="train.start")).hexdigest(), source
+        )
+
+    def load_into(self, net: Restorer) -> None:
+        """Give the weights to a network; raise ValueError with the name of the first layer that
+        does not fit.
+        """
+        from safetensors.torch import load_file
+
+        safetensors_need(self.file, 2.0, "train.start")
+        options: Any = getattr(net, "options", {})
+        try:
+            fits(net.stored, self.file, "the network of this training", options)
+        except ParameterError as error:
+            raise ValueError(f"{self.source}   {KEY}.start   {error}") from error
+        net.stored.load_state_dict(load_file(self.file))
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """Return what `training.json` says of the start."""
+        return {"file": str(self.file), "sha256": self.digest}
+
+
+# --- training iteration ---------------------------------------------------------------------------
+
+# The trainable parts of a training (mask, restoration network, critics), and one training
+# iteration.
 
 
 class Scales(NamedTuple):
@@ -53,43 +184,68 @@ class Scales(NamedTuple):
 
 
 class Learner:
-    """The mask, the networks and the optimisers of a training, with equal values in all processes."""
+    """The mask, the networks and the optimisers of a training, with equal values in all
+    processes.
+    """
 
     def __init__(
-        self, recipe: Recipe, settings: Training, device: str, designed: bool = False, mesh: Mesh = ALONE,
+        self,
+        recipe: Recipe,
+        settings: Training,
+        device: str,
+        designed: bool = False,
+        mesh: Mesh = ALONE,
         start: WarmStart | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.settings, self.seed, self.device, self.mesh = settings, recipe.seed, device, mesh
         self.stop: Stop | None = None
         self._moment = 0, 0  # stage and iteration
-        self.mask = nn.Module() if designed or not settings.learn else self._start(recipe, settings.learn)
+        self.mask = (
+            nn.Module() if designed or not settings.learn else self._start(recipe, settings.learn)
+        )
         self.net: Restorer = self._network(settings.network)
         if start is not None:
             start.load_into(self.net)
-        self.critics = nn.ModuleList(critics(self._rng("critics"), settings.critics.width)).to(settings.dtype)
+        self.critics = nn.ModuleList(critics(self._rng("critics"), settings.critics.width)).to(
+            settings.dtype
+        )
         self.average = averaged(self.net, settings.average)
         self.begin(Stage(iterations=0), learns=True)
 
     def _network(self, network: Network) -> Restorer:
-        """Return the network with its initial weights; that of a user's class passes one call on this device first."""
+        """Return the network with its initial weights; that of a user's class passes one call on
+        this device first.
+        """
         if network.architecture is None:
-            return start_network(lambda: _network_of(network), self._rng("network")).to(self.settings.dtype)
+            return start_network(lambda: _network_of(network), self._rng("network")).to(
+                self.settings.dtype
+            )
         own = own_network(
-            network.architecture, network.parameters, network.multiple, stream_seed(self.seed, "train network")
+            network.architecture,
+            network.parameters,
+            network.multiple,
+            stream_seed(self.seed, "train network"),
         )
         try_network(own, self.settings.dtype, self.device)
         return own.train()
 
     def _start(self, recipe: Recipe, learn: str) -> nn.Module:
-        """Return the mask of the recipe step ``learn`` as a PyTorch module with trainable parameters."""
+        """Return the mask of the recipe step ``learn`` as a PyTorch module with trainable
+        parameters.
+        """
         step = recipe.steps[learn]
         path = step.node.path
         if path not in PARAMETRISATIONS:
-            text = f"{learn} is {path}, which has no trainable parameters; {nearest(path, PARAMETRISATIONS)}"
+            text = (
+                f"{learn} is {path}, which has no trainable parameters;"
+                f" {nearest(path, PARAMETRISATIONS)}"
+            )
             raise ValueError(f"train: {text}; or design a mask without images: --stage mask")
         stop = recipe.steps[str(step.wires["stop"])]
         self.stop = call(stop, [], stop.params, recipe.seed, "cpu")
-        return PARAMETRISATIONS[path](self.stop, step.params, self._rng("element")).to(self.settings.dtype)
+        return PARAMETRISATIONS[path](self.stop, step.params, self._rng("element")).to(
+            self.settings.dtype
+        )
 
     def height(self) -> Tensor:
         """Return the height map (v, u) of the mask in m; raise ValueError if no mask is trained."""
@@ -99,7 +255,9 @@ class Learner:
         return height
 
     def _rng(self, *names: object) -> torch.Generator:
-        return torch.Generator(self.device).manual_seed(stream_seed(self.seed, " ".join(map(str, ("train", *names)))))
+        return torch.Generator(self.device).manual_seed(
+            stream_seed(self.seed, " ".join(map(str, ("train", *names))))
+        )
 
     def begin(self, stage: Stage, learns: bool) -> None:
         """Begin a stage of the training with new optimisers and the initial learning rates.
@@ -112,89 +270,124 @@ class Learner:
             groups += [{"params": list(self.mask.parameters()), "lr": rates.mask}]
         self.generator_optimizer = torch.optim.Adam(groups, betas=self.settings.betas)
         self.critic_optimizer = torch.optim.Adam(
-            parameter_groups(self.critics, rates.weights, rates.biases), betas=self.settings.critics.betas
+            parameter_groups(self.critics, rates.weights, rates.biases),
+            betas=self.settings.critics.betas,
         )
-        self._first = [[g["lr"] for g in o.param_groups] for o in (self.generator_optimizer, self.critic_optimizer)]
+        self._first = [
+            [g["lr"] for g in o.param_groups]
+            for o in (self.generator_optimizer, self.critic_optimizer)
+        ]
 
     def set_rates(self, iteration: int) -> float:
-        """Set the learning rates of a training iteration, and return the factor on the initial learning rates."""
+        """Set the learning rates of a training iteration, and return the factor on the initial
+        learning rates.
+        """
         factor = self.settings.rates.share(iteration)
-        for optimiser, first in zip((self.generator_optimizer, self.critic_optimizer), self._first, strict=True):
+        for optimiser, first in zip(
+            (self.generator_optimizer, self.critic_optimizer), self._first, strict=True
+        ):
             for group, rate in zip(optimiser.param_groups, first, strict=True):
                 group["lr"] = max(rate * factor, min(rate, self.settings.rates.least))
         return factor
 
     def parts(self) -> dict[str, Any]:
         """Return by name the objects whose state a checkpoint must contain."""
-        parts = {"mask": self.mask, "net": self.net, "critics": self.critics, "makers": self.generator_optimizer}
-        return {**parts, "judges": self.critic_optimizer, **({"average": self.average} if self.average else {})}
+        parts = {
+            "mask": self.mask,
+            "net": self.net,
+            "critics": self.critics,
+            "makers": self.generator_optimizer,
+        }
+        return {
+            **parts,
+            "judges": self.critic_optimizer,
+            **({"average": self.average} if self.average else {}),
+        }
 
-    # --- one iteration ------------------------------------------------------------------------------------------------
+    # --- one iteration ----------------------------------------------------------------------------
 
     def iterate(self, samples: Samples, stage: int, iteration: int) -> tuple[Losses, list[Sample]]:
-        """Train on one batch of pictures; raise `NotFinite` if a loss or gradient is NaN or infinite.
+        """Train on one batch of pictures; raise `NotFinite` if a loss or gradient is NaN or
+        infinite.
 
-        Returns the losses of the batch, and the pictures of this process. Each of several processes has its own
-        pictures, and all processes apply the sum of the gradients.
+        Returns the losses of the batch, and the pictures of this process. Each of several processes
+        has its own pictures, and all processes apply the sum of the gradients.
         """
         self.generator_optimizer.zero_grad(set_to_none=True)
         self._moment = stage, iteration
         shared = samples.begin(self.height()) if samples.shared else Shared.of({})
-        found = self._mask_suppression(shared, samples) if self.learns else {}
-        batch, seen, pairs = self.stage.batch, list[Sample](), dict[int, tuple[Scales, Scales]]()
-        pictures = noted(samples.batch(shared, stage, iteration * batch, batch), seen)
+        sums = self._mask_suppression(shared, samples) if self.learns else {}
+        batch, record, pairs = self.stage.batch, list[Sample](), dict[int, tuple[Scales, Scales]]()
+        pictures = noted(samples.batch(shared, stage, iteration * batch, batch), record)
         for numbers, sample in together(pictures, self._whole):
             terms, truth, estimate = self._restoration_terms(sample)
             pairs |= _apart(numbers, truth, estimate)
             share = len(numbers) / batch
             _backward([weight * term * share for weight, term in terms.values() if weight])
-            for name, (_, term) in terms.items():
-                found[name] = found.get(name, 0.0) + float(term.detach()) * share
+            _add_terms(sums, terms, share)
         shared.back()
-        found = self.mesh.numbers(found, self._names(), self.device)
-        found["slope"] = self._move(
-            self.generator_optimizer, found, (self.net, self.mask) if self.learns else (self.net,)
+        sums = self.mesh.numbers(sums, self._names(), self.device)
+        sums["slope"] = self._move(
+            self.generator_optimizer, sums, (self.net, self.mask) if self.learns else (self.net,)
         )
         if isinstance(self.net, OwnNetwork):
             self.mesh.share_buffers(self.net)
         if self.average:
             self.average.update_parameters(self.net)
         if self.stage.adversarial:
-            found |= self._train_critics(pairs, self._rng("between", stage, iteration))
-        return found, seen
+            sums |= self._train_critics(pairs, self._rng("between", stage, iteration))
+        return sums, record
 
     @property
     def _whole(self) -> bool:
-        """Return True where the pictures of a batch go through the network together: on a GPU, behind a fixed mask.
+        """Return True where the pictures of a batch go through the network together: on a GPU,
+        behind a fixed mask.
 
-        A class of the user has random numbers of its own for each picture, and sums over pixels are of one picture.
+        A class of the user has random numbers of its own for each picture, and sums over pixels are
+        of one picture.
         """
         gpu = device_kind(self.device) != "cpu" and not self.learns and not self.stage.bsr
         return gpu and self.settings.reduction == "mean" and not isinstance(self.net, OwnNetwork)
 
     @torch.no_grad()
     def shared(self, samples: Samples) -> Shared:
-        """Return the results that depend on the present mask but on no picture, without gradients."""
+        """Return the results that depend on the present mask but on no picture, without
+        gradients.
+        """
         return samples.begin(self.height()) if samples.shared else Shared.of({})
 
     def _names(self) -> list[str]:
-        """Return the names of the losses in the present training stage, in the same order in every process."""
-        weights = {"BSR": self.stage.bsr, "reconstruction": self.stage.reconstruction,
-                   "decibels": self.stage.decibels, "adversarial": self.stage.adversarial}  # fmt: skip
-        return [*(["LSR"] if self.learns else []), "L1", *(name for name, weight in weights.items() if weight)]
+        """Return the names of the losses in the present training stage, in the same order in
+        every process.
+        """
+        weights = {
+            "BSR": self.stage.bsr,
+            "reconstruction": self.stage.reconstruction,
+            "decibels": self.stage.decibels,
+            "adversarial": self.stage.adversarial,
+        }
+        return [
+            *(["LSR"] if self.learns else []),
+            "L1",
+            *(name for name, weight in weights.items() if weight),
+        ]
 
     def _mask_suppression(self, shared: Shared, samples: Samples) -> Losses:
-        """Backpropagate the laser suppression loss band by band to save memory, and return the mean suppression ratio.
+        """Backpropagate the laser suppression loss band by band to save memory, and return the mean
+        suppression ratio.
 
-        Processes have different bands, or the same bands with smaller weights, so that each band counts once.
+        Processes have different bands, or the same bands with smaller weights, so that each band
+        counts once.
         """
         psf: Psf = shared.values[samples.psf]
         count, times = samples.counted(samples.psf, len(psf.clear_peak))
         with torch.no_grad():
             peaks: Tensor = metrics.lsr(psf)
         if self.stage.lsr:
-            for one in range(len(psf.clear_peak)):
-                loss = checkpoint(self._suppression, psf.intensity, psf.clear_peak, one, use_reentrant=False)
+            for band in range(len(psf.clear_peak)):
+                loss = checkpoint(
+                    self._suppression, psf.intensity, psf.clear_peak, band, use_reentrant=False
+                )
                 (self.stage.lsr / times * loss).backward()
         return {"LSR": float(peaks.mean()) * (len(peaks) / count) / times}
 
@@ -203,9 +396,15 @@ class Learner:
         loss: Tensor = losses.suppression_loss(psf, log=self.settings.logarithm)
         return loss
 
-    def _restoration_terms(self, sample: Sample) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:
-        """Restore a training picture; return its weighted loss terms, true picture and detached restored picture."""
-        low = torch.autocast(device_kind(self.device), torch.bfloat16, self.settings.precision == "bfloat16")
+    def _restoration_terms(
+        self, sample: Sample
+    ) -> tuple[dict[str, tuple[float, Tensor]], Scales, Scales]:
+        """Restore a training picture; return its weighted loss terms, true picture and detached
+        restored picture.
+        """
+        low = torch.autocast(
+            device_kind(self.device), torch.bfloat16, self.settings.precision == "bfloat16"
+        )
         picture = sample.picture if self.learns else sample.picture.detach()
         with low, self._seeded(sample):
             coarse, fine = self.net.pyramid(picture, *sample.given)
@@ -217,7 +416,10 @@ class Learner:
         if self.stage.bsr:
             terms["BSR"] = (self.stage.bsr, (1.0 / sample.light.clamp_min(1e-30)).sum())
         if self.stage.reconstruction:
-            terms["reconstruction"] = (self.stage.reconstruction, sum(self._errors(estimate, truth), zero))
+            terms["reconstruction"] = (
+                self.stage.reconstruction,
+                sum(self._errors(estimate, truth), zero),
+            )
         if self.stage.decibels:
             terms["decibels"] = (self.stage.decibels, losses.log_error(estimate.fine, truth.fine))
         if self.stage.adversarial:
@@ -227,23 +429,33 @@ class Learner:
 
     @contextmanager
     def _seeded(self, sample: Sample) -> Iterator[None]:
-        """Seed the random numbers of a user's network, such as those of dropout, by picture and iteration."""
+        """Seed the random numbers of a user's network, such as those of dropout, by picture and
+        iteration.
+        """
         if not isinstance(self.net, OwnNetwork):
             yield
             return
         with torch.random.fork_rng([self.device] if self.device.startswith("cuda") else []):
-            torch.manual_seed(stream_seed(self.seed, f"train layers {self._moment} {sample.drawn['noise']}"))
+            torch.manual_seed(
+                stream_seed(self.seed, f"train layers {self._moment} {sample.drawn['noise']}")
+            )
             yield
 
     def _errors(self, estimate: Scales, truth: Scales) -> Iterator[Tensor]:
-        how = {} if self.settings.reduction == "mean" else {"reduction": self.settings.reduction}
+        options = (
+            {} if self.settings.reduction == "mean" else {"reduction": self.settings.reduction}
+        )
         for e, t in zip(estimate, truth, strict=True):
-            yield losses.charbonnier(e, t, **how) + losses.fft_l1(e, t, **how)
+            yield losses.charbonnier(e, t, **options) + losses.fft_l1(e, t, **options)
 
-    def _train_critics(self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator) -> Losses:
-        """Train the critics to distinguish true from restored pictures, with equal random numbers in all processes."""
+    def _train_critics(
+        self, pairs: Mapping[int, tuple[Scales, Scales]], rng: torch.Generator
+    ) -> Losses:
+        """Train the critics to distinguish true from restored pictures, with equal random
+        numbers in all processes.
+        """
         self.critic_optimizer.zero_grad(set_to_none=True)
-        found, batch = {"critics": 0.0, "penalty": 0.0}, self.stage.batch
+        numbers, batch = {"critics": 0.0, "penalty": 0.0}, self.stage.batch
         for i in range(batch):
             if i not in pairs:
                 for _ in self.critics:
@@ -253,30 +465,54 @@ class Learner:
                 apart = (critic(e) - critic(t)).mean()
                 steep = losses.gradient_penalty(critic_slopes(critic, t, e, rng))
                 _backward([(self.stage.adversarial * apart + self.stage.penalty * steep) / batch])
-                found["critics"] += float(apart.detach()) / batch
-                found["penalty"] += float(steep.detach()) / batch
-        found = self.mesh.numbers(found, tuple(found), self.device)
-        self._move(self.critic_optimizer, found, list(self.critics))
-        return found
+                numbers["critics"] += float(apart.detach()) / batch
+                numbers["penalty"] += float(steep.detach()) / batch
+        numbers = self.mesh.numbers(numbers, tuple(numbers), self.device)
+        self._move(self.critic_optimizer, numbers, list(self.critics))
+        return numbers
 
-    def _move(self, optimiser: torch.optim.Optimizer, found: Mapping[str, float], parts: Sequence[nn.Module]) -> float:
-        """Apply one optimiser step, and return the largest gradient norm of the modules ``parts`` before clipping.
+    def _move(
+        self,
+        optimiser: torch.optim.Optimizer,
+        losses: Mapping[str, float],
+        parts: Sequence[nn.Module],
+    ) -> float:
+        """Apply one optimiser step, and return the largest gradient norm of the modules ``parts``
+        before clipping.
 
-        The gradient of each module is clipped to ``train.clip`` separately, because the laser suppression loss has a
-        thousand times as large a gradient for the mask as for a network. Raises `NotFinite` before the step.
+        The gradient of each module is clipped to ``train.clip`` separately, because the laser
+        suppression loss has a thousand times as large a gradient for the mask as for a network.
+        Raises `NotFinite` before the step.
         """
         self.mesh.add_gradients(parts)
         largest = math.inf if self.settings.clip is None else self.settings.clip
-        norm = max(float(nn.utils.clip_grad_norm_(part.parameters(), largest)) for part in parts)
-        require_finite({**found, "norm of the gradient": norm})
+        norm = max(
+            float(nn.utils.clip_grad_norm_(module.parameters(), largest)) for module in parts
+        )
+        require_finite({**losses, "norm of the gradient": norm})
         optimiser.step()
         return norm
 
 
-def _apart(numbers: Sequence[int], truth: Scales, estimate: Scales) -> dict[int, tuple[Scales, Scales]]:
-    """Return the true and the restored picture of each number, of pictures that went through the network together."""
-    each = [[x.chunk(len(numbers)) for x in scales] for scales in (truth, estimate)]
-    return {n: (Scales(*(x[i] for x in each[0])), Scales(*(x[i] for x in each[1]))) for i, n in enumerate(numbers)}
+def _add_terms(
+    sums: dict[str, float], terms: Mapping[str, tuple[float, Tensor]], share: float
+) -> None:
+    """Add a share of each term of a loss to the sum of its name."""
+    for name, (_, term) in terms.items():
+        sums[name] = sums.get(name, 0.0) + float(term.detach()) * share
+
+
+def _apart(
+    numbers: Sequence[int], truth: Scales, estimate: Scales
+) -> dict[int, tuple[Scales, Scales]]:
+    """Return the true and the restored picture of each number, of pictures that went through the
+    network together.
+    """
+    pictures = [[x.chunk(len(numbers)) for x in scales] for scales in (truth, estimate)]
+    return {
+        n: (Scales(*(x[i] for x in pictures[0])), Scales(*(x[i] for x in pictures[1])))
+        for i, n in enumerate(numbers)
+    }
 
 
 def _backward(terms: Sequence[Tensor]) -> None:

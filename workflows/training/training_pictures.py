@@ -1,14 +1,11 @@
-"""The numbered training pictures, each with its own scene, laser, sensor parameters and noise.
-
-Steps that depend neither on the mask nor on a drawn value are computed once, steps that depend only on the mask once
-in each iteration, and steps that depend on a scene, a drawn value or noise once for each picture. Gradients of steps
-that depend only on the mask are summed over all pictures, so that one picture is in memory at a time.
-"""
+"""The numbered training pictures: scene, laser, camera and noise, and their stored pool."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -16,27 +13,271 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neusee.nodes.bicubic_resize import resize
+from neusee.nodes import restore
+from neusee.nodes.resampling import resize
 from neusee.nodes.scene import Change, Photographs, symmetry
+from neusee.nodes.values import FilterFacts, WienerProblem
 from neusee.workflows.engine.differentiable_function import as_function
-from neusee.workflows.graph.recipe_graph import Recipe, dependents, needed
-from neusee.workflows.graph.told_copies import TOLD
-from neusee.workflows.recipe.blocks.train_block import Training
+from neusee.workflows.engine.node_call import place
+from neusee.workflows.graph.diagnostics import nearest
+from neusee.workflows.graph.recipe_graph import TOLD, Recipe, Step, dependents, needed
+from neusee.workflows.keys.cache_key import device_kind, digest, is_private, key_of
+from neusee.workflows.keys.code_digest import Code, engine
+from neusee.workflows.recipe.blocks.train_block import KEY, POSED, Training
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
-from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.result_store import Store, compute_once
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
+from neusee.workflows.training.band_shards import Pictures, Shards, Shared
 from neusee.workflows.training.camera_mismatch import CameraMismatch
-from neusee.workflows.training.parallel.band_shards import Shards
-from neusee.workflows.training.parallel.picture_rounds import Pictures
-from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
-from neusee.workflows.training.parallel.shared_graph import Shared
-from neusee.workflows.training.posed_pictures import Given, PosedPictures, given_of, tensors_of, turned
-from neusee.workflows.training.stored_pool import StoredPool
-from neusee.workflows.training.training_recipe import frame_of, in_precision, require_steps
+from neusee.workflows.training.process_mesh import ALONE, Mesh, MeshError
 
-_LASER = ("optics.laser_irradiance", "strength")  #: the node of a laser, and the parameter that is 0 without a laser
+# --- training recipe ------------------------------------------------------------------------------
+
+# What a training asks of a recipe: steps that exist, a scene of stated size, and float64 where it
+# is wanted.
+
+
+def in_precision(recipe: Recipe, dtype: torch.dtype) -> Recipe:
+    """Return the recipe with steps in float64 if ``dtype`` is float64: steps with a choice of
+    precision are double.
+    """
+    if dtype != torch.float64:
+        return recipe
+    steps = {
+        name: _precise(step) if "precision" in step.params else step
+        for name, step in recipe.steps.items()
+    }
+    return replace(recipe, steps=steps)
+
+
+def _precise(step: Step) -> Step:
+    return replace(step, params={**step.params, "precision": "double"})
+
+
+def require_steps(recipe: Recipe, block: str, names: Sequence[str]) -> None:
+    """Raise ValueError unless the recipe has all steps ``names``, which the settings block
+    ``block`` names.
+    """
+    for name in names:
+        if name not in recipe.steps:
+            raise ValueError(
+                f"{block}: the recipe has no step {name}; {nearest(name, recipe.steps)}"
+            )
+
+
+def frame_of(recipe: Recipe, scene: str) -> tuple[int, int]:
+    """Return the sides of the scene in pixels (y, x); raise ValueError if the step ``scene``
+    does not state them.
+    """
+    shape = recipe.steps[scene].params.get("shape")
+    if shape is None:
+        raise ValueError(
+            f"train: the step {scene} has no shape: set {scene}.shape in pixels, such as [96, 96]"
+        )
+    return shape[0], shape[1]
+
+
+# --- posed pictures -------------------------------------------------------------------------------
+
+# Training pictures of a network that needs what the Wiener filter knows: the filter is solved once
+# for each picture.
+#
+# The networks `unrolled` and `informed` need the PSF, the glare, the clipped pixels and the noise
+# of a picture. The recipe gives them to the step of the filter, whose result `train.picture`
+# converts to colours. In the training the node of this step is `restore.wiener_problem` or
+# `restore.filter_facts`, with the same inputs, so that the answer of the filter is the input of the
+# network.
+
+
+Posed = WienerProblem | FilterFacts
+#: nothing, or what the filter poses and knows, and the colour matrix
+Given = tuple[()] | tuple[Posed, Tensor]
+_FILTERS = ("restore.wiener", "restore.unrolled", "restore.informed")
+_KNOWN: dict[str, Any] = {"unrolled": restore.wiener_problem, "informed": restore.filter_facts}
+_PARAMETERS = ("balance", "doubt", "least_doubt", "read_noise")
+
+
+@dataclass(frozen=True)
+class PosedPictures:
+    """The steps of a recipe that pose the problem of a picture, and that compute the colour
+    matrix.
+    """
+
+    filter: str
+    matrix: str
+    kind: str = "unrolled"  #: of the network
+
+    @classmethod
+    def of(cls, recipe: Recipe, settings: Training) -> PosedPictures | None:
+        """Return the steps of a training of such a network, or None for every other network.
+
+        Raises ValueError if the picture of the training is not that of the Wiener filter.
+        """
+        kind = settings.network.kind
+        if settings.network.architecture is not None or kind not in POSED:
+            return None
+        shown = recipe.steps[settings.picture]
+        channels, matrix = (str(shown.wires.get(name)) for name in ("channels", "matrix"))
+        if shown.node.path != "restore.colour" or recipe.steps[channels].node.path not in _FILTERS:
+            setting = recipe.config.settings.get(f"{KEY}.picture")
+            text = (
+                f"{settings.picture} is {shown.node.path}, and the network {kind} starts from the"
+                f" Wiener filter: use restore: wiener and {KEY}.picture: restored"
+            )
+            raise ValueError(
+                f"{setting.source if setting else recipe.name}   {KEY}.picture   {text}"
+            )
+        return cls(channels, matrix, kind)
+
+    @property
+    def steps(self) -> tuple[str, str]:
+        """Return the steps from which `read` makes the input of the network."""
+        return (self.filter, self.matrix)
+
+    def within(self, recipe: Recipe) -> Recipe:
+        """Return the recipe whose filter poses the problem and solves it."""
+        step = recipe.steps[self.filter]
+        params = {name: value for name, value in step.params.items() if name in _PARAMETERS}
+        posed = replace(step, node=_KNOWN[self.kind], params=params)
+        return replace(recipe, steps={**recipe.steps, self.filter: posed})
+
+    def read(self, values: Mapping[str, Any], dtype: torch.dtype) -> tuple[Tensor, Given]:
+        """Return the picture of the filter (3, y, x), and what the network needs beside it in the
+        given precision.
+
+        The filter solves small pictures in float64; the steps of a training take half the time in
+        float32.
+        """
+        posed, matrix = values[self.filter], values[self.matrix]
+        picture: Tensor = restore.colour(posed.answer * posed.scale + posed.mean, matrix)
+        return picture, (posed._make(tensor.to(dtype) for tensor in posed), matrix.to(dtype))
+
+
+def tensors_of(beside: Given) -> dict[str, Tensor]:
+    """Return the tensors by name of what a network needs beside a picture."""
+    if not beside:
+        return {}
+    posed, matrix = beside
+    return {**{f"given.{name}": x for name, x in posed._asdict().items()}, "given.matrix": matrix}
+
+
+def given_of(tensors: Mapping[str, Tensor]) -> Given:
+    """Return what a network needs beside a picture, from its tensors by name."""
+    if "given.matrix" not in tensors:
+        return ()
+    kind = FilterFacts if "given.maps" in tensors else WienerProblem
+    return (
+        kind(**{name: tensors[f"given.{name}"] for name in kind._fields}),
+        tensors["given.matrix"],
+    )
+
+
+def turned(beside: Given, seed: tuple[int, ...]) -> Given:
+    """Turn the maps that a network sees beside a picture, as `scene.symmetry` turns the picture
+    with the same seed.
+    """
+    facts = beside[0] if beside else None
+    if not beside or not isinstance(facts, FilterFacts):
+        return beside
+    maps = {name: symmetry(getattr(facts, name), seed) for name in ("answer", "deviation", "maps")}
+    return facts._replace(**maps), beside[1]
+
+
+# --- stored pool ----------------------------------------------------------------------------------
+
+# Simulated training pictures in the store, so that a later training with the same pictures begins
+# at once.
+#
+# The key of a picture is made of the keys of its steps with the values that were drawn for it, of
+# the scene itself and of the noise. So a picture of another optics, sensor, laser, distribution or
+# code has another key.
+
+
+_ABOUT = {"step": "training picture"}
+_CODE = ("training.training_pictures", "training.training_pictures")
+
+
+class StoredPool:
+    """The pictures of a pool behind a fixed mask, each in the store under a key of its own."""
+
+    def __init__(
+        self, recipe: Recipe, settings: Training, outputs: Sequence[str], store: Store, device: str
+    ) -> None:
+        self.recipe, self.settings, self.store, self.device = recipe, settings, store, device
+        self._outputs = tuple(outputs)
+        self._order = [name for name in needed(recipe, self._outputs) if name != settings.scene]
+        self._code = Code(store.code_memo)
+        self._resize = self._code.digest("neusee.nodes.resampling")
+        #: pictures that came from the store, and pictures that were simulated
+        self.read, self.computed = 0, 0
+
+    def picture(
+        self,
+        scene: Tensor,
+        drawn: Mapping[str, Any],
+        noise: int,
+        compute: Callable[[], dict[str, Tensor]],
+    ) -> dict[str, Tensor]:
+        """Return the tensors of a picture from the store, or compute and store them before the
+        next picture.
+        """
+        key = self._key(scene, drawn, noise)
+        computed: list[bool] = []
+
+        def simulated() -> dict[str, Tensor]:
+            computed.append(True)
+            return compute()
+
+        tensors: dict[str, Tensor] = (
+            simulated()
+            if is_private(key)
+            else compute_once(self.store, key, dict, simulated, _ABOUT)
+        )
+        self.computed, self.read = self.computed + bool(computed), self.read + (not computed)
+        return {name: x.to(self.device) for name, x in tensors.items()}
+
+    def _key(self, scene: Tensor, changed: Mapping[str, Any], noise: int) -> str:
+        settings, recipe = self.settings, self.recipe
+        pixels = scene.detach().cpu().contiguous()
+        keys = {settings.scene: hashlib.sha256(pixels.numpy().tobytes()).hexdigest()}
+        drawn: dict[str, dict[str, Any]] = {}
+        for reader, value in changed.items():
+            reads, _, param = reader.rpartition(".")
+            drawn.setdefault(reads, {})[param] = value
+        for name in self._order:
+            step = recipe.steps[name]
+            step = replace(step, params={**step.params, **drawn.get(name, {})})
+            keys[name], _ = key_of(step, keys, recipe.seed, self._code, place(step, self.device))
+        own = [keys[name] for name in self._outputs]
+        if private := next(filter(is_private, own), None):
+            return private
+        cut = [settings.size, settings.patch, settings.patches, settings.precision, self._resize]
+        within = [
+            list(pixels.shape),
+            noise,
+            recipe.tolerance,
+            recipe.exact,
+            recipe.estimates,
+            device_kind(self.device),
+        ]
+        return digest("training picture", engine(*_CODE), own, cut, within)
+
+
+# --- training pictures ----------------------------------------------------------------------------
+
+# The numbered training pictures, each with its own scene, laser, sensor parameters and noise.
+#
+# Steps that depend neither on the mask nor on a drawn value are computed once, steps that depend
+# only on the mask once in each iteration, and steps that depend on a scene, a drawn value or noise
+# once for each picture. Gradients of steps that depend only on the mask are summed over all
+# pictures, so that one picture is in memory at a time.
+
+
+#: the node of a laser, and the parameter that is 0 without a laser
+_LASER = ("optics.laser_irradiance", "strength")
 _SEEDS = 2**31
-HELD_OUT = 3  #: in place of the number of a stage: the pictures of held-out photographs, the same in both stages
+#: in place of the number of a stage: the pictures of held-out photographs, the same in both stages
+HELD_OUT = 3
 
 
 @dataclass(frozen=True)
@@ -45,14 +286,23 @@ class Sample:
 
     picture: Tensor  #: (n, 3, y, x), the developed picture of the camera
     truth: Tensor  #: (n, 3, y, x), the true picture
-    light: Tensor  #: (band,), the fraction of the light of the scene that the mask keeps; empty where no loss reads it
+    #: (band,), the fraction of the light of the scene that the mask keeps; empty where no loss
+    #: reads it
+    light: Tensor
     drawn: Mapping[str, Any]  #: the values that were sampled for the picture
     given: Given = ()  #: what the network needs beside the picture
 
     @property
     def tensors(self) -> dict[str, Tensor]:
-        """Return picture, true picture, light, and what the network needs beside the picture, by name."""
-        return {"picture": self.picture, "truth": self.truth, "light": self.light, **tensors_of(self.given)}
+        """Return picture, true picture, light, and what the network needs beside the picture, by
+        name.
+        """
+        return {
+            "picture": self.picture,
+            "truth": self.truth,
+            "light": self.light,
+            **tensors_of(self.given),
+        }
 
     @classmethod
     def of(cls, tensors: Mapping[str, Tensor], drawn: Mapping[str, Any]) -> Sample:
@@ -60,11 +310,14 @@ class Sample:
         return cls(tensors["picture"], tensors["truth"], tensors["light"], drawn, given_of(tensors))
 
 
-_NOTHING = Sample(torch.zeros(0), torch.zeros(0), torch.zeros(0), {})  #: of a process without a picture in a round
+#: of a process without a picture in a round
+_NOTHING = Sample(torch.zeros(0), torch.zeros(0), torch.zeros(0), {})
 
 
 class TrainingStream:
-    """The training pictures of a recipe, behind a mask that is trained or behind the fixed mask of ``frozen``."""
+    """The training pictures of a recipe, behind a mask that is trained or behind the fixed mask
+    of ``frozen``.
+    """
 
     repeats = 1  #: pictures of each held-out photograph
 
@@ -80,74 +333,105 @@ class TrainingStream:
         held_out: Sequence[Path] = (),
     ) -> None:
         learn = None if frozen else settings.learn
+        learns = {learn} if learn else set[str]()
         self.settings, self.photographs, self.device = settings, photographs, device
         self.seed, self.mesh, self.held_out = recipe.seed, mesh, held_out
         self._pool = settings.pool if frozen else None
         self._kept: dict[tuple[int, int], Sample] = {}
-        self._rounds: dict[tuple[int, ...], Sample] = {}  #: by stage and numbers, of processes that divide the bands
+        #: by stage and numbers, of processes that divide the bands
+        self._rounds: dict[tuple[int, ...], Sample] = {}
         outputs: tuple[str, ...] = (settings.picture, settings.truth, settings.light, settings.psf)
-        require_steps(recipe, "train", (*outputs, settings.scene, *([learn] if learn else [])))
-        self._inputs = Inputs.of(recipe, outputs) if recipe.uncertain and recipe.uncertain.names else None
+        require_steps(recipe, "train", (*outputs, settings.scene, *learns))
+        self._inputs = _uncertain_inputs(recipe, outputs)
         self._mismatch = CameraMismatch.of(recipe, settings)
         self.shape = frame_of(recipe, settings.scene)
         believed = in_precision(frozen or recipe, settings.dtype)
         self._posed = PosedPictures.of(recipe, settings)
-        believed = self._posed.within(believed) if self._posed else believed
+        if self._posed:
+            believed = self._posed.within(believed)
         self._made = self._outputs(2 if frozen else 1)
         recipe, self.psf = self._mismatch.camera(believed, self._made, settings.psf)
         outputs = (*self._made, self.psf)
-        recipe = with_substitutions(replace(recipe, estimates=False), outputs, {learn} if learn else ())
+        recipe = with_substitutions(replace(recipe, estimates=False), outputs, learns)
         order = needed(recipe, outputs)
-        keeps = self._pool and settings.keep_pool
-        self._stored = StoredPool(recipe, settings, self._made, store, device) if keeps else None
-        self._lasers = [f"{n}.{_LASER[1]}" for n in order if recipe.steps[n].node.path == _LASER[0]]
+        self._stored = self._stored_pool(recipe, store)
+        self._lasers = _parameters_of_lasers(recipe, order)
         self._readers = self._read(believed, order)
         noise, drawn = self._changing(recipe, order)
-        learnt = dependents(recipe, {learn} if learn else (), order)
+        learnt = dependents(recipe, learns, order)
         self.shards = Shards.of(recipe, self.psf, outputs, drawn | learnt, store, mesh)
         drawn |= self.shards.behind
         read = _sources(recipe, drawn) | {self.psf}
-        self._divide(recipe, learn, [n for n in order if n in (learnt - drawn) & read], drawn, noise, store)
+        border = [name for name in order if name in (learnt - drawn) & read]
+        self._divide(recipe, learn, border, drawn, noise, store)
+
+    def _stored_pool(self, recipe: Recipe, store: Store) -> StoredPool | None:
+        """Return the pictures of a pool in the store, or None if there is no pool to keep."""
+        if not self._pool or not self.settings.keep_pool:
+            return None
+        return StoredPool(recipe, self.settings, self._made, store, self.device)
 
     def _changing(self, recipe: Recipe, order: Sequence[str]) -> tuple[set[str], set[str]]:
-        """Return the steps that draw noise for each picture, and all steps that change with each picture."""
-        fixed = set(needed(recipe, [self.psf]))  # random effects in the PSF, such as dirt, are constant
+        """Return the steps that draw noise for each picture, and all steps that change with each
+        picture.
+        """
+        # random effects in the PSF, such as dirt, are constant
+        fixed = set(needed(recipe, [self.psf]))
         noise = {name for name in order if recipe.steps[name].node.random and name not in fixed}
         read = {self.settings.scene, *(name.rpartition(".")[0] for name in self._readers)}
         drawn = dependents(recipe, noise | read, order)
         if self.psf in drawn:
             raise ValueError(
-                f"train.psf: {self.settings.psf} changes with each picture: name a step with a constant PSF"
+                f"train.psf: {self.settings.psf} changes with each picture: name a step with a"
+                " constant PSF"
             )
         return noise, drawn
 
     def _outputs(self, number: int) -> tuple[str, ...]:
-        """Return the steps that make a picture of a stage: what a network sees, the truth, light if a loss reads it."""
+        """Return the steps that make a picture of a stage: what a network sees, the truth, light
+        if a loss reads it.
+        """
         stage = self.settings.stages.get(number)
         light = (self.settings.light,) if stage is not None and stage.bsr else ()
-        seen = self._posed.steps if self._posed else (self.settings.picture,)
-        return (*seen, self.settings.truth, *light)
+        shown = self._posed.steps if self._posed else (self.settings.picture,)
+        return (*shown, self.settings.truth, *light)
 
     def _read(self, believed: Recipe, order: Sequence[str]) -> dict[str, Any]:
-        """Return the parameters that change with each picture, with the values that the recipe states.
+        """Return the parameters that change with each picture, with the values that the recipe
+        states.
 
-        What is drawn for the camera is told to the restorer too, but for the differences of ``train.mismatch``.
+        What is drawn for the camera is told to the restorer too, but for the differences of
+        ``train.mismatch``.
         """
         drawn = dict.fromkeys([*(self._inputs.readers if self._inputs else ()), *self._lasers])
-        told, steps = [TOLD + name for name in drawn], set(order)
-        each = [name for name in (*drawn, *told, *self._mismatch.moved) if name.rpartition(".")[0] in steps]
-        return {name: _given(believed, name.removeprefix(TOLD)) for name in each}
+        believed_names, steps = [TOLD + name for name in drawn], set(order)
+        changing = [
+            name
+            for name in (*drawn, *believed_names, *self._mismatch.moved)
+            if name.rpartition(".")[0] in steps
+        ]
+        return {name: _given(believed, name.removeprefix(TOLD)) for name in changing}
 
     def _divide(
-        self, recipe: Recipe, learn: str | None, border: list[str], drawn: set[str], noise: set[str], store: Store
+        self,
+        recipe: Recipe,
+        learn: str | None,
+        border: list[str],
+        drawn: set[str],
+        noise: set[str],
+        store: Store,
     ) -> None:
-        """Divide the recipe into steps that depend on the mask alone, up to ``border``, and steps for each picture."""
+        """Divide the recipe into steps that depend on the mask alone, up to ``border``, and
+        steps for each picture.
+        """
         settings = self.settings
         ways: dict[str, Any] = {"store": store, "device": self.device}
         read = self.shards.steps & _sources(recipe, drawn - self.shards.steps)
         self._whole = [name for name in border if name in read]
         caller = self.shards.call
-        self.shared = as_function(recipe, learn, outputs=border, caller=caller, **ways) if learn else None
+        self.shared = (
+            as_function(recipe, learn, outputs=border, caller=caller, **ways) if learn else None
+        )
         free = [*border, settings.scene, *self._readers]
         self._each = Pictures(recipe, free, self._made, noise, self.shards, ways)
         if self._each.by_band:
@@ -155,50 +439,73 @@ class TrainingStream:
 
     @property
     def pool_counts(self) -> dict[str, int]:
-        """Return how many pictures of the pool this process read from the store, and how many it simulated."""
-        return {"from_store": self._stored.read, "simulated": self._stored.computed} if self._stored else {}
+        """Return how many pictures of the pool this process read from the store, and how many it
+        simulated.
+        """
+        return (
+            {"from_store": self._stored.read, "simulated": self._stored.computed}
+            if self._stored
+            else {}
+        )
 
     def begin(self, height: Tensor) -> Shared:
-        """Compute the steps that depend on the mask alone, once for all pictures of a training iteration."""
+        """Compute the steps that depend on the mask alone, once for all pictures of a training
+        iteration.
+        """
         results = self.shared({str(self.settings.learn): height}) if self.shared else {}
         return Shared.of(results, self.shards, self._whole)
 
     def counted(self, name: str, here: int) -> tuple[int, int]:
-        """Return the total number of spectral bands of a result, and the number of processes that compute each band."""
+        """Return the total number of spectral bands of a result, and the number of processes
+        that compute each band.
+        """
         by_band = name in self.shards.steps
         return (self.shards.count, self.mesh.data) if by_band else (here, self.mesh.size)
 
-    def batch(self, shared: Shared, stage: int, first: int, count: int) -> Iterator[tuple[int, Sample]]:
+    def batch(
+        self, shared: Shared, stage: int, first: int, count: int
+    ) -> Iterator[tuple[int, Sample]]:
         """Yield index and picture for each picture of a training batch that this process completes.
 
         The batch has ``count`` pictures and begins with the picture number ``first``.
 
-        The caller must exhaust the iterator, because gradients return to all processes that computed a part.
+        The caller must exhaust the iterator, because gradients return to all processes that
+        computed a part.
         """
         group = range(self.mesh.row, count, self.mesh.data)
         for begin in range(0, len(group), self.mesh.band):
             together = group[begin : begin + self.mesh.band]
             mine = together[self.mesh.column] if self.mesh.column < len(together) else None
-            if not self._each.by_band:
-                if mine is not None:
-                    yield mine, self.turned(self(shared.seen, stage, first + mine), stage, first + mine)
-                continue
-            key = (stage, *(self._number(stage, first + i) for i in together))
-            if key in self._rounds:  # in the memory of all processes, or of none
-                if mine is not None:
-                    yield mine, self.turned(self._rounds[key], stage, first + mine)
-                continue
-            begun = {i: self._drawn(stage, number) for i, number in zip(together, key[1:], strict=True)}
-            parts = {i: (theta, noise) for i, (theta, noise, _) in begun.items()}
-            with self._each.together(shared, parts, mine) as values:
-                sample = _NOTHING if mine is None else self._sample(values, begun[mine][2])
-                if mine is not None:
-                    yield mine, self.turned(sample, stage, first + mine)
-            if self._pool is not None and stage != HELD_OUT:
-                self._rounds[key] = sample
+            if self._each.by_band:
+                yield from self._round(shared, stage, first, together, mine)
+            elif mine is not None:
+                sample = self(shared.seen, stage, first + mine)
+                yield mine, self.turned(sample, stage, first + mine)
+
+    def _round(
+        self, shared: Shared, stage: int, first: int, together: Sequence[int], mine: int | None
+    ) -> Iterator[tuple[int, Sample]]:
+        """Compute the pictures ``together`` with the processes that divide the bands, and yield the
+        picture of this process.
+        """
+        key = (stage, *(self._number(stage, first + i) for i in together))
+        if key in self._rounds:  # in the memory of all processes, or of none
+            if mine is not None:
+                yield mine, self.turned(self._rounds[key], stage, first + mine)
+            return
+        begun = {i: self._drawn(stage, number) for i, number in zip(together, key[1:], strict=True)}
+        parts = {i: (theta, noise) for i, (theta, noise, _) in begun.items()}
+        with self._each.together(shared, parts, mine) as values:
+            sample = _NOTHING if mine is None else self._sample(values, begun[mine][2])
+            if mine is not None:
+                yield mine, self.turned(sample, stage, first + mine)
+        if self._pool is not None and stage != HELD_OUT:
+            self._rounds[key] = sample
 
     def __call__(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
-        """Return the training picture with the given number, which does not depend on order or process."""
+        """Return the training picture with the given number, which does not depend on order or
+        process.
+        """
         number = self._number(stage, number)
         if self._pool is None or stage == HELD_OUT:
             return self._alone(shared, stage, number)
@@ -211,7 +518,9 @@ class TrainingStream:
         return number % (self._pool or _SEEDS) if stage != HELD_OUT else number
 
     def turned(self, sample: Sample, stage: int, number: int) -> Sample:
-        """Turn a pooled picture and the true picture together, each time otherwise: as behind a mask that is turned."""
+        """Turn a pooled picture and the true picture together, each time otherwise: as behind a
+        mask that is turned.
+        """
         if self._pool is None or stage == HELD_OUT or self.settings.augment.pooled == "none":
             return sample
         seed = (self.seed, stage, number, 4)
@@ -221,11 +530,20 @@ class TrainingStream:
     def _scene(self, stage: int, number: int) -> Tensor:
         """Return the scene of a picture (3, y, x), with the changes of ``train.augment``."""
         if stage == HELD_OUT:
-            return Photographs((self.held_out[number],)).crop(self.shape, self.seed, (stage, number))
-        how = self.settings.augment
-        much = how.exposure, how.colour, how.enlarge
-        change = Change.drawn((self.seed, stage, number, 3), how.symmetries == "all", *much)
-        return change.of(self.photographs.crop(change.frame(self.shape), self.seed, (stage, number)), self.shape)
+            return Photographs((self.held_out[number],)).crop(
+                self.shape, self.seed, (stage, number)
+            )
+        augment = self.settings.augment
+        change = Change.drawn(
+            (self.seed, stage, number, 3),
+            augment.symmetries == "all",
+            augment.exposure,
+            augment.colour,
+            augment.enlarge,
+        )
+        return change.of(
+            self.photographs.crop(change.frame(self.shape), self.seed, (stage, number)), self.shape
+        )
 
     def _alone(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
         theta, noise, drawn = self._drawn(stage, number)
@@ -235,12 +553,16 @@ class TrainingStream:
 
         if self._stored is None or stage == HELD_OUT:
             return simulated()
-        given = {name: theta[name] for name in self._readers}
-        kept = self._stored.picture(theta[self.settings.scene], given, noise, lambda: simulated().tensors)
-        return Sample.of(kept, drawn)
+        changed = {name: theta[name] for name in self._readers}
+        tensors = self._stored.picture(
+            theta[self.settings.scene], changed, noise, lambda: simulated().tensors
+        )
+        return Sample.of(tensors, drawn)
 
     def _drawn(self, stage: int, number: int) -> tuple[dict[str, Any], int, dict[str, Any]]:
-        """Sample the random inputs of a training picture; return the inputs, the noise seed, and all values by name."""
+        """Sample the random inputs of a training picture; return the inputs, the noise seed, and
+        all values by name.
+        """
         rng = np.random.default_rng((self.seed, stage, number, 1))
         theta, drawn = dict(self._readers), dict[str, Any]()
         if self._inputs is not None:
@@ -254,39 +576,64 @@ class TrainingStream:
         if rng.random() < self.settings.laser_free:
             theta |= dict.fromkeys(self._lasers, 0.0)
             drawn["laser"] = "none"
-        theta |= {self.settings.scene: self._scene(stage, number).to(self.device, self.settings.dtype)}
+        theta |= {
+            self.settings.scene: self._scene(stage, number).to(self.device, self.settings.dtype)
+        }
         noise = int(rng.integers(_SEEDS))
         return theta, noise, {**drawn, "noise": noise, "number": number}
 
     def _sample(self, values: Mapping[str, Any], drawn: Mapping[str, Any]) -> Sample:
-        """Resize a training picture and the true picture to ``train.size``, and cut both into patches.
+        """Resize a training picture and the true picture to ``train.size``, and cut both into
+        patches.
 
-        Antialiased `kornia.geometry.transform.resize` lets stripes alias: at 2/3 of the size the finest stripes keep a
-        contrast of 0.69 with kornia, and of 0.09 with `resize`.
+        Antialiased `kornia.geometry.transform.resize` lets stripes alias: at 2/3 of the size the
+        finest stripes keep a contrast of 0.69 with kornia, and of 0.09 with `resize`.
         """
         light = values.get(self.settings.light, torch.zeros(0))
         dtype = self.settings.dtype
-        picture, given = self._posed.read(values, dtype) if self._posed else (values[self.settings.picture], ())
+        picture, beside = (
+            self._posed.read(values, dtype) if self._posed else (values[self.settings.picture], ())
+        )
         both = [x.to(dtype) for x in (picture, values[self.settings.truth])]
         if self.settings.size is not None:
             both = [resize(picture, *self.settings.size) for picture in both]
         picture, truth = self._patches(torch.stack(both), drawn["noise"])
-        return Sample(picture, truth, light, drawn, given)
+        return Sample(picture, truth, light, drawn, beside)
 
     def _patches(self, both: Tensor, seed: int) -> Tensor:
-        """Cut patches from a training picture and the true picture at the same positions, as a tensor (2, n, 3, y, x).
+        """Cut patches from a training picture and the true picture at the same positions, as a
+        tensor (2, n, 3, y, x).
 
-        A slice gives the same pixels as `kornia.geometry.transform.crop_by_indices` in a tenth of the time.
+        A slice gives the same pixels as `kornia.geometry.transform.crop_by_indices` in a tenth of
+        the time.
         """
         if self.settings.patch is None:
             return both[:, None]
         size, patch = (both.shape[-2], both.shape[-1]), self.settings.patch
         if any(have < want for have, want in zip(size, patch, strict=True)):
-            raise ValueError(f"train.patch: {list(patch)} is larger than the picture {list(size)}: set a smaller patch")
+            raise ValueError(
+                f"train.patch: {list(patch)} is larger than the picture {list(size)}: set a smaller"
+                " patch"
+            )
         rng = np.random.default_rng((seed, 2))
         count = self.settings.patches
-        places = [[int(rng.integers(h - w + 1)) for h, w in zip(size, patch, strict=True)] for _ in range(count)]
+        places = [
+            [int(rng.integers(h - w + 1)) for h, w in zip(size, patch, strict=True)]
+            for _ in range(count)
+        ]
         return torch.stack([both[..., y : y + patch[0], x : x + patch[1]] for y, x in places], 1)
+
+
+def _uncertain_inputs(recipe: Recipe, outputs: Sequence[str]) -> Inputs | None:
+    if recipe.uncertain and recipe.uncertain.names:
+        return Inputs.of(recipe, outputs)
+    return None
+
+
+def _parameters_of_lasers(recipe: Recipe, order: Sequence[str]) -> list[str]:
+    """Return the parameter of each laser that changes with each picture."""
+    lasers = [name for name in order if recipe.steps[name].node.path == _LASER[0]]
+    return [f"{name}.{_LASER[1]}" for name in lasers]
 
 
 def _given(recipe: Recipe, name: str) -> Any:
@@ -295,4 +642,100 @@ def _given(recipe: Recipe, name: str) -> Any:
 
 
 def _sources(recipe: Recipe, readers: Iterable[str]) -> set[str]:
-    return {source for reader in readers for source in recipe.steps[reader].sources}
+    return set(chain.from_iterable(recipe.steps[reader].sources for reader in readers))
+
+
+# --- several cameras ------------------------------------------------------------------------------
+
+# Training pictures of several cameras in turn, so that one network learns to restore the pictures
+# of all of them.
+
+
+class SeveralCameras:
+    """The pictures of a training with the camera of its recipe and with each of ``train.cameras``.
+
+    The picture with the number n, or its number n in the pool, is of camera n modulo their count. A
+    held-out photograph is seen by every camera.
+    """
+
+    shared = None  #: no mask is trained, so that no result depends on one
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        settings: Training,
+        photographs: Photographs,
+        store: Store,
+        device: str,
+        held_out: Sequence[Path],
+    ) -> None:
+        recipes = (recipe, *recipe.cameras)
+        self.repeats, self._pool = len(recipes), settings.pool
+        judged: list[Path] = []
+        for path in held_out:
+            judged += [path] * len(recipes)
+        self._streams = [
+            TrainingStream(
+                camera, settings, photographs, store, device, frozen=camera, held_out=judged
+            )
+            for camera in recipes
+        ]
+        self.psf = self._streams[0].psf
+
+    @property
+    def pool_counts(self) -> dict[str, int]:
+        """Return how many pictures of the pool came from the store, and how many were simulated."""
+        counts = [stream.pool_counts for stream in self._streams]
+        return {
+            name: sum(counts_of_camera[name] for counts_of_camera in counts) for name in counts[0]
+        }
+
+    def begin(self, height: Any) -> Shared:
+        """Return no results: none depends on a mask that is trained."""
+        return Shared.of({})
+
+    def counted(self, name: str, here: int) -> tuple[int, int]:
+        """Return the total number of spectral bands of a result, and how many processes compute
+        each: one.
+        """
+        return here, 1
+
+    def batch(
+        self, shared: Shared, stage: int, first: int, count: int
+    ) -> Iterator[tuple[int, Sample]]:
+        """Yield index and picture of each of the ``count`` pictures of a batch, from the picture
+        number ``first``.
+        """
+        for i in range(count):
+            number = first + i
+            within = number % self._pool if self._pool and stage != HELD_OUT else number
+            stream = self._streams[within % self.repeats]
+            yield i, stream.turned(stream(shared.seen, stage, number), stage, number)
+
+
+Samples = TrainingStream | SeveralCameras
+
+
+def samples_of(
+    recipe: Recipe,
+    settings: Training,
+    photographs: Photographs,
+    store: Store,
+    device: str,
+    frozen: Recipe | None,
+    mesh: Mesh,
+    held_out: Sequence[Path],
+) -> Samples:
+    """Return the pictures of a training, of one camera or of several in turn."""
+    if frozen is not None and frozen.cameras:
+        return SeveralCameras(frozen, settings, photographs, store, device, held_out)
+    return TrainingStream(recipe, settings, photographs, store, device, frozen, mesh, held_out)
+
+
+def require_alone(recipe: Recipe, mesh: Mesh) -> None:
+    """Raise an error for a training with several cameras in several processes."""
+    if recipe.cameras and mesh.size > 1:
+        raise MeshError(
+            f"{KEY}.cameras: a training with several cameras runs in a single process, without"
+            " torchrun"
+        )

@@ -1,4 +1,6 @@
-"""Intensity of the PSF with a hand-written gradient, which computes the field in the pupil again to save memory."""
+"""Intensity of the PSF with a hand-written gradient, which computes the field in the pupil again
+to save memory.
+"""
 
 import math
 from collections.abc import Sequence
@@ -10,9 +12,8 @@ from torch import Tensor
 
 from neusee.nodes.optics._transform._fused import FusedPupil, available, operators
 from neusee.nodes.optics._transform._pupil_field import Field, Screens, View, refuse_too_many_turns
-from neusee.nodes.optics._transform._sample_axis import patch_of
+from neusee.nodes.optics._transform._sample_axis import Workspace, borrowed, patch_of
 from neusee.nodes.optics._transform._scaled_transform import Method, propagate
-from neusee.nodes.optics._transform._workspace import Workspace, borrowed
 from neusee.nodes.torch_func import one_by_one, transformed
 
 _ONCE = "the PSF has no second derivative here: differentiate without create_graph=True"
@@ -21,12 +22,15 @@ KEPT_FIELD_BYTES = 1 << 30  #: bytes; focal fields up to this size are kept for 
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """The grids of focal points, and the precision and method of the transform from the pupil to these grids."""
+    """The grids of focal points, and the precision and method of the transform from the pupil to
+    these grids.
+    """
 
     views: tuple[View, ...]
     dtype: torch.dtype
     method: Method | Literal["fused"] = "auto"
-    keep: bool = True  #: focal fields are stored for back-propagation, if they fit in `KEPT_FIELD_BYTES`
+    #: focal fields are stored for back-propagation, if they fit in `KEPT_FIELD_BYTES`
+    keep: bool = True
 
     @property
     def by_torch(self) -> Method:
@@ -34,28 +38,39 @@ class Sampling:
         return "auto" if self.method == "fused" else self.method
 
     def fused(self, device: torch.device) -> bool:
-        """Return True if the C++ computes intensity and gradient; raise NoCompilerError if only C++ may and cannot."""
+        """Return True if the C++ computes intensity and gradient; raise NoCompilerError if only
+        C++ may and cannot.
+        """
         if self.method == "fused":
             operators()
         return self.method == "fused" or (self.method == "auto" and available(device))
 
 
 def intensity_of(amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
-    """Return the intensity of the PSF, differentiable by back-propagation and by the transforms of `torch.func`."""
+    """Return the intensity of the PSF, differentiable by back-propagation and by the transforms
+    of `torch.func`.
+    """
     form = _Transformed if transformed() else PupilIntensity
     result: Tensor = form.apply(amplitude, height, path, sampling)  # type: ignore[no-untyped-call]
     return result
 
 
 class PupilIntensity(torch.autograd.Function):
-    """The PSF intensity ``sum over views of weight * envelope * |U|^2``, whose gradient is an adjoint transform."""
+    """The PSF intensity ``sum over views of weight * envelope * |U|^2``, whose gradient is an
+    adjoint transform.
+    """
 
     @staticmethod
-    def forward(ctx: Any, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Tensor:
+    def forward(
+        ctx: Any, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling
+    ) -> Tensor:
         screens = Screens.of(amplitude, height, path)
         intensity, fields = _computed(screens, sampling, any(ctx.needs_input_grad))
-        # as saved tensors the fields are freed with the graph, even where a result still holds this node
-        ctx.save_for_backward(amplitude, height, path, *(field for field in fields if field is not None))
+        # as saved tensors the fields are freed with the graph, even where a result still holds this
+        # node
+        ctx.save_for_backward(
+            amplitude, height, path, *(field for field in fields if field is not None)
+        )
         ctx.sampling, ctx.screens = sampling, screens[3:]
         return intensity
 
@@ -89,12 +104,14 @@ class _Transformed(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, *tangents: Tensor | None) -> Any:
         saved = ctx.saved_tensors
-        given = [torch.zeros_like(x) if t is None else t for x, t in zip(saved, tangents, strict=False)]
-        return _Tangent.apply(*saved, *given, ctx.sampling)  # type: ignore[no-untyped-call]
+        pushed = [
+            torch.zeros_like(x) if t is None else t for x, t in zip(saved, tangents, strict=False)
+        ]
+        return _Tangent.apply(*saved, *pushed, ctx.sampling)  # type: ignore[no-untyped-call]
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
-        return one_by_one(_Transformed.apply, info.batch_size, in_dims, given)
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> Any:
+        return one_by_one(_Transformed.apply, info.batch_size, in_dims, inputs)
 
 
 class _Once(torch.autograd.Function):
@@ -114,32 +131,44 @@ class _Once(torch.autograd.Function):
 
 
 class _Tangent(_Once):
-    """The change of the PSF intensity for small changes of amplitude, height and path (forward mode)."""
+    """The change of the PSF intensity for small changes of amplitude, height and path (forward
+    mode).
+    """
 
     @staticmethod
-    def forward(*given: Any) -> Tensor:
-        return _pushed(Screens.of(*given[:3]), given[3:6], given[6])
+    def forward(*inputs: Any) -> Tensor:
+        return _pushed(Screens.of(*inputs[:3]), inputs[3:6], inputs[6])
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
-        return one_by_one(_Tangent.apply, info.batch_size, in_dims, given)
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> Any:
+        return one_by_one(_Tangent.apply, info.batch_size, in_dims, inputs)
 
 
 class _Gradient(_Once):
     """The gradients of the PSF intensity for amplitude, height and path (reverse mode)."""
 
     @staticmethod
-    def forward(weight: Tensor, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling) -> Any:
+    def forward(
+        weight: Tensor, amplitude: Tensor, height: Tensor, path: Tensor, sampling: Sampling
+    ) -> Any:
         fields = [None] * len(sampling.views)
-        return tuple(_adjoint(weight, Screens.of(amplitude, height, path), sampling, fields, (True, True, True)))
+        return tuple(
+            _adjoint(
+                weight, Screens.of(amplitude, height, path), sampling, fields, (True, True, True)
+            )
+        )
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *given: Any) -> Any:
-        return one_by_one(_Gradient.apply, info.batch_size, in_dims, given)
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> Any:
+        return one_by_one(_Gradient.apply, info.batch_size, in_dims, inputs)
 
 
-def _computed(screens: Screens, sampling: Sampling, keep: bool) -> tuple[Tensor, list[Tensor | None]]:
-    """Return the PSF intensity, and the focal field of each view, or None instead of fields that are not stored."""
+def _computed(
+    screens: Screens, sampling: Sampling, keep: bool
+) -> tuple[Tensor, list[Tensor | None]]:
+    """Return the PSF intensity, and the focal field of each view, or None instead of fields that
+    are not stored.
+    """
     refuse_too_many_turns(screens, sampling.views)
     views, shape = sampling.views, (sampling.views[0].rows.n_out, sampling.views[0].columns.n_out)
     device, fields, done = screens.height.device, list[Tensor | None](), -1
@@ -149,13 +178,19 @@ def _computed(screens: Screens, sampling: Sampling, keep: bool) -> tuple[Tensor,
     with borrowed(sampling.dtype, device) as work:
         pupil = FusedPupil(screens, sampling.dtype, work) if fused else None
         for view in views:
-            kept = torch.empty(2, *shape[:: 1 if fused else -1], dtype=sampling.dtype, device=device) if keep else None
+            focal = (
+                torch.empty(2, *shape[:: 1 if fused else -1], dtype=sampling.dtype, device=device)
+                if keep
+                else None
+            )
             if pupil is not None:
-                pupil.forward(view, intensity[view.band], view.band == done, kept)
+                pupil.forward(view, intensity[view.band], view.band == done, focal)
             else:
                 field = Field(screens, view, sampling.dtype)
-                _power(field, intensity[view.band], view.band == done, kept, sampling.by_torch, work)
-            fields.append(kept)
+                _power(
+                    field, intensity[view.band], view.band == done, focal, sampling.by_torch, work
+                )
+            fields.append(focal)
             done = view.band
     return intensity, fields
 
@@ -167,26 +202,35 @@ def _adjoint(
     fields: Sequence[Tensor | None],
     needs: Sequence[bool],
 ) -> list[Tensor | None]:
-    """Return the gradients with respect to amplitude, height and path, each only if autograd requests the gradient.
+    """Return the gradients with respect to amplitude, height and path, each only if autograd
+    requests the gradient.
 
     A focal field that was not stored is computed again.
     """
-    grads = [torch.zeros_like(x) if need else None for x, need in zip(screens[:3], needs, strict=True)]
+    grads = [
+        torch.zeros_like(x) if need else None for x, need in zip(screens[:3], needs, strict=True)
+    ]
     with borrowed(weight.dtype, weight.device) as work:
         if sampling.fused(weight.device):
-            FusedPupil(screens, weight.dtype, work).add_gradients(sampling.views, weight, fields, grads)
+            FusedPupil(screens, weight.dtype, work).add_gradients(
+                sampling.views, weight, fields, grads
+            )
             return grads
-        for view, kept in zip(sampling.views, fields, strict=True):
+        for view, focal in zip(sampling.views, fields, strict=True):
             field = Field(screens, view, weight.dtype)
-            planes = kept if kept is not None else _focal(field, sampling, work)
+            planes = focal if focal is not None else _focal(field, sampling, work)
             _add_gradient(field, planes, weight[view.band], grads, sampling.by_torch, work)
     return grads
 
 
 def _pushed(screens: Screens, tangents: Sequence[Tensor], sampling: Sampling) -> Tensor:
-    """Return the change of the PSF intensity, 2 Re(U* dU), for changes ``tangents`` of amplitude, height and path."""
+    """Return the change of the PSF intensity, 2 Re(U* dU), for changes ``tangents`` of
+    amplitude, height and path.
+    """
     views, shape = sampling.views, (sampling.views[0].rows.n_out, sampling.views[0].columns.n_out)
-    change = torch.zeros(views[-1].band + 1, *shape, dtype=sampling.dtype, device=screens.height.device)
+    change = torch.zeros(
+        views[-1].band + 1, *shape, dtype=sampling.dtype, device=screens.height.device
+    )
     with borrowed(sampling.dtype, change.device) as work:
         for view in views:
             field = Field(screens, view, sampling.dtype)
@@ -196,9 +240,16 @@ def _pushed(screens: Screens, tangents: Sequence[Tensor], sampling: Sampling) ->
 
 
 def _add_change(
-    field: Field, tangents: Sequence[Tensor], planes: Tensor, change: Tensor, method: Method, work: Workspace
+    field: Field,
+    tangents: Sequence[Tensor],
+    planes: Tensor,
+    change: Tensor,
+    method: Method,
+    work: Workspace,
 ) -> None:
-    """Add the change of the weighted intensity of one view to ``change``, given the focal field ``planes``."""
+    """Add the change of the weighted intensity of one view to ``change``, given the focal field
+    ``planes``.
+    """
 
     def source(start: int, stop: int, out: Tensor) -> None:
         rows, everywhere = slice(start, stop), slice(0, out.shape[2])
@@ -212,25 +263,33 @@ def _add_change(
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
         focal = patch_of(planes.transpose(1, 2), rows, columns, patch)
-        patch_of(change, rows, columns, patch).add_(_scaled(field.view, (2 * focal * patch).sum(0), rows, columns))
+        patch_of(change, rows, columns, patch).add_(
+            _scaled(field.view, (2 * focal * patch).sum(0), rows, columns)
+        )
 
     propagate(field.view.rows, field.view.columns, source, sink, work, method)
 
 
 def _scaled(view: View, values: Tensor, rows: slice, columns: slice) -> Tensor:
-    """Multiply ``values`` on one patch of the focal plane, in place, by the weight and the envelope of the view."""
+    """Multiply ``values`` on one patch of the focal plane, in place, by the weight and the
+    envelope of the view.
+    """
     if view.envelope is None:
         return values.mul_(view.weight)
     y, x = view.envelope
     return values.mul_(y[rows].view(*values.shape[:-1], 1)).mul_(x[columns]).mul_(view.weight)
 
 
-def _power(field: Field, out: Tensor, add: bool, kept: Tensor | None, method: Method, work: Workspace) -> None:
-    """Write the weighted intensity |U|^2 of one window of the focal plane to ``out``, or add it to ``out``."""
+def _power(
+    field: Field, out: Tensor, add: bool, focal: Tensor | None, method: Method, work: Workspace
+) -> None:
+    """Write the weighted intensity |U|^2 of one window of the focal plane to ``out``, or add it
+    to ``out``.
+    """
 
     def sink(rows: slice, columns: slice, patch: Tensor) -> None:
-        if kept is not None:
-            _keep(kept, rows, columns, patch)
+        if focal is not None:
+            _keep(focal, rows, columns, patch)
         power = _scaled(field.view, patch[0].square().addcmul_(patch[1], patch[1]), rows, columns)
         into = patch_of(out, rows, columns, patch)
         into.add_(power) if add else into.copy_(power)
@@ -238,13 +297,17 @@ def _power(field: Field, out: Tensor, add: bool, kept: Tensor | None, method: Me
     propagate(field.view.rows, field.view.columns, field.rows(work), sink, work, method)
 
 
-def _keep(kept: Tensor, rows: slice, columns: slice, patch: Tensor) -> None:
-    """Store a patch of the focal field transposed, the memory layout of the fastest transform and its adjoint."""
-    patch_of(kept.transpose(1, 2), rows, columns, patch).copy_(patch)
+def _keep(focal: Tensor, rows: slice, columns: slice, patch: Tensor) -> None:
+    """Store a patch of the focal field transposed, the memory layout of the fastest transform
+    and its adjoint.
+    """
+    patch_of(focal.transpose(1, 2), rows, columns, patch).copy_(patch)
 
 
 def _focal(field: Field, sampling: Sampling, work: Workspace) -> Tensor:
-    """Compute the focal field of a view again for back-propagation, and return the transposed field."""
+    """Compute the focal field of a view again for back-propagation, and return the transposed
+    field.
+    """
     view = field.view
     planes = work.take("focal", 2, view.columns.n_out, view.rows.n_out)
 
@@ -256,14 +319,22 @@ def _focal(field: Field, sampling: Sampling, work: Workspace) -> Tensor:
 
 
 def _add_gradient(
-    field: Field, planes: Tensor, weight: Tensor, grads: list[Tensor | None], method: Method, work: Workspace
+    field: Field,
+    planes: Tensor,
+    weight: Tensor,
+    grads: list[Tensor | None],
+    method: Method,
+    work: Workspace,
 ) -> None:
-    """Add the gradients of ``sum(weight * |U|^2)`` to ``grads`` by the adjoint transform of 2 weight U.
+    """Add the gradients of ``sum(weight * |U|^2)`` to ``grads`` by the adjoint transform of 2
+    weight U.
 
-    The transform runs on the transposed problem, so that its result comes back in rows of the pupil.
+    The transform runs on the transposed problem, so that its result comes back in rows of the
+    pupil.
     """
     view, everywhere = field.view, slice(0, planes.shape[2])
-    gain = work.take("gain", *planes.shape[1:]).copy_(weight.T)  # one copy; by slabs of a power of two it is slow
+    # one copy; by slabs of a power of two it is slow
+    gain = work.take("gain", *planes.shape[1:]).copy_(weight.T)
 
     def source(start: int, stop: int, out: Tensor) -> None:
         _scaled(view, gain[start:stop].mul_(2).T, everywhere, slice(start, stop))
@@ -278,9 +349,16 @@ def _add_gradient(
 
 
 def _chain(
-    field: Field, rows: slice, columns: slice, patch: Tensor, grads: list[Tensor | None], work: Workspace
+    field: Field,
+    rows: slice,
+    columns: slice,
+    patch: Tensor,
+    grads: list[Tensor | None],
+    work: Workspace,
 ) -> None:
-    """Add the gradients of amplitude, height and path by the chain rule, given the gradient ``patch`` of the field."""
+    """Add the gradients of amplitude, height and path by the chain rule, given the gradient
+    ``patch`` of the field.
+    """
     unit = work.take("unit", *patch.shape)
     field.phasor(rows, columns, unit, work)
     if grads[0] is not None:

@@ -1,4 +1,6 @@
-"""The complex field in the pupil, computed patch by patch from amplitude, height and path, and never stored whole."""
+"""The complex field in the pupil, computed patch by patch from amplitude, height and path, and
+never stored whole.
+"""
 
 import math
 from collections.abc import Sequence
@@ -8,17 +10,19 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neusee.nodes._half_precision import refuse_not_finite
-from neusee.nodes.optics._transform._sample_axis import Axis, Source, centred
-from neusee.nodes.optics._transform._workspace import Workspace
+from neusee.nodes.optics._transform._sample_axis import Axis, Source, Workspace, centred
+from neusee.nodes.precision import refuse_not_finite
 
 _MOST_TURNS = 1e9  #: turns of phase that float64 holds to 2e-7 turn
-_FEW_TURNS = 2.0  #: below this many turns a float32 phase is exact to 5e-7 rad, like a float64 phase after a cast
+#: below this many turns a float32 phase is exact to 5e-7 rad, like a float64 phase after a cast
+_FEW_TURNS = 2.0
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """A grid of focal points in one band, whose intensity |U|^2 is multiplied by ``weight`` and by two envelopes."""
+    """A grid of focal points in one band, whose intensity |U|^2 is multiplied by ``weight`` and
+    by two envelopes.
+    """
 
     band: int
     rows: Axis
@@ -31,7 +35,9 @@ class View:
 
 
 class Screens(NamedTuple):
-    """The amplitude, height and path of the pupil in all bands, with the largest height and path in metres."""
+    """The amplitude, height and path of the pupil in all bands, with the largest height and path
+    in metres.
+    """
 
     amplitude: Tensor
     height: Tensor
@@ -41,7 +47,9 @@ class Screens(NamedTuple):
 
     @classmethod
     def of(cls, amplitude: Tensor, height: Tensor, path: Tensor) -> "Screens":
-        """Return the pupil's factors and largest height and path; raise ValueError if height or path is not finite."""
+        """Return the pupil's factors and largest height and path; raise ValueError if height or
+        path is not finite.
+        """
         extents = [float(torch.stack(x.detach().aminmax()).abs().max()) for x in (height, path)]
         refuse_not_finite("no light has such a phase", height=extents[0], path=extents[1])
         return cls(amplitude, height, path, *extents)
@@ -49,16 +57,22 @@ class Screens(NamedTuple):
 
 def refuse_too_many_turns(screens: Screens, views: Sequence[View]) -> None:
     """Raise ValueError if the phase has more turns than float64 can hold to 1e-6 turn."""
-    turns = max(screens.highest * abs(view.turns_height) + screens.longest * view.turns_path for view in views)
+    turns = max(
+        screens.highest * abs(view.turns_height) + screens.longest * view.turns_path
+        for view in views
+    )
     if turns > _MOST_TURNS:
         raise ValueError(
-            f"height {screens.highest:.3g} m and path {screens.longest:.3g} m are {turns:.2g} turns of phase, more "
-            f"than {_MOST_TURNS:.0e}, beyond which float64 loses the phase: give heights and paths in metres"
+            f"height {screens.highest:.3g} m and path {screens.longest:.3g} m are {turns:.2g} turns"
+            f" of phase, more than {_MOST_TURNS:.0e}, beyond which float64 loses the phase: give"
+            " heights and paths in metres"
         )
 
 
 class Field:
-    """The field in the pupil for one view: amplitude * exp(2 pi i (height + path + tilt)), phases in turns."""
+    """The field in the pupil for one view: amplitude * exp(2 pi i (height + path + tilt)),
+    phases in turns.
+    """
 
     def __init__(self, screens: Screens, view: View, dtype: torch.dtype) -> None:
         self.screens, self.view = screens, view
@@ -70,7 +84,9 @@ class Field:
         self.tilt_v, self.tilt_u = v.to(kind)[:, None], u.to(kind)
 
     def phasor(self, rows: slice, columns: slice, planes: Tensor, work: Workspace) -> None:
-        """Write the cosine and sine of the pupil phase in one patch, in float64 if the phase exceeds two turns."""
+        """Write the cosine and sine of the pupil phase in one patch, in float64 if the phase
+        exceeds two turns.
+        """
         angle = work.take("angle", *planes.shape[1:])
         turns = angle if self.few else work.take("turns", *planes.shape[1:], dtype=torch.float64)
         turns.copy_(self.screens.height[rows, columns])  # cast before the product
@@ -83,7 +99,9 @@ class Field:
         torch.sin(angle, out=planes[1])
 
     def rows(self, work: Workspace) -> Source:
-        """Return a function that writes the requested rows of the pupil field to a buffer for the transform."""
+        """Return a function that writes the requested rows of the pupil field to a buffer for
+        the transform.
+        """
         everywhere = slice(0, self.screens.height.shape[1])
 
         def fill(start: int, stop: int, planes: Tensor) -> None:

@@ -1,28 +1,90 @@
-"""The axes of the scaled Fourier transform, and phasors with an exact phase."""
+"""What all transforms share: axes, phasors with an exact phase, reusable buffers."""
 
+import contextlib
 import math
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from math import prod
 
 import torch
 from torch import Tensor
+
+# --- workspace ------------------------------------------------------------------------------------
+
+# Reusable buffers: the page faults of a new 100 MB buffer take longer than the transform that fills
+# the buffer.
+
+
+__depends__ = ("unaffected:_idle",)
+_IDLE_AT_MOST = 2
+_idle: list["Workspace"] = []
+_lock = threading.Lock()
+
+
+class Workspace:
+    """Named buffers for one thread at a time; each name returns the same memory, enlarged for
+    larger requests.
+    """
+
+    def __init__(self, dtype: torch.dtype, device: torch.device) -> None:
+        self.dtype, self.device = dtype, device
+        self._flat: dict[tuple[str, torch.dtype], Tensor] = {}
+
+    def take(self, name: str, *shape: int, dtype: torch.dtype | None = None) -> Tensor:
+        """Return an uninitialised buffer; an earlier buffer of the same name and type is
+        overwritten.
+        """
+        key = (name, dtype or self.dtype)
+        flat, size = self._flat.get(key), prod(shape)
+        if flat is None or flat.numel() < size:
+            self._flat.pop(key, None)
+            flat = self._flat[key] = torch.empty(size, dtype=key[1], device=self.device)
+        return flat[:size].view(shape)
+
+
+@contextlib.contextmanager
+def borrowed(dtype: torch.dtype, device: torch.device) -> Iterator[Workspace]:
+    """Yield a workspace that no other thread uses; at most two idle workspaces are kept."""
+    with _lock:
+        fits = [w for w in _idle if (w.dtype, w.device) == (dtype, device)]
+        work = fits[-1] if fits else Workspace(dtype, device)
+        if fits:
+            _idle.remove(work)
+    try:
+        yield work
+    finally:
+        with _lock:
+            _idle.append(work)
+            del _idle[:-_IDLE_AT_MOST]
+
+
+# --- sample axis ----------------------------------------------------------------------------------
+
+# The axes of the scaled Fourier transform, and phasors with an exact phase.
+
 
 Source = Callable[
     [int, int, Tensor], None
 ]  #: fills ``planes`` (2, stop - start, n_in) with rows start..stop of the field
 Sink = Callable[[slice, slice, Tensor], None]
-#: takes a patch (2, ..., columns) of the result, re and im; the dimensions between are the rows, unflattened
+#: takes a patch (2, ..., columns) of the result, re and im; the dimensions between are the rows,
+#: unflattened
 
-LITTLE = 1 / 10  #: share of the work of the first axis, up to which the last axis is transformed in float64
+#: share of the work of the first axis, up to which the last axis is transformed in float64
+LITTLE = 1 / 10
 
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """An axis of ``U[k] = sum_j P[j] exp(sign 2 pi i alpha (j - j0) (k - k0))``; j0 and k0 are the centres."""
+    """An axis of ``U[k] = sum_j P[j] exp(sign 2 pi i alpha (j - j0) (k - k0))``; j0 and k0 are
+    the centres.
+    """
 
     n_in: int
     n_out: int
-    alpha: float  #: turns per input sample and output sample: pitch times pitch over wavelength and focal length
+    #: turns per input sample and output sample: pitch times pitch over wavelength and focal length
+    alpha: float
     sign: int = -1
 
     def adjoint(self) -> "Axis":
@@ -31,7 +93,9 @@ class Axis:
 
     @property
     def bandwidth(self) -> float:
-        """Return the time-bandwidth product, the number of independent samples that the transform carries."""
+        """Return the time-bandwidth product, the number of independent samples that the
+        transform carries.
+        """
         return self.alpha * self.n_in * self.n_out
 
 
@@ -41,7 +105,9 @@ def centred(n: int, device: torch.device) -> Tensor:
 
 
 def radians(turns: Tensor) -> Tensor:
-    """Return the phase ``turns`` modulo one turn, in radians, so that a cast to float32 is exact to 2e-7 rad."""
+    """Return the phase ``turns`` modulo one turn, in radians, so that a cast to float32 is exact
+    to 2e-7 rad.
+    """
     return (turns - turns.round()).mul_(2 * math.pi)
 
 
@@ -52,19 +118,20 @@ def unit_phasor(turns: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def last_type(first: float, last: float, dtype: torch.dtype, little: float = LITTLE) -> torch.dtype:
-    """Return the number type of the transform along the last axis, given the work along the first and the last axis.
+    """Return the number type of the transform along the last axis, given the work along the first
+    and the last axis.
 
-    The type is float64 where this costs little. The round-off of the first axis averages out along the last axis; that
-    of the last axis does not. In float32 the last axis errs by about 2^-24 of the brightest field, which is 1.2e-3 of
-    an intensity that is 1e-8 of the brightest pixel.
+    The type is float64 where this costs little. The round-off of the first axis averages out along
+    the last axis; that of the last axis does not. In float32 the last axis errs by about 2^-24 of
+    the brightest field, which is 1.2e-3 of an intensity that is 1e-8 of the brightest pixel.
     """
     return torch.float64 if last <= little * first else dtype
 
 
 def patch_of(x: Tensor, rows: slice, columns: slice, like: Tensor) -> Tensor:
     """Return a view of ``x[..., rows, columns]`` in the shape of the patch ``like``."""
-    part = x[..., rows, columns]
-    return part.view(*x.shape[:-2], *like.shape[1:])
+    view = x[..., rows, columns]
+    return view.view(*x.shape[:-2], *like.shape[1:])
 
 
 def row_chunks(rows: int, columns: int, elements: int = 1 << 19) -> list[tuple[int, int]]:

@@ -1,25 +1,47 @@
-"""The glare of lasers in a picture: strength, variance of the pattern, and other patterns that are as likely."""
+"""The glare of lasers in a picture: its strength, scatter, doubt and other likely patterns."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
-from torch import Tensor
+from pydantic import Field
+from torch import Generator, Tensor
+from torch.nn.functional import avg_pool2d
 
-_REACH = (1, 4, 16, 64)  #: pixels; radii of the squares around a pixel, an octave's light of counting alike
+from neusee.nodes import Check, node
+from neusee.nodes.optics import psf as focus
+from neusee.nodes.optics._psf_definition import SensorSampling
+from neusee.nodes.optics._pupil import DEFOCUS_WAVELENGTH
+from neusee.nodes.precision import single
+from neusee.nodes.units import FocalLength, Length, PixelPitch, Waves
+from neusee.nodes.values import Bands, Pupil
+
+# --- glare ----------------------------------------------------------------------------------------
+
+# The glare of lasers in a picture: strength, variance of the pattern, and other patterns that are
+# as likely.
+
+
+#: pixels; radii of the squares around a pixel, an octave's light of counting alike
+_REACH = (1, 4, 16, 64)
 _ROWS = 64  #: rows of a picture at a time, so that their float64 copies fit in the cache
 
 
 class Glare(NamedTuple):
-    """Patterns of glare whose strengths are unknown, and for some of them other patterns that are as likely."""
+    """Patterns of glare whose strengths are unknown, and for some of them other patterns that
+    are as likely.
+    """
 
     patterns: list[Tensor]  #: (channel, y, x), of maximum 1
     nearby: list[Tensor | None]  #: (pattern, channel, y, x), in the same unit
-    around: list[Tensor] | None = None  #: (channel, y, x), of each pattern; by `with_light_around`, for a doubt
+    #: (channel, y, x), of each pattern; by `with_light_around`, for a doubt
+    around: list[Tensor] | None = None
     peaks: Sequence[float] = ()  #: by which patterns were divided
-    smooth: list[list[Tensor]] | None = None  #: (channel, y, x), of each pattern spread over each radius that is tried
+    #: (channel, y, x), of each pattern spread over each radius that is tried
+    smooth: list[list[Tensor]] | None = None
 
 
 class Light(NamedTuple):
@@ -27,16 +49,27 @@ class Light(NamedTuple):
 
     sum: Tensor  #: (channel, y, x) e-
     variance: Tensor  #: (channel, y, x) e-^2, of each pixel by itself
-    modes: list[Tensor]  #: (channel, y, x) e-; the sum of their outer products is the rest of the covariance
+    #: (channel, y, x) e-; the sum of their outer products is the rest of the covariance
+    modes: list[Tensor]
 
 
-def visible(patterns: Sequence[Tensor], nearby: Sequence[Tensor | None], known: Tensor) -> Glare:
-    """Return the glare patterns that are nonzero at some known pixel, each scaled to a maximum of 1."""
-    peaks = [float((pattern.detach().abs() * known).max()) for pattern in patterns]
-    seen = [
-        (p / peak, n if n is None else n / peak) for p, n, peak in zip(patterns, nearby, peaks, strict=True) if peak
+def visible(
+    patterns: Sequence[Tensor], nearby: Sequence[Tensor | None], unclipped: Tensor
+) -> Glare:
+    """Return the glare patterns that are nonzero at some known pixel, each scaled to a maximum
+    of 1.
+    """
+    peaks = [float((pattern.detach().abs() * unclipped).max()) for pattern in patterns]
+    visible_patterns = [
+        (p / peak, n if n is None else n / peak)
+        for p, n, peak in zip(patterns, nearby, peaks, strict=True)
+        if peak
     ]
-    return Glare([p for p, _ in seen], [n for _, n in seen], peaks=[peak for peak in peaks if peak])
+    return Glare(
+        [p for p, _ in visible_patterns],
+        [n for _, n in visible_patterns],
+        peaks=[peak for peak in peaks if peak],
+    )
 
 
 def with_light_around(glare: Glare) -> Glare:
@@ -47,9 +80,9 @@ def with_light_around(glare: Glare) -> Glare:
 def light_around(pattern: Tensor) -> Tensor:
     """Return the light around each pixel of a pattern (channel, y, x), in its unit.
 
-    The mean over squares of 3, 9, 33 and 129 pixels a side, each over its radius and summed: a point of light spreads
-    as 1 / distance^3, like the rings of a lens and the light that edges, dirt and defocus move. Beyond the picture is
-    no light.
+    The mean over squares of 3, 9, 33 and 129 pixels a side, each over its radius and summed: a
+    point of light spreads as 1 / distance^3, like the rings of a lens and the light that edges,
+    dirt and defocus move. Beyond the picture is no light.
     """
     exact = pattern.double()
     total = sum((square_mean(exact, radius) / radius for radius in _REACH), torch.zeros_like(exact))
@@ -61,45 +94,50 @@ def square_mean(picture: Tensor, radius: int) -> Tensor:
     for dim in (-2, -1):
         size = picture.shape[dim]
         sums = torch.cat([torch.zeros_like(picture.narrow(dim, 0, 1)), picture.cumsum(dim)], dim)
-        at = torch.arange(size, device=picture.device)
-        upper, lower = (at + radius + 1).clamp(max=size), (at - radius).clamp(min=0)
+        index = torch.arange(size, device=picture.device)
+        upper, lower = (index + radius + 1).clamp(max=size), (index - radius).clamp(min=0)
         picture = (sums.index_select(dim, upper) - sums.index_select(dim, lower)) / (2 * radius + 1)
     return picture
 
 
 def doubted(
-    electrons: Tensor, known: Tensor, glare: Glare, doubt: float, noise: Callable[[Tensor], Tensor]
+    electrons: Tensor,
+    unclipped: Tensor,
+    glare: Glare,
+    doubt: float,
+    noise: Callable[[Tensor], Tensor],
 ) -> tuple[Tensor, Light, Tensor]:
-    """Return the weights of pixels, an estimate of the glare, and the mean variance of its pattern by these weights.
+    """Return the weights of pixels, an estimate of the glare, and the mean variance of its pattern
+    by these weights.
 
-    A ``doubt`` above 0 needs the light around the patterns. If they are uncertain, the estimate is made twice: a pixel
-    then weighs noise / (noise + variance of the glare). ``noise`` returns the variance of the noise for the mean of the
-    picture without glare.
+    A ``doubt`` above 0 needs the light around the patterns. If they are uncertain, the estimate is
+    made twice: a pixel then weighs noise / (noise + variance of the glare). ``noise`` returns the
+    variance of the noise for the mean of the picture without glare.
     """
-    light = _estimated(electrons, known, glare, doubt)
+    light = _estimated(electrons, unclipped, glare, doubt)
     if not (doubt or light.modes) or not glare.patterns:
-        return known, light, torch.zeros_like(known[:, :1, :1])
-    trusted = known
+        return unclipped, light, torch.zeros_like(unclipped[:, :1, :1])
+    trusted = unclipped
     for _ in range(2):
         own = noise(average(electrons - light.sum, trusted))
-        trusted = known * own / (own + _total(light))
+        trusted = unclipped * own / (own + _total(light))
         light = _estimated(electrons, trusted, glare, doubt)
     return trusted, light, average(_total(light), trusted)
 
 
 def _estimated(electrons: Tensor, weights: Tensor, glare: Glare, doubt: float) -> Light:
-    """Return the glare whose strengths fit a picture best, and its uncertainty at these strengths."""
+    """Return the glare whose strengths fit a picture best, and its uncertainty at these
+    strengths.
+    """
     dark = torch.zeros_like(electrons)
     fit = strengths(electrons, weights, glare.patterns)
     parts = [strength * pattern for strength, pattern in zip(fit, glare.patterns, strict=True)]
     doubtful = zip(fit, glare.around or (), strict=True) if doubt else ()
     own = sum(((doubt * strength * around).square() for strength, around in doubtful), dark)
-    modes = [
-        strength * (other - pattern) / len(others) ** 0.5
-        for strength, pattern, others in zip(fit, glare.patterns, glare.nearby, strict=True)
-        if others is not None
-        for other in others
-    ]
+    modes = []
+    for strength, pattern, others in zip(fit, glare.patterns, glare.nearby, strict=True):
+        if others is not None:
+            modes += [strength * (other - pattern) / len(others) ** 0.5 for other in others]
     return Light(sum(parts, dark), own, modes)
 
 
@@ -115,17 +153,506 @@ def average(picture: Tensor, weights: Tensor) -> Tensor:
 
 
 def strengths(electrons: Tensor, weights: Tensor, glare: Sequence[Tensor]) -> Tensor:
-    """Return the strength of each glare pattern by a weighted least-squares fit of all patterns and a constant."""
+    """Return the strength of each glare pattern by a weighted least-squares fit of all patterns
+    and a constant.
+    """
     if not glare:
         return electrons.new_zeros(0)
     means = [average(pattern, weights) for pattern in glare]
     products = torch.zeros(len(glare), len(glare) + 1, dtype=torch.float64, device=electrons.device)
     for channel in range(len(electrons)):
         for some in range(0, electrons.shape[-2], _ROWS):
-            at = (channel, slice(some, some + _ROWS))
-            flat = [(p[at] - m[channel]).flatten() for p, m in zip(glare, means, strict=True)]
-            weight = weights[at].flatten()
-            every = torch.stack([*flat, electrons[at].flatten()]).double()
+            block = (channel, slice(some, some + _ROWS))
+            flat = [(p[block] - m[channel]).flatten() for p, m in zip(glare, means, strict=True)]
+            weight = weights[block].flatten()
+            every = torch.stack([*flat, electrons[block].flatten()]).double()
             products += (every[:-1] * weight) @ every.T
     fit: Tensor = torch.linalg.pinv(products[:, :-1], hermitian=True) @ products[:, -1]
     return fit.to(electrons)
+
+
+# --- glare doubt ----------------------------------------------------------------------------------
+
+# How far a glare pattern is to be doubted: the light around it that it may get wrong, and the
+# likeliest such doubt.
+
+
+DOUBTS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0)  #: that are tried
+#: variances of the scene that are tried for each doubt, each half of an octave below the other
+_STEPS = 30
+#: pixels of a channel from which the variance of the scene is chosen; all decide on the doubt
+_SAMPLE = 1 << 16
+
+
+def likeliest_doubt(
+    electrons: Tensor,
+    unclipped: Tensor,
+    glare: Glare,
+    noise: Callable[[Tensor], Tensor],
+    smallest: float = 0.0,
+) -> float:
+    """Return the doubt of highest likelihood, at least ``smallest``, for a picture of which
+    ``unclipped`` pixels count.
+
+    Likelihood: what is left of the picture without glare, less the mean of the 3 x 3 pixels around,
+            is Gaussian in each
+    pixel by itself, with the variance of the noise, of the doubted glare and of a scene that is the
+    same in all pixels of a channel. Errors of a pattern are sharper than scenes, so that little of
+    the scene hides them.
+    """
+    if not glare.patterns:
+        return 0.0
+    interior = _mean_around(unclipped) > 1 - 1e-6  # all of the 3 x 3 pixels are known
+
+    def likelihood(doubt: float) -> float:
+        trusted, light, _ = doubted(electrons, unclipped, glare, doubt, noise)
+        remainder = electrons - light.sum
+        variance = 8 / 9 * (noise(average(remainder, trusted)) + light.variance)
+        for mode in light.modes:
+            variance = variance + _sharp(mode).square()
+        channels = zip(_sharp(remainder), variance, interior, strict=True)
+        return sum(
+            _profile(errors[use].square(), own[use]) for errors, own, use in channels if use.any()
+        )
+
+    with torch.no_grad():
+        return max((smallest, *(doubt for doubt in DOUBTS if doubt > smallest)), key=likelihood)
+
+
+def _profile(squares: Tensor, variance: Tensor) -> float:
+    """Return the log likelihood of squared Gaussian errors, with the likeliest constant added to
+    their variance.
+    """
+    some = slice(None, None, max(1, len(squares) // _SAMPLE))
+    top = float(squares.mean())
+    variances = [top * 2 ** (-n / 2) for n in range(_STEPS)]
+    best = max(variances, key=lambda scene: _gaussian(squares[some], variance[some] + scene))
+    return _gaussian(squares, variance + best)
+
+
+def _gaussian(squares: Tensor, variance: Tensor) -> float:
+    return -0.5 * float((variance.log() + squares / variance).double().sum())
+
+
+def _sharp(picture: Tensor) -> Tensor:
+    return picture - _mean_around(picture)
+
+
+def _mean_around(picture: Tensor) -> Tensor:
+    return avg_pool2d(picture[None], 3, stride=1, padding=1, count_include_pad=False)[0]
+
+
+# --- scattered glare ------------------------------------------------------------------------------
+
+# The glare of a laser behind a lens that is not quite its recipe's: part of its light is scattered
+# around it.
+#
+# Dirt, edges and defocus take light out of a pattern and spread it over some pixels (defocus,
+# edges) or many (grains of dirt, each like a hole of its size). Laser light is coherent: where
+# scattered light of mean d meets light c of the pattern, the intensity has the mean c + d and the
+# variance d^2 + 2 c d, speckle. Smooth light may be scene, speckle is not, and it has the colour of
+# the laser: speckle tells how much is scattered. Source: Goodman, Speckle Phenomena in Optics,
+# 2007, ch. 3 (speckle with a known phasor).
+
+
+RADII = (4, 16, 64)  #: pixels, over which light is scattered
+_TIMES = 3  #: running means one after another, which are nearly a Gaussian
+#: of the light of a pattern, scattered over each radius, in the median of lenses
+_SHARES = (0.1, 0.01, 0.02)
+_FACTORS = (3.0, 3.0, 2.0)  #: of one standard deviation of these shares
+_STRENGTH = 0.5  #: standard deviation of the logarithm of a strength that was found
+#: part of the variance of speckle two pixels wide that differs from the mean of the 3 x 3 pixels
+#: around
+_SHARP = 0.5
+#: pixels that share a grain of speckle, so that a likelihood of pixels counts too much
+_ALIKE = 4.0
+#: variance of a pixel over that of its speckle, because grains of speckle are wider than pixels
+_GRAINY = 2.0
+#: standard deviations of scattered light and of a pattern, over their light
+_SMOOTH, _SIZE = 1.0, 0.3
+_COLOUR = 0.1  #: variance of speckle that differs between channels, over that of all
+_BRIGHT = 0.01  #: probability that something else than the patterns fills a pixel
+_GLARE_SAMPLE = 1 << 15  #: pixels of a frame that tell of speckle
+_FEW = 300  #: pixels known in all channels, fewer of which do not tell
+_EVALUATIONS = 160  #: of the likelihood
+
+
+def scattered(
+    electrons: Tensor, unclipped: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
+) -> tuple[Tensor, Light, Tensor]:
+    """Return what `doubted` returns, for glare in electrons of which a part that the picture
+    tells is scattered.
+    """
+    if glare.smooth is None:
+        glare = with_smooth(glare)
+    strength, *shares = _likeliest(electrons, unclipped, glare, noise)
+    light = _light(glare, strength, shares)
+    total = sum((mode.square() for mode in light.modes), light.variance)
+    # a channel without known pixels has a mean
+    unclipped = torch.where(unclipped.amax((-2, -1), keepdim=True) > 0, unclipped, 1.0)
+    trusted = unclipped
+    for _ in range(2):
+        own = noise(average(electrons - light.sum, trusted))
+        trusted = unclipped * own / (own + total)
+    return trusted, light, average(total, trusted)
+
+
+def speckle(
+    electrons: Tensor, unclipped: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """Return the variance of each pixel by the likeliest speckle of glare: (channel, y, x) e-^2."""
+    if not glare.patterns:
+        return torch.zeros_like(electrons)
+    glare = with_smooth(glare)
+    strength, *shares = _likeliest(electrons, unclipped, glare, noise)
+    return _light(glare, strength, shares).variance
+
+
+def with_smooth(glare: Glare) -> Glare:
+    """Return the glare with each of its patterns spread over each of the `RADII`."""
+    return glare._replace(
+        smooth=[[_spread(pattern, radius) for radius in RADII] for pattern in glare.patterns]
+    )
+
+
+def _spread(pattern: Tensor, radius: int) -> Tensor:
+    """Return a pattern spread over about ``radius`` pixels; beyond the picture is no light."""
+    wide = pattern.double()
+    for _ in range(_TIMES):
+        wide = square_mean(wide, max(1, round(radius / _TIMES**0.5)))
+    return wide.to(pattern)
+
+
+def _light(glare: Glare, strength: float, shares: Sequence[float]) -> Light:
+    """Return the light of all patterns, with its uncertainty, if ``shares`` of each are
+    scattered.
+    """
+    total = variance = torch.zeros_like(glare.patterns[0])
+    modes: list[Tensor] = []
+    sources = zip(glare.patterns, glare.peaks, glare.nearby, glare.smooth or (), strict=True)
+    for pattern, peak, others, smooth in sources:
+        straight = strength * peak * pattern
+        scattered_light = [share * peak * wide for share, wide in zip(shares, smooth, strict=True)]
+        wide = sum(scattered_light, torch.zeros_like(pattern))
+        total, variance = (
+            total + straight + wide,
+            variance + _GRAINY * (wide.square() + 2.0 * straight * wide),
+        )
+        modes += [_SMOOTH * x for x in scattered_light] + [_SIZE * straight]
+        if others is not None:
+            modes += [strength * peak * (other - pattern) / len(others) ** 0.5 for other in others]
+    return Light(total, variance, modes)
+
+
+# --- what a picture tells of the shares -----------------------------------------------------------
+
+
+class _Pixels(NamedTuple):
+    """Pixels that are known with all around them, one a column: of all channels (channel, pixel) or
+    of any (1, pixel).
+
+    Sharp pictures lack the mean of the 3 x 3 pixels around.
+    """
+
+    picture: Tensor  #: sharp
+    parts: Tensor  #: sharp patterns: straight, and over each radius (part, channel, pixel)
+    light: Tensor  #: as ``parts``, not sharp
+    noise: Tensor  #: variance of the noise in the dark
+    whole: Tensor  #: the picture, not sharp
+    hidden: _Hidden
+
+
+class _Hidden(NamedTuple):
+    """Pixels that are not known, because their light is at least full."""
+
+    light: Tensor  #: (part, pixel)
+    full: Tensor  #: (pixel,)
+    channel: Tensor  #: (pixel,), the row of `_Pixels`
+
+
+def _likeliest(
+    electrons: Tensor, unclipped: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
+) -> tuple[float, ...]:
+    """Return the strength of the patterns over that told, and the share scattered over each
+    radius: the likeliest.
+    """
+    from scipy.optimize import minimize
+
+    start = [0.0, *(math.log(share) for share in _SHARES)]
+    with torch.no_grad():
+        likelihood = _likelihood(electrons, unclipped, glare, noise)
+    if likelihood is None:
+        return tuple(math.exp(x) for x in start)
+    simplex = [
+        start,
+        *([x + 1.2 * (i == j) for j, x in enumerate(start)] for i in range(len(start))),
+    ]
+    options = {"maxfev": _EVALUATIONS, "xatol": 0.05, "fatol": 0.1, "initial_simplex": simplex}
+    fit = minimize(
+        lambda x: -likelihood(x) / _ALIKE - _prior(x), start, method="Nelder-Mead", options=options
+    )
+    return tuple(math.exp(x) for x in fit.x)
+
+
+def _prior(logs: Sequence[float]) -> float:
+    """Return the log prior density of the logarithms of the strength and of what is scattered."""
+    ratios = [
+        (log - logs[0] - math.log(share)) / math.log(factor)
+        for log, share, factor in zip(logs[1:], _SHARES, _FACTORS, strict=True)
+    ]
+    return -0.5 * ((logs[0] / _STRENGTH) ** 2 + sum(x * x for x in ratios))
+
+
+def _likelihood(
+    electrons: Tensor, unclipped: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
+) -> Callable[[Sequence[float]], float] | None:
+    """Return the log likelihood of logarithms of the strength and of what is scattered; None
+    where nothing tells.
+    """
+    pixels = _pixels(electrons, unclipped, glare, noise)
+    if pixels is None:
+        return None
+    scenes: list[float] = []
+
+    def likelihood(logs: Sequence[float]) -> float:
+        amounts = torch.tensor([math.exp(x) for x in logs]).to(pixels.picture)[:, None, None]
+        straight, wide = amounts[0] * pixels.light[0], (amounts[1:] * pixels.light[1:]).sum(0)
+        speckle = wide.square() + 2.0 * straight * wide
+        mean = _average(pixels.whole - straight - wide, pixels.noise / (pixels.noise + speckle))
+        arguments = (
+            pixels.picture - (amounts * pixels.parts).sum(0),
+            8 / 9 * torch.maximum(pixels.noise, mean),
+            _SHARP * speckle,
+            mean / mean.norm(),
+        )
+        top = float(arguments[0].square().mean())
+        tried = (
+            [scenes[-1] * f for f in (0.5, 0.7, 1.0, 1.4, 2.0)]
+            if scenes
+            else [top * 0.5**n for n in range(20)]
+        )
+        best = max((_log_density(*arguments, scene), scene) for scene in tried)
+        scenes[:] = best[1:]
+        return best[0] + _log_full(pixels.hidden, amounts[:, :, 0], mean[:, 0])
+
+    return likelihood
+
+
+def _light_by_kind(glare: Glare, electrons: Tensor) -> list[Tensor]:
+    """Return the light of all patterns as told: straight, and scattered over each radius."""
+    smooth, dark = glare.smooth or (), torch.zeros_like(electrons)
+    kinds = [glare.patterns]
+    for number in range(len(RADII)):
+        kinds.append([widened[number] for widened in smooth])
+    lights = []
+    for patterns in kinds:
+        weighted = (peak * x for x, peak in zip(patterns, glare.peaks, strict=True))
+        lights.append(sum(weighted, dark).detach())
+    return lights
+
+
+def _hidden_pixels(
+    electrons: Tensor, unclipped: Tensor, lights: Sequence[Tensor], joint: bool
+) -> _Hidden:
+    """Return a sample of the clipped pixels."""
+    sample = tuple(
+        indices[:: max(1, len(indices) // _GLARE_SAMPLE)]
+        for indices in (unclipped == 0).nonzero(as_tuple=True)
+    )
+    rows = sample[0] if joint else torch.zeros_like(sample[0])
+    return _Hidden(torch.stack([x[sample] for x in lights]), electrons[sample], rows)
+
+
+def _pixels(
+    electrons: Tensor, unclipped: Tensor, glare: Glare, noise: Callable[[Tensor], Tensor]
+) -> _Pixels | None:
+    """Return the pixels of a frame that tell of speckle; None for too few."""
+    lights = _light_by_kind(glare, electrons)
+    use = _mean_around(unclipped) > 1 - 1e-6  # all of the 3 x 3 pixels are known
+    dark = noise(torch.zeros_like(average(electrons, torch.ones_like(electrons))))
+    together = use.all(0)
+    joint = int(together.sum()) >= _FEW
+    if not joint and int(use.sum()) < _FEW:
+        return None
+    some = slice(None, None, max(1, int((together if joint else use).sum()) // _GLARE_SAMPLE))
+
+    def picked(picture: Tensor) -> Tensor:
+        return picture[:, together][:, some] if joint else picture[use][None, some]
+
+    parts, light = (
+        torch.stack([picked(x) for x in pictures])
+        for pictures in ([_sharp(x) for x in lights], lights)
+    )
+    full = _hidden_pixels(electrons, unclipped, lights, joint)
+    return _Pixels(picked(_sharp(electrons)), parts, light, picked(dark), picked(electrons), full)
+
+
+def _log_density(
+    error: Tensor, noise: Tensor, speckle: Tensor, grey: Tensor, scene: float
+) -> float:
+    """Return the log density of sharp pictures (channel, pixel).
+
+    Speckle is that of one colour, the root of its variance. A scene has the variance ``scene`` in
+    each channel, and details of any strength that have the colour ``grey`` in all channels, which
+    therefore count for nothing.
+    """
+    if len(error) == 1:
+        variance = noise + scene + speckle
+        return -0.5 * float((variance.log() + error.square() / variance).sum())
+    inverse, colour = 1.0 / (noise + _COLOUR * speckle + scene), speckle.sqrt()
+    grey = grey.expand_as(error)
+
+    def products(a: Tensor, b: Tensor) -> Tensor:
+        return (a * b * inverse).sum(0)
+
+    own, lost = products(colour, colour), products(colour, grey)
+    across, share = products(colour, error), 1.0 / (1.0 + products(colour, colour))
+    greys = products(grey, grey) - share * lost.square()
+    dull = products(grey, error) - share * lost * across
+    squares = products(error, error) - share * across.square() - dull.square() / greys
+    return -0.5 * float((own.log1p() - inverse.log().sum(0) + greys.log() + squares).sum())
+
+
+def _log_full(hidden: _Hidden, amounts: Tensor, mean: Tensor) -> float:
+    """Return the log probability that pixels which are not known are full."""
+    straight, wide = amounts[0] * hidden.light[0], (amounts[1:] * hidden.light[1:]).sum(0)
+    scene = mean[hidden.channel]
+    over = straight + wide + scene - hidden.full
+    short = torch.special.ndtr(
+        -over / (wide.square() + 2.0 * straight * wide + scene.square()).sqrt()
+    )
+    return float(torch.log1p(-(1.0 - _BRIGHT) * short).sum())
+
+
+def _average(values: Tensor, weights: Tensor) -> Tensor:
+    """Return the weighted mean of each channel of pixels, (channel, 1), at least 1 e-."""
+    return ((values * weights).sum(-1, keepdim=True) / weights.sum(-1, keepdim=True)).clamp_min(1.0)
+
+
+# --- nearby glare ---------------------------------------------------------------------------------
+
+# Other patterns that the glare of a laser may have if its direction, wavelength and focus are known
+# roughly.
+
+
+Shift = Annotated[Length, Field(ge=0, le=100e-9)]  #: of the wavelength
+Patterns = Annotated[int, Field(ge=1, le=256)]
+Pixels = Annotated[float, Field(ge=0, le=100)]
+
+
+@node()
+def nearby_glare(
+    glare: Tensor,
+    pupil: Pupil,
+    direction: Tensor,
+    line: Bands,
+    responses: Tensor,
+    *,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
+    sensor: SensorSampling = "point",
+    patterns: Patterns = 12,
+    pixels: Pixels = 0.5,
+    wavelength: Shift = 2e-9,
+    defocus: Waves = 0.1,
+    rng: Generator,
+) -> Tensor:
+    """Draw patterns that the glare of a laser may have, if its direction, wavelength and focus are
+    known roughly.
+
+    Each pattern has its own direction, wavelength and defocus, drawn from normal distributions
+    around those of the laser; ``pixels`` (along each axis, of the spot), ``wavelength`` and
+    ``defocus`` are standard deviations. A Latin hypercube spreads the draws evenly over each law.
+    `restore.wiener` takes the patterns as ``nearby``.
+
+    Shapes: glare (channel, y, x), pupil (band,), direction (2,), line (band,), responses (channel,
+            band) -> (pattern, channel, y, x).
+    Units:  result as glare; pixels on the sensor; wavelength m; defocus waves at 550 nm, peak to
+            valley.
+    Error:  that of `optics.psf`, 3e-6 of the brightest pixel, and 1 / samples of the defocus. The
+            covariance of the patterns has the relative error sqrt(2 / patterns), and at most
+            ``patterns`` dimensions. Dispersion of the mask is neglected, 1e-4 of its phase for 2 nm
+            of fused silica, and so is the change of the response.
+    Raises: ValueError where pupil and line differ in the number of bands, or responses and glare in
+            the channels.
+    Source: sampled prior of a nuisance parameter as in Kaipio and Somersalo, Statistical and
+            Computational Inverse Problems, 2005, ch. 5 (approximation error); McKay et al.,
+            Technometrics 21, 239 (1979).
+    """
+    _agree(glare, pupil, line, responses)
+    share = (responses.double() * (line.weights * line.centres)).to(single(glare))
+    camera: dict[str, Any] = {
+        "focal_length": focal_length,
+        "pixel_pitch": pixel_pitch,
+        "sensor": sensor,
+    }
+    camera["shape"] = (glare.shape[-2], glare.shape[-1])
+
+    def pattern_of(around: Pupil, towards: Tensor) -> Tensor:
+        channels: Tensor = torch.tensordot(
+            share, focus(around, towards, **camera).intensity.to(share), 1
+        )
+        return channels
+
+    own = pattern_of(pupil, direction).sum(dtype=torch.float64)
+    unit = (glare.sum(dtype=torch.float64) / own.where(own > 0, 1.0)).to(share)
+    bowl, patterns_drawn = _bowl(pupil), []
+    for y, x, longer, further in _normal(patterns, rng).tolist():
+        moved = direction + pixels * pixel_pitch / focal_length * direction.new_tensor([y, x])
+        path = pupil.path + further * defocus * DEFOCUS_WAVELENGTH * bowl
+        patterns_drawn.append(
+            unit
+            * pattern_of(
+                pupil._replace(path=path, wavelengths=pupil.wavelengths + longer * wavelength),
+                moved,
+            )
+        )
+    return torch.stack(patterns_drawn)
+
+
+@nearby_glare.check
+def _(result: Tensor, glare: Tensor, *inputs: Any, **params: Any) -> list[Check]:
+    size = float(glare.square().mean().sqrt())
+    apart = float((result - glare).square().mean().sqrt()) / size if size else 0.0
+    return [
+        Check(
+            f"{len(result)} patterns, rms difference {apart:.2g} of the glare", math.isfinite(apart)
+        )
+    ]
+
+
+def _agree(glare: Tensor, pupil: Pupil, line: Bands, responses: Tensor) -> None:
+    if len(pupil.wavelengths) != len(line.centres) or responses.shape != (
+        len(glare),
+        len(line.centres),
+    ):
+        raise ValueError(
+            f"glare of {len(glare)} channels, responses {tuple(responses.shape)}, pupil of"
+            f" {len(pupil.wavelengths)} bands and line of {len(line.centres)} bands do not fit:"
+            " compute all from one `line` step"
+        )
+
+
+def _bowl(pupil: Pupil) -> Tensor:
+    """Return the square of the distance from the axis, 1 at the rim of the disc with the area of
+    the clear aperture.
+    """
+    side = pupil.aperture.shape[-1]
+    offset = torch.arange(side, dtype=torch.float64, device=pupil.path.device) - (side - 1) / 2
+    rim = pupil.aperture.sum(dtype=torch.float64).clamp_min(1.0) / math.pi
+    return ((offset[:, None].square() + offset.square()) * (pupil.aperture > 0) / rim).to(
+        pupil.path
+    )
+
+
+def _normal(count: int, rng: Generator) -> Tensor:
+    """Return (count, 4) normal numbers, one in each of ``count`` equally likely parts of each of
+    the four axes.
+    """
+    shape = (4, count)
+    order = torch.rand(shape, generator=rng, device=rng.device, dtype=torch.float64).argsort(-1)
+    even = (
+        order + torch.rand(shape, generator=rng, device=rng.device, dtype=torch.float64)
+    ) / count
+    numbers: Tensor = torch.special.ndtri(even.clamp(1e-9, 1 - 1e-9)).T
+    return numbers

@@ -1,20 +1,128 @@
-"""The model of a blurred picture of which only some pixels are seen, and the prior of the picture before the blur.
-
-All spectra are half spectra of a torus: (channel, fy, fx) with fx >= 0, as `torch.fft.rfft2` returns them.
-"""
+"""The blur of a camera on a periodic grid, with hidden pixels and the prior of the picture."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
+
+from neusee.nodes.precision import single
+from neusee.nodes.values import Bands, Psf
+
+# --- grey psf -------------------------------------------------------------------------------------
+
+# What the channels of a sensor see of a grey scene: the PSF of each, shares of the bands, and the
+# white.
+
+
+def effective_psf(
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    dtype: torch.dtype = torch.float32,
+) -> Tensor:
+    """Return the PSF of each channel of the sensor for a grey scene, (channel, y, x), in the more
+    precise of the types of the PSF and ``dtype``.
+    """
+    lengths = {len(psf.intensity), len(illuminant), responses.shape[-1], len(bands.centres)}
+    if len(lengths) > 1:
+        raise ValueError(
+            f"PSF, illuminant, responses and bands have {sorted(lengths)} bands: use one `bands`"
+            " step"
+        )
+    intensity = single(psf.intensity)
+    shares = grey_shares(illuminant, responses, bands).to(intensity.device)
+    if torch.promote_types(intensity.dtype, dtype) == intensity.dtype:
+        kernels: Tensor = torch.tensordot(shares.to(intensity), intensity, 1)
+        return kernels
+    # band by band, without a copy of all bands
+    planes = zip(shares.to(dtype).T, intensity, strict=True)
+    kernels_sum = torch.zeros(
+        len(shares), *intensity.shape[-2:], dtype=dtype, device=intensity.device
+    )
+    for share, plane in planes:
+        kernels_sum = kernels_sum + share[:, None, None] * plane.to(dtype)
+    return kernels_sum
+
+
+def grey_shares(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
+    """Return the share of each band in the signal of each channel from a grey scene: (channel,
+    band), float64.
+    """
+    share = responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()
+    blind = share.sum(-1, keepdim=True) <= 0  # a channel without response gets equal shares
+    share = share.where(~blind, 1.0)
+    return share / share.sum(-1, keepdim=True)
+
+
+def grey_white(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
+    """Return what each channel sees of a grey scene, (channel, 1, 1) float64, over what the best
+    channel sees.
+    """
+    light = (responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()).sum(-1)
+    return (light / light.max().clamp_min(1e-30)).clamp_min(1e-3)[:, None, None]
+
+
+# --- psf on grid ----------------------------------------------------------------------------------
+
+# A PSF on the periodic grid of a picture, and how far it reaches.
+
+
+_LIGHT = 0.999  #: share of the light that the unknown border around the picture is wide enough for
+
+
+def edge(kernels: Tensor, picture: tuple[int, int]) -> tuple[int, int]:
+    """Return the radii (y, x) that hold 99.9 % of the PSF, at most the larger of 256 pixels and
+    half the picture.
+    """
+    reach = []
+    for dim, size in ((-1, picture[0]), (-2, picture[1])):
+        profile = kernels.detach().sum((0, dim)).double()
+        radius = (torch.arange(len(profile), device=profile.device) - len(profile) // 2).abs()
+        inside = profile.new_zeros(int(radius.max()) + 1).index_add(0, radius, profile).cumsum(0)
+        reach.append(min(int((inside < _LIGHT * inside[-1]).sum()), max(256, size // 2), size))
+    return reach[0], reach[1]
+
+
+def bordered(reach: tuple[int, int], border: float) -> tuple[int, int]:
+    """Return the width (y, x) of the unknown border around a picture, ``border`` times the reach
+    of the PSF.
+    """
+    return math.ceil(border * reach[0]), math.ceil(border * reach[1])
+
+
+def wrapped(kernels: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return PSFs centred on the first sample of a periodic grid; a PSF wider than the grid
+    wraps around.
+    """
+    (m, n), (y, x) = kernels.shape[-2:], size
+    rows, columns = -(-m // y), -(-n // x)
+    around = pad(kernels, (0, columns * x - n, 0, rows * y - m))
+    if rows * columns > 1:
+        around = around.reshape(-1, rows, y, columns, x).sum((1, 3))
+    return around.roll((-(m // 2), -(n // 2)), (-2, -1))
+
+
+# --- masked blur ----------------------------------------------------------------------------------
+
+# The model of a blurred picture of which only some pixels are seen, and the prior of the picture
+# before the blur.
+#
+# All spectra are half spectra of a torus: (channel, fy, fx) with fx >= 0, as `torch.fft.rfft2`
+# returns them.
+
 
 Size = tuple[int, int]
 Map = Callable[[Tensor], Tensor]
 
-_ALIKE = 1e-13  #: added to products of patterns of norm 1, so that equal patterns have a Cholesky factor
+#: added to products of patterns of norm 1, so that equal patterns have a Cholesky factor
+_ALIKE = 1e-13
 _PIECE = 2**18  #: pixels of all patterns that are converted to float64 at a time
 
 
@@ -24,14 +132,19 @@ class Blurred:
 
     picture: Tensor  #: (channel, y, x)
     weight: Tensor  #: (channel, y, x), 1 / variance of the noise; 0 where a pixel is not seen
-    transfer: Tensor  #: (channel, fy, fx), half a spectrum of the torus, with the picture in its first corner
-    power: Tensor  #: (fy, fx), power spectrum of x; the mean over the whole spectrum is the variance of x
+    #: (channel, fy, fx), half a spectrum of the torus, with the picture in its first corner
+    transfer: Tensor
+    #: (fy, fx), power spectrum of x; the mean over the whole spectrum is the variance of x
+    power: Tensor
     torus: Size
     grey: float  #: correlation of any two channels of x, below 1
-    glare: tuple[Tensor, ...] = ()  #: (channel, y, x) patterns of unknown strength that are added to the picture
+    #: (channel, y, x) patterns of unknown strength that are added to the picture
+    glare: tuple[Tensor, ...] = ()
     pull: Tensor | None = None  #: (channel, fy, fx), a further term of the log posterior's gradient
-    bounded: int = 0  #: how many patterns, the last ones, have strengths of mean 0 and variance 1, not any strength
-    held: Tensor | None = None  #: (channel, y, x), precision of a further prior of x in the frame, of mean 0
+    #: how many patterns, the last ones, have strengths of mean 0 and variance 1, not any strength
+    bounded: int = 0
+    #: (channel, y, x), precision of a further prior of x in the frame, of mean 0
+    held: Tensor | None = None
 
     def blur(self, spectrum: Tensor) -> Tensor:
         """Return the blurred picture, given half the spectrum of x."""
@@ -41,15 +154,20 @@ class Blurred:
     def first(self, spectrum: Tensor) -> Tensor:
         """Return the pixels of x in the frame of the picture, given half the spectrum of x."""
         y, x = self.picture.shape[-2:]
-        parts = [torch.fft.irfft2(s, s=self.torus)[:y, :x] for s in spectrum]  # one batch takes twice as long
+        # one batch takes twice as long
+        parts = [torch.fft.irfft2(s, s=self.torus)[:y, :x] for s in spectrum]
         return torch.stack(parts)
 
     def gathered(self, pixels: Tensor) -> Tensor:
-        """Return half the spectrum that results from the adjoint of `blur`, applied to a picture."""
+        """Return half the spectrum that results from the adjoint of `blur`, applied to a
+        picture.
+        """
         return gathered(self.transfer, pixels, self.torus)
 
     def slope(self, x: Tensor) -> Tensor:
-        """Return the gradient of the log posterior at the picture of spectrum x; the most likely picture has 0."""
+        """Return the gradient of the log posterior at the picture of spectrum x; the most likely
+        picture has 0.
+        """
         own, shared = inverse_colour(len(x), self.grey)
         prior = mixed(x, own, -shared) / self.power.clamp_min(1e-30)
         rise = self.gathered(weighing(self)(self.picture - self.blur(x))) - prior
@@ -59,41 +177,54 @@ class Blurred:
 
 
 def blurred(transfer: Tensor, spectrum: Tensor, torus: Size, size: Size) -> Tensor:
-    """Return the first corner (..., channel, *size) of blurred pictures, given half their spectra (..., fy, fx)."""
-    whole = spectrum.expand(*spectrum.shape[:-3], *transfer.shape)
-    pairs = zip(transfer, whole.unbind(-3), strict=True)  # one batch of all channels takes twice as long
-    return torch.stack([torch.fft.irfft2(t * s, s=torus)[..., : size[0], : size[1]] for t, s in pairs], -3)
+    """Return the first corner (..., channel, *size) of blurred pictures, given half their
+    spectra (..., fy, fx).
+    """
+    spectra = spectrum.expand(*spectrum.shape[:-3], *transfer.shape)
+    # one batch of all channels takes twice as long
+    pairs = zip(transfer, spectra.unbind(-3), strict=True)
+    return torch.stack(
+        [torch.fft.irfft2(t * s, s=torus)[..., : size[0], : size[1]] for t, s in pairs], -3
+    )
 
 
 def gathered(transfer: Tensor, pixels: Tensor, torus: Size) -> Tensor:
-    """Return half the spectra that result from the adjoint of `blurred`, applied to pictures (..., channel, y, x)."""
+    """Return half the spectra that result from the adjoint of `blurred`, applied to pictures
+    (..., channel, y, x).
+    """
     spectrum: Tensor = transfer.conj() * torch.fft.rfft2(pixels, s=torus)
     return spectrum
 
 
-def weighing(seen: Blurred) -> Map:
-    """Return a function that multiplies residuals by the pixel weights and removes the fitted glare patterns."""
-    if not seen.glare:
-        return lambda residual: seen.weight * residual
-    flat = torch.stack(seen.glare).flatten(1)
-    weighted = seen.weight.flatten() * flat
-    products = with_bounds(weighted.double() @ flat.double().T, seen.bounded)
-    if seen.bounded:  # similar patterns: differences of large sums would lose digits in float32
+def weighing(problem: Blurred) -> Map:
+    """Return a function that multiplies residuals by the pixel weights and removes the fitted
+    glare patterns.
+    """
+    if not problem.glare:
+        return lambda residual: problem.weight * residual
+    flat = torch.stack(problem.glare).flatten(1)
+    weighted = problem.weight.flatten() * flat
+    products = with_bounds(weighted.double() @ flat.double().T, problem.bounded)
+    if problem.bounded:  # similar patterns: differences of large sums would lose digits in float32
         weighted, inverse = _apart(weighted, products), None
     else:
         inverse = torch.linalg.pinv(products, hermitian=True).to(flat)
 
     def weigh(residual: Tensor) -> Tensor:
-        rest, found = seen.weight * residual, weighted @ residual.flatten()
-        for strength, pattern in zip(found if inverse is None else inverse @ found, weighted, strict=True):
-            rest.addcmul_(strength, pattern.view_as(rest), value=-1.0)
-        return rest
+        weighted_residual, strengths = problem.weight * residual, weighted @ residual.flatten()
+        for strength, pattern in zip(
+            strengths if inverse is None else inverse @ strengths, weighted, strict=True
+        ):
+            weighted_residual.addcmul_(strength, pattern.view_as(weighted_residual), value=-1.0)
+        return weighted_residual
 
     return weigh
 
 
 def with_bounds(products: Tensor, bounded: int) -> Tensor:
-    """Return the products of all pairs of glare patterns, plus the precisions of their strengths: 1 if bounded."""
+    """Return the products of all pairs of glare patterns, plus the precisions of their
+    strengths: 1 if bounded.
+    """
     if not bounded:
         return products
     certain = torch.zeros(len(products), dtype=products.dtype, device=products.device)
@@ -102,35 +233,48 @@ def with_bounds(products: Tensor, bounded: int) -> Tensor:
 
 
 def _apart(weighted: Tensor, products: Tensor) -> Tensor:
-    """Return combinations of patterns whose outer products add up to those of the patterns through inverse products.
+    """Return combinations of patterns whose outer products add up to those of the patterns through
+    inverse products.
 
-    The combinations are the rows of L^-1 for the Cholesky factor L of the products, computed in float64 piece by piece.
+    The combinations are the rows of L^-1 for the Cholesky factor L of the products, computed in
+    float64 piece by piece.
     """
     scale = products.diagonal().detach().clamp_min(1e-300).rsqrt()
     even = scale[:, None] * products * scale
     even = even + _ALIKE * torch.eye(len(even), dtype=even.dtype, device=even.device)
     lower = torch.linalg.cholesky(even)
-    pieces = (scale[:, None] * part.double() for part in torch.split(weighted, _PIECE, 1))
-    return torch.cat([torch.linalg.solve_triangular(lower, part, upper=False).to(weighted) for part in pieces], 1)
+    pieces = (scale[:, None] * patterns.double() for patterns in torch.split(weighted, _PIECE, 1))
+    return torch.cat(
+        [torch.linalg.solve_triangular(lower, piece, upper=False).to(weighted) for piece in pieces],
+        1,
+    )
 
 
 def mixed(spectrum: Tensor, own: float, shared: float) -> Tensor:
-    """Return `own` times the spectrum of each channel plus `shared` times the sum of the spectra of all channels."""
+    """Return `own` times the spectrum of each channel plus `shared` times the sum of the spectra
+    of all channels.
+    """
     return own * spectrum + shared * spectrum.sum(0)
 
 
 def inverse_colour(channels: int, grey: float) -> tuple[float, float]:
-    """Return (own, shared) such that  own I - shared  is the inverse of  (1 - grey) I + grey  over the channels."""
+    """Return (own, shared) such that  own I - shared  is the inverse of  (1 - grey) I + grey  over
+    the channels.
+    """
     return 1.0 / (1.0 - grey), grey / ((1.0 - grey) * (1.0 - grey + channels * grey))
 
 
 def variance(power: Tensor, size: Size) -> Tensor:
-    """Return the variance of pictures with a given power spectrum, which is the mean over all frequencies."""
+    """Return the variance of pictures with a given power spectrum, which is the mean over all
+    frequencies.
+    """
     return (power.sum(-2) * times(size, power)).sum(-1) / (size[0] * size[1])
 
 
 def times(size: Size, like: Tensor) -> Tensor:
-    """Return the number of times that each column of half a spectrum occurs in the whole spectrum."""
+    """Return the number of times that each column of half a spectrum occurs in the whole
+    spectrum.
+    """
     count = torch.full((size[1] // 2 + 1,), 2.0, dtype=like.real.dtype, device=like.device)
     count[0] = 1.0
     if size[1] % 2 == 0:
@@ -139,7 +283,9 @@ def times(size: Size, like: Tensor) -> Tensor:
 
 
 def narrowed(spectrum: Tensor, size: Size) -> Tensor:
-    """Return half a spectrum cropped to the frequencies of a coarser grid `size`; the Nyquist frequencies are 0."""
+    """Return half a spectrum cropped to the frequencies of a coarser grid `size`; the Nyquist
+    frequencies are 0.
+    """
     up, down, right = (size[0] + 1) // 2, (size[0] - 1) // 2, (size[1] + 1) // 2
     cut = spectrum.new_zeros(*spectrum.shape[:-2], size[0], size[1] // 2 + 1)
     cut[..., :up, :right] = spectrum[..., :up, :right]
@@ -148,9 +294,120 @@ def narrowed(spectrum: Tensor, size: Size) -> Tensor:
 
 
 def widened(spectrum: Tensor, size: Size, wide: Size) -> Tensor:
-    """Return half a spectrum of a grid `size`, extended by zeros to a grid `wide` that is twice as fine."""
+    """Return half a spectrum of a grid `size`, extended by zeros to a grid `wide` that is twice
+    as fine.
+    """
     up, down, right = (size[0] + 1) // 2, (size[0] - 1) // 2, (size[1] + 1) // 2
-    whole = spectrum.new_zeros(*spectrum.shape[:-2], wide[0], wide[1] // 2 + 1)
-    whole[..., :up, :right] = 4.0 * spectrum[..., :up, :right]
-    whole[..., wide[0] - down :, :right] = 4.0 * spectrum[..., size[0] - down :, :right]
-    return whole
+    wide_spectrum = spectrum.new_zeros(*spectrum.shape[:-2], wide[0], wide[1] // 2 + 1)
+    wide_spectrum[..., :up, :right] = 4.0 * spectrum[..., :up, :right]
+    wide_spectrum[..., wide[0] - down :, :right] = 4.0 * spectrum[..., size[0] - down :, :right]
+    return wide_spectrum
+
+
+# --- fft grid -------------------------------------------------------------------------------------
+
+# Size of the periodic grid on which a picture is deblurred: unknown pixels around the picture, and
+# fast FFTs.
+
+
+DENSE = 20  #: pixels a side, up to which a picture is solved exactly
+
+
+def torus(picture: Size, edge: Size) -> Size:
+    """Return the size of a periodic grid for the picture and `edge` unknown pixels on each side."""
+    granule = 2 ** halvings(picture)
+    y, x = (
+        granule * _smooth(-(-(n + 2 * e) // granule)) for n, e in zip(picture, edge, strict=True)
+    )
+    return y, x
+
+
+def _smooth(n: int) -> int:
+    """Return the least whole number of at least ``n`` without prime factors above 7, for which
+    FFTs are fast.
+    """
+    while 210**32 % n:
+        n += 1
+    return n
+
+
+def halvings(picture: Size) -> int:
+    """Return how often the grid of a picture is halved until the picture is small enough to be
+    solved exactly.
+    """
+    return max(0, math.ceil(math.log2(max(picture) / DENSE)))
+
+
+# --- frame blur -----------------------------------------------------------------------------------
+
+# The blur of a camera as a linear operator, from a scene wider than the frame to the frame, and its
+# adjoint.
+
+
+class FrameBlur(NamedTuple):
+    """The blur from a scene (..., channel, *scene) to a frame (..., channel, *frame), and the
+    adjoint of this blur.
+
+    The frame is the middle of the scene. The border of the scene beyond the frame is as wide as the
+    radius that holds 99.9 % of the PSF, as in `restore.wiener`. Each pixel of the frame is thus a
+    sum over scene pixels that are unknowns themselves. Light from beyond the border is taken from
+    the opposite side of the scene.
+    """
+
+    #: (channel, fy, fx), half the spectrum of the PSF of each channel on the grid of the scene
+    transfer: Tensor
+    scene: Size
+    frame: Size
+
+    def seen(self, scene: Tensor) -> Tensor:
+        """Return the frame that the camera sees of a scene: blurred, and cropped to the sensor."""
+        spectrum = torch.fft.rfft2(scene.roll([-n for n in self.corner()], (-2, -1)))
+        return blurred(self._transfer(scene), spectrum, self.scene, self.frame)
+
+    def adjoint(self, frame: Tensor) -> Tensor:
+        """Return the adjoint of `seen`, applied to a frame."""
+        spectrum = gathered(self._transfer(frame), frame, self.scene)
+        gathered_light: Tensor = torch.fft.irfft2(spectrum, s=self.scene)
+        return gathered_light.roll(self.corner(), (-2, -1))
+
+    def cropped(self, scene: Tensor) -> Tensor:
+        """Return the part of a scene that lies in the frame."""
+        (top, left), (y, x) = self.corner(), self.frame
+        return scene[..., top : top + y, left : left + x]
+
+    def corner(self) -> Size:
+        """Return the place of the first pixel of the frame in the scene."""
+        y, x = ((wide - n) // 2 for wide, n in zip(self.scene, self.frame, strict=True))
+        return y, x
+
+    def gain(self) -> float:
+        """Return the largest gain at any frequency, which the norm of the blur does not exceed."""
+        return float(self.transfer.abs().max())
+
+    def _transfer(self, like: Tensor) -> Tensor:
+        """Return the transfer function in the precision of a picture, which the result then has
+        too.
+        """
+        return self.transfer.to(like.dtype.to_complex())
+
+
+def frame_blur(
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    frame: Size,
+    dtype: torch.dtype = torch.float32,
+) -> FrameBlur:
+    """Return the blur of a camera for a grey scene, whose frames have the size ``frame``.
+
+    Shapes: psf.intensity (band, any, any), illuminant (band,), responses (channel, band).
+    Units:  scene and frame in one unit: the electrons of a pixel behind a perfect lens without
+            losses, and behind the lens of the PSF.
+    Error:  a grey scene is assumed, as in `restore.wiener`. 0.1 % of the light, and what falls
+            beyond the window of the PSF, comes from the wrong place or from none.
+    Raises: ValueError where the number of bands differs.
+    """
+    kernels = effective_psf(psf, illuminant, responses, bands, torch.float64)
+    scene = torus(frame, edge(kernels, frame))
+    return FrameBlur(torch.fft.rfft2(wrapped(kernels, scene)).to(dtype.to_complex()), scene, frame)

@@ -1,21 +1,245 @@
-"""What a deconvolved picture does not know: the standard deviation of each pixel under the model of the filter."""
+"""What a deconvolved picture does not know: the standard deviation of each pixel."""
+
+from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from pydantic import Field
 from torch import Generator, Tensor
+from torch.nn.functional import avg_pool2d
 
 from neusee.nodes import Check, node
-from neusee.nodes._half_precision import single
-from neusee.nodes.restore._inverse._frame_deviation import drawn_noise, drawn_scene, frame_deviation
-from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_white
+from neusee.nodes.precision import single
 from neusee.nodes.restore._inverse._hidden_pixels import Inverses, most_likely
-from neusee.nodes.restore._inverse._wiener import Border, Doubt, LeastDoubt, Scaled, Settings, known_and_light, posed
+from neusee.nodes.restore._inverse._masked_blur import (
+    Blurred,
+    blurred,
+    effective_psf,
+    grey_white,
+    mixed,
+    wrapped,
+)
+from neusee.nodes.restore._inverse._wiener import (
+    Border,
+    Doubt,
+    LaserLight,
+    LeastDoubt,
+    Scaled,
+    Settings,
+    known_and_light,
+    posed,
+)
+from neusee.nodes.restore._inverse._wiener_prior import drawn_blotches, fitted_law
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf, Shading
+
+# --- frame deviation ------------------------------------------------------------------------------
+
+# The error of the filter on scenes like that of a frame: with its power spectrum, and details where
+# it has any.
+
+
+_DETAIL = 5  #: pixels a side; what differs from its mean over such a square is a detail
+_NEAR = 11  #: pixels a side of the square around a pixel whose details tell of this pixel
+_SMOOTH = 7  #: pixels a side of the square over which the variance of few draws is averaged
+#: share of known pixels around a pixel, below which nothing around it tells of details
+_KNOWN = 0.02
+#: mean square of errors of photographs averaged over 11 x 11 pixels, over that of scenes of their
+#: law
+_COARSE = 2.0
+_SHOWN = 0.2  #: part of the energy of details that is restored, from which on a lack of them tells
+_DARK = 1e-30  #: added to energies
+
+
+def frame_deviation(
+    scaled: Scaled, matrix: Tensor, draws: int, rng: Generator, kernels: Tensor | None = None
+) -> Tensor:
+    """Return the root mean square error (colour, y, x) of the filter for scenes and noise like
+    those of its frame.
+
+    Scenes and noise are drawn apart by the law of the frame, each half of ``draws``, one of which
+    is the frame itself. The variance of details (errors of a scene less their mean over 11 x 11
+    pixels) grows and falls with the energy of the details of the restored picture around a pixel,
+    relative to that of the restored draws: an edge has larger errors than a sky. Where the picture
+    has more details than the draws, the rest of the variance grows as well. Low frequencies of
+    photographs vary about a power law, by `_COARSE`, and are not below those of the prior. What is
+    not known of a scene behind glare is drawn too. ``kernels`` (any, channel, y, x) are PSFs that
+    blur the drawn scenes in turn, in place of the PSF of the filter.
+    """
+    problem, inverses = scaled.problem, Inverses()
+    scenes = max(1, draws // 2)
+    noises = max(1, draws - scenes - 1)
+    with torch.no_grad():
+        law = fitted_law(problem, scaled.doubt)
+        own = _details(problem.first(most_likely(problem, inverses=inverses)))
+    drawn = _of_scenes(scaled, law.power, scenes, rng, kernels, inverses)
+    scenes_found = _Scenes.of(drawn, scenes, scaled, matrix)
+    noisy, details = torch.zeros_like(scenes_found.coarse), scenes_found.restored
+    for error in _of_noise(scaled, law.noise**0.5, noises, rng, inverses):
+        noisy = noisy + _square(scaled.scale / scaled.share * error, matrix) / noises
+        details = details + _details(error) / noises
+    ratio = _ratio(own, details, problem.weight)
+    # a lack of details means little where none could be seen
+    ratio = ratio.where(ratio > 1.0, ratio**scenes_found.told)
+    slow = _COARSE * law.low * scenes_found.coarse + noisy
+    total: Tensor = ratio * _around(scenes_found.fine, _SMOOTH) + ratio.clamp_min(1.0) * _around(
+        slow, _SMOOTH
+    )
+    return total.sqrt()
+
+
+class _Scenes(NamedTuple):
+    """Mean squares over drawn scenes, (colour, y, x) of errors and (y, x) of details."""
+
+    coarse: Tensor  #: of errors averaged over the pixels near
+    fine: Tensor  #: of the rest of the errors
+    restored: Tensor  #: of restored details
+    #: from 0 to 1, how far a lack of restored details near a pixel tells of a lack of details
+    told: Tensor
+
+    @classmethod
+    def of(
+        cls, drawn: Iterator[tuple[Tensor, Tensor]], count: int, scaled: Scaled, matrix: Tensor
+    ) -> _Scenes:
+        """Return the mean squares of drawn errors and restored scenes."""
+        coarse = fine = scaled.problem.picture.new_zeros(
+            len(matrix), *scaled.problem.picture.shape[-2:]
+        )
+        restored = true = torch.zeros_like(coarse[0])
+        for error, contrast in drawn:
+            smooth = _around(error, _NEAR)
+            coarse = coarse + _square(smooth, matrix) / count
+            fine = fine + _square(error - smooth, matrix) / count
+            restored = restored + _details(contrast) / count
+            true = true + _details(contrast + error * scaled.share / scaled.scale) / count
+        resolved = (_around(restored, _NEAR) / (_SHOWN * _around(true, _NEAR) + _DARK)).clamp(
+            max=1.0
+        )
+        return cls(coarse, fine, restored, resolved)
+
+
+def drawn_scene(problem: Blurred, power: Tensor, rng: Generator) -> Tensor:
+    """Return the spectrum of a drawn scene with a power spectrum, and with the colours of the
+    prior.
+    """
+    white = _normal((len(problem.picture), *problem.torus), problem.picture, rng)
+    own, shared = _root_of_colour(len(white), problem.grey)
+    return mixed(torch.fft.rfft2(white), own, shared) * power.clamp_min(0.0).sqrt()
+
+
+def drawn_noise(problem: Blurred, rng: Generator) -> Tensor:
+    """Return drawn noise of a picture (channel, y, x): of its pixels, and of the patterns of
+    bounded strength.
+    """
+    noise = _normal(problem.picture.shape, problem.picture, rng)
+    unclipped = problem.weight > 0
+    noise = torch.where(unclipped, noise / problem.weight.where(unclipped, 1.0).sqrt(), 0.0)
+    for pattern in problem.glare[len(problem.glare) - problem.bounded :]:
+        noise = noise + _normal((), noise, rng) * pattern
+    return noise
+
+
+def _normal(shape: tuple[int, ...], like: Tensor, rng: Generator) -> Tensor:
+    drawn: Tensor = torch.randn(shape, generator=rng, device=rng.device, dtype=like.dtype).to(like)
+    return drawn
+
+
+def _transfer(scaled: Scaled, kernels: Tensor | None, number: int) -> Tensor:
+    """Return the transfer that blurs a drawn scene: of the PSF of this number in turn, or that
+    of the filter.
+    """
+    if kernels is None:
+        return scaled.problem.transfer
+    other = kernels[number % len(kernels)].to(scaled.share) / scaled.share
+    transfer: Tensor = torch.fft.rfft2(wrapped(other, scaled.problem.torus))
+    return transfer
+
+
+def _of_scenes(
+    scaled: Scaled,
+    power: Tensor,
+    draws: int,
+    rng: Generator,
+    kernels: Tensor | None,
+    inverses: Inverses,
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Draw the error of the filter without noise, in e-, and the contrast of the picture that it
+    restores.
+    """
+    problem = scaled.problem
+    size = (problem.picture.shape[-2], problem.picture.shape[-1])
+    for number in range(draws):
+        with torch.no_grad():
+            scene = drawn_scene(problem, power, rng)
+            picture = blurred(_transfer(scaled, kernels, number), scene, problem.torus, size)
+            answer = most_likely(replace(problem, picture=picture), inverses=inverses)
+            error_and_contrast = scaled.pixels(scene - answer), problem.first(answer)
+        yield error_and_contrast
+
+
+def _of_noise(
+    scaled: Scaled, factor: float, draws: int, rng: Generator, inverses: Inverses
+) -> Iterator[Tensor]:
+    """Draw the contrast that the filter restores from noise alone."""
+    for _ in range(draws):
+        with torch.no_grad():
+            noise = factor * drawn_noise(scaled.problem, rng)
+            if scaled.doubt is not None:
+                noise = noise + drawn_blotches(scaled.doubt.blotches, rng)
+            error = scaled.problem.first(
+                most_likely(replace(scaled.problem, picture=noise), inverses=inverses)
+            )
+        yield error
+
+
+def _square(error: Tensor, matrix: Tensor) -> Tensor:
+    square: Tensor = torch.tensordot(matrix.to(error), error, 1).square()
+    return square
+
+
+def _details(contrast: Tensor) -> Tensor:
+    """Return the energy (y, x) of details of a picture, in the mean of its channels."""
+    energy: Tensor = (contrast - _around(contrast, _DETAIL)).square().mean(0)
+    return energy
+
+
+def _ratio(energy: Tensor, drawn: Tensor, weight: Tensor) -> Tensor:
+    """Return the energy of details (y, x) around each pixel over that of drawn pictures; 1 where
+    nothing tells.
+    """
+    unclipped = (weight > 0).all(0).to(energy)
+    ratio = (_around(energy * unclipped, _NEAR) + _DARK) / (
+        _around(drawn * unclipped, _NEAR) + _DARK
+    )
+    return ratio.where(_around(unclipped, _NEAR) > _KNOWN, 1.0)
+
+
+def _around(pictures: Tensor, side: int) -> Tensor:
+    """Return the mean over a square of odd side around each pixel, of the pixels in the picture."""
+    wide = pictures.reshape(1, -1, *pictures.shape[-2:])
+    for window in ((side, 1), (1, side)):
+        rim = (window[0] // 2, window[1] // 2)
+        wide = avg_pool2d(wide, window, stride=1, padding=rim, count_include_pad=False)
+    return wide.reshape(pictures.shape)
+
+
+def _root_of_colour(channels: int, grey: float) -> tuple[float, float]:
+    """Return (own, shared) such that  own I + shared  is the root of the correlation  (1 - grey) I
+    + grey.
+    """
+    own = (1.0 - grey) ** 0.5
+    return own, ((1.0 - grey + channels * grey) ** 0.5 - own) / channels
+
+
+# --- posterior spread -----------------------------------------------------------------------------
+
+# What a deconvolved picture does not know: the standard deviation of each pixel under the model of
+# the filter.
+
 
 Draws = Annotated[int, Field(ge=2, le=4096)]
 
@@ -45,71 +269,86 @@ def wiener_spread(
     read_noise: Electrons,
     rng: Generator,
 ) -> Tensor:
-    """Compute the standard deviation of each pixel that `restore.wiener` deconvolves, and `matrix` converts to colour.
+    """Compute the standard deviation of each pixel that `restore.wiener` deconvolves, and `matrix`
+    converts to colour.
 
-    Each draw is a scene, or noise, that the filter restores; the variance is that of the errors. With `law` filter the
-    scenes have the power spectrum of the prior, so that the errors of scene and noise are draws from the posterior.
-    With `law` frame they have the spectrum A / f^b of the highest debiased Whittle likelihood for this frame, and the
-    noise has a factor of the same fit, because a scene that is rougher than the prior is restored worse than the prior
-    says. The frame itself is then one of the draws: where the restored frame has more details (differences from the
-    mean over 5 x 5 pixels) than the restored draws have, errors are larger, and where it is even, errors of details
-    are smaller, unless no details could be restored. Low frequencies of photographs vary about a power law: errors
-    averaged over 11 x 11 pixels have twice the variance. Clipped pixels, and the ``border`` beyond the edge, are as
-    unknown as in `restore.wiener`.
+    Each draw is a scene, or noise, that the filter restores; the variance is that of the errors.
+    With `law` filter the scenes have the power spectrum of the prior, so that the errors of scene
+    and noise are draws from the posterior. With `law` frame they have the spectrum A / f^b of the
+    highest debiased Whittle likelihood for this frame, and the noise has a factor of the same fit,
+    because a scene that is rougher than the prior is restored worse than the prior says. The frame
+    itself is then one of the draws: where the restored frame has more details (differences from the
+    mean over 5 x 5 pixels) than the restored draws have, errors are larger, and where it is even,
+    errors of details are smaller, unless no details could be restored. Low frequencies of
+    photographs vary about a power law: errors averaged over 11 x 11 pixels have twice the variance.
+    Clipped pixels, and the ``border`` beyond the edge, are as unknown as in `restore.wiener`.
 
-    With ``scatter`` the mean and the contrast of the scene are as doubtful as the glare leaves them, given that a
-    camera is mostly exposed to a seventh of the fullest pixel, to a factor of three, and that the deviation of a scene
-    is 0.8 of its mean, to a factor of 1.6; and scattered light has blotches of 16 pixels, with 0.4 of the deviation of
-    its speckle.
+    With ``scatter`` the mean and the contrast of the scene are as doubtful as the glare leaves
+    them, given that a camera is mostly exposed to a seventh of the fullest pixel, to a factor of
+    three, and that the deviation of a scene is 0.8 of its mean, to a factor of 1.6; and scattered
+    light has blotches of 16 pixels, with 0.4 of the deviation of its speckle.
 
-    With ``restored``, the picture in colour, and ``shading``, by which the frame was divided, what is not known of the
-    shading counts too: its relative deviation times the picture.
+    With ``restored``, the picture in colour, and ``shading``, by which the frame was divided, what
+    is not known of the shading counts too: its relative deviation times the picture.
 
     Shapes: as `restore.wiener`, matrix (colour, channel) -> (colour, y, x).
     Units:  those of `restore.colour`; with the unit matrix e-.
-    Error:  with `law` filter a relative standard deviation of 1 / sqrt(2 draws) in each pixel, independent of the
-            picture; with `law` frame less, because variances are averaged over 7 x 7 pixels. The interval of 90 % is
-            the deviation times the 95 % quantile of Student's t of four degrees of freedom for each draw. The deviation
-            holds under the model of the filter: not for light that the filter is not told of, such as a laser, nor for
-            a wrong PSF, and not for the colour of paints. The iteration adds what `restore.wiener` says. On 60
-            photographs behind three masks, lasers of 0 to 1e6 found by the search, intervals of 90 % hold 92.6 % of the
-            pixels; of a single frame 45 to 100 %, least behind a mask that spreads light over most of the frame.
-            The result has a derivative with respect to ``matrix`` alone; draws and fitted power count as constants.
+    Error:  with `law` filter a relative standard deviation of 1 / sqrt(2 draws) in each pixel,
+            independent of the picture; with `law` frame less, because variances are averaged over 7
+            x 7 pixels. The interval of 90 % is the deviation times the 95 % quantile of Student's t
+            of four degrees of freedom for each draw. The deviation holds under the model of the
+            filter: not for light that the filter is not told of, such as a laser, nor for a wrong
+            PSF, and not for the colour of paints. The iteration adds what `restore.wiener` says. On
+            60 photographs behind three masks, lasers of 0 to 1e6 found by the search, intervals of
+            90 % hold 92.6 % of the pixels; of a single frame 45 to 100 %, least behind a mask that
+            spreads light over most of the frame. The result has a derivative with respect to
+            ``matrix`` alone; draws and fitted power count as constants.
     Raises: ValueError as `restore.wiener`.
-    Source: Papandreou and Yuille, Gaussian sampling by local perturbations, NIPS 23 (2010), algorithm 1; Sykulski,
-            Olhede, Guillaumin, Lilly and Early, Biometrika 106, 251 (2019).
+    Source: Papandreou and Yuille, Gaussian sampling by local perturbations, NIPS 23 (2010),
+            algorithm 1; Sykulski, Olhede, Guillaumin, Lilly and Early, Biometrika 106, 251 (2019).
     """
     with torch.no_grad():
-        fine, known, light = known_and_light(psf, responses, single(electrons), clipped, glare, nearby, ghosts)
+        light = LaserLight(glare, nearby, ghosts)
+        fine, unclipped, shapes = known_and_light(psf, responses, single(electrons), clipped, light)
         kernels = effective_psf(psf, illuminant, responses, bands, fine.dtype).to(fine)
         white = grey_white(illuminant, responses, bands).to(fine)
         settings = Settings(balance, read_noise, doubt, least_doubt, scatter, border)
-        scaled = posed(fine, known, kernels, light, settings, white)
+        scaled = posed(fine, unclipped, kernels, shapes, settings, white)
     drawn = drawn_deviation if law == "filter" else frame_deviation
     return with_shading(drawn(scaled, matrix, draws, rng).to(single(electrons)), restored, shading)
 
 
 def with_shading(deviation: Tensor, restored: Tensor | None, shading: Shading | None) -> Tensor:
-    """Return the deviation of a picture (colour, y, x) that includes what is not known of its shading."""
+    """Return the deviation of a picture (colour, y, x) that includes what is not known of its
+    shading.
+    """
     if restored is None or shading is None:
         return deviation
     return torch.hypot(deviation, (restored * shading.spread).to(deviation).abs())
 
 
 def drawn_deviation(scaled: Scaled, matrix: Tensor, draws: int, rng: Generator) -> Tensor:
-    """Return the root mean square error (colour, y, x) of the filter over scenes and noise drawn from its prior."""
+    """Return the root mean square error (colour, y, x) of the filter over scenes and noise drawn
+    from its prior.
+    """
     problem, inverses = scaled.problem, Inverses()
     total = problem.picture.new_zeros(len(matrix), *problem.picture.shape[-2:])
     for _ in range(draws):
         with torch.no_grad():
             scene = drawn_scene(problem, problem.power, rng)
             picture = problem.blur(scene) + drawn_noise(problem, rng)
-            error = scaled.pixels(scene - most_likely(replace(problem, picture=picture), inverses=inverses))
+            error = scaled.pixels(
+                scene - most_likely(replace(problem, picture=picture), inverses=inverses)
+            )
         total = total + torch.tensordot(matrix.to(error), error, 1).square()
     return (total / draws).sqrt()
 
 
 @wiener_spread.check
 def _(result: Tensor, *inputs: Any, **params: Any) -> list[Check]:
-    least, most = float(result.min()), float(result.max())
-    return [Check(f"deviation from {least:.2g} to {most:.2g}", math.isfinite(most) and least >= 0)]
+    lowest, highest = float(result.min()), float(result.max())
+    return [
+        Check(
+            f"deviation from {lowest:.2g} to {highest:.2g}", math.isfinite(highest) and lowest >= 0
+        )
+    ]

@@ -1,25 +1,29 @@
-"""Richardson-Lucy deconvolution with a known PSF, for scenes with lamps much brighter than the rest."""
+"""Richardson-Lucy deconvolution with a known PSF, for scenes with lamps much brighter than the
+rest.
+"""
 
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes._half_precision import single
-from neusee.nodes.restore._inverse._fft_grid import torus
-from neusee.nodes.restore._inverse._grey_psf import effective_psf
-from neusee.nodes.restore._inverse._psf_on_grid import edge, wrapped
+from neusee.nodes.precision import single
+from neusee.nodes.restore._inverse._masked_blur import edge, effective_psf, torus, wrapped
 from neusee.nodes.restore._inverse._wiener import refuse_other_pictures
 from neusee.nodes.sensor._digitization import crop
 from neusee.nodes.units import Electrons
 from neusee.nodes.values import Bands, Psf
 
-_UNSEEN = 1e-3  #: share of the light of a scene pixel that reaches known pixels, below which the share counts as this
+#: share of the light of a scene pixel that reaches known pixels, below which the share counts as
+#: this
+_UNSEEN = 1e-3
 _DARK = 1e-6  #: e-, least expected count, because the expectation is a divisor
-_GONE = 1e-30  #: e-, light below which a scene pixel stays dark; its gradient would grow with each step and overflow
+#: e-, light below which a scene pixel stays dark; its gradient would grow with each step and
+#: overflow
+_GONE = 1e-30
 
 
 @node(rtol=3e-4, additive_inputs=[("glare",), ("ghosts",)])
@@ -36,79 +40,114 @@ def richardson_lucy(
     iterations: Annotated[int, Field(ge=1, le=1000)] = 40,
     read_noise: Electrons,
 ) -> Tensor:
-    """Deconvolve a picture with a known PSF: approach the most likely scene without negative light, step by step.
+    """Deconvolve a picture with a known PSF: approach the most likely scene without negative light,
+    step by step.
 
-    Each step multiplies the scene by the blurred ratio of the picture to the picture that the scene would give, which
-    raises the likelihood of Poisson counts. The scene stays nonnegative, so that no dark ring can balance the glare of
-    a lamp, as it does in `restore.wiener`. Few steps keep the result smooth. The variance of the read noise is added to
-    the counts. Clipped pixels, and the border beyond the edge, are unknown, and so is the strength of each pattern of
-    ``glare`` and ``ghosts``, as in `restore.wiener`.
+    Each step multiplies the scene by the blurred ratio of the picture to the picture that the scene
+    would give, which raises the likelihood of Poisson counts. The scene stays nonnegative, so that
+    no dark ring can balance the glare of a lamp, as it does in `restore.wiener`. Few steps keep the
+    result smooth. The variance of the read noise is added to the counts. Clipped pixels, and the
+    border beyond the edge, are unknown, and so is the strength of each pattern of ``glare`` and
+    ``ghosts``, as in `restore.wiener`.
 
-    Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses (channel, band),
-            each glare and ghost (channel, at least y, at least x), cropped to the centre -> (channel, y, x).
+    Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses
+            (channel, band), each glare and ghost (channel, at least y, at least x), cropped to the
+            centre -> (channel, y, x).
     Units:  e-; glare any; the result as behind a perfect lens without losses.
-    Error:  a grey scene is assumed. The number of steps decides between blur and noise, and is no convergence: more
-            steps restore finer detail and more noise. Without such lamps `restore.wiener` leaves less error.
-            float32: 1e-5 of the brightest pixel after 40 steps, and 3e-4 at pixels of which 1e-3 of the light is seen,
-            where the rounding of a Fourier transform, 1e-7, counts a thousandfold.
+    Error:  a grey scene is assumed. The number of steps decides between blur and noise, and is no
+            convergence: more steps restore finer detail and more noise. Without such lamps
+            `restore.wiener` leaves less error. float32: 1e-5 of the brightest pixel after 40 steps,
+            and 3e-4 at pixels of which 1e-3 of the light is seen, where the rounding of a Fourier
+            transform, 1e-7, counts a thousandfold.
     Raises: ValueError where shapes or bands differ, and for pictures and PSFs that are not finite.
-    Source: Richardson, J. Opt. Soc. Am. 62, 55 (1972); Lucy, Astron. J. 79, 745 (1974); read noise as in Snyder,
-            Hammoud and White, J. Opt. Soc. Am. A 10, 1014 (1993).
+    Source: Richardson, J. Opt. Soc. Am. 62, 55 (1972); Lucy, Astron. J. 79, 745 (1974); read noise
+            as in Snyder, Hammoud and White, J. Opt. Soc. Am. A 10, 1014 (1993).
     """
     electrons = single(electrons)
     glare = [*(glare or ()), *(ghosts or ())]
     refuse_other_pictures(electrons, psf, responses, clipped, glare)
     size = (electrons.shape[-2], electrons.shape[-1])
     kernels = effective_psf(psf, illuminant, responses, bands).to(electrons)
-    known = _known(clipped, electrons)
-    patterns = [crop(pattern.to(electrons), shape=size) for pattern in glare]
-    patterns = [p / peak for p in patterns if (peak := float((p.detach().abs() * known).max())) > 0]
+    unclipped = _known(clipped, electrons)
+    patterns = []
+    for light in glare:
+        pattern = crop(light.to(electrons), shape=size)
+        peak = float((pattern.detach().abs() * unclipped).max())
+        if peak > 0:
+            patterns.append(pattern / peak)
     wide = torus(size, edge(kernels, size))
     total = kernels.sum((-2, -1), keepdim=True)
     total = torch.where(total > 0, total, 1.0)
-    transfer = torch.fft.rfft2(wrapped(kernels / total, wide))  # of sum 1, so that no scale of the PSF overflows
-    return _climb(electrons, known, transfer, wide, patterns, iterations, read_noise**2) / total
+    # of sum 1, so that no scale of the PSF overflows
+    blur = _Blur(torch.fft.rfft2(wrapped(kernels / total, wide)), wide)
+    return _climb(electrons, unclipped, blur, patterns, iterations, read_noise**2) / total
 
 
 @richardson_lucy.check
 def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: Any) -> list[Check]:
     share = float(inputs[4].any(-3).double().mean())
     ratio = float(result.mean() / electrons.mean())
-    return [Check(f"{share:.2%} of pixels clipped, restored mean {ratio:.2f} of raw mean", math.isfinite(ratio))]
+    return [
+        Check(
+            f"{share:.2%} of pixels clipped, restored mean {ratio:.2f} of raw mean",
+            math.isfinite(ratio),
+        )
+    ]
 
 
 def _known(clipped: Tensor, like: Tensor) -> Tensor:
-    """Return 1 for each pixel that is not clipped and 0 for the others; a channel without known pixels has only 1."""
-    known = (~clipped).to(like)
-    return torch.where(known.amax((-2, -1), keepdim=True) > 0, known, 1.0)
+    """Return 1 for each pixel that is not clipped and 0 for the others; a channel without known
+    pixels has only 1.
+    """
+    unclipped = (~clipped).to(like)
+    return torch.where(unclipped.amax((-2, -1), keepdim=True) > 0, unclipped, 1.0)
+
+
+class _Blur(NamedTuple):
+    """The blur of each channel on a periodic grid."""
+
+    transfer: Tensor  #: (channel, fy, fx)
+    grid: tuple[int, int]
+
+    def picture(self, scene: Tensor) -> Tensor:
+        """Return the blurred scene, on the whole grid."""
+        blurred: Tensor = torch.fft.irfft2(self.transfer * torch.fft.rfft2(scene), s=self.grid)
+        return blurred
+
+    def gathered(self, pixels: Tensor) -> Tensor:
+        """Return the adjoint of the blur, applied to the pixels of a picture."""
+        spectrum = torch.fft.rfft2(pixels, s=self.grid)
+        scene: Tensor = torch.fft.irfft2(self.transfer.conj() * spectrum, s=self.grid)
+        return scene
 
 
 def _climb(
     electrons: Tensor,
-    known: Tensor,
-    transfer: Tensor,
-    wide: tuple[int, int],
+    unclipped: Tensor,
+    blur: _Blur,
     patterns: list[Tensor],
     iterations: int,
     variance: float,
 ) -> Tensor:
     """Return the scene after ``iterations`` steps from an even scene of the mean of the picture."""
     y, x = electrons.shape[-2:]
-
-    def seen_from(pixels: Tensor) -> Tensor:
-        gathered: Tensor = torch.fft.irfft2(transfer.conj() * torch.fft.rfft2(pixels, s=wide), s=wide)
-        return gathered
-
-    counts = (electrons + variance).clamp_min(0) * known
-    mean = (electrons * known).sum((-2, -1), keepdim=True) / known.sum((-2, -1), keepdim=True)
-    scene = mean.clamp_min(0).expand(-1, *wide)
-    share = seen_from(known).clamp_min(_UNSEEN)
+    counts = (electrons + variance).clamp_min(0) * unclipped
+    mean = (electrons * unclipped).sum((-2, -1), keepdim=True) / unclipped.sum(
+        (-2, -1), keepdim=True
+    )
+    scene = mean.clamp_min(0).expand(-1, *blur.grid)
+    share = blur.gathered(unclipped).clamp_min(_UNSEEN)
     strengths = [mean.mean().clamp_min(0) for _ in patterns]
     for _ in range(iterations):
-        expected = torch.fft.irfft2(transfer * torch.fft.rfft2(scene), s=wide)[..., :y, :x].clamp_min(0) + variance
+        expected = blur.picture(scene)[..., :y, :x].clamp_min(0) + variance
         for strength, pattern in zip(strengths, patterns, strict=True):
             expected = expected + strength * pattern
         ratio = counts / expected.clamp_min(_DARK)
-        scene = torch.where(scene <= _GONE, 0.0, scene * (seen_from(ratio) / share).clamp_min(0))
-        strengths = [s * (p * ratio).sum() / (p * known).sum() for s, p in zip(strengths, patterns, strict=True)]
+        scene = torch.where(
+            scene <= _GONE, 0.0, scene * (blur.gathered(ratio) / share).clamp_min(0)
+        )
+        strengths = [
+            s * (p * ratio).sum() / (p * unclipped).sum()
+            for s, p in zip(strengths, patterns, strict=True)
+        ]
     return scene[..., :y, :x]

@@ -1,4 +1,4 @@
-"""Wiener deconvolution with a known PSF, a baseline that needs no training."""
+"""Wiener deconvolution with a known PSF: the filter, its problem, and what it knows."""
 
 import math
 from collections.abc import Callable
@@ -9,36 +9,61 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes._half_precision import refuse_not_finite, single
-from neusee.nodes.restore._inverse._fft_grid import torus
-from neusee.nodes.restore._inverse._glare import Glare, Light, average, doubted, visible, with_light_around
-from neusee.nodes.restore._inverse._glare_doubt import likeliest_doubt
-from neusee.nodes.restore._inverse._grey_psf import effective_psf, grey_white
+from neusee.nodes.precision import refuse_not_finite, single
+from neusee.nodes.restore._inverse._glare import (
+    Glare,
+    Light,
+    average,
+    doubted,
+    likeliest_doubt,
+    scattered,
+    visible,
+    with_light_around,
+)
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
-from neusee.nodes.restore._inverse._masked_blur import Blurred, Size
-from neusee.nodes.restore._inverse._picture_scale import (
+from neusee.nodes.restore._inverse._masked_blur import (
+    Blurred,
+    Size,
+    bordered,
+    edge,
+    effective_psf,
+    grey_white,
+    torus,
+    variance,
+    wrapped,
+)
+from neusee.nodes.restore._inverse._wiener_prior import (
+    SceneDoubt,
     about_mean,
     expected_variance,
     fall,
     picture_noise,
     power_of_two,
+    scene_doubt,
     shared_level,
+    told_of_scene,
 )
-from neusee.nodes.restore._inverse._psf_on_grid import bordered, edge, wrapped
-from neusee.nodes.restore._inverse._scattered_glare import scattered
-from neusee.nodes.restore._inverse._scene_level import SceneDoubt, scene_doubt, told_of_scene
 from neusee.nodes.sensor._digitization import crop
 from neusee.nodes.units import Electrons
-from neusee.nodes.values import Bands, Psf
+from neusee.nodes.values import Bands, FilterFacts, Psf, WienerProblem
+
+# --- wiener ---------------------------------------------------------------------------------------
+
+# Wiener deconvolution with a known PSF, a baseline that needs no training.
+
 
 GREY = 0.95  #: correlation between the channels of pictures
-PRECISE = 256  #: pixels a side, up to which all is computed in float64: the dense float64 algebra takes most time there
+#: pixels a side, up to which all is computed in float64: the dense float64 algebra takes most time
+#: there
+PRECISE = 256
 
 
-#: standard deviation of a glare pattern in each pixel over its light around there; None: the likeliest for the picture
+#: standard deviation of a glare pattern in each pixel over its light around there; None: the
+#: likeliest for the picture
 Doubt = Annotated[float, Field(ge=0, le=10)] | None
 LeastDoubt = Annotated[float, Field(ge=0, le=10)]  #: of a doubt that is found
-Border = Annotated[float, Field(ge=1, le=4)]  #: of unknown pixels around a picture, over the reach of its PSF
+#: of unknown pixels around a picture, over the reach of its PSF
+Border = Annotated[float, Field(ge=1, le=4)]
 
 
 class Settings(NamedTuple):
@@ -72,77 +97,109 @@ def wiener(
     coarser_grids: bool = True,
     read_noise: Electrons,
 ) -> Tensor:
-    """Deconvolve a picture with a known PSF: compute the most likely scene, given the pixels that are not clipped.
+    """Deconvolve a picture with a known PSF: compute the most likely scene, given the pixels that
+    are not clipped.
 
-    Least squares with a Gaussian prior, which for a picture without edges is the Wiener filter. Each channel has the
-    PSF that it sees of a grey scene: the mean over bands, weighted by illuminant x response x wavelength. The power
-    spectrum of the prior falls as 1 / frequency^3, like that of edges, with the variance of this picture; channels have
-    a correlation of 0.95. Clipped pixels and pixels beyond the edge are unknown. The picture with its border repeats
-    itself, so that opposite ends agree. `border` above 1 widens the border beyond the reach of the PSF, so that they
-    may differ behind a wide PSF; the prior then hardly rises below half a cycle in the picture, and its variance counts
-    about the mean of the picture. The patterns of `glare` and `ghosts`, wide as the scene, are removed, each with its
-    own unknown strength. By default their shapes count as known exactly.
-    `doubt` is the standard deviation of a pattern in each pixel over the light of the pattern around this pixel, which
-    falls as 1 / distance^3 from each point of it: the variance of the noise grows by (doubt x this light)^2. Without a
-    number (null) it is the likeliest of 0, 0.01, 0.03, 0.1, 0.3, 1 and 3 for this picture that is not below
-    `least_doubt`. `nearby` has other possible patterns of each glare, as `restore.nearby_glare` computes them: their
-    differences from the glare, averaged over the patterns, are its covariance. The glare in a variance is a
-    least-squares estimate, in which uncertain pixels count less. With `scatter`, patterns are in e- and nearly of the
-    strength told, and `doubt` does not count: dirt and defocus scatter part of their light over 4, 16 and 64 pixels,
-    as much as speckle and clipped pixels of this picture tell, and channels that glare covers take mean and contrast of
-    others, as of a grey scene. The iteration starts from the answer on
-    `coarser_grids`; without these it starts from a picture without contrast: faster, and right for a plain lens alone.
+    Least squares with a Gaussian prior, which for a picture without edges is the Wiener filter.
+    Each channel has the PSF that it sees of a grey scene: the mean over bands, weighted by
+    illuminant x response x wavelength. The power spectrum of the prior falls as 1 / frequency^3,
+    like that of edges, with the variance of this picture; channels have a correlation of 0.95.
+    Clipped pixels and pixels beyond the edge are unknown. The picture with its border repeats
+    itself, so that opposite ends agree. `border` above 1 widens the border beyond the reach of the
+    PSF, so that they may differ behind a wide PSF; the prior then hardly rises below half a cycle
+    in the picture, and its variance counts about the mean of the picture. The patterns of `glare`
+    and `ghosts`, wide as the scene, are removed, each with its own unknown strength. By default
+    their shapes count as known exactly. `doubt` is the standard deviation of a pattern in each
+    pixel over the light of the pattern around this pixel, which falls as 1 / distance^3 from each
+    point of it: the variance of the noise grows by (doubt x this light)^2. Without a number (null)
+    it is the likeliest of 0, 0.01, 0.03, 0.1, 0.3, 1 and 3 for this picture that is not below
+    `least_doubt`. `nearby` has other possible patterns of each glare, as `restore.nearby_glare`
+    computes them: their differences from the glare, averaged over the patterns, are its covariance.
+    The glare in a variance is a least-squares estimate, in which uncertain pixels count less. With
+    `scatter`, patterns are in e- and nearly of the strength told, and `doubt` does not count: dirt
+    and defocus scatter part of their light over 4, 16 and 64 pixels, as much as speckle and clipped
+    pixels of this picture tell, and channels that glare covers take mean and contrast of others, as
+    of a grey scene. The iteration starts from the answer on `coarser_grids`; without these it
+    starts from a picture without contrast: faster, and right for a plain lens alone.
 
-    Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses (channel, band),
-            each glare and ghost (channel, at least y, at least x), cropped to the centre, each nearby
-            (pattern, channel, y, x) -> (channel, y, x).
-    Units:  e-; glare any, nearby as its glare; the result as behind a perfect lens without losses. `balance` multiplies
-            the noise variance, without that of the glare; doubt none.
-    Error:  a grey scene is assumed, and noise in the dark no smaller than that of the mean picture. Without `glare` a
-            laser that does not clip is taken for scene. The result may be negative: beside lamps hundreds of times as
-            bright as the scene it rings. The iteration ends by its residual, or after 20 steps on the finest grid: rms
-            from the converged answer over the contrast, for 96 pixels a side, 4e-4 to 5e-3 (medians behind four masks)
-            and at most 0.025; for 384, 0.010 behind five half-rings and 0.023 behind a half-ring, where it costs 0.05
-            dB; 4e-3 without coarser grids behind a plain lens. Gradients: of the exact answer, first order only; a
-            doubt that is found counts as constant. Up to 256 pixels a side all is float64, and rounding adds 1e-6 to
-            both (`rtol` holds there); in wider pictures float32 adds 3e-4 to the result and up to 2e-3 to the
-            gradients; in pictures of 1e7 e-, 2e-2 and 8e-2. With less noise rounding adds more to the gradients,
-            1e-16 of the largest ratio of the variances of scene and noise at one frequency: 1 in pictures of 1e15 e-,
-            whose result up to 20 pixels a side is right to 1e-7.
-            With `scatter`, the light that is scattered over 4 and 64 pixels is found to a factor of 2 to 3.
+    Shapes: electrons and clipped (channel, y, x), psf.intensity (band, any, any), responses
+            (channel, band), each glare and ghost (channel, at least y, at least x), cropped to the
+            centre, each nearby (pattern, channel, y, x) -> (channel, y, x).
+    Units:  e-; glare any, nearby as its glare; the result as behind a perfect lens without losses.
+            `balance` multiplies the noise variance, without that of the glare; doubt none.
+    Error:  a grey scene is assumed, and noise in the dark no smaller than that of the mean picture.
+            Without `glare` a laser that does not clip is taken for scene. The result may be
+            negative: beside lamps hundreds of times as bright as the scene it rings. The iteration
+            ends by its residual, or after 20 steps on the finest grid: rms from the converged
+            answer over the contrast, for 96 pixels a side, 4e-4 to 5e-3 (medians behind four masks)
+            and at most 0.025; for 384, 0.010 behind five half-rings and 0.023 behind a half-ring,
+            where it costs 0.05 dB; 4e-3 without coarser grids behind a plain lens. Gradients: of
+            the exact answer, first order only; a doubt that is found counts as constant. Up to 256
+            pixels a side all is float64, and rounding adds 1e-6 to both (`rtol` holds there); in
+            wider pictures float32 adds 3e-4 to the result and up to 2e-3 to the gradients; in
+            pictures of 1e7 e-, 2e-2 and 8e-2. With less noise rounding adds more to the gradients,
+            1e-16 of the largest ratio of the variances of scene and noise at one frequency: 1 in
+            pictures of 1e15 e-, whose result up to 20 pixels a side is right to 1e-7. With
+            `scatter`, the light that is scattered over 4 and 64 pixels is found to a factor of 2 to
+            3.
     Raises: ValueError where shapes or bands differ, and for pictures and PSFs that are not finite.
-    Source: Wiener filter as in Gonzalez and Woods, Digital Image Processing, 4th ed., ch. 5; as least squares with a
-            prior, Kaipio and Somersalo, Statistical and Computational Inverse Problems, 2005, ch. 3.
+    Source: Wiener filter as in Gonzalez and Woods, Digital Image Processing, 4th ed., ch. 5; as
+            least squares with a prior, Kaipio and Somersalo, Statistical and Computational Inverse
+            Problems, 2005, ch. 3.
     """
-    electrons, light = single(electrons), (glare, nearby, ghosts)
+    electrons, light = single(electrons), LaserLight(glare, nearby, ghosts)
+    view = View(psf, illuminant, responses, bands)
     settings = Settings(balance, read_noise, doubt, least_doubt, scatter, border)
-    scaled = pose(electrons, psf, illuminant, responses, bands, clipped, *light, settings)
-    return (scaled.pixels(most_likely(scaled.problem, coarser=coarser_grids)) + scaled.mean).to(electrons)
+    scaled = pose(electrons, clipped, view, light, settings)
+    return (scaled.pixels(most_likely(scaled.problem, coarser=coarser_grids)) + scaled.mean).to(
+        electrons
+    )
+
+
+class View(NamedTuple):
+    """The PSF of a camera by band, and what its channels see of a grey scene."""
+
+    psf: Psf
+    illuminant: Tensor
+    responses: Tensor
+    bands: Bands
+
+
+class LaserLight(NamedTuple):
+    """Patterns of the light of lasers in a picture, as inputs of `wiener`."""
+
+    glare: list[Tensor] | None
+    nearby: list[Tensor] | None
+    ghosts: list[Tensor] | None = None
 
 
 def known_and_light(
-    psf: Psf,
-    responses: Tensor,
-    electrons: Tensor,
-    clipped: Tensor,
-    glare: list[Tensor] | None,
-    nearby: list[Tensor] | None,
-    ghosts: list[Tensor] | None,
+    psf: Psf, responses: Tensor, electrons: Tensor, clipped: Tensor, light: LaserLight
 ) -> tuple[Tensor, Tensor, Glare]:
-    """Return a picture in the type of the computation, 1 for each pixel that is not clipped, and the visible glare.
+    """Return a picture in the type of the computation, 1 for each pixel that is not clipped, and
+    the visible glare.
 
     Raises ValueError for inputs that differ in shape or are not finite.
     """
-    refuse_other_pictures(electrons, psf, responses, clipped, [*(glare or ()), *(nearby or ()), *(ghosts or ())])
+    glare, nearby, ghosts = light
+    refuse_other_pictures(
+        electrons, psf, responses, clipped, [*(glare or ()), *(nearby or ()), *(ghosts or ())]
+    )
     _refuse_other_glare(glare or [], nearby)
     size = (electrons.shape[-2], electrons.shape[-1])
     fine = electrons.double() if max(size) <= PRECISE else electrons
-    patterns, others, ghostly = ([crop(x.to(fine), shape=size) for x in g or ()] for g in (glare, nearby, ghosts))
-    known = (~clipped).to(fine)
+    patterns, others, ghostly = (
+        [crop(x.to(fine), shape=size) for x in g or ()] for g in (glare, nearby, ghosts)
+    )
+    unclipped = (~clipped).to(fine)
     return (
         fine,
-        known,
-        visible([*patterns, *ghostly], [*others, *[None] * (len(patterns) + len(ghostly) - len(others))], known),
+        unclipped,
+        visible(
+            [*patterns, *ghostly],
+            [*others, *[None] * (len(patterns) + len(ghostly) - len(others))],
+            unclipped,
+        ),
     )
 
 
@@ -152,7 +209,8 @@ def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: float) -> list[
     finite = math.isfinite(float(result.sum()))
     return [
         Check(
-            f"{share:.2%} of pixels clipped, restored mean {float(result.mean() / electrons.mean()):.2f} of raw mean",
+            f"{share:.2%} of pixels clipped, restored mean"
+            f" {float(result.mean() / electrons.mean()):.2f} of raw mean",
             finite,
         )
     ]
@@ -160,28 +218,42 @@ def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: float) -> list[
 
 def _refuse_other_glare(glare: list[Tensor], nearby: list[Tensor] | None) -> None:
     if nearby and [x.shape[-3:] for x in nearby] != [x.shape for x in glare]:
-        found, wanted = [tuple(x.shape) for x in nearby], [tuple(x.shape) for x in glare]
+        nearby_shapes, glare_shapes = (
+            [tuple(x.shape) for x in nearby],
+            [tuple(x.shape) for x in glare],
+        )
         raise ValueError(
-            f"nearby {found} does not fit glare {wanted}: give one nearby, (pattern, channel, y, x), for each glare"
+            f"nearby {nearby_shapes} does not fit glare {glare_shapes}: give one nearby, (pattern,"
+            " channel, y, x), for each glare"
         )
 
 
 def refuse_other_pictures(
     electrons: Tensor, psf: Psf, responses: Tensor, clipped: Tensor, glare: list[Tensor] | None
 ) -> None:
-    """Raise ValueError for inputs that differ in channels or pixels, and for inputs that are not finite."""
+    """Raise ValueError for inputs that differ in channels or pixels, and for inputs that are not
+    finite.
+    """
     if electrons.shape != clipped.shape or len(responses) != electrons.shape[-3]:
         raise ValueError(
             f"electrons {tuple(electrons.shape)}, clipped {tuple(clipped.shape)} and responses "
             f"{tuple(responses.shape)} must have the same channels and pixels"
         )
-    for name, values in {"electrons": [electrons], "psf": [psf.intensity], "glare": glare or ()}.items():
+    for name, values in {
+        "electrons": [electrons],
+        "psf": [psf.intensity],
+        "glare": glare or (),
+    }.items():
         for x in values:
-            refuse_not_finite("the picture cannot be restored", **{name: x.sum(-1).sum(dtype=torch.float64)})
+            refuse_not_finite(
+                "the picture cannot be restored", **{name: x.sum(-1).sum(dtype=torch.float64)}
+            )
 
 
 class Scaled(NamedTuple):
-    """A deconvolution whose scene has mean 0 and variance 1, and what gives the result its scale and mean back."""
+    """A deconvolution whose scene has mean 0 and variance 1, and what gives the result its scale
+    and mean back.
+    """
 
     problem: Blurred
     scale: Tensor  #: (channel, 1, 1)
@@ -196,26 +268,22 @@ class Scaled(NamedTuple):
 
 
 def pose(
-    electrons: Tensor,
-    psf: Psf,
-    illuminant: Tensor,
-    responses: Tensor,
-    bands: Bands,
-    clipped: Tensor,
-    glare: list[Tensor] | None,
-    nearby: list[Tensor] | None,
-    ghosts: list[Tensor] | None,
-    settings: Settings,
+    electrons: Tensor, clipped: Tensor, view: View, light: LaserLight, settings: Settings
 ) -> Scaled:
-    """Return the inputs of `wiener` as a linear problem, unsolved; ``settings`` as `Settings` says."""
-    fine, known, light = known_and_light(psf, responses, electrons, clipped, glare, nearby, ghosts)
-    kernels = effective_psf(psf, illuminant, responses, bands, fine.dtype).to(fine)
-    return posed(fine, known, kernels, light, settings, grey_white(illuminant, responses, bands).to(fine))
+    """Return the inputs of `wiener` as a linear problem, unsolved; ``settings`` as `Settings`
+    says.
+    """
+    fine, unclipped, glare = known_and_light(view.psf, view.responses, electrons, clipped, light)
+    kernels = effective_psf(view.psf, view.illuminant, view.responses, view.bands, fine.dtype).to(
+        fine
+    )
+    white = grey_white(view.illuminant, view.responses, view.bands).to(fine)
+    return posed(fine, unclipped, kernels, glare, settings, white)
 
 
 def posed(
     electrons: Tensor,
-    known: Tensor,
+    unclipped: Tensor,
     kernels: Tensor,
     glare: Glare,
     settings: Settings,
@@ -223,40 +291,54 @@ def posed(
 ) -> Scaled:
     """Return the deconvolution of a picture as a linear problem; ``settings`` as `Settings` says.
 
-    With `Settings.scatter` and ``white``, what the channels (channel, 1, 1) see of a grey scene, channels that glare
-    covers take mean and contrast of others.
+    With `Settings.scatter` and ``white``, what the channels (channel, 1, 1) see of a grey scene,
+    channels that glare covers take mean and contrast of others.
     """
     frame = (electrons.shape[-2], electrons.shape[-1])
     read, scatter = settings.read_noise, settings.scatter
-    seen, some = known, known.amax((-2, -1), keepdim=True)
-    known = torch.where(some > 0, known, 1.0)
+    with_blind, some = unclipped, unclipped.amax((-2, -1), keepdim=True)
+    unclipped = torch.where(some > 0, unclipped, 1.0)
     share = power_of_two(kernels.sum((-2, -1), keepdim=True).detach())
-    kernels = kernels / share  # the same bits, and the floors below concern the shape of the PSF, not a grey filter
+    # the same bits, and the floors below concern the shape of the PSF, not a grey filter
+    kernels = kernels / share
 
-    free, trusted, light, wrong = _found_light(electrons, (known, seen), glare, settings)
+    free, trusted, light, wrong = _found_light(electrons, (unclipped, with_blind), glare, settings)
     picture = electrons - light.sum
     mean = average(picture, trusted)
-    found = average((picture - mean).square(), trusted)
+    total_variance = average((picture - mean).square(), trusted)
     size, transfer, power, passed = _on_torus(kernels, frame, settings.border)
-    told = mean, (found - mean - read**2 - wrong) / passed
-    scale = torch.maximum(told[1], 0.01 * found / passed).clamp_min(1e-6).sqrt()
+    moments = mean, (total_variance - mean - read**2 - wrong) / passed
+    scale = torch.maximum(moments[1], 0.01 * total_variance / passed).clamp_min(1e-6).sqrt()
     if scatter and white is not None and light.modes:
-        trust = trusted.sum((-2, -1), keepdim=True) / known.sum((-2, -1), keepdim=True) * some
+        trust = trusted.sum((-2, -1), keepdim=True) / unclipped.sum((-2, -1), keepdim=True) * some
         mean, scale = (shared_level(x, trust.detach(), white) for x in (mean.clamp_min(1.0), scale))
     noise = settings.balance * picture_noise(electrons, mean, read) + light.variance
-    weight = known * (scale / noise.sqrt()).square()
+    weight = unclipped * (scale / noise.sqrt()).square()
     scaled = tuple(pattern / scale for pattern in (*free, *light.modes))
-    problem = Blurred((picture - mean) / scale, weight, transfer, power, size, GREY, scaled, bounded=len(light.modes))
+    problem = Blurred(
+        (picture - mean) / scale,
+        weight,
+        transfer,
+        power,
+        size,
+        GREY,
+        scaled,
+        bounded=len(light.modes),
+    )
     bright = mean / kernels.sum((-2, -1)).clamp_min(1e-3)[:, None, None] / share
     if not scatter:
         return Scaled(problem, scale, bright, share, kernels)
     full = float(electrons.detach().max())
-    both = told_of_scene(*told, wrong / passed, light, trusted, (some == 0) * full)
-    return Scaled(problem, scale, bright, share, kernels, scene_doubt((mean, scale), both, white, full, light))
+    both = told_of_scene(*moments, wrong / passed, light, trusted, (some == 0) * full)
+    return Scaled(
+        problem, scale, bright, share, kernels, scene_doubt((mean, scale), both, white, full, light)
+    )
 
 
 def _on_torus(kernels: Tensor, frame: Size, border: float) -> tuple[Size, Tensor, Tensor, Tensor]:
-    """Return the torus of a picture, the transfer of the PSF, the prior, and the variance that a picture then has."""
+    """Return the torus of a picture, the transfer of the PSF, the prior, and the variance that a
+    picture then has.
+    """
     size = torus(frame, bordered(edge(kernels, frame), border))
     transfer, wide = torch.fft.rfft2(wrapped(kernels, size)), border > 1
     power = fall(size, (2 * frame[0], 2 * frame[1]) if wide else None).to(kernels)
@@ -265,31 +347,264 @@ def _on_torus(kernels: Tensor, frame: Size, border: float) -> tuple[Size, Tensor
 
 
 def _found_light(
-    electrons: Tensor, known: tuple[Tensor, Tensor], glare: Glare, settings: Settings
+    electrons: Tensor, unclipped: tuple[Tensor, Tensor], glare: Glare, settings: Settings
 ) -> tuple[list[Tensor], Tensor, Light, Tensor]:
-    """Return the patterns of unknown strength, and what `doubted` returns; ``known`` with and without blind channels.
+    """Return the patterns of unknown strength, and what `doubted` returns; ``unclipped`` with and
+    without blind channels.
 
-    With `Settings.scatter` the strengths are found too, so that no pattern of unknown strength is left.
+    With `Settings.scatter` the strengths are found too, so that no pattern of unknown strength is
+    left.
     """
 
     def own_noise(mean: Tensor) -> Tensor:
         return picture_noise(electrons, mean, settings.read_noise)
 
     if settings.scatter and glare.patterns:
-        return [], *scattered(electrons, known[1], glare, own_noise)
-    return glare.patterns, *_doubted(electrons, known[0], glare, (settings.doubt, settings.least_doubt), own_noise)
+        return [], *scattered(electrons, unclipped[1], glare, own_noise)
+    return glare.patterns, *_doubted(
+        electrons, unclipped[0], glare, (settings.doubt, settings.least_doubt), own_noise
+    )
 
 
 def _doubted(
     electrons: Tensor,
-    known: Tensor,
+    unclipped: Tensor,
     glare: Glare,
     doubts: tuple[float | None, float],
     noise: Callable[[Tensor], Tensor],
 ) -> tuple[Tensor, Light, Tensor]:
     """Return what `doubted` returns, for a doubt, or None and the least doubt that is found."""
-    doubt, least = doubts
+    doubt, smallest = doubts
     if doubt != 0 and glare.around is None:
         glare = with_light_around(glare)
-    doubt = likeliest_doubt(electrons, known, glare, noise, least) if doubt is None else doubt
-    return doubted(electrons, known, glare, doubt, noise)
+    doubt = (
+        likeliest_doubt(electrons, unclipped, glare, noise, smallest) if doubt is None else doubt
+    )
+    return doubted(electrons, unclipped, glare, doubt, noise)
+
+
+# --- wiener problem -------------------------------------------------------------------------------
+
+# The problem that the Wiener filter solves, as a value: for the training of restorers that begin
+# with its answer.
+
+
+@node(rtol=1e-5, additive_inputs=[("glare", "nearby"), ("ghosts",)])
+def wiener_problem(
+    electrons: Tensor,
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    clipped: Tensor,
+    glare: list[Tensor] | None = None,
+    nearby: list[Tensor] | None = None,
+    ghosts: list[Tensor] | None = None,
+    *,
+    balance: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0,
+    doubt: Doubt = 0.0,
+    least_doubt: LeastDoubt = 0.0,
+    read_noise: Electrons,
+) -> WienerProblem:
+    """Pose the deconvolution of `restore.wiener` as a linear problem, and solve it: the answer is
+    that of the filter.
+
+    A training of `restore.unrolled` poses the problem of each picture once, and uses it at each of
+    its iterations.
+
+    Shapes: as `restore.wiener`; those of the result as `WienerProblem` says.
+    Units:  e-; the fields of the result as `WienerProblem` says.
+    Error:  as `restore.wiener`.
+    Raises: ValueError as `restore.wiener`.
+    Source: as `restore.wiener`.
+    """
+    electrons, light = single(electrons), LaserLight(glare, nearby, ghosts)
+    view = View(psf, illuminant, responses, bands)
+    settings = Settings(balance, read_noise, doubt, least_doubt)
+    return packed(pose(electrons, clipped, view, light, settings))
+
+
+@wiener_problem.check
+def _(result: WienerProblem, *inputs: Any, **params: Any) -> list[Check]:
+    largest = float(result.answer.abs().max())
+    return [
+        Check(f"contrast of the answer up to {largest:.3g} of its scale", largest < float("inf"))
+    ]
+
+
+def packed(scaled: Scaled) -> WienerProblem:
+    """Return a posed deconvolution and its answer as a value."""
+    problem = scaled.problem
+    free = len(problem.glare) - problem.bounded
+    none = problem.picture.new_zeros(0, *problem.picture.shape)
+    parts = [
+        torch.stack(some) if some else none for some in (problem.glare[:free], problem.glare[free:])
+    ]
+    spectrum = most_likely(problem)
+    scale = scaled.scale / scaled.share
+    answer = (problem.first(spectrum), problem.blur(spectrum))
+    return WienerProblem._make(
+        (problem.picture, problem.weight, scaled.kernels, *parts, *answer, scale, scaled.mean)
+    )
+
+
+def unpacked(value: WienerProblem) -> Blurred:
+    """Return the linear problem of a value."""
+    frame = (value.picture.shape[-2], value.picture.shape[-1])
+    size = torus(frame, edge(value.psf, frame))
+    transfer, power = torch.fft.rfft2(wrapped(value.psf, size)), fall(size).to(value.psf)
+    glare = (*value.glare, *value.doubts)
+    return Blurred(
+        value.picture, value.weight, transfer, power, size, GREY, glare, bounded=len(value.doubts)
+    )
+
+
+# --- filter facts ---------------------------------------------------------------------------------
+
+# What the Wiener filter finds in a picture and knows of it, as maps for a network that goes on from
+# its answer.
+
+
+_OCTAVES = 5  #: of frequency, below half a cycle per pixel
+_BRIGHT = 1e3  #: of a glare pattern of maximum 1, so that its far rings are seen
+_GAMMA = 1 / 2.2  #: of a display, so that dark parts are seen
+EACH = 9  #: maps of each channel
+MAPS = 3 * EACH + _OCTAVES  #: of a picture of three channels
+
+
+@node(rtol=1e-5, additive_inputs=[("glare", "nearby"), ("ghosts",)])
+def filter_facts(
+    electrons: Tensor,
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    clipped: Tensor,
+    glare: list[Tensor] | None = None,
+    nearby: list[Tensor] | None = None,
+    ghosts: list[Tensor] | None = None,
+    *,
+    balance: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0,
+    doubt: Doubt = 0.0,
+    least_doubt: LeastDoubt = 0.0,
+    read_noise: Electrons,
+) -> FilterFacts:
+    """Deconvolve a picture by `restore.wiener`, and map what the filter knows of each pixel and of
+    each frequency.
+
+    Nine maps of each channel, all without a unit: the answer; the brightness, the answer above
+    black to the power 1 / 2.2; the frame y without the glare; the residual y - B x over its noise;
+    the certainty of the pixel of the frame, its inverse noise variance W; 1 where it is not
+    clipped; the pattern of the glare; the variance of what is not known of this pattern; and the
+    deviation, the predicted error of the answer. Wide ranges are compressed by asinh or log. Then,
+    for each of five octaves of frequency from the finest down, one map with the share of the
+    prior's variance that the frame tells: the mean over the octave of S / (S + 1), where S =
+    |OTF|^2 W P with the mean W of the picture and the prior's spectrum P. The square of the
+    deviation has the mean 1 - S / (S + 1) weighted by P, and is larger where the frame tells less.
+
+    Shapes: as `restore.wiener`; maps (9 channels + 5, y, x).
+    Units:  as `restore.wiener`; the maps none.
+    Error:  as `restore.wiener`; the deviation leaves out light from beyond the frame and errors of
+            PSF and glare, so that behind masks the true error was 10 to 30 times as large: it
+            orders pixels, no more.
+    Raises: ValueError as `restore.wiener`.
+    Source: as `restore.wiener`; the maps are ours.
+    """
+    electrons, light = single(electrons), LaserLight(glare, nearby, ghosts)
+    view = View(psf, illuminant, responses, bands)
+    settings = Settings(balance, read_noise, doubt, least_doubt)
+    return facts(pose(electrons, clipped, view, light, settings))
+
+
+@filter_facts.check
+def _(result: FilterFacts, *inputs: Any, **params: Any) -> list[Check]:
+    largest = float(result.maps.abs().max())
+    return [Check(f"maps of the filter up to {largest:.3g}", largest < float("inf"))]
+
+
+def facts(scaled: Scaled) -> FilterFacts:
+    """Return the answer of a posed deconvolution and its maps."""
+    problem, scale = scaled.problem, scaled.scale / scaled.share
+    spectrum = most_likely(problem)
+    answer = problem.first(spectrum)
+    deviation_and_maps = maps(problem, answer, answer + scaled.mean / scale, problem.blur(spectrum))
+    return FilterFacts(answer, *deviation_and_maps, scale, scaled.mean)
+
+
+def maps(
+    problem: Blurred, answer: Tensor, brightness: Tensor, blurred: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the predicted deviation and all maps of an answer, its value above black, and its
+    blur by the camera.
+    """
+    unclipped = (problem.weight > 0).to(answer)
+    # the slope of sqrt is infinite at 0
+    root = torch.where(problem.weight > 0, problem.weight, 1.0).sqrt() * unclipped
+    free = len(problem.glare) - problem.bounded
+    glare = sum(problem.glare[:free], torch.zeros_like(answer))
+    doubt = sum((mode.square() for mode in problem.glare[free:]), torch.zeros_like(answer))
+    deviation, octaves = _predicted(problem, problem.weight / (1.0 + problem.weight * doubt))
+    channel_maps = [
+        answer,
+        brightness.sign() * brightness.abs().clamp_min(1e-12).pow(_GAMMA),
+        problem.picture.asinh(),
+        (root * (problem.picture - blurred)).asinh(),
+        problem.weight.log1p() / 10.0,
+        unclipped,
+        (_BRIGHT / glare.detach().amax().clamp_min(1e-30) * glare).asinh() / 5.0,
+        (100.0 * doubt).log1p() / 10.0,
+        deviation.log() / 5.0,
+    ]
+    return deviation, torch.cat([*channel_maps, octaves])
+
+
+def _predicted(problem: Blurred, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the deviation of the answer from the scene that the filter expects, and a map for each
+    octave.
+
+    The mean square over the frame follows from the share of each frequency that the frame tells. It
+    is divided over the pixels by the inverse of 1 + I, where I is the diagonal of B' W B: a pixel
+    behind a clipped one is less certain.
+    """
+    gain = problem.transfer.abs().square() * weight.mean((-2, -1), keepdim=True) * problem.power
+    untold = _whole_mean(problem.power / (1.0 + gain), problem.torus) / _whole_mean(
+        problem.power, problem.torus
+    )
+    information = _information(problem, weight)
+    uneven = (1.0 + information.mean((-2, -1), keepdim=True)) / (1.0 + information)
+    return (untold * uneven).clamp(1e-6, 1.0).sqrt(), _octaves(gain / (1.0 + gain), problem)
+
+
+def _whole_mean(half: Tensor, size: tuple[int, int]) -> Tensor:
+    """Return the means over whole spectra (..., 1, 1), given their halves."""
+    return (variance(half, size))[..., None, None]
+
+
+def _information(problem: Blurred, weight: Tensor) -> Tensor:
+    """Return the diagonal of B' W B for the blur B: the information of the frame on each pixel
+    of the scene.
+    """
+    squared = torch.fft.rfft2(torch.fft.irfft2(problem.transfer, s=problem.torus).square())
+    information: Tensor = torch.fft.irfft2(
+        squared.conj() * torch.fft.rfft2(weight, s=problem.torus), s=problem.torus
+    )
+    return information[..., : problem.picture.shape[-2], : problem.picture.shape[-1]].clamp_min(0.0)
+
+
+def _octaves(shares: Tensor, problem: Blurred) -> Tensor:
+    """Return for each octave of frequency a map of the mean of the shares (channel, fy, fx)."""
+    mean_share = shares.mean(0)
+    rows = torch.fft.fftfreq(problem.torus[0], dtype=mean_share.dtype, device=mean_share.device)
+    columns = torch.fft.rfftfreq(problem.torus[1], dtype=mean_share.dtype, device=mean_share.device)
+    octave = (
+        (-torch.hypot(rows[:, None], columns).clamp(1e-9, 0.5).log2() - 1.0)
+        .floor()
+        .clamp_max(_OCTAVES - 1)
+    )
+    means = torch.stack(
+        [
+            mean_share[octave == k].mean() if (octave == k).any() else mean_share.mean()
+            for k in range(_OCTAVES)
+        ]
+    )
+    return means[:, None, None].expand(_OCTAVES, *problem.picture.shape[-2:])

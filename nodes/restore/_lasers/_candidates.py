@@ -1,4 +1,4 @@
-"""Where a pattern may lie: its likelihood at every place of the frame at once, by fast correlations."""
+"""Where a pattern may lie: its likelihood at every place, and the best place near one."""
 
 from __future__ import annotations
 
@@ -10,9 +10,16 @@ import torch
 from torch import Tensor
 
 from neusee.nodes.optics import psf as focus
-from neusee.nodes.restore._lasers._line_pattern import Lens, index_at, response_at
+from neusee.nodes.restore._lasers._components import NANOMETRE, Camera
+from neusee.nodes.restore._lasers._joint_fit import Data
+from neusee.nodes.restore._lasers._line_pattern import Lens, grid_patterns, index_at, response_at
 from neusee.nodes.restore._lasers._whitening import Filter, Weights, fast_size
 from neusee.nodes.values import Bands, Pupil
+
+# --- candidates -----------------------------------------------------------------------------------
+
+# Where a pattern may lie: its likelihood at every place of the frame at once, by fast correlations.
+
 
 _STEP = 5e-9  #: m between the wavelengths that are tried
 _REACH = 192  #: pixels from the spot, as far as a pattern is compared before it is fitted
@@ -30,7 +37,9 @@ class Candidate(NamedTuple):
 
 
 class Templates(NamedTuple):
-    """Patterns on the axis, in windows of odd sides about the spot, with the response of each channel to them."""
+    """Patterns on the axis, in windows of odd sides about the spot, with the response of each
+    channel to them.
+    """
 
     wavelengths: Tensor  #: (line,) float64, m; 0 for light of many wavelengths
     patterns: Tensor  #: (line, 1 or channel, y, x)
@@ -41,24 +50,35 @@ def line_templates(pupil: Pupil, responses: Tensor, bands: Bands, lens: Lens) ->
     """Return the patterns of spectral lines over the range of the bands."""
     low, high = float(bands.centres.min()), float(bands.centres.max())
     count = max(2, math.ceil((high - low) / _STEP) + 1)
-    at = torch.linspace(low, high, count, dtype=torch.float64)
-    heard = torch.stack([response_at(x, responses.cpu().double(), bands) for x in at])
-    at, heard = at[heard.amax(1) > 0.01 * heard.max()], heard[heard.amax(1) > 0.01 * heard.max()]
-    index = torch.stack([index_at(x, pupil) for x in at])
-    reach = float(at.min()) * lens.focal_length / (2 * float(pupil.pitch) * lens.pixel_pitch)
+    wavelengths = torch.linspace(low, high, count, dtype=torch.float64)
+    heard = torch.stack([response_at(x, responses.cpu().double(), bands) for x in wavelengths])
+    wavelengths, heard = (
+        wavelengths[heard.amax(1) > 0.01 * heard.max()],
+        heard[heard.amax(1) > 0.01 * heard.max()],
+    )
+    index = torch.stack([index_at(x, pupil) for x in wavelengths])
+    reach = (
+        float(wavelengths.min()) * lens.focal_length / (2 * float(pupil.pitch) * lens.pixel_pitch)
+    )
     sides = tuple(2 * min(n - 1, int(reach) - 1, _REACH) + 1 for n in lens.shape)
-    each = pupil._replace(wavelengths=at.to(pupil.wavelengths), index=index.to(pupil.index))
+    line_pupil = pupil._replace(
+        wavelengths=wavelengths.to(pupil.wavelengths), index=index.to(pupil.index)
+    )
     camera = {"focal_length": lens.focal_length, "pixel_pitch": lens.pixel_pitch, "shape": sides}
-    intensity = focus(each, sensor=lens.sensor, **camera).intensity
-    return Templates(at, intensity[:, None], heard)
+    intensity = focus(line_pupil, sensor=lens.sensor, **camera).intensity
+    return Templates(wavelengths, intensity[:, None], heard)
 
 
-def candidates(residual: Tensor, use: Filter, weights: Weights, templates: Templates, count: int) -> list[Candidate]:
-    """Return the most likely places and wavelengths of one more pattern in a filtered residual, the best first."""
+def candidates(
+    residual: Tensor, use: Filter, weights: Weights, templates: Templates, count: int
+) -> list[Candidate]:
+    """Return the most likely places and wavelengths of one more pattern in a filtered residual,
+    the best first.
+    """
     residual = residual.float()  # a start needs no more
     weights = Weights(*(x.float() for x in weights))
     white, frame = weights(residual), residual.shape[-2:]
-    found: list[Candidate] = []
+    peaks: list[Candidate] = []
     for line, pattern, heard in zip(*templates, strict=True):
         size = _size(frame, pattern)
         own = use.sharp(pattern.to(residual))
@@ -69,18 +89,26 @@ def candidates(residual: Tensor, use: Filter, weights: Weights, templates: Templ
             top, low = heard.to(residual)[:, None, None] * weights(white), by.square()
         product = _correlated(top, own, size).sum(0)
         norm = _correlated(low, own.square(), size).sum(0).clamp_min(0.0)
-        found += _peaks(_gain(product, norm), product / norm.clamp_min(1e-30), float(line), pattern, frame, count)
-    return _apart(sorted(found, reverse=True), count)
+        peaks += _peaks(
+            _gain(product, norm),
+            product / norm.clamp_min(1e-30),
+            float(line),
+            pattern,
+            frame,
+            count,
+        )
+    return _apart(sorted(peaks, reverse=True), count)
 
 
 def clipped_candidates(
     picture: Tensor, full: float, use: Filter, weights: Weights, templates: Templates, count: int
 ) -> list[Candidate]:
-    """Return candidates for a pattern that the sensor clips, in a frame with clipped pixels at ``full``.
+    """Return candidates for a pattern that the sensor clips, in a frame with clipped pixels at
+    ``full``.
 
-    Each pattern is so strong that as many of its pixels are clipped as in the frame, or `_MORE` times as many, of which
-    some lie beyond the frame. Each channel is clipped by itself: those that hardly see a wavelength show more of its
-    pattern.
+    Each pattern is so strong that as many of its pixels are clipped as in the frame, or `_MORE`
+    times as many, of which some lie beyond the frame. Each channel is clipped by itself: those that
+    hardly see a wavelength show more of its pattern.
     """
     clipped = int((picture >= 0.98 * full).any(0).sum())
     picture, frame = picture.float(), picture.shape[-2:]
@@ -88,19 +116,23 @@ def clipped_candidates(
     size = _size(frame, templates.patterns[0])
     pairs = list(itertools.combinations_with_replacement(range(len(picture)), 2))
     both = torch.fft.rfft2(weights.twice(use.sharp(picture)), s=size)
-    inverse = torch.fft.rfft2(torch.stack([weights.pair(*pair) * (1 + (pair[0] != pair[1])) for pair in pairs]), s=size)
-    found: list[Candidate] = []
-    for (line, pattern, heard), more in itertools.product(zip(*templates, strict=True), _MORE):
-        share, level = (heard / heard.max()).to(picture), _level(pattern, round(more * clipped))
+    inverse = torch.fft.rfft2(
+        torch.stack([weights.pair(*pair) * (1 + (pair[0] != pair[1])) for pair in pairs]), s=size
+    )
+    peaks: list[Candidate] = []
+    for (line, pattern, heard), margin in itertools.product(zip(*templates, strict=True), _MORE):
+        share, level = (heard / heard.max()).to(picture), _level(pattern, round(margin * clipped))
         own = use.sharp((share[:, None, None] * pattern.to(picture) / level).clamp_max(1.0))
-        squares = torch.stack([own[one] * own[other] for one, other in pairs])
+        squares = torch.stack([own[first] * own[other] for first, other in pairs])
         product, norm = (
             torch.fft.irfft2((data * torch.fft.rfft2(model, s=size).conj()).sum(0), s=size)
             for data, model in ((both, own), (inverse, squares))
         )
         strength = torch.full_like(norm, full / (level * float(heard.max())))
-        found += _peaks(_gain(product, norm.clamp_min(0.0)), strength, float(line), pattern, frame, count)
-    return _apart(sorted(found, reverse=True), count)
+        peaks += _peaks(
+            _gain(product, norm.clamp_min(0.0)), strength, float(line), pattern, frame, count
+        )
+    return _apart(sorted(peaks, reverse=True), count)
 
 
 def _size(frame: torch.Size, pattern: Tensor) -> list[int]:
@@ -117,7 +149,9 @@ def _level(pattern: Tensor, count: int) -> float:
 
 
 def _correlated(picture: Tensor, pattern: Tensor, size: list[int]) -> Tensor:
-    """Return the sum of picture x shifted pattern for every shift of the spot that lies in the frame or near it."""
+    """Return the sum of picture x shifted pattern for every shift of the spot that lies in the
+    frame or near it.
+    """
     product = torch.fft.rfft2(picture, s=size) * torch.fft.rfft2(pattern, s=size).conj()
     result: Tensor = torch.fft.irfft2(product, s=size)
     return result
@@ -133,22 +167,120 @@ def _peaks(
     )
     inside, sizes = gain[rows[:, None], columns], strength[rows[:, None], columns]
     best = torch.topk(inside.flatten(), min(3 * count, inside.numel()))
-    found = []
-    for value, at in zip(best.values.tolist(), best.indices.tolist(), strict=True):
-        y, x = divmod(at, frame[1])
-        found.append(Candidate(value, (y - frame[0] // 2, x - frame[1] // 2), line, float(sizes[y, x])))
-    return _apart(found, count)
+    spots = []
+    for value, index in zip(best.values.tolist(), best.indices.tolist(), strict=True):
+        y, x = divmod(index, frame[1])
+        spots.append(
+            Candidate(value, (y - frame[0] // 2, x - frame[1] // 2), line, float(sizes[y, x]))
+        )
+    return _apart(spots, count)
 
 
-def _apart(found: list[Candidate], count: int) -> list[Candidate]:
-    """Return the first candidates of a list that differ from all earlier ones in place or wavelength."""
-    kept: list[Candidate] = []
-    for one in found:
-        if len(kept) < count and all(_differ(one, other) for other in kept):
-            kept.append(one)
-    return kept
+def _apart(ranked: list[Candidate], count: int) -> list[Candidate]:
+    """Return the first candidates of a list that differ from all earlier ones in place or
+    wavelength.
+    """
+    distinct: list[Candidate] = []
+    for candidate in ranked:
+        if len(distinct) < count and all(_differ(candidate, other) for other in distinct):
+            distinct.append(candidate)
+    return distinct
 
 
 def _differ(a: Candidate, b: Candidate) -> bool:
     away = math.dist(a.spot, b.spot)
     return away > _APART[0] or abs(a.wavelength - b.wavelength) > _APART[1]
+
+
+# --- nearest --------------------------------------------------------------------------------------
+
+# Where around a rough candidate a pattern gains most, with the clipped pixels left out as in the
+# fit.
+
+
+#: pixels and nm around a candidate
+_HALVES, _NEAR = (-0.6, -0.3, 0.0, 0.3, 0.6), (-3.0, -1.5, 0.0, 1.5, 3.0)
+#: nm around a laser whose colours do not fit its wavelength
+FAR = tuple(1.5 * n for n in range(-10, 11))
+#: pixels around a tile, and of the tiles
+_COARSE, _TILES = (-0.5, 0.0, 0.5), (-3.0, -1.5, 0.0, 1.5, 3.0)
+_AROUND = 256  #: pixels a side of the window in which these are compared
+
+
+def nearest_of_many(camera: Camera, data: Data, residual: Tensor, start: Candidate) -> Candidate:
+    """Return the best candidate within 3.5 pixels and 3 nm of a rough one; ``residual`` is
+    filtered.
+
+    Clipped pixels tell the place of a wide pattern to a few pixels, and a pattern of fine rings
+    gains nothing where it is half a pixel off.
+    """
+    y, x = start.spot
+    tiles = [
+        start._replace(spot=(y + down, x + right))
+        for down, right in itertools.product(_TILES, _TILES)
+    ]
+    best = max(nearest(camera, data, residual, tile, halves=_COARSE) for tile in tiles)
+    return nearest(camera, data, residual, best)
+
+
+def nearest(
+    camera: Camera,
+    data: Data,
+    residual: Tensor,
+    start: Candidate,
+    *,
+    halves: tuple[float, ...] = _HALVES,
+    near: tuple[float, ...] = _NEAR,
+) -> Candidate:
+    """Return the best of the candidates around one, because the rings far from a clipped spot are
+    narrow.
+
+    Candidates are ``halves`` (pixels) away along y and along x, and ``near`` (nm); ``residual`` is
+    filtered. All channels count with the responses of the camera, so that a wrong wavelength gains
+    less than in a fit.
+    """
+    window, middle = _window(residual, start.spot)
+    local_filter = Filter(data.use.seen[..., *window], data.use.kernel)
+    within = Weights(*(x[..., *window] for x in data.weights))
+    white, best = within(residual[..., *window]), start._replace(gain=0.0)
+    lens = camera.lens._replace(shape=(white.shape[-2], white.shape[-1]))
+    down, right = (
+        torch.tensor(
+            [spot_place + half - m for half in halves], dtype=torch.float64, device=white.device
+        )
+        for spot_place, m in zip(start.spot, middle, strict=True)
+    )
+    for nm in near:
+        wavelength = torch.tensor(
+            start.wavelength + nm * NANOMETRE, dtype=torch.float64, device=white.device
+        )
+        heard = start.strength * response_at(wavelength, camera.responses, camera.bands).to(white)
+        patterns = grid_patterns(camera.pupil, down, right, wavelength, lens).to(white)
+        light = within(heard[:, None, None] * local_filter(patterns.flatten(0, 1)[:, None]))
+        product, norm = (
+            (light * white).sum((1, 2, 3)),
+            light.square().sum((1, 2, 3)).clamp_min(1e-30),
+        )
+        gain = 0.5 * product.clamp_min(0.0).square() / norm
+        n = int(gain.argmax())
+        if float(gain[n]) > best.gain:
+            y, x = divmod(n, len(halves))
+            spot = (start.spot[0] + halves[y], start.spot[1] + halves[x])
+            strength = max(float(product[n] / norm[n]), 0.01) * start.strength
+            best = Candidate(float(gain[n]), spot, float(wavelength), strength)
+    return best
+
+
+def _window(
+    frame: Tensor, spot: tuple[float, float]
+) -> tuple[tuple[slice, slice], tuple[int, int]]:
+    """Return the window of a frame around a spot that tells the candidates apart, and where its
+    middle lies.
+    """
+    window, middle = [], []
+    for n, spot_place in zip(frame.shape[-2:], spot, strict=True):
+        side = min(n, _AROUND)
+        first = min(max(round(spot_place) + n // 2 - side // 2, 0), n - side)
+        window.append(slice(first, first + side))
+        middle.append(first + side // 2 - n // 2)
+    return (window[0], window[1]), (middle[0], middle[1])

@@ -1,23 +1,198 @@
-"""What adds light to a frame beside the scene: a laser, of one spectral line, and a lamp, of light in many bands."""
+"""What adds light to a frame beside the scene: a laser of one line, a lamp of many bands."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from neusee.nodes.restore._lasers._lamp_light import LampLight, phases
-from neusee.nodes.restore._lasers._line_pattern import Lens, deviation, line_moves, line_pattern, response_at
-from neusee.nodes.values import Bands, Pupil
+from neusee.nodes.optics import psf as focus
+from neusee.nodes.restore._inverse._masked_blur import grey_shares
+from neusee.nodes.restore._lasers._line_pattern import (
+    Lens,
+    deviation,
+    line_moves,
+    line_pattern,
+    response_at,
+)
+from neusee.nodes.restore._lasers._whitening import fast_size
+from neusee.nodes.values import Bands, Psf, Pupil
+
+# --- lamp light -----------------------------------------------------------------------------------
+
+# The light that a point source of many wavelengths adds to each channel, over the whole frame.
+
+
+_TILT = 50e-9  #: m, the scale of the tilt and the bend of a lamp's spectrum
+_FINEST, _MOST = 4, 4096  #: samples a pixel, and samples a side of a pattern, at most
+#: pixels beyond the farthest of the frame, over which a pattern fades, for a step rings when it is
+#: moved
+_RIM = 10
+
+
+class LampLight(NamedTuple):
+    """Patterns of a point source of many wavelengths: even, tilted and bent spectra, as each
+    channel sees them.
+    """
+
+    #: (kind, channel, fy, fx), half spectra on a torus, with the spot in its first sample
+    spectra: Tensor
+    torus: tuple[int, int]  #: samples
+    finer: int  #: samples a pixel along each axis, enough for the finest detail of a pattern
+    #: (channel,), electrons of each channel from the illuminant, relative to the largest
+    colour: Tensor
+    patterns: Tensor  #: (channel, y, x) of the even spectrum, in pixels
+
+
+def lamp_light(
+    psf: Psf,
+    pupil: Pupil,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    lens: Lens,
+    kind: torch.dtype,
+) -> LampLight:
+    """Return what a lamp adds to each channel, from a spot anywhere in the frame to every pixel.
+
+    A lamp that clips the sensor adds light farther from its spot than the window of ``psf``
+    reaches, and its spot lies between pixels, where a pattern that is sampled by pixels cannot be
+    moved to. So the pattern is computed from ``pupil``, as that of a laser is, over the whole frame
+    and on a finer grid. What ``psf`` has beyond it within its window, such as stray light, is
+    added.
+    """
+    kinds = _kinds(illuminant, responses, bands).to(psf.intensity.device, kind)
+    finer, (y, x) = _finer(pupil, lens), (lens.shape[0] + _RIM, lens.shape[1] + _RIM)
+    torus = (fast_size(2 * y + 1), fast_size(2 * x + 1))  # pixels
+    fine = (finer * torus[0], finer * torus[1])
+    spectra = torch.fft.rfft2(_fine_patterns(kinds, pupil, lens, finer), s=fine)
+    spectra = spectra * phases(fine, torch.tensor([-float(finer * y), -float(finer * x)]).to(kinds))
+    spectra = spectra * _pixel(fine, finer, lens).to(kinds)
+    coarse = torch.fft.irfft2(spectra, s=fine)[..., ::finer, ::finer].roll((y, x), (-2, -1))
+    coarse = coarse[..., : 2 * y + 1, : 2 * x + 1]
+    beyond = _beyond_pupil(torch.einsum("kcb,byx->kcyx", kinds, psf.intensity.to(kinds)), coarse)
+    back = phases(torus, torch.tensor([-float(y), -float(x)]).to(kinds))
+    spectra = spectra + _between_pixels(torch.fft.rfft2(beyond, s=torus) * back, torus, finer)
+    heard = (responses.cpu().double() * illuminant.cpu().double() * bands.centres.cpu()).sum(-1)
+    return LampLight(spectra, fine, finer, (heard / heard.max()).to(kinds), (coarse + beyond)[0])
+
+
+def phases(torus: tuple[int, int], move: Tensor) -> Tensor:
+    """Return the factor of a half spectrum that moves a picture by (y, x) samples."""
+    y, x = torus
+    fy, fx = torch.fft.fftfreq(y).to(move), torch.fft.rfftfreq(x).to(move)
+    turns = fy[:, None] * move[0] + fx * move[1]
+    return torch.polar(torch.ones_like(turns), -2 * torch.pi * turns)
+
+
+def _kinds(illuminant: Tensor, responses: Tensor, bands: Bands) -> Tensor:
+    """Return the share of each band in each channel for the three kinds of spectra: (kind,
+    channel, band).
+    """
+    shares, centres = grey_shares(illuminant, responses, bands), bands.centres.cpu()
+    tilt = (centres - (shares * centres).sum(-1, keepdim=True)) / _TILT
+    return torch.stack([shares, shares * tilt, shares * tilt.square()])
+
+
+def _finer(pupil: Pupil, lens: Lens) -> int:
+    """Return how many samples a pixel the finest fringe of the lens asks for, within limits of
+    time and memory.
+    """
+    width = max(int((pupil.aperture.amax(axis) > 0).sum()) for axis in (0, 1)) * float(pupil.pitch)
+    needed = 2.0 * lens.pixel_pitch * width / (float(pupil.wavelengths.min()) * lens.focal_length)
+    return max(1, min(math.ceil(needed), _FINEST, _MOST // (2 * max(lens.shape) + 1)))
+
+
+def _fine_patterns(kinds: Tensor, pupil: Pupil, lens: Lens, finer: int) -> Tensor:
+    """Return the patterns (kind, channel, y, x) with the spot in the middle sample, as the light
+    in each sample.
+    """
+    sides = tuple(2 * finer * (n + _RIM) + 1 for n in lens.shape)
+    pitch = lens.pixel_pitch / finer
+    total = torch.zeros(*kinds.shape[:2], *sides).to(kinds)
+    for band in range(kinds.shape[-1]):
+        band_pupil = pupil._replace(
+            wavelengths=pupil.wavelengths[band][None], index=pupil.index[band][None]
+        )
+        # samples
+        free = float(band_pupil.wavelengths[0]) * lens.focal_length / (float(pupil.pitch) * pitch)
+        shape = tuple(min(side, 2 * max(int(free / 2) - 1, 0) + 1) for side in sides)
+        camera = {"focal_length": lens.focal_length, "pixel_pitch": pitch, "sensor": lens.sensor}
+        light = _framed(focus(band_pupil, shape=shape, **camera).intensity[0].to(kinds), sides)
+        total += kinds[:, :, band, None, None] * light
+    down, right = (_fading(n, finer).to(kinds) for n in lens.shape)
+    return total * down[:, None] * right
+
+
+def _fading(pixels: int, finer: int) -> Tensor:
+    """Return the factor of the samples along one axis, 1 as far as the frame reaches from any
+    spot in it.
+    """
+    away = torch.arange(-finer * (pixels + _RIM), finer * (pixels + _RIM) + 1).abs() / finer
+    return 0.5 + 0.5 * torch.cos(torch.pi * ((away - pixels - 1) / (_RIM - 1)).clamp(0.0, 1.0))
+
+
+def _pixel(fine: tuple[int, int], finer: int, lens: Lens) -> Tensor:
+    """Return the factor of a half spectrum of the light in samples that makes it the light in
+    the pixel around each.
+    """
+    if lens.sensor != "integrated":  # a pixel has the light of its middle, times its area
+        return torch.tensor(float(finer**2))
+    steps = torch.arange(finer, dtype=torch.float64) - (finer - 1) / 2
+    fy, fx = torch.fft.fftfreq(fine[0]).double(), torch.fft.rfftfreq(fine[1]).double()
+    y, x = (torch.cos(2 * torch.pi * f[:, None] * steps).sum(1) for f in (fy, fx))
+    return y[:, None] * x
+
+
+def _beyond_pupil(inner: Tensor, coarse: Tensor) -> Tensor:
+    """Return what patterns have in their window beyond others of odd sides, in the size of the
+    latter.
+    """
+    sides = coarse.shape[-2:]
+    inside = _framed(torch.ones_like(inner), sides) > 0
+    return torch.where(inside, _framed(inner, sides) - coarse, 0.0)
+
+
+def _between_pixels(spectra: Tensor, torus: tuple[int, int], finer: int) -> Tensor:
+    """Return half spectra of pictures in pixels as those of the smoothest pictures on the finer
+    grid.
+    """
+    (y, x), some = torus, (torus[1] + 1) // 2
+    wide = spectra.new_zeros(*spectra.shape[:-2], finer * y, finer * x // 2 + 1)
+    wide[..., : (y + 1) // 2, :some] = spectra[..., : (y + 1) // 2, :some]
+    wide[..., finer * y - (y - 1) // 2 :, :some] = spectra[..., y - (y - 1) // 2 :, :some]
+    return wide * finer**2
+
+
+def _framed(picture: Tensor, sides: tuple[int, ...]) -> Tensor:
+    """Return pictures (..., y, x), cropped or continued with 0, whose middle pixel stays in the
+    middle.
+    """
+    rims = []
+    # `pad` counts from the last axis
+    for n, side in zip(picture.shape[:-3:-1], sides[::-1], strict=True):
+        rims += [side // 2 - n // 2, side - side // 2 - (n - n // 2)]
+    return pad(picture, rims)
+
+
+# --- components -----------------------------------------------------------------------------------
+
+# What adds light to a frame beside the scene: a laser, of one spectral line, and a lamp, of light
+# in many bands.
+
 
 NANOMETRE = 1e-9
-_WIDTH = 0.5  #: nm^2, standard deviation of the variance of a line, or that variance itself where it is more
+#: nm^2, standard deviation of the variance of a line, or that variance itself where it is more
+_WIDTH = 0.5
 _WIDEST = 50.0  #: nm^2, most that is added to the variance of a line
 _KNOWN = 0.03  #: relative standard deviation of the response of a channel to one line
-_BLIND = 0.003  #: the same as a share of the largest response, for a channel that hardly sees the line
+#: the same as a share of the largest response, for a channel that hardly sees the line
+_BLIND = 0.003
 
 
 class Camera(NamedTuple):
@@ -32,11 +207,13 @@ class Camera(NamedTuple):
 
 @dataclass(frozen=True)
 class Laser:
-    """A laser: place (y, x) of the spot in pixels from the middle, wavelength in nm, strength, width, errors."""
+    """A laser: place (y, x) of the spot in pixels from the middle, wavelength in nm, strength,
+    width, errors.
+    """
 
     camera: Camera
-    #: (5 + channel,): y, x, nm, electrons at response 1, nm^2 of the variance of the line beyond that of the camera's
-    #: ``fwhm``, and the errors of the responses over their spread
+    #: (5 + channel,): y, x, nm, electrons at response 1, nm^2 of the variance of the line beyond
+    #: that of the camera's ``fwhm``, and the errors of the responses over their spread
     values: Tensor
 
     @property
@@ -64,35 +241,49 @@ class Laser:
         return self.values[3] * (heard + spread * self.values[5:])
 
     def columns(self, of: Callable[[Tensor], Tensor]) -> Tensor:
-        """Return ``of`` of the change of the light for a unit change of each value: (value, channel, ...).
+        """Return ``of`` of the change of the light for a unit change of each value: (value,
+        channel, ...).
 
-        ``of`` is linear, treats each channel by itself, and takes pictures (picture, 1 or channel, y, x).
+        ``of`` is linear, treats each channel by itself, and takes pictures (picture, 1 or channel,
+        y, x).
         """
-        seen = of(self._slopes()[:, None])  # one picture for all channels before, one for each after
-        ones = (1,) * (seen.ndim - 2)
+        # one picture for all channels before, one for each after
+        filtered = of(self._slopes()[:, None])
+        ones = (1,) * (filtered.ndim - 2)
         channels = self.channels().view(-1, *ones)
         heard, spread = self._response(self.values[2])
-        wave = channels * seen[3] + self._response_slope().view(-1, *ones) * seen[0]
-        columns = [channels * seen[1], channels * seen[2], wave, (channels / self.values[3].clamp_min(1e-9)) * seen[0]]
-        columns.append(channels * seen[4])
+        wave = channels * filtered[3] + self._response_slope().view(-1, *ones) * filtered[0]
+        columns = [
+            channels * filtered[1],
+            channels * filtered[2],
+            wave,
+            (channels / self.values[3].clamp_min(1e-9)) * filtered[0],
+        ]
+        columns.append(channels * filtered[4])
         for i in range(len(heard)):
-            one = torch.zeros_like(heard)
-            one[i] = self.values[3] * spread[i]
-            columns.append(one.view(-1, *ones) * seen[0])
+            unit = torch.zeros_like(heard)
+            unit[i] = self.values[3] * spread[i]
+            columns.append(unit.view(-1, *ones) * filtered[0])
         return torch.stack(columns)
 
     def _slopes(self) -> Tensor:
-        """Return the pattern and its change with y, x (pixels), wavelength (nm) and variance (nm^2): (5, y, x)."""
-        camera, at = self.camera, self.values[:3].double()
-        moves = line_moves(camera.pupil, at[:2], at[2] * NANOMETRE, camera.lens, self.fwhm)
+        """Return the pattern and its change with y, x (pixels), wavelength (nm) and variance
+        (nm^2): (5, y, x).
+        """
+        camera, place = self.camera, self.values[:3].double()
+        moves = line_moves(camera.pupil, place[:2], place[2] * NANOMETRE, camera.lens, self.fwhm)
         moves = moves._replace(wave=moves.wave * NANOMETRE, blur=moves.blur * NANOMETRE**2)
         return torch.stack(list(moves)).to(self.values)
 
     def moved(self, step: Tensor) -> Laser:
-        """Return the laser after a step, which stays in the range of the bands and near the frame."""
+        """Return the laser after a step, which stays in the range of the bands and near the
+        frame.
+        """
         centres, shape = self.camera.bands.centres / NANOMETRE, self.camera.lens.shape
-        most = torch.tensor([1.0, 1.0, 5.0]).to(step)
-        step = torch.cat([torch.maximum(torch.minimum(step[:3], most), -most), step[3:]])
+        longest_step = torch.tensor([1.0, 1.0, 5.0]).to(step)
+        step = torch.cat(
+            [torch.maximum(torch.minimum(step[:3], longest_step), -longest_step), step[3:]]
+        )
         values = self.values + step
         for i in range(2):
             values[i] = values[i].clamp(-0.5 * shape[i] - 1, 0.5 * shape[i] + 1)
@@ -102,7 +293,9 @@ class Laser:
         return replace(self, values=values)
 
     def channel_slopes(self) -> Tensor:
-        """Return the change of the electrons of each channel for a unit change of each value: (channel, value)."""
+        """Return the change of the electrons of each channel for a unit change of each value:
+        (channel, value).
+        """
         heard, spread = self._response(self.values[2])
         slopes = torch.zeros(len(heard), len(self.values)).to(self.values)
         slopes[:, 2] = self._response_slope()
@@ -118,17 +311,19 @@ class Laser:
         ends = [self._response(self.values[2] + sign)[0] for sign in (1, -1)]
         return self.values[3] * (ends[0] - ends[1]) / 2.0
 
-    def _pattern(self, at: Tensor) -> Tensor:
+    def _pattern(self, place: Tensor) -> Tensor:
         lens = self.camera.lens
-        at = at.double()  # phases need that
-        towards = at[:2] * (lens.pixel_pitch / lens.focal_length)
-        pattern = line_pattern(self.camera.pupil, towards, at[2] * NANOMETRE, lens, self.fwhm)
+        place = place.double()  # phases need that
+        towards = place[:2] * (lens.pixel_pitch / lens.focal_length)
+        pattern = line_pattern(self.camera.pupil, towards, place[2] * NANOMETRE, lens, self.fwhm)
         return pattern.to(self.values)
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """A lamp: place (y, x) of its spot in pixels from the middle, and electrons in each channel by kind of spectrum."""
+    """A lamp: place (y, x) of its spot in pixels from the middle, and electrons in each channel
+    by kind of spectrum.
+    """
 
     light: LampLight
     shape: tuple[int, int]
@@ -144,24 +339,31 @@ class Lamp:
         return self._pictures(self._spectra())
 
     def columns(self, of: Callable[[Tensor], Tensor]) -> Tensor:
-        """Return ``of`` of the change of the light for a unit change of each value: (value, channel, ...).
+        """Return ``of`` of the change of the light for a unit change of each value: (value,
+        channel, ...).
 
-        ``of`` is linear, treats each channel by itself, and takes pictures (picture, channel, y, x).
+        ``of`` is linear, treats each channel by itself, and takes pictures (picture, channel, y,
+        x).
         """
         kinds, channels = self.light.spectra.shape[:2]
-        seen = of(torch.stack([self._pictures(each) for each in self._slopes()]))
-        amounts = seen.new_zeros(kinds * channels, *seen.shape[1:])
+        filtered = of(torch.stack([self._pictures(slope) for slope in self._slopes()]))
+        amounts = filtered.new_zeros(kinds * channels, *filtered.shape[1:])
         for k in range(kinds):
             for c in range(channels):
-                amounts[k * channels + c, c] = seen[2 + k, c]
-        return torch.cat([seen[:2], amounts])
+                amounts[k * channels + c, c] = filtered[2 + k, c]
+        return torch.cat([filtered[:2], amounts])
 
     def _slopes(self) -> Iterator[Tensor]:
-        """Yield the spectra of the changes with y, x (pixels) and each kind, one after another to save memory."""
-        (y, x), whole = self.light.torus, self._spectra()
-        fy, fx = torch.fft.fftfreq(y).to(self.values)[:, None], torch.fft.rfftfreq(x).to(self.values)
+        """Yield the spectra of the changes with y, x (pixels) and each kind, one after another
+        to save memory.
+        """
+        (y, x), spectra = self.light.torus, self._spectra()
+        fy, fx = (
+            torch.fft.fftfreq(y).to(self.values)[:, None],
+            torch.fft.rfftfreq(x).to(self.values),
+        )
         for frequency in (fy, fx):
-            yield -2j * torch.pi * self.light.finer * frequency * whole
+            yield -2j * torch.pi * self.light.finer * frequency * spectra
         for kind in self.light.spectra:
             yield kind * self._phase()
 
@@ -183,5 +385,5 @@ class Lamp:
     def _pictures(self, spectra: Tensor) -> Tensor:
         step, (y, x) = self.light.finer, self.light.torus
         rows = torch.fft.ifft(spectra, n=y, dim=-2)[..., : step * self.shape[0] : step, :]
-        whole: Tensor = torch.fft.irfft(rows, n=x, dim=-1)
-        return whole[..., : step * self.shape[1] : step]
+        wide: Tensor = torch.fft.irfft(rows, n=x, dim=-1)
+        return wide[..., : step * self.shape[1] : step]

@@ -1,33 +1,136 @@
-"""The node that finds lasers in one frame of a known camera, without any knowledge of the lasers."""
+"""The nodes that find lasers in a frame of a known camera, and the glare of those found."""
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
 import torch
 from pydantic import Field
-from torch import Tensor
+from torch import Generator, Tensor
 
 from neusee.nodes import Check, ParameterError, node
-from neusee.nodes._half_precision import refuse_not_finite
+from neusee.nodes.precision import refuse_not_finite, single
+from neusee.nodes.restore._inverse._glare import Patterns
 from neusee.nodes.restore._inverse._wiener import refuse_other_pictures
-from neusee.nodes.restore._lasers._beyond_scatter import without_scattered
 from neusee.nodes.restore._lasers._candidates import line_templates
-from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Laser
-from neusee.nodes.restore._lasers._greedy_search import Found, Known, search
-from neusee.nodes.restore._lasers._intervals import NORMAL, spreads
-from neusee.nodes.restore._lasers._lamp_light import lamp_light
-from neusee.nodes.restore._lasers._line_pattern import Lens, Sensor
-from neusee.nodes.restore._lasers._lost_light import at_the_aperture
+from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Laser, lamp_light
+from neusee.nodes.restore._lasers._greedy_search import Found, Known, search, without_scattered
+from neusee.nodes.restore._lasers._joint_fit import NORMAL, spreads
+from neusee.nodes.restore._lasers._line_pattern import Lens, Sensor, line_pattern
 from neusee.nodes.units import Electrons, FocalLength, PixelPitch, PositiveLength, Ratio
 from neusee.nodes.values import Bands, FoundLasers, Psf, Pupil
 
+# --- lost light -----------------------------------------------------------------------------------
+
+# The light of a laser at the aperture, from the light that follows its pattern: dirt scatters and
+# absorbs the rest.
+#
+# No lens is as its recipe says. Dust, scratches, grease, dents and defocus take light out of the
+# pattern, and what they scatter makes the frame differ from the pattern. A fit then finds less
+# light in the pattern, and even less where bright pixels are clipped, because the pixels that are
+# seen are those that happen to be dark. The same difference makes the electrons of a fit scatter
+# more between parts of the frame than noise and scene do, and so tells of the light that is lost.
+#
+# The law: every second lens is as its recipe says. In the others the logarithm of light at the
+# aperture over light that follows the pattern is lognormal, about a power of that scatter and an
+# exponential of the clipped share. Power, exponential and width were learnt from fits in frames of
+# lenses with the dirt of `recipes/flare/dirty_windshield.yaml` (dust, scratches, grease and dents,
+# each 3 to 100 % of it) and the defocus of `recipes/mismatch/usual.yaml`. An even attenuation, as
+# by smudges, changes no pattern and is not part of it.
+
+
+#: growth of a standard deviation by the scatter of a residual, up to which a clean lens explains it
+_PLAIN = 1.05
+#: pixels a side of the frame for which a scatter counts, and of the largest frame of which all
+#: pixels tell of it
+_SIDE, _MOST = 64, 128
+#: relative scatter of electrons behind a dirty lens: median, factor of one deviation
+_USUAL, _FACTOR = 0.004, 2.0
+#: of the median logarithm that is lost: its value at scatter 1, the power of scatter, and its
+#: growth with clipping
+_LOST, _POWER, _CLIPPED = 2.10, 0.74, 2.15
+#: standard deviations of the logarithm of it, where the frame tells the scatter, and where not
+_WIDTHS = (0.7, 1.2)
+_ALL = 10.0  #: logarithm, beyond which nothing of a laser follows its pattern
+_NODES = 256  #: quantiles that stand for a law
+_ENDS = (0.5, 0.05, 0.95)  #: probabilities of an estimate and of the ends of a 90 % interval
+_HALVINGS = 60
+
+
+def at_the_aperture(
+    straight: Tensor, spread: Tensor, ideal: Tensor, unclipped: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the electrons that a laser would leave behind a clean lens, and the ends of a 90 %
+    interval.
+
+    ``straight`` are those that follow the pattern, with the standard deviation ``spread``; that of
+    a lens which is as its recipe says would be ``ideal``.
+
+    Shapes: each (channel,), seen (channel, y, x), 0 for clipped pixels -> (channel,), (channel, 2).
+    Units:  e-.
+    """
+    # the scatter is a mean over the frame, so that it falls as 1 / side
+    side = min(unclipped[0].numel() ** 0.5, _MOST)
+    clipped = 1.0 - unclipped.mean((-2, -1)).to(straight)
+    size = torch.maximum(straight, spread).clamp_min(1e-30) * (_SIDE / side)
+    scatter = (spread.square() - ideal.square()).clamp_min(0.0).sqrt() / size
+    faint = math.sqrt(_PLAIN**2 - 1.0) * ideal / size
+    measurable = scatter > faint
+    hidden = torch.special.ndtr((faint / _USUAL).log() / math.log(_FACTOR))
+    dirty = torch.ones_like(size) if bool(measurable.any()) else hidden / (1.0 + hidden)
+    scatter = torch.where(measurable, scatter, faint.clamp_max(_USUAL))
+    width = torch.where(measurable, _WIDTHS[0], _WIDTHS[1])
+    middle = math.log(_LOST) + _POWER * scatter.log() + _CLIPPED * clipped
+    lost = torch.exp(middle[:, None] + width[:, None] * _normal_quantiles().to(size)).clamp_max(
+        _ALL
+    )
+    return _quantiles(straight, spread, lost, dirty)
+
+
+def _normal_quantiles() -> Tensor:
+    quantiles: Tensor = torch.special.ndtri(
+        (torch.arange(_NODES, dtype=torch.float64) + 0.5) / _NODES
+    )
+    return quantiles
+
+
+def _quantiles(
+    straight: Tensor, spread: Tensor, lost: Tensor, dirty: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the median and a 90 % interval of straight light with its error, times the exponential
+    of what is lost.
+
+    ``lost`` (channel, node) are equally likely values for a dirty lens, ``dirty`` (channel,) is its
+    probability.
+    """
+    strengths = straight[:, None] * torch.cat([torch.ones_like(lost[:, :1]), lost.exp()], 1)
+    weight = torch.cat([1.0 - dirty[:, None], (dirty / lost.shape[1])[:, None].expand_as(lost)], 1)
+    probabilities = torch.tensor(_ENDS).to(strengths).expand(len(strengths), -1)
+    low = (strengths.amin(1) - 8.0 * spread)[:, None].expand_as(probabilities)
+    high = (strengths.amax(1) + 8.0 * spread)[:, None].expand_as(probabilities)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        below = torch.special.ndtr(
+            (middle[..., None] - strengths[:, None]) / spread.clamp_min(1e-30)[:, None, None]
+        )
+        short = (weight[:, None] * below).sum(-1) < probabilities
+        low, high = torch.where(short, middle, low), torch.where(short, high, middle)
+    return high[:, 0], high[:, 1:]
+
+
+# --- find lasers ----------------------------------------------------------------------------------
+
+# The node that finds lasers in one frame of a known camera, without any knowledge of the lasers.
+
+
 _WIDEST = (0.5, 10.0)  #: pixels and nm; half of a wider interval does not identify
-_RIVAL = 5.0  #: log likelihood by which the fit exceeds one at another place or wavelength, to identify
+#: log likelihood by which the fit exceeds one at another place or wavelength, to identify
+_RIVAL = 5.0
 _CHANNELS, _SMALLEST = (1, 3), 20
 _COLOURS = (
-    "lasers are found in a frame of 3 colour channels (3, y, x), or of one: give such a camera, or restore without a "
-    "search, as `restore=wiener_blind` does"
+    "lasers are found in a frame of 3 colour channels (3, y, x), or of one: give such a camera, or"
+    " restore without a search, as `restore=wiener_blind` does"
 )
 _PRECISE = 256  #: pixels a side, up to which all is computed in float64
 
@@ -55,40 +158,45 @@ def find_lasers(
     least: Ratio = 40.0,
     margin: Annotated[float, Field(ge=0, lt=1)] = 0.02,
 ) -> FoundLasers:
-    """Find the lasers in one frame: their number, and direction, wavelength and strength of each, with intervals.
+    """Find the lasers in one frame: their number, and direction, wavelength and strength of each,
+    with intervals.
 
-    The camera is known and the lasers are not. The pattern of a spectral line at every place and wavelength is compared
-    with the frame, which a short filter has made nearly white: the scene counts as a random picture whose details
-    are as strong as those around each pixel. The values of clipped pixels are not used; their number and places say
-    where a fit begins. The best candidates are fitted with a free response of each channel (3 %), and with each of the
-    ``widths`` (full width at half maximum) of a line. A laser must gain ``least`` of log likelihood, and at least
-    ``margin`` of its gain beyond that of a lamp, a point source whose spectrum is smooth. The pattern of a lamp comes
-    from the pupil too, for any place between pixels and over the whole frame; what ``psf`` has beyond it, such as stray
-    light, is added. All lasers and lamps are fitted at once, and the search goes on in the rest. At the end a laser
-    that does not gain ``least`` beside the likeliest speckle of stronger ones, which a dirty lens scatters, is left
+    The camera is known and the lasers are not. The pattern of a spectral line at every place and
+    wavelength is compared with the frame, which a short filter has made nearly white: the scene
+    counts as a random picture whose details are as strong as those around each pixel. The values of
+    clipped pixels are not used; their number and places say where a fit begins. The best candidates
+    are fitted with a free response of each channel (3 %), and with each of the ``widths`` (full
+    width at half maximum) of a line. A laser must gain ``least`` of log likelihood, and at least
+    ``margin`` of its gain beyond that of a lamp, a point source whose spectrum is smooth. The
+    pattern of a lamp comes from the pupil too, for any place between pixels and over the whole
+    frame; what ``psf`` has beyond it, such as stray light, is added. All lasers and lamps are
+    fitted at once, and the search goes on in the rest. At the end a laser that does not gain
+    ``least`` beside the likeliest speckle of stronger ones, which a dirty lens scatters, is left
     out. Intervals (90 %) come from the second derivatives and the scatter of the residual.
 
-    The strength counts all light at the aperture, as in a recipe. Dirt, edges and defocus take part of it out of the
-    pattern; the scatter of the residual tells how much that may be, by a law that was learnt from the dirt of
-    `recipes/flare/dirty_windshield.yaml`. An even attenuation is not told from a weaker laser.
+    The strength counts all light at the aperture, as in a recipe. Dirt, edges and defocus take part
+    of it out of the pattern; the scatter of the residual tells how much that may be, by a law that
+    was learnt from the dirt of `recipes/flare/dirty_windshield.yaml`. An even attenuation is not
+    told from a weaker laser.
 
-    In a frame of one channel nothing but the scale of a pattern tells its wavelength, and nothing but its sharpness
-    tells a laser from a lamp.
+    In a frame of one channel nothing but the scale of a pattern tells its wavelength, and nothing
+    but its sharpness tells a laser from a lamp.
 
-    Shapes: electrons and clipped (channel, y, x) of 1 or 3 channels, psf.intensity (band, any, any), pupil,
-            illuminant (band,), responses (channel, band), bands -> FoundLasers of ``most`` rows.
+    Shapes: electrons and clipped (channel, y, x) of 1 or 3 channels, psf.intensity (band, any,
+            any), pupil, illuminant (band,), responses (channel, band), bands -> FoundLasers of
+            ``most`` rows.
     Units:  electrons e-; direction rad; wavelength and widths m; strength e-; gain none.
-    Error:  in frames of more than 256 pixels a side float32 rounds the fit. A light that is narrow but no laser, such
-            as a light-emitting diode, may be taken for one. A laser that changes no pixel that is seen is not found.
-            Two lasers within 2 pixels and 25 nm count as one. The responses are linear between the bands. The
-            pattern of a lamp has at most 4 samples along a pixel and 4096 a side: where the lens draws finer fringes,
-            a lamp between pixels is not exact.
-            `recipes/guide/found_lasers.md` has measured rates and coverage.
-    Raises: ValueError for other numbers of channels, frames of fewer than 20 pixels a side, inputs of different
-            channels, bands or pixels, and values that are not finite.
+    Error:  in frames of more than 256 pixels a side float32 rounds the fit. A light that is narrow
+            but no laser, such as a light-emitting diode, may be taken for one. A laser that changes
+            no pixel that is seen is not found. Two lasers within 2 pixels and 25 nm count as one.
+            The responses are linear between the bands. The pattern of a lamp has at most 4 samples
+            along a pixel and 4096 a side: where the lens draws finer fringes, a lamp between pixels
+            is not exact. `recipes/guide/found_lasers.md` has measured rates and coverage.
+    Raises: ValueError for other numbers of channels, frames of fewer than 20 pixels a side, inputs
+            of different channels, bands or pixels, and values that are not finite.
     Gradient: none, because a search chooses between candidates.
-    Source: matched filter as in Kay, Fundamentals of Statistical Signal Processing II, 1998, ch. 4; covariance of a
-            model that may be wrong as in White, Econometrica 50, 1 (1982).
+    Source: matched filter as in Kay, Fundamentals of Statistical Signal Processing II, 1998, ch. 4;
+            covariance of a model that may be wrong as in White, Econometrica 50, 1 (1982).
     """
     _refuse(electrons, clipped, psf, pupil, responses, bands)
     lens = Lens(focal_length, pixel_pitch, (electrons.shape[-2], electrons.shape[-1]), sensor)
@@ -96,30 +204,47 @@ def find_lasers(
         precise = max(electrons.shape[-2:]) <= _PRECISE
         frame = electrons.detach().to(torch.float64 if precise else torch.float32)
         plain = Pupil(*(x.detach() for x in pupil))
-        known = Known(
+        frame_and_camera = Known(
             frame,
             (~clipped).to(frame),
-            Camera(plain, responses.detach().to(frame), bands, lens, torch.tensor(widths[0], dtype=torch.float64)),
+            Camera(
+                plain,
+                responses.detach().to(frame),
+                bands,
+                lens,
+                torch.tensor(widths[0], dtype=torch.float64),
+            ),
             lamp_light(psf, plain, illuminant, responses, bands, lens, frame.dtype),
             line_templates(plain, responses, bands, lens),
             read_noise,
             widths,
         )
-        found = without_scattered(search(known, most, lamps, least, margin), known, least)
-        return _table(found, known, most)
+        lasers = without_scattered(
+            search(frame_and_camera, most, lamps, least, margin), frame_and_camera, least
+        )
+        return _table(lasers, frame_and_camera, most)
 
 
 @find_lasers.preflight
 def _(*, responses: Any = None, **_: Any) -> list[str]:
-    """Refuse a camera of another number of channels, where its responses are known before the run."""
+    """Refuse a camera of another number of channels, where its responses are known before the
+    run.
+    """
     if responses is not None and len(responses) not in _CHANNELS:
-        raise ParameterError("responses.camera", f"the camera has {_told(len(responses))}: {_COLOURS}")
+        raise ParameterError(
+            "responses.camera", f"the camera has {_told(len(responses))}: {_COLOURS}"
+        )
     return []
 
 
 @find_lasers.check
 def _(
-    result: FoundLasers, electrons: Tensor, *inputs: Any, focal_length: float, pixel_pitch: float, **_: Any
+    result: FoundLasers,
+    electrons: Tensor,
+    *inputs: Any,
+    focal_length: float,
+    pixel_pitch: float,
+    **_: Any,
 ) -> list[Check]:
     count = int(result.number)
     if not count:
@@ -128,69 +253,234 @@ def _(
     for n in range(count):
         y, x = (result.direction[n] * (focal_length / pixel_pitch)).tolist()
         low, high = (result.wavelength_interval[n] / NANOMETRE).tolist()
-        known = "" if bool(result.identifiable[n].all()) else ", not identifiable"
+        doubt_text = "" if bool(result.identifiable[n].all()) else ", not identifiable"
         texts.append(
-            f"{y:+.2f}, {x:+.2f} px, {float(result.wavelength[n]) / NANOMETRE:.1f} nm ({low:.1f} to {high:.1f}){known}"
+            f"{y:+.2f}, {x:+.2f} px, {float(result.wavelength[n]) / NANOMETRE:.1f} nm ({low:.1f} to"
+            f" {high:.1f}){doubt_text}"
         )
-    alone = "" if len(electrons) > 1 else "; with one channel, wavelengths come from the scale of the patterns alone"
+    alone = (
+        ""
+        if len(electrons) > 1
+        else "; with one channel, wavelengths come from the scale of the patterns alone"
+    )
     return [Check(f"{count} laser{'s' * (count > 1)} found: {'; '.join(texts)}{alone}")]
 
 
-def _refuse(electrons: Tensor, clipped: Tensor, psf: Psf, pupil: Pupil, responses: Tensor, bands: Bands) -> None:
+def _refuse(
+    electrons: Tensor, clipped: Tensor, psf: Psf, pupil: Pupil, responses: Tensor, bands: Bands
+) -> None:
     if electrons.ndim != 3 or len(electrons) not in _CHANNELS:
         raise ValueError(f"electrons {tuple(electrons.shape)}: {_COLOURS}")
     refuse_other_pictures(electrons, psf, responses, clipped, None)
     if min(electrons.shape[-2:]) < _SMALLEST:
         raise ValueError(
-            f"a frame of {tuple(electrons.shape[-2:])} pixels is too small: give at least {_SMALLEST} a side"
+            f"a frame of {tuple(electrons.shape[-2:])} pixels is too small: give at least"
+            f" {_SMALLEST} a side"
         )
     if len(pupil.wavelengths) != len(bands.centres):
         raise ValueError(
             f"pupil of {len(pupil.wavelengths)} bands and {len(bands.centres)} bands differ: "
             "compute both from one `bands` step"
         )
-    refuse_not_finite("no laser can be found", pupil=pupil.path.sum() + pupil.height.sum() + pupil.amplitude.sum())
+    refuse_not_finite(
+        "no laser can be found", pupil=pupil.path.sum() + pupil.height.sum() + pupil.amplitude.sum()
+    )
 
 
 def _told(channels: int) -> str:
     return f"{channels} channel{'s' * (channels != 1)}"
 
 
-def _table(found: Found, known: Known, most: int) -> FoundLasers:
+def _table(search_result: Found, frame: Known, rows: int) -> FoundLasers:
     """Return what was found in SI units, the laser of the largest gain first."""
-    at = [n for n, part in enumerate(found.fit.parts) if isinstance(part, Laser)]
-    spread = spreads(found.fit, known.seen) if at else []
-    order = sorted(range(len(at)), key=lambda n: -found.choices[at[n]].gain)
-    result = _empty(most, len(known.electrons))
-    pixel = known.camera.lens.pixel_pitch / known.camera.lens.focal_length
+    laser_indices = [
+        n for n, component in enumerate(search_result.fit.parts) if isinstance(component, Laser)
+    ]
+    spread = spreads(search_result.fit, frame.seen) if laser_indices else []
+    order = sorted(
+        range(len(laser_indices)), key=lambda n: -search_result.choices[laser_indices[n]].gain
+    )
+    result = _empty(rows, len(frame.electrons))
+    pixel = frame.camera.lens.pixel_pitch / frame.camera.lens.focal_length
     for row, n in enumerate(order):
-        part = found.fit.parts[at[n]]
-        assert isinstance(part, Laser)
-        values = torch.cat([part.values[:3], part.channels()]).cpu().double()
+        laser = search_result.fit.parts[laser_indices[n]]
+        assert isinstance(laser, Laser)
+        values = torch.cat([laser.values[:3], laser.channels()]).cpu().double()
         covariance = spread[n].covariance.cpu().double()
         half = NORMAL * covariance.diagonal().sqrt()
         ends = torch.stack([values - half, values + half], -1)
         result.direction[row], result.direction_interval[row] = pixel * values[:2], pixel * ends[:2]
-        result.wavelength[row], result.wavelength_interval[row] = NANOMETRE * values[2], NANOMETRE * ends[2]
-        result.fwhm[row] = part.fwhm
+        result.wavelength[row], result.wavelength_interval[row] = (
+            NANOMETRE * values[2],
+            NANOMETRE * ends[2],
+        )
+        result.fwhm[row] = laser.fwhm
         result.straight[row], result.straight_spread[row] = values[3:], half[3:] / NORMAL
         light = (result.straight[row], result.straight_spread[row], spread[n].ideal.cpu().double())
-        result.strength[row], result.strength_interval[row] = at_the_aperture(*light, known.seen.cpu())
-        choice = found.choices[at[n]]
+        result.strength[row], result.strength_interval[row] = at_the_aperture(
+            *light, frame.seen.cpu()
+        )
+        choice = search_result.choices[laser_indices[n]]
         alone = choice.rival > _RIVAL
         result.identifiable[row, 0] = alone and float(half[:2].max()) < _WIDEST[0]
         result.identifiable[row, 1] = alone and float(half[2]) < _WIDEST[1]
         result.gain[row] = torch.tensor([choice.gain, choice.margin])
         result.correlation[row] = covariance / torch.outer(half / NORMAL, half / NORMAL)
-    return result._replace(number=torch.tensor(len(at)))
+    return result._replace(number=torch.tensor(len(laser_indices)))
 
 
-def _empty(most: int, channels: int) -> FoundLasers:
+def _empty(rows: int, channels: int) -> FoundLasers:
     shapes = ((2,), (), (), (channels,), (2, 2), (2,), (channels, 2))
-    blank = [torch.zeros(most, *shape, dtype=torch.float64) for shape in shapes]
-    certain = torch.zeros(most, 2, dtype=torch.bool)
-    gain, spread = (torch.zeros(most, *shape, dtype=torch.float64) for shape in ((2,), (3 + channels, 3 + channels)))
+    blank = [torch.zeros(rows, *shape, dtype=torch.float64) for shape in shapes]
+    certain = torch.zeros(rows, 2, dtype=torch.bool)
+    gain, spread = (
+        torch.zeros(rows, *shape, dtype=torch.float64)
+        for shape in ((2,), (3 + channels, 3 + channels))
+    )
     places, wave, width, size, ends, wave_ends, size_ends = blank
     none = torch.tensor(0)
     straight = (torch.zeros_like(size), torch.zeros_like(size))
-    return FoundLasers(none, places, wave, width, size, ends, wave_ends, size_ends, certain, gain, spread, *straight)
+    return FoundLasers(
+        none,
+        places,
+        wave,
+        width,
+        size,
+        ends,
+        wave_ends,
+        size_ends,
+        certain,
+        gain,
+        spread,
+        *straight,
+    )
+
+
+# --- found glare ----------------------------------------------------------------------------------
+
+# The glare of a laser that was found in a frame, and other patterns that it may have.
+
+
+Rank = Annotated[int, Field(ge=1, le=8)]
+
+
+@node()
+def found_glare(
+    found: FoundLasers,
+    pupil: Pupil,
+    electrons: Tensor,
+    *,
+    rank: Rank = 1,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
+    sensor: Sensor = "point",
+) -> Tensor:
+    """Compute the glare of a laser that was found in a frame; 0 where fewer than ``rank`` lasers
+    were found.
+
+    The glare is the pattern of a spectral line at the direction and wavelength found, times the
+    electrons of each channel that follow it. `restore.wiener` takes it as ``glare``. Every tensor
+    of ``found`` and ``pupil`` receives a derivative. Of ``electrons``, the frame, only the shape is
+    used.
+
+    Shapes: found (laser,), pupil (v, u), electrons (channel, y, x) -> (channel, y, x).
+    Units:  e-; rank counts from 1, the laser of the largest gain.
+    Error:  the sums over the pupil are exact in the precision of the height: 1e-6 of the brightest
+            pixel for float32. The index of the mask is a cubic between the bands of the pupil.
+            Beyond half the alias-free field from the spot the glare is 0.
+    Raises: ValueError where the found lasers and the frame differ in the number of channels.
+    Source: Goodman, Introduction to Fourier Optics, 3rd edition, eq. 5-14 (field in the focal plane
+            of a lens).
+    """
+    _agree(found, electrons)
+    if rank > int(found.number):
+        return torch.zeros_like(single(electrons))
+    lens = Lens(focal_length, pixel_pitch, (electrons.shape[-2], electrons.shape[-1]), sensor)
+    row = rank - 1
+    pattern = line_pattern(
+        pupil, found.direction[row], found.wavelength[row], lens, found.fwhm[row]
+    )
+    glare: Tensor = found.straight[row].to(pattern)[:, None, None] * pattern
+    return glare.to(single(electrons))
+
+
+@node()
+def found_nearby(
+    found: FoundLasers,
+    pupil: Pupil,
+    electrons: Tensor,
+    *,
+    rank: Rank = 1,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
+    sensor: Sensor = "point",
+    patterns: Patterns = 12,
+    rng: Generator,
+) -> Tensor:
+    """Draw patterns that the glare of a found laser may have, from the joint normal law of what was
+    found.
+
+    Each pattern has its own direction, wavelength and electrons of each channel, drawn with the
+    covariance of the found laser. `restore.wiener` takes the patterns as ``nearby``. A laser that
+    was not found has patterns of 0.
+
+    Shapes: found (laser,), pupil (v, u), electrons (channel, y, x) -> (pattern, channel, y, x).
+    Units:  e-; rank counts from 1.
+    Error:  each pattern as `restore.found_glare`. The covariance of the patterns has the relative
+            error sqrt(2 / patterns), and at most ``patterns`` dimensions.
+    Raises: ValueError where the found lasers and the frame differ in the number of channels.
+    Source: sampled prior of a nuisance parameter as in Kaipio and Somersalo, Statistical and
+            Computational Inverse Problems, 2005, ch. 5 (approximation error).
+    """
+    _agree(found, electrons)
+    if rank > int(found.number):
+        return torch.zeros(patterns, *electrons.shape).to(single(electrons))
+    row, lens = (
+        rank - 1,
+        Lens(focal_length, pixel_pitch, (electrons.shape[-2], electrons.shape[-1]), sensor),
+    )
+    drawn = []
+    for values in _drawn(found, row, patterns, rng):
+        pattern = line_pattern(pupil, values[:2], values[2], lens, found.fwhm[row])
+        drawn.append(values[3:].clamp_min(0.0).to(pattern)[:, None, None] * pattern)
+    return torch.stack(drawn).to(single(electrons))
+
+
+@found_nearby.check
+@found_glare.check
+def _(
+    result: Tensor, found: FoundLasers, *inputs: Any, rank: int = 1, **params: Any
+) -> list[Check]:
+    if rank > int(found.number):
+        return [Check(f"no laser of rank {rank} was found, so there is no glare")]
+    return [Check(f"brightest pixel {float(result.max()):.3g} e-", bool(result.isfinite().all()))]
+
+
+def _drawn(lasers: FoundLasers, row: int, count: int, rng: Generator) -> Tensor:
+    """Return draws (draw, value) of direction, wavelength and the strength of each channel of
+    one found laser.
+    """
+    middle = torch.cat([lasers.direction[row], lasers.wavelength[row][None], lasers.straight[row]])
+    intervals = (lasers.direction_interval[row], lasers.wavelength_interval[row][None])
+    spread = torch.cat(
+        [
+            *((ends[:, 1] - ends[:, 0]) / (2 * NORMAL) for ends in intervals),
+            lasers.straight_spread[row],
+        ]
+    )
+    # the factor reads one triangle alone
+    even = (lasers.correlation[row] + lasers.correlation[row].mT) / 2
+    lower = torch.linalg.cholesky(even + 1e-9 * torch.eye(len(even)).to(even))
+    numbers = torch.randn(
+        count, len(middle), generator=rng, device=rng.device, dtype=torch.float64
+    ).to(middle)
+    draws: Tensor = middle + spread * (numbers @ lower.mT)
+    return draws
+
+
+def _agree(lasers: FoundLasers, electrons: Tensor) -> None:
+    if electrons.ndim != 3 or len(electrons) != lasers.strength.shape[-1]:
+        raise ValueError(
+            f"electrons {tuple(electrons.shape)} and found lasers of {lasers.strength.shape[-1]}"
+            " channels do not fit: give the frame in which the lasers were found, (channel, y, x)"
+        )

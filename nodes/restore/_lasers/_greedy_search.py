@@ -1,27 +1,42 @@
-"""The search: one more laser or lamp at a time, as long as it explains much more of the frame."""
+"""The search: one more laser or lamp at a time, while it explains much more of the frame."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from neusee.nodes.restore._lasers._candidates import Candidate, Templates, candidates, clipped_candidates
-from neusee.nodes.restore._lasers._censored import censored
-from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Lamp, Laser
-from neusee.nodes.restore._lasers._joint_fit import Data, Fit, Parts, fitted, misfit_of
-from neusee.nodes.restore._lasers._lamp_light import LampLight
-from neusee.nodes.restore._lasers._nearest import FAR, nearest, nearest_of_many
+from neusee.nodes.restore._inverse._glare import speckle, visible
+from neusee.nodes.restore._inverse._wiener_prior import picture_noise
+from neusee.nodes.restore._lasers._candidates import (
+    FAR,
+    Candidate,
+    Templates,
+    candidates,
+    clipped_candidates,
+    nearest,
+    nearest_of_many,
+)
+from neusee.nodes.restore._lasers._components import NANOMETRE, Camera, Lamp, LampLight, Laser
+from neusee.nodes.restore._lasers._joint_fit import Data, Fit, Parts, censored, fitted, misfit_of
 from neusee.nodes.restore._lasers._whitening import Filter, Weights, filter_of, noise_of, weights_of
+
+# --- greedy search --------------------------------------------------------------------------------
+
+# The search: one more laser or lamp at a time, as long as it explains much more of the frame.
+
 
 _AHEAD = 10.0  #: log likelihood by which a laser is ahead of a lamp at least
 _SAME = (2.0, 25.0)  #: pixels and nm, within which two lasers are one
 _FEW = 4  #: clipped pixels, fewer of which need no explanation
 _TRIED = 2  #: candidates that are fitted before one of them is chosen
-_LEFT = 0.25  #: share of the clipped pixels that no part explains, from which on one more is sought farther away
-_ODD = 6.25  #: sum of squares of the errors of three responses, which one laser in ten exceeds by chance
+#: share of the clipped pixels that no part explains, from which on one more is sought farther away
+_LEFT = 0.25
+#: sum of squares of the errors of three responses, which one laser in ten exceeds by chance
+_ODD = 6.25
 _CLIPPED = 4  #: candidates for clipped pixels, whose surroundings are searched before any is fitted
 _BEHIND = 0.25  #: share of a gain, candidates below which are not fitted
 _WIDER = 1.5  #: times the first width, up to which a fitted width is not compared with others
@@ -41,7 +56,9 @@ class Known(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """A part that explains some of a frame, the log likelihood that it gains, and how far it is ahead of others."""
+    """A part that explains some of a frame, the log likelihood that it gains, and how far it is
+    ahead of others.
+    """
 
     part: Laser | Lamp
     gain: float
@@ -57,160 +74,235 @@ class Found(NamedTuple):
     data: Data
 
 
-def search(known: Known, most: int, lamps: int, least: float, margin: float) -> Found:
-    """Return the lasers and lamps of a frame: each gains at least ``least``, a laser ``margin`` of it beyond a lamp."""
+def search(
+    frame: Known, largest_number: int, lamps: int, smallest_gain: float, margin: float
+) -> Found:
+    """Return the lasers and lamps of a frame: each gains at least ``smallest_gain``, a laser
+    ``margin`` of it beyond a lamp.
+    """
     parts: Parts = ()
-    chosen: list[Choice] = []
+    choices: list[Choice] = []
     while True:
-        data = _data(known, parts)
+        data = _data(frame, parts)
         fit = fitted(data, parts, _LAST) if parts else _empty(data)
         parts = fit.parts
-        best = _best(known, fit, data, least, margin)
-        if best is None or best.gain < least or _full(best.part, parts, most, lamps):
+        best = _best(frame, fit, data, smallest_gain, margin)
+        if (
+            best is None
+            or best.gain < smallest_gain
+            or _full(best.part, parts, largest_number, lamps)
+        ):
             break
-        parts, chosen = (*parts, best.part), [*chosen, best]
-    return _pruned(Found(fit, tuple(chosen), data), least)
+        parts, choices = (*parts, best.part), [*choices, best]
+    return _pruned(Found(fit, tuple(choices), data), smallest_gain)
 
 
-def _pruned(found: Found, least: float) -> Found:
-    """Return what was found without parts that later parts made needless, each with its gain beside the rest."""
-    parts, chosen = found.fit.parts, found.choices
-    data = found.data._replace(clipped=None)
+def _pruned(search_result: Found, smallest_gain: float) -> Found:
+    """Return what was found without parts that later parts made needless, each with its gain
+    beside the rest.
+    """
+    parts, choices = search_result.fit.parts, search_result.choices
+    data = search_result.data._replace(clipped=None)
     while len(parts) > 1:
         now = misfit_of(data, parts, 1)[1]
         others = [parts[:n] + parts[n + 1 :] for n in range(len(parts))]
-        costs = [misfit_of(data, rest, _FIRST)[1] - now for rest in others]
-        chosen = tuple(choice._replace(gain=cost) for choice, cost in zip(chosen, costs, strict=True))
+        costs = [misfit_of(data, remaining, _FIRST)[1] - now for remaining in others]
+        choices = tuple(
+            choice._replace(gain=cost) for choice, cost in zip(choices, costs, strict=True)
+        )
         least_needed = min(range(len(parts)), key=lambda n: costs[n])
-        if costs[least_needed] >= least:
+        if costs[least_needed] >= smallest_gain:
             break
-        parts, chosen = others[least_needed], chosen[:least_needed] + chosen[least_needed + 1 :]
-    fit = fitted(found.data, parts, _LAST) if len(parts) < len(found.fit.parts) else found.fit
-    return found._replace(fit=fit, choices=chosen)
+        parts, choices = others[least_needed], choices[:least_needed] + choices[least_needed + 1 :]
+    fit = (
+        fitted(search_result.data, parts, _LAST)
+        if len(parts) < len(search_result.fit.parts)
+        else search_result.fit
+    )
+    return search_result._replace(fit=fit, choices=choices)
 
 
-def _full(part: Laser | Lamp, parts: Parts, most: int, lamps: int) -> bool:
+def _full(candidate: Laser | Lamp, parts: Parts, largest_number: int, lamps: int) -> bool:
     """Return True if there are as many lasers, or lamps, as there may be."""
-    alike = sum(isinstance(part, Laser) == isinstance(other, Laser) for other in parts)
-    return alike >= (most if isinstance(part, Laser) else lamps)
+    alike = sum(isinstance(candidate, Laser) == isinstance(other, Laser) for other in parts)
+    return alike >= (largest_number if isinstance(candidate, Laser) else lamps)
 
 
-def _light(known: Known, parts: Parts) -> Tensor:
-    return sum((part.electrons() for part in parts), torch.zeros_like(known.electrons))
+def _light(frame: Known, parts: Parts) -> Tensor:
+    return sum((component.electrons() for component in parts), torch.zeros_like(frame.electrons))
 
 
-def _data(known: Known, parts: Parts) -> Data:
-    """Return the frame with the filter and the weights that the frame without the parts asks for."""
-    noise = noise_of(known.electrons, known.seen, known.read_noise)
-    scene = known.electrons - _light(known, parts)
-    use = filter_of(scene, noise, known.seen)
+def _data(frame: Known, parts: Parts) -> Data:
+    """Return the frame with the filter and the weights that the frame without the parts asks
+    for.
+    """
+    noise = noise_of(frame.electrons, frame.seen, frame.read_noise)
+    scene = frame.electrons - _light(frame, parts)
+    use = filter_of(scene, noise, frame.seen)
     weights = weights_of(use(scene), use, noise, scene)
-    return Data(known.electrons, use, weights, censored(known.electrons, known.seen, scene, known.read_noise))
+    return Data(
+        frame.electrons,
+        use,
+        weights,
+        censored(frame.electrons, frame.seen, scene, frame.read_noise),
+    )
 
 
 def _empty(data: Data) -> Fit:
-    rest = data.weights(data.use(data.electrons)).flatten()
-    none = rest.new_zeros(0, 0)
-    return Fit((), 0.5 * float(rest.square().sum()), none, none, rest)
+    white_residual = data.weights(data.use(data.electrons)).flatten()
+    none = white_residual.new_zeros(0, 0)
+    return Fit((), 0.5 * float(white_residual.square().sum()), none, none, white_residual)
 
 
 class _Left(NamedTuple):
-    """What the parts found so far leave, in float32, which is enough to choose between candidates."""
+    """What the parts found so far leave, in float32, which is enough to choose between
+    candidates.
+    """
 
     known: Known
     data: Data
     before: float  #: misfit
 
 
-def _rough(known: Known, fit: Fit, data: Data) -> _Left:
-    left = (known.electrons - _light(known, fit.parts)).float()
+def _rough(frame: Known, fit: Fit, data: Data) -> _Left:
+    left = (frame.electrons - _light(frame, fit.parts)).float()
     weights = Weights(*(x.float() for x in data.weights))
-    camera = known.camera._replace(responses=known.camera.responses.float())
-    light, seen = known.lamp, known.seen.float()
+    camera = frame.camera._replace(responses=frame.camera.responses.float())
+    light, unclipped = frame.lamp, frame.seen.float()
     lamp = light._replace(
-        spectra=light.spectra.to(torch.complex64), colour=light.colour.float(), patterns=light.patterns.float()
+        spectra=light.spectra.to(torch.complex64),
+        colour=light.colour.float(),
+        patterns=light.patterns.float(),
     )
-    less = known._replace(electrons=known.electrons.float(), seen=seen, camera=camera, lamp=lamp)
-    rough = Data(left, Filter(seen, data.use.kernel.float()), weights)
+    less = frame._replace(
+        electrons=frame.electrons.float(), seen=unclipped, camera=camera, lamp=lamp
+    )
+    rough = Data(left, Filter(unclipped, data.use.kernel.float()), weights)
     return _Left(less, rough, misfit_of(rough, (), 0)[1])
 
 
-def _best(known: Known, fit: Fit, data: Data, least: float, margin: float) -> Choice | None:
+def _best(frame: Known, fit: Fit, data: Data, smallest_gain: float, margin: float) -> Choice | None:
     """Return the laser or lamp that explains most of what is left; None if nothing does."""
-    left = _rough(known, fit, data)
+    left = _rough(frame, fit, data)
     residual = left.data.use(left.data.electrons)
-    choose = (residual, left.data.use, left.data.weights)
-    lamp = Templates(torch.zeros(1).double(), left.known.lamp.patterns[None], left.known.lamp.colour[None])
-    starts = [*candidates(*choose, known.lines, _TRIED), *candidates(*choose, lamp, 1)]
-    all_clipped = _clipped_starts(known, fit.parts, data.use)
-    clipped = [one for one in all_clipped if one.gain >= _BEHIND * all_clipped[0].gain]
-    rough = (left.known.camera, left.data)
-    near = [nearest(*rough, residual, one) for one in clipped]
+    starts = _unclipped_starts(left, residual, frame.lines)
+    clipped = _clipped_starts(frame, fit.parts, data.use)
+    near = [nearest(left.known.camera, left.data, residual, start) for start in clipped]
     starts += sorted(near, reverse=True)[:_TRIED]
     grown = _all_grown(left, sorted(starts, reverse=True))
-    if clipped and _leaves_dark(known, fit.parts, grown):
-        grown = _with_more(left, grown, [nearest_of_many(*rough, residual, one) for one in clipped[:_TRIED]])
+    if clipped and _leaves_dark(frame, fit.parts, grown):
+        many = [
+            nearest_of_many(left.known.camera, left.data, residual, start)
+            for start in clipped[:_TRIED]
+        ]
+        grown = _with_more(left, grown, many)
+    grown = _with_far_wavelengths(left, grown, residual)
+    new_choices = [choice for choice in grown if not _known_already(choice.part, fit.parts)]
+    best = _first_or_ahead(left, new_choices, smallest_gain, margin)
+    return best and best._replace(part=_precise(best.part, frame))
+
+
+def _unclipped_starts(left: _Left, residual: Tensor, lines: Templates) -> list[Candidate]:
+    """Return the most likely lasers and the most likely lamp of a filtered residual."""
+    use, weights, lamp = left.data.use, left.data.weights, left.known.lamp
+    spot = Templates(torch.zeros(1).double(), lamp.patterns[None], lamp.colour[None])
+    return [
+        *candidates(residual, use, weights, lines, _TRIED),
+        *candidates(residual, use, weights, spot, 1),
+    ]
+
+
+def _with_far_wavelengths(left: _Left, grown: list[Choice], residual: Tensor) -> list[Choice]:
+    """Return what was grown with what grows farther away, as long as the best laser has unlikely
+    responses.
+    """
     for _ in range(_TRIED):
-        odd = [each.part for each in grown if isinstance(each.part, Laser)][:1]
-        if not odd or float(odd[0].values[5:].square().sum()) < _ODD:
+        best = next((choice.part for choice in grown if isinstance(choice.part, Laser)), None)
+        if best is None or float(best.values[5:].square().sum()) < _ODD:
             break
-        grown = _with_more(left, grown, [nearest(*rough, residual, _start(odd[0]), near=FAR)])
-    found = [each for each in grown if not _known_already(each.part, fit.parts)]
-    lasers = [each for each in found if isinstance(each.part, Laser)]
-    best = _ahead(left, found, lasers, least, margin) if lasers else (found[0] if found else None)
-    return best and best._replace(part=_precise(best.part, known))
+        start = nearest(left.known.camera, left.data, residual, _start(best), near=FAR)
+        grown = _with_more(left, grown, [start])
+    return grown
 
 
-def _ahead(left: _Left, found: list[Choice], lasers: list[Choice], least: float, margin: float) -> Choice | None:
-    """Return the best laser, or the best lamp where the laser is not ahead of it enough; None for too little gain."""
-    if found[0].gain < least:
+def _first_or_ahead(
+    left: _Left, new_choices: list[Choice], smallest_gain: float, margin: float
+) -> Choice | None:
+    """Return the choice of the largest gain, or what `_ahead` says where there is a laser."""
+    lasers = [choice for choice in new_choices if isinstance(choice.part, Laser)]
+    if lasers:
+        return _ahead(left, new_choices, lasers, smallest_gain, margin)
+    return new_choices[0] if new_choices else None
+
+
+def _ahead(
+    left: _Left,
+    new_choices: list[Choice],
+    lasers: list[Choice],
+    smallest_gain: float,
+    margin: float,
+) -> Choice | None:
+    """Return the best laser, or the best lamp where the laser is not ahead of it enough; None
+    for too little gain.
+    """
+    if new_choices[0].gain < smallest_gain:
         return None
     best = _widened(left, lasers[0])
-    y, x = (round(float(at)) for at in best.part.values[:2])
-    lamps = [each for each in found if isinstance(each.part, Lamp)]
+    y, x = (round(float(coordinate)) for coordinate in best.part.values[:2])
+    lamps = [choice for choice in new_choices if isinstance(choice.part, Lamp)]
     lamps += _all_grown(left, [Candidate(0.0, (y, x), 0.0, float(best.part.values[3]))])
-    lamps.sort(key=lambda each: -each.gain)
+    lamps.sort(key=lambda choice: -choice.gain)
     ahead = best.gain - (lamps[0].gain if lamps else 0.0)
     if lamps and ahead < max(margin * best.gain, _AHEAD):
         return lamps[0]._replace(margin=-ahead)
-    rival = max((each.gain for each in lasers[1:] if _elsewhere(best.part, each.part)), default=0.0)
+    rival = max(
+        (laser.gain for laser in lasers[1:] if _elsewhere(best.part, laser.part)), default=0.0
+    )
     return best._replace(margin=ahead, rival=best.gain - rival)
 
 
-def _precise(part: Laser | Lamp, known: Known) -> Laser | Lamp:
+def _precise(component: Laser | Lamp, frame: Known) -> Laser | Lamp:
     """Return a part in the precision of the frame."""
-    values = part.values.to(known.electrons)
-    if isinstance(part, Lamp):
-        return replace(part, light=known.lamp, values=values)
-    return replace(part, camera=known.camera._replace(fwhm=part.camera.fwhm), values=values)
+    values = component.values.to(frame.electrons)
+    if isinstance(component, Lamp):
+        return replace(component, light=frame.lamp, values=values)
+    return replace(
+        component, camera=frame.camera._replace(fwhm=component.camera.fwhm), values=values
+    )
 
 
 def _all_grown(left: _Left, starts: list[Candidate]) -> list[Choice]:
-    """Return what grows from candidates that are not far behind what others have grown to, the largest gain first."""
-    found: list[Choice] = []
+    """Return what grows from candidates that are not far behind what others have grown to, the
+    largest gain first.
+    """
+    grown: list[Choice] = []
     for start in starts:
-        if start.gain >= _BEHIND * max((each.gain for each in found), default=0.0):
-            found += filter(None, [_grown(left, start)])
-    return sorted(found, key=lambda each: -each.gain)
+        if start.gain >= _BEHIND * max((choice.gain for choice in grown), default=0.0):
+            grown += filter(None, [_grown(left, start)])
+    return sorted(grown, key=lambda choice: -choice.gain)
 
 
 def _with_more(left: _Left, grown: list[Choice], starts: list[Candidate]) -> list[Choice]:
     """Return what was grown with what grows from more candidates, the largest gain first."""
-    return sorted([*grown, *_all_grown(left, sorted(starts, reverse=True))], key=lambda each: -each.gain)
+    return sorted(
+        [*grown, *_all_grown(left, sorted(starts, reverse=True))], key=lambda choice: -choice.gain
+    )
 
 
-def _start(part: Laser) -> Candidate:
+def _start(laser: Laser) -> Candidate:
     """Return a laser as a candidate."""
-    y, x, nm, strength = part.values[:4].tolist()
+    y, x, nm, strength = laser.values[:4].tolist()
     return Candidate(0.0, (y, x), nm * NANOMETRE, strength)
 
 
-def _widened(left: _Left, one: Choice) -> Choice:
-    """Return a laser with the width of its line that explains most; one of a narrow line stays as it is."""
-    best, widths = one, left.known.widths
-    assert isinstance(one.part, Laser)
-    if float(one.part.fwhm) < _WIDER * widths[0]:
-        return one
+def _widened(left: _Left, laser: Choice) -> Choice:
+    """Return a laser with the width of its line that explains most; one of a narrow line stays
+    as it is.
+    """
+    best, widths = laser, left.known.widths
+    assert isinstance(laser.part, Laser)
+    if float(laser.part.fwhm) < _WIDER * widths[0]:
+        return laser
     for width in widths[1:]:
         camera = left.known.camera._replace(fwhm=left.known.camera.fwhm.new_tensor(width))
         assert isinstance(best.part, Laser)
@@ -220,67 +312,140 @@ def _widened(left: _Left, one: Choice) -> Choice:
     return best
 
 
-def _known_already(part: Laser | Lamp, parts: Parts) -> bool:
+def _known_already(component: Laser | Lamp, parts: Parts) -> bool:
     """Return True for a laser that is told from one of the parts only by the width of a line."""
     for other in parts:
-        if isinstance(part, Laser) and isinstance(other, Laser):
-            away = (part.values[:3] - other.values[:3]).abs().tolist()
+        if isinstance(component, Laser) and isinstance(other, Laser):
+            away = (component.values[:3] - other.values[:3]).abs().tolist()
             if max(away[:2]) < _SAME[0] and away[2] < _SAME[1]:
                 return True
     return False
 
 
-def _full_well(known: Known) -> Tensor:
-    """Return the value of the clipped pixels of each channel, 0 in a channel without any: (channel, 1, 1)."""
-    return known.electrons.where(known.seen == 0, 0.0).amax((-2, -1), keepdim=True)
+def _full_well(frame: Known) -> Tensor:
+    """Return the value of the clipped pixels of each channel, 0 in a channel without any:
+    (channel, 1, 1).
+    """
+    return frame.electrons.where(frame.seen == 0, 0.0).amax((-2, -1), keepdim=True)
 
 
-def _dark(known: Known, light: Tensor) -> int:
+def _dark(frame: Known, light: Tensor) -> int:
     """Return the number of clipped pixels for which the light of the parts is too weak."""
-    return int(((known.seen == 0) & (light < 0.5 * _full_well(known))).any(0).sum())
+    return int(((frame.seen == 0) & (light < 0.5 * _full_well(frame))).any(0).sum())
 
 
-def _leaves_dark(known: Known, parts: Parts, grown: list[Choice]) -> bool:
-    """Return True if many of the clipped pixels are too bright for the parts and for the one that gains most."""
-    more = [_precise(each.part, known).electrons() for each in grown[:1]]
-    return _dark(known, sum(more, _light(known, parts))) > _LEFT * int((known.seen == 0).any(0).sum())
+def _leaves_dark(frame: Known, parts: Parts, grown: list[Choice]) -> bool:
+    """Return True if many of the clipped pixels are too bright for the parts and for the one
+    that gains most.
+    """
+    strongest = [_precise(choice.part, frame).electrons() for choice in grown[:1]]
+    return _dark(frame, sum(strongest, _light(frame, parts))) > _LEFT * int(
+        (frame.seen == 0).any(0).sum()
+    )
 
 
-def _clipped_starts(known: Known, parts: Parts, use: Filter) -> list[Candidate]:
-    """Return candidates whose clipped pixels are those that no part explains; none where all are explained."""
-    full, light = _full_well(known), _light(known, parts)
-    if _dark(known, light) < _FEW:
+def _clipped_starts(frame: Known, parts: Parts, use: Filter) -> list[Candidate]:
+    """Return candidates whose clipped pixels are those that no part explains; none where all are
+    explained.
+    """
+    full, light = _full_well(frame), _light(frame, parts)
+    if _dark(frame, light) < _FEW:
         return []
-    picture = known.electrons - torch.minimum(light, full.where(full > 0, torch.inf))
-    every = Filter(torch.ones_like(known.seen), use.kernel)
-    noise = noise_of(known.electrons, every.seen, known.read_noise)
+    picture = frame.electrons - torch.minimum(light, full.where(full > 0, torch.inf))
+    every = Filter(torch.ones_like(frame.seen), use.kernel)
+    noise = noise_of(frame.electrons, every.seen, frame.read_noise)
     weights = weights_of(every(picture), every, noise, picture)
-    return clipped_candidates(picture, float(full.max()), every, weights, known.lines, _CLIPPED)
+    starts = clipped_candidates(picture, float(full.max()), every, weights, frame.lines, _CLIPPED)
+    return [start for start in starts if start.gain >= _BEHIND * starts[0].gain]
 
 
-def _laser(known: Known, start: Candidate, like: Tensor) -> Laser:
-    rest = torch.zeros(3 + len(like)).to(like)
-    rest[0], rest[1] = start.wavelength / NANOMETRE, max(start.strength, 1.0)
-    return Laser(known.camera, torch.cat([torch.tensor(start.spot).to(like), rest]))
+def _laser(frame: Known, start: Candidate, like: Tensor) -> Laser:
+    wavelength_and_strengths = torch.zeros(3 + len(like)).to(like)
+    wavelength_and_strengths[0], wavelength_and_strengths[1] = (
+        start.wavelength / NANOMETRE,
+        max(start.strength, 1.0),
+    )
+    return Laser(
+        frame.camera, torch.cat([torch.tensor(start.spot).to(like), wavelength_and_strengths])
+    )
 
 
-def _elsewhere(one: Laser | Lamp, other: Laser | Lamp) -> bool:
+def _elsewhere(first: Laser | Lamp, other: Laser | Lamp) -> bool:
     """Return True if two fits ended at different places or wavelengths."""
-    away = (one.values[:3] - other.values[:3]).abs().tolist()
+    away = (first.values[:3] - other.values[:3]).abs().tolist()
     return bool(max(away[:2]) > 0.5 or away[2] > 5.0)
 
 
 def _grown(left: _Left, start: Candidate) -> Choice | None:
     """Return the part that grows from a candidate, and its gain; None for no gain."""
-    electrons, known = left.data.electrons, left.known
+    electrons, frame = left.data.electrons, left.known
     spot = torch.tensor(start.spot).to(electrons)
-    part: Laser | Lamp
+    component: Laser | Lamp
     if start.wavelength:
-        part = _laser(known, start, electrons)
+        component = _laser(frame, start, electrons)
     else:
-        amounts = torch.zeros_like(known.lamp.spectra[:, :, 0, 0].real)
-        amounts[0] = max(start.strength, 1.0) * known.lamp.colour
-        part = Lamp(known.lamp, known.camera.lens.shape, torch.cat([spot, amounts.flatten()]))
-    parts, misfit = misfit_of(left.data, (part,), _FIRST)
+        amounts = torch.zeros_like(frame.lamp.spectra[:, :, 0, 0].real)
+        amounts[0] = max(start.strength, 1.0) * frame.lamp.colour
+        component = Lamp(frame.lamp, frame.camera.lens.shape, torch.cat([spot, amounts.flatten()]))
+    parts, misfit = misfit_of(left.data, (component,), _FIRST)
     gain = left.before - misfit
     return Choice(parts[0], gain, 0.0, 0.0) if gain > 0 else None
+
+
+# --- beyond scatter -------------------------------------------------------------------------------
+
+# Lasers that are more than light which dirt, edges and defocus scatter out of the pattern of a
+# stronger laser.
+
+
+_FEW_SPECKLES, _STEPS = 5, 12  #: steps of a fit without one laser, and of the last fit
+
+
+def without_scattered(search_result: Found, frame: Known, smallest_gain: float) -> Found:
+    """Return what was found without lasers that gain less than ``smallest_gain`` where scattered
+    light counts as noise.
+
+    A lens that is not as its recipe says leaves grains of speckle around a strong laser, and each
+    looks like a weak laser of the same colour. The frame tells how strong this speckle is likely to
+    be; its variance is added to that of the noise, beginning with the weakest laser, whose stronger
+    ones may have scattered it.
+    """
+    every, choices = search_result.fit.parts, search_result.choices
+    lasers = [n for n, component in enumerate(every) if isinstance(component, Laser)]
+    remaining = set(range(len(every)))
+    for n in sorted(lasers, key=lambda n: choices[n].gain)[:-1]:
+        stronger = [m for m in lasers if choices[m].gain > choices[n].gain]
+        data = _with_speckle(search_result.data, frame, every, _numbered(every, stronger))
+        parts = _numbered(every, sorted(remaining))
+        others = _numbered(every, sorted(remaining - {n}))
+        if misfit_of(data, others, _FEW_SPECKLES)[1] - misfit_of(data, parts, 1)[1] < smallest_gain:
+            remaining.remove(n)
+    if len(remaining) == len(every):
+        return search_result
+    fit = fitted(search_result.data, _numbered(every, sorted(remaining)), _STEPS)
+    return search_result._replace(fit=fit, choices=tuple(choices[n] for n in sorted(remaining)))
+
+
+def _numbered(parts: Parts, numbers: Sequence[int]) -> Parts:
+    return tuple(parts[n] for n in numbers)
+
+
+def _with_speckle(data: Data, frame: Known, parts: Parts, lasers: Parts) -> Data:
+    """Return the frame with weights for which the likeliest speckle of some lasers is noise,
+    without clipped pixels.
+    """
+    dark = torch.zeros_like(frame.electrons)
+    every, own = (
+        sum((component.electrons() for component in some), dark) for some in (parts, lasers)
+    )
+    left = frame.electrons - every
+
+    def noise(mean: Tensor) -> Tensor:
+        return picture_noise(left + own, mean, frame.read_noise)
+
+    glare = visible([laser.electrons() for laser in lasers], [None] * len(lasers), frame.seen)
+    variance = noise_of(frame.electrons, frame.seen, frame.read_noise) + speckle(
+        left + own, frame.seen, glare, noise
+    )
+    weights = weights_of(data.use(left), data.use, variance, left)
+    return data._replace(weights=weights, clipped=None)

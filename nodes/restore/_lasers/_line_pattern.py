@@ -9,21 +9,24 @@ import torch
 from numpy.polynomial.hermite_e import hermegauss
 from torch import Tensor
 
-from neusee.nodes.optics._notch import passed_by_notches
-from neusee.nodes.optics._pixel_filter import FineAxis, averaged, fine_axis
+from neusee.nodes.optics._lens import passed_by_notches
+from neusee.nodes.optics._pixel_average import FineAxis, averaged, fine_axis
 from neusee.nodes.optics._psf_definition import SensorSampling
 from neusee.nodes.optics._transform._sample_axis import centred
 from neusee.nodes.values import Bands, Pupil
 
 Sensor = SensorSampling
 
-_COUNTS, _MOST = ((2.5e-9, 3), (6e-9, 5)), 7  #: widths of a line in m, each with the number of its parts; then the most
+#: widths of a line in m, each with the number of its parts; then the most
+_COUNTS, _MOST = ((2.5e-9, 3), (6e-9, 5)), 7
 _NARROW = 0.1e-9  #: m, width of a line, below which slopes are those of a line so wide
 _FILTER_ERROR = 1e-8  #: of the average over a pixel, relative to the brightest pixel
 
 
 class Lens(NamedTuple):
-    """What forms the pattern: focal length and pixel pitch in m, window in pixels, and how a pixel sees it."""
+    """What forms the pattern: focal length and pixel pitch in m, window in pixels, and how a
+    pixel sees it.
+    """
 
     focal_length: float
     pixel_pitch: float
@@ -31,29 +34,43 @@ class Lens(NamedTuple):
     sensor: Sensor = "point"
 
 
-def line_pattern(pupil: Pupil, direction: Tensor, wavelength: Tensor, lens: Lens, fwhm: Tensor) -> Tensor:
+def line_pattern(
+    pupil: Pupil, direction: Tensor, wavelength: Tensor, lens: Lens, fwhm: Tensor
+) -> Tensor:
     """Return the share of the clear pupil's light in each pixel (y, x), mean over a Gaussian line.
 
-    The result has derivatives with respect to every tensor. Beyond half the alias-free field from the spot it is 0,
-    because a sampled pupil repeats its pattern there.
+    The result has derivatives with respect to every tensor. Beyond half the alias-free field from
+    the spot it is 0, because a sampled pupil repeats its pattern there.
     """
     offsets, shares = _parts(fwhm)
-    patterns = [_pattern(pupil, direction, wavelength + at * deviation(fwhm), lens) for at in offsets]
-    return sum((share * each for share, each in zip(shares, patterns, strict=True)), torch.zeros_like(patterns[0]))
+    patterns = [
+        _pattern(pupil, direction, wavelength + offset * deviation(fwhm), lens)
+        for offset in offsets
+    ]
+    return sum(
+        (share * pattern for share, pattern in zip(shares, patterns, strict=True)),
+        torch.zeros_like(patterns[0]),
+    )
 
 
 def deviation(fwhm: Tensor) -> Tensor:
-    """Return the standard deviation of a Gaussian line in m, from its full width at half maximum."""
+    """Return the standard deviation of a Gaussian line in m, from its full width at half
+    maximum.
+    """
     return fwhm / (2.0 * math.sqrt(2.0 * math.log(2.0)))
 
 
 def _parts(fwhm: Tensor) -> tuple[list[float], list[float]]:
-    """Return the wavelengths that stand for a Gaussian line, in standard deviations, and their shares of its light.
+    """Return the wavelengths that stand for a Gaussian line, in standard deviations, and their
+    shares of its light.
 
-    The sums over them are exact for every polynomial of the wavelength up to degree 5, 9 or 13 (Gauss and Hermite).
+    The sums over them are exact for every polynomial of the wavelength up to degree 5, 9 or 13
+    (Gauss and Hermite).
     """
-    at, weights = hermegauss(next((count for most, count in _COUNTS if float(fwhm.detach()) < most), _MOST))
-    return at.tolist(), (weights / weights.sum()).tolist()
+    nodes, weights = hermegauss(
+        next((count for limit, count in _COUNTS if float(fwhm.detach()) < limit), _MOST)
+    )
+    return nodes.tolist(), (weights / weights.sum()).tolist()
 
 
 def _pattern(pupil: Pupil, direction: Tensor, wavelength: Tensor, lens: Lens) -> Tensor:
@@ -68,7 +85,9 @@ def _pattern(pupil: Pupil, direction: Tensor, wavelength: Tensor, lens: Lens) ->
 
 
 class _Window(NamedTuple):
-    """The places along both axes at which the light of a window is computed, and what its pixels see of it."""
+    """The places along both axes at which the light of a window is computed, and what its pixels
+    see of it.
+    """
 
     places: tuple[Tensor, Tensor]  #: pixels from the middle pixel
     pixels: tuple[Tensor, Tensor]  #: the middles of the pixels
@@ -76,11 +95,14 @@ class _Window(NamedTuple):
 
     @classmethod
     def of(cls, lens: Lens, field: Tensor, reach: Tensor) -> _Window:
-        y, x = (torch.arange(n, dtype=torch.float64, device=field.device) - n // 2 for n in lens.shape)
+        y, x = (
+            torch.arange(n, dtype=torch.float64, device=field.device) - n // 2 for n in lens.shape
+        )
         if lens.sensor != "integrated":
             return cls((y, x), (y, x), None)
         rows, columns = (
-            fine_axis(n, k * float(reach.detach()), _FILTER_ERROR) for n, k in zip(lens.shape, field.shape, strict=True)
+            fine_axis(n, k * float(reach.detach()), _FILTER_ERROR)
+            for n, k in zip(lens.shape, field.shape, strict=True)
         )
         down, across = (
             centred(grid.samples, field.device) / grid.per_pixel + pixels.mean()
@@ -92,7 +114,10 @@ class _Window(NamedTuple):
         """Return the light (y, x) of each pixel; 0 where the pattern of a spot would repeat."""
         if self.grids is not None:
             light = averaged(light, *self.grids)
-        y, x = (_within(pixels, at, reach).to(light) for pixels, at in zip(self.pixels, spot, strict=True))
+        y, x = (
+            _within(pixels, place, reach).to(light)
+            for pixels, place in zip(self.pixels, spot, strict=True)
+        )
         return light * y[:, None] * x
 
 
@@ -102,7 +127,9 @@ def _reach(pupil: Pupil, wavelength: Tensor, lens: Lens) -> Tensor:
 
 
 def _share(pupil: Pupil, wavelength: Tensor, reach: Tensor) -> Tensor:
-    """Return the factor from the squared sum over the pupil to the share of its light in one pixel."""
+    """Return the factor from the squared sum over the pupil to the share of its light in one
+    pixel.
+    """
     area = pupil.aperture.double().square().sum()
     passed = passed_by_notches(pupil._replace(wavelengths=wavelength[None]))[0]
     return reach.square() * passed / area
@@ -110,8 +137,8 @@ def _share(pupil: Pupil, wavelength: Tensor, reach: Tensor) -> Tensor:
 
 def _turns(samples: int, reach: Tensor, field: Tensor) -> Tensor:
     """Return the factor (sample,) of a phasor's change when the spot moves by a pixel."""
-    at = torch.arange(samples, dtype=torch.float64, device=field.device) - (samples - 1) / 2
-    return 2j * math.pi * (reach * at).to(field)
+    position = torch.arange(samples, dtype=torch.float64, device=field.device) - (samples - 1) / 2
+    return 2j * math.pi * (reach * position).to(field)
 
 
 class Moves(NamedTuple):
@@ -127,45 +154,61 @@ class Moves(NamedTuple):
 def line_moves(pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens, fwhm: Tensor) -> Moves:
     """Return the pattern of `line_pattern` and its slopes, for a spot in pixels; no derivative.
 
-    The slopes with wavelength and variance are means over the line too, by parts of the integral over a Gaussian line.
+    The slopes with wavelength and variance are means over the line too, by parts of the integral
+    over a Gaussian line.
     """
     wide = fwhm.clamp_min(_NARROW)
     sigma, sums = deviation(wide), [torch.zeros(1)] * 5
-    for at, share in zip(*_parts(wide), strict=True):
-        still, down, right = _moves(pupil, spot, wavelength + at * sigma, lens)
-        by = (share * still, share * down, share * right, share * at / sigma * still)
-        blur = share * (at * at - 1.0) / (2.0 * sigma.square()) * still
-        sums = [total.to(each) + each for total, each in zip(sums, (*by, blur), strict=True)]
+    for offset, share in zip(*_parts(wide), strict=True):
+        still, down, right = _moves(pupil, spot, wavelength + offset * sigma, lens)
+        by = (share * still, share * down, share * right, share * offset / sigma * still)
+        blur = share * (offset * offset - 1.0) / (2.0 * sigma.square()) * still
+        sums = [
+            total.to(contribution) + contribution
+            for total, contribution in zip(sums, (*by, blur), strict=True)
+        ]
     return Moves(*sums)
 
 
-def _moves(pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens) -> tuple[Tensor, Tensor, Tensor]:
+def _moves(
+    pupil: Pupil, spot: Tensor, wavelength: Tensor, lens: Lens
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return the pattern of one wavelength, and its slopes along y and x by pixel."""
     field, reach = _field(pupil, wavelength), _reach(pupil, wavelength, lens)
     turn_y, turn_x = (_turns(n, reach, field) for n in field.shape)
-    window, at = _Window.of(lens, field, reach), (spot[0], spot[1])
+    window, spot_place = _Window.of(lens, field, reach), (spot[0], spot[1])
     rows, columns = (_axis(window.places[i], reach, spot[i], field, i) for i in (0, 1))
     both = field @ torch.cat([columns, turn_x * columns]).T
     far, right = (rows @ both).chunk(2, dim=1)
     down = (turn_y * rows) @ both[:, : len(columns)]
-    light = window.seen(far.real.square() + far.imag.square(), at, reach)
-    by_pixel = [window.seen(far.real * way.real + far.imag * way.imag, at, reach) for way in (down, right)]
+    light = window.seen(far.real.square() + far.imag.square(), spot_place, reach)
+    by_pixel = [
+        window.seen(far.real * way.real + far.imag * way.imag, spot_place, reach)
+        for way in (down, right)
+    ]
     share = _share(pupil, wavelength, reach).to(light)
     return share * light, 2 * share * by_pixel[0], 2 * share * by_pixel[1]
 
 
-def grid_patterns(pupil: Pupil, down: Tensor, right: Tensor, wavelength: Tensor, lens: Lens) -> Tensor:
-    """Return the patterns (row, column, y, x) of one wavelength with spots at each of ``down`` x ``right`` pixels."""
+def grid_patterns(
+    pupil: Pupil, down: Tensor, right: Tensor, wavelength: Tensor, lens: Lens
+) -> Tensor:
+    """Return the patterns (row, column, y, x) of one wavelength with spots at each of ``down`` x
+    ``right`` pixels.
+    """
     field, reach = _field(pupil, wavelength), _reach(pupil, wavelength, lens)
     window = _Window.of(lens, field, reach)
-    rows = torch.cat([_axis(window.places[0], reach, at, field, 0) for at in down])
-    columns = torch.cat([_axis(window.places[1], reach, at, field, 1) for at in right])
+    rows = torch.cat([_axis(window.places[0], reach, place, field, 0) for place in down])
+    columns = torch.cat([_axis(window.places[1], reach, place, field, 1) for place in right])
     far = rows @ (field @ columns.T)
     light = far.real.square() + far.imag.square()
     tall, wide = (len(places) for places in window.places)
     patterns = [
         torch.stack(
-            [window.seen(part, (y, x), reach) for x, part in zip(right, torch.split(row, wide, 1), strict=True)]
+            [
+                window.seen(columns_of_spot, (y, x), reach)
+                for x, columns_of_spot in zip(right, torch.split(row, wide, 1), strict=True)
+            ]
         )
         for y, row in zip(down, torch.split(light, tall), strict=True)
     ]
@@ -199,30 +242,42 @@ def _radians(turns: Tensor) -> Tensor:
 
 
 def index_at(wavelength: Tensor, pupil: Pupil) -> Tensor:
-    """Return the index of the mask at a wavelength, by the cubic through the four nearest bands or fewer."""
-    known, values = pupil.wavelengths.to(wavelength), pupil.index.to(wavelength)
-    count = min(4, len(known))
+    """Return the index of the mask at a wavelength, by the cubic through the four nearest bands
+    or fewer.
+    """
+    wavelengths, values = pupil.wavelengths.to(wavelength), pupil.index.to(wavelength)
+    count = min(4, len(wavelengths))
     first = int(
-        torch.searchsorted(known.detach(), wavelength.detach()).clamp(count // 2, len(known) - count + count // 2)
+        torch.searchsorted(wavelengths.detach(), wavelength.detach()).clamp(
+            count // 2, len(wavelengths) - count + count // 2
+        )
     )
-    at, value = (x[first - count // 2 : first - count // 2 + count] for x in (known, values))
+    near, value = (
+        x[first - count // 2 : first - count // 2 + count] for x in (wavelengths, values)
+    )
     total = torch.zeros_like(wavelength)
     for i in range(count):
         others = [j for j in range(count) if j != i]
-        factors = [(wavelength - at[j]) / (at[i] - at[j]) for j in others]
+        factors = [(wavelength - near[j]) / (near[i] - near[j]) for j in others]
         total = total + value[i] * (torch.stack(factors).prod() if factors else 1.0)
     return total
 
 
-def interpolated(at: Tensor, known: Tensor, values: Tensor) -> Tensor:
-    """Return values (row,) at one place, linear between known places in rising order and beyond their ends."""
-    if len(known) == 1:
-        return values[:, 0] + 0.0 * at
-    right = int(torch.searchsorted(known.detach(), at.detach()).clamp(1, len(known) - 1))
-    share = (at - known[right - 1]) / (known[right] - known[right - 1])
+def interpolated(place: Tensor, places: Tensor, values: Tensor) -> Tensor:
+    """Return values (row,) at one place, linear between known places in rising order and beyond
+    their ends.
+    """
+    if len(places) == 1:
+        return values[:, 0] + 0.0 * place
+    right = int(torch.searchsorted(places.detach(), place.detach()).clamp(1, len(places) - 1))
+    share = (place - places[right - 1]) / (places[right] - places[right - 1])
     return values[:, right - 1] * (1.0 - share) + values[:, right] * share
 
 
 def response_at(wavelength: Tensor, responses: Tensor, bands: Bands) -> Tensor:
-    """Return the response of each channel at a wavelength: (channel,), linear between the centres of the bands."""
-    return interpolated(wavelength, bands.centres.to(wavelength), responses.to(wavelength)).clamp_min(0.0)
+    """Return the response of each channel at a wavelength: (channel,), linear between the
+    centres of the bands.
+    """
+    return interpolated(
+        wavelength, bands.centres.to(wavelength), responses.to(wavelength)
+    ).clamp_min(0.0)

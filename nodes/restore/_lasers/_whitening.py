@@ -1,8 +1,9 @@
-"""A linear filter that makes the residual of a frame nearly white, so that squares of it can be compared.
+"""A linear filter that makes the residual of a frame nearly white, so that squares of it can be
+compared.
 
-Clipped pixels are filled from their neighbours, a short filter removes the smooth part of the scene, and each pixel is
-divided by what its neighbourhood says of noise and of details of the scene. The same filter acts on every pattern, so
-that filling makes no error of its own.
+Clipped pixels are filled from their neighbours, a short filter removes the smooth part of the
+scene, and each pixel is divided by what its neighbourhood says of noise and of details of the
+scene. The same filter acts on every pattern, so that filling makes no error of its own.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ _LEAST = 0.05  #: variance of details at a pixel, as a share of that of the fram
 
 
 class Weights(NamedTuple):
-    """The inverse root of the covariance of the three channels in each pixel: diagonal, and one colour of details."""
+    """The inverse root of the covariance of the three channels in each pixel: diagonal, and one
+    colour of details.
+    """
 
     diagonal: Tensor  #: (channel, y, x), 1 / standard deviation of each channel by itself
     grey: Tensor  #: (channel, y, x), details that all channels share, over the former
@@ -34,15 +37,19 @@ class Weights(NamedTuple):
         return own - self.grey * (self.share * (self.grey * own).sum(-3, keepdim=True))
 
     def twice(self, filtered: Tensor) -> Tensor:
-        """Return the product of these weights' transpose and of what they make of filtered pictures."""
+        """Return the product of these weights' transpose and of what they make of filtered
+        pictures.
+        """
         white = self(filtered)
-        return self.diagonal * (white - self.grey * (self.share * (self.grey * white).sum(-3, keepdim=True)))
+        return self.diagonal * (
+            white - self.grey * (self.share * (self.grey * white).sum(-3, keepdim=True))
+        )
 
-    def pair(self, one: int, other: int) -> Tensor:
+    def pair(self, first: int, other: int) -> Tensor:
         """Return the element (y, x) of the inverse covariance for two channels."""
         total = self.grey.square().sum(0)
-        lost = (2.0 - self.share[0] * total) * self.share[0] * self.grey[one] * self.grey[other]
-        return self.diagonal[one] * self.diagonal[other] * (float(one == other) - lost)
+        lost = (2.0 - self.share[0] * total) * self.share[0] * self.grey[first] * self.grey[other]
+        return self.diagonal[first] * self.diagonal[other] * (float(first == other) - lost)
 
 
 class Filter(NamedTuple):
@@ -52,7 +59,9 @@ class Filter(NamedTuple):
     kernel: Tensor  #: (side, side), symmetric
 
     def __call__(self, pictures: Tensor) -> Tensor:
-        """Return pictures (..., channel, y, x), or (..., 1, y, x) of the same values in each channel, filtered."""
+        """Return pictures (..., channel, y, x), or (..., 1, y, x) of the same values in each
+        channel, filtered.
+        """
         return self.sharp(filled(pictures, self.seen))
 
     def sharp(self, pictures: Tensor) -> Tensor:
@@ -60,19 +69,25 @@ class Filter(NamedTuple):
         return _convolved(pictures, self.kernel.to(pictures))
 
     def squared(self, variances: Tensor) -> Tensor:
-        """Return the variance of filtered pictures, given that of independent pixels: (channel, y, x)."""
+        """Return the variance of filtered pictures, given that of independent pixels: (channel,
+        y, x).
+        """
         return _convolved(variances, self.kernel.to(variances).square())
 
 
 def _convolved(pictures: Tensor, kernel: Tensor) -> Tensor:
-    """Return pictures (..., y, x), continued as in a mirror, convolved with a symmetric kernel of odd sides."""
+    """Return pictures (..., y, x), continued as in a mirror, convolved with a symmetric kernel
+    of odd sides.
+    """
     flat = pictures.reshape(-1, *pictures.shape[-2:])
     rim = len(kernel) // 2
-    whole = pad(flat, (rim,) * 4, mode="reflect")
-    size = [fast_size(n) for n in whole.shape[-2:]]
-    product = torch.fft.rfft2(whole, s=size) * torch.fft.rfft2(kernel, s=size)
+    padded = pad(flat, (rim,) * 4, mode="reflect")
+    size = [fast_size(n) for n in padded.shape[-2:]]
+    product = torch.fft.rfft2(padded, s=size) * torch.fft.rfft2(kernel, s=size)
     y, x = pictures.shape[-2:]
-    inner: Tensor = torch.fft.irfft2(product, s=size)[:, 2 * rim : 2 * rim + y, 2 * rim : 2 * rim + x]
+    inner: Tensor = torch.fft.irfft2(product, s=size)[
+        :, 2 * rim : 2 * rim + y, 2 * rim : 2 * rim + x
+    ]
     return inner.reshape(pictures.shape)
 
 
@@ -83,38 +98,53 @@ def fast_size(n: int) -> int:
     return n
 
 
-def filled(pictures: Tensor, seen: Tensor) -> Tensor:
-    """Return pictures (..., channel, y, x) in which pixels that are not seen follow the pixels around them."""
-    whole = pictures.expand(*pictures.shape[:-3], *seen.shape)
-    if bool(seen.all()):
-        return whole
-    return _from_coarse(whole.reshape(-1, *seen.shape), seen).view(whole.shape)
+def filled(pictures: Tensor, unclipped: Tensor) -> Tensor:
+    """Return pictures (..., channel, y, x) in which pixels that are not seen follow the pixels
+    around them.
+    """
+    pictures_by_channel = pictures.expand(*pictures.shape[:-3], *unclipped.shape)
+    if bool(unclipped.all()):
+        return pictures_by_channel
+    return _from_coarse(pictures_by_channel.reshape(-1, *unclipped.shape), unclipped).view(
+        pictures_by_channel.shape
+    )
 
 
-def _from_coarse(pictures: Tensor, seen: Tensor) -> Tensor:
-    """Return pictures (picture, channel, y, x) filled from the means over two by two pixels, and so on."""
-    y, x = seen.shape[-2:]
-    if bool(seen.all()) or max(y, x) < 2:
+def _from_coarse(pictures: Tensor, unclipped: Tensor) -> Tensor:
+    """Return pictures (picture, channel, y, x) filled from the means over two by two pixels, and
+    so on.
+    """
+    y, x = unclipped.shape[-2:]
+    if bool(unclipped.all()) or max(y, x) < 2:
         return pictures
     rim = (0, x % 2, 0, y % 2)
-    weight = avg_pool2d(pad(seen, rim), 2)
-    coarse = avg_pool2d(pad(pictures * seen, rim), 2) / weight.clamp_min(0.1)
-    wide = interpolate(_from_coarse(coarse, (weight > 0).to(seen)), scale_factor=2, mode="bilinear")
-    return torch.where(seen > 0, pictures, wide[..., :y, :x])
+    weight = avg_pool2d(pad(unclipped, rim), 2)
+    coarse = avg_pool2d(pad(pictures * unclipped, rim), 2) / weight.clamp_min(0.1)
+    wide = interpolate(
+        _from_coarse(coarse, (weight > 0).to(unclipped)), scale_factor=2, mode="bilinear"
+    )
+    return torch.where(unclipped > 0, pictures, wide[..., :y, :x])
 
 
 def box(pictures: Tensor, side: int) -> Tensor:
-    """Return the mean over squares of ``side`` pixels, an odd number; beyond the edge there is nothing."""
+    """Return the mean over squares of ``side`` pixels, an odd number; beyond the edge there is
+    nothing.
+    """
     flat = pictures.reshape(-1, 1, *pictures.shape[-2:])
     for window, rim in (((side, 1), (side // 2, 0)), ((1, side), (0, side // 2))):
         flat = avg_pool2d(flat, window, stride=1, padding=rim, count_include_pad=False)
     return flat.reshape(pictures.shape)
 
 
-def filter_of(picture: Tensor, noise: Tensor, seen: Tensor) -> Filter:
-    """Return the filter that makes a scene with the spectrum of this picture, and its noise, nearly white."""
-    grey = filled(picture, seen).mean(0)
-    y, x = (torch.hann_window(n, periodic=False, dtype=grey.dtype, device=grey.device) for n in grey.shape)
+def filter_of(picture: Tensor, noise: Tensor, unclipped: Tensor) -> Filter:
+    """Return the filter that makes a scene with the spectrum of this picture, and its noise,
+    nearly white.
+    """
+    grey = filled(picture, unclipped).mean(0)
+    y, x = (
+        torch.hann_window(n, periodic=False, dtype=grey.dtype, device=grey.device)
+        for n in grey.shape
+    )
     window = y[:, None] * x
     grey = (grey - (grey * window).sum() / window.sum()) * window
     power = torch.fft.rfft2(grey).abs().square() / window.square().sum()
@@ -122,7 +152,8 @@ def filter_of(picture: Tensor, noise: Tensor, seen: Tensor) -> Filter:
     away = torch.hypot(fy[:, None], fx)
     level = noise.mean() / len(noise)
     some = (away > 0.05) & (away < 0.2)
-    size = ((power - level) * away**3)[some].median() / 0.69  # the median of an exponential law is ln 2
+    # the median of an exponential law is ln 2
+    size = ((power - level) * away**3)[some].median() / 0.69
     side = 2 * _RADIUS + 1
     fine = torch.fft.fftfreq(64).to(grey)
     far = torch.hypot(fine[:, None], torch.fft.rfftfreq(64).to(grey))
@@ -132,30 +163,32 @@ def filter_of(picture: Tensor, noise: Tensor, seen: Tensor) -> Filter:
     taper = taper[:, None] * taper
     kernel = kernel * taper
     kernel = kernel - taper * (kernel.sum() / taper.sum())
-    return Filter(seen, kernel / kernel.square().sum().sqrt())
+    return Filter(unclipped, kernel / kernel.square().sum().sqrt())
 
 
-def noise_of(electrons: Tensor, seen: Tensor, read_noise: float) -> Tensor:
+def noise_of(electrons: Tensor, unclipped: Tensor, read_noise: float) -> Tensor:
     """Return the variance of the noise of each pixel: its local mean, and the read noise."""
-    return box(filled(electrons, seen), _MEAN).clamp_min(1.0) + read_noise**2
+    return box(filled(electrons, unclipped), _MEAN).clamp_min(1.0) + read_noise**2
 
 
 def weights_of(filtered: Tensor, use: Filter, noise: Tensor, picture: Tensor) -> Weights:
-    """Return what each pixel of a filtered residual is divided by: noise, and the details around that pixel."""
-    seen = use.seen
-    spread = masked_variance(picture, seen)
-    own = use.squared(noise) + LOST * spread * use.squared(1.0 - seen)
-    colour = (picture * seen).sum((-2, -1)) / seen.sum((-2, -1)).clamp_min(1.0)
+    """Return what each pixel of a filtered residual is divided by: noise, and the details around
+    that pixel.
+    """
+    unclipped = use.seen
+    spread = masked_variance(picture, unclipped)
+    own = use.squared(noise) + LOST * spread * use.squared(1.0 - unclipped)
+    colour = (picture * unclipped).sum((-2, -1)) / unclipped.sum((-2, -1)).clamp_min(1.0)
     colour = (colour / colour.abs().max().clamp_min(1e-9)).clamp_min(0.05)[:, None, None]
-    inverse = seen / own
+    inverse = unclipped / own
     precision = (colour.square() * inverse).sum(0, keepdim=True)
     grey = (colour * inverse * filtered).sum(0, keepdim=True) / precision.clamp_min(1e-30)
-    some = (precision > 0).to(seen)
+    some = (precision > 0).to(unclipped)
     details = _around(grey.square(), some) - _around(1.0 / precision.clamp_min(1e-12), some)
     details = details.clamp_min(0.0)
     details = torch.maximum(details, _LEAST * (details * some).sum() / some.sum().clamp_min(1.0))
-    rest = _around((filtered - colour * grey).square(), seen)
-    variance = torch.where(seen > 0, torch.maximum(own, rest), _UNSEEN)
+    colour_variance = _around((filtered - colour * grey).square(), unclipped)
+    variance = torch.where(unclipped > 0, torch.maximum(own, colour_variance), _UNSEEN)
     diagonal = variance.rsqrt()
     shared = colour * details.sqrt() * diagonal
     total = shared.square().sum(0, keepdim=True)
@@ -163,12 +196,14 @@ def weights_of(filtered: Tensor, use: Filter, noise: Tensor, picture: Tensor) ->
     return Weights(diagonal, shared, share)
 
 
-def _around(values: Tensor, seen: Tensor) -> Tensor:
-    return box(values * seen, _AROUND) / box(seen.expand_as(values), _AROUND).clamp_min(1e-9)
+def _around(values: Tensor, unclipped: Tensor) -> Tensor:
+    return box(values * unclipped, _AROUND) / box(unclipped.expand_as(values), _AROUND).clamp_min(
+        1e-9
+    )
 
 
-def masked_variance(picture: Tensor, seen: Tensor) -> Tensor:
+def masked_variance(picture: Tensor, unclipped: Tensor) -> Tensor:
     """Return the variance of the pixels that are seen, of each channel: (channel, 1, 1)."""
-    count = seen.sum((-2, -1), keepdim=True).clamp_min(1.0)
-    mean = (picture * seen).sum((-2, -1), keepdim=True) / count
-    return ((picture - mean).square() * seen).sum((-2, -1), keepdim=True) / count
+    count = unclipped.sum((-2, -1), keepdim=True).clamp_min(1.0)
+    mean = (picture * unclipped).sum((-2, -1), keepdim=True) / count
+    return ((picture - mean).square() * unclipped).sum((-2, -1), keepdim=True) / count

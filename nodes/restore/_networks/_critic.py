@@ -1,7 +1,8 @@
-"""Critic networks, which are trained to score the distance of a restored picture from true pictures.
+"""Critic networks, which are trained to score the distance of a restored picture from true
+pictures.
 
-Critics are plain convolutions that are run uncompiled: their gradients are differentiated again, and a compiled or
-hand-written derivative may return a wrong second derivative without an error.
+Critics are plain convolutions that are run uncompiled: their gradients are differentiated again,
+and a compiled or hand-written derivative may return a wrong second derivative without an error.
 """
 
 from functools import partial
@@ -10,14 +11,15 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from neusee.nodes._half_precision import single
+from neusee.nodes.precision import single
 from neusee.nodes.restore._networks._restorer import LEAK, LEAKY, start_network
 
 SMALLEST = 16  #: pixels a side, from which four halvings leave one
 
 
 class Critic(nn.Module):
-    """A network that averages scores over all positions of a picture, halved four times: (n, 3, y, x) -> (n,).
+    """A network that averages scores over all positions of a picture, halved four times: (n, 3, y,
+    x) -> (n,).
 
     The network has no norm, so each picture is scored alone.
     """
@@ -27,34 +29,44 @@ class Critic(nn.Module):
     def __init__(self, width: int = 64) -> None:
         super().__init__()
         sizes = [3, width, 2 * width, 4 * width, 8 * width]
-        pairs = [(nn.Conv2d(a, b, 4, 2, 1), nn.LeakyReLU(LEAK)) for a, b in pairwise(sizes)]
-        self.layers = nn.Sequential(*(part for pair in pairs for part in pair), nn.Conv2d(sizes[-1], 1, 3, padding=1))
+        layers: list[nn.Module] = []
+        for a, b in pairwise(sizes):
+            layers += [nn.Conv2d(a, b, 4, 2, 1), nn.LeakyReLU(LEAK)]
+        self.layers = nn.Sequential(*layers, nn.Conv2d(sizes[-1], 1, 3, padding=1))
 
     def forward(self, picture: Tensor) -> Tensor:
         if min(picture.shape[-2:]) < SMALLEST:
             raise ValueError(
-                f"a picture {tuple(picture.shape)} is too small for the critic: give {SMALLEST} pixels a side"
+                f"a picture {tuple(picture.shape)} is too small for the critic: give {SMALLEST}"
+                " pixels a side"
             )
         scores: Tensor = self.layers(picture)
         return scores.mean((1, 2, 3))
 
 
 def critics(rng: torch.Generator, width: int = 64) -> tuple[Critic, Critic]:
-    """Return two critics with random orthogonal weights: D0 for coarse and D1 for fine estimates of pictures."""
+    """Return two critics with random orthogonal weights: D0 for coarse and D1 for fine estimates
+    of pictures.
+    """
     first, second = (start_network(partial(Critic, width), rng) for _ in range(2))
     return first, second
 
 
 def skip_critic_draws(rng: torch.Generator, count: int = 1) -> None:
-    """Advance ``rng`` as `critic_slopes` does for ``count`` pictures, whose gradients another process computes."""
+    """Advance ``rng`` as `critic_slopes` does for ``count`` pictures, whose gradients another
+    process computes.
+    """
     torch.rand(count, 1, 1, 1, generator=rng, device=rng.device)
 
 
-def critic_slopes(critic: nn.Module, truth: Tensor, estimate: Tensor, rng: torch.Generator) -> Tensor:
-    """Return the gradient of the critic at a random mixture of each true picture and the estimate of the picture.
+def critic_slopes(
+    critic: nn.Module, truth: Tensor, estimate: Tensor, rng: torch.Generator
+) -> Tensor:
+    """Return the gradient of the critic at a random mixture of each true picture and the estimate
+    of the picture.
 
-    The gradient is at least float32 and can be differentiated again, as `losses.gradient_penalty` does. The pictures
-    receive no gradient.
+    The gradient is at least float32 and can be differentiated again, as `losses.gradient_penalty`
+    does. The pictures receive no gradient.
     """
     truth, estimate = single(truth.detach()), single(estimate.detach())
     share = torch.rand(len(truth), 1, 1, 1, generator=rng, device=rng.device).to(truth)

@@ -1,26 +1,328 @@
-"""The restoring network of the paper: selective scans of a picture and its spectrum, first at half the size."""
+"""The restoring network of the paper: selective scans of a picture and its spectrum."""
 
+import functools
+import math
 from functools import partial
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from neusee.nodes import node
-from neusee.nodes.bicubic_resize import resize
-from neusee.nodes.restore._networks._mamba_blocks import Block, Directions, Form
-from neusee.nodes.restore._networks._restorer import PictureRestorer, Tile, fitting, restored, restorer_checks
-from neusee.nodes.restore._networks._scan_layer import Kind
+from neusee.nodes.precision import single
+from neusee.nodes.resampling import resize
+from neusee.nodes.restore._networks._restorer import (
+    ChannelNorm,
+    PictureRestorer,
+    Scale,
+    Tile,
+    fitting,
+    gated,
+    restored,
+    restorer_checks,
+)
+from neusee.nodes.restore._scan._selective_scan import selective_scan
+from neusee.nodes.restore._scan._torch_scan import dual_scan
 from neusee.nodes.units import Count, DataFile, Layers
+
+# --- scan layer -----------------------------------------------------------------------------------
+
+# Trainable layers for selective scans, with the initial values of their time steps and decay rates.
+
+
+Kind = Literal["s6", "ssd"]  #: s6: a decay for each channel and state; ssd: a decay for each head
+HEAD = 16  #: channels that share a decay
+#: range of the first steps of a scan, log-uniform: a memory of ten to a thousand positions
+STEPS = (1e-3, 0.1)
+
+
+class Scan(nn.Module):
+    """A selective scan along a sequence (n, length, channel), with step, input and output
+    weights from the sequence.
+    """
+
+    def __init__(self, channels: int, states: int, rank: int) -> None:
+        super().__init__()
+        self.sizes = [rank, states, states]
+        self.read = nn.Linear(channels, sum(self.sizes), bias=False)
+        self.rate = nn.Linear(rank, channels, bias=False)
+        self.dt_bias = nn.Parameter(torch.empty(channels))
+        self.A_log = nn.Parameter(torch.empty(channels, states))
+        self.D = nn.Parameter(torch.empty(channels))
+
+    def start(self, rng: torch.Generator) -> None:
+        """Set random time steps and fixed decay rates for the start of training.
+
+        Zero biases would give a memory of one position.
+        """
+        self.dt_bias.copy_(_first_steps(len(self.D), rng))
+        self.A_log.copy_(
+            torch.arange(1.0, 1.0 + self.A_log.shape[1], device=rng.device)
+            .log()
+            .expand_as(self.A_log)
+        )
+        self.D.fill_(1.0)
+
+    def forward(self, u: Tensor) -> Tensor:
+        rate, into, out = self.read(u).split(self.sizes, -1)
+        rate = single(self.rate(rate))
+        with torch.autocast(u.device.type, enabled=False):
+            u, step, decay = single(u), _step(rate, self.dt_bias), _decay(self.A_log)
+            return selective_scan(u, step, decay, single(into), single(out), self.D).to(u.dtype)
+
+
+class DualScan(nn.Module):
+    """A selective scan with one step and one decay rate for each head of channels, computed by
+    matrix products.
+    """
+
+    def __init__(self, channels: int, states: int, rank: int) -> None:
+        super().__init__()
+        heads = channels // math.gcd(channels, HEAD)
+        self.sizes = [heads, states, states]
+        self.read = nn.Linear(channels, sum(self.sizes), bias=False)
+        self.dt_bias, self.A_log, self.D = (nn.Parameter(torch.empty(heads)) for _ in range(3))
+
+    def start(self, rng: torch.Generator) -> None:
+        """Set random time steps for the start of training, and random decay rates from 1 to 16,
+        the range of `Scan`.
+        """
+        self.dt_bias.copy_(_first_steps(len(self.D), rng))
+        self.A_log.uniform_(1.0, 16.0, generator=rng).log_()
+        self.D.fill_(1.0)
+
+    def forward(self, u: Tensor) -> Tensor:
+        rate, into, out = (single(numbers) for numbers in self.read(u).split(self.sizes, -1))
+        with torch.autocast(u.device.type, enabled=False):
+            return dual_scan(
+                single(u), _step(rate, self.dt_bias), _decay(self.A_log), into, out, self.D
+            )
+
+
+class BothWays(nn.Module):
+    """The sum of a forward and a backward selective scan, each with its own weights."""
+
+    def __init__(self, channels: int, states: int, rank: int, kind: Kind = "s6") -> None:
+        super().__init__()
+        make = Scan if kind == "s6" else DualScan
+        self.there, self.back = (make(channels, states, rank) for _ in range(2))
+
+    def forward(self, u: Tensor) -> Tensor:
+        result: Tensor = self.there(u) + self.back(u.flip(1)).flip(1)
+        return result
+
+
+def _first_steps(count: int, rng: torch.Generator) -> Tensor:
+    """Return random biases that softplus turns into time steps, log-uniform within the range
+    `STEPS`.
+    """
+    low, high = map(math.log, STEPS)
+    steps = torch.rand(count, generator=rng, device=rng.device).mul_(high - low).add_(low).exp_()
+    return steps + torch.log(-torch.expm1(-steps))
+
+
+def _step(rate: Tensor, bias: Tensor) -> Tensor:
+    return F.softplus(rate + bias).clamp(1e-5, 8.0)
+
+
+def _decay(A_log: Tensor) -> Tensor:
+    return -torch.exp(A_log.clamp(-12.0, 6.0))
+
+
+# --- mamba blocks ---------------------------------------------------------------------------------
+
+# Blocks of the FFT-Mamba network, which combine selective scans of a picture and of the spectrum of
+# the picture.
+
+
+Directions = Literal[2, 4]  #: 2: a block scans rows or columns; 4: both
+#: the numbers that represent a spectrum in a scan and in its gate
+Form = Literal["complex", "amp_phase"]
+SMALL = 1e-4  #: added to the square of an amplitude, so that gradients stay finite
+
+
+class Spatial(nn.Module):
+    """A layer that applies selective scans along the rows or columns of a picture, or both, and
+    gates the result.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        states: int,
+        by_columns: bool,
+        kind: Kind = "s6",
+        directions: Directions = 2,
+    ) -> None:
+        super().__init__()
+        inner, self.by_columns = 2 * width, by_columns
+        self.enter = nn.Conv2d(width, 2 * inner, 1)
+        self.mix = nn.Conv2d(inner, inner, 3, padding=1, groups=inner)
+        self.scan = BothWays(inner, states, -(-width // 16), kind)
+        self.across = BothWays(inner, states, -(-width // 16), kind) if directions == 4 else None
+        self.norm = nn.LayerNorm(inner)
+        self.leave = nn.Conv2d(inner, width, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        value, gate = self.enter(x).chunk(2, 1)
+        value = F.silu(self.mix(value))
+        scanned = _along(self.scan, value, self.by_columns)
+        if self.across is not None:
+            scanned = scanned + _along(self.across, value, not self.by_columns)
+        scanned = self.norm(scanned.movedim(1, -1)).movedim(-1, 1)
+        result: Tensor = self.leave(scanned * F.silu(gate))
+        return result
+
+
+def _along(scan: nn.Module, value: Tensor, by_columns: bool) -> Tensor:
+    """Apply a selective scan along the rows of a picture (n, channel, y, x), or the columns if
+    ``by_columns``.
+    """
+    value = value.mT if by_columns else value
+    scanned: Tensor = (
+        scan(value.flatten(2).transpose(1, 2)).transpose(1, 2).unflatten(2, value.shape[-2:])
+    )
+    return scanned.mT if by_columns else scanned
+
+
+class _Phase(torch.autograd.Function):
+    """The angle of a complex number z, with a finite gradient: |z|**2 + `SMALL` replaces |z|**2."""
+
+    @staticmethod
+    def forward(ctx: Any, real: Tensor, imaginary: Tensor) -> Tensor:
+        ctx.save_for_backward(real, imaginary)
+        return torch.atan2(imaginary, real)
+
+    @staticmethod
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor, Tensor]:
+        real, imaginary = ctx.saved_tensors
+        slope = slopes[0] / (real.square() + imaginary.square() + SMALL)
+        return -slope * imaginary, slope * real
+
+
+@functools.lru_cache(maxsize=32)
+def radial_order(size: tuple[int, int], device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return the positions in the half spectrum of a (y, x) picture by rising radius, and the rank
+    of each position.
+
+    Radii are in cycles per pixel. Equal radii are ordered by angle, from -90 to 90 degrees.
+    """
+    y, x = size
+    with torch.inference_mode(False):  # the cache may serve a caller that trains
+        rows = torch.fft.fftfreq(y, 1 / y, dtype=torch.float64).round().long()[:, None] * x
+        columns = torch.arange(x // 2 + 1)[None] * y
+        # whole numbers, so that equal radii compare equal
+        radius = (rows * rows + columns * columns).flatten()
+        angle = torch.atan2(rows.double(), columns.double()).flatten()
+        order = angle.argsort(stable=True)
+        order = order[radius[order].argsort(stable=True)]
+        return order.to(device), order.argsort().to(device)
+
+
+class Frequency(nn.Module):
+    """A layer that multiplies the spectrum of a picture by a gate, computed by selective scans over
+    frequency.
+
+    The gate uses real and imaginary parts, because phase has no gradient at 0. Amplitude and phase,
+    ``amp_phase``, are for comparison. At the start of training the gate is close to 1 and the
+    picture passes almost unchanged.
+    """
+
+    def __init__(self, width: int, states: int, kind: Kind = "s6", form: Form = "complex") -> None:
+        super().__init__()
+        self.form = form
+        self.norm = nn.LayerNorm(2 * width)
+        self.enter = nn.Linear(2 * width, 2 * width)
+        self.scan = BothWays(width, states, -(-width // 16), kind)
+        self.scanned = nn.LayerNorm(width)
+        self.leave = nn.Linear(width, 2 * width)
+        self.strength = nn.Parameter(torch.empty(()))
+
+    def start(self, rng: torch.Generator) -> None:
+        nn.init.constant_(self.strength, 0.1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x, size = single(x), (x.shape[-2], x.shape[-1])
+        order, place = radial_order(size, x.device)
+        with torch.autocast(x.device.type, enabled=False):  # FFTs need full precision
+            spectrum = torch.fft.rfft2(x, norm="ortho")
+            sorted_ = spectrum.flatten(2).index_select(2, order)
+            features = self.norm(torch.cat(self._parts(sorted_), 1).transpose(1, 2))
+        value, gate = self.enter(features).chunk(2, -1)
+        drawn = single(self.leave(self.scanned(self.scan(F.silu(value))) * F.silu(gate)))
+        first, second = drawn.transpose(1, 2).index_select(2, place).chunk(2, 1)
+        with torch.autocast(x.device.type, enabled=False):
+            factor = self._factor(first, second).view_as(spectrum)
+            result: Tensor = torch.fft.irfft2(spectrum * factor, s=size, norm="ortho")
+        return result
+
+    def _parts(self, spectrum: Tensor) -> tuple[Tensor, Tensor]:
+        real, imaginary = spectrum.real, spectrum.imag
+        if self.form == "complex":
+            return real, imaginary
+        phase: Tensor = _Phase.apply(real, imaginary)  # type: ignore[no-untyped-call]
+        return (real.square() + imaginary.square() + SMALL).sqrt(), phase
+
+    def _factor(self, first: Tensor, second: Tensor) -> Tensor:
+        """Return the factor near 1 that multiplies the spectrum, in complex form or from
+        amplitude and phase.
+        """
+        if self.form == "complex":
+            return 1 + self.strength * torch.complex(first, second)
+        amplitude, turn = 1 + self.strength * first, self.strength * second
+        return torch.complex(amplitude * turn.cos(), amplitude * turn.sin())
+
+
+class Block(nn.Module):
+    """A block that mixes selective scans of a picture and of its spectrum, with a gated
+    feed-forward layer.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        states: int,
+        by_columns: bool,
+        kind: Kind = "s6",
+        directions: Directions = 2,
+        form: Form = "complex",
+    ) -> None:
+        super().__init__()
+        self.norm, self.second_norm = ChannelNorm(width), ChannelNorm(width)
+        self.spatial = Spatial(width, states, by_columns, kind, directions)
+        self.frequency = Frequency(width, states, kind, form)
+        self.weigh = nn.Conv2d(2 * width, width, 1)
+        self.widen = nn.Conv2d(width, 4 * width, 1)
+        self.mix = nn.Conv2d(4 * width, 4 * width, 3, padding=1, groups=4 * width)
+        self.narrow = nn.Conv2d(2 * width, width, 1)
+        self.scale, self.second_scale = Scale(width), Scale(width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        features = self.norm(x)
+        near, far = self.spatial(features), self.frequency(features)
+        share = torch.sigmoid(self.weigh(torch.cat([near.to(far), far], 1)))
+        x = x + self.scale(share * near + (1 - share) * far)
+        result: Tensor = x + self.second_scale(
+            self.narrow(gated(self.mix(self.widen(self.second_norm(x)))))
+        )
+        return result
+
+
+# --- fft mamba ------------------------------------------------------------------------------------
+
+# The restoring network of the paper: selective scans of a picture and its spectrum, first at half
+# the size.
 
 
 class FFTMamba(PictureRestorer):
-    """The FFT-Mamba network, whose blocks scan rows and columns in turn, with the same weights at half and full size.
+    """The FFT-Mamba network, whose blocks scan rows and columns in turn, with the same weights at
+    half and full size.
 
-    The first pass computes a coarse estimate, from which the second pass computes a fine estimate. With ``directions``
-    4 every block scans rows and columns. With ``pyramid`` the network runs once, and the coarse estimate is the reduced
-    fine estimate. Eight blocks, two scales and the modules are those of the paper. The sizes and connections of the
-    modules are our choice.
+    The first pass computes a coarse estimate, from which the second pass computes a fine estimate.
+    With ``directions`` 4 every block scans rows and columns. With ``pyramid`` the network runs
+    once, and the coarse estimate is the reduced fine estimate. Eight blocks, two scales and the
+    modules are those of the paper. The sizes and connections of the modules are our choice.
     """
 
     def __init__(
@@ -36,7 +338,12 @@ class FFTMamba(PictureRestorer):
     ) -> None:
         super().__init__()
         self.shuffle, self.multiple, self.one_pass = shuffle, 2 * shuffle, pyramid
-        self.options = {"ssm": ssm, "directions": directions, "pyramid": pyramid, "frequency": frequency}
+        self.options = {
+            "ssm": ssm,
+            "directions": directions,
+            "pyramid": pyramid,
+            "frequency": frequency,
+        }
         inside = 3 * shuffle**2
         self.enter = nn.Conv2d(2 * inside, width, 3, padding=1)
         self.blocks = nn.Sequential(
@@ -55,7 +362,9 @@ class FFTMamba(PictureRestorer):
         return coarse, self.improved(picture, resize(coarse, y, x))
 
     def improved(self, picture: Tensor, guess: Tensor) -> Tensor:
-        """Return the picture plus the correction that the network predicts from the picture and a first estimate."""
+        """Return the picture plus the correction that the network predicts from the picture and
+        a first estimate.
+        """
         first = self.enter(F.pixel_unshuffle(torch.cat([picture, guess], 1), self.shuffle))
         missing = self.last(first + self.leave(self.blocks(first)))
         return picture + F.pixel_shuffle(missing, self.shuffle)
@@ -80,24 +389,25 @@ def fft_mamba(
 ) -> Tensor:
     """Restore a colour picture with the FFT-Mamba network.
 
-    Each block scans the picture in both directions along rows or columns, scans the spectrum from low to high
-    frequencies and back to compute a gate for the spectrum, and weighs both. One pass runs at half the size; one pass
-    at the full size takes the result of the first pass.
-    ``tile``: a larger picture is restored in overlapping pieces of this side. Use the side of the training pictures,
-    because a network is less accurate on longer scans. ``reduce``: the picture is reduced by this factor first and
-    enlarged again afterwards, for an element behind which finer detail is lost. ``detail``: the finer detail is added
-    unchanged, for a deconvolved picture, in which finer detail is not lost.
-    ``ssm`` is the scan: s6 has a decay for each channel and state; ssd has a decay for 16 channels, by matrix products.
-    ``directions`` 4: each block scans rows and columns. ``pyramid``: one pass, at the full size. ``frequency``
-    amp_phase, for comparison: the gate is computed from amplitude and phase, and changes amplitude and phase.
+    Each block scans the picture in both directions along rows or columns, scans the spectrum from
+    low to high frequencies and back to compute a gate for the spectrum, and weighs both. One pass
+    runs at half the size; one pass at the full size takes the result of the first pass.
+    ``tile``: a larger picture is restored in overlapping pieces of this side. Use the side of the
+    training pictures, because a network is less accurate on longer scans. ``reduce``: the picture
+    is reduced by this factor first and enlarged again afterwards, for an element behind which finer
+    detail is lost. ``detail``: the finer detail is added unchanged, for a deconvolved picture, in
+    which finer detail is not lost. ``ssm`` is the scan: s6 has a decay for each channel and state;
+    ssd has a decay for 16 channels, by matrix products. ``directions`` 4: each block scans rows and
+    columns. ``pyramid``: one pass, at the full size. ``frequency`` amp_phase, for comparison: the
+    gate is computed from amplitude and phase, and changes amplitude and phase.
 
     Shapes: picture (3, y, x) of any size -> (3, y, x).
     Units:  linear sRGB, as in the training of the weights.
     Error:  float32, 1e-5; of the restoration, the error that the training reached.
-    Raises: ParameterError before the run without weights, or where the weights do not fit; ValueError for a picture
-            that is not a colour picture or not finite.
-    Source: NeuSee, section Image Restoration; Gu and Dao, Mamba, 2023 (s6), Dao and Gu, Mamba-2, 2024
-            (ssd); sizes and connections are ours.
+    Raises: ParameterError before the run without weights, or where the weights do not fit;
+            ValueError for a picture that is not a colour picture or not finite.
+    Source: NeuSee, section Image Restoration; Gu and Dao, Mamba, 2023 (s6), Dao and Gu, Mamba-2,
+            2024 (ssd); sizes and connections are ours.
     """
     kind = partial(FFTMamba, width, blocks, states, shuffle, ssm, directions, pyramid, frequency)
     return restored(picture, kind, weights, tile, reduce, detail)

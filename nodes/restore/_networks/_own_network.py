@@ -1,4 +1,6 @@
-"""A restoring network of a user: how it is built and called, and a first call that shows mistakes and costs."""
+"""A restoring network of a user: how it is built and called, and a first call that shows
+mistakes and costs.
+"""
 
 import functools
 import json
@@ -14,16 +16,24 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from neusee.nodes import ParameterError
-from neusee.nodes._mirror_padding import mirrored
-from neusee.nodes.bicubic_resize import resize
-from neusee.nodes.exact_convolution import exact_convolutions
-from neusee.nodes.network_classes import Architecture
+from neusee.nodes.own_modules import Architecture
+from neusee.nodes.precision import exact_convolutions
+from neusee.nodes.resampling import mirrored, resize
 from neusee.nodes.restore._networks._restorer import PictureRestorer
 
 _DRAWING = threading.Lock()  #: one thread at a time seeds the random numbers of the process
 _LEAST = 32  #: pixels of the smaller side of the picture on which a network is tried, at least
 #: errors of Python and torch that the code of a network may raise
-_FAILURES = (RuntimeError, TypeError, ValueError, LookupError, AttributeError, ArithmeticError, AssertionError, OSError)
+_FAILURES = (
+    RuntimeError,
+    TypeError,
+    ValueError,
+    LookupError,
+    AttributeError,
+    ArithmeticError,
+    AssertionError,
+    OSError,
+)
 
 
 class Trial(NamedTuple):
@@ -34,9 +44,13 @@ class Trial(NamedTuple):
 
 
 class OwnNetwork(PictureRestorer):
-    """A network of a user as a restorer: sides are padded to a multiple, and wrong results raise a named error."""
+    """A network of a user as a restorer: sides are padded to a multiple, and wrong results raise
+    a named error.
+    """
 
-    def __init__(self, inner: nn.Module, name: str, multiple: int, options: Mapping[str, Any]) -> None:
+    def __init__(
+        self, inner: nn.Module, name: str, multiple: int, options: Mapping[str, Any]
+    ) -> None:
         super().__init__()
         self.inner, self.name, self.multiple = inner, name, multiple
         #: what a file of weights says of the class that was trained
@@ -44,7 +58,9 @@ class OwnNetwork(PictureRestorer):
 
     @property
     def stored(self) -> nn.Module:
-        """Return the module of the user, whose tensors a file of weights holds under the user's names."""
+        """Return the module of the user, whose tensors a file of weights holds under the user's
+        names.
+        """
         return self.inner
 
     def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
@@ -52,12 +68,14 @@ class OwnNetwork(PictureRestorer):
         y, x = fine.shape[-2:]
         return resize(fine, -(-y // 2), -(-x // 2)), fine
 
-    def forward(self, picture: Tensor, *given: Any) -> Tensor:
+    def forward(self, picture: Tensor, *conditions: Any) -> Tensor:
         y, x = picture.shape[-2:]
         return self.called(mirrored(picture, -y % self.multiple, -x % self.multiple))[..., :y, :x]
 
     def called(self, picture: Tensor) -> Tensor:
-        """Return the result of the user's network; raise ValueError with its name for a wrong result or an error."""
+        """Return the result of the user's network; raise ValueError with its name for a wrong
+        result or an error.
+        """
         before = picture._version
         with self._located(picture):
             result = self.inner(picture)
@@ -65,14 +83,21 @@ class OwnNetwork(PictureRestorer):
         if picture._version != before:
             raise ValueError(f"{self.name} {_CHANGES}")
         if not isinstance(result, Tensor):
-            raise ValueError(f"{self.name} returns a {type(result).__name__}, not one picture {sizes}")
+            raise ValueError(
+                f"{self.name} returns a {type(result).__name__}, not one picture {sizes}"
+            )
         if result.shape != picture.shape:
-            raise ValueError(f"{self.name} returns {_sizes(result)} for a picture {sizes}: return the same shape")
+            raise ValueError(
+                f"{self.name} returns {_sizes(result)} for a picture {sizes}: return the same shape"
+            )
         if not result.is_floating_point():
             raise ValueError(f"{self.name} returns {result.dtype}: return floating-point numbers")
         if not self.training and not torch.isfinite(result).all():
             count = int((~torch.isfinite(result)).sum())
-            raise ValueError(f"{self.name} returns {count} values that are not finite (NaN or infinity) for {sizes}")
+            raise ValueError(
+                f"{self.name} returns {count} values that are not finite (NaN or infinity) for"
+                f" {sizes}"
+            )
         return result
 
     @contextmanager
@@ -85,18 +110,31 @@ class OwnNetwork(PictureRestorer):
         except _FAILURES as error:
             text = " ".join(str(error).split()) or type(error).__name__
             frames = traceback.extract_tb(error.__traceback__)
-            lines = [one for one in frames if "/torch/" not in one.filename and one.name != "__torch_function__"]
-            place = f"{lines[-1].filename.rpartition('/')[2]}:{lines[-1].lineno}: " if lines[1:] else ""
-            raise ValueError(f"{self.name} fails for a picture {_sizes(picture)}: {place}{text}") from error
+            lines = [
+                frame
+                for frame in frames
+                if "/torch/" not in frame.filename and frame.name != "__torch_function__"
+            ]
+            place = (
+                f"{lines[-1].filename.rpartition('/')[2]}:{lines[-1].lineno}: " if lines[1:] else ""
+            )
+            raise ValueError(
+                f"{self.name} fails for a picture {_sizes(picture)}: {place}{text}"
+            ) from error
 
 
 def own_network(
-    architecture: Architecture, parameters: dict[str, Any] | None, multiple: int | None, seed: int = 0
+    architecture: Architecture,
+    parameters: dict[str, Any] | None,
+    multiple: int | None,
+    seed: int = 0,
 ) -> OwnNetwork:
-    """Return a network of a user's class with the initial weights of the class, drawn from ``seed``.
+    """Return a network of a user's class with the initial weights of the class, drawn from
+    ``seed``.
 
-    ``multiple``: the divisor of the sides of a picture; by default the attribute ``multiple`` of the class, or 1. The
-    random numbers of the process do not change. Raises ParameterError for arguments that the class refuses.
+    ``multiple``: the divisor of the sides of a picture; by default the attribute ``multiple`` of
+    the class, or 1. The random numbers of the process do not change. Raises ParameterError for
+    arguments that the class refuses.
     """
     try:
         arguments = architecture.arguments(parameters)
@@ -104,45 +142,71 @@ def own_network(
             torch.manual_seed(seed)
             inner = architecture.network(**(parameters or {}))
     except _FAILURES as error:
-        text = str(error) if str(architecture) in str(error) else f"{architecture}({_listed(parameters)}): {error}"
+        text = (
+            str(error)
+            if str(architecture) in str(error)
+            else f"{architecture}({_listed(parameters)}): {error}"
+        )
         raise ParameterError("parameters", text) from error
     own = getattr(inner, "multiple", 1) if multiple is None else multiple
     if type(own) is not int or own < 1:
-        raise ParameterError("architecture", f"{architecture}.multiple = {own!r} must be a whole number from 1")
-    options = {"class": architecture.network.__qualname__, "parameters": json.loads(json.dumps(arguments, default=str))}
+        raise ParameterError(
+            "architecture", f"{architecture}.multiple = {own!r} must be a whole number from 1"
+        )
+    options = {
+        "class": architecture.network.__qualname__,
+        "parameters": json.loads(json.dumps(arguments, default=str)),
+    }
     return OwnNetwork(inner, str(architecture), own, options)
 
 
 def try_network(
-    net: OwnNetwork, dtype: torch.dtype = torch.float32, device: str = "cpu", sizes: tuple[int, int] | None = None
+    net: OwnNetwork,
+    dtype: torch.dtype = torch.float32,
+    device: str = "cpu",
+    sizes: tuple[int, int] | None = None,
 ) -> Trial:
-    """Call a network on a small picture, and return what the call cost; raise ParameterError for what is wrong.
+    """Call a network on a small picture, and return what the call cost; raise ParameterError for
+    what is wrong.
 
-    The sides of the picture differ, and no smaller power of two than `multiple` divides them, so that a network that
-    needs certain sizes and does not say so fails here.
+    The sides of the picture differ, and no smaller power of two than `multiple` divides them, so
+    that a network that needs certain sizes and does not say so fails here.
     """
-    least = math.ceil(_LEAST / net.multiple) | 1
-    y, x = sizes or (net.multiple * least, net.multiple * (least + 2))
+    multiples = math.ceil(_LEAST / net.multiple) | 1
+    y, x = sizes or (net.multiple * multiples, net.multiple * (multiples + 2))
     random = torch.Generator().manual_seed(1)
     picture = torch.rand(1, 3, y, x, generator=random, dtype=torch.float64).to(device, dtype)
     net.to(device, dtype).eval()
-    given = picture.clone()
+    argument = picture.clone()
     try:
-        with torch.no_grad(), torch.random.fork_rng(devices=[]), exact_convolutions(picture, deterministic=True):
+        with (
+            torch.no_grad(),
+            torch.random.fork_rng(devices=[]),
+            exact_convolutions(picture, deterministic=True),
+        ):
             with _Counting() as counted:
-                first = net.called(given)
+                first = net.called(argument)
             second = net.called(picture.clone())
     except ValueError as error:
-        hint = f"; if it needs sides of a certain multiple, write multiple = 8 in the class (now {net.multiple})"
-        raise ParameterError("architecture", f"{error}{hint if 'picture 1 x' in str(error) else ''}") from error
-    if not torch.equal(given, picture):
+        hint = (
+            "; if it needs sides of a certain multiple, write multiple = 8 in the class (now"
+            f" {net.multiple})"
+        )
+        raise ParameterError(
+            "architecture", f"{error}{hint if 'picture 1 x' in str(error) else ''}"
+        ) from error
+    if not torch.equal(argument, picture):
         raise ParameterError("architecture", f"{net.name} {_CHANGES}")
     if first.dtype != dtype:
         raise ParameterError(
-            "architecture", f"{net.name} returns {first.dtype} for {dtype}: keep the type of the input"
+            "architecture",
+            f"{net.name} returns {first.dtype} for {dtype}: keep the type of the input",
         )
     if not torch.equal(first, second):
-        raise ParameterError("architecture", f"{net.name} gives other numbers for the same picture in eval(): {_DRAWS}")
+        raise ParameterError(
+            "architecture",
+            f"{net.name} gives other numbers for the same picture in eval(): {_DRAWS}",
+        )
     return Trial(counted.operations / (y * x), counted.memory / (y * x))
 
 
@@ -150,8 +214,12 @@ _CHANGES = "changes its input: work on a copy, such as picture.clone()"
 _DRAWS = "draw random numbers only while self.training is true, and keep no state from call to call"
 
 
-def tried(architecture: Architecture, parameters: dict[str, Any] | None, multiple: int | None) -> Trial:
-    """Return what a call of a class costs, and remember the answer for this class and these parameters."""
+def tried(
+    architecture: Architecture, parameters: dict[str, Any] | None, multiple: int | None
+) -> Trial:
+    """Return what a call of a class costs, and remember the answer for this class and these
+    parameters.
+    """
     text = json.dumps(parameters, sort_keys=True, default=str)
     return _tried(architecture, text, multiple)
 
@@ -162,7 +230,9 @@ def _tried(architecture: Architecture, parameters: str, multiple: int | None) ->
 
 
 class _Counting(TorchFunctionMode):
-    """A mode of torch that counts operations, and the bytes of all results that share no memory with their input."""
+    """A mode of torch that counts operations, and the bytes of all results that share no memory
+    with their input.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -178,7 +248,9 @@ class _Counting(TorchFunctionMode):
 
 
 def _operations(name: str, tensors: list[Tensor], result: Tensor) -> float:
-    """Return the operations of a function of torch: two for each product of a layer, otherwise one for each number."""
+    """Return the operations of a function of torch: two for each product of a layer, otherwise
+    one for each number.
+    """
     if name.startswith("conv_transpose"):
         return 2.0 * tensors[0].numel() * tensors[1][0].numel()
     if name.startswith(("conv", "linear")):

@@ -1,9 +1,10 @@
-"""The common base of all restoring networks, with their initial weights and their application to a picture."""
+"""The base of all restoring networks: initial weights, and a picture restored in tiles."""
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -13,13 +14,72 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from neusee.nodes import Check, ParameterError
-from neusee.nodes._half_precision import refuse_not_finite, single
-from neusee.nodes._mirror_padding import mirrored
-from neusee.nodes.bicubic_resize import resize
-from neusee.nodes.exact_convolution import exact_convolutions
 from neusee.nodes.network_weights import empty, loaded, same_layout
-from neusee.nodes.restore._networks._tiles import tiled
+from neusee.nodes.precision import exact_convolutions, refuse_not_finite, single
+from neusee.nodes.resampling import mirrored, resize
 from neusee.nodes.units import Count
+
+# --- tiles ----------------------------------------------------------------------------------------
+
+# Restoration of a picture in tiles of the size that a network was trained on, joined without seams.
+
+
+_OVERLAP = 0.25  #: least share of a tile's side that overlaps the next tile
+
+
+def tiled(change: Callable[[Tensor], Tensor], picture: Tensor, side: int) -> Tensor:
+    """Apply ``change`` to a picture (n, 3, y, x) tile by tile, and return the weighted mean where
+    tiles overlap.
+
+    Weights fall linearly towards an edge beyond which another tile continues, so that tiles join
+    without a step. Tiles lie inside the picture; a picture that is no larger than a tile is changed
+    as a whole.
+    """
+    size = (picture.shape[-2], picture.shape[-1])
+    if max(size) <= side:
+        return change(picture)
+    total, weights = torch.zeros_like(picture), picture.new_zeros(size)
+    rows, columns = (_starts(n, side) for n in size)
+    for top, left in product(rows, columns):
+        window = (..., slice(top, top + side), slice(left, left + side))
+        weight = torch.outer(
+            *(_ramp(start, side, n, picture) for start, n in zip((top, left), size, strict=True))
+        )
+        total[window] += change(picture[window]) * weight
+        weights[window] += weight
+    return total / weights
+
+
+def _starts(length: int, side: int) -> list[int]:
+    """Return the first pixel of each tile along an axis, for the fewest even tiles that overlap
+    by `_OVERLAP`.
+    """
+    if length <= side:
+        return [0]
+    count = 1 + math.ceil((length - side) / (side * (1 - _OVERLAP)))
+    return [round(i * (length - side) / (count - 1)) for i in range(count)]
+
+
+def _ramp(start: int, side: int, length: int, like: Tensor) -> Tensor:
+    """Return the blending weights of a tile along one axis: 1, falling to almost 0 at tile edges
+    inside the picture.
+    """
+    side = min(side, length)
+    position = torch.arange(side, dtype=like.dtype, device=like.device) + 0.5
+    rise = (position / (side * _OVERLAP)).clamp(max=1.0)
+    ramp = torch.ones_like(position)
+    if start > 0:
+        ramp = ramp * rise
+    if start + side < length:
+        ramp = ramp * rise.flip(0)
+    return ramp
+
+
+# --- restorer -------------------------------------------------------------------------------------
+
+# The common base of all restoring networks, with their initial weights and their application to a
+# picture.
+
 
 Net = TypeVar("Net", bound=nn.Module)
 Tile = Annotated[Count, Field(ge=32)]  #: side of a piece, pixels
@@ -29,19 +89,21 @@ LAYERS = (nn.Conv2d, nn.ConvTranspose2d, nn.Linear)
 
 
 class Restorer(nn.Module, ABC):
-    """A network that restores pictures (n, 3, y, x) of any size at two scales, a coarse and a fine scale.
+    """A network that restores pictures (n, 3, y, x) of any size at two scales, a coarse and a fine
+    scale.
 
-    ``given`` is what a network needs of a picture beside its pixels; most networks need nothing.
+    ``conditions`` are what a network needs of a picture beside its pixels; most networks need
+    nothing.
     """
 
     multiple: int  #: divisor of the height and width inside the network
 
     @abstractmethod
-    def pyramid(self, picture: Tensor, *given: Any) -> tuple[Tensor, Tensor]:
+    def pyramid(self, picture: Tensor, *conditions: Any) -> tuple[Tensor, Tensor]:
         """Return the restored picture at half the size, rounded up, and at the full size."""
 
-    def forward(self, picture: Tensor, *given: Any) -> Tensor:
-        return self.pyramid(picture, *given)[1]
+    def forward(self, picture: Tensor, *conditions: Any) -> Tensor:
+        return self.pyramid(picture, *conditions)[1]
 
     @abstractmethod
     def begin(self) -> None:
@@ -60,9 +122,11 @@ class PictureRestorer(Restorer):
 
     @abstractmethod
     def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the restored picture at half and full size, for a picture whose sides are multiples of `multiple`."""
+        """Return the restored picture at half and full size, for a picture whose sides are
+        multiples of `multiple`.
+        """
 
-    def pyramid(self, picture: Tensor, *given: Any) -> tuple[Tensor, Tensor]:
+    def pyramid(self, picture: Tensor, *conditions: Any) -> tuple[Tensor, Tensor]:
         y, x = picture.shape[-2:]
         coarse, fine = self.scales(mirrored(picture, -y % self.multiple, -x % self.multiple))
         return coarse[..., : -(-y // 2), : -(-x // 2)], fine[..., :y, :x]
@@ -72,11 +136,15 @@ class PictureRestorer(Restorer):
 
 
 class Flat(PictureRestorer):
-    """A restoring network that works at full size only; its coarse estimate is the reduced fine estimate."""
+    """A restoring network that works at full size only; its coarse estimate is the reduced fine
+    estimate.
+    """
 
     @abstractmethod
     def change(self, picture: Tensor) -> Tensor:
-        """Return the restored picture minus ``picture``, whose sides are multiples of `multiple`."""
+        """Return the restored picture minus ``picture``, whose sides are multiples of
+        `multiple`.
+        """
 
     def scales(self, picture: Tensor) -> tuple[Tensor, Tensor]:
         fine = picture + self.change(picture)
@@ -84,14 +152,18 @@ class Flat(PictureRestorer):
 
 
 class ChannelNorm(nn.LayerNorm):
-    """A layer norm over the channels of a picture (n, channel, y, x), computed in float32 or better."""
+    """A layer norm over the channels of a picture (n, channel, y, x), computed in float32 or
+    better.
+    """
 
     def forward(self, input: Tensor) -> Tensor:
         return super().forward(single(input).movedim(1, -1)).movedim(-1, 1)
 
 
 class Scale(nn.Module):
-    """A trainable factor for each channel, small at the start, which scales the output of a network block."""
+    """A trainable factor for each channel, small at the start, which scales the output of a
+    network block.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -105,34 +177,39 @@ class Scale(nn.Module):
 
 
 def start_network(make: Callable[[], Net], rng: torch.Generator) -> Net:
-    """Return a network with initial values: random orthogonal weights and zero biases of linear and convolution layers.
+    """Return a network with initial values: random orthogonal weights and zero biases of linear and
+    convolution layers.
 
-    Norms, decays and factors have rules of their own. The weights of a network with leaky layers are multiplied by its
-    `gain`, which keeps the power from layer to layer. `Restorer.begin` makes the change to a picture small, so that
-    the network at first returns almost the same picture.
+    Norms, decays and factors have rules of their own. The weights of a network with leaky layers
+    are multiplied by its `gain`, which keeps the power from layer to layer. `Restorer.begin` makes
+    the change to a picture small, so that the network at first returns almost the same picture.
     """
     net = empty(make).to_empty(device=rng.device)
     gain = getattr(net, "gain", 1.0)
     with torch.no_grad():
-        for part in net.modules():
-            if isinstance(part, LAYERS):
-                nn.init.orthogonal_(part.weight, gain, generator=rng)
-                if part.bias is not None:
-                    part.bias.zero_()
-            elif isinstance(part, nn.LayerNorm):
-                part.reset_parameters()
-            elif callable(start := getattr(part, "start", None)):
+        for module in net.modules():
+            if isinstance(module, LAYERS):
+                nn.init.orthogonal_(module.weight, gain, generator=rng)
+                if module.bias is not None:
+                    module.bias.zero_()
+            elif isinstance(module, nn.LayerNorm):
+                module.reset_parameters()
+            elif callable(start := getattr(module, "start", None)):
                 start(rng)
         if isinstance(net, Restorer):
             net.begin()
     return net
 
 
-def parameter_groups(net: nn.Module, weights: float = 2e-4, biases: float = 4e-4) -> list[dict[str, Any]]:
-    """Return the network's parameters in two groups for an optimiser; the second group has the biases of layers."""
+def parameter_groups(
+    net: nn.Module, weights: float = 2e-4, biases: float = 4e-4
+) -> list[dict[str, Any]]:
+    """Return the network's parameters in two groups for an optimiser; the second group has the
+    biases of layers.
+    """
     of_layers = [m.bias for m in net.modules() if isinstance(m, LAYERS) and m.bias is not None]
-    known = set(map(id, of_layers))
-    others = [p for p in net.parameters() if id(p) not in known]
+    in_layers = set(map(id, of_layers))
+    others = [p for p in net.parameters() if id(p) not in in_layers]
     return [{"params": others, "lr": weights}, {"params": of_layers, "lr": biases}]
 
 
@@ -144,29 +221,40 @@ def restored(
     reduce: int = 1,
     detail: bool = False,
 ) -> Tensor:
-    """Restore a picture in float32 by a network with weights read from a file; only the picture receives gradients.
+    """Restore a picture in float32 by a network with weights read from a file; only the picture
+    receives gradients.
 
-    ``tile``: the side of the pieces in which a larger picture is restored. ``reduce``: the factor by which the picture
-    is first reduced and afterwards enlarged, antialiased; ``detail`` adds the detail that the reduction loses.
+    ``tile``: the side of the pieces in which a larger picture is restored. ``reduce``: the factor
+    by which the picture is first reduced and afterwards enlarged, antialiased; ``detail`` adds the
+    detail that the reduction loses.
     """
     return restored_by(lambda: loaded(make, _needed(weights)), picture, tile, reduce, detail)
 
 
 def restored_by(
-    ready: Callable[[], nn.Module], picture: Tensor, tile: int | None = None, reduce: int = 1, detail: bool = False
+    ready: Callable[[], nn.Module],
+    picture: Tensor,
+    tile: int | None = None,
+    reduce: int = 1,
+    detail: bool = False,
 ) -> Tensor:
     """Restore a picture as `restored` does, by the network with weights that ``ready`` returns."""
     if picture.ndim != 3 or len(picture) != 3:
-        raise ValueError(f"a picture {tuple(picture.shape)} is not a colour picture: give (3, y, x)")
+        raise ValueError(
+            f"a picture {tuple(picture.shape)} is not a colour picture: give (3, y, x)"
+        )
     refuse_not_finite("the network would spread them to every pixel", picture=picture)
     net = ready().requires_grad_(False).eval().to(picture.device)
-    with exact_convolutions(picture, deterministic=True), torch.autocast(picture.device.type, enabled=False):
+    with (
+        exact_convolutions(picture, deterministic=True),
+        torch.autocast(picture.device.type, enabled=False),
+    ):
         y, x = picture.shape[-2:]
-        whole = picture.float()[None]
-        seen = whole if reduce == 1 else resize(whole, -(-y // reduce), -(-x // reduce))
-        result: Tensor = net(seen) if tile is None else tiled(net, seen, tile)
+        batch = picture.float()[None]
+        reduced = batch if reduce == 1 else resize(batch, -(-y // reduce), -(-x // reduce))
+        result: Tensor = net(reduced) if tile is None else tiled(net, reduced, tile)
         if reduce > 1:
-            result = whole + resize(result - seen, y, x) if detail else resize(result, y, x)
+            result = batch + resize(result - reduced, y, x) if detail else resize(result, y, x)
     return result[0]
 
 
@@ -180,24 +268,34 @@ def fitting(
     width: int,
     **sizes: Any,
 ) -> list[str]:
-    """Raise ParameterError if the file of weights is absent or belongs to another network; return no warnings."""
+    """Raise ParameterError if the file of weights is absent or belongs to another network;
+    return no warnings.
+    """
     same_layout(partial(network, width, **sizes), _needed(weights), width)
     return []
 
 
 def _needed(weights: Path | None) -> Path:
     if weights is None:
-        text = "a network needs trained weights: give the .safetensors file of its weights, or choose restore: wiener"
+        text = (
+            "a network needs trained weights: give the .safetensors file of its weights, or choose"
+            " restore: wiener"
+        )
         raise ParameterError("weights", text)
     return weights
 
 
 def restorer_checks(result: Tensor, picture: Tensor, **params: Any) -> list[Check]:
-    """Return a check of the root mean square change by a network, which fails if this change is not finite."""
+    """Return a check of the root mean square change by a network, which fails if this change is
+    not finite.
+    """
     change = float((result - picture).square().mean(dtype=torch.float64).sqrt())
     before = float(picture.square().mean(dtype=torch.float64).sqrt())
     return [
-        Check(f"network changed the picture by {change:.3g} rms, of {before:.3g} rms before", math.isfinite(change))
+        Check(
+            f"network changed the picture by {change:.3g} rms, of {before:.3g} rms before",
+            math.isfinite(change),
+        )
     ]
 
 

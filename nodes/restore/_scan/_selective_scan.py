@@ -26,30 +26,39 @@ def selective_scan(
     *,
     backend: Literal["auto", "torch", "cpp", "triton", "mamba_ssm"] = "auto",
 ) -> Tensor:
-    """Run the scan h_t = exp(dt_t A) h_(t-1) + dt_t B_t u_t from h = 0, and return y_t = <C_t, h_t> + D u_t.
+    """Run the scan h_t = exp(dt_t A) h_(t-1) + dt_t B_t u_t from h = 0, and return y_t = <C_t, h_t>
+    + D u_t.
 
-    ``A`` is negative and ``dt`` positive: decays are at most 1 and are only multiplied, so nothing overflows at any
-    length. ``backend`` "auto" is C++ on a CPU with a compiler; on CUDA in float32 a Triton kernel, or mamba_ssm where
-    only mamba_ssm is installed; and torch in all other cases. ``NEUSEE_SCAN=torch`` selects torch everywhere.
-    The scan is differentiable once: a gradient of its gradient raises an error.
+    ``A`` is negative and ``dt`` positive: decays are at most 1 and are only multiplied, so nothing
+    overflows at any length. ``backend`` "auto" is C++ on a CPU with a compiler; on CUDA in float32
+    a Triton kernel, or mamba_ssm where only mamba_ssm is installed; and torch in all other cases.
+    ``NEUSEE_SCAN=torch`` selects torch everywhere. The scan is differentiable once: a gradient of
+    its gradient raises an error.
 
-    Shapes: u, dt (batch, length, d), A (d, n), B, C (batch, length, n), D (d) -> (batch, length, d).
+    Shapes: u, dt (batch, length, d), A (d, n), B, C (batch, length, n), D (d) -> (batch, length,
+            d).
     Units:  none; dt in those of 1 / A.
-    Error:  float32, also from half precision and under autocast: of the largest |y|, over 65 536 steps and for
-            dt |A| from 1e-6 to 200, 2e-7 in C++ and Triton, 7e-7 in torch. float64 if any input is float64: 1e-12.
-    Raises: ValueError for shapes that do not fit and for a backend that these tensors, or this machine, do not support.
-    Source: Gu and Dao, Mamba: Linear-Time Sequence Modeling with Selective State Spaces, 2023, algorithm 2.
+    Error:  float32, also from half precision and under autocast: of the largest |y|, over 65 536
+            steps and for dt |A| from 1e-6 to 200, 2e-7 in C++ and Triton, 7e-7 in torch. float64 if
+            any input is float64: 1e-12.
+    Raises: ValueError for shapes that do not fit and for a backend that these tensors, or this
+            machine, do not support.
+    Source: Gu and Dao, Mamba: Linear-Time Sequence Modeling with Selective State Spaces, 2023,
+            algorithm 2.
     """
     _check_shapes(u, dt, A, B, C, D)
     kind = _kind(u, dt, A, B, C)
-    chosen = _auto(u, kind) if backend == "auto" else backend
+    backend_used = _auto(u, kind) if backend == "auto" else backend
     with torch.autocast(u.device.type, enabled=False):
-        y = _run(chosen, *(x.to(kind) for x in (u, dt, A, B, C)))
+        y = _run(backend_used, *(x.to(kind) for x in (u, dt, A, B, C)))
         return y if D is None else torch.addcmul(y, D.to(kind), u.to(kind))
 
 
-def reference(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor | None = None) -> Tensor:
-    """Compute the selective scan by a loop over positions in float64, a slow reference with all derivatives.
+def reference(
+    u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor | None = None
+) -> Tensor:
+    """Compute the selective scan by a loop over positions in float64, a slow reference with all
+    derivatives.
 
     Shapes: as `selective_scan`.
     """
@@ -57,7 +66,9 @@ def reference(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor 
     u, dt, A, B, C = (x.double() for x in (u, dt, A, B, C))
     h, rows = u.new_zeros(u.shape[0], *A.shape), []
     # unbind, because the gradient of an indexed row is as long as all rows
-    for push, step, into, out in zip((dt * u).unbind(1), dt.unbind(1), B.unbind(1), C.unbind(1), strict=True):
+    for push, step, into, out in zip(
+        (dt * u).unbind(1), dt.unbind(1), B.unbind(1), C.unbind(1), strict=True
+    ):
         h = torch.exp(step[..., None] * A) * h + push[..., None] * into[:, None]
         rows.append((h @ out[..., None])[..., 0])
     y = torch.stack(rows, 1)
@@ -66,31 +77,44 @@ def reference(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor 
 
 def _check_shapes(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor | None) -> None:
     if u.ndim != 3 or A.ndim != 2:
-        raise ValueError(f"u must be (batch, length, d) and A (d, n), not {tuple(u.shape)} and {tuple(A.shape)}")
+        raise ValueError(
+            f"u must be (batch, length, d) and A (d, n), not {tuple(u.shape)} and {tuple(A.shape)}"
+        )
     if not (u.numel() and A.numel()):
-        raise ValueError(f"there is nothing to scan: u is {tuple(u.shape)} and A is {tuple(A.shape)}")
+        raise ValueError(
+            f"there is nothing to scan: u is {tuple(u.shape)} and A is {tuple(A.shape)}"
+        )
     (*line, d), n = u.shape, A.shape[1]
     shapes = {"dt": (*line, d), "A": (d, n), "B": (*line, n), "C": (*line, n), "D": (d,)}
     for (name, shape), x in zip(shapes.items(), (dt, A, B, C, D), strict=True):
         if x is None:
             continue
         if tuple(x.shape) != shape:
-            raise ValueError(f"{name} is {tuple(x.shape)}; u {tuple(u.shape)} and A {tuple(A.shape)} need {shape}")
+            raise ValueError(
+                f"{name} is {tuple(x.shape)}; u {tuple(u.shape)} and A {tuple(A.shape)} need"
+                f" {shape}"
+            )
         if x.device != u.device:
-            raise ValueError(f"{name} is on {x.device}, but u is on {u.device}: move both to one device")
+            raise ValueError(
+                f"{name} is on {x.device}, but u is on {u.device}: move both to one device"
+            )
 
 
 def _kind(*tensors: Tensor) -> torch.dtype:
     for x in tensors:
         if not x.is_floating_point():
-            raise ValueError(f"the selective scan needs real numbers in floating point, not {x.dtype}")
+            raise ValueError(
+                f"the selective scan needs real numbers in floating point, not {x.dtype}"
+            )
     return torch.float64 if any(x.dtype == torch.float64 for x in tensors) else torch.float32
 
 
 def _auto(u: Tensor, kind: torch.dtype) -> Backend:
     named = os.environ.get("NEUSEE_SCAN") or ""
     if named not in ("", *get_args(Backend)):
-        raise ValueError(f"NEUSEE_SCAN is {named!r}: write torch or cpp, or on CUDA triton or mamba_ssm")
+        raise ValueError(
+            f"NEUSEE_SCAN is {named!r}: write torch or cpp, or on CUDA triton or mamba_ssm"
+        )
     if named == "torch":
         return "torch"
     if u.device.type == "cpu":
@@ -101,14 +125,17 @@ def _auto(u: Tensor, kind: torch.dtype) -> Backend:
 
 
 def _kernel(named: str) -> Backend:
-    """Return the scan backend for CUDA: the named backend if it is installed, else another installed backend, else
-    torch.
+    """Return the scan backend for CUDA: the named backend if it is installed, else another
+    installed backend, else torch.
     """
     if named != "mamba_ssm" and importlib.util.find_spec("triton"):
         return "triton"
     if named != "triton" and importlib.util.find_spec("mamba_ssm"):
         return "mamba_ssm"
-    _say_once(f"neither Triton nor mamba_ssm is installed for the selective scan{named and f' ({named} is requested)'}")
+    _say_once(
+        "neither Triton nor mamba_ssm is installed for the selective"
+        f" scan{named and f' ({named} is requested)'}"
+    )
     return "torch"
 
 
@@ -122,7 +149,9 @@ def _run(backend: str, u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -
         raise ValueError(f"backend is {backend!r}: write auto, {', '.join(get_args(Backend))}")
     if backend in ("triton", "mamba_ssm"):
         if u.device.type != "cuda" or u.dtype != torch.float32:
-            raise ValueError(f"the backend {backend} is for float32 on CUDA, but u is {u.dtype} on {u.device}")
+            raise ValueError(
+                f"the backend {backend} is for float32 on CUDA, but u is {u.dtype} on {u.device}"
+            )
         return (by_mamba if backend == "mamba_ssm" else by_triton)(u, dt, A, B, C)
     if backend == "cpp" and u.device.type != "cpu":
         raise ValueError(f"the backend cpp is for the CPU, but u is on {u.device}")
@@ -134,7 +163,10 @@ def _run(backend: str, u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -
 def by_triton(*tensors: Tensor) -> Tensor:
     """Run the scan by the Triton kernel; raise ValueError if Triton is not installed."""
     if not importlib.util.find_spec("triton"):
-        raise ValueError("the backend triton is not installed: install a CUDA build of torch, which includes Triton")
+        raise ValueError(
+            "the backend triton is not installed: install a CUDA build of torch, which includes"
+            " Triton"
+        )
     from neusee.nodes.restore._scan import _triton_scan
 
     y: Tensor = _triton_scan.Scan.apply(*tensors)  # type: ignore[no-untyped-call]
@@ -142,16 +174,18 @@ def by_triton(*tensors: Tensor) -> Tensor:
 
 
 class _Once(torch.autograd.Function):
-    """An identity that refuses a second derivative, because mamba_ssm silently computes a wrong second derivative."""
+    """An identity that refuses a second derivative, because mamba_ssm silently computes a wrong
+    second derivative.
+    """
 
     @staticmethod
     def forward(ctx: object, y: Tensor) -> Tensor:
         return y.view_as(y)
 
     @staticmethod
-    def backward(ctx: object, *seen: Tensor) -> Tensor:
+    def backward(ctx: object, *slopes: Tensor) -> Tensor:
         _torch_scan.refuse_twice()
-        return seen[0]
+        return slopes[0]
 
 
 def by_mamba(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:

@@ -1,11 +1,4 @@
-"""The selective scan in torch operations: on any device that torch supports, in little memory.
-
-The length is cut into segments that fit in a cache, and each segment into chunks that are walked in parallel. A segment
-takes as many operations as a chunk has steps, and one more for the carry of each chunk. Only the states between
-segments are stored; back-propagation computes all other states again. Decays enter as exp(x) - 1, because the
-round-off of a decay near 1 would act at each step. The carry between chunks is float64, because a state that hardly
-decays is rounded at each carry.
-"""
+"""The selective scan in torch operations: on any device that torch supports."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -14,22 +7,40 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-#: Numbers in the states of a segment, and in one operation: the fastest on one core at 1536 numbers a step, by 3 % over
-#: segments twice as long, by a tenth over no chunks. Smaller operations take longer to call than to compute.
+# --- torch scan -----------------------------------------------------------------------------------
+
+# The selective scan in torch operations: on any device that torch supports, in little memory.
+#
+# The length is cut into segments that fit in a cache, and each segment into chunks that are walked
+# in parallel. A segment takes as many operations as a chunk has steps, and one more for the carry
+# of each chunk. Only the states between segments are stored; back-propagation computes all other
+# states again. Decays enter as exp(x) - 1, because the round-off of a decay near 1 would act at
+# each step. The carry between chunks is float64, because a state that hardly decays is rounded at
+# each carry.
+
+
+#: Numbers in the states of a segment, and in one operation: the fastest on one core at 1536 numbers
+#: a step, by 3 % over segments twice as long, by a tenth over no chunks. Smaller operations take
+#: longer to call than to compute.
 SEGMENT, ROW = 1 << 17, 1 << 14
 SEGMENT_CUDA, ROW_CUDA = 1 << 23, 1 << 17  #: the same two numbers on a GPU: chosen, not measured
 
 
 def refuse_twice() -> None:
-    """Raise RuntimeError for a second derivative, which would be silently wrong without a graph of the gradient."""
+    """Raise RuntimeError for a second derivative, which would be silently wrong without a graph
+    of the gradient.
+    """
     if torch.is_grad_enabled():
         raise RuntimeError(
-            "the selective scan has no second derivative: do not use create_graph for a gradient through the scan"
+            "the selective scan has no second derivative: do not use create_graph for a gradient"
+            " through the scan"
         )
 
 
 class Plan(NamedTuple):
-    """The division of a sequence into segments of ``chunks`` chunks, each of ``steps`` time steps."""
+    """The division of a sequence into segments of ``chunks`` chunks, each of ``steps`` time
+    steps.
+    """
 
     steps: int
     chunks: int
@@ -40,15 +51,19 @@ class Plan(NamedTuple):
 
 
 def plan(length: int, width: int, cuda: bool) -> Plan:
-    """Divide a sequence of ``length`` time steps with ``width`` numbers each into segments and chunks."""
-    row, whole = (ROW_CUDA, SEGMENT_CUDA) if cuda else (ROW, SEGMENT)
-    segment = min(length, max(16, whole // width))
+    """Divide a sequence of ``length`` time steps with ``width`` numbers each into segments and
+    chunks.
+    """
+    row, segment_numbers = (ROW_CUDA, SEGMENT_CUDA) if cuda else (ROW, SEGMENT)
+    segment = min(length, max(16, segment_numbers // width))
     chunks = max(1, min(row // width, int(segment**0.5)))
     return Plan(-(-segment // chunks), chunks)
 
 
 class _Segment:
-    """The inputs and decays of one segment of a sequence, (step, chunk, batch, d or n), padded by steps of length 0."""
+    """The inputs and decays of one segment of a sequence, (step, chunk, batch, d or n), padded
+    by steps of length 0.
+    """
 
     def __init__(self, division: Plan, rows: slice, rate: Tensor, *lines: Tensor) -> None:
         self.division, self.rows, self.rate = division, rows, rate
@@ -58,41 +73,55 @@ class _Segment:
         self.lost = (self.dt[..., None] * rate).expm1_()
 
     def turn(self, x: Tensor) -> Tensor:
-        """Rearrange one segment of a sequence from (batch, length, m) to (step, chunk, batch, m)."""
-        part = F.pad(x[:, self.rows], (0, 0, 0, self.division.segment - self.size)).contiguous()
-        return part.view(len(x), self.division.chunks, self.division.steps, -1).permute(2, 1, 0, 3).contiguous()
+        """Rearrange one segment of a sequence from (batch, length, m) to (step, chunk, batch,
+        m).
+        """
+        segment = F.pad(x[:, self.rows], (0, 0, 0, self.division.segment - self.size)).contiguous()
+        return (
+            segment.view(len(x), self.division.chunks, self.division.steps, -1)
+            .permute(2, 1, 0, 3)
+            .contiguous()
+        )
 
     def back(self, x: Tensor) -> Tensor:
         """Rearrange one segment of a sequence from (step, chunk, batch, m) to (batch, rows, m)."""
         return x.permute(2, 1, 0, 3).flatten(1, 2)[:, : self.size]
 
     def states(self, start: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the state of the scan after each step, from ``start`` (batch, d, n), and the last state in float64."""
+        """Return the state of the scan after each step, from ``start`` (batch, d, n), and the
+        last state in float64.
+        """
         h = self.pushed[..., None] * self.into[..., None, :]
         return h, _walk(h, list(self.lost.unbind(0)), start)
 
-    def slopes(self, seen: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the gradients of all states of a scan, and of the state before the first step in float64.
+    def slopes(self, output_slope: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the gradients of all states of a scan, and of the state before the first step in
+        float64.
 
-        The gradient of a state is the sum of the gradients through its output, ``seen``, and through the next state, or
-        ``end`` for the last state.
+        The gradient of a state is the sum of the gradients through its output, ``output_slope``,
+        and through the next state, or ``end`` for the last state.
         """
-        g = seen[..., None] * self.out[..., None, :]
+        g = output_slope[..., None] * self.out[..., None, :]
         first, *others = self.lost.unbind(0)
         next_chunk = torch.cat([first[1:], torch.zeros_like(first[:1])])
         at_first = _walk(g, [next_chunk, *others[::-1]], end, back=True)
         return g, at_first + first[0] * at_first
 
     def gradients(self, dy: Tensor, start: Tensor, end: Tensor) -> tuple[Tensor, ...]:
-        """Return the gradients of u, dt, B, C (batch, rows, m), A and the state before the first step (batch, d, n)."""
-        seen = self.turn(dy)
-        (h, _), (g, before) = self.states(start), self.slopes(seen, end)
+        """Return the gradients of u, dt, B, C (batch, rows, m), A and the state before the first
+        step (batch, d, n).
+        """
+        output_slope = self.turn(dy)
+        (h, _), (g, before) = self.states(start), self.slopes(output_slope, end)
         pushed = (g @ self.into[..., None])[..., 0]
-        into, out = (seen_by[..., None, :] @ x for seen_by, x in ((self.pushed, g), (seen, h)))
+        into, out = (
+            seen_by[..., None, :] @ x for seen_by, x in ((self.pushed, g), (output_slope, h))
+        )
         g[1:] *= h[:-1]
         g[0, 1:] *= h[-1, :-1]
         g[0, 0] *= start
-        g *= torch.mul(self.dt[..., None], self.rate, out=self.lost).exp_()  # now the gradient of dt * A
+        # now the gradient of dt * A
+        g *= torch.mul(self.dt[..., None], self.rate, out=self.lost).exp_()
         dt = torch.mul(g, self.rate, out=h).sum(-1).addcmul_(pushed, self.u)
         rate = g.mul_(self.dt[..., None]).sum((0, 1, 2))
         lines = (self.dt * pushed, dt, into[..., 0, :], out[..., 0, :])
@@ -100,23 +129,28 @@ class _Segment:
 
 
 def _walk(h: Tensor, lost: list[Tensor], start: Tensor, back: bool = False) -> Tensor:
-    """Turn the inputs ``h`` (step, chunk, ...) of a scan into states in place: h_i <- h_i + (1 + lost_i) h_(i-1).
+    """Turn the inputs ``h`` (step, chunk, ...) of a scan into states in place: h_i <- h_i + (1 +
+    lost_i) h_(i-1).
 
-    The state before the first step is ``start``. ``back`` walks from the last step to the first; ``lost``, (chunk, ...)
-    for each step, is in the order of the walk. Every chunk starts from 0, and the state that earlier chunks carry over
-    is added afterwards. The last state is returned in float64.
+    The state before the first step is ``start``. ``back`` walks from the last step to the first;
+    ``lost``, (chunk, ...) for each step, is in the order of the walk. Every chunk starts from 0,
+    and the state that earlier chunks carry over is added afterwards. The last state is returned in
+    float64.
     """
     turn = slice(None, None, -1 if back else 1)
     rows, through = h.unbind(0)[turn], torch.empty_like(h)
     shares = through.unbind(0)[turn]
     shares[0].copy_(lost[0])
-    for less, before, now, share, further in zip(lost[1:], rows, rows[1:], shares, shares[1:], strict=False):
+    for less, before, now, share, further in zip(
+        lost[1:], rows, rows[1:], shares, shares[1:], strict=False
+    ):
         now.addcmul_(less, before).add_(before)
-        torch.add(less, share, out=further).addcmul_(less, share)  # (1 + e)(1 + l) - 1, exact near 0
-    left, kept, starts = rows[-1].double(), shares[-1].double(), torch.empty_like(rows[-1])
+        # (1 + e)(1 + l) - 1, exact near 0
+        torch.add(less, share, out=further).addcmul_(less, share)
+    left, through_chunk, starts = rows[-1].double(), shares[-1].double(), torch.empty_like(rows[-1])
     for chunk in range(h.shape[1])[turn]:
         starts[chunk] = start
-        start = (left[chunk] + start).addcmul_(kept[chunk], start)
+        start = (left[chunk] + start).addcmul_(through_chunk[chunk], start)
     h.addcmul_(through, starts).add_(starts)
     return start
 
@@ -136,27 +170,92 @@ class Scan(torch.autograd.Function):
         u, dt, rate, *into_out = inputs
         (batch, length, _), (d, n) = u.shape, rate.shape
         ctx.division = plan(length, batch * d * n, u.is_cuda)
-        y, state, starts = torch.empty_like(u), u.new_zeros(batch, d, n, dtype=torch.float64), list[Tensor]()
+        y, state, starts = (
+            torch.empty_like(u),
+            u.new_zeros(batch, d, n, dtype=torch.float64),
+            list[Tensor](),
+        )
         for rows in _segments(length, ctx.division):
             starts.append(state.to(u))
-            part = _Segment(ctx.division, rows, rate, u, dt, *into_out)
-            h, state = part.states(state)
-            y[:, rows] = part.back((h @ part.out[..., None])[..., 0])
+            segment = _Segment(ctx.division, rows, rate, u, dt, *into_out)
+            h, state = segment.states(state)
+            y[:, rows] = segment.back((h @ segment.out[..., None])[..., 0])
         ctx.save_for_backward(*inputs, torch.stack(starts))
         return y
 
     @staticmethod
-    def backward(ctx: Any, *seen: Tensor) -> tuple[Tensor, ...]:
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor, ...]:
         refuse_twice()
         *inputs, starts = ctx.saved_tensors
         u, dt, rate, *into_out = inputs
         du, ddt, dB, dC = (torch.empty_like(x) for x in (u, dt, *into_out))
-        end, dA = torch.zeros_like(starts[0], dtype=torch.float64), torch.zeros_like(rate, dtype=torch.float64)
+        end, dA = (
+            torch.zeros_like(starts[0], dtype=torch.float64),
+            torch.zeros_like(rate, dtype=torch.float64),
+        )
         with torch.autocast(u.device.type, enabled=False):
-            for rows, start in reversed(list(zip(_segments(u.shape[1], ctx.division), starts, strict=True))):
-                part = _Segment(ctx.division, rows, rate, u, dt, *into_out)
-                *lines, slope, end = part.gradients(seen[0], start, end)
-                for whole, line in zip((du, ddt, dB, dC), lines, strict=True):
-                    whole[:, rows] = line
+            for rows, start in reversed(
+                list(zip(_segments(u.shape[1], ctx.division), starts, strict=True))
+            ):
+                segment = _Segment(ctx.division, rows, rate, u, dt, *into_out)
+                *lines, slope, end = segment.gradients(slopes[0], start, end)
+                for gradient, line in zip((du, ddt, dB, dC), lines, strict=True):
+                    gradient[:, rows] = line
                 dA += slope
         return du, ddt, dA.to(rate), dB, dC
+
+
+# --- one decay scan -------------------------------------------------------------------------------
+
+# The selective scan with one decay for each head, computed by matrix products of torch.
+
+
+def dual_scan(
+    u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor, D: Tensor, *, chunk: int = 32
+) -> Tensor:
+    """Compute h = exp(dt A) h + dt B u, y = C h + D u along the length, where all channels of a
+    head share dt and A.
+
+    Within a chunk a matrix connects every position with all earlier positions; a state passes from
+    chunk to chunk. Logarithms of decays are summed over each stretch separately, because a
+    difference of running sums loses precision.
+
+    Shapes: u (batch, length, head * channel), dt (batch, length, head), A and D (head,), B and C
+            (batch, length, n) -> as u. In single precision at least.
+    """
+    heads, length = len(A), u.shape[1]
+    padding = -length % chunk  # padding without input and decay changes nothing
+    x, step, into, out = (
+        F.pad(v, (0, 0, 0, padding)).view(len(v), -1, chunk, v.shape[-1]) for v in (u, dt, B, C)
+    )
+    x = x.view(*x.shape[:3], heads, -1).movedim(-2, 2)  # batch, chunk, head, position, channel
+    step = step.movedim(-1, 2)
+    stretch = _stretches(step * A[:, None])
+    fed = step[..., None] * x
+    within = ((out @ into.mT)[:, :, None] * stretch.exp()) @ fed
+    left = (into[:, :, None] * stretch[..., -1, :, None].exp()).mT @ fed
+    from_start = (step * A[:, None]).cumsum(-1).exp()[..., None]
+    handed = _handed_on(left, from_start[..., -1:, :])
+    y: Tensor = within + (out[:, :, None] * from_start) @ handed + D[:, None, None] * x
+    return y.movedim(2, -2).flatten(3).flatten(1, 2)[:, :length]
+
+
+def _stretches(logs: Tensor) -> Tensor:
+    """Return the sums (…, i, j) of ``logs`` over the positions j + 1 to i, or minus infinity if
+    j is after i.
+    """
+    size = logs.shape[-1]
+    here = torch.ones(size, size, dtype=torch.bool, device=logs.device).tril()
+    after = logs[..., None].expand(*logs.shape, size).masked_fill(~here.tril(-1), 0.0)
+    return after.cumsum(-2).masked_fill(~here, -torch.inf)
+
+
+def _handed_on(left: Tensor, decay: Tensor) -> Tensor:
+    """Return the state of the scan at the start of each chunk, to which all earlier chunks
+    contribute.
+    """
+    state, starts = torch.zeros_like(left[:, 0]), []
+    for new, share in zip(left.unbind(1), decay.unbind(1), strict=True):
+        starts.append(state)
+        state = share * state + new
+    return torch.stack(starts, 1)

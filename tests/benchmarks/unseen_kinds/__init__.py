@@ -1,1 +1,3 @@
-"""Which kinds of own nodes could be served stale? Each file is one family of cases; `case.py` says what a case is."""
+"""Which kinds of own nodes could be served stale? Each file is one family of cases; `case.py`
+says what a case is.
+"""

@@ -1,7 +1,7 @@
 """What a case is: the code of an own node, what it reads, and how this changes between two runs.
 
-Wherever a value may change, a pair `(first, second)` says both; a single value stays. `None` stands for a
-file that is not there.
+Wherever a value may change, a pair `(first, second)` says both; a single value stays. `None` stands
+for a file that is not there.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ Change = Text | tuple[Text, Text]
 class Case:
     """One own node, or a few, and what changes around it.
 
-    In texts of `env`, `files` and `folder`, `{folder}` stands for the folder of the case, `{prefix}` for that of
-    Python, and `{tmp}` for that of temporary files.
+    In texts of `env`, `files` and `folder`, `{folder}` stands for the folder of the case,
+    `{prefix}` for that of Python, and `{tmp}` for that of temporary files.
     """
 
     name: str
@@ -60,7 +60,8 @@ class Case:
     steps: str | tuple[str, str] = STEP
     nodes: str | tuple[str, str] = "own.py"
     files: Mapping[str, Change] = field(default_factory=dict)
-    make: Callable[[Path, int], object] | None = None  #: writes files that are no text; called with 1, then with 2
+    #: writes files that are no text; called with 1, then with 2
+    make: Callable[[Path, int], object] | None = None
     env: Mapping[str, Change] = field(default_factory=dict)
     folder: str | tuple[str, str] = "{folder}"  #: the working folder of the program
     stdin: str | tuple[str, str] = ""

@@ -1,4 +1,6 @@
-"""Chance without a seed of the recipe: nothing changes, and the next run should draw again or say a word."""
+"""Chance without a seed of the recipe: nothing changes, and the next run should draw again or
+say a word.
+"""
 
 from unseen_kinds.case import Case
 
@@ -6,12 +8,16 @@ from unseen_kinds.case import Case
 def draws(name: str, about: str, lines: str) -> Case:
     """Return a case whose node runs a few lines that return a number."""
     indented = "\n".join("    " + line for line in lines.strip("\n").splitlines())
-    return Case(name, about, f"@node()\ndef value(*, scale: float = 100.0) -> Tensor:\n{indented}\n")
+    return Case(
+        name, about, f"@node()\ndef value(*, scale: float = 100.0) -> Tensor:\n{indented}\n"
+    )
 
 
 CASES = [
     draws("torch_poisson", "shot noise", "return torch.poisson(torch.full((20, 20), scale))"),
-    draws("default_rng", "a generator of NumPy", "return picture(np.random.default_rng().normal())"),
+    draws(
+        "default_rng", "a generator of NumPy", "return picture(np.random.default_rng().normal())"
+    ),
     draws(
         "scipy_rvs",
         "a distribution of SciPy",
@@ -31,7 +37,9 @@ return picture(draw().rand())
 """,
     ),
     draws("bernoulli_", "an in-place draw", "return torch.empty(20, 20).bernoulli_(0.5)"),
-    draws("multinomial", "torch.multinomial", "return torch.multinomial(torch.ones(1000), 10).float()"),
+    draws(
+        "multinomial", "torch.multinomial", "return torch.multinomial(torch.ones(1000), 10).float()"
+    ),
     draws(
         "dropout",
         "a dropout that nobody switched off",

@@ -187,7 +187,10 @@ CASES = [
             return picture(matplotlib.rcParams["savefig.pad_inches"])
         """,
         env={"MATPLOTLIBRC": ("{folder}/one", "{folder}/two")},
-        files={"one/matplotlibrc": "savefig.pad_inches: 1\n", "two/matplotlibrc": "savefig.pad_inches: 2\n"},
+        files={
+            "one/matplotlibrc": "savefig.pad_inches: 1\n",
+            "two/matplotlibrc": "savefig.pad_inches: 2\n",
+        },
     ),
     variable(
         "dask_variable",

@@ -1,4 +1,6 @@
-"""Honest nodes: ordinary code whose result the parameters decide. The second run should find it in the cache."""
+"""Honest nodes: ordinary code whose result the parameters decide. The second run should find it
+in the cache.
+"""
 
 from pathlib import Path
 
@@ -21,7 +23,11 @@ def file(name: str, about: str, header: str, lines: str, **words) -> Case:
     indented = "\n".join("    " + line for line in lines.strip("\n").splitlines())
     steps = f"a: {{node: own.value, with: {{header: {header}}}}}"
     return honest(
-        name, about, f"@node()\ndef value(*, header: DataFile) -> Tensor:\n{indented}\n", steps=steps, **words
+        name,
+        about,
+        f"@node()\ndef value(*, header: DataFile) -> Tensor:\n{indented}\n",
+        steps=steps,
+        **words,
     )
 
 
@@ -660,13 +666,15 @@ CASES = [
             return picture(airy(GLASS[glass]))
         """,
         files={
-            "optics_lab/__init__.py": """
+            "optics_lab/__init__.py": (
+                """
 from optics_lab.tables import GLASS
 
 
 def airy(n):
     return ((n - 1) / (n + 1)) ** 2
-""",
+"""
+            ),
             "optics_lab/tables.py": "GLASS = {'bk7': 1.517}\n",
         },
     ),
@@ -681,7 +689,11 @@ def airy(n):
             return picture(gain(x))
         """,
         env={"PYTHONPATH": "{folder}/site"},
-        files={"site/labtools.py": "import functools\n\n\n@functools.cache\ndef gain(x):\n    return 2 * x\n"},
+        files={
+            "site/labtools.py": (
+                "import functools\n\n\n@functools.cache\ndef gain(x):\n    return 2 * x\n"
+            )
+        },
     ),
     honest(
         "two_steps",
@@ -738,7 +750,8 @@ def airy(n):
         "hdf_parameter",
         "an HDF5 file, which its library opens itself",
         "lab.h5",
-        "import h5py\n\nwith h5py.File(header) as lab:\n    return torch.from_numpy(lab['gain'][()])",
+        "import h5py\n\nwith h5py.File(header) as lab:\n    return"
+        " torch.from_numpy(lab['gain'][()])",
         make=_hdf,
     ),
     file(
@@ -757,7 +770,8 @@ with xarray.open_dataset(header, engine='h5netcdf', phony_dims='sort') as lab:
         "fits_parameter",
         "a FITS file",
         "lab.fits",
-        "from astropy.io import fits\n\nreturn torch.from_numpy(fits.getdata(header).astype(np.float32))",
+        "from astropy.io import fits\n\nreturn"
+        " torch.from_numpy(fits.getdata(header).astype(np.float32))",
         make=once(lambda folder: fits.writeto(folder / "lab.fits", np.ones((4, 4)))),
     ),
     file(
@@ -776,14 +790,16 @@ with OpenEXR.File(str(header)) as lab:
         "png_parameter",
         "a PNG file by imageio",
         "lab.png",
-        "import imageio.v3\n\nreturn torch.from_numpy(imageio.v3.imread(header).astype(np.float32))",
+        "import imageio.v3\n\nreturn"
+        " torch.from_numpy(imageio.v3.imread(header).astype(np.float32))",
         make=once(lambda folder: imageio.v3.imwrite(folder / "lab.png", np.ones((4, 4), np.uint8))),
     ),
     file(
         "pillow_parameter",
         "a PNG file by Pillow",
         "lab.png",
-        "from PIL import Image\n\nreturn torch.from_numpy(np.asarray(Image.open(header)).astype(np.float32))",
+        "from PIL import Image\n\nreturn"
+        " torch.from_numpy(np.asarray(Image.open(header)).astype(np.float32))",
         make=once(lambda folder: imageio.v3.imwrite(folder / "lab.png", np.ones((4, 4), np.uint8))),
     ),
     file(

@@ -1,4 +1,6 @@
-"""Parameters that are read rightly, but lead to something else: links, parts, journals, and own source as data."""
+"""Parameters that are read rightly, but lead to something else: links, parts, journals, and own
+source as data.
+"""
 
 import os
 import sqlite3
@@ -17,7 +19,13 @@ def through(name: str, about: str, header: str, lines: str, **words) -> Case:
     """Return a case whose node runs lines on its parameter `header` and returns a number."""
     indented = "\n".join("    " + line for line in lines.strip("\n").splitlines())
     steps = f"a: {{node: own.value, with: {{header: {header}}}}}"
-    return Case(name, about, f"@node()\ndef value(*, header: DataFile) -> Tensor:\n{indented}\n", steps, **words)
+    return Case(
+        name,
+        about,
+        f"@node()\ndef value(*, header: DataFile) -> Tensor:\n{indented}\n",
+        steps,
+        **words,
+    )
 
 
 def _linked(folder: Path, turn: int) -> None:
@@ -51,7 +59,8 @@ def _journal(folder: Path, turn: int) -> None:
     base.execute("pragma wal_autocheckpoint = 0")
     if turn == 1:
         base.executescript(
-            "create table gains (gain real); insert into gains values (1); pragma wal_checkpoint(truncate)"
+            "create table gains (gain real); insert into gains values (1); pragma"
+            " wal_checkpoint(truncate)"
         )
     else:
         base.execute("update gains set gain = 2")
@@ -95,7 +104,9 @@ def _extension(folder: Path, turn: int) -> None:
     (folder / "labc.c").write_text(_MODULE.replace("TURN", str(turn)))
     (folder / "labc.so").unlink(missing_ok=True)
     include = "-I" + sysconfig.get_path("include")
-    subprocess.run(["cc", "-shared", "-fPIC", include, "labc.c", "-o", "labc.so"], cwd=folder, check=True)
+    subprocess.run(
+        ["cc", "-shared", "-fPIC", include, "labc.c", "-o", "labc.so"], cwd=folder, check=True
+    )
 
 
 CASES = [
@@ -187,7 +198,8 @@ return picture(base.execute("select count(*) from other.sqlite_master").fetchone
 """,
         files={"lab.sql": "attach database 'other.db' as other;"},
         make=lambda folder, turn: (
-            turn == 2 and sqlite3.connect(folder / "other.db").execute("create table gains (gain real)")
+            turn == 2
+            and sqlite3.connect(folder / "other.db").execute("create table gains (gain real)")
         ),
     ),
     through(
@@ -425,7 +437,9 @@ return picture(yaml.load(Path(header).read_text(), Loader)["gain"])
             return picture(tables.gain)
         """,
         files={
-            "tables.py": "import numpy\n\n\ndef __getattr__(name):\n    return float(numpy.loadtxt(name))\n",
+            "tables.py": (
+                "import numpy\n\n\ndef __getattr__(name):\n    return float(numpy.loadtxt(name))\n"
+            ),
             "gain": ("1", "2"),
         },
     ),

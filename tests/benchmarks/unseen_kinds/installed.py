@@ -21,13 +21,23 @@ NODE = """
 def record(*names: str) -> dict[str, str]:
     """Return the metadata of a package that says its files."""
     listed = "".join(f"{name},,\n" for name in names)
-    return {"site/labtools-1.0.dist-info/METADATA": METADATA, "site/labtools-1.0.dist-info/RECORD": listed}
+    return {
+        "site/labtools-1.0.dist-info/METADATA": METADATA,
+        "site/labtools-1.0.dist-info/RECORD": listed,
+    }
 
 
 def installed(name: str, about: str, files: dict, code: str = NODE, **words) -> Case:
     """Return a case with packages in a folder of `PYTHONPATH`."""
     env = SITE | words.pop("env", {})
-    return Case(name, about, code, files={f"site/{path}": text for path, text in files.items()}, env=env, **words)
+    return Case(
+        name,
+        about,
+        code,
+        files={f"site/{path}": text for path, text in files.items()},
+        env=env,
+        **words,
+    )
 
 
 CASES = [
@@ -57,15 +67,13 @@ def gain():
         env=SITE,
         files={
             **record("labtools/__init__.py", "labtools/gain.txt"),
-            "site/labtools/__init__.py": (
-                """
+            "site/labtools/__init__.py": """
 from importlib.resources import files
 
 
 def gain():
 """
-                "    return files('labtools').joinpath('gain.txt').read_text()\n"
-            ),
+            "    return files('labtools').joinpath('gain.txt').read_text()\n",
             "site/labtools/gain.txt": ("1", "2"),
         },
     ),
@@ -73,7 +81,8 @@ def gain():
         "variable_at_import",
         "the package reads a variable when it is imported",
         {
-            "labtools/__init__.py": """
+            "labtools/__init__.py": (
+                """
 import os
 
 GAIN = os.environ['LAB_GAIN']
@@ -82,6 +91,7 @@ GAIN = os.environ['LAB_GAIN']
 def gain():
     return GAIN
 """
+            )
         },
         env={"LAB_GAIN": ("1", "2")},
     ),
@@ -89,13 +99,15 @@ def gain():
         "variable_at_call",
         "the package reads a variable when it is called",
         {
-            "labtools/__init__.py": """
+            "labtools/__init__.py": (
+                """
 import os
 
 
 def gain():
     return os.getenv('LAB_GAIN')
 """
+            )
         },
         env={"LAB_GAIN": ("1", "2")},
     ),
@@ -117,7 +129,10 @@ def gain():
         },
         env={"HOME": ("{folder}/site/one", "{folder}/site/two")},
         make=lambda folder, turn: [
-            ((folder / "site" / name).mkdir(exist_ok=True), (folder / "site" / name / ".labtools").write_text(text))
+            (
+                (folder / "site" / name).mkdir(exist_ok=True),
+                (folder / "site" / name / ".labtools").write_text(text),
+            )
             for name, text in (("one", "1"), ("two", "2"))
         ],
     ),
@@ -144,13 +159,15 @@ def gain():
         "second_package",
         "the package imports a package that changes",
         {
-            "labtools.py": """
+            "labtools.py": (
+                """
 import labcore
 
 
 def gain():
     return labcore.GAIN
-""",
+"""
+            ),
             "labcore.py": ("GAIN = 1\n", "GAIN = 2\n"),
         },
     ),
@@ -200,10 +217,12 @@ extra = labplug:GAIN
         {
             "labplug.py": ("GAIN = 1\n", "GAIN = 2\n"),
             "labplug-1.0.dist-info/METADATA": METADATA.replace("labtools", "labplug"),
-            "labplug-1.0.dist-info/entry_points.txt": """
+            "labplug-1.0.dist-info/entry_points.txt": (
+                """
 [lab.gains]
 extra = labplug:GAIN
-""",
+"""
+            ),
         },
         """
         from importlib.metadata import entry_points
@@ -228,7 +247,8 @@ from labtools import plugins
 def gain():
 """
                 "    names = [m.name for m in pkgutil.iter_modules(plugins.__path__)]\n"
-                "    return sum(importlib.import_module('labtools.plugins.' + n).GAIN for n in names)\n"
+                "    return sum(importlib.import_module('labtools.plugins.' + n).GAIN for n in"
+                " names)\n"
             ),
             "labtools/plugins/__init__.py": "",
             "labtools/plugins/one.py": "GAIN = 1\n",
@@ -300,11 +320,13 @@ numpy.trapezoid = lambda values: 2.0
         "namespace_package",
         "a namespace package whose second part changes",
         {
-            "lab/one.py": """
+            "lab/one.py": (
+                """
 from lab import two
 
 GAIN = two.GAIN
-""",
+"""
+            ),
             "lab/two.py": ("GAIN = 1\n", "GAIN = 2\n"),
         },
         """
@@ -319,19 +341,21 @@ GAIN = two.GAIN
         "typing_stub_beside",
         "the package reads a settings file beside its folder",
         {
-            "labtools/__init__.py": (
-                """
+            "labtools/__init__.py": """
 from pathlib import Path
 
 
 def gain():
 """
-                "    return (Path(__file__).parents[1] / 'labtools.cfg').read_text()\n"
-            ),
+            "    return (Path(__file__).parents[1] / 'labtools.cfg').read_text()\n",
             "labtools.cfg": ("1", "2"),
         },
     ),
-    table("file_below_prefix", "a settings file in the virtual environment", "{prefix}/etc/neusee_unseen_kind.cfg"),
+    table(
+        "file_below_prefix",
+        "a settings file in the virtual environment",
+        "{prefix}/etc/neusee_unseen_kind.cfg",
+    ),
     table(
         "file_beside_numpy",
         "a table that somebody put beside NumPy",

@@ -15,7 +15,9 @@ STEPS = tuple(
 
 
 def left(name: str, about: str, put: str, get: str, top: str = "", **words) -> Case:
-    """Return a case whose node `before` leaves `gain` by a line, and whose node `value` returns an expression."""
+    """Return a case whose node `before` leaves `gain` by a line, and whose node `value` returns
+    an expression.
+    """
     code = f"""
 {top}
 
@@ -48,7 +50,13 @@ def helper():
 helper.gain = 0
 """,
     ),
-    left("class_attribute", "an attribute of a class", "Lab.gain = gain", "Lab.gain", "class Lab:\n    gain = 0"),
+    left(
+        "class_attribute",
+        "an attribute of a class",
+        "Lab.gain = gain",
+        "Lab.gain",
+        "class Lab:\n    gain = 0",
+    ),
     left(
         "singleton",
         "the only object of a class",
@@ -205,7 +213,13 @@ COUNT = itertools.count()
         "next(STEPS)",
         "STEPS = (n for n in range(100))",
     ),
-    left("memo_of_dictionary", "a memo", "MEMO.setdefault('gain', gain)", "MEMO.setdefault('gain', 9)", "MEMO = {}"),
+    left(
+        "memo_of_dictionary",
+        "a memo",
+        "MEMO.setdefault('gain', gain)",
+        "MEMO.setdefault('gain', 9)",
+        "MEMO = {}",
+    ),
     left(
         "lru_cache",
         "functools.lru_cache of a function of the surroundings",
@@ -244,7 +258,13 @@ LAB = Lab()
     ),
     left("seed_of_torch", "a seed", "torch.manual_seed(gain)", "torch.rand(1)"),
     left("seed_of_numpy", "a seed of NumPy", "np.random.seed(gain)", "np.random.rand()"),
-    left("seed_of_random", "a seed of random", "random.seed(gain)", "random.random()", "import random"),
+    left(
+        "seed_of_random",
+        "a seed of random",
+        "random.seed(gain)",
+        "random.random()",
+        "import random",
+    ),
     left(
         "environment",
         "a variable of the process",
@@ -259,7 +279,13 @@ LAB = Lab()
         "len(str(decimal.Decimal(1) / 3))",
         "import decimal",
     ),
-    left("mpmath", "the digits of mpmath", "mpmath.mp.dps = 4 * gain", "len(str(mpmath.mpf(1) / 3))", "import mpmath"),
+    left(
+        "mpmath",
+        "the digits of mpmath",
+        "mpmath.mp.dps = 4 * gain",
+        "len(str(mpmath.mpf(1) / 3))",
+        "import mpmath",
+    ),
     left(
         "print_options",
         "how NumPy prints",
@@ -272,7 +298,12 @@ LAB = Lab()
         "torch.set_default_dtype([torch.float32, torch.float64][gain - 1])",
         "torch.ones(1).element_size()",
     ),
-    left("seterr", "np.seterr", "np.seterr(divide=['ignore', 'warn'][gain - 1])", "len(np.geterr()['divide'])"),
+    left(
+        "seterr",
+        "np.seterr",
+        "np.seterr(divide=['ignore', 'warn'][gain - 1])",
+        "len(np.geterr()['divide'])",
+    ),
     left(
         "fft_backend",
         "the workers of scipy.fft",
@@ -343,8 +374,18 @@ LAB = Lab()
         "len(networkx.config.warnings_to_ignore)",
         "import networkx",
     ),
-    left("recursion_limit", "the recursion limit", "sys.setrecursionlimit(2000 * gain)", "sys.getrecursionlimit()"),
-    left("switch_interval", "the switch interval", "sys.setswitchinterval(0.01 * gain)", "sys.getswitchinterval()"),
+    left(
+        "recursion_limit",
+        "the recursion limit",
+        "sys.setrecursionlimit(2000 * gain)",
+        "sys.getrecursionlimit()",
+    ),
+    left(
+        "switch_interval",
+        "the switch interval",
+        "sys.setswitchinterval(0.01 * gain)",
+        "sys.getswitchinterval()",
+    ),
     left(
         "warnings_filter",
         "a filter of warnings",
@@ -366,7 +407,12 @@ LAB = Lab()
         "len(locale.setlocale(locale.LC_CTYPE))",
         "import locale",
     ),
-    left("working_folder", "the working folder", "os.chdir(['/', '/usr'][gain - 1])", "len(Path.cwd().parts)"),
+    left(
+        "working_folder",
+        "the working folder",
+        "os.chdir(['/', '/usr'][gain - 1])",
+        "len(Path.cwd().parts)",
+    ),
     left(
         "working_folder_hidden",
         "the working folder, which the other step reads by a relative name",
@@ -377,7 +423,8 @@ LAB = Lab()
         "memory_file",
         "the file system of fsspec in memory",
         "fsspec.filesystem('memory').pipe('/gain', b'x' * gain)",
-        "fsspec.filesystem('memory').size('/gain') if fsspec.filesystem('memory').exists('/gain') else 0",
+        "fsspec.filesystem('memory').size('/gain') if fsspec.filesystem('memory').exists('/gain')"
+        " else 0",
         "import fsspec",
     ),
     left(
@@ -407,7 +454,13 @@ BASE.execute('insert into gains values (0)')
         "b'\\xff'.decode('ascii', 'lab')",
         "import codecs",
     ),
-    left("dialect", "a dialect of csv", "csv.field_size_limit(1000 * gain)", "csv.field_size_limit()", "import csv"),
+    left(
+        "dialect",
+        "a dialect of csv",
+        "csv.field_size_limit(1000 * gain)",
+        "csv.field_size_limit()",
+        "import csv",
+    ),
     left(
         "subclass",
         "a class that the step makes",
@@ -427,7 +480,12 @@ KEPT = []
         "np.lab_gain = gain",
         "getattr(np, 'lab_gain', 0)",
     ),
-    left("attribute_of_sys", "an attribute of sys", "sys.lab_gain = gain", "getattr(sys, 'lab_gain', 0)"),
+    left(
+        "attribute_of_sys",
+        "an attribute of sys",
+        "sys.lab_gain = gain",
+        "getattr(sys, 'lab_gain', 0)",
+    ),
     left(
         "attribute_of_builtins",
         "a name in builtins",
@@ -493,7 +551,9 @@ import ctypes
 CELL = ctypes.c_int(0)
 """,
     ),
-    left("byte_array", "a bytearray", "CELL.__setitem__(0, gain)", "CELL[0]", "CELL = bytearray(2)"),
+    left(
+        "byte_array", "a bytearray", "CELL.__setitem__(0, gain)", "CELL[0]", "CELL = bytearray(2)"
+    ),
     left(
         "shared_memory_map",
         "an anonymous memory map",
@@ -526,7 +586,8 @@ TEXT = io.StringIO()
     left(
         "thread_that_stays",
         "a thread that the step starts and that answers",
-        "threading.Thread(target=threading.Event().wait, args=(30,), name='lab' * gain, daemon=True).start()",
+        "threading.Thread(target=threading.Event().wait, args=(30,), name='lab' * gain,"
+        " daemon=True).start()",
         "sum(len(t.name) for t in threading.enumerate() if t.name.startswith('lab'))",
         "import threading",
     ),
@@ -573,7 +634,8 @@ class Lab:
         "shared.get('gain')",
         "import shared",
         files={
-            "shared.py": """
+            "shared.py": (
+                """
 _BOX = {}
 
 
@@ -584,6 +646,7 @@ def put(name, number):
 def get(name):
     return _BOX.get(name, 0)
 """
+            )
         },
     ),
     left(
@@ -593,13 +656,15 @@ def get(name):
         "shared.ALL[0][1].gain",
         "import shared",
         files={
-            "shared.py": """
+            "shared.py": (
+                """
 class Lab:
     gain = 0
 
 
 ALL = [('lab', Lab())]
 """
+            )
         },
     ),
     left(
@@ -610,7 +675,8 @@ ALL = [('lab', Lab())]
         "import labtools",
         env={"PYTHONPATH": "{folder}/site"},
         files={
-            "site/labtools.py": """
+            "site/labtools.py": (
+                """
 _BOX = {}
 
 
@@ -621,6 +687,7 @@ def put(gain):
 def get():
     return _BOX.get('gain', 0)
 """
+            )
         },
     ),
     left(
@@ -631,7 +698,8 @@ def get():
         "from labtools import LAB",
         env={"PYTHONPATH": "{folder}/site"},
         files={
-            "site/labtools.py": """
+            "site/labtools.py": (
+                """
 class Lab:
     def __init__(self):
         self._gain = 0
@@ -645,6 +713,7 @@ class Lab:
 
 LAB = Lab()
 """
+            )
         },
     ),
 ]

@@ -9,7 +9,9 @@ from unseen_kinds.case import Case
 def asks(name: str, about: str, lines: str, **words) -> Case:
     """Return a case whose node runs a few lines that return a number."""
     indented = "\n".join("    " + line for line in lines.strip("\n").splitlines())
-    return Case(name, about, f"@node()\ndef value(*, place: str = '.') -> Tensor:\n{indented}\n", **words)
+    return Case(
+        name, about, f"@node()\ndef value(*, place: str = '.') -> Tensor:\n{indented}\n", **words
+    )
 
 
 def table(name: str, about: str, path: str) -> Case:
@@ -43,9 +45,15 @@ PARAMETER = "a: {node: own.value, with: {header: dark.txt}}"
 
 CASES = [
     asks(
-        "clock_of_pandas", "pandas.Timestamp.now", "import pandas\n\nreturn picture(pandas.Timestamp.now().microsecond)"
+        "clock_of_pandas",
+        "pandas.Timestamp.now",
+        "import pandas\n\nreturn picture(pandas.Timestamp.now().microsecond)",
     ),
-    asks("clock_of_numpy", "np.datetime64('now')", "return picture(np.datetime64('now').astype(int) % 100000)"),
+    asks(
+        "clock_of_numpy",
+        "np.datetime64('now')",
+        "return picture(np.datetime64('now').astype(int) % 100000)",
+    ),
     asks(
         "clock_of_astropy",
         "astropy Time.now",
@@ -66,7 +74,11 @@ CASES = [
         "a clock that getattr finds",
         "import time\n\nreturn picture(getattr(time, 'monotonic' + '_ns')() % 1000)",
     ),
-    asks("clock_of_torch", "a timer of torch", "import timeit\n\nreturn picture(timeit.timeit('1', number=10) * 1e9)"),
+    asks(
+        "clock_of_torch",
+        "a timer of torch",
+        "import timeit\n\nreturn picture(timeit.timeit('1', number=10) * 1e9)",
+    ),
     asks(
         "clock_of_new_file",
         "the time of a file that the node has just made",
@@ -77,7 +89,11 @@ with tempfile.NamedTemporaryFile() as file:
     return picture(os.fstat(file.fileno())[8] % 100000)
 """,
     ),
-    asks("clock_of_uuid", "uuid1 and uuid4", "import uuid\n\nreturn picture(uuid.uuid1().time_low % 1000)"),
+    asks(
+        "clock_of_uuid",
+        "uuid1 and uuid4",
+        "import uuid\n\nreturn picture(uuid.uuid1().time_low % 1000)",
+    ),
     asks("number_of_process", "the process number", "return picture(os.getpid())"),
     asks("address", "id of an object", "return picture(id(object()) // 4096 % 10000)"),
     asks(
@@ -85,8 +101,14 @@ with tempfile.NamedTemporaryFile() as file:
         "the address in the text of an object",
         "return picture(int(repr(object())[-13:-1], 16) // 4096 % 10000)",
     ),
-    asks("hash_of_object", "the hash of an object, as a key of a bin", "return picture(hash(object()) // 256 % 10000)"),
-    asks("address_of_tensor", "data_ptr", "return picture(torch.ones(2).data_ptr() // 4096 % 10000)"),
+    asks(
+        "hash_of_object",
+        "the hash of an object, as a key of a bin",
+        "return picture(hash(object()) // 256 % 10000)",
+    ),
+    asks(
+        "address_of_tensor", "data_ptr", "return picture(torch.ones(2).data_ptr() // 4096 % 10000)"
+    ),
     asks(
         "temporary_name",
         "the name of a temporary file",
@@ -97,7 +119,11 @@ with tempfile.NamedTemporaryFile() as file:
     return picture(sum(map(ord, file.name)))
 """,
     ),
-    asks("thread_number", "the number of a thread", "import threading\n\nreturn picture(threading.get_native_id())"),
+    asks(
+        "thread_number",
+        "the number of a thread",
+        "import threading\n\nreturn picture(threading.get_native_id())",
+    ),
     asks(
         "memory_of_process",
         "how much memory the process has",
@@ -137,14 +163,19 @@ with tempfile.NamedTemporaryFile() as file:
         "import resource\n\nreturn picture(resource.getrlimit(resource.RLIMIT_NOFILE)[0])",
         prefix=("prlimit --nofile=1024:2048", "prlimit --nofile=1025:2048"),
     ),
-    asks("niceness", "the priority", "return picture(os.nice(0))", prefix=("nice -n 1", "nice -n 2")),
+    asks(
+        "niceness", "the priority", "return picture(os.nice(0))", prefix=("nice -n 1", "nice -n 2")
+    ),
     asks(
         "host_name",
         "the name of the machine",
         "import socket\n\nreturn picture(len(socket.gethostname()))",
         prefix=("unshare --uts", "{folder}/renamed"),
         files={
-            "renamed": '#!/bin/sh\nexec unshare --uts sh -c \'hostname a_long_name_of_a_machine; exec "$@"\' sh "$@"\n'
+            "renamed": (
+                "#!/bin/sh\nexec unshare --uts sh -c 'hostname a_long_name_of_a_machine; exec"
+                ' "$@"\' sh "$@"\n'
+            )
         },
         make=lambda folder, turn: (folder / "renamed").chmod(0o755),
     ),
@@ -154,7 +185,12 @@ with tempfile.NamedTemporaryFile() as file:
         "return picture(sys.stdin.readline())",
         stdin=("1\n", "2\n"),
     ),
-    asks("input_as_file", "input by its number", "return picture(os.read(0, 10))", stdin=("1\n", "2\n")),
+    asks(
+        "input_as_file",
+        "input by its number",
+        "return picture(os.read(0, 10))",
+        stdin=("1\n", "2\n"),
+    ),
     asks(
         "working_folder",
         "the name of the working folder",
@@ -169,7 +205,9 @@ with tempfile.NamedTemporaryFile() as file:
         folder=("{folder}/one", "{folder}/three"),
         files={"one/gain.txt": "1", "three/gain.txt": "2"},
     ),
-    asks("words_of_command", "the words of the command", "return picture(ord(sys.orig_argv[-1][-1]))"),
+    asks(
+        "words_of_command", "the words of the command", "return picture(ord(sys.orig_argv[-1][-1]))"
+    ),
     asks(
         "head_of_git",
         "the hash of the repository",
@@ -229,11 +267,21 @@ return picture(number)
 """,
         files={"/dev/shm/neusee_unseen_kind": (b"\x01" * 8, b"\x02" * 8)},
     ),
-    table("file_in_tmp", "what an earlier session left among temporary files", "{tmp}/neusee_unseen_kind.txt"),
+    table(
+        "file_in_tmp",
+        "what an earlier session left among temporary files",
+        "{tmp}/neusee_unseen_kind.txt",
+    ),
     table("file_of_system", "settings of the machine", "/usr/local/etc/neusee_unseen_kind.conf"),
-    table("file_in_var_tmp", "a scratch table that outlives a restart", "/var/tmp/neusee_unseen_kind.txt"),
+    table(
+        "file_in_var_tmp",
+        "a scratch table that outlives a restart",
+        "/var/tmp/neusee_unseen_kind.txt",
+    ),
     table("file_in_shared_memory", "a file in shared memory", "/dev/shm/neusee_unseen_kind.txt"),
     table(
-        "file_in_cache_of_user", "a table that a download left in the cache of the user", "{folder}/.cache/lab/gain.txt"
+        "file_in_cache_of_user",
+        "a table that a download left in the cache of the user",
+        "{folder}/.cache/lab/gain.txt",
     ),
 ]

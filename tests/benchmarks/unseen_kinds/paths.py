@@ -72,7 +72,9 @@ CASES = [
             return picture(np.genfromtxt(tables() / "gain.txt"))
         """,
         files={
-            "where.py": "from pathlib import Path\n\ndef tables():\n    return Path.cwd() / 'lab'\n",
+            "where.py": (
+                "from pathlib import Path\n\ndef tables():\n    return Path.cwd() / 'lab'\n"
+            ),
             "lab/gain.txt": TWO,
         },
     ),

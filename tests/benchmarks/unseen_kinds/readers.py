@@ -19,10 +19,14 @@ TABLE = ("400, 1\n410, 1\n420, 1\n", "400, 2\n410, 2\n420, 2\n")
 
 
 def reads(name: str, about: str, table: str, lines: str, **words) -> Case:
-    """Return a case whose node runs a few lines that return a number; `table` is the name of a file, as a text."""
+    """Return a case whose node runs a few lines that return a number; `table` is the name of a
+    file, as a text.
+    """
     indented = "\n".join("    " + line for line in lines.strip("\n").splitlines())
     steps = f"a: {{node: own.value, with: {{table: {table}}}}}"
-    return Case(name, about, f"@node()\ndef value(*, table: str) -> Tensor:\n{indented}\n", steps, **words)
+    return Case(
+        name, about, f"@node()\ndef value(*, table: str) -> Tensor:\n{indented}\n", steps, **words
+    )
 
 
 def _shelf(folder: Path, turn: int) -> None:
@@ -49,7 +53,10 @@ def _tar(folder: Path, turn: int) -> None:
 
 def _database(folder: Path, turn: int) -> None:
     base = sqlite3.connect(folder / "lab.db")
-    base.executescript(f"drop table if exists gains; create table gains (gain real); insert into gains values ({turn})")
+    base.executescript(
+        "drop table if exists gains; create table gains (gain real); insert into gains values"
+        f" ({turn})"
+    )
     base.close()
 
 
@@ -103,7 +110,9 @@ import scipy.io
 
 return picture(scipy.io.mmread(table).sum())
 """,
-        make=lambda folder, turn: scipy.io.mmwrite(folder / "lab.mtx", np.full((1, 1), float(turn))),
+        make=lambda folder, turn: scipy.io.mmwrite(
+            folder / "lab.mtx", np.full((1, 1), float(turn))
+        ),
     ),
     reads(
         "colour_table",
@@ -201,7 +210,9 @@ import gzip as squeezed
 with squeezed.open(table, "rt") as file:
     return picture(file.read())
 """,
-        make=lambda folder, turn: (folder / "gain.gz").write_bytes(gzip.compress(str(turn).encode())),
+        make=lambda folder, turn: (folder / "gain.gz").write_bytes(
+            gzip.compress(str(turn).encode())
+        ),
     ),
     reads(
         "database",

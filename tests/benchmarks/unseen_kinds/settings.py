@@ -1,17 +1,23 @@
-"""Settings of a library or of the process, which another file of the recipe sets when it is imported."""
+"""Settings of a library or of the process, which another file of the recipe sets when it is
+imported.
+"""
 
 from unseen_kinds.case import OTHER, Case
 
 
 def setting(name: str, about: str, lines: str, other: str, first: str, second: str) -> Case:
-    """Return a case whose file `other.py` makes a call with the first or the second word in the place of `WORD`."""
+    """Return a case whose file `other.py` makes a call with the first or the second word in the
+    place of `WORD`.
+    """
     indented = "\n".join("    " + line for line in lines.strip("\n").splitlines())
     code = f"@node()\ndef value() -> Tensor:\n{indented}\n"
     texts = (other.replace("WORD", first) + OTHER, other.replace("WORD", second) + OTHER)
     return Case(name, about, code, nodes="own.py, other.py", files={"other.py": texts})
 
 
-def setting_of_import(name: str, about: str, line: str, other: str, first: str, second: str) -> Case:
+def setting_of_import(
+    name: str, about: str, line: str, other: str, first: str, second: str
+) -> Case:
     """Return a case whose module makes a constant when it is imported, after `other.py`."""
     code = f"""
 try:

@@ -7,7 +7,9 @@ BOTH = "own.py, other.py"
 
 def sibling(name: str, about: str, code: str, first: str, second: str, **files) -> Case:
     """Return a case whose file `other.py` changes from one text to another."""
-    return Case(name, about, code, nodes=BOTH, files={"other.py": (first + OTHER, second + OTHER), **files})
+    return Case(
+        name, about, code, nodes=BOTH, files={"other.py": (first + OTHER, second + OTHER), **files}
+    )
 
 
 CASES = [

@@ -1,8 +1,10 @@
-"""Draw recipes/samples/overexposed_point.png again: a point source of 540 to 560 nm behind a lens that scatters.
+"""Draw recipes/samples/overexposed_point.png again: a point source of 540 to 560 nm behind a lens
+that scatters.
 
     python tests/nodes/calibrate/make_overexposed_point.py recipes/samples/overexposed_point.png
 
-The core is the Airy pattern of f/10 by SciPy's Bessel function at nine wavelengths, on 10 x 10 points of a pixel.
+The core is the Airy pattern of f/10 by SciPy's Bessel function at nine wavelengths, on 10 x 10
+points of a pixel.
 """
 
 import sys
@@ -27,7 +29,13 @@ def mean_light():
             scattered += (1 + (radius / FOCAL / WIDTH) ** 2) ** (SLOPE / 2) / 100
             for wave in WAVES:
                 v = np.pi * radius * DIAMETER / (wave * FOCAL)
-                core += (2 * j1(v) / v) ** 2 * np.pi / 4 * (PITCH * DIAMETER / (wave * FOCAL)) ** 2 / 900
+                core += (
+                    (2 * j1(v) / v) ** 2
+                    * np.pi
+                    / 4
+                    * (PITCH * DIAMETER / (wave * FOCAL)) ** 2
+                    / 900
+                )
     edge = (WIDTH**2 + 1) ** ((SLOPE + 2) / 2) - WIDTH ** (SLOPE + 2)
     total = 2 * np.pi * B0 * edge / (WIDTH**SLOPE * (SLOPE + 2))
     return ELECTRONS * ((1 - total) * core + B0 * (PITCH / FOCAL) ** 2 * scattered)
@@ -35,7 +43,11 @@ def mean_light():
 
 def main(path):
     draw = np.random.default_rng(20261)
-    light = draw.poisson(np.minimum(mean_light(), 1e9)) + OFFSET + draw.normal(0, READ_NOISE, (SIZE, SIZE))
+    light = (
+        draw.poisson(np.minimum(mean_light(), 1e9))
+        + OFFSET
+        + draw.normal(0, READ_NOISE, (SIZE, SIZE))
+    )
     numbers = np.clip(np.round(np.minimum(light, WELL) * GAIN), 0, 2**BITS - 1)
     Image.fromarray(numbers.astype(np.uint16)).save(path, optimize=True)
 

@@ -1,7 +1,9 @@
-"""A camera in NumPy alone, which shares no code with the nodes, and faults that can be planted in its frames.
+"""A camera in NumPy alone, which shares no code with the nodes, and faults that can be planted in
+its frames.
 
-``Camera(seed, **faults).levels()`` gives (name, photons, exposure, frames) of darks and lit levels. Faults are numbers
-or arrays by the names of `FAULTS`; without one the camera is clean: Poisson light, Gaussian read noise, rounding.
+``Camera(seed, **faults).levels()`` gives (name, photons, exposure, frames) of darks and lit levels.
+Faults are numbers or arrays by the names of `FAULTS`; without one the camera is clean: Poisson
+light, Gaussian read noise, rounding.
 """
 
 from dataclasses import dataclass, field
@@ -16,10 +18,14 @@ FAULTS = {
     "lag": "share of a frame that stays in the next",
     "telegraph": "share of the pixels with jumps of 60 e-",
     "stuck": "bit that is always 0",
-    "black": "standard deviations of the dark above its mean at which the black is cut, and set to 0",
+    "black": (
+        "standard deviations of the dark above its mean at which the black is cut, and set to 0"
+    ),
     "rows": "e-, noise that a whole row shares",
     "columns": "e-, noise that a whole column shares",
-    "coloured": "share of the read noise of a pixel that the next pixel of its row has with the other sign",
+    "coloured": (
+        "share of the read noise of a pixel that the next pixel of its row has with the other sign"
+    ),
     "compression": "DN, step of the cosines of blocks of 8 x 8 pixels",
     "drift": "relative change of the lamp within a pair",
     "lamp": "relative scatter of the lamp from level to level",
@@ -83,7 +89,9 @@ class Camera:
 
     def _electrons(self, rng, mean, exposure):
         shape = (self.size, self.size)
-        electrons = rng.poisson(mean + (5 + self._hot) * exposure) + self.noise * self._read(rng.standard_normal(shape))
+        electrons = rng.poisson(mean + (5 + self._hot) * exposure) + self.noise * self._read(
+            rng.standard_normal(shape)
+        )
         electrons += self._dsnu + 60 * (self._jumping & (rng.random(shape) < 0.5))
         electrons += self._of("rows") * rng.standard_normal((self.size, 1))
         return electrons + self._of("columns") * rng.standard_normal((1, self.size))

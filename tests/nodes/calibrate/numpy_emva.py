@@ -1,7 +1,8 @@
-"""The quantities of EMVA 1288, release 4.0 Linear, from frames in NumPy alone, which shares no code with the nodes.
+"""The quantities of EMVA 1288, release 4.0 Linear, from frames in NumPy alone, which shares no code
+with the nodes.
 
-``quantities(pairs, series)`` takes a list of (photons, exposure in s, two frames) and the dark and the lit series
-(frame, y, x), and gives the quantities by the keys of `emva_sheet`.
+``quantities(pairs, series)`` takes a list of (photons, exposure in s, two frames) and the dark and
+the lit series (frame, y, x), and gives the quantities by the keys of `emva_sheet`.
 """
 
 import numpy as np
@@ -18,7 +19,9 @@ def quantities(pairs, series):
     mu_p, y, s2 = lit[:, 0], lit[:, 2] - own[:, 2], lit[:, 3] - own[:, 3]
     full = lit[:, 3].argmax()
     fit = y <= 0.7 * y[full]
-    k, r = (np.linalg.lstsq(x[fit, None], z[fit], rcond=None)[0][0] for x, z in ((y, s2), (mu_p, y)))
+    k, r = (
+        np.linalg.lstsq(x[fit, None], z[fit], rcond=None)[0][0] for x, z in ((y, s2), (mu_p, y))
+    )
     slopes = [np.polyfit(dark[:, 1], dark[:, i], 1) for i in (2, 3)]
     sigma, eta, most = np.sqrt(slopes[1][1]), r / k, mu_p[full]
     least = (sigma / k + 0.5) / eta
@@ -50,7 +53,9 @@ def _moments(one, two):
 
 
 def _spatial(stack):
-    """Spatial variances: the three equations of the standard for rows, columns and pixels, solved."""
+    """Spatial variances: the three equations of the standard for rows, columns and pixels,
+    solved.
+    """
     count, rows, columns = stack.shape
     image, left = stack.mean(0), stack.var(0, ddof=1).mean() / count
     total = image.var(ddof=1) - left

@@ -1,4 +1,6 @@
-"""EMVA 1288 least squares: the published figures of a real data set, known truths, and measurements without hope."""
+"""EMVA 1288 least squares: the published figures of a real data set, known truths, and
+measurements without hope.
+"""
 
 import math
 import os
@@ -10,7 +12,9 @@ import torch
 from neusee.nodes.calibrate import expose, least_squares, levels, reduce, table
 from neusee.nodes.values import Levels
 
-DATA = Path(os.environ.get("NEUSEE_EMVA1288", Path(__file__).parents[3] / "../shared/data/emva1288"))
+DATA = Path(
+    os.environ.get("NEUSEE_EMVA1288", Path(__file__).parents[3] / "../shared/data/emva1288")
+)
 COLUMNS = {
     "exposure": "exposure_ns",
     "exposure_unit": "ns",
@@ -38,14 +42,18 @@ def synthetic(gain=2.0, efficiency=0.5, dark=100.0, noise=4.0, light=LIGHT, expo
     electrons = efficiency * photons
     variance = gain**2 * (noise**2 + electrons) + 1 / 12
     mean = dark + gain * electrons
-    return Levels(photons, exposure * one, 2e5 * one, mean, variance, 1e5 * one, none.long(), none, none)
+    return Levels(
+        photons, exposure * one, 2e5 * one, mean, variance, 1e5 * one, none.long(), none, none
+    )
 
 
 def simulated(light, exposures, seed, **how):
     rng = torch.Generator().manual_seed(seed)
     parts = []
     for photons, exposure in zip(light, exposures, strict=True):
-        frames = expose(photons=photons, exposure=exposure, shape=(128, 128), rng=rng, **{**SENSOR, **how})
+        frames = expose(
+            photons=photons, exposure=exposure, shape=(128, 128), rng=rng, **{**SENSOR, **how}
+        )
         parts.append(reduce(frames, photons=photons, exposure=exposure))
     return levels(parts)
 
@@ -89,7 +97,8 @@ def test_each_level_is_taken_less_the_dark_of_its_exposure():
     assert float(found.efficiency) == pytest.approx(0.5, rel=1e-10)
     assert float(found.dark_signal) == 100.0
     assert float(found.temporal_dark_noise) == pytest.approx(4.0, rel=1e-9)
-    assert float(found.dark_current) == pytest.approx(40 / 2 / 2.0, rel=1e-10)  # 40 DN in 2 s at 2 DN/e-
+    # 40 DN in 2 s at 2 DN/e-
+    assert float(found.dark_current) == pytest.approx(40 / 2 / 2.0, rel=1e-10)
 
 
 def test_simulated_frames_give_their_sensor_within_the_stated_errors():
@@ -98,7 +107,12 @@ def test_simulated_frames_give_their_sensor_within_the_stated_errors():
     for seed in range(40):
         found = least_squares(simulated(LIGHT, [0.1] * len(LIGHT), seed, dark_current=0.0))
         truth = {"gain": 0.37, "efficiency": 0.56, "temporal_dark_noise": 10.5}
-        pulls.append([float((found._asdict()[k] - v) / found._asdict()[f"{k}_error"]) for k, v in truth.items()])
+        pulls.append(
+            [
+                float((found._asdict()[k] - v) / found._asdict()[f"{k}_error"])
+                for k, v in truth.items()
+            ]
+        )
     pulls = torch.tensor(pulls, dtype=torch.float64)
     assert float(pulls.mean(0).abs().max()) < 4 / math.sqrt(40)
     assert float((pulls.std(0) - 1).abs().max()) < 4 / math.sqrt(2 * 40)
@@ -106,7 +120,9 @@ def test_simulated_frames_give_their_sensor_within_the_stated_errors():
 
 def test_dark_current_is_found():
     found = least_squares(simulated([0.0, 0.0, *LIGHT[1:]], [0.1, 10.0, *[0.1] * 6], 4))
-    assert float(found.dark_current) == pytest.approx(50.0, abs=4 * 25 / math.sqrt(2 * 128**2) / 9.9)
+    assert float(found.dark_current) == pytest.approx(
+        50.0, abs=4 * 25 / math.sqrt(2 * 128**2) / 9.9
+    )
 
 
 def test_a_dark_that_rounding_swallows_has_an_endless_error():
@@ -134,8 +150,14 @@ def test_measurements_without_hope_are_refused(light, message):
 def test_a_camera_without_response_is_refused():
     blind = synthetic()
     with pytest.raises(ValueError, match="light must raise mean and variance"):
-        least_squares(blind._replace(mean=torch.full_like(blind.mean, 100.0), variance=torch.ones_like(blind.mean)))
-    quieter = blind._replace(variance=torch.tensor([9.0, 3.0, 3.0, 3.0, 3.0, 3.0, 4.0], dtype=torch.float64))
+        least_squares(
+            blind._replace(
+                mean=torch.full_like(blind.mean, 100.0), variance=torch.ones_like(blind.mean)
+            )
+        )
+    quieter = blind._replace(
+        variance=torch.tensor([9.0, 3.0, 3.0, 3.0, 3.0, 3.0, 4.0], dtype=torch.float64)
+    )
     with pytest.raises(ValueError, match="slopes -"):
         least_squares(quieter)
     with pytest.raises(ValueError, match="below 100% of saturation"):

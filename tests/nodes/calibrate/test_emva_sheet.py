@@ -1,4 +1,6 @@
-"""The sheet of EMVA 1288: published numbers, a camera of known truth in NumPy, and what frames do not tell."""
+"""The sheet of EMVA 1288: published numbers, a camera of known truth in NumPy, and what frames
+do not tell.
+"""
 
 import os
 from pathlib import Path
@@ -20,12 +22,15 @@ from neusee.nodes.calibrate import (
     without_trend,
 )
 from neusee.nodes.calibrate import levels as joined
-from neusee.nodes.calibrate._sheet._nonuniformity import nonuniformity, spatial_variances
-from neusee.nodes.calibrate._sheet._photon_transfer import photon_transfer, saturation_point
+from neusee.nodes.calibrate._emva_quantities import photon_transfer, saturation_point
+from neusee.nodes.calibrate._nonuniformity import nonuniformity, spatial_variances
 from neusee.nodes.values import Levels
 
-DATA = Path(os.environ.get("NEUSEE_EMVA1288", Path(__file__).parents[3] / "../shared/data/emva1288"))
-#: doc/datasets/datasets_results.rst of the reference implementation of the working group (set 001, release 3.0)
+DATA = Path(
+    os.environ.get("NEUSEE_EMVA1288", Path(__file__).parents[3] / "../shared/data/emva1288")
+)
+#: doc/datasets/datasets_results.rst of the reference implementation of the working group (set 001,
+#: release 3.0)
 PUBLISHED = {
     "inverse_K": 3.56164319936, "K": 0.280769280926, "eta": 45.1356082834, "R": 0.126726922819,
     "sigma_y_dark": 3.07341849276, "sigma_d": 10.8980275235, "mu_p_min": 25.3600660517, "mu_p_sat": 30957.0,
@@ -33,7 +38,8 @@ PUBLISHED = {
     "DR_bit": 10.2534914503, "LE_min": -0.615797581149, "LE_max": 0.480448332752, "mu_I_mean": 28.4074312749,
 }  # fmt: skip
 GAIN, EFFICIENCY, NOISE, OFFSET, CURRENT = 0.4, 0.55, 12.0, 60.0, 900.0
-DSNU, PRNU = {"row": 1.0, "column": 1.5, "pixel": 2.0}, {"row": 0.4, "column": 0.3, "pixel": 1.0}  # DN and %
+# DN and %
+DSNU, PRNU = {"row": 1.0, "column": 1.5, "pixel": 2.0}, {"row": 0.4, "column": 0.3, "pixel": 1.0}
 SHAPE, EXPOSURE, SERIES = (200, 240), 0.01, 24
 
 
@@ -55,13 +61,18 @@ def ideal(photons, **changes):
 
 def pattern(rng, parts):
     row, column = rng.standard_normal((SHAPE[0], 1)), rng.standard_normal((1, SHAPE[1]))
-    return sum(parts[name] * x for name, x in (("row", row), ("column", column), ("pixel", rng.standard_normal(SHAPE))))
+    return sum(
+        parts[name] * x
+        for name, x in (("row", row), ("column", column), ("pixel", rng.standard_normal(SHAPE)))
+    )
 
 
 def camera(rng, photons, frames, exposure=EXPOSURE, patterns=(0.0, 0.0)):
     """Frames of a camera in NumPy alone, which saturates at 4095 DN."""
     dark, response = patterns
-    electrons = rng.poisson(EFFICIENCY * photons * (1 + response / 100) + CURRENT * exposure, (frames, *SHAPE))
+    electrons = rng.poisson(
+        EFFICIENCY * photons * (1 + response / 100) + CURRENT * exposure, (frames, *SHAPE)
+    )
     numbers = OFFSET + dark + GAIN * (electrons + NOISE * rng.standard_normal(electrons.shape))
     return torch.from_numpy(np.clip(np.round(numbers), 0, 4095).astype(np.int32))
 
@@ -73,8 +84,14 @@ def known():
     patterns = pattern(rng, DSNU), pattern(rng, PRNU)
     grid = np.linspace(0, 21000, 22)
     pairs = [(p, EXPOSURE) for p in grid] + [(0.0, t) for t in (0.11, 0.21, 0.31)]
-    parts = [reduce(camera(rng, p, 2, t, patterns), photons=p, exposure=t, scatter="steady") for p, t in pairs]
-    series = [spatial_series(p, EXPOSURE, camera(rng, p, SERIES, patterns=patterns)) for p in (0.0, 9000.0)]
+    parts = [
+        reduce(camera(rng, p, 2, t, patterns), photons=p, exposure=t, scatter="steady")
+        for p, t in pairs
+    ]
+    series = [
+        spatial_series(p, EXPOSURE, camera(rng, p, SERIES, patterns=patterns))
+        for p in (0.0, 9000.0)
+    ]
     return emva_sheet(joined(parts), Nonuniformity(*series))
 
 
@@ -86,7 +103,8 @@ def known():
         ("sigma_d", NOISE, 0.01),
         ("mu_y_dark", OFFSET + GAIN * CURRENT * EXPOSURE, 0.005),
         ("mu_p_min", ((NOISE**2 + CURRENT * 0 + 1 / 12 / GAIN**2) ** 0.5 + 0.5) / EFFICIENCY, 0.02),
-        ("mu_p_sat", 17000.0, 0.0),  # of the level at 18000 the converter cuts 4 %, which lowers its variance
+        # of the level at 18000 the converter cuts 4 %, which lowers its variance
+        ("mu_p_sat", 17000.0, 0.0),
         ("mu_e_sat", 9350.0, 0.006),
         ("SNR_max", 9350.0**0.5, 0.004),
         ("mu_I_mean", CURRENT, 0.01),
@@ -116,7 +134,12 @@ def test_published_numbers_of_the_first_reference_set():
     file = DATA / "EMVA1288_ReferenceSet_001_CCD_12Bit_moments.csv"
     if not file.is_file():
         pytest.skip(f"no {file.name} in {DATA}: set NEUSEE_EMVA1288")
-    names = {"pixels": "npix", "mean": "mean_DN", "variance": "temporal_var_DN2", "exposure": "exposure_ns"}
+    names = {
+        "pixels": "npix",
+        "mean": "mean_DN",
+        "variance": "temporal_var_DN2",
+        "exposure": "exposure_ns",
+    }
     found = emva_sheet(table(file=file, **names, drift="mean_diff", exposure_unit="ns"))
     assert {key: found[key].value for key in PUBLISHED} == pytest.approx(PUBLISHED, rel=1e-5)
     assert found.transfer.saturation == 36
@@ -128,7 +151,9 @@ def test_moments_without_noise_give_the_camera_back():
     assert found["eta"].value == pytest.approx(100 * EFFICIENCY, rel=1e-12)
     assert found["sigma_d"].value == pytest.approx(NOISE, rel=1e-12)
     assert abs(found["LE_max"].value) < 1e-10
-    assert found["DR_dB"].value == pytest.approx(20 * np.log10(found["mu_p_sat"].value / found["mu_p_min"].value))
+    assert found["DR_dB"].value == pytest.approx(
+        20 * np.log10(found["mu_p_sat"].value / found["mu_p_min"].value)
+    )
 
 
 def test_linearity_error_is_the_weighted_fit_of_the_standard():
@@ -140,7 +165,9 @@ def test_linearity_error_is_the_weighted_fit_of_the_standard():
     used = (y >= 0.05 * y[-1]) & (y <= 0.95 * y[-1])
     line = np.polynomial.Polynomial.fit(photons[1:][used], y[used], 1, w=1 / y[used])
     apart = 100 * (y[used] / line(photons[1:][used]) - 1)
-    assert (found["LE_min"].value, found["LE_max"].value) == pytest.approx((apart.min(), apart.max()), rel=1e-8)
+    assert (found["LE_min"].value, found["LE_max"].value) == pytest.approx(
+        (apart.min(), apart.max()), rel=1e-8
+    )
 
 
 def test_saturation_is_the_last_peak_and_no_noise_of_saturated_levels():
@@ -158,20 +185,34 @@ def test_without_saturation_there_are_limits_only():
 
 def test_dark_noise_below_rounding_is_a_limit():
     found = emva_sheet(ideal(np.linspace(0, 20000, 41), noise=0.5))
-    assert (found["sigma_y_dark"].value, found["sigma_y_dark"].bound) == (pytest.approx(0.24**0.5), "<")
+    assert (found["sigma_y_dark"].value, found["sigma_y_dark"].bound) == (
+        pytest.approx(0.24**0.5),
+        "<",
+    )
     assert found["sigma_d"].value == pytest.approx((0.24 - 1 / 12) ** 0.5 / GAIN, rel=1e-9)
-    assert [found[key].bound for key in ("sigma_d", "mu_p_min", "mu_e_min", "DR")] == ["<", "<", "<", ">"]
+    assert [found[key].bound for key in ("sigma_d", "mu_p_min", "mu_e_min", "DR")] == [
+        "<",
+        "<",
+        "<",
+        ">",
+    ]
     assert "below the 0.49 DN that the standard sets" in found["sigma_d"].reason
 
 
 def test_without_a_gain_nothing_is_told_in_electrons():
     levels = ideal(np.linspace(0, 20000, 41))
     series = spatial_series(0.0, EXPOSURE, torch.arange(100).reshape(1, 10, 10).expand(4, 10, 10))
-    found = emva_sheet(levels._replace(variance=torch.full((41,), 5.0)), Nonuniformity(series, None))
-    in_electrons = [q for q in found.quantities if "e-" in q.unit or q.key.startswith(("SNR", "DR", "K", "eta"))]
+    found = emva_sheet(
+        levels._replace(variance=torch.full((41,), 5.0)), Nonuniformity(series, None)
+    )
+    in_electrons = [
+        q for q in found.quantities if "e-" in q.unit or q.key.startswith(("SNR", "DR", "K", "eta"))
+    ]
     in_electrons = [q for q in in_electrons if not q.key.endswith("general")]
     assert len(in_electrons) == 19
-    assert {(q.value, q.text, q.reason != "") for q in in_electrons} == {(None, "not measured", True)}
+    assert {(q.value, q.text, q.reason != "") for q in in_electrons} == {
+        (None, "not measured", True)
+    }
     assert found["DSNU1288_DN"].value > 0
 
 
@@ -197,12 +238,19 @@ def test_a_dark_current_within_its_error_is_not_told():
     jumps = np.resize([1.0, -1.0], 9)
     darks = moments(np.zeros(9), OFFSET + jumps, 40 + jumps, np.arange(9.0))
     found = emva_sheet(joined([ideal(np.linspace(500, 20000, 40)), darks]))
-    assert ["no rise with the exposure" in found[k].reason for k in ("mu_I_mean", "mu_I_var")] == [True, True]
+    assert ["no rise with the exposure" in found[k].reason for k in ("mu_I_mean", "mu_I_var")] == [
+        True,
+        True,
+    ]
 
 
 def test_parts_of_the_spatial_variance_solve_the_equations_of_the_standard():
     rng = np.random.default_rng(3)
-    frames = rng.integers(0, 50, (5, 12, 20)) + 9 * rng.integers(0, 5, (12, 1)) + 4 * rng.integers(0, 5, (1, 20))
+    frames = (
+        rng.integers(0, 50, (5, 12, 20))
+        + 9 * rng.integers(0, 5, (12, 1))
+        + 4 * rng.integers(0, 5, (1, 20))
+    )
     image, left = frames.mean(0), frames.var(0, ddof=1).mean() / 5
     total = image.var(ddof=1) - left
     columns, rows = image.mean(0).var() - left / 12, image.mean(1).var() - left / 20
@@ -234,13 +282,21 @@ def test_spectrograms_of_noise_and_of_a_wave():
     assert wave.amplitude[20] == pytest.approx(20 * 200**0.5 / 2, rel=0.02)
     assert np.median(np.delete(wave.amplitude, (0, 20))) == pytest.approx(3.0, rel=0.02)
     assert (flat.frequency[-1], len(flat.frequency)) == (0.5, 201)
-    assert (np.delete(wave.amplitude, 0) ** 2 * 2).sum() / 200 == pytest.approx(image.var(), rel=0.02)  # Parseval
+    # Parseval
+    assert (np.delete(wave.amplitude, 0) ** 2 * 2).sum() / 200 == pytest.approx(
+        image.var(), rel=0.02
+    )
 
 
 def test_profiles_are_lines_of_the_frame():
     image = np.arange(48.0).reshape(6, 8)
     rows, columns = profiles(image), profiles(image, vertical=True)
-    assert [x.tolist() for x in rows] == [[*range(24, 32)], [*range(20, 28)], [*range(8)], [*range(40, 48)]]
+    assert [x.tolist() for x in rows] == [
+        [*range(24, 32)],
+        [*range(20, 28)],
+        [*range(8)],
+        [*range(40, 48)],
+    ]
     assert columns.middle.tolist() == [4, 12, 20, 28, 36, 44]
     assert columns.greatest.tolist() == [7, 15, 23, 31, 39, 47]
 
@@ -274,8 +330,14 @@ def test_a_nonuniformity_within_chance_is_a_limit():
     rng = np.random.default_rng(11)
     stated, most = 0, 0.0
     for _ in range(60):
-        frames = torch.from_numpy(np.round(100 + 10 * rng.standard_normal((3, 24, 32))).astype(np.int64))
-        found = [q for q in nonuniformity(Nonuniformity(spatial_series(0.0, 1.0, frames), None), 1.0) if q.unit == "DN"]
+        frames = torch.from_numpy(
+            np.round(100 + 10 * rng.standard_normal((3, 24, 32))).astype(np.int64)
+        )
+        found = [
+            q
+            for q in nonuniformity(Nonuniformity(spatial_series(0.0, 1.0, frames), None), 1.0)
+            if q.unit == "DN"
+        ]
         stated += sum(q.bound == "" for q in found)
         most = max(most, *(q.value for q in found))
     assert stated <= 0.1 * 4 * 60  # two standard errors of a variance from few rows
@@ -285,9 +347,13 @@ def test_a_nonuniformity_within_chance_is_a_limit():
 def test_a_nonuniformity_beyond_chance_is_stated():
     rng = np.random.default_rng(12)
     image = 100 + 5 * rng.standard_normal((24, 32))
-    frames = torch.from_numpy(np.round(image + 4 * rng.standard_normal((9, 24, 32))).astype(np.int64))
+    frames = torch.from_numpy(
+        np.round(image + 4 * rng.standard_normal((9, 24, 32))).astype(np.int64)
+    )
     total, _, _, pixel = (
-        q for q in nonuniformity(Nonuniformity(spatial_series(0.0, 1.0, frames), None), 1.0) if q.unit == "DN"
+        q
+        for q in nonuniformity(Nonuniformity(spatial_series(0.0, 1.0, frames), None), 1.0)
+        if q.unit == "DN"
     )
     assert (total.bound, pixel.bound) == ("", "")
     assert (total.value, pixel.value) == (pytest.approx(5, rel=0.1), pytest.approx(5, rel=0.1))
@@ -299,8 +365,12 @@ def test_the_general_model_of_a_linear_camera_is_the_linear_one():
     least = (0.5 + np.sqrt(0.25 + noise)) / EFFICIENCY
     most = EFFICIENCY * found["mu_p_sat"].value
     assert found["mu_p_min_general"].value == pytest.approx(least, rel=1e-9)
-    assert found["SNR_max_general"].value == pytest.approx(20 * np.log10(most / np.sqrt(most + noise)), rel=1e-9)
-    assert found["DR_general"].value == pytest.approx(20 * np.log10(most / EFFICIENCY / least), rel=1e-9)
+    assert found["SNR_max_general"].value == pytest.approx(
+        20 * np.log10(most / np.sqrt(most + noise)), rel=1e-9
+    )
+    assert found["DR_general"].value == pytest.approx(
+        20 * np.log10(most / EFFICIENCY / least), rel=1e-9
+    )
 
 
 def test_the_general_model_of_a_bent_camera_has_the_slope_at_each_level():
@@ -308,18 +378,28 @@ def test_the_general_model_of_a_bent_camera_has_the_slope_at_each_level():
     levels = ideal(photons)
     bend = 0.4 / 17000  # the signal is lower by 40 % of the line at the end
     found = general_model(
-        photon_transfer(levels._replace(mean=OFFSET + (levels.mean - OFFSET) * (1 - bend * levels.photons)))
+        photon_transfer(
+            levels._replace(mean=OFFSET + (levels.mean - OFFSET) * (1 - bend * levels.photons))
+        )
     )
     slope = GAIN * EFFICIENCY * (1 - 2 * bend * photons)
     assert found.slope == pytest.approx(slope, rel=1e-9)
-    assert found.ratio == pytest.approx((photons * slope / np.sqrt(levels.variance.numpy()))[1:], rel=1e-9)
+    assert found.ratio == pytest.approx(
+        (photons * slope / np.sqrt(levels.variance.numpy()))[1:], rel=1e-9
+    )
 
 
 def test_the_general_model_needs_levels():
     found = emva_sheet(ideal([0, 1000, 20000]))
-    assert {found[key].value for key in ("mu_p_min_general", "SNR_max_general", "DR_general")} == {None}
+    assert {found[key].value for key in ("mu_p_min_general", "SNR_max_general", "DR_general")} == {
+        None
+    }
     dim = emva_sheet(ideal(np.linspace(0, 9000, 10), noise=0.4), photons_told=False)
-    assert (dim["mu_p_min_general"].value, dim["DR_general"].bound, dim["SNR_max_general"].bound) == (None, ">", ">")
+    assert (
+        dim["mu_p_min_general"].value,
+        dim["DR_general"].bound,
+        dim["SNR_max_general"].bound,
+    ) == (None, ">", ">")
 
 
 def test_light_that_scatters_tells_no_slope_of_a_few_levels():
@@ -327,7 +407,13 @@ def test_light_that_scatters_tells_no_slope_of_a_few_levels():
     levels = ideal(np.linspace(0, 20000, 31))
     truth = emva_sheet(levels)["SNR_max_general"].value
     for scatter, told in ((1e-4, True), (0.02, False)):
-        light = OFFSET + (levels.mean - OFFSET) * (1 + scatter * torch.from_numpy(rng.standard_normal(31)))
+        light = OFFSET + (levels.mean - OFFSET) * (
+            1 + scatter * torch.from_numpy(rng.standard_normal(31))
+        )
         found = emva_sheet(levels._replace(mean=light.clamp(max=4000.0)))["SNR_max_general"]
         assert (found.value is not None) == told
-        assert found.value == pytest.approx(truth, abs=0.05) if told else "the light scatters" in found.reason
+        assert (
+            found.value == pytest.approx(truth, abs=0.05)
+            if told
+            else "the light scatters" in found.reason
+        )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from neusee.nodes import ParameterError, calibrate
-from neusee.nodes.calibrate._scatter._point_source import _Camera, reduce_rings
+from neusee.nodes.calibrate._scatter_likelihood import _Camera, reduce_rings
 
 CAMERA = {"gain": 0.5, "offset": 100.0, "full_well": 20000.0, "read_noise": 5.0, "bits": 14}
 
@@ -56,9 +56,17 @@ def test_rings_of_cut_pixels_are_kept_as_a_limit():
     ("numbers", "params", "message"),
     [
         (frame() * 0.5, {}, "no pixel is saturated: the brightest has 5000 DN of 10000 DN"),
-        (frame(), {"bits": 12}, "the frames hold 10000 DN, which 12 bits cannot: give the `bits` of the files"),
+        (
+            frame(),
+            {"bits": 12},
+            "the frames hold 10000 DN, which 12 bits cannot: give the `bits` of the files",
+        ),
         (frame(), {"full_well": 40000.0}, "no pixel is saturated"),
-        (frame(), {"centre": (200.0, 3.0)}, r"the source at \(200, 3\) is not in the frame of 96 x 96 pixels"),
+        (
+            frame(),
+            {"centre": (200.0, 3.0)},
+            r"the source at \(200, 3\) is not in the frame of 96 x 96 pixels",
+        ),
         (frame(24, (12, 12)), {}, "rings of pixels lie between the saturated pixels and the edge"),
         (np.full((64, 64), 10000.0), {}, "only 0 rings of pixels lie between"),
     ],
@@ -76,4 +84,6 @@ def test_pictures_that_tell_nothing_are_refused_before_the_run(numbers, params, 
 def test_a_file_that_is_no_picture_is_refused_before_the_run(tmp_path):
     (tmp_path / "point.png").write_text("no picture")
     with pytest.raises(ParameterError, match=r"point\.png"):
-        calibrate.point_source.hooks.preflight(files=[tmp_path / "point.png"], centre=None, **CAMERA)
+        calibrate.point_source.hooks.preflight(
+            files=[tmp_path / "point.png"], centre=None, **CAMERA
+        )

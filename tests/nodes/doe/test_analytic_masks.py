@@ -44,7 +44,9 @@ def test_mask_delays_its_wavelength_by_its_formula(name, material, wavelength):
     height = getattr(doe, name)(STOP, **params, material=material, wavelength=wavelength)
     v, u, open_ = plane()
     wanted = formula(torch.hypot(v, u), torch.atan2(v, u))[open_]
-    assert_close(turns(height, material, wavelength)[open_], wanted - wanted.min(), rtol=0, atol=1e-5)
+    assert_close(
+        turns(height, material, wavelength)[open_], wanted - wanted.min(), rtol=0, atol=1e-5
+    )
     assert height.dtype == torch.float32
     assert float(height.min()) == 0
     assert not height[~open_].any()
@@ -77,7 +79,10 @@ def test_half_ring_has_a_real_amplitude_spread():
     phase = 2 * math.pi * turns(doe.half_rings(STOP, waves=(6.0,)))
     v, u, open_ = plane()
     field = torch.polar(open_.double(), phase - phase[open_].mean())
-    y, x = torch.linspace(-20, 20, 21, dtype=torch.float64), torch.linspace(-20, 20, 21, dtype=torch.float64)
+    y, x = (
+        torch.linspace(-20, 20, 21, dtype=torch.float64),
+        torch.linspace(-20, 20, 21, dtype=torch.float64),
+    )
     kernel = [torch.exp(-2j * math.pi * a[:, None] * b) for a, b in ((y, v[:, 0]), (x, u[0]))]
     amplitude = kernel[0] @ field @ kernel[1].T
     assert float(amplitude.imag.abs().max()) < 1e-4 * float(amplitude.abs().max())
@@ -91,14 +96,20 @@ def test_orientation_turns_the_element():
 
 def test_every_reading_of_the_aperture_comes_from_one_place():
     def axicon(samples=64, pitch=5e-6, diameter=480e-6, **aperture):
-        return doe.axicon(optics.stop(samples=samples, pitch=pitch, diameter=diameter, **aperture), waves=8.0)
+        return doe.axicon(
+            optics.stop(samples=samples, pitch=pitch, diameter=diameter, **aperture), waves=8.0
+        )
 
-    with pytest.raises(ParameterError, match="give samples: 96, leave the pitch out, or choose aperture: stretched"):
+    with pytest.raises(
+        ParameterError, match="give samples: 96, leave the pitch out, or choose aperture: stretched"
+    ):
         axicon()
     assert_close(axicon(aperture="inscribed"), axicon(diameter=320e-6))
     assert_close(axicon(aperture="stretched"), axicon(pitch=7.5e-6))
     assert_close(axicon(pitch=None), axicon(pitch=7.5e-6))
-    assert_close(axicon(aperture="stretched", diameter=160e-6), axicon(pitch=2.5e-6, diameter=160e-6))
+    assert_close(
+        axicon(aperture="stretched", diameter=160e-6), axicon(pitch=2.5e-6, diameter=160e-6)
+    )
     whole = axicon(samples=96)[16:-16, 16:-16]
     assert_close(axicon(aperture="clipped"), whole, rtol=1e-4, atol=float(whole.max()) * 1e-2)
     small = axicon(diameter=160e-6)
@@ -111,14 +122,26 @@ def test_preflight_says_what_the_grid_does_to_the_aperture():
     grid = "pupil grid 2160 x 3.74 um = 8.078 mm"
     assert note == f"aperture 11 mm > {grid}: inscribed, a disc of 8.078 mm; see reading.aperture"
     (note,) = optics.stop.hooks.preflight(**paper, aperture="stretched")
-    assert note == f"aperture 11 mm, {grid}: the pitch becomes 5.093 um, so that 2160 samples span the aperture"
-    with pytest.raises(ParameterError, match=r"11 mm is wider than the pupil grid of 2160 x 3\.74 um") as caught:
+    assert (
+        note == f"aperture 11 mm, {grid}: the pitch becomes 5.093 um, so that 2160 samples span the"
+        " aperture"
+    )
+    with pytest.raises(
+        ParameterError, match=r"11 mm is wider than the pupil grid of 2160 x 3\.74 um"
+    ) as caught:
         optics.stop.hooks.preflight(**paper)
     assert caught.value.parameter == "diameter"
     assert "samples: 2942" in str(caught.value)
-    assert optics.stop.hooks.preflight(**{**paper, "diameter": 8.0784e-3}, aperture="stretched") == []
+    assert (
+        optics.stop.hooks.preflight(**{**paper, "diameter": 8.0784e-3}, aperture="stretched") == []
+    )
     assert optics.stop.hooks.preflight(**{**paper, "pitch": None}) == []
-    assert optics.stop.hooks.preflight(samples=2160, pitch=3.74e-6, diameter=8e-3, aperture="inscribed") == []
+    assert (
+        optics.stop.hooks.preflight(
+            samples=2160, pitch=3.74e-6, diameter=8e-3, aperture="inscribed"
+        )
+        == []
+    )
     with pytest.raises(ParameterError, match="no pupil sample") as caught:
         optics.stop.hooks.preflight(samples=4, pitch=1e-3, diameter=1e-3, aperture="inscribed")
     assert caught.value.parameter == "diameter"
@@ -153,6 +176,8 @@ def test_recipe_parameters_are_read_with_their_units():
     assert read.waves == (12.0, 18.0)
     assert read.orientation == pytest.approx(math.pi / 2)
     assert doe.zernike.params(coefficients={"4": "55 nm"}).coefficients == {4: pytest.approx(55e-9)}
-    assert optics.stop.params(samples=8, pitch="3.74 um", diameter="8 mm").pitch == pytest.approx(3.74e-6)
+    assert optics.stop.params(samples=8, pitch="3.74 um", diameter="8 mm").pitch == pytest.approx(
+        3.74e-6
+    )
     with pytest.raises(ValueError, match="at least 1 item"):
         doe.half_rings.params(waves=[])

@@ -14,7 +14,9 @@ from neusee.nodes.doe._refractive_index import wave_height
 
 WAVE = wave_height("fused silica", 550e-9)
 PLAIN = {"material": "fused silica", "wrap_at": None, "levels": None, "max_height": None}
-heights = arrays.arrays("float32", (3, 4), elements=st.floats(0, 0.0001220703125, width=32)).map(torch.from_numpy)
+heights = arrays.arrays("float32", (3, 4), elements=st.floats(0, 0.0001220703125, width=32)).map(
+    torch.from_numpy
+)
 
 
 @settings(max_examples=60, deadline=None)
@@ -23,7 +25,9 @@ def test_wrapping_leaves_the_phase_at_its_wavelength(height):
     made = doe.fabricate(height, wrap_at=550e-9)
     assert float(made.min()) >= 0
     assert float(made.max()) <= WAVE * (1 + 1e-6)
-    off = ((height.double() - made.double()) / WAVE).sub(((height.double() - made.double()) / WAVE).round())
+    off = ((height.double() - made.double()) / WAVE).sub(
+        ((height.double() - made.double()) / WAVE).round()
+    )
     assert float(off.abs().max()) < 1e-4
 
 
@@ -66,7 +70,10 @@ def test_agrees_with_the_reference(params):
     height = 10e-6 * torch.rand(40, 40, generator=torch.Generator().manual_seed(5))
     params = PLAIN | params
     assert_close(
-        doe.fabricate(height, **params).double(), doe.fabricate.hooks.reference(height, **params), rtol=0, atol=2e-12
+        doe.fabricate(height, **params).double(),
+        doe.fabricate.hooks.reference(height, **params),
+        rtol=0,
+        atol=2e-12,
     )
 
 
@@ -82,7 +89,9 @@ def test_steps_cost_the_efficiency_of_a_multi_level_grating(levels):
     made = doe.fabricate(ramp[None, :], wrap_at=550e-9, levels=levels)[0]
     field = torch.polar(torch.ones_like(made), 2 * math.pi * made / WAVE)
     order = torch.fft.fft(field)[16].abs().square() / 4096**2
-    assert float(order) == pytest.approx((math.sin(math.pi / levels) / (math.pi / levels)) ** 2, rel=2e-3)
+    assert float(order) == pytest.approx(
+        (math.sin(math.pi / levels) / (math.pi / levels)) ** 2, rel=2e-3
+    )
 
 
 def test_gradient_passes_straight_through_steps_and_wraps_but_not_through_the_cut():
@@ -119,7 +128,10 @@ def test_negligible_only_where_nothing_changes():
     facts = TensorStats.of(torch.tensor([[0.0, 1e-6]]))
     assert doe.fabricate.hooks.skip_bound(facts, **PLAIN | {"wrap_at": 550e-9}) == 0
     assert doe.fabricate.hooks.skip_bound(facts, **PLAIN | {"max_height": 2e-6}) == 0
-    assert doe.fabricate.hooks.skip_bound(facts, **PLAIN | {"max_height": float(torch.tensor(1e-6))}) == 0
+    assert (
+        doe.fabricate.hooks.skip_bound(facts, **PLAIN | {"max_height": float(torch.tensor(1e-6))})
+        == 0
+    )
     assert doe.fabricate.hooks.skip_bound(facts, **PLAIN | {"wrap_at": 400e-9}) > 1
 
 
@@ -134,14 +146,23 @@ def test_small_in_height_is_not_small_in_phase():
 @pytest.mark.parametrize("wavelength", [540e-9, 549e-9, 551e-9, 552e-9])
 def test_the_bound_tells_a_relief_of_just_one_wave_as_it_is_made(wavelength, dtype):
     wave = torch.tensor(wave_height("fused silica", wavelength), dtype=dtype)
-    for top in (wave, wave.nextafter(torch.zeros_like(wave)), wave.nextafter(torch.ones_like(wave))):
+    for top in (
+        wave,
+        wave.nextafter(torch.zeros_like(wave)),
+        wave.nextafter(torch.ones_like(wave)),
+    ):
         height = torch.stack([torch.zeros_like(top), 0.5 * top, top])[None]
         changed = not torch.equal(doe.fabricate(height, **PLAIN | {"wrap_at": wavelength}), height)
         assert (
-            doe.fabricate.hooks.skip_bound(TensorStats.of(height), **PLAIN | {"wrap_at": wavelength}) > 0
+            doe.fabricate.hooks.skip_bound(
+                TensorStats.of(height), **PLAIN | {"wrap_at": wavelength}
+            )
+            > 0
         ) == changed
 
 
-@pytest.mark.parametrize("params", [{"wrap_at": 550e-9, "levels": 4}, {"max_height": 2e-6, "levels": 4}])
+@pytest.mark.parametrize(
+    "params", [{"wrap_at": 550e-9, "levels": 4}, {"max_height": 2e-6, "levels": 4}]
+)
 def test_made_where_the_relief_is(params):
     assert doe.fabricate(torch.zeros(4, 4, device="meta"), **params).device.type == "meta"

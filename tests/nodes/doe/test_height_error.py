@@ -1,4 +1,6 @@
-"""The error of a mask that was made: its statistics against the closed form, its depth, and what it does to a spot."""
+"""The error of a mask that was made: its statistics against the closed form, its depth, and what
+it does to a spot.
+"""
 
 import numpy as np
 import pytest
@@ -23,9 +25,13 @@ def ramp(samples=SAMPLES):
 
 
 def test_the_random_error_has_its_rms_and_its_correlation():
-    """Over 400 masks; the error of an average of 400 normal squares is 7 %, and averages over places are closer."""
+    """Over 400 masks; the error of an average of 400 normal squares is 7 %, and averages over
+    places are closer.
+    """
     flat = torch.zeros(SAMPLES, SAMPLES, dtype=torch.float64)
-    made = [doe.height_error(flat, stop(), rms=20e-9, scale=0.2, rng=rng(i)).numpy() for i in range(400)]
+    made = [
+        doe.height_error(flat, stop(), rms=20e-9, scale=0.2, rng=rng(i)).numpy() for i in range(400)
+    ]
     fields = np.array(made) / 20e-9
     assert (fields**2).mean() == pytest.approx(1, abs=0.03)
     for apart in (2, 4, 7):
@@ -35,7 +41,9 @@ def test_the_random_error_has_its_rms_and_its_correlation():
 
 
 def test_the_draw_does_not_depend_on_the_sampling():
-    coarse, fine = (doe.height_error(torch.zeros(n, n), stop(n), rms=1e-8, rng=rng()) for n in (33, 99))
+    coarse, fine = (
+        doe.height_error(torch.zeros(n, n), stop(n), rms=1e-8, rng=rng()) for n in (33, 99)
+    )
     assert torch.allclose(fine[1::3, 1::3], coarse, atol=1e-14)
 
 
@@ -47,19 +55,25 @@ def test_a_depth_error_scales_every_height_and_none_is_the_design():
         doe.height_error(ramp(32), stop(), rng=rng())
 
 
-@pytest.mark.parametrize("error", [{"rms": 3e-9}, {"depth": -0.003}, {"rms": 2e-9, "depth": 0.01}, {}])
+@pytest.mark.parametrize(
+    "error", [{"rms": 3e-9}, {"depth": -0.003}, {"rms": 2e-9, "depth": 0.01}, {}]
+)
 def test_the_bound_of_leaving_it_out_covers_height_and_phase(error):
     made = doe.height_error(ramp(), stop(), **error, rng=rng(4))
     change = float((made - ramp()).abs().max())
     stats = TensorStats.of(ramp())
-    bound = doe.height_error.hooks.skip_bound(stats, None, **{"rms": 0.0, "scale": 0.1, "depth": 0.0, **error})
+    bound = doe.height_error.hooks.skip_bound(
+        stats, None, **{"rms": 0.0, "scale": 0.1, "depth": 0.0, **error}
+    )
     assert change / float(made.max()) <= bound
     assert 2 * np.pi * change / 400e-9 <= bound
     assert bool(bound) == bool(error)
 
 
 def test_the_peak_behind_a_rough_flat_is_that_of_marechal():
-    """A fine error of rms s leaves exp(-(2 pi (n - 1) s / wavelength)^2) of the peak, the mean over masks."""
+    """A fine error of rms s leaves exp(-(2 pi (n - 1) s / wavelength)^2) of the peak, the mean
+    over masks.
+    """
     bands = Bands(*(torch.tensor([x], dtype=torch.float64) for x in (550e-9, 1e-9, 1.0)))
     index, flat = doe.material(bands, material="fused silica"), torch.zeros(SAMPLES, SAMPLES)
     peaks = []

@@ -1,4 +1,6 @@
-"""Height maps of one's own: five kinds of files, their units and pitch, resampling with a known error, and mistakes."""
+"""Height maps of one's own: five kinds of files, their units and pitch, resampling with a known
+error, and mistakes.
+"""
 
 import numpy as np
 import OpenEXR
@@ -37,7 +39,11 @@ def saved(folder, kind, height, **stated):
     if kind == "npy":
         np.save(file, height)
     elif kind == "safetensors":
-        save_file({"height": torch.from_numpy(height), "more": torch.zeros(2)}, file, metadata=stated or None)
+        save_file(
+            {"height": torch.from_numpy(height), "more": torch.zeros(2)},
+            file,
+            metadata=stated or None,
+        )
     elif kind == "exr":
         OpenEXR.File(dict(stated), {"height": height, "more": height * 0}).write(str(file))
     elif kind == "mat":
@@ -50,7 +56,7 @@ def saved(folder, kind, height, **stated):
     return file
 
 
-# --- units ------------------------------------------------------------------------------------------------------------
+# --- units ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ["npy", "safetensors", "exr", "mat"])
@@ -68,8 +74,13 @@ def test_a_picture_states_the_height_of_white(tmp_path):
     found = read(saved(tmp_path, "png", levels, depth="2.5 um"))
     np.testing.assert_allclose(found.numpy(), levels / 65535 * 2.5e-6, rtol=1e-6)
     assert_close(read(saved(tmp_path, "png", levels), depth=2.5e-6), found, rtol=0, atol=0)
-    (note,) = doe.pixelwise.hooks.preflight(stop=STOP, file=saved(tmp_path, "png", levels), **STATED)
-    assert note == "map.png: white counts as 1.2 um high, because nothing states its height: give depth"
+    (note,) = doe.pixelwise.hooks.preflight(
+        stop=STOP, file=saved(tmp_path, "png", levels), **STATED
+    )
+    assert (
+        note
+        == "map.png: white counts as 1.2 um high, because nothing states its height: give depth"
+    )
 
 
 @pytest.mark.parametrize("shape", [(), (0, 0), (1, 64), (3, 64, 64)])
@@ -97,39 +108,52 @@ def test_the_recipe_and_the_header_must_agree(tmp_path, kind):
     )
 
 
-# --- resampling -------------------------------------------------------------------------------------------------------
+# --- resampling -----------------------------------------------------------------------------------
 
 
 def wave(shape, pitch, period=4e-3):
     """A smooth surface whose samples are ``pitch`` apart, centred on the axis."""
     v, u = ((np.arange(n) - (n - 1) / 2) * pitch for n in shape)
-    return 1e-6 * (2 + np.sin(2 * np.pi * u[None, :] / period + 0.3) * np.cos(2 * np.pi * v[:, None] / period - 0.7))
+    return 1e-6 * (
+        2
+        + np.sin(2 * np.pi * u[None, :] / period + 0.3)
+        * np.cos(2 * np.pi * v[:, None] / period - 0.7)
+    )
 
 
-@pytest.mark.parametrize(("shape", "pitch"), [((48, 48), 1.4e-4), ((33, 50), 2e-4), ((130, 131), 5e-5)])
+@pytest.mark.parametrize(
+    ("shape", "pitch"), [((48, 48), 1.4e-4), ((33, 50), 2e-4), ((130, 131), 5e-5)]
+)
 def test_a_map_with_its_own_pitch_is_resampled_and_its_error_is_told(tmp_path, shape, pitch):
     np.save(tmp_path / "map.npy", wave(shape, pitch))
     params = {"file": tmp_path / "map.npy", "pitch": pitch}
     found = doe.pixelwise(STOP, **params, rng=seeded())
     _, told = doe.pixelwise.hooks.check(found, STOP, **params)
     sizes = " x ".join(map(str, shape))
-    assert told.text.startswith(f"map.npy resampled from {sizes} samples {pitch * 1e6:g} um apart, rms error ")
+    assert told.text.startswith(
+        f"map.npy resampled from {sizes} samples {pitch * 1e6:g} um apart, rms error "
+    )
     u = (np.arange(64) - 31.5) * 1e-4
     clear = np.hypot(*np.meshgrid(u, u)) <= 3.2e-3
     off = np.sqrt(np.mean((found.double().numpy() - wave((64, 64), 1e-4))[clear] ** 2))
     assert 0.7 < float(told.text.split()[-2]) * 1e-9 / off < 1.4
-    assert off < 0.2 * (2 * np.pi / 4e-3) ** 2 * pitch**2 * 1e-6  # h^2 / 8 of the curvature of both sines
+    # h^2 / 8 of the curvature of both sines
+    assert off < 0.2 * (2 * np.pi / 4e-3) ** 2 * pitch**2 * 1e-6
 
 
 def test_a_finer_map_loses_detail_and_says_so(tmp_path):
     np.save(tmp_path / "map.npy", wave((256, 256), 2.5e-5))
     (note,) = doe.pixelwise.hooks.preflight(stop=STOP, file=tmp_path / "map.npy", pitch=2.5e-5)
-    assert note.startswith("map.npy: the map has 4 samples for each sample of the pupil, so that its finest detail is")
+    assert note.startswith(
+        "map.npy: the map has 4 samples for each sample of the pupil, so that its finest detail is"
+    )
     assert note.endswith("set samples to 256 to keep it")
 
 
 def test_a_plane_is_resampled_exactly_and_centred(tmp_path):
-    """A tilted plane with an even and an odd number of samples: its height at the axis is the mean of the plane."""
+    """A tilted plane with an even and an odd number of samples: its height at the axis is the
+    mean of the plane.
+    """
     v, u = np.arange(41.0)[:, None], np.arange(70.0)
     np.save(tmp_path / "map.npy", 1e-8 * (v + u))
     found = doe.pixelwise(STOP, file=tmp_path / "map.npy", pitch=1.7e-4, rng=seeded())
@@ -140,8 +164,15 @@ def test_a_plane_is_resampled_exactly_and_centred(tmp_path):
 def test_steps_are_kept_by_the_nearest_sample(tmp_path):
     steps = np.where(np.arange(40) < 20, 0.0, 1e-6)[None, :].repeat(40, 0)
     np.save(tmp_path / "map.npy", steps)
-    found = doe.pixelwise(STOP, file=tmp_path / "map.npy", pitch=2e-4, between="nearest", rng=seeded())
-    assert_close(found, torch.from_numpy(np.where(np.arange(64) < 32, 0, 1e-6)).float().expand(64, 64), rtol=0, atol=0)
+    found = doe.pixelwise(
+        STOP, file=tmp_path / "map.npy", pitch=2e-4, between="nearest", rng=seeded()
+    )
+    assert_close(
+        found,
+        torch.from_numpy(np.where(np.arange(64) < 32, 0, 1e-6)).float().expand(64, 64),
+        rtol=0,
+        atol=0,
+    )
     parameter, text = refused(tmp_path / "map.npy", pitch=2e-4)
     assert parameter == "file"
     assert "the height jumps by 1 um of 1 um from column 19 to 20, at row " in text
@@ -152,15 +183,20 @@ def test_a_step_outside_the_clear_aperture_is_no_step(tmp_path):
     x = (np.arange(80) - 39.5) * 1e-4
     height = wave((80, 80), 1e-4) * (np.hypot(x[:, None], x) < 3.5e-3)
     np.save(tmp_path / "map.npy", height)
-    assert doe.pixelwise.hooks.preflight(stop=STOP, file=tmp_path / "map.npy", pitch=1.0001e-4) == []
+    assert (
+        doe.pixelwise.hooks.preflight(stop=STOP, file=tmp_path / "map.npy", pitch=1.0001e-4) == []
+    )
 
 
-# --- mistakes ---------------------------------------------------------------------------------------------------------
+# --- mistakes -------------------------------------------------------------------------------------
 
 
 def test_a_wrapped_map_is_refused_before_it_is_resampled(tmp_path):
     np.save(tmp_path / "map.npy", (wave((48, 48), 1.4e-4) * 3) % 1.2e-6)
-    assert "linear interpolation makes a ramp: unwrap" in refused(tmp_path / "map.npy", pitch=1.4e-4)[1]
+    assert (
+        "linear interpolation makes a ramp: unwrap"
+        in refused(tmp_path / "map.npy", pitch=1.4e-4)[1]
+    )
 
 
 @pytest.mark.parametrize(("shape", "pitch"), [((48, 48), 1.3e-4), ((64, 60), 1e-4)])
@@ -173,7 +209,9 @@ def test_a_map_smaller_than_the_pupil_is_refused(tmp_path, shape, pitch):
 
 def test_a_map_that_is_not_square_needs_its_pitch(tmp_path):
     np.save(tmp_path / "map.npy", np.zeros((64, 60)))
-    assert "(64, 60), not the pupil grid (64, 64): state its pitch" in refused(tmp_path / "map.npy")[1]
+    assert (
+        "(64, 60), not the pupil grid (64, 64): state its pitch" in refused(tmp_path / "map.npy")[1]
+    )
 
 
 @pytest.mark.parametrize("kind", ["npy", "safetensors", "exr"])
@@ -193,14 +231,20 @@ def test_the_place_of_what_is_not_finite_is_told(tmp_path):
     height = HEIGHT.copy()
     height[3, 7] = height[9, 9] = np.nan
     text = refused(saved(tmp_path, "npy", height))[1]
-    assert text.startswith("map.npy: 2 heights are NaN or infinite, the first in row 3, column 7, but every height")
+    assert text.startswith(
+        "map.npy: 2 heights are NaN or infinite, the first in row 3, column 7, but every height"
+    )
 
 
 def test_heights_without_their_unit_are_refused(tmp_path):
-    assert refused(saved(tmp_path, "npy", HEIGHT * 1e6))[1].endswith("state the unit of the file, such as unit: 1 um")
+    assert refused(saved(tmp_path, "npy", HEIGHT * 1e6))[1].endswith(
+        "state the unit of the file, such as unit: 1 um"
+    )
 
 
-@pytest.mark.parametrize(("text", "said"), [("10", "needs a unit"), ("10 K", "wrong unit"), ("-1 um", "above 0")])
+@pytest.mark.parametrize(
+    ("text", "said"), [("10", "needs a unit"), ("10 K", "wrong unit"), ("-1 um", "above 0")]
+)
 def test_a_header_with_a_wrong_length_is_refused(tmp_path, text, said):
     parameter, message = refused(saved(tmp_path, "mat", HEIGHT, pitch=text))
     assert parameter == "file"
@@ -212,7 +256,9 @@ def test_a_matlab_file_of_version_7_3_is_refused_with_the_command_that_saves_ano
     (tmp_path / "map.mat").write_bytes(
         b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512, b" ") + b"\x89HDF\r\n\x1a\n"
     )
-    assert refused(tmp_path / "map.mat")[1].endswith("save it in MATLAB by save('map.mat', 'height', '-v7')")
+    assert refused(tmp_path / "map.mat")[1].endswith(
+        "save it in MATLAB by save('map.mat', 'height', '-v7')"
+    )
 
 
 @pytest.mark.parametrize("kind", ["mat", "exr", "npy", "safetensors", "png"])
@@ -223,15 +269,21 @@ def test_bytes_that_are_no_height_map_are_refused(tmp_path, kind):
 
 def test_several_variables_need_a_name(tmp_path):
     savemat(tmp_path / "map.mat", {"a": HEIGHT, "b": HEIGHT})
-    assert "map.mat holds a, b: name the tensor of the height map 'height'" in refused(tmp_path / "map.mat")[1]
+    assert (
+        "map.mat holds a, b: name the tensor of the height map 'height'"
+        in refused(tmp_path / "map.mat")[1]
+    )
 
 
 def test_grey_levels_have_no_unit(tmp_path):
     file = saved(tmp_path, "png", np.ones((64, 64), np.uint16))
-    assert refused(file, unit=1e-6) == ("unit", "map.png holds grey levels: give depth, the height of white")
+    assert refused(file, unit=1e-6) == (
+        "unit",
+        "map.png holds grey levels: give depth, the height of white",
+    )
 
 
-# --- the size of a map is never changed without a word ----------------------------------------------------------------
+# --- the size of a map is never changed without a word --------------------------------------------
 
 
 def test_a_map_without_a_pitch_is_refused_on_a_stretched_pupil(tmp_path):
@@ -239,11 +291,21 @@ def test_a_map_without_a_pitch_is_refused_on_a_stretched_pupil(tmp_path):
     np.save(tmp_path / "map.npy", np.zeros((64, 64)))
     parameter, text = refused(tmp_path / "map.npy", pupil_pitch=3e-5)
     assert parameter == "pitch"
-    assert "states no pitch, and the samples of the pupil are 100 um apart and written as 30 um: give pitch" in text
+    assert (
+        "states no pitch, and the samples of the pupil are 100 um apart and written as 30 um: give"
+        " pitch" in text
+    )
     for fitting in (1e-4, 1.0004e-4):
-        assert doe.pixelwise.hooks.preflight(stop=STOP, file=tmp_path / "map.npy", pupil_pitch=fitting) == []
+        assert (
+            doe.pixelwise.hooks.preflight(stop=STOP, file=tmp_path / "map.npy", pupil_pitch=fitting)
+            == []
+        )
     (note,) = doe.pixelwise.hooks.preflight(stop=STOP, file=tmp_path / "map.npy")
-    assert note == "map.npy states no pitch: its samples count as those of the pupil, 100 um apart, 6.4 mm wide"
+    assert (
+        note
+        == "map.npy states no pitch: its samples count as those of the pupil, 100 um apart, 6.4 mm"
+        " wide"
+    )
     found = doe.pixelwise(STOP, file=tmp_path / "map.npy", rng=seeded())
     checks = doe.pixelwise.hooks.check(found, STOP, file=tmp_path / "map.npy")
     assert checks[-1].text == "map.npy: 64 x 64 samples, 100 um apart, 6.4 mm wide"
@@ -255,13 +317,20 @@ def test_a_map_with_a_pitch_keeps_its_size_on_another_pupil(tmp_path):
     ring = (np.abs(np.hypot(at[:, None], at) - 1e-3) < 1e-4).astype(np.float64) * 1e-6
     np.save(tmp_path / "map.npy", ring)
     half = optics.stop(samples=320, diameter=3.2e-3)
-    options = {"file": tmp_path / "map.npy", "pitch": 1e-5, "pupil_pitch": 2e-5, "between": "nearest"}
+    options = {
+        "file": tmp_path / "map.npy",
+        "pitch": 1e-5,
+        "pupil_pitch": 2e-5,
+        "between": "nearest",
+    }
     found = doe.pixelwise(half, **options, rng=seeded())
     np.testing.assert_array_equal(found.numpy(), ring[160:-160, 160:-160].astype(np.float32))
 
 
 def test_a_designed_mask_states_its_pitch(tmp_path):
-    save_file({"height": torch.zeros(8, 8)}, tmp_path / "mask.safetensors", doe.size_metadata(14.96e-6))
+    save_file(
+        {"height": torch.zeros(8, 8)}, tmp_path / "mask.safetensors", doe.size_metadata(14.96e-6)
+    )
     height, pitch = doe.height_map(tmp_path / "mask.safetensors")
     assert height.shape == (8, 8)
     assert pitch == pytest.approx(14.96e-6, rel=1e-11)

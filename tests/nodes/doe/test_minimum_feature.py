@@ -19,7 +19,10 @@ def relief(seed=1):
 
 @pytest.mark.parametrize("feature", [0.5e-6, 4e-6, 20e-6, 1e-3])
 def test_it_agrees_with_its_reference(feature):
-    found, truth = smooth(relief(), STOP, feature=feature), smooth.hooks.reference(relief(), STOP, feature=feature)
+    found, truth = (
+        smooth(relief(), STOP, feature=feature),
+        smooth.hooks.reference(relief(), STOP, feature=feature),
+    )
     assert float((found.double() - truth).abs().max()) <= 1e-6 * float(truth.max())
 
 
@@ -35,13 +38,17 @@ def test_a_wave_fades_as_the_spot_has_it():
     stop = optics.stop(samples=200, pitch=1e-6, diameter=200e-6)
     wave = torch.cos(2 * math.pi * torch.arange(200) / 10).expand(200, 200) * 1e-6
     made = smooth(wave, stop, feature=5e-6)[100, 80:120]
-    assert float(made.max() / 1e-6) == pytest.approx(math.exp(-((math.pi * 0.5) ** 2) / (4 * math.log(2))), rel=1e-3)
+    assert float(made.max() / 1e-6) == pytest.approx(
+        math.exp(-((math.pi * 0.5) ** 2) / (4 * math.log(2))), rel=1e-3
+    )
 
 
 def test_gradient():
     height = (1e-6 * torch.rand(6, 6, dtype=torch.float64)).requires_grad_()
     small = optics.stop(samples=6, pitch=2e-6, diameter=12e-6)
-    assert torch.autograd.gradcheck(lambda h: 1e6 * smooth(h / 1e6, small, feature=5e-6), (height * 1e6,))
+    assert torch.autograd.gradcheck(
+        lambda h: 1e6 * smooth(h / 1e6, small, feature=5e-6), (height * 1e6,)
+    )
 
 
 def test_what_does_not_fit_is_refused_and_a_narrow_spot_said():
@@ -51,10 +58,11 @@ def test_what_does_not_fit_is_refused_and_a_narrow_spot_said():
         smooth(relief().half(), STOP, feature=4e-6)
     assert "1.5 samples" in smooth.hooks.preflight(stop=STOP, feature=1e-6)[0]
     assert smooth.hooks.preflight(stop=STOP, feature=4e-6) == []
-    assert smooth.hooks.preflight(stop=None, feature=1e-6) == []  # the grid is known only during the run
+    # the grid is known only during the run
+    assert smooth.hooks.preflight(stop=None, feature=1e-6) == []
 
 
-# --- reliefs with numbers to learn ------------------------------------------------------------------------------------
+# --- reliefs with numbers to learn ----------------------------------------------------------------
 
 
 def shapes():
@@ -75,8 +83,10 @@ def test_a_relief_counts_from_zero_at_every_sampling_and_reaches_all_its_numbers
         assert float(height.detach().std()) > 0
     weights = torch.rand(48, 48, generator=torch.Generator().manual_seed(3))
     (height * weights * 1e6).square().sum().backward()
-    assert all(p.grad is not None and bool(p.grad.isfinite().all()) and float(p.grad.abs().sum()) > 0
-               for p in shape.parameters())  # fmt: skip
+    assert all(
+        p.grad is not None and bool(p.grad.isfinite().all()) and float(p.grad.abs().sum()) > 0
+        for p in shape.parameters()
+    )
 
 
 def test_rings_hold_five_half_rings_and_modes_are_those_of_zernike():

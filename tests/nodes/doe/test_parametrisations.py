@@ -10,9 +10,9 @@ from safetensors.torch import save_file
 from torch.testing import assert_close
 
 from neusee.nodes import ParameterError, doe, optics
-from neusee.nodes.bicubic_resize import enlarge
 from neusee.nodes.doe._parametrisations import PARAMETRISATIONS
 from neusee.nodes.doe._unet_height_map import HeightNet, coordinates, fresh, height_of
+from neusee.nodes.resampling import enlarge
 
 STOP = optics.stop(samples=64, pitch=5e-6, diameter=320e-6)
 
@@ -32,12 +32,18 @@ def suppression(height):
 
 @pytest.mark.parametrize("suffix", [".npy", ".safetensors"])
 def test_a_height_that_is_complex_is_refused_before_the_run_and_in_it(tmp_path, suffix):
-    file, height = tmp_path / f"mask{suffix}", torch.full((64, 64), 1e-6 + 1e-6j, dtype=torch.complex64)
+    file, height = (
+        tmp_path / f"mask{suffix}",
+        torch.full((64, 64), 1e-6 + 1e-6j, dtype=torch.complex64),
+    )
     if suffix == ".npy":
         np.save(file, height.numpy())
     else:
         save_file({"height": height}, file)
-    with pytest.raises(ParameterError, match=rf"mask{suffix} holds values of type .*64: save the heights as real num"):
+    with pytest.raises(
+        ParameterError,
+        match=rf"mask{suffix} holds values of type .*64: save the heights as real num",
+    ):
         doe.pixelwise.hooks.preflight(stop=STOP, file=file)
     with pytest.raises(ParameterError, match="save the heights as real numbers, in m"):
         doe.pixelwise(STOP, file=file, rng=seeded())
@@ -60,7 +66,9 @@ def test_start_is_seeded_bounded_and_far_from_flat(name):
 def test_start_from_a_random_relief_has_a_slope_and_a_flat_one_has_none():
     steep = doe.pixelwise(STOP, rng=seeded()).requires_grad_()
     flat = torch.zeros(64, 64, requires_grad=True)
-    found = [torch.autograd.grad(suppression(height), height)[0].abs().max() for height in (steep, flat)]
+    found = [
+        torch.autograd.grad(suppression(height), height)[0].abs().max() for height in (steep, flat)
+    ]
     assert float(found[0]) > 1e3 * float(found[1])
 
 
@@ -71,7 +79,9 @@ def test_pixelwise_start_is_the_same_at_every_sampling():
 
 
 def test_pixelwise_features_have_the_asked_scale():
-    fields = torch.stack([doe.pixelwise(STOP, depth=1.0, scale=0.2, rng=seeded(k)).double() for k in range(200)])
+    fields = torch.stack(
+        [doe.pixelwise(STOP, depth=1.0, scale=0.2, rng=seeded(k)).double() for k in range(200)]
+    )
     fields = torch.logit(fields) / 1.5
     assert float(fields.square().mean()) == pytest.approx(1, rel=0.1)
     step = 10
@@ -91,7 +101,9 @@ def test_pixelwise_reads_a_file(tmp_path, suffix):
     (note,) = doe.pixelwise.hooks.preflight(stop=STOP, **params)
     assert "states no pitch" in note
     assert "5 um apart" in note
-    assert_close(doe.pixelwise(STOP, **params, rng=seeded()), torch.from_numpy(relief), rtol=0, atol=0)
+    assert_close(
+        doe.pixelwise(STOP, **params, rng=seeded()), torch.from_numpy(relief), rtol=0, atol=0
+    )
 
 
 def test_pixelwise_refuses_a_file_that_does_not_fit(tmp_path):
@@ -127,12 +139,21 @@ def test_unet_starts_orthogonal_with_zero_biases():
     net = fresh(4, 16, seeded())
     rows = net.down[2].weight.flatten(1)
     assert_close(rows @ rows.T, 2 * torch.eye(len(rows)), rtol=0, atol=1e-5)
-    assert all(not p.any() for name, p in net.named_parameters() if name.endswith("bias") and "last" not in name)
+    assert all(
+        not p.any()
+        for name, p in net.named_parameters()
+        if name.endswith("bias") and "last" not in name
+    )
 
 
 @pytest.mark.parametrize("samples", [1, 7, 64])
 def test_unet_works_at_any_sampling(samples):
-    height = doe.unet(optics.stop(samples=samples, pitch=1e-6, diameter=samples * 1e-6), width=2, grid=9, rng=seeded())
+    height = doe.unet(
+        optics.stop(samples=samples, pitch=1e-6, diameter=samples * 1e-6),
+        width=2,
+        grid=9,
+        rng=seeded(),
+    )
     assert height.shape == (samples, samples)
     assert bool(torch.isfinite(height).all())
 
@@ -142,7 +163,9 @@ def test_unet_learns_through_the_resampling():
     weight = net.down[0].weight.detach().clone().requires_grad_()
 
     def relief(kernel):
-        logits = torch.func.functional_call(net, {"down.0.weight": kernel}, (coordinates(6).double(),))
+        logits = torch.func.functional_call(
+            net, {"down.0.weight": kernel}, (coordinates(6).double(),)
+        )
         return torch.sigmoid(enlarge(logits, 11, 11))
 
     assert torch.autograd.gradcheck(relief, (weight,), fast_mode=True)
@@ -184,19 +207,26 @@ def test_pixelwise_reads_levels_of_a_grey_picture(tmp_path):
     (tmp_path / "broken.png").write_bytes((tmp_path / "deep.png").read_bytes()[:30])
     for name, top in (("deep", 65535), ("shallow", 255)):
         found = doe.pixelwise(STOP, file=tmp_path / f"{name}.png", depth=5e-6, rng=seeded())
-        wanted = torch.from_numpy((levels if top > 255 else levels >> 8).astype(np.float64)) * 5e-6 / top
+        wanted = (
+            torch.from_numpy((levels if top > 255 else levels >> 8).astype(np.float64)) * 5e-6 / top
+        )
         assert_close(found.double(), wanted, rtol=1e-6, atol=0)
     for name, said in (("coloured", "not grey"), ("broken", "cannot be read")):
         with pytest.raises(ParameterError, match=said):
-            doe.pixelwise.hooks.preflight(stop=STOP, depth=5e-6, scale=0.1, file=tmp_path / f"{name}.png")
+            doe.pixelwise.hooks.preflight(
+                stop=STOP, depth=5e-6, scale=0.1, file=tmp_path / f"{name}.png"
+            )
 
 
-@pytest.mark.parametrize(("name", "params"), [("half_rings", {"waves": (9.0,)}), ("cubic", {"waves": 3.0})])
+@pytest.mark.parametrize(
+    ("name", "params"), [("half_rings", {"waves": (9.0,)}), ("cubic", {"waves": 3.0})]
+)
 def test_every_sample_of_a_formula_can_be_freed(name, params):
     start = getattr(doe, name)(STOP, **params)
     freed = PARAMETRISATIONS[f"doe.{name}"](STOP, params, seeded())
     moved = freed(STOP).detach() - start
-    assert_close(moved, torch.full_like(moved, float(moved.mean())), rtol=1e-3, atol=1e-10)  # a piston
+    # a piston
+    assert_close(moved, torch.full_like(moved, float(moved.mean())), rtol=1e-3, atol=1e-10)
     slope = torch.autograd.grad(suppression(freed(STOP)), freed.logits)[0]
     assert float(slope.abs().max()) > 0
     height = freed(STOP).detach()

@@ -1,4 +1,6 @@
-"""Height maps of few numbers: their polynomials, their gradients, the line of a streak and a stop that is learnt."""
+"""Height maps of few numbers: their polynomials, their gradients, the line of a streak and a
+stop that is learnt.
+"""
 
 import math
 
@@ -9,7 +11,7 @@ from numpy.polynomial.legendre import legval2d
 from scipy.special import eval_legendre
 
 from neusee.nodes import doe, optics
-from neusee.nodes.doe._polynomial_height_maps import LearntStop, Polynomials, Streak, legendre
+from neusee.nodes.doe._parametrisations import LearntStop, Polynomials, Streak, legendre
 
 STOP = optics.stop(samples=64, pitch=5e-6, diameter=320e-6)
 LINE = (np.arange(64) - 31.5) / 32
@@ -41,7 +43,9 @@ def test_a_sum_of_products_is_that_of_numpy_and_has_no_tilt():
         numbers[i, j] = value * math.sqrt((2 * i + 1) * (2 * j + 1))
     expected = legval2d(LINE[:, None] + 0 * LINE, 0 * LINE[:, None] + LINE, numbers)
     found = turns(shape(STOP))
-    np.testing.assert_allclose(found[INSIDE], (expected - expected[INSIDE].min())[INSIDE], atol=1e-5)
+    np.testing.assert_allclose(
+        found[INSIDE], (expected - expected[INSIDE].min())[INSIDE], atol=1e-5
+    )
     assert (found[~INSIDE] == 0).all()
     assert float(shape.waves.detach().norm()) == pytest.approx(2, rel=1e-6)
 
@@ -53,7 +57,9 @@ def test_a_streak_varies_along_one_direction_and_throws_its_light_into_a_line():
     sums = np.polynomial.legendre.legval(
         along, [0, 0, *(x * math.sqrt(2 * k + 5) for k, x in enumerate(shape.waves.tolist()))]
     )
-    np.testing.assert_allclose(turns(shape(STOP))[INSIDE], (sums - sums[INSIDE].min())[INSIDE], atol=1e-5)
+    np.testing.assert_allclose(
+        turns(shape(STOP))[INSIDE], (sums - sums[INSIDE].min())[INSIDE], atol=1e-5
+    )
     field = INSIDE * np.exp(2j * math.pi * turns(shape(STOP)))
     light = np.abs(np.fft.fftshift(np.fft.fft2(field, (256, 256)))) ** 2
     v, u = np.meshgrid(np.arange(256) - 128, np.arange(256) - 128, indexing="ij")

@@ -45,5 +45,7 @@ def test_dispersion_is_normal_over_the_visible_and_differentiable(material):
 def test_check_says_where_the_formula_was_not_fitted():
     for centres, ok in (((450, 700), True), ((400, 700), False)):
         given = bands(*centres)
-        checks = doe.material.hooks.check(doe.material(given, material="PMMA"), given, material="PMMA")
+        checks = doe.material.hooks.check(
+            doe.material(given, material="PMMA"), given, material="PMMA"
+        )
         assert [check.ok for check in checks] == [True, ok]

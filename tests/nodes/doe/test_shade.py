@@ -1,4 +1,6 @@
-"""Shades: the grey filter, the smaller stop and the notch act in the pupil of one arm, and in every figure of merit."""
+"""Shades: the grey filter, the smaller stop and the notch act in the pupil of one arm, and in
+every figure of merit.
+"""
 
 import math
 
@@ -17,8 +19,14 @@ from neusee.workflows.store.result_store import Store
 STOP = stop(samples=270, pitch=29.92e-6, diameter=8.0784e-3)
 BANDS = bands(start=500e-9, stop=600e-9, count=3)
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6, "shape": (48, 48)}
-SMALL = ["scene.shape=[64, 64]", "sensor.shape=[48, 48]", "optics.samples=64", "optics.pitch=126 um",
-         "optics.window=[32, 32]", "optics.bands=4"]  # fmt: skip
+SMALL = [
+    "scene.shape=[64, 64]",
+    "sensor.shape=[48, 48]",
+    "optics.samples=64",
+    "optics.pitch=126 um",
+    "optics.window=[32, 32]",
+    "optics.bands=4",
+]
 
 
 def shaded(**given):
@@ -27,7 +35,9 @@ def shaded(**given):
 
 
 def test_a_filter_passes_its_share_and_a_stop_the_fourth_power_of_its_diameter():
-    assert lsr(psf(shaded(transmittance=0.037), **LENS)).tolist() == pytest.approx([0.037] * 3, rel=1e-6)
+    assert lsr(psf(shaded(transmittance=0.037), **LENS)).tolist() == pytest.approx(
+        [0.037] * 3, rel=1e-6
+    )
     assert lsr(psf(shaded(diameter=0.5), **LENS)).tolist() == pytest.approx([0.5**4] * 3, rel=0.01)
     both = shaded(diameter=0.5, transmittance=0.1)
     assert lsr(psf(both, **LENS)).tolist() == pytest.approx([0.1 * 0.5**4] * 3, rel=0.01)
@@ -37,7 +47,10 @@ def test_a_notch_passes_what_its_formula_says_at_each_wavelength_and_no_colour_c
     found = shaded(notches=(550e-9, 500e-9), width=60e-9, depth=0.9)
     at = [500e-9, 550e-9, 600e-9]
     passed = [
-        math.prod(1 - 0.9 * math.exp(-((x - c) ** 2) * 4 * math.log(2) / 60e-9**2) for c in (550e-9, 500e-9))
+        math.prod(
+            1 - 0.9 * math.exp(-((x - c) ** 2) * 4 * math.log(2) / 60e-9**2)
+            for c in (550e-9, 500e-9)
+        )
         for x in at
     ]
     focused = psf(found, **LENS)
@@ -51,8 +64,13 @@ def test_a_notch_passes_what_its_formula_says_at_each_wavelength_and_no_colour_c
 def test_the_fast_transform_of_a_shaded_pupil_agrees_with_the_definition(sampling):
     small = stop(samples=32, pitch=252.5e-6, diameter=8.08e-3)
     height = 2e-6 * torch.rand(32, 32, generator=torch.Generator().manual_seed(3))
-    given = pupil(height, 0.46 + 0 * BANDS.centres, BANDS, small,
-                  shade=shade(small, transmittance=0.3, diameter=0.7, notches=(540e-9,), width=70e-9))  # fmt: skip
+    given = pupil(
+        height,
+        0.46 + 0 * BANDS.centres,
+        BANDS,
+        small,
+        shade=shade(small, transmittance=0.3, diameter=0.7, notches=(540e-9,), width=70e-9),
+    )
     lens = {**LENS, "shape": (12, 12), "sensor": sampling}
     fast, slow = psf(given, **lens, precision="double"), psf.hooks.reference(given, **lens)
     assert (fast.intensity - slow.intensity).abs().max() < 1e-5 * slow.intensity.max()
@@ -61,7 +79,9 @@ def test_the_fast_transform_of_a_shaded_pupil_agrees_with_the_definition(samplin
 
 def test_only_the_arm_of_the_mask_is_shaded(tmp_path):
     store, outputs = Store(tmp_path), ["outputs=[lsr, bsr]", *SMALL]
-    plain, grey = (load("plain_lens", [f"doe={name}", *outputs]).run(store) for name in ("flat", "grey_filter"))
+    plain, grey = (
+        load("plain_lens", [f"doe={name}", *outputs]).run(store) for name in ("flat", "grey_filter")
+    )
     assert torch.equal(grey["bsr[plain]"], plain["bsr[plain]"])
     assert torch.allclose(grey["lsr[mask]"], 0.01 * plain["lsr[mask]"], rtol=1e-5)
     assert torch.allclose(grey["bsr[mask]"], 0.01 * plain["bsr[mask]"], rtol=1e-4)

@@ -10,11 +10,18 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from neusee.nodes import flare, optics
-from neusee.nodes.flare._dirt import _dents, _grains, _scratches, _streams
-from neusee.nodes.flare._grains_and_scratches import Grain, Scratch, _distance, stamp
-from neusee.nodes.optics._phase_screen import screen
+from neusee.nodes.flare._dirt import (
+    Grain,
+    Scratch,
+    _dents,
+    _distance,
+    _grains,
+    _scratches,
+    _streams,
+    stamp,
+)
 from neusee.nodes.optics._pupil_grid import grid_of, inside, pupil_grid
-from neusee.nodes.optics._zernike import surface
+from neusee.nodes.optics._zernike import screen, surface
 
 STOP = optics.stop(samples=128, pitch=10e-6, diameter=1.28e-3)
 FILTHY = {"dust": 30.0, "scratches": 10.0, "grease": 0.2, "smudges": 0.5, "dents": 0.4}
@@ -39,7 +46,9 @@ def test_a_seed_is_a_window():
 
 
 def test_more_dust_leaves_the_rest_as_it_was():
-    with_dust, without = (flare.dirt(STOP, **FILTHY | {"dust": n}, rng=seeded()) for n in (30.0, 0.0))
+    with_dust, without = (
+        flare.dirt(STOP, **FILTHY | {"dust": n}, rng=seeded()) for n in (30.0, 0.0)
+    )
     assert torch.equal(with_dust.path, without.path)
     assert bool((with_dust.amplitude <= without.amplitude).all())
     assert bool((with_dust.amplitude == without.amplitude).double().mean() > 0.5)
@@ -56,10 +65,17 @@ def test_more_dust_leaves_the_rest_as_it_was():
 )
 def test_no_window_gives_light(samples, dust, scratches, sizes, soft, seed):
     found = flare.dirt(
-        optics.stop(samples=samples, pitch=1e-5, diameter=samples * 1e-5), dust=dust, scratches=scratches,
-        dust_radius=sizes[0], scratch_length=sizes[1], scratch_width=sizes[2],
-        grease=soft[0], smudges=soft[1], dents=soft[2], rng=seeded(seed),
-    )  # fmt: skip
+        optics.stop(samples=samples, pitch=1e-5, diameter=samples * 1e-5),
+        dust=dust,
+        scratches=scratches,
+        dust_radius=sizes[0],
+        scratch_length=sizes[1],
+        scratch_width=sizes[2],
+        grease=soft[0],
+        smudges=soft[1],
+        dents=soft[2],
+        rng=seeded(seed),
+    )
     assert float(found.amplitude.min()) >= 0
     assert float(found.amplitude.max()) <= 1
     assert bool(torch.isfinite(found.path).all())
@@ -79,7 +95,10 @@ def test_dirt_does_not_depend_on_the_sampling():
 
 @pytest.mark.parametrize("across", [0.2, 0.6, 1.0, 1.2, 2.0])
 def test_grains_about_a_sample_across_cover_their_area_on_average(across):
-    grid, places = pupil_grid(16, 1.0, 16.0), torch.rand(300, 2, generator=seeded(), dtype=torch.float64)
+    grid, places = (
+        pupil_grid(16, 1.0, 16.0),
+        torch.rand(300, 2, generator=seeded(), dtype=torch.float64),
+    )
     marks = [Grain(v / 16, u / 16, across / 32, 1.0) for v, u in places.tolist()]
     shade = sum(float((1 - stamp(torch.ones(16, 16), [mark], grid)).sum()) for mark in marks)
     assert shade / 300 == pytest.approx(math.pi * across**2 / 4, rel=0.05)
@@ -110,7 +129,9 @@ def test_marks_off_the_grid_leave_no_trace():
 
 
 def test_numbers_and_sizes_are_those_of_wu():
-    """30 grains and scratches with a spread of 5; radius uniform under a largest one; 0 is opaque, 1/2 the clearest."""
+    """30 grains and scratches with a spread of 5; radius uniform under a largest one; 0 is
+    opaque, 1/2 the clearest.
+    """
     windows = [_grains(30, 1 / 60, seeded(k)) for k in range(300)]
     numbers = torch.tensor([float(len(w)) for w in windows])
     assert float(numbers.mean()) == pytest.approx(30, abs=1)
@@ -124,7 +145,9 @@ def test_numbers_and_sizes_are_those_of_wu():
     assert (float(steps.min()), float(steps.max())) == (1, 16)
     assert float(steps.mean()) == pytest.approx(8.5, abs=0.4)
     assert all(0.5 <= s.opacity <= 1 for s in scratches)
-    strides = [math.dist(a, b) for s in scratches for a, b in zip(s.points, s.points[1:], strict=False)]
+    strides = [
+        math.dist(a, b) for s in scratches for a, b in zip(s.points, s.points[1:], strict=False)
+    ]
     assert max(strides) <= 0.1
 
 
@@ -182,8 +205,13 @@ def test_recipe_cannot_ask_for_negative_dirt():
 
 
 def test_a_scratch_is_darkest_where_its_nearest_step_says():
-    """Each step darkens its own neighbourhood only; together they are the distance to the whole line."""
-    grid, points = pupil_grid(200, 1.0, 200.0), [(-0.3, -0.4), (0.1, -0.35), (0.1, 0.2), (-0.2, 0.3), (-0.2, 0.6)]
+    """Each step darkens its own neighbourhood only; together they are the distance to the whole
+    line.
+    """
+    grid, points = (
+        pupil_grid(200, 1.0, 200.0),
+        [(-0.3, -0.4), (0.1, -0.35), (0.1, 0.2), (-0.2, 0.3), (-0.2, 0.6)],
+    )
     shade = 1 - stamp(torch.ones(200, 200), [Scratch(points, 3 / 200, 0.7)], grid)
     y, x = torch.meshgrid(torch.arange(200.0), torch.arange(200.0), indexing="ij")
     places = [(v * 200 + 99.5, u * 200 + 99.5) for v, u in points]

@@ -21,7 +21,9 @@ def seeded(seed=1):
 
 
 def bands(centres=LINE):
-    return Bands(centres, torch.full_like(centres, 7e-9), torch.full_like(centres, 1 / len(centres)))
+    return Bands(
+        centres, torch.full_like(centres, 7e-9), torch.full_like(centres, 1 / len(centres))
+    )
 
 
 def spot(size=301, bands=3):
@@ -37,19 +39,25 @@ def towards(y, x):
 def ghosts(light=None, angle=(5e-4, -8e-4), **params):
     light = spot() if light is None else light
     line = bands(LINE[: len(light)])
-    return flare.ghosts(light, line, towards(*angle), **LENS, **{"radius": 60e-6, "rng": seeded()} | params)
+    return flare.ghosts(
+        light, line, towards(*angle), **LENS, **{"radius": 60e-6, "rng": seeded()} | params
+    )
 
 
 def test_energy_in_is_energy_out():
     light = spot()
     found = ghosts(light, energy=1e-3)
-    assert float(found.double().sum()) == pytest.approx(1e-3 * float(light.double().sum()), rel=1e-5)
+    assert float(found.double().sum()) == pytest.approx(
+        1e-3 * float(light.double().sum()), rel=1e-5
+    )
     assert float(found.min()) == 0
 
 
 def test_a_single_band_carries_all_of_it():
     light = spot(bands=1)
-    assert float(ghosts(light, energy=1e-4).sum()) == pytest.approx(1e-4 * float(light.sum()), rel=1e-5)
+    assert float(ghosts(light, energy=1e-4).sum()) == pytest.approx(
+        1e-4 * float(light.sum()), rel=1e-5
+    )
 
 
 def test_what_leaves_the_window_is_lost():
@@ -69,7 +77,10 @@ def test_each_ghost_lies_on_the_line_through_axis_and_source():
         found = ghosts(count=1, rng=seeded(seed), angle=(6e-4, 3e-4), energy=1.0)
         line = torch.arange(301, dtype=torch.float64) - 150
         total = found.sum(0, dtype=torch.float64)
-        y, x = float((total.sum(1) * line).sum() / total.sum()), float((total.sum(0) * line).sum() / total.sum())
+        y, x = (
+            float((total.sum(1) * line).sum() / total.sum()),
+            float((total.sum(0) * line).sum() / total.sum()),
+        )
         assert y == pytest.approx(2 * x, abs=0.1)
         assert abs(y) <= 2 * 6e-4 * 0.11 / 2.9e-6 + 0.1
 
@@ -85,16 +96,22 @@ def test_colour_differs_between_ghosts_and_energy_follows_the_spot():
     light = torch.zeros(14, 64, 64)
     light[:, 32, 32] = 1e6
     params = {"direction": towards(0.0, 0.0), "count": 1} | LENS
-    first, second = (flare.ghosts(light, bands(centres), **params, rng=seeded(k)).sum((-1, -2)) for k in (1, 2))
+    first, second = (
+        flare.ghosts(light, bands(centres), **params, rng=seeded(k)).sum((-1, -2)) for k in (1, 2)
+    )
     assert float(first.max() / first.min()) > 1.2
     assert not torch.allclose(first, second, rtol=0.05)
 
 
 def coated(wavelengths, tuned, layer=1.38, glass=1.70):
-    """Reflectance of magnesium fluoride on dense flint glass, by Airy's sum, over that of the bare glass."""
+    """Reflectance of magnesium fluoride on dense flint glass, by Airy's sum, over that of the
+    bare glass.
+    """
     above, below = (1 - layer) / (1 + layer), (layer - glass) / (layer + glass)
     twice = torch.exp(-1j * math.pi * tuned / wavelengths)
-    return ((above + below * twice) / (1 + above * below * twice)).abs().square() / ((1 - glass) / (1 + glass)) ** 2
+    return ((above + below * twice) / (1 + above * below * twice)).abs().square() / (
+        (1 - glass) / (1 + glass)
+    ) ** 2
 
 
 @pytest.mark.parametrize("tuned", [400e-9, 550e-9, 700e-9])
@@ -105,10 +122,20 @@ def test_a_coating_reflects_as_a_quarter_wave_of_magnesium_fluoride(tuned):
 
 def test_coatings_are_tuned_to_all_of_the_visible_range():
     """That of a camera lens, 400 to 700 nm, and evenly."""
-    tuned = torch.tensor([ghost.tuned for ghost in _draw(1000, 2.0, 3e-4, seeded())], dtype=torch.float64) * 1e9
+    tuned = (
+        torch.tensor(
+            [ghost.tuned for ghost in _draw(1000, 2.0, 3e-4, seeded())], dtype=torch.float64
+        )
+        * 1e9
+    )
     assert 400 <= float(tuned.min()) < 402
     assert 698 < float(tuned.max()) <= 700
-    assert_close(tuned.mean(0), torch.full((2,), 550.0, dtype=torch.float64), rtol=0, atol=4 * 300 / math.sqrt(12e3))
+    assert_close(
+        tuned.mean(0),
+        torch.full((2,), 550.0, dtype=torch.float64),
+        rtol=0,
+        atol=4 * 300 / math.sqrt(12e3),
+    )
 
 
 @settings(max_examples=25, deadline=None)
@@ -133,7 +160,9 @@ def test_ghosts_are_linear_in_the_spot_and_learn():
     light = torch.rand(2, 9, 9, dtype=torch.float64, requires_grad=True)
 
     def run(x):
-        return flare.ghosts(x, bands(LINE[:2]), towards(1e-4, 0.0), **LENS, radius=8e-6, energy=0.1, rng=seeded())
+        return flare.ghosts(
+            x, bands(LINE[:2]), towards(1e-4, 0.0), **LENS, radius=8e-6, energy=0.1, rng=seeded()
+        )
 
     assert torch.autograd.gradcheck(run, (light,), fast_mode=True)
 
@@ -145,7 +174,9 @@ def test_bands_of_another_laser_are_refused():
 
 def test_check_reports_the_share():
     light = spot()
-    (line,) = flare.ghosts.hooks.check(ghosts(light, energy=1e-3), light, bands(), towards(0.0, 0.0), energy=1e-3)
+    (line,) = flare.ghosts.hooks.check(
+        ghosts(light, energy=1e-3), light, bands(), towards(0.0, 0.0), energy=1e-3
+    )
     assert line.ok
     assert "have 0.001 of" in line.text
     assert not flare.ghosts.hooks.check(light, light, bands(), towards(0.0, 0.0), energy=1e-3)[0].ok
@@ -161,7 +192,9 @@ def test_ghosts_fall_where_the_spot_is():
 def test_a_ghost_that_is_smaller_than_a_pixel_is_seen_all_the_same(angle):
     light = spot()
     found = ghosts(light, angle=angle, radius=1e-7, energy=1e-3, count=3, spread=1.0)
-    assert float(found.double().sum()) == pytest.approx(1e-3 * float(light.double().sum()), rel=1e-5)
+    assert float(found.double().sum()) == pytest.approx(
+        1e-3 * float(light.double().sum()), rel=1e-5
+    )
 
 
 def test_no_ghost_is_asked_for_where_nothing_is_reflected():

@@ -1,4 +1,6 @@
-"""The veil of a lens over the distance from the spot, against SciPy's integral of Harvey and Shack's law."""
+"""The veil of a lens over the distance from the spot, against SciPy's integral of Harvey and
+Shack's law.
+"""
 
 import math
 
@@ -10,17 +12,26 @@ from neusee.nodes.flare import surface_of, veil_at
 
 LENS = {"focal_length": 0.05, "pixel_pitch": 3.45e-6, "diameter": 12e-3}
 ONE = {"front": {"b0": 0.442, "l": 0.01, "s": -1.5}}
-TWO = {"front": {"b0": 0.5, "l": 0.02, "s": -1.5}, "inner": {"b0": 600.0, "l": 4e-4, "s": -2.2, "radius": 2e-3}}
+TWO = {
+    "front": {"b0": 0.5, "l": 0.02, "s": -1.5},
+    "inner": {"b0": 600.0, "l": 4e-4, "s": -2.2, "radius": 2e-3},
+}
 
 
 def scale_of(surface):
-    """Direction cosine per pixel: the numerical aperture times the pitch over the radius of the beam."""
+    """Direction cosine per pixel: the numerical aperture times the pitch over the radius of the
+    beam.
+    """
     return 6e-3 / 0.05 * 3.45e-6 / surface.get("radius", 6e-3)
 
 
 def scattered(surface):
     b0, l, s = (surface[name] for name in ("b0", "l", "s"))  # noqa: E741
-    return quad(lambda v: 2 * math.pi * b0 * (1 + (math.exp(v) / l) ** 2) ** (s / 2) * math.exp(2 * v), -30, 0)[0]
+    return quad(
+        lambda v: 2 * math.pi * b0 * (1 + (math.exp(v) / l) ** 2) ** (s / 2) * math.exp(2 * v),
+        -30,
+        0,
+    )[0]
 
 
 def over_pixel(surface, distance):
@@ -31,7 +42,9 @@ def over_pixel(surface, distance):
 
 
 @pytest.mark.parametrize("surfaces", [ONE, TWO], ids=["one", "two"])
-@pytest.mark.parametrize(("distance", "rel"), [(0, 1e-6), (1, 1e-6), (6, 1e-6), (17, 1e-5), (80, 1e-6), (900, 1e-6)])
+@pytest.mark.parametrize(
+    ("distance", "rel"), [(0, 1e-6), (1, 1e-6), (6, 1e-6), (17, 1e-5), (80, 1e-6), (900, 1e-6)]
+)
 def test_the_veil_is_the_integral_of_the_law_over_the_pixel(surfaces, distance, rel):
     expected, left = 0.0, 1.0
     for surface in surfaces.values():
@@ -59,4 +72,6 @@ def test_a_surface_of_a_share_scatters_it_and_its_veil_is_proportional(l, s):  #
     assert scattered(few) == pytest.approx(0.002, rel=1e-6)
     at = torch.tensor([0.0, 3.0, 40.0])
     veils = [veil_at(at, surfaces={"lens": surface}, **LENS)[0] for surface in (few, many)]
-    torch.testing.assert_close(veils[1] / veils[0], torch.full((3,), 15.0, dtype=torch.float64), rtol=1e-9, atol=0.0)
+    torch.testing.assert_close(
+        veils[1] / veils[0], torch.full((3,), 15.0, dtype=torch.float64), rtol=1e-9, atol=0.0
+    )

@@ -1,4 +1,6 @@
-"""Transmittance of air by the visibility: the laws of Kruse and Kim, against their published tables."""
+"""Transmittance of air by the visibility: the laws of Kruse and Kim, against their published
+tables.
+"""
 
 import math
 
@@ -33,7 +35,9 @@ def test_attenuation_is_that_of_the_published_table(visibility, law, wavelength,
     assert lost == pytest.approx(decibels, rel=0.05, abs=0.5)
 
 
-@pytest.mark.parametrize(("km", "q"), [(0.4, 0.0), (0.7, 0.2), (1.0, 0.5), (6.0, 1.3), (20.0, 1.3), (60.0, 1.6)])
+@pytest.mark.parametrize(
+    ("km", "q"), [(0.4, 0.0), (0.7, 0.2), (1.0, 0.5), (6.0, 1.3), (20.0, 1.3), (60.0, 1.6)]
+)
 def test_exponent_of_kim_is_continuous_up_to_six_kilometres(km, q):
     assert size_exponent(km * 1e3, "kim") == pytest.approx(q)
 
@@ -45,7 +49,12 @@ def test_the_laws_differ_tenfold_and_more_at_1550_nm_in_fog():
 
 @pytest.mark.parametrize(
     ("distance", "visibility", "name"),
-    [(-1.0, None, "distance"), (math.inf, None, "distance"), (1.0, 0.0, "visibility"), (1.0, -5.0, "visibility")],
+    [
+        (-1.0, None, "distance"),
+        (math.inf, None, "distance"),
+        (1.0, 0.0, "visibility"),
+        (1.0, -5.0, "visibility"),
+    ],
 )
 def test_what_no_air_has_is_refused_by_name(distance, visibility, name):
     with pytest.raises(ParameterError) as error:

@@ -1,4 +1,6 @@
-"""The Gaussian beam, against closed forms and against integrals of its profile over the aperture by SciPy."""
+"""The Gaussian beam, against closed forms and against integrals of its profile over the aperture
+by SciPy.
+"""
 
 import math
 
@@ -25,14 +27,18 @@ from neusee.nodes.laser import (
 )
 
 POINTER = beam(532e-9, power=5e-3, divergence=1e-3)
-LIDAR = beam(905e-9, pulse_energy=1e-6, pulse_duration=5e-9, repetition_rate=1e5, waist=2e-3, divergence=3e-3)
+LIDAR = beam(
+    905e-9, pulse_energy=1e-6, pulse_duration=5e-9, repetition_rate=1e5, waist=2e-3, divergence=3e-3
+)
 DISTANCES = (0.0, 0.3, 7.0, 100.0, 5e3)
 lasers = pytest.mark.parametrize("laser", [POINTER, LIDAR], ids=["pointer", "lidar"])
 distances = pytest.mark.parametrize("distance", DISTANCES)
 
 
 def profile(laser, distance):
-    """Irradiance over the radius, from the text book: total power P, 1/e2 radius w by the quadrature sum."""
+    """Irradiance over the radius, from the text book: total power P, 1/e2 radius w by the
+    quadrature sum.
+    """
     w = math.hypot(laser.waist, laser.divergence * distance / 2)
     return lambda r: 2 * laser.power / (math.pi * w**2) * math.exp(-2 * (r / w) ** 2)
 
@@ -61,9 +67,13 @@ def test_all_power_passes_a_wide_aperture_and_the_radius_is_that_of_1_over_e2(la
 def test_peak_behind_a_lens_is_the_square_of_the_diffraction_integral(laser, distance):
     """The field sqrt(I) adds in phase on the axis: |2 pi int sqrt(I) r dr|^2 / (lambda f)^2."""
     irradiance, radius, focal = profile(laser, distance), 5.5e-3, 0.11
-    field, _ = integrate.quad(lambda r: 2 * math.pi * r * math.sqrt(irradiance(r)), 0, radius, epsrel=1e-12)
+    field, _ = integrate.quad(
+        lambda r: 2 * math.pi * r * math.sqrt(irradiance(r)), 0, radius, epsrel=1e-12
+    )
     peak = 0.8 * 0.9 * field**2 / (laser.wavelength * focal) ** 2
-    assert peak_on_sensor(laser, distance, 2 * radius, focal, 0.8, 0.9) == pytest.approx(peak, rel=1e-9)
+    assert peak_on_sensor(laser, distance, 2 * radius, focal, 0.8, 0.9) == pytest.approx(
+        peak, rel=1e-9
+    )
 
 
 def test_an_overfilled_lens_has_the_airy_peak_and_the_airy_pattern_holds_its_power():
@@ -76,7 +86,9 @@ def test_an_overfilled_lens_has_the_airy_peak_and_the_airy_pattern_holds_its_pow
         return peak * (2 * special.j1(scale * r) / (scale * r)) ** 2 if r else peak
 
     rings = special.jn_zeros(1, 40) / scale
-    caught, _ = integrate.quad(lambda r: 2 * math.pi * r * airy(r), 0, rings[-1], limit=400, points=list(rings[:-1]))
+    caught, _ = integrate.quad(
+        lambda r: 2 * math.pi * r * airy(r), 0, rings[-1], limit=400, points=list(rings[:-1])
+    )
     assert caught == pytest.approx(incoming * (1 - special.j0(scale * rings[-1]) ** 2), rel=1e-5)
 
 
@@ -108,7 +120,9 @@ def test_tensors_of_distances_give_what_numbers_give_with_gradients():
 
 def test_the_wavefront_of_a_perfect_beam_is_that_of_the_text_book():
     rayleigh = math.pi * POINTER.waist**2 / POINTER.wavelength
-    assert curvature_radius(POINTER, 100.0) == pytest.approx(100 * (1 + (rayleigh / 100) ** 2), rel=1e-12)
+    assert curvature_radius(POINTER, 100.0) == pytest.approx(
+        100 * (1 + (rayleigh / 100) ** 2), rel=1e-12
+    )
     assert curvature_radius(POINTER, rayleigh) == pytest.approx(2 * rayleigh)
 
 
@@ -117,9 +131,15 @@ def test_one_width_is_completed_by_a_perfect_beam_and_two_give_the_third():
     assert POINTER.m_squared == 1.0
     wide = beam(1e-6, power=1.0, waist=1e-3)
     assert (wide.divergence, wide.m_squared) == (pytest.approx(2e-6 / (math.pi * 1e-3)), 1.0)
-    assert beam(1e-6, power=1.0, waist=1e-3, m_squared=3.0).divergence == pytest.approx(3 * wide.divergence)
-    assert beam(1e-6, power=1.0, divergence=1e-3, m_squared=3.0).waist == pytest.approx(3 * 2e-6 / (math.pi * 1e-3))
-    assert beam(1e-6, power=1.0, waist=1e-3, divergence=2e-3).m_squared == pytest.approx(2e-6 * math.pi / 2e-6)
+    assert beam(1e-6, power=1.0, waist=1e-3, m_squared=3.0).divergence == pytest.approx(
+        3 * wide.divergence
+    )
+    assert beam(1e-6, power=1.0, divergence=1e-3, m_squared=3.0).waist == pytest.approx(
+        3 * 2e-6 / (math.pi * 1e-3)
+    )
+    assert beam(1e-6, power=1.0, waist=1e-3, divergence=2e-3).m_squared == pytest.approx(
+        2e-6 * math.pi / 2e-6
+    )
 
 
 def test_a_width_at_1_over_e_is_smaller_by_the_root_of_two():
@@ -131,7 +151,11 @@ def test_a_width_at_1_over_e_is_smaller_by_the_root_of_two():
 
 
 def test_pulse_trains_know_mean_power_energy_and_peak_power():
-    assert (LIDAR.power, LIDAR.peak_power, LIDAR.is_pulsed) == (pytest.approx(0.1), pytest.approx(200.0), True)
+    assert (LIDAR.power, LIDAR.peak_power, LIDAR.is_pulsed) == (
+        pytest.approx(0.1),
+        pytest.approx(200.0),
+        True,
+    )
     same = beam(905e-9, power=0.1, pulse_duration=5e-9, repetition_rate=1e5, waist=2e-3)
     assert same.pulse_energy == pytest.approx(1e-6)
     single = beam(905e-9, pulse_energy=1e-6, pulse_duration=5e-9, waist=2e-3)
@@ -178,12 +202,14 @@ def test_what_disagrees_is_refused_by_name(case):
 def test_rounded_data_sheets_are_not_refused():
     exact = 2 * 532e-9 / (math.pi * 1e-3)
     assert beam(532e-9, power=1.0, waist=1e-3, divergence=0.99 * exact).m_squared == 1.0
-    assert beam(532e-9, power=1.0, waist=1e-3, divergence=2 * exact, m_squared=2.02).m_squared == pytest.approx(2.0)
+    assert beam(
+        532e-9, power=1.0, waist=1e-3, divergence=2 * exact, m_squared=2.02
+    ).m_squared == pytest.approx(2.0)
     train = {"pulse_energy": 1e-3, "pulse_duration": 1e-9, "repetition_rate": 1e3, "waist": 1e-3}
     assert beam(532e-9, power=1.01, **train).power == pytest.approx(1.0)
 
 
-# --- borders ----------------------------------------------------------------------------------------------------------
+# --- borders --------------------------------------------------------------------------------------
 
 PULSED = {"pulse_energy": 1e-6, "waist": 1e-3}
 
@@ -191,13 +217,22 @@ PULSED = {"pulse_energy": 1e-6, "waist": 1e-3}
 def test_a_pulse_as_long_as_the_period_is_refused_and_a_shorter_one_is_not():
     with pytest.raises(ParameterError, match="does not fit into the period"):
         beam(905e-9, pulse_duration=0.125, repetition_rate=8.0, **PULSED)
-    assert beam(905e-9, pulse_duration=0.1249, repetition_rate=8.0, **PULSED).power == pytest.approx(8e-6)
+    assert beam(
+        905e-9, pulse_duration=0.1249, repetition_rate=8.0, **PULSED
+    ).power == pytest.approx(8e-6)
 
 
-@pytest.mark.parametrize(("off", "agrees"), [(1.019, True), (0.9815, True), (1.021, False), (0.979, False)])
+@pytest.mark.parametrize(
+    ("off", "agrees"), [(1.019, True), (0.9815, True), (1.021, False), (0.979, False)]
+)
 def test_statements_agree_within_two_per_cent(off, agrees):
     train = {"pulse_duration": 1e-9, "repetition_rate": 1e3, "power": 1e-3 * off, **PULSED}
-    shaped = {"power": 1.0, "waist": 1e-3, "divergence": 3 * 2e-6 / (math.pi * 1e-3), "m_squared": 3 * off}
+    shaped = {
+        "power": 1.0,
+        "waist": 1e-3,
+        "divergence": 3 * 2e-6 / (math.pi * 1e-3),
+        "m_squared": 3 * off,
+    }
     for statements, wavelength in ((train, 905e-9), (shaped, 1e-6)):
         if agrees:
             beam(wavelength, **statements)
@@ -206,7 +241,9 @@ def test_statements_agree_within_two_per_cent(off, agrees):
                 beam(wavelength, **statements)
 
 
-@pytest.mark.parametrize(("quality", "found"), [(0.981, 1.0), (0.979, None), (1.0, 1.0), (1.5, 1.5)])
+@pytest.mark.parametrize(
+    ("quality", "found"), [(0.981, 1.0), (0.979, None), (1.0, 1.0), (1.5, 1.5)]
+)
 def test_two_per_cent_below_diffraction_are_rounding_and_count_as_a_perfect_beam(quality, found):
     shape = {"waist": 1e-3, "divergence": quality * 2e-6 / (math.pi * 1e-3)}
     if found is None:
@@ -231,7 +268,9 @@ def test_the_series_of_an_underfilled_lens_agrees_with_the_closed_form_to_its_la
     """1 - x^2 / 12 + x^4 / 120, from the series of the hyperbolic tangent."""
     exact = 2 / x * math.tanh(x / 2) if x > 0.01 else 1 - x**2 / 12 + x**4 / 120
     assert 1 - underfilled(x) == pytest.approx(1 - exact, rel=1e-6, abs=1e-15)
-    assert float(1 - underfilled(torch.tensor(x, dtype=torch.float64))) == pytest.approx(1 - exact, rel=1e-6, abs=1e-15)
+    assert float(1 - underfilled(torch.tensor(x, dtype=torch.float64))) == pytest.approx(
+        1 - exact, rel=1e-6, abs=1e-15
+    )
 
 
 def test_a_pinhole_far_away_passes_what_its_area_says():
@@ -240,7 +279,7 @@ def test_a_pinhole_far_away_passes_what_its_area_says():
     assert share == pytest.approx(axis_density(POINTER, 1e6) * math.pi * (0.5e-6) ** 2, rel=1e-9)
 
 
-# --- along the axis ---------------------------------------------------------------------------------------------------
+# --- along the axis -------------------------------------------------------------------------------
 
 
 def sag(radius, rim):
@@ -250,31 +289,48 @@ def sag(radius, rim):
 
 @pytest.mark.parametrize("focus", [2.0, 40.0, math.inf])
 @pytest.mark.parametrize("distance", [3.0, 25.0, 4e3])
-def test_defocus_is_the_path_at_the_rim_between_the_wavefront_and_the_sphere_of_the_focus(distance, focus):
+def test_defocus_is_the_path_at_the_rim_between_the_wavefront_and_the_sphere_of_the_focus(
+    distance, focus
+):
     """Of the LIDAR, whose waist of 2 mm bends the wavefront less near to it."""
     rayleigh = math.pi * LIDAR.waist**2 / (905e-9 * LIDAR.m_squared)
     path = sag(distance + rayleigh**2 / distance, 6e-3) - sag(focus, 6e-3)
     assert defocus_at(LIDAR, distance, 12e-3, focus) == pytest.approx(path / 905e-9, rel=1e-5)
-    off = defocus_at(LIDAR, distance, 12e-3, focus, 0.7 * 905e-9) - defocus_at(LIDAR, distance, 12e-3, focus)
+    off = defocus_at(LIDAR, distance, 12e-3, focus, 0.7 * 905e-9) - defocus_at(
+        LIDAR, distance, 12e-3, focus
+    )
     assert off == pytest.approx(0.7, rel=1e-9)
 
 
 @lasers
 @pytest.mark.parametrize("waves", [0.0, 0.3, -0.45])
-def test_the_density_out_of_focus_is_the_square_of_the_diffraction_integral_with_its_phase(laser, waves):
-    """On the axis, which is the brightest point up to half a wave: 2 pi int sqrt(I) exp(2 pi i W r^2) r dr."""
+def test_the_density_out_of_focus_is_the_square_of_the_diffraction_integral_with_its_phase(
+    laser, waves
+):
+    """On the axis, which is the brightest point up to half a wave: 2 pi int sqrt(I) exp(2 pi i W
+    r^2) r dr.
+    """
     radius, focal = 5.5e-3, 0.11
     for distance in (0.3, 7.0, 5e3):
         irradiance = profile(laser, distance)
         field = [
-            lambda r, f=f, i=irradiance: math.sqrt(i(r)) * f(2 * math.pi * waves * (r / radius) ** 2)
+            lambda r, f=f, i=irradiance: (
+                math.sqrt(i(r)) * f(2 * math.pi * waves * (r / radius) ** 2)
+            )
             for f in (math.cos, math.sin)
         ]
-        parts = [integrate.quad(lambda r, f=f: 2 * math.pi * r * f(r), 0, radius, epsrel=1e-11)[0] for f in field]
+        parts = [
+            integrate.quad(lambda r, f=f: 2 * math.pi * r * f(r), 0, radius, epsrel=1e-11)[0]
+            for f in field
+        ]
         expected = (parts[0] ** 2 + parts[1] ** 2) / (laser.wavelength * focal) ** 2 / laser.power
-        columns = (torch.tensor(x, dtype=torch.float64) for x in (distance, 2 * radius, focal, waves))
+        columns = (
+            torch.tensor(x, dtype=torch.float64) for x in (distance, 2 * radius, focal, waves)
+        )
         at, diameter, length, defocus = columns
-        assert float(density_in_spot(laser, at, diameter, length, defocus)) == pytest.approx(expected, rel=1e-6)
+        assert float(density_in_spot(laser, at, diameter, length, defocus)) == pytest.approx(
+            expected, rel=1e-6
+        )
 
 
 @pytest.mark.parametrize(("distance", "cn2"), [(300.0, 1e-15), (1e3, 1e-14), (2e3, 3e-14)])
@@ -286,7 +342,9 @@ def test_turbulence_multiplies_by_the_quantile_of_scipys_lognormal_law(distance,
     assert law.mean() == pytest.approx(1)
     expected = float(law.ppf(worst)) if spread < stats.norm.ppf(worst) else None
     found = float(scintillation(532e-9, distance, cn2, worst))
-    assert found == pytest.approx(expected if expected else math.exp(stats.norm.ppf(worst) ** 2 / 2), rel=1e-9)
+    assert found == pytest.approx(
+        expected if expected else math.exp(stats.norm.ppf(worst) ** 2 / 2), rel=1e-9
+    )
 
 
 @pytest.mark.parametrize("worst", [0.05, 0.3, 0.5, 0.7, 0.99])

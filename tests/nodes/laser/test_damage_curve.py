@@ -1,4 +1,6 @@
-"""Threshold of the first damage over the duration: figures by hand, and what no duration and no spot may contradict."""
+"""Threshold of the first damage over the duration: figures by hand, and what no duration and no
+spot may contradict.
+"""
 
 import math
 
@@ -12,7 +14,9 @@ ENDS = {
     device: CurveEnds(
         *(
             next(
-                law for law in PUBLISHED_DAMAGE if (law.device, law.damage, law.quantity) == (device, "point", quantity)
+                law
+                for law in PUBLISHED_DAMAGE
+                if (law.device, law.damage, law.quantity) == (device, "point", quantity)
             )
             for quantity in ("fluence", "irradiance")
         )
@@ -24,7 +28,9 @@ DURATIONS = np.geomspace(1e-9, 100, 2000)
 SPOTS = [None, 1e-6, 5e-6, 25.7e-6, 26e-6, 60e-6, 300e-6, 5e-3]
 
 
-@pytest.mark.parametrize(("duration", "joules"), [(1e-9, 0.1), (1e-8, 0.1), (1e-7, 0.15), (1e-6, 0.22), (1e-5, 0.32)])
+@pytest.mark.parametrize(
+    ("duration", "joules"), [(1e-9, 0.1), (1e-8, 0.1), (1e-7, 0.15), (1e-6, 0.22), (1e-5, 0.32)]
+)
 def test_the_fluence_is_interpolated_in_logarithms(duration, joules):
     assert float(first_damage(CMOS, duration).middle) / 1e4 == pytest.approx(joules, rel=0.025)
 
@@ -34,14 +40,18 @@ def test_beyond_ten_microseconds_the_continuous_law_counts(duration):
     found = first_damage(CMOS, duration)
     assert float(found.middle) / duration / 1e4 == pytest.approx(10**4.5)
     assert float(found.low) / duration / 1e4 == pytest.approx(1e4)
-    assert float(found.high) / duration / 1e4 == pytest.approx(max(1e5, 2e5 * 1e-5 / duration), rel=0.01)
+    assert float(found.high) / duration / 1e4 == pytest.approx(
+        max(1e5, 2e5 * 1e-5 / duration), rel=0.01
+    )
 
 
 @pytest.mark.parametrize("spot", SPOTS)
 @pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("device", ENDS)
 def test_a_longer_pulse_never_needs_less_fluence_and_never_more_irradiance(spot, exponent, device):
-    """Power in the pulse over the continuous law once gave 0.044 J/cm2 at 1 us, less than the 0.1 J/cm2 of 10 ns."""
+    """Power in the pulse over the continuous law once gave 0.044 J/cm2 at 1 us, less than the
+    0.1 J/cm2 of 10 ns.
+    """
     found = first_damage(ENDS[device], torch.from_numpy(DURATIONS), spot, exponent)
     for end in (found.low, found.middle, found.high):
         fluence = end.numpy()
@@ -62,7 +72,9 @@ def test_the_spread_is_at_least_six_times_between_the_ends():
 
 
 def test_the_bracket_holds_every_first_damage_that_was_read_for_nanoseconds():
-    """0.1 J/cm2, 78.9 mJ/cm2, and 30.06 mJ/cm2 of a back-illuminated CMOS module (Chinese Optics, CO.2025-0090)."""
+    """0.1 J/cm2, 78.9 mJ/cm2, and 30.06 mJ/cm2 of a back-illuminated CMOS module (Chinese
+    Optics, CO.2025-0090).
+    """
     found = first_damage(CMOS, 1e-8)
     for joules in (0.1, 0.0789, 0.03006):
         assert float(found.low) < joules * 1e4 < float(found.high)

@@ -59,10 +59,14 @@ def test_a_zone_and_a_gap_narrower_than_a_step_are_found(sign):
 
     ends = [37 * math.exp(-width), 37 * math.exp(width)]
     found = distance_intervals(margin, 1.0, 1e4)
-    assert [end for pair in found for end in pair] == pytest.approx(ends if sign > 0 else [1.0, *ends, 1e4], rel=1e-9)
+    assert [end for pair in found for end in pair] == pytest.approx(
+        ends if sign > 0 else [1.0, *ends, 1e4], rel=1e-9
+    )
 
 
-@pytest.mark.parametrize("ends", [(0.0, 10.0), (10.0, 10.0), (5.0, 1.0), (1.0, math.inf), (-1.0, 2.0)])
+@pytest.mark.parametrize(
+    "ends", [(0.0, 10.0), (10.0, 10.0), (5.0, 1.0), (1.0, math.inf), (-1.0, 2.0)]
+)
 def test_distances_without_an_interval_are_refused(ends):
     with pytest.raises(ValueError, match="give 0 < near < far"):
         distance_intervals(lambda distance: 1.0, *ends)
@@ -71,9 +75,9 @@ def test_distances_without_an_interval_are_refused(ends):
 def test_a_margin_that_is_not_a_number_is_refused_with_its_distance():
     with pytest.raises(ValueError, match="margin at 1 m is not a number"):
         distance_intervals(lambda distance: math.nan, 1.0, 2.0)
-    assert distance_intervals(lambda distance: -math.inf if distance < 1.5 else math.inf, 1.0, 2.0) == [
-        (pytest.approx(1.5), 2.0)
-    ]
+    assert distance_intervals(
+        lambda distance: -math.inf if distance < 1.5 else math.inf, 1.0, 2.0
+    ) == [(pytest.approx(1.5), 2.0)]
 
 
 def test_a_source_at_2_m_is_eight_waves_out_of_focus():
@@ -83,7 +87,9 @@ def test_a_source_at_2_m_is_eight_waves_out_of_focus():
 
 
 def test_a_near_laser_that_is_out_of_focus_has_several_zones_of_damage():
-    """A beam of 8 mm before a lens that is focused far away: the peak falls and rises with the distance."""
+    """A beam of 8 mm before a lens that is focused far away: the peak falls and rises with the
+    distance.
+    """
     laser = beam(532e-9, power=20.0, waist=4e-3, divergence=2e-3)
     diameter, focal_length, threshold = 8.08e-3, 0.11, 2.5e9
 
@@ -101,10 +107,14 @@ def test_a_near_laser_that_is_out_of_focus_has_several_zones_of_damage():
 
 
 def test_the_exposure_limit_at_the_lens_gives_the_threshold_on_the_sensor():
-    """The irradiance of a beam at the distance where it is at the limit, and its peak on the sensor."""
+    """The irradiance of a beam at the distance where it is at the limit, and its peak on the
+    sensor.
+    """
     laser = beam(532e-9, power=50.0, waist=1e-3, divergence=1e-3)
     gain = sensor_gain(532e-9, 0.11, 8.08e-3, 0.9)
     limit = exposure_limit(3e8, gain)
-    (interval,) = distance_intervals(lambda r: math.log(axis_irradiance(laser, r) / limit), 100.0, 1e5)
+    (interval,) = distance_intervals(
+        lambda r: math.log(axis_irradiance(laser, r) / limit), 100.0, 1e5
+    )
     assert peak_on_sensor(laser, interval[1], 8.08e-3, 0.11, 0.9) == pytest.approx(3e8, rel=3e-4)
     assert sensor_gain(532e-9, 0.11, 8.08e-3, 0.9, peak_ratio=1e-2) == pytest.approx(gain / 100)

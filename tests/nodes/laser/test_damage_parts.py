@@ -1,4 +1,6 @@
-"""Parts of a laser's light: 2000 drawn lasers, superposed heat by hand, and trains that become continuous light."""
+"""Parts of a laser's light: 2000 drawn lasers, superposed heat by hand, and trains that become
+continuous light.
+"""
 
 import math
 
@@ -11,15 +13,22 @@ from neusee.nodes.laser import PARTS, DamageLaw, LightInTime, damage_parts, stat
 LIGHTS = 2000
 OWN = DamageLaw(
     "CMOS", "line", "fluence", 5e3, 1.5, 1.2, (1500e-9, 1600e-9), (1e-9, 1e-7), None, "own test"
-)  # fmt: skip
+)
 
 
 def drawn_light(draw):
-    """Return a laser from femtoseconds to continuous, 300 to 1600 nm, one pulse to MHz, with its spot and dwell."""
+    """Return a laser from femtoseconds to continuous, 300 to 1600 nm, one pulse to MHz, with its
+    spot and dwell.
+    """
     wavelength = draw.uniform(300e-9, 1600e-9)
     dwell = 10 ** draw.uniform(-6, 2)
     spot = draw.choice([None, 10 ** draw.uniform(-6, -3)])
-    common = {"wavelength": wavelength, "dwell": dwell, "spot": spot, "small_spot_exponent": draw.choice([0.0, 0.5])}
+    common = {
+        "wavelength": wavelength,
+        "dwell": dwell,
+        "spot": spot,
+        "small_spot_exponent": draw.choice([0.0, 0.5]),
+    }
     sort = draw.integers(0, 4)
     if sort == 0:
         return LightInTime(**common)
@@ -31,7 +40,9 @@ def drawn_light(draw):
 
 
 def judged(light, device="CMOS", exposure=1.0, own=()):
-    """Return the ratio, the state and the part of each part, for an irradiance, or a fluence, at the peak."""
+    """Return the ratio, the state and the part of each part, for an irradiance, or a fluence, at
+    the peak.
+    """
     found = []
     for part in damage_parts(light, device, own):
         if part.threshold is None:
@@ -39,7 +50,9 @@ def judged(light, device="CMOS", exposure=1.0, own=()):
             continue
         rate = float(light.rate * light.caught) if light.pulse_duration is not None else 1.0
         level = exposure * rate if part.part == "mean" else exposure
-        low, middle, high = (float(x) for x in (part.threshold.low, part.threshold.middle, part.threshold.high))
+        low, middle, high = (
+            float(x) for x in (part.threshold.low, part.threshold.middle, part.threshold.high)
+        )
         assert 0 <= low <= middle * (1 + 1e-12)
         assert middle <= high * (1 + 1e-12)
         state = state_of(level / high, level / low if low else math.inf, part.open_below)
@@ -68,7 +81,9 @@ def test_no_laser_is_without_its_rows_and_none_is_safe_by_what_is_not_judged(dev
                 assert state != "below", (light, part)
         inside = 400e-9 <= light.wavelength <= 1100e-9 and device != "InGaAs"
         assert all(part.threshold is not None for _, _, part in rows) == inside
-    assert seen == ({"not judged"} if device == "InGaAs" else {"above", "within", "below", "not judged"})
+    assert seen == (
+        {"not judged"} if device == "InGaAs" else {"above", "within", "below", "not judged"}
+    )
 
 
 def test_more_energy_and_more_power_never_read_as_safer():
@@ -76,26 +91,37 @@ def test_more_energy_and_more_power_never_read_as_safer():
     order = {"below": 0, "within": 1, "not judged": 1, "above": 2}
     for _ in range(300):
         light = drawn_light(draw)
-        states = [worst_state(s for _, s, _ in judged(light, exposure=10.0**e)) for e in range(-3, 13)]
+        states = [
+            worst_state(s for _, s, _ in judged(light, exposure=10.0**e)) for e in range(-3, 13)
+        ]
         ranks = [order[state] for state in states]
         assert ranks == sorted(ranks), (light, states)
 
 
 @pytest.mark.parametrize(("rate", "pulse"), [(10.0, 1e-8), (1e5, 5e-9), (2e5, 1e-7), (1e3, 1e-6)])
 def test_the_heat_of_one_pulse_and_of_the_mean_superpose(rate, pulse):
-    """F (1 - duty) / F_th + E_mean / E_cw = 1 at the threshold, with figures of the curve by hand."""
+    """F (1 - duty) / F_th + E_mean / E_cw = 1 at the threshold, with figures of the curve by
+    hand.
+    """
     light = LightInTime(532e-9, 1.0, pulse, rate)
     own, mean, both, many = damage_parts(light, "CMOS")[:4]
     per_decade = math.log10(math.sqrt(10)) / 3
     fluence = 1e3 * 10 ** (per_decade * max(0.0, math.log10(pulse / 1e-8)))
-    ends = {"low": (fluence / math.sqrt(40), 1e8), "middle": (fluence, 10**8.5), "high": (fluence * math.sqrt(40), 1e9)}
+    ends = {
+        "low": (fluence / math.sqrt(40), 1e8),
+        "middle": (fluence, 10**8.5),
+        "high": (fluence * math.sqrt(40), 1e9),
+    }
     for end, (joules, watts) in ends.items():
         assert float(getattr(own.threshold, end)) == pytest.approx(joules)
         assert float(getattr(mean.threshold, end)) == pytest.approx(watts)
         at = float(getattr(both.threshold, end))
         assert at * (1 - pulse * rate) / joules + at * rate / watts == pytest.approx(1.0)
-    assert float(many.threshold.middle) == pytest.approx(fluence * rate**-0.1, rel=0.03)  # a duty of at most 2 %
-    assert float(many.threshold.low) == pytest.approx(float(own.threshold.low) * rate**-0.2, rel=0.2)
+    # a duty of at most 2 %
+    assert float(many.threshold.middle) == pytest.approx(fluence * rate**-0.1, rel=0.03)
+    assert float(many.threshold.low) == pytest.approx(
+        float(own.threshold.low) * rate**-0.2, rel=0.2
+    )
     assert float(many.threshold.high) == pytest.approx(float(own.threshold.high))
 
 
@@ -116,7 +142,9 @@ def test_of_a_train_that_is_slower_than_the_dwell_one_pulse_warms():
 
 
 def test_the_shutter_or_the_scan_catches_a_part_of_each_pulse():
-    """Half of a pulse of 20 ns within 10 ns: the fluence of the whole pulse may be twice as large."""
+    """Half of a pulse of 20 ns within 10 ns: the fluence of the whole pulse may be twice as
+    large.
+    """
     parts = damage_parts(LightInTime(532e-9, 1e-8, 2e-8), "CMOS")
     assert float(parts[0].threshold.middle) == pytest.approx(2e3)
     joules = {part.kind: part.threshold for part in parts[4:]}
@@ -135,7 +163,9 @@ def test_further_kinds_of_damage_have_the_spread_of_one_figure():
 
 
 def test_a_train_of_a_lidar_is_beyond_by_its_mean():
-    """6 J/cm2 at 200 kHz are 1.2 MW/cm2 mean, 38 times the continuous law at a wavelength that has one."""
+    """6 J/cm2 at 200 kHz are 1.2 MW/cm2 mean, 38 times the continuous law at a wavelength that
+    has one.
+    """
     light = LightInTime(1064e-9, 1.0, 3e-9, 2e5)
     rows = judged(light, exposure=6e4)
     assert rows[1][0] == pytest.approx(1.2e6 / 10**4.5)
@@ -167,7 +197,9 @@ def test_a_pulse_that_outlasts_the_dwell_is_continuous_light_of_the_dwell(dwell)
 
 
 def test_a_scanned_beam_is_judged_by_the_time_it_stays():
-    """At 10 ns the irradiance of 0.1 J/cm2 is 10 MW/cm2, and not the tens of kW/cm2 of continuous light."""
+    """At 10 ns the irradiance of 0.1 J/cm2 is 10 MW/cm2, and not the tens of kW/cm2 of
+    continuous light.
+    """
     (first, *_) = damage_parts(LightInTime(532e-9, 1e-8), "CMOS")
     assert float(first.threshold.middle) == pytest.approx(1e3 / 1e-8)
     (first, *_) = damage_parts(LightInTime(532e-9, 1e-15), "CMOS")
@@ -178,14 +210,22 @@ def test_own_laws_count_where_they_hold_and_the_rest_is_said():
     light = LightInTime(1550e-9, 1.0, 3e-9, 2e5)
     rows = judged(light, exposure=6e4, own=(OWN,))
     assert (rows[0][0], rows[0][2].kind, rows[0][2].law) == (pytest.approx(12.0), "line", OWN)
-    assert [part.part for _, state, part in rows if state == "not judged"] == ["mean", "accumulation"]
-    assert worst_state(state for _, state, _ in judged(light, exposure=1e-3, own=(OWN,))) == "not judged"
+    assert [part.part for _, state, part in rows if state == "not judged"] == [
+        "mean",
+        "accumulation",
+    ]
+    assert (
+        worst_state(state for _, state, _ in judged(light, exposure=1e-3, own=(OWN,)))
+        == "not judged"
+    )
     green = judged(LightInTime(532e-9, 1.0, 3e-9, 2e5), exposure=6e4, own=(OWN,))
     assert all(part.law is None for _, _, part in green)
 
 
 def test_an_own_law_of_continuous_light_judges_pulses_of_its_durations():
-    law = OWN._replace(quantity="irradiance", median=2e8, durations=(1e-3, 10.0), wavelengths=(500e-9, 600e-9))
+    law = OWN._replace(
+        quantity="irradiance", median=2e8, durations=(1e-3, 10.0), wavelengths=(500e-9, 600e-9)
+    )
     rows = judged(LightInTime(532e-9, 1.0, 2e-3), exposure=4e5, own=(law,))
     assert rows[0][0] == pytest.approx(4e5 / (2e8 * 2e-3))
 
@@ -193,7 +233,10 @@ def test_an_own_law_of_continuous_light_judges_pulses_of_its_durations():
 def test_an_own_fluence_judges_continuous_light_of_its_durations_by_its_energy():
     law = OWN._replace(durations=(1e-9, 1e-6), wavelengths=(500e-9, 600e-9))
     for part in damage_parts(LightInTime(532e-9, 2e-7), "CMOS", (law,))[:3]:
-        assert (part.quantity, float(part.threshold.middle)) == ("irradiance", pytest.approx(5e3 / 2e-7))
+        assert (part.quantity, float(part.threshold.middle)) == (
+            "irradiance",
+            pytest.approx(5e3 / 2e-7),
+        )
 
 
 def test_the_bracket_of_an_own_law_holds_nine_of_ten_devices_with_what_is_unknown_of_their_median():
@@ -202,7 +245,9 @@ def test_the_bracket_of_an_own_law_holds_nine_of_ten_devices_with_what_is_unknow
     devices = 5e3 * 1.5 ** draws[0] * 1.2 ** draws[1]
     ends = (float(bracket.low), float(bracket.middle), float(bracket.high))
     assert ends == pytest.approx(tuple(np.quantile(devices, (0.05, 0.5, 0.95))), rel=0.01)
-    known = damage_parts(LightInTime(1550e-9, 1.0, 3e-9), "CMOS", (OWN._replace(median_factor=None),))[0].threshold
+    known = damage_parts(
+        LightInTime(1550e-9, 1.0, 3e-9), "CMOS", (OWN._replace(median_factor=None),)
+    )[0].threshold
     assert float(known.low) == pytest.approx(lognorm.ppf(0.05, math.log(1.5), scale=5e3))
 
 
@@ -223,7 +268,9 @@ def test_an_own_irradiance_falls_with_a_wider_spot_and_an_own_fluence_does_not()
     steady = OWN._replace(quantity="irradiance", median=2e8, **spot)
     (wide, *_) = damage_parts(LightInTime(532e-9, 1.0, spot=400e-6), "CMOS", (steady,))
     assert float(wide.threshold.middle) == pytest.approx(2e8 / 20, rel=0.03)
-    (pulse, *_) = damage_parts(LightInTime(532e-9, 1.0, 1e-8, spot=400e-6), "CMOS", (OWN._replace(**spot),))
+    (pulse, *_) = damage_parts(
+        LightInTime(532e-9, 1.0, 1e-8, spot=400e-6), "CMOS", (OWN._replace(**spot),)
+    )
     assert float(pulse.threshold.middle) == pytest.approx(5e3)
 
 
@@ -240,14 +287,21 @@ def test_a_duration_without_an_experiment_is_named(dwell, words):
 
 
 def test_away_from_the_experiment_the_upper_end_is_that_of_silicon_alone():
-    """3 um of silicon absorb 0.900 at 532 nm and 0.0824 at 905 nm: the threshold is up to 10.9 times as high."""
-    ends = [damage_parts(LightInTime(nm * 1e-9, 1.0, 1e-8), "CMOS")[0].threshold for nm in (532, 905, 405)]
+    """3 um of silicon absorb 0.900 at 532 nm and 0.0824 at 905 nm: the threshold is up to 10.9
+    times as high.
+    """
+    ends = [
+        damage_parts(LightInTime(nm * 1e-9, 1.0, 1e-8), "CMOS")[0].threshold
+        for nm in (532, 905, 405)
+    ]
     assert float(ends[1].high / ends[0].high) == pytest.approx(0.900 / 0.0824, rel=2e-3)
     assert float(ends[1].low) == float(ends[0].low)
     assert float(ends[2].low / ends[0].low) == pytest.approx(0.900, rel=2e-3)
 
 
-@pytest.mark.parametrize(("nm", "named"), [(520, False), (532, False), (561, True), (405, True), (1064, True)])
+@pytest.mark.parametrize(
+    ("nm", "named"), [(520, False), (532, False), (561, True), (405, True), (1064, True)]
+)
 def test_a_wavelength_without_an_experiment_is_named_as_an_extrapolation(nm, named):
     parts = damage_parts(LightInTime(nm * 1e-9, 1.0, 1e-8, 10.0), "CMOS")
     for part in parts[:3]:
@@ -265,4 +319,8 @@ def test_states_are_ordered_so_that_nothing_unknown_reads_as_safe():
     assert worst_state(["below", "not judged", "above"]) == "above"
     assert state_of(math.nan, math.nan) == "not judged"
     assert state_of(0.5, math.inf, open_below=True) == "not judged"
-    assert (state_of(1.0, 5.0), state_of(0.9, 1.0), state_of(0.1, 0.99)) == ("above", "within", "below")
+    assert (state_of(1.0, 5.0), state_of(0.9, 1.0), state_of(0.1, 0.99)) == (
+        "above",
+        "within",
+        "below",
+    )

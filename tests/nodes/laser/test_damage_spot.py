@@ -1,4 +1,6 @@
-"""Damage by the light on a sensor: heat by a direct sum, verdicts that no camera setting moves, dead pixels."""
+"""Damage by the light on a sensor: heat by a direct sum, verdicts that no camera setting moves,
+dead pixels.
+"""
 
 import math
 
@@ -8,19 +10,31 @@ import torch
 from scipy.stats import norm
 
 from neusee.nodes import Check, ParameterError
-from neusee.nodes.laser import KINDS, PUBLISHED_DAMAGE, SpotDamage, airy_diameter, damage, damaged_pixels
+from neusee.nodes.laser import (
+    KINDS,
+    PUBLISHED_DAMAGE,
+    SpotDamage,
+    airy_diameter,
+    damage,
+    damaged_pixels,
+)
 from neusee.nodes.laser._damage_spot import steady_heat
 from neusee.nodes.values import Bands, LaserLight
 
 PITCH, SHAPE = 2.9e-6, (64, 80)
 SENSOR = {"pixel_pitch": PITCH, "exposure": 0.1, "dwell": 0.1}
-CMOS = next(law for law in PUBLISHED_DAMAGE if law.device == "CMOS" and law.quantity == "irradiance")
+CMOS = next(
+    law for law in PUBLISHED_DAMAGE if law.device == "CMOS" and law.quantity == "irradiance"
+)
 HEADER = (
     "device,damage,wavelength from (nm),wavelength to (nm),duration from (ns),duration to (ns),"
     "threshold (J/cm2),factor,median factor,spot (um),source\n"
 )
 STEADY = "CMOS,point,500,1100,0.001,10,40,1.6,1.2,30,own test\n"
-INFRARED = "CMOS,point,1500,1600,1,100,0.5,1.6,1.2,20,own test\nCMOS,line,1500,1600,1,100,1.5,,,20,own test\n"
+INFRARED = (
+    "CMOS,point,1500,1600,1,100,0.5,1.6,1.2,20,own test\nCMOS,line,1500,1600,1,100,1.5,,,20,own"
+    " test\n"
+)
 
 
 def line(nm=532.0):
@@ -44,19 +58,27 @@ def test_the_heat_is_the_direct_sum_over_all_pixels():
     image = torch.rand(6, 8, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     expected = np.zeros((6, 8))
     inside = (np.arange(400) + 0.5) / 400 - 0.5  # the mean of 1 / r over a pixel by many points
-    near = {(y, x): (1 / np.hypot(inside[:, None] + y, inside + x)).mean() for y in range(6) for x in range(8)}
+    near = {
+        (y, x): (1 / np.hypot(inside[:, None] + y, inside + x)).mean()
+        for y in range(6)
+        for x in range(8)
+    }
     for y in range(6):
         for x in range(8):
             for j in range(6):
                 for i in range(8):
-                    expected[y, x] += float(image[j, i]) * PITCH / (2 * np.pi) * near[abs(y - j), abs(x - i)]
+                    expected[y, x] += (
+                        float(image[j, i]) * PITCH / (2 * np.pi) * near[abs(y - j), abs(x - i)]
+                    )
     np.testing.assert_allclose(steady_heat(image, PITCH).numpy(), expected, rtol=5e-4)
 
 
 @pytest.mark.parametrize("diameter", [28e-6, 40e-6, 60e-6])
 def test_a_wider_gaussian_spot_is_at_the_threshold_where_it_heats_as_the_published_one(diameter):
     found = damage(gaussian(1e8, diameter, (160, 160)), line(), **SENSOR)
-    assert found.ratio[:4].tolist() == pytest.approx([1e8 / CMOS.median * diameter / CMOS.spot] * 4, rel=0.02)
+    assert found.ratio[:4].tolist() == pytest.approx(
+        [1e8 / CMOS.median * diameter / CMOS.spot] * 4, rel=0.02
+    )
     assert float(found.threshold[0]) == pytest.approx(CMOS.median * CMOS.spot / diameter, rel=0.02)
     assert float(found.peak[0]) == pytest.approx(1e8)
 
@@ -66,9 +88,12 @@ def test_a_narrower_spot_is_judged_as_the_published_one_unless_a_bonus_is_asked_
     spot = gaussian(1e8, diameter)
     found = damage(spot, line(), **SENSOR)
     assert float(found.ratio[0]) == pytest.approx(1e8 / CMOS.median)
-    assert (float(found.least[0]), float(found.most[0])) == pytest.approx((0.1, 1.0))  # 10 of 10 to 100 kW/cm2
+    # 10 of 10 to 100 kW/cm2
+    assert (float(found.least[0]), float(found.most[0])) == pytest.approx((0.1, 1.0))
     bonus = damage(spot, line(), **SENSOR, small_spot_exponent=1.0)
-    assert float(bonus.ratio[0]) == pytest.approx(1e8 / CMOS.median * diameter / CMOS.spot, rel=0.02)
+    assert float(bonus.ratio[0]) == pytest.approx(
+        1e8 / CMOS.median * diameter / CMOS.spot, rel=0.02
+    )
 
 
 def test_an_airy_spot_is_judged_by_its_equivalent_diameter():
@@ -81,7 +106,9 @@ def test_an_airy_spot_is_judged_by_its_equivalent_diameter():
 
 
 def test_a_probability_is_stated_for_data_of_devices_alone(tmp_path):
-    (tmp_path / "own.csv").write_text(HEADER.replace("J/cm2", "kW/cm2").replace("(ns)", "(s)") + STEADY)
+    (tmp_path / "own.csv").write_text(
+        HEADER.replace("J/cm2", "kW/cm2").replace("(ns)", "(s)") + STEADY
+    )
     spot = gaussian(2e8, 15e-6)
     found = damage(spot, line(), **SENSOR, thresholds=tmp_path / "own.csv")
     away = math.log(0.5) / math.log(1.6)
@@ -93,7 +120,9 @@ def test_a_probability_is_stated_for_data_of_devices_alone(tmp_path):
 
 
 def test_the_verdict_is_the_same_for_every_exposure_of_a_continuous_laser():
-    every = [damage(gaussian(2e8, 20e-6), line(), **{**SENSOR, "exposure": t}) for t in (1e-6, 1e-3, 1.0)]
+    every = [
+        damage(gaussian(2e8, 20e-6), line(), **{**SENSOR, "exposure": t}) for t in (1e-6, 1e-3, 1.0)
+    ]
     for other in every[1:]:
         for one, same in zip(every[0], other, strict=True):
             assert torch.equal(one, same)
@@ -102,18 +131,22 @@ def test_the_verdict_is_the_same_for_every_exposure_of_a_continuous_laser():
 @pytest.mark.parametrize("exposure", [1e-6, 1e-3, 1.0])
 @pytest.mark.parametrize("pulses", [1.0, 0.5, 20.0])
 def test_the_fluence_of_a_pulse_is_the_same_for_every_exposure(exposure, pulses):
-    """The spot is the mean over the exposure, of which the shutter catches some pulses, or a part of one."""
+    """The spot is the mean over the exposure, of which the shutter catches some pulses, or a
+    part of one.
+    """
     fluence = 900.0
     mean = gaussian(fluence * pulses / exposure, 12e-6)
     choice = {**SENSOR, "exposure": exposure, "pulse_duration": 10e-9}
     found = damage(mean, line(), train(pulses), **choice)
-    assert len(found.ratio) == 4 + 3  # pulse, mean, accumulation, incubation, and three further kinds of one pulse
+    # pulse, mean, accumulation, incubation, and three further kinds of one pulse
+    assert len(found.ratio) == 4 + 3
     assert float(found.ratio[0]) == pytest.approx(0.9)
     assert found.ratio[4:].tolist() == pytest.approx([9e-4, 900 / 2419, 900 / 20054])
     rate = pulses / exposure if pulses > 1 else 1 / SENSOR["dwell"]
     rate = max(rate, 1 / SENSOR["dwell"])
     assert float(found.ratio[1]) == pytest.approx(fluence * rate / 10**8.5)
-    assert float(found.ratio[2]) == pytest.approx(0.9 + fluence * rate / 10**8.5, rel=0.011)  # duty at most 1 %
+    # duty at most 1 %
+    assert float(found.ratio[2]) == pytest.approx(0.9 + fluence * rate / 10**8.5, rel=0.011)
     assert found.probability.tolist() == [-1.0] * 7
     if pulses == 1:
         torch.testing.assert_close(damage(mean, line(), **choice).ratio, found.ratio)
@@ -131,9 +164,17 @@ def test_a_pulse_that_the_shutter_misses_is_not_judged_and_never_safe():
 
 
 def test_the_megawatts_of_a_long_pulse_are_not_hidden_by_its_mean():
-    """1 mJ in 1 us at 10 Hz: the mean was 0.34 of the threshold, and the pulse 3.4e4 times its own."""
+    """1 mJ in 1 us at 10 Hz: the mean was 0.34 of the threshold, and the pulse 3.4e4 times its
+    own.
+    """
     fluence = 7.3e7  # J/m2
-    choice = {**SENSOR, "dwell": 1.0, "exposure": 0.1, "pulse_duration": 1e-6, "repetition_rate": 10.0}
+    choice = {
+        **SENSOR,
+        "dwell": 1.0,
+        "exposure": 0.1,
+        "pulse_duration": 1e-6,
+        "repetition_rate": 10.0,
+    }
     spot = gaussian(fluence / 0.1, 5e-6)
     found = damage(spot, line(), train(1.0), **choice)
     assert float(found.ratio[0]) == pytest.approx(7.3e3 / 0.2154, rel=1e-3)
@@ -154,8 +195,10 @@ def test_at_1550_nm_own_thresholds_are_judged_and_the_mean_is_said_to_be_open(tm
     assert found.ratio[1:3].isnan().all()
     notes = damage.hooks.preflight(line=line(1550), **choice)
     assert notes[0].startswith("pulse, point: 0.5 (0.")
-    assert notes[1] == (
-        "mean, point: not judged: no law of damage at 1550 nm: published laws are used from 400 to 1100 nm"
+    assert (
+        notes[1]
+        == "mean, point: not judged: no law of damage at 1550 nm: published laws are used from 400"
+        " to 1100 nm"
     )
     dim = gaussian(1.0, 15e-6)
     checks = damage.hooks.check(damage(dim, line(1550), **choice), dim, line(1550), **choice)
@@ -196,7 +239,9 @@ def test_lasers_that_were_refused_before_are_judged(nm, change):
 def test_a_mistake_in_the_file_of_thresholds_is_told_before_the_run(tmp_path):
     own = tmp_path / "own.csv"
     own.write_text(HEADER + INFRARED.replace("0.5", "half"))
-    with pytest.raises(ParameterError, match=r"own.csv:2, column 7, threshold \(J/cm2\): 'half'") as raised:
+    with pytest.raises(
+        ParameterError, match=r"own.csv:2, column 7, threshold \(J/cm2\): 'half'"
+    ) as raised:
         damage.hooks.preflight(dwell=0.1, thresholds=own)
     assert raised.value.parameter == "thresholds"
 
@@ -205,13 +250,18 @@ def test_each_part_has_a_sentence_with_its_numbers_and_the_verdict_comes_first()
     spot = gaussian(2e3 / 0.1, 12e-6)
     choice = {**SENSOR, "pulse_duration": 10e-9}
     checks = damage.hooks.check(damage(spot, line(), **choice), spot, line(), **choice)
-    assert checks[0].text == "damage cannot be excluded: a part of the light is within the bracket of its threshold"
+    assert (
+        checks[0].text
+        == "damage cannot be excluded: a part of the light is within the bracket of its threshold"
+    )
     assert checks[1].text == "pulse, point: 0.2 of 0.1 J/cm2, 2 (0.316 to 12.6) times the threshold"
     assert [check.ok for check in checks] == [False, False, True, False, False, True, False, True]
     dim = gaussian(1.0, CMOS.spot)
     first, *_ = damage.hooks.check(damage(dim, line(), **SENSOR), dim, line(), **SENSOR)
     assert first.ok
-    assert first.text.startswith("no damage is expected: every part of the light is judged and below")
+    assert first.text.startswith(
+        "no damage is expected: every part of the light is judged and below"
+    )
 
 
 def test_pulses_below_a_nanosecond_are_judged_from_above_alone():
@@ -238,7 +288,12 @@ def test_the_pattern_has_the_pixels_beyond_the_threshold_of_the_device():
     choice = {**SENSOR, "pulse_duration": 10e-9}
     for resilience in (0.5, 1.0, 2.0):
         found = damage(spot, line(), **choice, resilience=resilience).pattern
-        for kind, threshold in (("point", 999.0), ("cross", 2419.0), ("frame", 20054.0), ("destruction", 1e6)):
+        for kind, threshold in (
+            ("point", 999.0),
+            ("cross", 2419.0),
+            ("frame", 20054.0),
+            ("destruction", 1e6),
+        ):
             marked = (found >> KINDS.index(kind)) % 2 == 1
             assert torch.equal(marked, spot[0] * 0.1 >= threshold * resilience), kind
 
@@ -273,7 +328,9 @@ def test_a_frame_in_half_precision_holds_the_white_of_sixteen_bits(dtype):
 
 def test_a_cross_is_a_row_and_a_column_and_lasers_add_up():
     raw = torch.full((1, 5, 7), 100.0)
-    found = damaged_pixels(raw, [pattern(cross=(2, 3)), pattern(point=(4, 5))], full_well=1e6, gain=1.0, bits=8)[0]
+    found = damaged_pixels(
+        raw, [pattern(cross=(2, 3)), pattern(point=(4, 5))], full_well=1e6, gain=1.0, bits=8
+    )[0]
     expected = torch.full((5, 7), 100.0)
     expected[3, 4] = 255.0
     expected[1, :], expected[:, 2] = 0.0, 0.0

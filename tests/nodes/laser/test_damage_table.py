@@ -32,13 +32,25 @@ def test_a_row_is_a_law_in_si_units(write):
 
 def test_continuous_light_and_pulses_stand_in_one_file_and_cells_may_be_empty(write):
     header = (
-        "source,threshold (kW/cm2),threshold (mJ/cm2),device,damage,wavelength from (um),wavelength to (um),"
-        "duration from (s),duration to (s)"
+        "source,threshold (kW/cm2),threshold (mJ/cm2),device,damage,wavelength from (um),wavelength"
+        " to (um),duration from (s),duration to (s)"
     )
-    rows = 'a data sheet,30,,CCD,line,0.5,0.6,0.001,10\n"mine, 2 devices",,80,CCD,point,0.5,0.6,1e-9,1e-7\n'
+    rows = (
+        'a data sheet,30,,CCD,line,0.5,0.6,0.001,10\n"mine, 2'
+        ' devices",,80,CCD,point,0.5,0.6,1e-9,1e-7\n'
+    )
     one, other = read_damage_laws(write(f"{header}\n{rows}"))
-    assert (one.quantity, one.median, one.factor, one.spot) == ("irradiance", pytest.approx(3e8), None, None)
-    assert (other.quantity, other.median, other.source) == ("fluence", pytest.approx(800.0), "mine, 2 devices")
+    assert (one.quantity, one.median, one.factor, one.spot) == (
+        "irradiance",
+        pytest.approx(3e8),
+        None,
+        None,
+    )
+    assert (other.quantity, other.median, other.source) == (
+        "fluence",
+        pytest.approx(800.0),
+        "mine, 2 devices",
+    )
 
 
 def test_an_empty_spread_is_a_law_without_probability(write):
@@ -76,6 +88,10 @@ def test_a_mistake_is_told_with_line_and_column(write, old, new, message):
 
 @pytest.mark.parametrize("name", ["mine.yaml", "mine.YML", "mine.json"])
 def test_thresholds_in_yaml_are_refused_with_the_form_of_a_table(tmp_path, name):
-    (tmp_path / name).write_text("- {device: CMOS, threshold: 1 J/cm2}\n- {device: CCD, threshold: 1 J/cm2}\n")
-    with pytest.raises(ValueError, match=r"is no CSV file: .* write a header such as device,damage"):
+    (tmp_path / name).write_text(
+        "- {device: CMOS, threshold: 1 J/cm2}\n- {device: CCD, threshold: 1 J/cm2}\n"
+    )
+    with pytest.raises(
+        ValueError, match=r"is no CSV file: .* write a header such as device,damage"
+    ):
         read_damage_laws(tmp_path / name)

@@ -1,4 +1,6 @@
-"""The dazzled area against the Airy pattern by SciPy, and behind masks against their own Fourier integrals."""
+"""The dazzled area against the Airy pattern by SciPy, and behind masks against their own Fourier
+integrals.
+"""
 
 import numpy as np
 import pytest
@@ -27,7 +29,9 @@ DECADES = (1e2, 1e3, 1e4, 1e5, 1e6)
 
 
 def airy(spread, half, points):
-    """The Airy pattern over the pixels (y, x), the mean of points x points samples of each, by SciPy."""
+    """The Airy pattern over the pixels (y, x), the mean of points x points samples of each, by
+    SciPy.
+    """
     inside = (np.arange(points) - (points - 1) / 2) / points
     at = (np.arange(-half, half + 1)[:, None] + inside).ravel()
     reach = np.hypot(at[:, None], at[None, :]) * np.pi / spread
@@ -44,11 +48,14 @@ def psf(spread, window, sensor="point", mask=doe.flat, samples=540):
     stop = optics.stop(samples=samples, pitch=DIAMETER / samples, diameter=DIAMETER)
     pupil = optics.pupil(mask(stop), doe.material(LINE), LINE, stop)
     focal_length = spread * DIAMETER * PITCH / WAVELENGTH
-    return optics.psf(pupil, focal_length=focal_length, pixel_pitch=PITCH, shape=(window, window), sensor=sensor)
+    return optics.psf(
+        pupil, focal_length=focal_length, pixel_pitch=PITCH, shape=(window, window), sensor=sensor
+    )
 
 
 @pytest.mark.parametrize(
-    ("spread", "half", "points"), [(0.35, 32, 21), (0.64, 40, 15), (1.3, 70, 9), (PAPER, 122, 5), (5.0, 230, 3)]
+    ("spread", "half", "points"),
+    [(0.35, 32, 21), (0.64, 40, 15), (1.3, 70, 9), (PAPER, 122, 5), (5.0, 230, 3)],
 )
 def test_the_clear_lens_dazzles_the_pixels_of_the_airy_pattern(spread, half, points):
     pattern = airy(spread, half, points)
@@ -79,7 +86,9 @@ def test_the_psf_of_the_clear_lens_dazzles_the_same_pixels(spread, half, points)
 def test_a_psf_that_is_not_finite_has_no_curve(value):
     found = psf(PAPER, 33)
     found.intensity[0, 4, 5] = value
-    with pytest.raises(ValueError, match="psf holds values that are not finite: its pixels cannot be counted"):
+    with pytest.raises(
+        ValueError, match="psf holds values that are not finite: its pixels cannot be counted"
+    ):
         dazzle_curve(found, LINE)
 
 
@@ -97,23 +106,32 @@ def test_the_area_of_the_papers_camera_grows_with_the_power_0_64():
 
 
 def test_an_axicon_dazzles_the_pixels_of_its_own_integral_and_more_than_the_clear_lens():
-    """The Hankel integral of the pupil exp(2 pi i 5 r), by Gauss-Legendre and SciPy's J0, at every pixel."""
+    """The Hankel integral of the pupil exp(2 pi i 5 r), by Gauss-Legendre and SciPy's J0, at
+    every pixel.
+    """
     at, weights = np.polynomial.legendre.leggauss(300)
     radius = (at + 1) / 2
     side = np.arange(-90, 91)
     distance, where = np.unique(np.hypot(side[:, None], side[None, :]), return_inverse=True)
-    field = j0(np.outer(np.pi / PAPER * distance, radius)) @ (radius * weights * np.exp(2j * np.pi * 5 * radius))
+    field = j0(np.outer(np.pi / PAPER * distance, radius)) @ (
+        radius * weights * np.exp(2j * np.pi * 5 * radius)
+    )
     pattern = (np.abs(field) ** 2)[where].reshape(181, 181)
     strengths = (5e2, 1e3, 1e4, 5e4)
-    found = dazzle_curve(psf(PAPER, 181, mask=lambda s: doe.axicon(s, waves=5, wavelength=550e-9)), LINE,
-                         strengths=strengths)  # fmt: skip
+    found = dazzle_curve(
+        psf(PAPER, 181, mask=lambda s: doe.axicon(s, waves=5, wavelength=550e-9)),
+        LINE,
+        strengths=strengths,
+    )
     expected = [counted(pattern, strength, 1.0) for strength in strengths]
     np.testing.assert_allclose(found.pixels.numpy(), expected, rtol=0.02)
     assert found.pixels[2] > 3 * counted_pixels(1e4, PAPER, "point")
 
 
 def test_a_half_ring_dazzles_the_pixels_of_its_own_integral():
-    """The Fourier integral of the pupil exp(2 pi i 4 r sgn(cos t)) over radius and azimuth, at every pixel."""
+    """The Fourier integral of the pupil exp(2 pi i 4 r sgn(cos t)) over radius and azimuth, at
+    every pixel.
+    """
     (at, one), (turn, other) = (np.polynomial.legendre.leggauss(n) for n in (50, 60))
     radius, angle = (at + 1) / 2, np.concatenate([turn * np.pi / 2, turn * np.pi / 2 + np.pi])
     side, weight = np.sign(np.cos(angle)), np.outer(radius * one / 2, np.tile(other * np.pi / 2, 2))
@@ -150,7 +168,9 @@ def test_the_strength_for_an_area_is_the_inverse_of_the_area():
 
 
 def test_the_dazzle_limit_at_the_lens_dazzles_the_share_of_the_field_that_it_states():
-    """Through the lens to the sensor and the Airy pattern, by another way than the limit was computed."""
+    """Through the lens to the sensor and the Airy pattern, by another way than the limit was
+    computed.
+    """
     saturation, pixels, transmittance = 0.0196, 0.01 * 2048**2, 0.9
     gain = sensor_gain(WAVELENGTH, 0.11, DIAMETER, transmittance)
     limit = dazzle_exposure_limit(saturation, gain, pixels, PAPER)

@@ -21,7 +21,9 @@ def spot(peak, shape=(24, 30), width=4.0):
 
 
 def by_loops(scene, lasers, feature, contrast, rule, threshold, offset):
-    """The counts by plain loops over the pixels, in NumPy, with means over windows cut at the border."""
+    """The counts by plain loops over the pixels, in NumPy, with means over windows cut at the
+    border.
+    """
     scene, veil = scene.numpy() * 0.5, sum(x.numpy() for x in lasers) * 0.5
     saturated = veiled = visible = 0
     channels, rows, columns = scene.shape
@@ -34,9 +36,15 @@ def by_loops(scene, lasers, feature, contrast, rule, threshold, offset):
             for light in (0, 1):
                 seen = False
                 for c in range(channels):
-                    window = np.s_[c, max(0, y - before) : y + after, max(0, x - before) : x + after]
+                    window = np.s_[
+                        c, max(0, y - before) : y + after, max(0, x - before) : x + after
+                    ]
                     n, v = scene[window].mean(), light * veil[window].mean()
-                    signal = contrast * n * (feature / math.sqrt(n + v + 16) if rule == "snr" else 1 / (n + v))
+                    signal = (
+                        contrast
+                        * n
+                        * (feature / math.sqrt(n + v + 16) if rule == "snr" else 1 / (n + v))
+                    )
                     seen |= signal >= threshold
                 shown.append(seen)
             visible += shown[0] and not lost
@@ -52,7 +60,13 @@ def test_the_counts_are_those_of_the_criterion_at_each_pixel(rule, threshold, fe
     scene = 40 * rand(3, 2, 24, 30) + torch.tensor([110.0, 20.0])[:, None, None]
     scene[:, :3, :3] = 2100.0
     lasers = [spot(5000.0), spot(40.0, width=9.0)]
-    choice = {"feature": feature, "contrast": 0.3, "rule": rule, "threshold": threshold, "offset": offset}
+    choice = {
+        "feature": feature,
+        "contrast": 0.3,
+        "rule": rule,
+        "threshold": threshold,
+        "offset": offset,
+    }
     found = dazzle(scene, lasers, **SENSOR, **choice)
     expected = by_loops(scene, lasers, **choice)
     assert (int(found.saturated), int(found.veiled)) == expected[:2]
@@ -92,7 +106,9 @@ def test_at_the_limit_the_veil_leaves_just_the_threshold(rule):
     assert (veil > 0).all()
     left = 0.2 * background / (background + veil)
     snr = 0.2 * background * 10 / (background + veil + 64).sqrt()
-    torch.testing.assert_close(left if rule == "contrast" else snr, torch.full_like(left, choice["threshold"]))
+    torch.testing.assert_close(
+        left if rule == "contrast" else snr, torch.full_like(left, choice["threshold"])
+    )
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
@@ -100,7 +116,9 @@ def test_light_that_is_not_finite_is_refused_and_named(value):
     scene, light = torch.full((2, 24, 30), 600.0), spot(4000.0)
     broken = scene.clone()
     broken[1, 4, 5] = value
-    with pytest.raises(ValueError, match="photons holds values that are not finite: its dazzled pixels"):
+    with pytest.raises(
+        ValueError, match="photons holds values that are not finite: its dazzled pixels"
+    ):
         dazzle(broken, [light], **SENSOR)
     for lasers, ghosts in (([light, broken], None), ([light], [broken])):
         with pytest.raises(ValueError, match="laser holds values that are not finite"):

@@ -1,4 +1,6 @@
-"""Dazzle of the eye: the veil and the threshold against numbers worked by hand, and the exposure put back."""
+"""Dazzle of the eye: the veil and the threshold against numbers worked by hand, and the exposure
+put back.
+"""
 
 import math
 
@@ -39,7 +41,8 @@ def test_the_eye_sees_nothing_beyond_the_visible(nm):
         maximum_dazzle_exposure(nm * 1e-9, DazzleTask(10, 10))
 
 
-#: degrees, years, pigmentation -> cd/m2 a lux, worked by hand from the general equation of CIE 146:2002
+#: degrees, years, pigmentation -> cd/m2 a lux, worked by hand from the general equation of CIE
+#: 146:2002
 VEIL = [
     (1.0, 25, 0.5, 10 + 5.05 * (1 + 0.4**4) + 0.00125),
     (0.1, 62.5, 0.0, 11000.0),
@@ -75,7 +78,8 @@ def test_the_threshold_is_that_of_adrian(background, size, age, expected):
 
 
 @pytest.mark.parametrize(
-    ("size", "age", "parameter"), [(0.5, 40, "size"), (61, 40, "size"), (10, 20, "age"), (10, 80, "age")]
+    ("size", "age", "parameter"),
+    [(0.5, 40, "size"), (61, 40, "size"), (10, 20, "age"), (10, 80, "age")],
 )
 def test_a_target_or_a_viewer_beyond_the_threshold_is_refused(size, age, parameter):
     with pytest.raises(ParameterError, match="Adrian") as raised:
@@ -99,11 +103,15 @@ def test_the_target_is_at_its_threshold_with_the_illuminance_put_back():
         lux = dazzle_illuminance(task)
         difference = task.contrast * task.background
         if lux == 0:
-            assert difference < task.margin * threshold_luminance(task.background * 1.00001, task.size, task.age)
+            assert difference < task.margin * threshold_luminance(
+                task.background * 1.00001, task.size, task.age
+            )
             continue
         seen += 1
         around = task.background + lux * veil_per_lux(task.angle, task.age, task.pigmentation)
-        assert task.margin * threshold_luminance(around, task.size, task.age) == pytest.approx(difference, rel=1e-3)
+        assert task.margin * threshold_luminance(around, task.size, task.age) == pytest.approx(
+            difference, rel=1e-3
+        )
     assert seen > 100
 
 
@@ -127,8 +135,9 @@ def test_a_target_that_nobody_sees_has_no_exposure():
         dazzle_illuminance(DazzleTask(angle=10, background=0.0))
 
 
-#: W/m2 at 555 nm that the safety framework of Williamson and McLin (J. Laser Appl. 30, 2018) gives for night, dusk and
-#: day (0.1, 10, 1000 cd/m2), by the half angle in degrees, as a public calculator prints them, rounded to one digit
+#: W/m2 at 555 nm that the safety framework of Williamson and McLin (J. Laser Appl. 30, 2018) gives
+#: for night, dusk and day (0.1, 10, 1000 cd/m2), by the half angle in degrees, as a public
+#: calculator prints them, rounded to one digit
 FRAMEWORK = {
     1: (1e-5, 6e-3, 0.4),
     5: (4e-4, 0.3, 20.0),
@@ -140,7 +149,10 @@ FRAMEWORK = {
 @pytest.mark.parametrize("light", [0, 1, 2])
 def test_the_steps_between_angles_are_those_of_the_published_framework(light):
     background = (0.1, 10.0, 1000.0)[light]
-    own = {angle: maximum_dazzle_exposure(555e-9, DazzleTask(angle, background, age=25)) for angle in FRAMEWORK}
+    own = {
+        angle: maximum_dazzle_exposure(555e-9, DazzleTask(angle, background, age=25))
+        for angle in FRAMEWORK
+    }
     for angle in (1, 10, 20):
         step = FRAMEWORK[angle][light] / FRAMEWORK[5][light]
         rounded = 0.35 if angle == 1 and light == 0 else 0.12  # 0.001 has one digit
@@ -148,10 +160,14 @@ def test_the_steps_between_angles_are_those_of_the_published_framework(light):
 
 
 def test_the_exposures_are_within_three_times_of_the_published_framework():
-    """Another threshold than theirs: a target of contrast 0.2 and 10 arc minutes, which theirs does not name."""
+    """Another threshold than theirs: a target of contrast 0.2 and 10 arc minutes, which theirs
+    does not name.
+    """
     for angle, limits in FRAMEWORK.items():
         for background, limit in zip((0.1, 10.0, 1000.0), limits, strict=True):
-            assert 1 / 3 < maximum_dazzle_exposure(555e-9, DazzleTask(angle, background)) / limit < 3
+            assert (
+                1 / 3 < maximum_dazzle_exposure(555e-9, DazzleTask(angle, background)) / limit < 3
+            )
 
 
 def test_older_eyes_smaller_angles_and_darker_surroundings_bear_less():
@@ -163,7 +179,9 @@ def test_older_eyes_smaller_angles_and_darker_surroundings_bear_less():
 
 def test_the_irradiance_at_the_dazzle_distance_is_the_limit():
     show = beam(532e-9, power=1.0, divergence=1e-3, waist=2e-3)
-    assert axis_irradiance(show, nominal_ocular_dazzle_distance(show, 0.4)) == pytest.approx(0.4, rel=1e-9)
+    assert axis_irradiance(show, nominal_ocular_dazzle_distance(show, 0.4)) == pytest.approx(
+        0.4, rel=1e-9
+    )
     assert nominal_ocular_dazzle_distance(show, 1e6) == 0.0
 
 
@@ -172,7 +190,12 @@ def test_a_fast_train_dazzles_as_its_mean_and_a_slow_one_is_refused():
     train = {"pulse_duration": 1e-8, "divergence": 1e-3, "waist": 2e-3}
     fast = beam(532e-9, power=0.5, repetition_rate=1e4, **train)
     assert nominal_ocular_dazzle_distance(fast, 1.0) == nominal_ocular_dazzle_distance(steady, 1.0)
-    assert unsteady(steady) == unsteady(fast) == unsteady(beam(532e-9, power=0.5, repetition_rate=100.0, **train)) == ""
+    assert (
+        unsteady(steady)
+        == unsteady(fast)
+        == unsteady(beam(532e-9, power=0.5, repetition_rate=100.0, **train))
+        == ""
+    )
     for laser, word in (
         (beam(532e-9, power=0.5, repetition_rate=99.0, **train), "flicker"),
         (beam(532e-9, pulse_energy=1e-3, **train), "flash"),

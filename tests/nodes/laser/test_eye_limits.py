@@ -1,4 +1,6 @@
-"""Exposure limits of the eye against the values of the table, and hazard distances against the beam itself."""
+"""Exposure limits of the eye against the values of the table, and hazard distances against the
+beam itself.
+"""
 
 import itertools
 import math
@@ -20,7 +22,8 @@ from neusee.nodes.laser import (
     share_through,
 )
 
-#: wavelength nm, duration s, radiant exposure J/m2: each worked out by hand from Table A.1 of IEC 60825-1:2014
+#: wavelength nm, duration s, radiant exposure J/m2: each worked out by hand from Table A.1 of IEC
+#: 60825-1:2014
 TABLE = [
     (532, 1e-8, 2e-3),
     (532, 0.25, 6.364),  # 18 x 0.25^0.75, the familiar 25.5 W/m2
@@ -56,23 +59,34 @@ def test_the_limit_is_that_of_the_table(nm, duration, expected):
     assert eye_mpe(nm * 1e-9, duration) == pytest.approx(expected, rel=2e-4)
 
 
-@pytest.mark.parametrize("nm", [400, 449, 500, 600, 700, 900, 1049.9, 1050, 1199.9, 1300, 1399, 1400, 1550, 2000, 1e4])
+@pytest.mark.parametrize(
+    "nm", [400, 449, 500, 600, 700, 900, 1049.9, 1050, 1199.9, 1300, 1399, 1400, 1550, 2000, 1e4]
+)
 def test_the_limit_has_no_jump_in_time_and_never_falls_with_a_longer_exposure(nm):
     limits = [(t, eye_mpe(nm * 1e-9, t)) for t in (1e-11 * 10 ** (k / 50) for k in range(770))]
     for (one, before), (other, after) in itertools.pairwise(limits):
-        assert before * 0.94 <= after <= before * other / one * 1.07  # the table's numbers are rounded to two digits
+        # the table's numbers are rounded to two digits
+        assert before * 0.94 <= after <= before * other / one * 1.07
 
 
 def test_infrared_from_700_nm_is_limited_without_a_jump_in_wavelength():
     for nm in (700, 1050, 1150, 1200):
         for duration in (1e-8, 1e-4, 0.25, 100):
             step = eye_mpe((nm + 1e-6) * 1e-9, duration) / eye_mpe((nm - 1e-6) * 1e-9, duration)
-            assert step == pytest.approx(2 if (nm, duration) == (1050, 1e-8) else 1, rel=0.15), (nm, duration)
+            assert step == pytest.approx(2 if (nm, duration) == (1050, 1e-8) else 1, rel=0.15), (
+                nm,
+                duration,
+            )
 
 
 @pytest.mark.parametrize(
     ("wavelength", "duration", "parameter"),
-    [(355e-9, 0.25, "wavelength"), (200e-6, 1, "wavelength"), (532e-9, 1e-12, "duration"), (532e-9, 1e5, "duration")],
+    [
+        (355e-9, 0.25, "wavelength"),
+        (200e-6, 1, "wavelength"),
+        (532e-9, 1e-12, "duration"),
+        (532e-9, 1e5, "duration"),
+    ],
 )
 def test_what_the_formulas_do_not_cover_is_refused(wavelength, duration, parameter):
     for limit in (eye_mpe, eye_aperture):
@@ -88,7 +102,9 @@ def test_the_aperture_is_a_wide_pupil_in_the_retinal_region_and_small_beyond():
 
 
 def test_a_published_hazard_distance_is_met():
-    """A laser of 1 W and 1 mrad (at 1/e) is commonly stated to have 225 m, by 25 W/m2 (laser show handbooks)."""
+    """A laser of 1 W and 1 mrad (at 1/e) is commonly stated to have 225 m, by 25 W/m2 (laser
+    show handbooks).
+    """
     show = beam(532e-9, power=1.0, divergence=1e-3, waist=0.5e-3, convention="1/e")
     assert nominal_ocular_hazard_distance(show) == pytest.approx(225, rel=0.01)
 
@@ -118,23 +134,31 @@ def test_a_laser_that_is_safe_everywhere_has_the_distance_0():
 def test_a_pulsed_laser_is_judged_by_the_energy_of_a_pulse():
     single = beam(1064e-9, pulse_energy=0.1, pulse_duration=1e-8, divergence=1e-3)
     distance = nominal_ocular_hazard_distance(single)
-    assert share_through(single, distance, 7e-3) * 0.1 / (math.pi * 3.5e-3**2) == pytest.approx(0.02, rel=1e-9)
+    assert share_through(single, distance, 7e-3) * 0.1 / (math.pi * 3.5e-3**2) == pytest.approx(
+        0.02, rel=1e-9
+    )
     assert 0.1 * axis_density(single, distance) == pytest.approx(0.02, rel=1e-3)
 
 
 def test_a_train_is_limited_by_the_strictest_of_three_rules():
     one, rate, seconds, old = eye_mpe(905e-9, 1e-8), 100.0, 10.0, "N^(-1/4)"
     count = rate * seconds
-    assert eye_mpe_train(905e-9, 1e-8, rate, seconds, old) == pytest.approx(one * count**-0.25, rel=1e-12)
+    assert eye_mpe_train(905e-9, 1e-8, rate, seconds, old) == pytest.approx(
+        one * count**-0.25, rel=1e-12
+    )
     fast = 50e3  # 5e5 pulses: the mean irradiance decides
-    assert eye_mpe_train(905e-9, 1e-8, fast, seconds, old) == pytest.approx(one * (fast * seconds) ** -0.25, rel=1e-12)
+    assert eye_mpe_train(905e-9, 1e-8, fast, seconds, old) == pytest.approx(
+        one * (fast * seconds) ** -0.25, rel=1e-12
+    )
     very = 1e6  # five pulses within 5 us count as one
     groups = very * seconds / 5
     assert eye_mpe_train(905e-9, 1e-8, very, seconds, old) == pytest.approx(
         min(eye_mpe(905e-9, seconds) / (very * seconds), one / 5 * groups**-0.25), rel=1e-9
     )
     assert eye_mpe_train(1550e-9, 5e-9, 1e5, 10) == pytest.approx(1e4 / 1e6, rel=1e-12)
-    lidar = beam(905e-9, pulse_energy=1e-6, pulse_duration=5e-9, repetition_rate=1e5, divergence=2e-3)
+    lidar = beam(
+        905e-9, pulse_energy=1e-6, pulse_duration=5e-9, repetition_rate=1e5, divergence=2e-3
+    )
     assert eye_limit(lidar, 10) == eye_mpe_train(905e-9, 5e-9, 1e5, 10)
     assert eye_limit(lidar, 1e-6) == eye_mpe(905e-9, 5e-9)
     with pytest.raises(ParameterError, match="too long"):

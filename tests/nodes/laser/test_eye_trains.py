@@ -1,4 +1,6 @@
-"""Limits of the eye for trains of pulses, against a second writing of the published rules and hand-worked numbers."""
+"""Limits of the eye for trains of pulses, against a second writing of the published rules and
+hand-worked numbers.
+"""
 
 import math
 
@@ -18,8 +20,9 @@ from neusee.nodes.laser import (
     train_limit,
 )
 
-#: C5 of the edition of 2014 below 5 mrad: nm, pulse s, rate Hz, exposure s -> pulses as one, groups within 10 s, C5.
-#: Worked by hand: T_i 5 us below 1050 nm, 13 us from there; 1 up to 600; 5 N^(-1/4) above; 0.4 from 24 414 groups on.
+#: C5 of the edition of 2014 below 5 mrad: nm, pulse s, rate Hz, exposure s -> pulses as one, groups
+#: within 10 s, C5. Worked by hand: T_i 5 us below 1050 nm, 13 us from there; 1 up to 600; 5
+#: N^(-1/4) above; 0.4 from 24 414 groups on.
 GROUPS = [
     (905, 1e-8, 50.0, 10.0, 1.0, 500.0, 1.0),
     (905, 1e-8, 60.0, 10.0, 1.0, 600.0, 1.0),
@@ -39,16 +42,20 @@ GROUPS = [
 
 
 @pytest.mark.parametrize(("nm", "pulse", "rate", "seconds", "together", "count", "factor"), GROUPS)
-def test_the_groups_and_the_factor_of_2014_are_those_worked_by_hand(nm, pulse, rate, seconds, together, count, factor):
+def test_the_groups_and_the_factor_of_2014_are_those_worked_by_hand(
+    nm, pulse, rate, seconds, together, count, factor
+):
     train = train_limit(nm * 1e-9, pulse, rate, seconds, "IEC 60825-1:2014")
     assert train.together == pytest.approx(together, rel=1e-9)
     assert train.groups == pytest.approx(count, rel=1e-9)
     assert train.factor == pytest.approx(factor, rel=1e-4)
 
 
-#: nm, pulse s, rate Hz, exposure s, rule -> J/m2 of a pulse by the rule for repeated pulses, worked by hand
+#: nm, pulse s, rate Hz, exposure s, rule -> J/m2 of a pulse by the rule for repeated pulses, worked
+#: by hand
 REPEATED = [
-    (905, 1e-8, 1e5, 10.0, "N^(-1/4)", 5.1404e-3 * 1e6**-0.25),  # 0.1626 mJ/m2; T_i of 13 us would give 58 % more
+    # 0.1626 mJ/m2; T_i of 13 us would give 58 % more
+    (905, 1e-8, 1e5, 10.0, "N^(-1/4)", 5.1404e-3 * 1e6**-0.25),
     (905, 1e-8, 3e5, 10.0, "N^(-1/4)", 5.1404e-3 / 1.5 * 2e6**-0.25),
     (905, 1e-8, 1e5, 100.0, "N^(-1/4)", 5.1404e-3 * 1e7**-0.25),  # the whole exposure counts
     (905, 1e-8, 2000.0, 10.0, "IEC 60825-1:2014", 5.1404e-3 * 0.42045),
@@ -60,26 +67,42 @@ REPEATED = [
 
 
 @pytest.mark.parametrize(("nm", "pulse", "rate", "seconds", "rule", "expected"), REPEATED)
-def test_the_limit_of_repeated_pulses_is_that_worked_by_hand(nm, pulse, rate, seconds, rule, expected):
-    assert train_limit(nm * 1e-9, pulse, rate, seconds, rule).repeated == pytest.approx(expected, rel=2e-4)
+def test_the_limit_of_repeated_pulses_is_that_worked_by_hand(
+    nm, pulse, rate, seconds, rule, expected
+):
+    assert train_limit(nm * 1e-9, pulse, rate, seconds, rule).repeated == pytest.approx(
+        expected, rel=2e-4
+    )
 
 
-# --- the published tables, written a second time ----------------------------------------------------------------------
+# --- the published tables, written a second time --------------------------------------------------
 
 
 def factors(nm):
     """C4 and C7 of Table 9."""
     c4 = np.interp(nm, [400, 700, 1050, 1400], [0, 0, 0.7, 0.7])
-    c7 = 0.0 if nm < 1150 else 0.018 * (nm - 1150) if nm < 1200 else math.log10(8 + 10 ** ((nm - 1250) / 25))
+    c7 = (
+        0.0
+        if nm < 1150
+        else 0.018 * (nm - 1150)
+        if nm < 1200
+        else math.log10(8 + 10 ** ((nm - 1250) / 25))
+    )
     return 10 ** (c4 if nm < 1050 else math.log10(5)), 10**c7
 
 
 def one_pulse(nm, seconds):
-    """Table A.1 in W/m2 for 400 to 1400 nm and 10 ps to 100 s, as irradiances, and the skin of Table A.5."""
+    """Table A.1 in W/m2 for 400 to 1400 nm and 10 ps to 100 s, as irradiances, and the skin of
+    Table A.5.
+    """
     c4, c7 = factors(nm)
     flat, power, until = (2e-3, 18.0, 5e-6) if nm < 1050 else (2e-2, 90.0, 13e-6)
     weight = c4 if nm < 1050 else c7
-    steps = [(until, flat / seconds), (10.0, power * seconds**-0.25), (math.inf, 10 * c4 * c7 / weight)]
+    steps = [
+        (until, flat / seconds),
+        (10.0, power * seconds**-0.25),
+        (math.inf, 10 * c4 * c7 / weight),
+    ]
     retina = weight * next(value for end, value in steps if seconds <= end)
     if nm < 500 and seconds > 10:
         retina = min(retina, 10 ** max(0.0, (nm - 450) / 50) * max(1.0, 100 / seconds))
@@ -112,7 +135,11 @@ def test_trains_agree_with_the_second_writing_of_both_rules():
         several = one_pulse(nm, group) * group * period / group if joined else alone
         per_group = group if joined else period
         new, old = max(1.0, min(seconds, 10) / per_group), max(1.0, seconds / per_group)
-        c5 = 1.0 if pulse > group or seconds <= 0.25 or new <= 600 else min(1.0, max(0.4, 5 / new**0.25))
+        c5 = (
+            1.0
+            if pulse > group or seconds <= 0.25 or new <= 600
+            else min(1.0, max(0.4, 5 / new**0.25))
+        )
         mean = one_pulse(nm, seconds) * min(seconds, period)
         if seconds * rate < 2 or seconds < 3 * group:
             continue
@@ -139,7 +166,10 @@ def test_the_older_factor_is_never_less_strict():
     for nm, pulse, rate, seconds in drawn(300, 14):
         if seconds * rate < 1.5:
             continue
-        limits = [eye_mpe_train(nm * 1e-9, pulse, rate, seconds, rule) for rule in ("N^(-1/4)", "IEC 60825-1:2014")]
+        limits = [
+            eye_mpe_train(nm * 1e-9, pulse, rate, seconds, rule)
+            for rule in ("N^(-1/4)", "IEC 60825-1:2014")
+        ]
         assert limits[0] <= limits[1] * (1 + 1e-12)
 
 
@@ -157,7 +187,7 @@ def test_a_pulse_longer_than_the_period_or_the_exposure_is_refused():
         assert raised.value.parameter == "pulse_duration"
 
 
-# --- the rule that is printed is the one that is computed -------------------------------------------------------------
+# --- the rule that is printed is the one that is computed -----------------------------------------
 
 TRAIN = beam(905e-9, pulse_energy=1e-6, pulse_duration=5e-9, repetition_rate=2e3, divergence=2e-3)
 
@@ -193,7 +223,7 @@ def test_beams_without_a_train_name_no_rule_of_trains():
     assert "C5" not in eye_limit_source(TRAIN._replace(wavelength=1550e-9), 10)
 
 
-# --- worked examples that others printed ------------------------------------------------------------------------------
+# --- worked examples that others printed ----------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -218,4 +248,6 @@ def test_the_formula_that_is_printed_gives_the_limit():
     for _ in range(1000):
         nm, seconds = 10 ** rng.uniform(math.log10(400), 4), 10 ** rng.uniform(-11, 4)
         text = eye_mpe_formula(nm * 1e-9, seconds)
-        assert eval(text, {"__builtins__": {}}) == pytest.approx(eye_mpe(nm * 1e-9, seconds), rel=1e-5), text
+        assert eval(text, {"__builtins__": {}}) == pytest.approx(
+            eye_mpe(nm * 1e-9, seconds), rel=1e-5
+        ), text

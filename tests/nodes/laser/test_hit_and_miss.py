@@ -1,4 +1,6 @@
-"""Own shots fitted to a law of damage: SciPy's likelihood, coverage of the median, and data that show no threshold."""
+"""Own shots fitted to a law of damage: SciPy's likelihood, coverage of the median, and data that
+show no threshold.
+"""
 
 import math
 
@@ -11,8 +13,8 @@ from neusee.nodes.laser import Shots, fit_shots, read_damage_laws
 
 LEVELS = (200.0, 300.0, 500.0, 800.0, 1200.0, 2000.0)
 HEADER = (
-    "device,damage,wavelength from (nm),wavelength to (nm),duration from (ns),duration to (ns),level (J/cm2),"
-    "shots,damaged,spot (um),source\n"
+    "device,damage,wavelength from (nm),wavelength to (nm),duration from (ns),duration to"
+    " (ns),level (J/cm2),shots,damaged,spot (um),source\n"
 )
 PLACE = "CMOS,point,900,910,1,100"
 
@@ -22,7 +24,10 @@ def shots_of(damaged, count=10, levels=LEVELS):
 
 
 def rows(damaged, place=PLACE):
-    return "".join(f"{place},{level / 1e4},10,{hits},20,bench\n" for level, hits in zip(LEVELS, damaged, strict=True))
+    return "".join(
+        f"{place},{level / 1e4},10,{hits},20,bench\n"
+        for level, hits in zip(LEVELS, damaged, strict=True)
+    )
 
 
 @pytest.mark.parametrize("damaged", [(0, 1, 4, 6, 9, 10), (1, 0, 2, 5, 8, 9), (3, 4, 5, 5, 6, 8)])
@@ -35,7 +40,10 @@ def test_the_fit_has_the_largest_likelihood(damaged):
         return -float((hits * log_ndtr(away) + (10 - hits) * log_ndtr(-away)).sum())
 
     best = minimize(
-        misfit, [6.3, -0.5], method="Nelder-Mead", options={"xatol": 1e-10, "fatol": 1e-12, "maxiter": 4000}
+        misfit,
+        [6.3, -0.5],
+        method="Nelder-Mead",
+        options={"xatol": 1e-10, "fatol": 1e-12, "maxiter": 4000},
     )
     found = fit_shots(shots_of(damaged))
     assert math.log(found.median) == pytest.approx(best.x[0], abs=1e-5)
@@ -44,16 +52,23 @@ def test_the_fit_has_the_largest_likelihood(damaged):
     hessian = np.empty((2, 2))
     for i in range(2):
         for j in range(2):
-            corners = [(a, b, best.x + step * (a * np.eye(2)[i] + b * np.eye(2)[j])) for a in (1, -1) for b in (1, -1)]
+            corners = [
+                (a, b, best.x + step * (a * np.eye(2)[i] + b * np.eye(2)[j]))
+                for a in (1, -1)
+                for b in (1, -1)
+            ]
             hessian[i, j] = sum(a * b * misfit(x) for a, b, x in corners) / (4 * step**2)
     deviation = math.sqrt(np.linalg.inv(hessian)[0, 0])
-    assert math.log(found.median_factor) == pytest.approx(deviation, rel=0.15)  # observed against expected information
+    # observed against expected information
+    assert math.log(found.median_factor) == pytest.approx(deviation, rel=0.15)
 
 
 def test_the_interval_holds_the_true_median_in_nine_of_ten_tests():
     draw, held, fitted = np.random.default_rng(3), 0, 0
     for _ in range(2000):
-        hits = draw.binomial(20, [float(np.exp(log_ndtr(math.log(x / 600) / math.log(1.7)))) for x in LEVELS])
+        hits = draw.binomial(
+            20, [float(np.exp(log_ndtr(math.log(x / 600) / math.log(1.7)))) for x in LEVELS]
+        )
         found = fit_shots(shots_of(hits, 20))
         if found.factor is None:
             continue
@@ -65,7 +80,9 @@ def test_the_interval_holds_the_true_median_in_nine_of_ten_tests():
 
 @pytest.mark.parametrize("median", [150.0, 600.0, 3000.0])
 def test_a_median_beyond_the_levels_is_as_uncertain_as_it_scatters_from_test_to_test(median):
-    """Extrapolated from levels of which none is near, the median takes the error of the slope with it."""
+    """Extrapolated from levels of which none is near, the median takes the error of the slope
+    with it.
+    """
     draw = np.random.default_rng(4)
     shares = [float(np.exp(log_ndtr(math.log(x / median) / math.log(2.0)))) for x in LEVELS]
     fits = [fit_shots(shots_of(draw.binomial(200, shares), 200)) for _ in range(300)]
@@ -109,9 +126,16 @@ def test_a_table_of_shots_is_one_law_a_test(tmp_path):
     point, line = read_damage_laws(file)
     expected = fit_shots(shots_of((0, 1, 4, 6, 9, 10)))
     assert (point.damage, point.quantity, point.spot) == ("point", "fluence", pytest.approx(20e-6))
-    assert (point.median, point.factor) == (pytest.approx(expected.median), pytest.approx(expected.factor))
+    assert (point.median, point.factor) == (
+        pytest.approx(expected.median),
+        pytest.approx(expected.factor),
+    )
     assert point.has_spread
-    assert (line.damage, line.low, line.high) == ("line", pytest.approx(500.0), pytest.approx(800.0))
+    assert (line.damage, line.low, line.high) == (
+        "line",
+        pytest.approx(500.0),
+        pytest.approx(800.0),
+    )
     assert not line.has_spread
 
 
@@ -137,5 +161,7 @@ def test_a_mistake_in_a_table_of_shots_is_told_with_its_place(tmp_path, old, new
 
 def test_shots_without_a_threshold_are_told_with_the_place_of_their_first_row(tmp_path):
     (tmp_path / "shots.csv").write_text(HEADER + rows((0,) * 6))
-    with pytest.raises(ValueError, match=r"shots.csv:2, column 7, level \(J/cm2\): no shot was damaged"):
+    with pytest.raises(
+        ValueError, match=r"shots.csv:2, column 7, level \(J/cm2\): no shot was damaged"
+    ):
         read_damage_laws(tmp_path / "shots.csv")

@@ -1,4 +1,6 @@
-"""What filters and stops do: closed forms, a tilted notch by its layer, white light by another sum, counted pixels."""
+"""What filters and stops do: closed forms, a tilted notch by its layer, white light by another
+sum, counted pixels.
+"""
 
 import math
 
@@ -33,22 +35,32 @@ def test_a_density_is_a_decimal_logarithm_and_never_below_zero():
 @pytest.mark.parametrize("index", [1.0, 1.5, 1.8, 2.3])
 @pytest.mark.parametrize("degrees", [0, 5, 15, 30, 45])
 def test_a_tilted_notch_blocks_where_its_layers_have_the_phase_of_normal_incidence(index, degrees):
-    """The phase of a layer is index x thickness x cos(angle inside) / wavelength, by Snell's law."""
+    """The phase of a layer is index x thickness x cos(angle inside) / wavelength, by Snell's
+    law.
+    """
     inside = math.asin(math.sin(math.radians(degrees)) / index)
     expected = 532e-9 * math.cos(inside)
-    assert notch_wavelength(532e-9, math.radians(degrees), index) == pytest.approx(expected, rel=1e-12)
+    assert notch_wavelength(532e-9, math.radians(degrees), index) == pytest.approx(
+        expected, rel=1e-12
+    )
 
 
 def test_a_shift_worked_by_hand():
     """20 degrees and an index of 2: 1 - sin2 / 4 = 0.970756, its root 0.985270."""
     assert notch_wavelength(1.0, math.radians(20), 2.0) == pytest.approx(0.985270, rel=1e-6)
-    assert notch_band(532e-9, 532e-9, math.radians(20), 2.0)[1] == pytest.approx(539.953e-9, rel=1e-6)
+    assert notch_band(532e-9, 532e-9, math.radians(20), 2.0)[1] == pytest.approx(
+        539.953e-9, rel=1e-6
+    )
 
 
 def test_the_band_covers_the_laser_from_every_angle_of_the_field():
     rng = np.random.default_rng(3)
     for _ in range(200):
-        low, index, angle = rng.uniform(400e-9, 1100e-9), rng.uniform(1.2, 2.5), rng.uniform(0.0, 0.7)
+        low, index, angle = (
+            rng.uniform(400e-9, 1100e-9),
+            rng.uniform(1.2, 2.5),
+            rng.uniform(0.0, 0.7),
+        )
         high = low * rng.uniform(1.0, 1.02)
         band = notch_band(low, high, angle, index)
         for theta in np.linspace(0, angle, 7):
@@ -66,7 +78,9 @@ def test_a_filter_that_no_glass_can_make_is_refused():
 
 
 def test_a_joule_of_one_micrometre_has_5e18_photons():
-    """1 um / (6.62607015e-34 J s x 299792458 m/s); a photon of 1.239842 um has 1 eV = 1.602176634e-19 J."""
+    """1 um / (6.62607015e-34 J s x 299792458 m/s); a photon of 1.239842 um has 1 eV =
+    1.602176634e-19 J.
+    """
     assert photons_in_joule(1e-6) == pytest.approx(5.0341166e18, rel=1e-7)
     assert photons_in_joule(1.239841984e-6) == pytest.approx(1 / 1.602176634e-19, rel=1e-9)
 
@@ -78,7 +92,9 @@ def test_the_share_of_white_light_is_a_share_of_the_photons_of_daylight():
     photons = np.interp(nm, table.wavelengths, table.values) * nm
     for low, high in ((532, 540), (450, 470), (390, 420), (690, 720)):
         inside = (nm >= low * 0.99) & (nm <= high * 1.01)
-        assert white_share(low * 1e-9, high * 1e-9) == pytest.approx(photons[inside].sum() / photons.sum(), rel=0.02)
+        assert white_share(low * 1e-9, high * 1e-9) == pytest.approx(
+            photons[inside].sum() / photons.sum(), rel=0.02
+        )
     assert white_share(400e-9, 700e-9) == pytest.approx(1.0, rel=1e-9)
     assert white_share(905e-9, 915e-9) == 0.0
     assert white_share(532e-9, 532e-9, edge=0.0) == 0.0
@@ -94,7 +110,8 @@ def test_a_stop_passes_the_square_of_its_diameter_and_never_more_than_the_lens()
 
 
 def test_diffraction_cuts_off_at_the_wavelength_times_the_f_number():
-    assert diffraction_cutoff(0.05, 0.05 / 8, 4.4e-6) == pytest.approx(1.0, rel=1e-12)  # 550 nm x 8 = 4.4 um
+    # 550 nm x 8 = 4.4 um
+    assert diffraction_cutoff(0.05, 0.05 / 8, 4.4e-6) == pytest.approx(1.0, rel=1e-12)
     assert diffraction_cutoff(0.05, 0.05 / 16, 4.4e-6) == pytest.approx(0.5, rel=1e-12)
 
 
@@ -102,13 +119,17 @@ def test_the_feature_is_at_its_threshold_under_the_veil_that_veil_limit_names():
     import torch
 
     told = {"contrast": 0.3, "feature": 8.0, "read_noise": 7.0}
-    veil = float(veil_limit(torch.tensor(400.0, dtype=torch.float64), threshold=5.0, rule="snr", **told))
+    veil = float(
+        veil_limit(torch.tensor(400.0, dtype=torch.float64), threshold=5.0, rule="snr", **told)
+    )
     assert feature_snr(400.0, veil, **told) == pytest.approx(5.0, rel=1e-12)
-    assert feature_snr(400.0, 0.0, contrast=0.3, feature=8.0) == pytest.approx(0.3 * 20 * 8, rel=1e-12)
+    assert feature_snr(400.0, 0.0, contrast=0.3, feature=8.0) == pytest.approx(
+        0.3 * 20 * 8, rel=1e-12
+    )
     assert feature_snr(0.0, 0.0, contrast=0.3, feature=8.0) == 0.0
 
 
-# --- the saturated area behind a filter and a stop, counted pixel by pixel --------------------------------------------
+# --- the saturated area behind a filter and a stop, counted pixel by pixel ------------------------
 
 
 def slope(counts, factors):

@@ -3,10 +3,19 @@
 import pytest
 import torch
 
-from neusee.nodes.laser import SpotDamage, bright_pixels, damage, damaged_pixels, dazzle, dazzle_curve
+from neusee.nodes.laser import (
+    SpotDamage,
+    bright_pixels,
+    damage,
+    damaged_pixels,
+    dazzle,
+    dazzle_curve,
+)
 from neusee.nodes.values import Bands, LaserLight, Psf
 
-LINE = Bands(*(torch.tensor(x, dtype=torch.float64) for x in ([531e-9, 533e-9], [1e-9, 1e-9], [0.5, 0.5])))
+LINE = Bands(
+    *(torch.tensor(x, dtype=torch.float64) for x in ([531e-9, 533e-9], [1e-9, 1e-9], [0.5, 0.5]))
+)
 SPOT = torch.rand(2, 8, 10)
 RAW = torch.rand(3, 6, 7)
 SENSOR = {"pixel_pitch": 2.9e-6, "exposure": 0.1, "dwell": 0.1}
@@ -19,7 +28,9 @@ def light(pulses):
 
 
 def empty_pattern():
-    return SpotDamage(*torch.zeros(8, 0, dtype=torch.float64), pattern=torch.zeros(8, 10, dtype=torch.uint8))
+    return SpotDamage(
+        *torch.zeros(8, 0, dtype=torch.float64), pattern=torch.zeros(8, 10, dtype=torch.uint8)
+    )
 
 
 @pytest.mark.parametrize(("node", "inputs", "params"), [

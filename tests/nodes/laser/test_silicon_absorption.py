@@ -1,4 +1,6 @@
-"""Absorption of silicon: shares that a text book gives, and the bracket of a threshold at another wavelength."""
+"""Absorption of silicon: shares that a text book gives, and the bracket of a threshold at
+another wavelength.
+"""
 
 import math
 
@@ -19,7 +21,9 @@ def test_three_micrometres_absorb_the_share_that_is_known(nm, share):
 @pytest.mark.parametrize("nm", SCHINKE)
 def test_the_table_agrees_with_another_measurement_within_its_uncertainty(nm):
     """Schinke et al. state 11 % at 600 nm."""
-    assert silicon_absorption(nm * 1e-9) == pytest.approx(4 * math.pi * SCHINKE[nm] / (nm * 1e-9), rel=0.12)
+    assert silicon_absorption(nm * 1e-9) == pytest.approx(
+        4 * math.pi * SCHINKE[nm] / (nm * 1e-9), rel=0.12
+    )
 
 
 def test_absorption_falls_with_the_wavelength_and_has_ends():
@@ -31,15 +35,21 @@ def test_absorption_falls_with_the_wavelength_and_has_ends():
 
 
 def test_no_entry_of_the_table_stands_out():
-    """A mistyped digit is a kink: what a parabola through the neighbours of an entry says of the logarithm of k."""
+    """A mistyped digit is a kink: what a parabola through the neighbours of an entry says of the
+    logarithm of k.
+    """
     logs = np.log([silicon_absorption(nm * 1e-9) * nm for nm in range(400, 1101, 10)])
     for index in range(2, len(logs) - 2):
         around = logs[[index - 2, index - 1, index + 1, index + 2]]
-        assert around @ [-1 / 6, 4 / 6, 4 / 6, -1 / 6] == pytest.approx(logs[index], abs=0.03), 400 + 10 * index
+        assert around @ [-1 / 6, 4 / 6, 4 / 6, -1 / 6] == pytest.approx(logs[index], abs=0.03), (
+            400 + 10 * index
+        )
 
 
 def test_between_two_entries_the_logarithm_is_a_straight_line():
-    """At 535 nm k is the geometric mean of its neighbours, and at 532 nm it is nearer to that of 530 nm."""
+    """At 535 nm k is the geometric mean of its neighbours, and at 532 nm it is nearer to that of
+    530 nm.
+    """
     k = {nm: silicon_absorption(nm * 1e-9) * nm for nm in (530, 532, 535, 540)}
     assert k[535] == pytest.approx(math.sqrt(k[530] * k[540]), rel=1e-9)
     assert k[532] == pytest.approx(k[530] ** 0.8 * k[540] ** 0.2, rel=1e-9)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from neusee.nodes.laser import beam, density_in_spot, heated_in_spot
-from neusee.nodes.laser._spot_heat import spot_heat
+from neusee.nodes.laser._damage_distances import spot_heat
 
 AIRY = 16 / (3 * math.pi)  # integral of (2 J1(v) / v)^2 over v
 
@@ -17,20 +17,27 @@ def heat_of(fill, waves):
 
 
 def summed_heat(fill, waves, samples=1024, pad=16.0):
-    """The largest sum of E dA / (2 pi r) near the middle of a spot by FFT, over that of the even, focused pupil."""
+    """The largest sum of E dA / (2 pi r) near the middle of a spot by FFT, over that of the
+    even, focused pupil.
+    """
     step = 2 * pad / samples
     x = (np.arange(samples) - samples / 2 + 0.5) * step
     square = x**2 + x[:, None] ** 2
-    lit = np.clip((1 - np.sqrt(square)) / step + 0.5, 0, 1)  # cells that the rim cuts count by their share
+    # cells that the rim cuts count by their share
+    lit = np.clip((1 - np.sqrt(square)) / step + 0.5, 0, 1)
     pupil = lit * np.exp((-fill + 2j * np.pi * waves) * square)
     light = np.abs(np.fft.fftshift(np.fft.fft2(pupil))) ** 2 * (step**2 / np.pi) ** 2
     dv = math.pi / pad
     v = (np.arange(samples) - samples // 2) * dv
+    # the spot is even: rows above the middle stand for those below, and the last one is dark
+    light = light[samples // 2 :]
+    light[1:] *= 2
     found = []
     for place in v[(v >= 0) & (v < 5)][::3]:
-        apart = np.hypot(v - place, v[:, None])
+        apart = np.hypot(v - place, v[samples // 2 :, None])
         inverse = 1 / np.where(apart > 0, apart, np.inf)
-        inverse[apart == 0] = 4 * math.log(1 + math.sqrt(2)) / dv  # mean over a square cell around the point
+        # mean over a square cell around the point
+        inverse[apart == 0] = 4 * math.log(1 + math.sqrt(2)) / dv
         found.append((light * inverse).sum() * dv**2 / (2 * np.pi))
     return max(found) / AIRY
 
@@ -62,7 +69,7 @@ def test_the_heat_is_that_of_the_sampled_spot(fill, waves):
     assert heat_of(fill, waves) == pytest.approx(summed_heat(fill, waves), rel=0.012)
 
 
-@pytest.mark.parametrize(("fill", "waves"), [(0.0, 9.0), (0.0, 9.5), (0.0, 12.0), (0.5, 10.0), (2.0, 9.0)])
+@pytest.mark.parametrize(("fill", "waves"), [(0.0, 9.0), (0.0, 12.0), (2.0, 9.0)])
 def test_beyond_the_table_the_heat_is_an_upper_bound_that_is_near(fill, waves):
     found = summed_heat(fill, waves, samples=4096)
     assert found * 0.998 < heat_of(fill, waves) < found * 1.025

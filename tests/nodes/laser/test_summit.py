@@ -45,7 +45,9 @@ def test_dark_and_narrow_images_gain_nothing():
 
 
 def airy_light(half, samples):
-    """The share of an Airy pattern's light at each sample of a window of 2 half wavelengths times f-number."""
+    """The share of an Airy pattern's light at each sample of a window of 2 half wavelengths
+    times f-number.
+    """
     at = np.arange(-half * samples, half * samples + 1) / samples
     v = np.pi * np.hypot(at[:, None], at)
     v[v < 1e-9] = 1e-9
@@ -53,7 +55,9 @@ def airy_light(half, samples):
 
 
 def test_light_outside_a_window_is_in_no_spot_where_the_wings_explain_it():
-    """The window of 15 wavelengths times f-number to each side lacks 1.2 % of an Airy pattern; light may be a share."""
+    """The window of 15 wavelengths times f-number to each side lacks 1.2 % of an Airy pattern;
+    light may be a share.
+    """
     spot = airy_light(15, 3)
     assert 0.005 < 1 - float(spot.sum()) < 0.02
     assert float(unseen_light(spot, 1.0)) == 0
@@ -61,7 +65,9 @@ def test_light_outside_a_window_is_in_no_spot_where_the_wings_explain_it():
 
 
 def test_light_that_the_wings_do_not_explain_may_be_in_one_spot():
-    """Of an Airy pattern with 2 % of its light elsewhere; and of one of which a part of the spot itself is cut."""
+    """Of an Airy pattern with 2 % of its light elsewhere; and of one of which a part of the spot
+    itself is cut.
+    """
     spot = airy_light(30, 3)
     assert 0.010 < float(unseen_light(0.98 * spot, 1.0)) < 0.021
     lacking = 1 - float(airy_light(3, 3).sum())

@@ -8,12 +8,21 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.losses import background_loss, charbonnier, fft_l1, log_error, mrae, suppression_loss
+from neusee.nodes.losses import (
+    background_loss,
+    charbonnier,
+    fft_l1,
+    log_error,
+    mrae,
+    suppression_loss,
+)
 from neusee.nodes.values import Psf
 
 
 def rand(*shape):
-    return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(len(shape)))
+    return torch.rand(
+        *shape, dtype=torch.float64, generator=torch.Generator().manual_seed(len(shape))
+    )
 
 
 def as_psf(kernel):
@@ -25,7 +34,8 @@ def as_psf(kernel):
 def test_lsr_agrees_with_its_reference(power, log, size):
     psf = as_psf(rand(2, 4, 5) * 10**size)
     torch.testing.assert_close(
-        suppression_loss(psf, power=power, log=log), suppression_loss.hooks.reference(psf, power=power, log=log)
+        suppression_loss(psf, power=power, log=log),
+        suppression_loss.hooks.reference(psf, power=power, log=log),
     )
 
 
@@ -35,20 +45,26 @@ def test_lsr_lies_just_above_the_peak():
     assert float(suppression_loss(as_psf(kernel))) == pytest.approx(2.0, rel=1e-6)
     even = torch.ones(2, 8, 8, dtype=torch.float64) * torch.tensor([0.5, 0.1])[:, None, None]
     assert float(suppression_loss(as_psf(even), power=16)) == pytest.approx(2 * 64 ** (1 / 16))
-    assert float(suppression_loss(as_psf(even), power=16, log=True)) == pytest.approx(2 * math.log(64) / 16)
+    assert float(suppression_loss(as_psf(even), power=16, log=True)) == pytest.approx(
+        2 * math.log(64) / 16
+    )
 
 
 def test_lsr_does_not_underflow_in_single_precision():
     kernel = torch.full((2, 4, 4), 1e-9)
     found = suppression_loss(as_psf(kernel), power=64)
-    assert float(found) == pytest.approx(float(suppression_loss.hooks.reference(as_psf(kernel), power=64)), rel=1e-5)
+    assert float(found) == pytest.approx(
+        float(suppression_loss.hooks.reference(as_psf(kernel), power=64)), rel=1e-5
+    )
     assert torch.isfinite(suppression_loss(as_psf(torch.zeros(2, 4, 4))))
 
 
 @pytest.mark.parametrize("log", [False, True])
 def test_lsr_gradient(log):
     kernel = (1e-3 * rand(2, 4, 4)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda k: suppression_loss(as_psf(k), log=log), (kernel,), eps=1e-8, atol=1e-5)
+    assert torch.autograd.gradcheck(
+        lambda k: suppression_loss(as_psf(k), log=log), (kernel,), eps=1e-8, atol=1e-5
+    )
     assert torch.autograd.gradgradcheck(
         lambda k: suppression_loss(as_psf(1e-3 * k), log=log), (rand(2, 2, 2).requires_grad_(),)
     )
@@ -80,14 +96,17 @@ def test_fft_l1_does_not_grow_with_the_picture(y, x):
     noise, nothing = rand(y, x), torch.zeros(y, x, dtype=torch.float64)
     rms = float(noise.square().mean().sqrt())
     found = float(fft_l1(noise, nothing))
-    assert rms / math.sqrt(x * y) - 1e-12 <= found <= rms + 1e-12  # Parseval, then Cauchy and Schwarz
+    # Parseval, then Cauchy and Schwarz
+    assert rms / math.sqrt(x * y) - 1e-12 <= found <= rms + 1e-12
     point = nothing.clone()
     point[0, 0] = 1.0
     assert float(fft_l1(point, nothing)) == pytest.approx(1 / math.sqrt(x * y))
 
 
 def test_a_decibel_of_the_log_error_is_one_of_the_psnr_in_every_picture():
-    """Against scikit-image, for pictures within the range of a display; beyond it the loss has a slope of its own."""
+    """Against scikit-image, for pictures within the range of a display; beyond it the loss has a
+    slope of its own.
+    """
     from skimage.metrics import peak_signal_noise_ratio
 
     def shown(x):
@@ -95,9 +114,16 @@ def test_a_decibel_of_the_log_error_is_one_of_the_psnr_in_every_picture():
         return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
 
     truth = rand(2, 3, 8, 9)
-    estimate = (truth + torch.tensor([0.1, 1e-2])[:, None, None, None] * (rand(2, 3, 8, 9).flip(1) - 0.5)).clamp(0, 1)
-    each = [peak_signal_noise_ratio(shown(t), shown(e), data_range=1) for t, e in zip(truth, estimate, strict=True)]
-    assert float(log_error(estimate, truth)) == pytest.approx(-math.log(10) / 10 * np.mean(each), abs=0.02)
+    estimate = (
+        truth + torch.tensor([0.1, 1e-2])[:, None, None, None] * (rand(2, 3, 8, 9).flip(1) - 0.5)
+    ).clamp(0, 1)
+    each = [
+        peak_signal_noise_ratio(shown(t), shown(e), data_range=1)
+        for t, e in zip(truth, estimate, strict=True)
+    ]
+    assert float(log_error(estimate, truth)) == pytest.approx(
+        -math.log(10) / 10 * np.mean(each), abs=0.02
+    )
     dark = torch.full((3, 4, 4), -0.5, dtype=torch.float64, requires_grad=True)
     log_error(dark, torch.zeros(3, 4, 4, dtype=torch.float64)).backward()
     assert bool((dark.grad < 0).all())
@@ -118,10 +144,15 @@ def test_gradients_of_the_restoration_losses(loss):
 def test_mrae_is_the_published_measure_above_its_floor_and_bounded_below():
     truth = torch.tensor([0.5, 0.1, 0.0])
     estimate = torch.tensor([0.4, 0.12, 0.01], requires_grad=True)
-    assert float(mrae(estimate.detach()[:2], truth[:2], floor=0.01)) == pytest.approx((0.2 + 0.2) / 2)
+    assert float(mrae(estimate.detach()[:2], truth[:2], floor=0.01)) == pytest.approx(
+        (0.2 + 0.2) / 2
+    )
     loss = mrae(estimate, truth, floor=0.02)
     torch.testing.assert_close(
-        loss.detach().double(), mrae.hooks.reference(estimate.detach(), truth, floor=0.02), rtol=1e-6, atol=0
+        loss.detach().double(),
+        mrae.hooks.reference(estimate.detach(), truth, floor=0.02),
+        rtol=1e-6,
+        atol=0,
     )
     loss.backward()
     assert float(estimate.grad.abs().max()) <= 1 / 0.02 / 3 * (1 + 1e-6)

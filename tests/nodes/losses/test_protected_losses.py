@@ -1,4 +1,6 @@
-"""Losses of a mask behind a peak limit: NumPy from the definitions, simulated pictures, gradients, and the rival."""
+"""Losses of a mask behind a peak limit: NumPy from the definitions, simulated pictures,
+gradients, and the rival.
+"""
 
 import math
 
@@ -11,7 +13,9 @@ from neusee.nodes.metrics import stop_diameter
 from neusee.nodes.values import Bands, Psf
 
 HOW = {"light": 40.0, "read_noise": 6.0, "limit": 0.2}
-EACH = pytest.mark.parametrize("loss", [filtered_error, information], ids=lambda loss: loss.fn.__name__)
+EACH = pytest.mark.parametrize(
+    "loss", [filtered_error, information], ids=lambda loss: loss.fn.__name__
+)
 
 
 def rand(*shape, seed=1):
@@ -34,7 +38,9 @@ def kernels(*shape, seed=1):
 
 @EACH
 @pytest.mark.parametrize("shape", [(3, 16, 16), (2, 15, 16), (3, 16, 15), (1, 1, 7)])
-@pytest.mark.parametrize("how", [{}, {"veil": 30.0, "contrast": 0.4, "transmittance": 0.5}, {"up_to": 0.3, "power": 9}])
+@pytest.mark.parametrize(
+    "how", [{}, {"veil": 30.0, "contrast": 0.4, "transmittance": 0.5}, {"up_to": 0.3, "power": 9}]
+)
 def test_it_agrees_with_its_reference(loss, shape, how):
     psf, *rest = given(kernels(*shape))
     expected = loss.hooks.reference(psf, *rest, **{**HOW, **how})
@@ -44,7 +50,9 @@ def test_it_agrees_with_its_reference(loss, shape, how):
 
 
 def aperture(phase, samples=24, window=64):
-    """The PSF in NumPy of a round pupil with a phase in turns, and the light in the brightest clear pixel."""
+    """The PSF in NumPy of a round pupil with a phase in turns, and the light in the brightest
+    clear pixel.
+    """
     at = (np.arange(samples) - (samples - 1) / 2) / (samples / 2)
     inside = at[:, None] ** 2 + at**2 <= 1
     field = np.zeros((window, window), complex)
@@ -65,7 +73,12 @@ def test_equals_numpy_for_a_mask_behind_a_lens(light, limit):
     grey = 1.0 if limit is None else min(1.0, limit * clear / psf.max())
     snr = (grey * light * np.abs(np.fft.fft2(psf))) ** 2 / (grey * light + 36.0) * scene
     one = torch.ones(1, dtype=torch.float64)
-    inputs = (Psf(torch.from_numpy(psf)[None], clear * one), one, one[None], Bands(550e-9 * one, one, one))
+    inputs = (
+        Psf(torch.from_numpy(psf)[None], clear * one),
+        one,
+        one[None],
+        Bands(550e-9 * one, one, one),
+    )
     how = {"light": light, "read_noise": 6.0, "limit": limit}
     lost = math.log((scene / (1 + snr)).sum() / scene.sum())
     assert float(filtered_error(*inputs, **how)) == pytest.approx(lost, rel=1e-9)
@@ -74,7 +87,9 @@ def test_equals_numpy_for_a_mask_behind_a_lens(light, limit):
 
 
 def test_it_is_the_error_that_filtering_leaves():
-    """Pictures with the noise of light and reading, filtered in NumPy: the mean square error of many."""
+    """Pictures with the noise of light and reading, filtered in NumPy: the mean square error of
+    many.
+    """
     psf, clear = aperture(lambda y, x: 1.5 * (y**3 + x**3), samples=12, window=24)
     rng, (light, read) = np.random.default_rng(4), (80.0, 5.0)
     nu = np.hypot(*np.meshgrid(np.fft.fftfreq(24), np.fft.fftfreq(24), indexing="ij"))
@@ -84,11 +99,24 @@ def test_it_is_the_error_that_filtering_leaves():
     scene = np.fft.fft2(rng.standard_normal((1500, 24, 24))) * np.sqrt(power)
     otf, noise = np.fft.fft2(np.fft.ifftshift(psf)), light + read**2
     drawn = np.fft.fft2(math.sqrt(noise) * rng.standard_normal((1500, 24, 24)))
-    found = (light * otf * scene + drawn) * power * light * otf.conj() / (power * light**2 * np.abs(otf) ** 2 + noise)
+    found = (
+        (light * otf * scene + drawn)
+        * power
+        * light
+        * otf.conj()
+        / (power * light**2 * np.abs(otf) ** 2 + noise)
+    )
     share = (np.abs(found - scene) ** 2).sum() / (np.abs(scene) ** 2).sum()
     one = torch.ones(1, dtype=torch.float64)
-    inputs = (Psf(torch.from_numpy(psf)[None], clear * one), one, one[None], Bands(550e-9 * one, one, one))
-    assert float(filtered_error(*inputs, light=light, read_noise=read)) == pytest.approx(math.log(share), abs=0.01)
+    inputs = (
+        Psf(torch.from_numpy(psf)[None], clear * one),
+        one,
+        one[None],
+        Bands(550e-9 * one, one, one),
+    )
+    assert float(filtered_error(*inputs, light=light, read_noise=read)) == pytest.approx(
+        math.log(share), abs=0.01
+    )
 
 
 @EACH
@@ -108,17 +136,23 @@ def test_gradient(loss):
     assert torch.autograd.gradcheck(lambda k: loss(*given(k), **HOW, power=8.0), (kernel,))
     share = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(
-        lambda k, t: loss(*given(k), **HOW, power=8.0, transmittance=t), (kernel, share), nondet_tol=0
+        lambda k, t: loss(*given(k), **HOW, power=8.0, transmittance=t),
+        (kernel, share),
+        nondet_tol=0,
     )
-    own, truth = (torch.autograd.grad(f(*given(kernel), **HOW, power=8.0), kernel)[0]
-                  for f in (loss, loss.hooks.reference))  # fmt: skip
+    own, truth = (
+        torch.autograd.grad(f(*given(kernel), **HOW, power=8.0), kernel)[0]
+        for f in (loss, loss.hooks.reference)
+    )
     torch.testing.assert_close(own, truth)
 
 
 @EACH
 @pytest.mark.parametrize("limit", [None, 0.03])
 def test_the_rival_is_no_worse_than_any_stop_and_filter_of_the_fourier_transform(loss, limit):
-    """Stops of 40 to 64 samples in one pupil grid; the best of the closed form is better than each, by little."""
+    """Stops of 40 to 64 samples in one pupil grid; the best of the closed form is better than
+    each, by little.
+    """
     window, one, found = 192, torch.ones(1, dtype=torch.float64), []
     grey = (one, one[None], Bands(550e-9 * one, one, one))
     clear = aperture(lambda y, x: 0 * y * x, 64, window)[1] * one
@@ -128,7 +162,9 @@ def test_the_rival_is_no_worse_than_any_stop_and_filter_of_the_fourier_transform
         area = float(own / clear)
         stopped = Psf(torch.from_numpy(area * psf)[None], clear)
         found.append(float(loss(stopped, *grey, **how, transmittance=area)))
-    rival, width, passed = best_stop(Psf(stopped.intensity, clear), *grey, **how, measure=loss.fn.__name__)
+    rival, width, passed = best_stop(
+        Psf(stopped.intensity, clear), *grey, **how, measure=loss.fn.__name__
+    )
     assert rival <= min(found) + 2e-3 * abs(min(found))
     assert rival > min(found) - 0.05 * abs(min(found))
     if limit is None:

@@ -1,4 +1,6 @@
-"""The loss of what a Wiener filter leaves wrong: closed forms, its reference, its gradient, and the filter itself."""
+"""The loss of what a Wiener filter leaves wrong: closed forms, its reference, its gradient, and
+the filter itself.
+"""
 
 import math
 
@@ -6,7 +8,7 @@ import pytest
 import torch
 
 from neusee.nodes.losses import wiener
-from neusee.nodes.restore._inverse._picture_scale import fall
+from neusee.nodes.restore._inverse._wiener_prior import fall
 from neusee.nodes.values import Bands, Psf
 
 
@@ -19,7 +21,12 @@ def given(kernel, channels=2):
     count = len(kernel)
     centres = torch.linspace(450e-9, 650e-9, count, dtype=torch.float64)
     bands = Bands(centres, torch.full_like(centres, 10e-9), torch.ones_like(centres))
-    return Psf(kernel, torch.full((count,), 0.1)), rand(count, seed=2), rand(channels, count, seed=3), bands
+    return (
+        Psf(kernel, torch.full((count,), 0.1)),
+        rand(count, seed=2),
+        rand(channels, count, seed=3),
+        bands,
+    )
 
 
 def kernels(*shape, seed=1):
@@ -41,10 +48,13 @@ def test_it_agrees_with_its_reference(shape, how):
 def test_a_point_leaves_what_the_noise_hides_and_no_light_leaves_nothing():
     point, noise = torch.zeros(2, 16, 16, dtype=torch.float64), 0.05
     point[:, 8, 8] = 1.0
-    power = torch.cat([fall((16, 16)), fall((16, 16))[:, 1:8]], 1).flatten()[1:]  # with mirrors, without the mean
+    # with mirrors, without the mean
+    power = torch.cat([fall((16, 16)), fall((16, 16))[:, 1:8]], 1).flatten()[1:]
     hidden = float((power / (power / noise + 1)).sum() / power.sum())
     assert float(wiener(*given(point), noise=noise)) == pytest.approx(math.log(hidden), rel=1e-6)
-    assert float(wiener(*given(torch.zeros_like(point)), noise=noise)) == pytest.approx(0.0, abs=1e-9)
+    assert float(wiener(*given(torch.zeros_like(point)), noise=noise)) == pytest.approx(
+        0.0, abs=1e-9
+    )
 
 
 def test_it_is_the_error_that_filtering_leaves():
@@ -61,7 +71,9 @@ def test_it_is_the_error_that_filtering_leaves():
     )
     found = seen * power * transfer.conj() / (power * transfer.abs().square() + noise)
     share = float((found - scene)[:, power > 0].abs().square().sum() / scene.abs().square().sum())
-    assert float(wiener(psf, light, responses, bands, noise=noise)) == pytest.approx(math.log(share), abs=0.01)
+    assert float(wiener(psf, light, responses, bands, noise=noise)) == pytest.approx(
+        math.log(share), abs=0.01
+    )
 
 
 def test_bands_that_agree_leave_no_colour_wrong():
@@ -75,7 +87,9 @@ def test_bands_that_agree_leave_no_colour_wrong():
 def test_gradient():
     kernel = kernels(2, 5, 6).requires_grad_()
     assert torch.autograd.gradcheck(lambda k: wiener(*given(k)), (kernel,))
-    own, truth = (torch.autograd.grad(f(*given(kernel)), kernel)[0] for f in (wiener, wiener.hooks.reference))
+    own, truth = (
+        torch.autograd.grad(f(*given(kernel)), kernel)[0] for f in (wiener, wiener.hooks.reference)
+    )
     torch.testing.assert_close(own, truth)
 
 

@@ -1,4 +1,6 @@
-"""NEQ and error of a filtered picture behind masks and stops, in plain NumPy: no line is shared with the nodes."""
+"""NEQ and error of a filtered picture behind masks and stops, in plain NumPy: no line is shared
+with the nodes.
+"""
 
 import numpy as np
 
@@ -15,7 +17,9 @@ POWER *= 0.1 / POWER.mean()
 
 def _half_rings(waves):
     annulus = np.minimum((R**2 * len(waves)).astype(int), len(waves) - 1)
-    return 2 * np.pi * np.array([w * (-1) ** i for i, w in enumerate(waves)])[annulus] * R * np.sign(U)
+    return (
+        2 * np.pi * np.array([w * (-1) ** i for i, w in enumerate(waves)])[annulus] * R * np.sign(U)
+    )
 
 
 def phases():
@@ -31,7 +35,9 @@ def phases():
 
 
 def psf(opening, phase=0.0):
-    """Light in each pixel, as a share of the light of the clear pupil: a padded FFT has not this pitch, so two sums."""
+    """Light in each pixel, as a share of the light of the clear pupil: a padded FFT has not this
+    pitch, so two sums.
+    """
     turns = (
         PITCH
         * PIXEL
@@ -50,7 +56,9 @@ def stops(diameters):
 
 
 def gains(spectrum, lsr, rivals, light, read_noise):
-    """(mean log NEQ, filtered error) of a mask and of the best stop-and-filter of its peak, in dB, at one light."""
+    """(mean log NEQ, filtered error) of a mask and of the best stop-and-filter of its peak, in
+    dB, at one light.
+    """
 
     def measure(otf):
         neq = (light * np.abs(otf)) ** 2 / (light * otf[0, 0].real + read_noise**2)

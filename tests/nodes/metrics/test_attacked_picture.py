@@ -30,7 +30,9 @@ def spot(width, side=64, light=1.0):
     """A Gaussian PSF and the peak of the clear lens, whose width is 1."""
     at = torch.arange(side, dtype=torch.float64) - side // 2
     one = torch.exp(-(at[:, None].square() + at.square()) / (2 * width**2))
-    return Psf((light * one / one.sum())[None], torch.tensor([1 / (2 * math.pi)], dtype=torch.float64))
+    return Psf(
+        (light * one / one.sum())[None], torch.tensor([1 / (2 * math.pi)], dtype=torch.float64)
+    )
 
 
 def test_a_picture_under_attack_is_the_mean_over_its_pixels():
@@ -60,7 +62,13 @@ def test_a_laser_too_weak_to_matter_leaves_the_quiet_picture_and_a_strong_one_le
     even = glare_levels(torch.full((8, 8), 1e-4, dtype=torch.float64), 0.1)
     sensor = PixelNoise(5.0, 1e4, 0.0, 0.0)
     found = attacked_picture(
-        spectrum, even, sensor, electrons=50.0, transmittance=1.0, strengths=torch.tensor([0.0, 1e9]), colour=ONE
+        spectrum,
+        even,
+        sensor,
+        electrons=50.0,
+        transmittance=1.0,
+        strengths=torch.tensor([0.0, 1e9]),
+        colour=ONE,
     )
     quiet = metrics.filtered_picture(one, ONE, ONE[None], GREEN, electrons=50.0, read_noise=5.0)
     assert float(found.error[0]) == pytest.approx(float(quiet.error), rel=1e-3)
@@ -74,14 +82,19 @@ def test_the_heat_of_a_pulse_is_its_peak_and_that_of_continuous_light_falls_less
     pulse = heat_ratio(wide, clear, pixel_pitch=3e-6, dwell=1e-12)
     steady = heat_ratio(wide, clear, pixel_pitch=3e-6, dwell=10.0)
     assert float(pulse) == pytest.approx(1 / 9, rel=1e-6)  # of the peaks
-    assert float(steady) == pytest.approx(1 / 3, rel=0.02)  # as 1 / width, as the threshold of small spots
+    # as 1 / width, as the threshold of small spots
+    assert float(steady) == pytest.approx(1 / 3, rel=0.02)
 
 
 def test_the_heat_agrees_with_its_reference():
     rng = torch.Generator().manual_seed(2)
-    one, other = (Psf(torch.rand(2, 11, 9, generator=rng).double(), ONE.expand(2)) for _ in range(2))
+    one, other = (
+        Psf(torch.rand(2, 11, 9, generator=rng).double(), ONE.expand(2)) for _ in range(2)
+    )
     given = {"pixel_pitch": 3e-6, "dwell": 2e-7}
-    assert heat_ratio(one, other, **given) == pytest.approx(heat_ratio.hooks.reference(one, other, **given), rel=1e-6)
+    assert heat_ratio(one, other, **given) == pytest.approx(
+        heat_ratio.hooks.reference(one, other, **given), rel=1e-6
+    )
 
 
 def test_psfs_of_other_windows_are_refused():
@@ -107,7 +120,9 @@ def test_detection_is_the_norm_of_the_seen_target_over_the_noise():
         canvas[: target.shape[0], : target.shape[1]] = target.numpy()
         seen = np.fft.ifft2(np.fft.fft2(canvas) * np.fft.fft2(one.intensity[0].numpy())).real
         wanted = 300 * 0.2 * np.linalg.norm(seen) / math.sqrt(90)
-        assert float(detection_snr(energy[name], 300.0, 0.2, torch.tensor([[90.0]]))) == pytest.approx(wanted, rel=1e-6)
+        assert float(
+            detection_snr(energy[name], 300.0, 0.2, torch.tensor([[90.0]]))
+        ) == pytest.approx(wanted, rel=1e-6)
     assert energy["tri-bar"] < detail_energy(spot(0.5), ONE, ONE[None], GREEN, size)["tri-bar"]
 
 

@@ -1,6 +1,8 @@
-"""The background suppression ratio is a share of the scene's light: at most 1, and the sum of what stays in the field.
+"""The background suppression ratio is a share of the scene's light: at most 1, and the sum of what
+stays in the field.
 
-PSFs of random masks come from `independent_psf`, and the light in the field from a sum over pairs of pixels in NumPy.
+PSFs of random masks come from `independent_psf`, and the light in the field from a sum over pairs
+of pixels in NumPy.
 """
 
 from typing import get_args
@@ -17,14 +19,17 @@ from neusee.nodes.metrics import bsr, light_outside
 from neusee.nodes.values import LowRankCube, Psf, Pupil
 from tests.nodes.optics.independent_psf import round_stop, window
 
-PERIOD = 64  #: pixels after which the PSF of the shorter wavelength repeats: one period holds all light
+#: pixels after which the PSF of the shorter wavelength repeats: one period holds all light
+PERIOD = 64
 LENS = {"wavelength": 2.0**-21, "pitch": 2.0**-17, "focal_length": 2.0**-4, "pixel_pitch": 2.0**-14}
 SAMPLES, INDEX = 24, 0.46
 ROUND_OFF = {torch.float32: 1e-6, torch.float64: 1e-12}
 
 
 def mask(kind, rng):
-    """Draw a height map, m: flat, rough in every sample, or a prism that moves all light to one side."""
+    """Draw a height map, m: flat, rough in every sample, or a prism that moves all light to one
+    side.
+    """
     if kind == "prism":
         v, u = np.indices((SAMPLES, SAMPLES))
         return rng.uniform(-1, 1) * 2e-7 * v + rng.uniform(-1, 1) * 2e-7 * u
@@ -45,13 +50,24 @@ def scene(kind, shape, rng):
 
 
 def psf_of(height, shape):
-    seen = [window(height, 0 * height, round_stop(SAMPLES, LENS["pitch"], SAMPLES * LENS["pitch"]), INDEX,
-                   **LENS | {"wavelength": LENS["wavelength"] * s}, shape=shape) for s in (1.0, 2.0)]  # fmt: skip
+    seen = [
+        window(
+            height,
+            0 * height,
+            round_stop(SAMPLES, LENS["pitch"], SAMPLES * LENS["pitch"]),
+            INDEX,
+            **LENS | {"wavelength": LENS["wavelength"] * s},
+            shape=shape,
+        )
+        for s in (1.0, 2.0)
+    ]
     return np.stack(seen)
 
 
 def by_pairs(kernel, picture):
-    """Add up, for each scene pixel, the PSF samples that reach a pixel of the field, and weigh with the scene."""
+    """Add up, for each scene pixel, the PSF samples that reach a pixel of the field, and weigh
+    with the scene.
+    """
     (m, n), (y, x) = kernel.shape, picture.shape
     kept = 0.0
     for v in range(y):
@@ -81,8 +97,12 @@ def test_no_passive_mask_keeps_more_than_all_light(seed, relief, picture, size, 
     assert float(found.min()) >= 0
     expected = [by_pairs(k, x) for k, x in zip(kernel, light, strict=True)]
     np.testing.assert_allclose(found.numpy(), expected, rtol=0, atol=ROUND_OFF[dtype])
-    np.testing.assert_allclose(bsr.hooks.reference(psf, torch.tensor(light, dtype=dtype)), expected, atol=1e-6)
-    assert float(background_loss(psf, torch.tensor(light, dtype=dtype))) >= 2 * (1 - ROUND_OFF[dtype])
+    np.testing.assert_allclose(
+        bsr.hooks.reference(psf, torch.tensor(light, dtype=dtype)), expected, atol=1e-6
+    )
+    assert float(background_loss(psf, torch.tensor(light, dtype=dtype))) >= 2 * (
+        1 - ROUND_OFF[dtype]
+    )
     assert bsr.hooks.check(found)[0].ok
 
 
@@ -100,7 +120,10 @@ def test_all_light_stays_where_field_and_window_hold_it():
 def test_each_scene_of_a_batch_has_its_own_share():
     rng = torch.Generator().manual_seed(2)
     kernel = torch.rand(5, 9, 12, generator=rng, dtype=torch.float64) / 120
-    psf, light = Psf(kernel, kernel[:, 0, 0]), torch.rand(3, 5, 14, 11, generator=rng, dtype=torch.float64)
+    psf, light = (
+        Psf(kernel, kernel[:, 0, 0]),
+        torch.rand(3, 5, 14, 11, generator=rng, dtype=torch.float64),
+    )
     found = bsr(psf, light)
     torch.testing.assert_close(found, torch.stack([bsr(psf, one) for one in light]), rtol=0, atol=0)
 
@@ -115,7 +138,9 @@ def test_darkness_and_scenes_of_other_bands():
     assert bsr(psf, dark).tolist() == [1.0, 1.0]
     assert float(background_loss(psf, dark)) == 2.0
     for radiance in (torch.ones(3, 4, 4), torch.ones(4, 4)):
-        with pytest.raises(ValueError, match=r"radiance \(.*must have the same bands: compute both"):
+        with pytest.raises(
+            ValueError, match=r"radiance \(.*must have the same bands: compute both"
+        ):
             bsr(psf, radiance)
 
 
@@ -130,8 +155,12 @@ def test_the_loss_sees_light_that_leaves_window_and_field():
     assert torch.autograd.gradcheck(loss, (kernel.clone().requires_grad_(),))
     slope = torch.func.grad(loss)(kernel)
     assert bool((slope < 0).all())  # more light in the window, less loss
-    assert float(loss(kernel)) == pytest.approx(float((1 / bsr(Psf(kernel, torch.ones(2)), light)).sum()))
-    assert float(background_loss(Psf(kernel, torch.ones(2)))) == pytest.approx(float((1 / kernel.sum((1, 2))).sum()))
+    assert float(loss(kernel)) == pytest.approx(
+        float((1 / bsr(Psf(kernel, torch.ones(2)), light)).sum())
+    )
+    assert float(background_loss(Psf(kernel, torch.ones(2)))) == pytest.approx(
+        float((1 / kernel.sum((1, 2))).sum())
+    )
 
 
 def test_the_light_outside_is_what_passes_and_misses_the_window():
@@ -140,15 +169,21 @@ def test_the_light_outside_is_what_passes_and_misses_the_window():
     clear = optics.pupil(doe.half_rings(stop, waves=(12.0,)), doe.material(line), line, stop)
     dirty = clear._replace(amplitude=clear.amplitude * 0.5)
     sizes = [(24, 24), (160, 160)]
-    few, many, dim = (optics.psf(p, focal_length=0.11, pixel_pitch=3e-6, shape=s)
-                      for p, s in ((clear, sizes[0]), (clear, sizes[1]), (dirty, sizes[1])))  # fmt: skip
+    few, many, dim = (
+        optics.psf(p, focal_length=0.11, pixel_pitch=3e-6, shape=s)
+        for p, s in ((clear, sizes[0]), (clear, sizes[1]), (dirty, sizes[1]))
+    )
     found = light_outside(many, clear)
     assert bool((light_outside(few, clear) > 0.5).all())
     assert bool((found < 0.2).all())
-    torch.testing.assert_close(light_outside(dim, dirty), found, rtol=0, atol=1e-6)  # a loss of dirt, not of the window
+    # a loss of dirt, not of the window
+    torch.testing.assert_close(light_outside(dim, dirty), found, rtol=0, atol=1e-6)
     assert light_outside(many, clear).tolist() == pytest.approx(
         (1 - many.intensity.double().sum((1, 2))).tolist(), rel=1e-12
     )
     assert "outside the window" in light_outside.hooks.check(found)[0].text
     black = dirty._replace(amplitude=dirty.amplitude * 0)
-    assert light_outside(Psf(many.intensity * 0, many.clear_peak), Pupil(*black)).tolist() == [0.0, 0.0]
+    assert light_outside(Psf(many.intensity * 0, many.clear_peak), Pupil(*black)).tolist() == [
+        0.0,
+        0.0,
+    ]

@@ -1,4 +1,6 @@
-"""What no element can do better: the floor of the LSR and the most contrast, against closed forms and any PSF."""
+"""What no element can do better: the floor of the LSR and the most contrast, against closed
+forms and any PSF.
+"""
 
 import math
 
@@ -8,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.metrics import limits, lsr, most_contrast, mtf
-from neusee.nodes.metrics._mask_limits import least_lsr, most_unsuppressed, shares
+from neusee.nodes.metrics._suppression_ratios import least_lsr, most_unsuppressed, shares
 from neusee.nodes.values import Psf
 
 
@@ -28,7 +30,8 @@ def test_no_psf_has_more_contrast_or_less_peak_than_is_possible(seed, clear_peak
     intensity = torch.rand((1, 48, 48), generator=torch.Generator().manual_seed(seed)) ** 8
     drawn = psf(intensity * kept / intensity.sum(), clear_peak)
     bounds = limits(drawn)
-    assert float(mtf(drawn).rms) <= 1.05 * float(bounds.passed)  # one half of the frequencies stands for all
+    # one half of the frequencies stands for all
+    assert float(mtf(drawn).rms) <= 1.05 * float(bounds.passed)
     assert float(bounds.rms) <= float(bounds.bound) * (1 + 1e-6)
     assert float(mtf(drawn).median) <= 1.05 * float(bounds.median)
     assert float(lsr(drawn)) >= float(bounds.floor) * (1 - 1e-6)

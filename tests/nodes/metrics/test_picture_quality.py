@@ -12,8 +12,13 @@ from neusee.nodes.metrics import quality
 def pair(size=256, noise=0.05):
     rng = np.random.default_rng(0)
     grid = np.linspace(0, 12, size)
-    truth = 0.5 + 0.3 * np.sin(grid)[:, None] * np.cos(np.array([1.0, 1.7, 2.3])[:, None, None] * grid)
-    return (np.clip(x, 0, 1).astype("float32") for x in (truth + noise * rng.standard_normal(truth.shape), truth))
+    truth = 0.5 + 0.3 * np.sin(grid)[:, None] * np.cos(
+        np.array([1.0, 1.7, 2.3])[:, None, None] * grid
+    )
+    return (
+        np.clip(x, 0, 1).astype("float32")
+        for x in (truth + noise * rng.standard_normal(truth.shape), truth)
+    )
 
 
 def gaussian_ssim(a, b):
@@ -28,15 +33,19 @@ def test_ssim_is_that_of_kornia_at_any_size(shape):
     truth = torch.rand(3, *shape)
     estimate = (truth + 0.1 * torch.randn_like(truth)).clamp(0, 1)
     whole = ssim(estimate[None], truth[None], 11, padding="valid")
-    assert float(quality(estimate, truth, domain="linear").ssim) == pytest.approx(float(whole.mean()), abs=1e-6)
+    assert float(quality(estimate, truth, domain="linear").ssim) == pytest.approx(
+        float(whole.mean()), abs=1e-6
+    )
 
 
 def test_what_is_compared_by_stripes_has_the_gradient_of_the_whole():
     torch.manual_seed(0)
     truth, estimate = torch.rand(2, 3, 70, 20).double()
     grads = []
-    for measure in (lambda x: quality(x, truth, domain="linear").ssim,
-                    lambda x: ssim(x[None], truth[None], 11, padding="valid").mean()):  # fmt: skip
+    for measure in (
+        lambda x: quality(x, truth, domain="linear").ssim,
+        lambda x: ssim(x[None], truth[None], 11, padding="valid").mean(),
+    ):
         x = estimate.clone().requires_grad_()
         measure(x).backward()
         grads.append(x.grad)
@@ -46,7 +55,9 @@ def test_what_is_compared_by_stripes_has_the_gradient_of_the_whole():
 def test_agrees_with_scikit_image():
     noisy, truth = pair()
     found = quality(torch.tensor(noisy), torch.tensor(truth), domain="linear")
-    assert float(found.psnr) == pytest.approx(peak_signal_noise_ratio(truth, noisy, data_range=1.0), abs=2e-5)
+    assert float(found.psnr) == pytest.approx(
+        peak_signal_noise_ratio(truth, noisy, data_range=1.0), abs=2e-5
+    )
     assert float(found.ssim) == pytest.approx(gaussian_ssim(truth, noisy), abs=2e-5)
     assert float(found.l1) == pytest.approx(np.abs(noisy - truth).mean(), rel=1e-5)
     assert all(x.dtype == torch.float64 and x.ndim == 0 for x in found)
@@ -70,7 +81,9 @@ def test_both_are_clipped_to_what_can_be_shown():
 @pytest.mark.parametrize("bright", [1.0, 50.0])
 def test_white_in_place_of_black_is_an_error_of_exactly_one(bright, dtype):
     """1.055 - 0.055 is 1 - 6e-8 in single precision: PSNR would be 3e-7 dB in place of 0 dB."""
-    found = quality(torch.full((3, 70, 12), bright, dtype=dtype), torch.zeros(3, 70, 12, dtype=dtype))
+    found = quality(
+        torch.full((3, 70, 12), bright, dtype=dtype), torch.zeros(3, 70, 12, dtype=dtype)
+    )
     assert (float(found.l1), float(found.psnr)) == (1.0, 0.0)
 
 
@@ -98,4 +111,7 @@ def test_what_cannot_be_compared():
 
 def test_check():
     picture = torch.rand(3, 16, 16)
-    assert quality.hooks.check(quality(picture, picture))[0].text == "L1 0.0000, PSNR 200.00 dB, SSIM 1.000"
+    assert (
+        quality.hooks.check(quality(picture, picture))[0].text
+        == "L1 0.0000, PSNR 200.00 dB, SSIM 1.000"
+    )

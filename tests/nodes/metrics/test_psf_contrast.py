@@ -12,7 +12,9 @@ DIAMETER, FOCAL, WAVE, PITCH = 8.0784e-3, 0.11, 550e-9, 2.9e-6
 
 
 def lens(turns=None, window=512, samples=432):
-    """PSF of a disc by the plain Fourier sum; ``turns`` gives the phase at (u, v) in units of the radius."""
+    """PSF of a disc by the plain Fourier sum; ``turns`` gives the phase at (u, v) in units of
+    the radius.
+    """
     u = (torch.arange(samples, dtype=torch.float64) - (samples - 1) / 2) * (DIAMETER / samples)
     v, w = torch.meshgrid(u / (DIAMETER / 2), u / (DIAMETER / 2), indexing="ij")
     disc = (torch.hypot(v, w) <= 1).double()
@@ -48,7 +50,9 @@ def test_a_half_ring_keeps_its_median_contrast(waves, rms, median):
 
 
 def test_an_axicon_of_the_same_slope_falls_into_nulls_where_a_half_ring_does_not():
-    ring, axicon = (mtf(lens(turns)) for turns in (half_ring(20), lambda v, u: 20 * torch.hypot(v, u)))
+    ring, axicon = (
+        mtf(lens(turns)) for turns in (half_ring(20), lambda v, u: 20 * torch.hypot(v, u))
+    )
     assert float(ring.median) > 30 * float(axicon.median)
     assert float(ring.low) > 10 * float(axicon.low)
 
@@ -73,7 +77,9 @@ def test_a_delta_passes_everything_and_nothing_passes_nothing():
 def test_encircled_energy_of_an_airy_pattern():
     first_zero = 1.2197 * WAVE * FOCAL / DIAMETER
     # whole pixels of 0.3 radii: the shares hold to a few per cent
-    assert float(encircled(lens(), pixel_pitch=PITCH, radius=first_zero)) == pytest.approx(0.838, abs=0.03)
+    assert float(encircled(lens(), pixel_pitch=PITCH, radius=first_zero)) == pytest.approx(
+        0.838, abs=0.03
+    )
     found = encircled(lens(), pixel_pitch=PITCH, radius=200 * PITCH)
     assert float(found) == pytest.approx(
         1 - 2 / (math.pi * math.pi * DIAMETER * 200 * PITCH / (WAVE * FOCAL)), abs=2e-3
@@ -96,7 +102,10 @@ def test_the_clear_lens_over_its_own_peak_is_one_on_the_axis():
 
 
 def test_each_band_is_over_the_peak_of_its_own_clear_lens():
-    flat = Psf(torch.full((2, 3, 3), 0.2, dtype=torch.float64), torch.tensor([0.5, 0.8], dtype=torch.float64))
+    flat = Psf(
+        torch.full((2, 3, 3), 0.2, dtype=torch.float64),
+        torch.tensor([0.5, 0.8], dtype=torch.float64),
+    )
     assert float(over_clear_peak(flat, 0)[0, 0]) == pytest.approx(0.4)
     assert float(over_clear_peak(flat, 1)[2, 1]) == pytest.approx(0.25)
 
@@ -114,41 +123,52 @@ def test_only_the_root_mean_square_has_a_gradient():
     assert [x.requires_grad for x in found] == [True, False, False]
 
 
-# --- borders ----------------------------------------------------------------------------------------------------------
+# --- borders --------------------------------------------------------------------------------------
 
 
 def two_pixels(ratio, size=8, clear=0.5):
-    """Return a PSF of two neighbours, whose contrast along x is that of two slits: |cos(pi f) + ...|."""
+    """Return a PSF of two neighbours, whose contrast along x is that of two slits: |cos(pi f) +
+    ...|.
+    """
     kernel = torch.zeros(1, size, size, dtype=torch.float64)
     kernel[0, size // 2, size // 2], kernel[0, size // 2, size // 2 + 1] = 1.0, ratio
     return Psf(kernel, torch.tensor([clear], dtype=torch.float64))
 
 
 def contrasts(ratio, size, cut):
-    """Return the sorted contrasts of two pixels at all frequencies of the half plane up to ``cut``, in closed form."""
+    """Return the sorted contrasts of two pixels at all frequencies of the half plane up to
+    ``cut``, in closed form.
+    """
     found = []
     for i in range(size):
         for j in range(size // 2 + 1):
             fy, fx = (i if i < size / 2 else i - size) / size, j / size
             if math.hypot(fy, fx) <= cut + 1e-12:
-                found.append(math.sqrt(1 + ratio**2 + 2 * ratio * math.cos(2 * math.pi * fx)) / (1 + ratio))
+                found.append(
+                    math.sqrt(1 + ratio**2 + 2 * ratio * math.cos(2 * math.pi * fx)) / (1 + ratio)
+                )
     return sorted(found)
 
 
 @pytest.mark.parametrize("cut", [0.25, 0.3, 0.5])
 @pytest.mark.parametrize("size", [8, 24])
 def test_statistics_of_two_pixels_are_those_of_their_closed_form(size, cut):
-    """The cut-off itself counts; the median of an even number is the lower one; 1 of 100 is below `low`."""
+    """The cut-off itself counts; the median of an even number is the lower one; 1 of 100 is
+    below `low`.
+    """
     found = mtf(two_pixels(0.6, size, clear=math.pi * (cut + 1e-9) ** 2 / 4))
     exact = contrasts(0.6, size, cut)
-    assert float(found.rms) == pytest.approx(math.sqrt(sum(x**2 for x in exact) / len(exact)), rel=1e-9)
+    assert float(found.rms) == pytest.approx(
+        math.sqrt(sum(x**2 for x in exact) / len(exact)), rel=1e-9
+    )
     assert float(found.median) == pytest.approx(exact[(len(exact) - 1) // 2], rel=1e-9)
     assert float(found.low) == pytest.approx(exact[math.floor(0.01 * (len(exact) - 1))], rel=1e-9)
 
 
 def test_a_contrast_is_at_most_one_and_light_below_the_darkest_has_none():
     kernel = torch.zeros(3, 8, 8, dtype=torch.float64)
-    kernel[0, 4, 4], kernel[0, 4, 5] = 1.0, -0.5  # an error that is negative: 1.5 times the light at high frequencies
+    # an error that is negative: 1.5 times the light at high frequencies
+    kernel[0, 4, 4], kernel[0, 4, 5] = 1.0, -0.5
     kernel[1, 4, 4], kernel[2, 4, 4] = 0.9e-30, 1.1e-30
     found = mtf(Psf(kernel, torch.full((3,), 0.5, dtype=torch.float64)))
     assert float(found.median[0]) == 1.0
@@ -157,7 +177,9 @@ def test_a_contrast_is_at_most_one_and_light_below_the_darkest_has_none():
     assert not mtf.hooks.check(found._replace(rms=found.rms + 0.1))[0].ok
 
 
-@pytest.mark.parametrize(("radius", "count"), [(0.999, 1), (1.0, 5), (1.414, 5), (1.4143, 9), (2.0, 13)])
+@pytest.mark.parametrize(
+    ("radius", "count"), [(0.999, 1), (1.0, 5), (1.414, 5), (1.4143, 9), (2.0, 13)]
+)
 def test_a_pixel_counts_whose_centre_is_within_the_radius_or_on_it(radius, count):
     flat = Psf(torch.ones(1, 7, 6, dtype=torch.float64), torch.ones(1, dtype=torch.float64))
     assert float(encircled(flat, pixel_pitch=2.0, radius=2.0 * radius)) == count

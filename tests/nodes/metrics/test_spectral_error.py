@@ -6,7 +6,7 @@ import torch
 
 from neusee.nodes import doe, optics, spectra
 from neusee.nodes.metrics import spectral_error
-from neusee.nodes.metrics._spectral_error import _interpolated
+from neusee.nodes.metrics._psf_quality import _interpolated
 from tests.nodes.optics.independent_psf import window
 
 LENS = {"focal_length": 0.11, "pixel_pitch": 2.9e-6}
@@ -24,7 +24,9 @@ def pupil(mask, bands):
 
 def light(mask, bands, weights):
     """Add up the PSF of each channel over the bands, (channel, pixel), scaled to a sum of 1."""
-    intensity = optics.psf(pupil(mask, bands), shape=(192, 192), **LENS).intensity.double().flatten(1)
+    intensity = (
+        optics.psf(pupil(mask, bands), shape=(192, 192), **LENS).intensity.double().flatten(1)
+    )
     seen = weights @ intensity
     return seen / seen.sum(1, keepdim=True)
 
@@ -46,7 +48,9 @@ def test_a_white_point(mask, count):
     width = float(few.widths[0]) / 8
     fine = (few.centres[0] - few.widths[0] / 2 + width * (torch.arange(8 * count) + 0.5)).tolist()
     many = spectra.filters(centres=tuple(fine), widths=(width,))
-    found = spectral_error(pupil(mask, few), few, spectra.illuminant(few), spectra.responses(few), **LENS)
+    found = spectral_error(
+        pupil(mask, few), few, spectra.illuminant(few), spectra.responses(few), **LENS
+    )
     truth = true_error(mask, few, many, photons(few), photons(many))
     assert bool((found < (3 if mask == "flat" else 2) * truth).all())
     assert bool((found > truth / 2).all())
@@ -81,7 +85,11 @@ def test_filters_that_do_not_adjoin_are_split():
 def test_one_band_and_darkness_and_other_bands():
     single = spectra.bands(start=500e-9, stop=600e-9, count=1)
     none, one = torch.zeros(3, 1), torch.ones(1)
-    assert spectral_error(pupil("flat", single), single, one, none, **LENS).tolist() == [0.0, 0.0, 0.0]
+    assert spectral_error(pupil("flat", single), single, one, none, **LENS).tolist() == [
+        0.0,
+        0.0,
+        0.0,
+    ]
     assert 0 < float(spectral_error(pupil("flat", single), single, **LENS)) < 1
     with pytest.raises(ValueError, match="pupil, bands and weights have 1, 1 and 2 bands"):
         spectral_error(pupil("flat", single), single, torch.ones(2), torch.ones(3, 2), **LENS)
@@ -101,18 +109,26 @@ SIDE = 113  # the alias-free field of 0.1667 mm samples at 500 nm, in pixels of 
 def narrow(dtype=torch.float32):
     height = doe.half_rings(COARSE, waves=(3.0,))
     found = optics.pupil(height, doe.material(NARROW), NARROW, COARSE)
-    screens = {name: getattr(found, name).to(dtype) for name in ("aperture", "amplitude", "height", "path")}
+    screens = {
+        name: getattr(found, name).to(dtype) for name in ("aperture", "amplitude", "height", "path")
+    }
     return found._replace(**screens)
 
 
 def doubled_rule(pupil, height):
-    """Return the estimate for one channel of equal weights by its definition, with PSFs that share no code."""
+    """Return the estimate for one channel of equal weights by its definition, with PSFs that
+    share no code.
+    """
     centres = NARROW.centres.numpy()
     lengths = np.concatenate([centres, (centres[1:] + centres[:-1]) / 2])
     index = np.polynomial.Polynomial.fit(centres, pupil.index.numpy(), 4)(lengths)
     lens = {"pitch": float(pupil.pitch), **LENS, "shape": (SIDE, SIDE)}
-    light = [window(height, pupil.path, pupil.aperture, n, w, **lens) for n, w in zip(index, lengths, strict=True)]
-    coarse = sum(light[:5]) - (light[0] + light[4]) / 2  # by the trapezoidal rule, and with half its step
+    light = [
+        window(height, pupil.path, pupil.aperture, n, w, **lens)
+        for n, w in zip(index, lengths, strict=True)
+    ]
+    # by the trapezoidal rule, and with half its step
+    coarse = sum(light[:5]) - (light[0] + light[4]) / 2
     fine = (coarse + sum(light[5:])) / 2
     return np.linalg.norm(coarse - fine) / np.linalg.norm(sum(light[:5]))
 
@@ -123,7 +139,9 @@ def estimate(pupil):
 
 
 def test_bands_of_a_fifth_of_a_nanometre_and_the_gradient_of_their_estimate():
-    """The PSFs of both rules differ by 1e-5 or less, so that float32 would leave two digits of the result."""
+    """The PSFs of both rules differ by 1e-5 or less, so that float32 would leave two digits of
+    the result.
+    """
     pupil = narrow()
     truth = doubled_rule(pupil, pupil.height)
     assert 1e-7 < truth < 1e-4
@@ -131,9 +149,16 @@ def test_bands_of_a_fifth_of_a_nanometre_and_the_gradient_of_their_estimate():
     found = estimate(pupil._replace(height=height))
     assert float(found.detach()) == pytest.approx(truth, rel=1e-4)
     found.backward()
-    way = torch.rand(48, 48, generator=torch.Generator().manual_seed(2), dtype=torch.float64).numpy() * 1e-9
-    low, high = (doubled_rule(pupil, pupil.height.double().numpy() + sign * way) for sign in (-1, 1))
-    assert float((height.grad.double() * torch.tensor(way)).sum()) == pytest.approx((high - low) / 2, rel=1e-3)
+    way = (
+        torch.rand(48, 48, generator=torch.Generator().manual_seed(2), dtype=torch.float64).numpy()
+        * 1e-9
+    )
+    low, high = (
+        doubled_rule(pupil, pupil.height.double().numpy() + sign * way) for sign in (-1, 1)
+    )
+    assert float((height.grad.double() * torch.tensor(way)).sum()) == pytest.approx(
+        (high - low) / 2, rel=1e-3
+    )
 
 
 def test_a_pupil_in_half_precision_is_refused():

@@ -26,20 +26,26 @@ def test_lsr_is_the_peak_over_the_clear_peak():
     kernel = torch.rand(2, 5, 5)
     found = lsr(Psf(kernel, torch.tensor([2.0, 4.0], dtype=torch.float64)))
     assert found.dtype == torch.float64
-    torch.testing.assert_close(found, kernel.amax((1, 2)).double() / torch.tensor([2.0, 4.0], dtype=torch.float64))
+    torch.testing.assert_close(
+        found, kernel.amax((1, 2)).double() / torch.tensor([2.0, 4.0], dtype=torch.float64)
+    )
 
 
 def test_lsr_check_names_the_floor():
     psf = Psf(torch.full((1, 10, 10), 0.01), torch.tensor([0.1], dtype=torch.float64))
     lines = lsr.hooks.check(lsr(psf), psf)
     assert lines[0].ok
-    assert lines[1].text == "light spread evenly over the field would give a laser suppression ratio of 0.1"
+    assert (
+        lines[1].text
+        == "light spread evenly over the field would give a laser suppression ratio of 0.1"
+    )
     assert not lsr.hooks.check(torch.tensor([1.2]), psf)[0].ok
 
 
 @pytest.mark.parametrize("rounding", ["nearest", "truncation", "dithered_floor"])
 @pytest.mark.parametrize(
-    ("gain", "unit", "bits"), [(0.37, "e-/DN", 16), (0.37, "DN/e-", 16), (7.0, "e-/DN", 12), (1e4, "e-/DN", 1)]
+    ("gain", "unit", "bits"),
+    [(0.37, "e-/DN", 16), (0.37, "DN/e-", 16), (7.0, "e-/DN", 12), (1e4, "e-/DN", 1)],
 )
 def test_a_full_pixel_counts_whether_well_or_converter_ends_first(gain, unit, bits, rounding):
     sensor = {"gain": read_quantity(f"{gain} {unit}", "DN/e-"), "bits": bits}
@@ -74,11 +80,15 @@ def test_the_peak_of_a_laser_alone_is_its_strength(strength):
 def test_the_multiple_of_the_paper_is_a_reading_and_no_verdict_and_can_be_left_out():
     """A multiple of saturation is no damage: the same light exceeds it after a longer exposure."""
     light, one = torch.full((1, 2, 2), 1e5), torch.ones(1)
-    short, long = (peak_irradiance(light, bands(550e-9), one, **{**SENSOR, "exposure": t}) for t in (1e-3, 1.0))
+    short, long = (
+        peak_irradiance(light, bands(550e-9), one, **{**SENSOR, "exposure": t}) for t in (1e-3, 1.0)
+    )
     assert (float(short.above), float(long.above)) == (0.0, 1.0)
     (check,) = peak_irradiance.hooks.check(long, exposure=1.0)
     assert check.ok
-    assert check.text.endswith("above the 1e+06 that the paper names (C10), which is no threshold of damage")
+    assert check.text.endswith(
+        "above the 1e+06 that the paper names (C10), which is no threshold of damage"
+    )
     none = peak_irradiance(light, bands(550e-9), one, **{**SENSOR, "exposure": 1.0}, multiple=None)
     assert math.isnan(float(none.above))
     (check,) = peak_irradiance.hooks.check(none, exposure=1.0, multiple=None)
@@ -91,7 +101,9 @@ def test_scene_and_lasers_add():
     factor = level(scene, visible, torch.ones(1, 2), strength=0.7, **SENSOR)
     found = peak_irradiance(scene, visible, factor, **SENSOR)
     assert float(found.irradiance) == pytest.approx(0.7, rel=1e-5)
-    electrons = 0.56 * expose(scene, visible, torch.ones(1, 2), factor, pixel_pitch=2.9e-6, exposure=0.1)
+    electrons = 0.56 * expose(
+        scene, visible, torch.ones(1, 2), factor, pixel_pitch=2.9e-6, exposure=0.1
+    )
     assert float(electrons.max()) == pytest.approx(0.7 * 25500, rel=1e-5)
     even = saturation(visible, **SENSOR)[:, None, None].expand(2, 4, 4).float()
     both = peak_irradiance(scene, visible, factor, [even, even], [visible, visible], **SENSOR)
@@ -103,11 +115,18 @@ def test_scene_and_lasers_add():
 
 @pytest.mark.parametrize("exposure", [1e-3, 1e-2, 0.1, 3.0])
 def test_the_peak_is_counted_in_saturation_of_its_own_exposure(exposure):
-    """The same light is as many multiples of I_sat as the exposure is long: h c / (lambda QE) well / (t p^2)."""
+    """The same light is as many multiples of I_sat as the exposure is long: h c / (lambda QE)
+    well / (t p^2).
+    """
     light, line = torch.full((1, 2, 2), 3.0), bands(532e-9)
     one_well = 25500 / 0.56 * 6.62607015e-34 * 299792458 / 532e-9 / (exposure * 2.9e-6**2)
     found = peak_irradiance(
-        torch.zeros(1, 2, 2), line, torch.ones(1), [light], [line], **{**SENSOR, "exposure": exposure}
+        torch.zeros(1, 2, 2),
+        line,
+        torch.ones(1),
+        [light],
+        [line],
+        **{**SENSOR, "exposure": exposure},
     )
     assert float(found.irradiance) == pytest.approx(3.0 / one_well, rel=1e-6)
     assert float(found.laser) == pytest.approx(3.0, rel=1e-6)
@@ -115,11 +134,18 @@ def test_the_peak_is_counted_in_saturation_of_its_own_exposure(exposure):
 
 def test_every_spot_needs_its_line():
     with pytest.raises(ValueError, match="1 spots and 0 laser lines"):
-        peak_irradiance(torch.ones(1, 2, 2), bands(5e-7), torch.ones(1), [torch.ones(1, 2, 2)], [], **SENSOR)
+        peak_irradiance(
+            torch.ones(1, 2, 2), bands(5e-7), torch.ones(1), [torch.ones(1, 2, 2)], [], **SENSOR
+        )
 
 
 def test_a_level_of_zero_is_dark():
-    assert float(peak_irradiance(torch.ones(1, 2, 2), bands(5e-7), torch.zeros(1), **SENSOR).irradiance) == 0.0
+    assert (
+        float(
+            peak_irradiance(torch.ones(1, 2, 2), bands(5e-7), torch.zeros(1), **SENSOR).irradiance
+        )
+        == 0.0
+    )
 
 
 def channels(light, weights):
@@ -128,13 +154,21 @@ def channels(light, weights):
 
 
 def test_the_peak_of_channels_is_that_of_all_bands():
-    visible, seen = bands(450e-9, 520e-9, 600e-9), torch.tensor([[0.1, 0.9, 0.2]], dtype=torch.float64)
+    visible, seen = (
+        bands(450e-9, 520e-9, 600e-9),
+        torch.tensor([[0.1, 0.9, 0.2]], dtype=torch.float64),
+    )
     scene = torch.rand(3, 6, 7, dtype=torch.float64)
     summed = channels(scene, rows(visible, seen))
     factor = level(scene, visible, seen, strength=0.7, **SENSOR)
     laser = torch.rand(3, 6, 7, dtype=torch.float64)
-    found = [peak_irradiance(x, visible, factor, [laser], [visible], **SENSOR) for x in (scene, summed)]
+    found = [
+        peak_irradiance(x, visible, factor, [laser], [visible], **SENSOR) for x in (scene, summed)
+    ]
     torch.testing.assert_close(*found, rtol=1e-12, atol=0)
     with pytest.raises(ValueError, match="from every combination of these weights"):
         peak_irradiance(channels(scene, rows(visible, seen)[:1]), visible, factor, **SENSOR)
-    assert (peak_irradiance.accepts_channel_sums, peak_irradiance.needs_band_invariant) == (("image",), ("level",))
+    assert (peak_irradiance.accepts_channel_sums, peak_irradiance.needs_band_invariant) == (
+        ("image",),
+        ("level",),
+    )

@@ -1,4 +1,6 @@
-"""PSFs averaged over pixels, in NumPy and double precision, from the transfer function: no line of the nodes."""
+"""PSFs averaged over pixels, in NumPy and double precision, from the transfer function: no line
+of the nodes.
+"""
 
 import numpy as np
 
@@ -14,9 +16,11 @@ def autocorrelation(field):
 
 
 def averaged(field, light, alpha, shape, spot=(0.0, 0.0)):
-    """The share of ``light`` in each pixel: a Fourier series of the lags, each averaged over the pixel by a sinc.
+    """The share of ``light`` in each pixel: a Fourier series of the lags, each averaged over the
+    pixel by a sinc.
 
-    ``alpha`` is in turns for each sample and pixel; ``spot`` in pixels from the middle pixel n // 2.
+    ``alpha`` is in turns for each sample and pixel; ``spot`` in pixels from the middle pixel n //
+    2.
     """
     lags = autocorrelation(field)
     axes = []
@@ -28,7 +32,9 @@ def averaged(field, light, alpha, shape, spot=(0.0, 0.0)):
 
 
 def by_points(field, light, alpha, shape, spot=(0.0, 0.0)):
-    """The same by Gauss-Legendre points across each pixel, with the envelope of square pupil samples."""
+    """The same by Gauss-Legendre points across each pixel, with the envelope of square pupil
+    samples.
+    """
     x, w = np.polynomial.legendre.leggauss(10 + int(3 * alpha * max(field.shape)))
     total = np.zeros(shape)
     j = [np.arange(count) - (count - 1) / 2 for count in field.shape]

@@ -1,4 +1,6 @@
-"""Random cameras whose PSF is averaged over pixels: drawn from a seed, and compared with separate code."""
+"""Random cameras whose PSF is averaged over pixels: drawn from a seed, and compared with
+separate code.
+"""
 
 from typing import NamedTuple
 
@@ -33,10 +35,14 @@ class Camera(NamedTuple):
 
 
 def drawn(seed):
-    """A camera from f/1.2 to f/32, 1 to 20 um and 355 to 1600 nm, or None where its samples cannot carry a window."""
+    """A camera from f/1.2 to f/32, 1 to 20 um and 355 to 1600 nm, or None where its samples
+    cannot carry a window.
+    """
     rng = np.random.default_rng(seed)
     ranges = ((1.2, 32), (1e-6, 20e-6), (355e-9, 1.6e-6))
-    number, pixel, wavelength = (float(np.exp(rng.uniform(np.log(low), np.log(high)))) for low, high in ranges)
+    number, pixel, wavelength = (
+        float(np.exp(rng.uniform(np.log(low), np.log(high)))) for low, high in ranges
+    )
     side = int(rng.integers(40, LARGEST + 1))
     samples = (side, side - int(rng.integers(0, 3)) if rng.random() < 0.3 else side)
     period = number * samples[0] * wavelength / pixel  # pixels after which the PSF repeats
@@ -45,8 +51,19 @@ def drawn(seed):
     shape = tuple(int(n) for n in np.ceil(rng.uniform(0.05, 1.2, 2) * period))
     if max(shape) > most or max(shape) > 600:
         return None
-    square = bool(rng.random() < 0.2) and samples[0] < 3 * period  # more fringes a pixel need too many points
-    return Camera(seed, number, pixel, wavelength, samples, shape, spot, square, float(rng.choice([0.0, 5e-8, 5e-7])))
+    # more fringes a pixel need too many points
+    square = bool(rng.random() < 0.2) and samples[0] < 3 * period
+    return Camera(
+        seed,
+        number,
+        pixel,
+        wavelength,
+        samples,
+        shape,
+        spot,
+        square,
+        float(rng.choice([0.0, 5e-8, 5e-7])),
+    )
 
 
 def pupil_of(camera):
@@ -79,7 +96,9 @@ def energy(camera):
 
 
 def compared(camera):
-    """The largest difference from separate double-precision code, relative to the peak of the clear lens."""
+    """The largest difference from separate double-precision code, relative to the peak of the
+    clear lens.
+    """
     pupil = pupil_of(camera)
     phase = own.SILICA * pupil.height.double().numpy() / camera.wavelength
     clear = pupil.aperture.double().numpy()

@@ -27,7 +27,9 @@ def test_the_spread_is_that_of_the_paper_read_with_a_sense():
 
 
 @settings(max_examples=40, deadline=None)
-@given(seed=st.integers(0, 2**31), share=st.floats(0, 1), y=st.integers(1, 64), x=st.integers(1, 64))
+@given(
+    seed=st.integers(0, 2**31), share=st.floats(0, 1), y=st.integers(1, 64), x=st.integers(1, 64)
+)
 def test_a_drawn_spot_falls_on_the_sensor(seed, share, y, x):
     place = drawn(seed, share=share, shape=(y, x)) * 0.11 / 2.9e-6
     assert abs(float(place[0])) <= y / 2 + 1e-9
@@ -36,11 +38,18 @@ def test_a_drawn_spot_falls_on_the_sensor(seed, share, y, x):
 
 
 def test_the_printed_rule_is_refused_with_its_shift():
-    with pytest.raises(ParameterError, match=r"6\.67 rad would put the spot 0\.73 m off the axis") as caught:
-        optics.direction.hooks.preflight(angle=None, **PAPER, **RULE | {"rule": "focal_length_over_width"})
+    with pytest.raises(
+        ParameterError, match=r"6\.67 rad would put the spot 0\.73 m off the axis"
+    ) as caught:
+        optics.direction.hooks.preflight(
+            angle=None, **PAPER, **RULE | {"rule": "focal_length_over_width"}
+        )
     assert caught.value.parameter == "rule"
     assert (
-        optics.direction.hooks.preflight(angle=(0.0, 0.0), **PAPER, **RULE | {"rule": "focal_length_over_width"}) == []
+        optics.direction.hooks.preflight(
+            angle=(0.0, 0.0), **PAPER, **RULE | {"rule": "focal_length_over_width"}
+        )
+        == []
     )
 
 
@@ -60,5 +69,7 @@ def test_a_wired_direction_moves_the_spot_like_an_angle():
     camera = {"focal_length": 0.11, "pixel_pitch": 2.9e-6, "shape": (24, 24)}
     towards = torch.tensor([1.3e-4, -0.7e-4], dtype=torch.float64)
     wired = optics.psf(pupil, towards, **camera)
-    assert torch.equal(wired.intensity, optics.psf(pupil, angle=(1.3e-4, -0.7e-4), **camera).intensity)
+    assert torch.equal(
+        wired.intensity, optics.psf(pupil, angle=(1.3e-4, -0.7e-4), **camera).intensity
+    )
     assert not torch.equal(wired.intensity, optics.psf(pupil, **camera).intensity)

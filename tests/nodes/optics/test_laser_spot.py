@@ -33,14 +33,21 @@ def test_the_clear_peak_is_strength_times_saturation(strength):
 
 
 def test_each_wavelength_sends_its_share_of_the_energy():
-    energy = laser_irradiance(clear_psf(), LINE, strength=10.0, **SENSOR).double() / clear_psf().intensity
-    torch.testing.assert_close(energy[:, 2, 2] / energy[:, 2, 2].sum(), LINE.weights, rtol=1e-6, atol=0.0)
+    energy = (
+        laser_irradiance(clear_psf(), LINE, strength=10.0, **SENSOR).double()
+        / clear_psf().intensity
+    )
+    torch.testing.assert_close(
+        energy[:, 2, 2] / energy[:, 2, 2].sum(), LINE.weights, rtol=1e-6, atol=0.0
+    )
 
 
 def test_an_element_that_suppresses_by_a_thousand_does_so_here():
     weak = Psf(clear_psf().intensity / 1000, CLEAR)
     found = laser_irradiance(weak, LINE, strength=1e6, **SENSOR).double()
-    assert float((found / saturation(LINE, **SENSOR)[:, None, None]).sum(0).max()) == pytest.approx(1e3, rel=1e-6)
+    assert float((found / saturation(LINE, **SENSOR)[:, None, None]).sum(0).max()) == pytest.approx(
+        1e3, rel=1e-6
+    )
     assert (
         laser_irradiance.hooks.check(found, weak, LINE, strength=1e6, **SENSOR)[0].text
         == "peak of the spot 20.22 W/m2, strength 1e+06 at the nominal exposure of 0.1 s"
@@ -48,7 +55,9 @@ def test_an_element_that_suppresses_by_a_thousand_does_so_here():
 
 
 def photons_of(found, seen, at=(2, 2)):
-    """Photons of each channel in one pixel, from the photoelectric sum: lambda / (h c) x irradiance x time x area."""
+    """Photons of each channel in one pixel, from the photoelectric sum: lambda / (h c) x
+    irradiance x time x area.
+    """
     joules = found[:, at[0], at[1]] * 0.1 * 2.9e-6**2
     return (seen * joules * LINE.centres / (6.62607015e-34 * 299792458.0)).sum(-1)
 
@@ -56,8 +65,12 @@ def photons_of(found, seen, at=(2, 2)):
 @pytest.mark.parametrize("strength", [1.0, 40.0])
 @pytest.mark.parametrize("row", [0, 1, 2])
 def test_a_strength_of_the_first_channel_fills_one_pixel_of_it_in_every_colour(strength, row):
-    seen = torch.tensor([[0.2, 0.25, 0.3], [0.02, 0.03, 0.05], [0.1, 0.0, 0.0]], dtype=torch.float64).roll(row, 0)
-    found = laser_irradiance(clear_psf(), LINE, seen, strength=strength, meaning="first_channel", **SENSOR).double()
+    seen = torch.tensor(
+        [[0.2, 0.25, 0.3], [0.02, 0.03, 0.05], [0.1, 0.0, 0.0]], dtype=torch.float64
+    ).roll(row, 0)
+    found = laser_irradiance(
+        clear_psf(), LINE, seen, strength=strength, meaning="first_channel", **SENSOR
+    ).double()
     assert float(photons_of(found, seen).max()) * 0.56 == pytest.approx(strength * 25500, rel=1e-6)
     assert int(photons_of(found, seen).argmax()) == row
 
@@ -77,14 +90,19 @@ WATTS = LaserLight(*torch.tensor([3.0, 2e-6, 0.5, 1e-6, 2.4, 0.0, 0.0], dtype=to
 
 def test_light_in_watts_lands_whole_on_the_sensor_and_states_its_strength():
     seen = torch.full((1, 3), 0.5, dtype=torch.float64)
-    found = laser_irradiance(clear_psf(), LINE, seen, WATTS, meaning="first_channel", **SENSOR).double()
+    found = laser_irradiance(
+        clear_psf(), LINE, seen, WATTS, meaning="first_channel", **SENSOR
+    ).double()
     share = (clear_psf().intensity.double().sum((-2, -1)) * LINE.weights).sum()
     assert float(found.sum()) * 2.9e-6**2 == pytest.approx(2e-6 * float(share), rel=1e-6)
     hook = laser_irradiance.hooks.check
     (told,) = hook(found, clear_psf(), LINE, seen, WATTS, meaning="first_channel", **SENSOR)
     strength = float(told.text.partition("a strength of ")[2].split()[0])
-    again = laser_irradiance(clear_psf(), LINE, seen, strength=strength, meaning="first_channel", **SENSOR).double()
-    torch.testing.assert_close(again, found * (2.4 / 3.0), rtol=1e-3, atol=0.0)  # of the peak of the tapered pupil
+    again = laser_irradiance(
+        clear_psf(), LINE, seen, strength=strength, meaning="first_channel", **SENSOR
+    ).double()
+    # of the peak of the tapered pupil
+    torch.testing.assert_close(again, found * (2.4 / 3.0), rtol=1e-3, atol=0.0)
 
 
 def test_no_laser_is_no_light():
@@ -93,7 +111,9 @@ def test_no_laser_is_no_light():
 
 def test_gradient():
     kernel = clear_psf().intensity.double().requires_grad_()
-    assert torch.autograd.gradcheck(lambda k: laser_irradiance(Psf(k, CLEAR), LINE, strength=3.0, **SENSOR), (kernel,))
+    assert torch.autograd.gradcheck(
+        lambda k: laser_irradiance(Psf(k, CLEAR), LINE, strength=3.0, **SENSOR), (kernel,)
+    )
 
 
 def test_psf_and_line_must_agree():

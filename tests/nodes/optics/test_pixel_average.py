@@ -1,4 +1,6 @@
-"""The PSF averaged over pixels: against its transfer function, in all shapes, and what is refused."""
+"""The PSF averaged over pixels: against its transfer function, in all shapes, and what is
+refused.
+"""
 
 import itertools
 import math
@@ -11,8 +13,8 @@ from hypothesis import strategies as st
 
 from neusee.nodes import ParameterError, optics
 from neusee.nodes.optics import _pixel_average, psf
-from neusee.nodes.optics._lens_band import cut_off, round_lens
-from neusee.nodes.optics._pixel_filter import averaged, fine_axis
+from neusee.nodes.optics._lens import cut_off, round_lens
+from neusee.nodes.optics._pixel_average import averaged, fine_axis
 from neusee.nodes.values import Pupil
 from tests.nodes.optics import own_pixel_average as own
 from tests.nodes.optics.random_pixel_cameras import compared, drawn, energy
@@ -68,9 +70,16 @@ def test_a_pixel_has_the_mean_of_its_square(samples, number, pixel, shape, spot)
 
 def test_square_pupil_samples_wear_their_envelope_within_each_pixel():
     pupil = pupil_of(own.disc(24), height=rough((24, 24)), number=2.0)
-    light, alpha, shape, spot = float((pupil.aperture**2).sum()), turns(pupil, 6e-6), (9, 8), (0.4, 0.0)
+    light, alpha, shape, spot = (
+        float((pupil.aperture**2).sum()),
+        turns(pupil, 6e-6),
+        (9, 8),
+        (0.4, 0.0),
+    )
     expected = own.by_points(field_of(pupil), light, alpha, shape, spot)
-    camera = dict(focal_length=FOCAL, pixel_pitch=6e-6, shape=shape, sensor="integrated", pixel="zoh")
+    camera = dict(
+        focal_length=FOCAL, pixel_pitch=6e-6, shape=shape, sensor="integrated", pixel="zoh"
+    )
     found = psf(pupil, **camera, angle=(0.4 * 6e-6 / FOCAL, 0.0), precision="double")
     assert np.abs(found.intensity[0].numpy() - expected).max() < 1e-11 * float(found.clear_peak)
     centre = own.by_points(pupil.aperture.numpy() + 0j, light, alpha, (1, 1))[0, 0]
@@ -90,11 +99,24 @@ def test_wings_are_right_to_1e_minus_10_of_the_peak_in_double():
 
 def test_strips_change_nothing(monkeypatch):
     pupil = pupil_of(own.disc(64), (450e-9, 640e-9), rough((64, 64)))
-    camera = dict(focal_length=FOCAL, pixel_pitch=3.45e-6, shape=(21, 16), sensor="integrated", precision="double")
+    camera = dict(
+        focal_length=FOCAL,
+        pixel_pitch=3.45e-6,
+        shape=(21, 16),
+        sensor="integrated",
+        precision="double",
+    )
     angle = (1e-4, -3e-5)
     at_once = psf(pupil, **camera, angle=angle).intensity
     monkeypatch.setattr(_pixel_average, "FINE_SAMPLES", 1)
-    assert len(_pixel_average.strips(*_pixel_average.fine_axes((64, 64), (21, 16), 0.03, torch.float64))) == 21
+    assert (
+        len(
+            _pixel_average.strips(
+                *_pixel_average.fine_axes((64, 64), (21, 16), 0.03, torch.float64)
+            )
+        )
+        == 21
+    )
     row_by_row = psf(pupil, **camera, angle=angle).intensity
     torch.testing.assert_close(row_by_row, at_once, rtol=0, atol=1e-12 * float(at_once.max()))
 
@@ -123,24 +145,41 @@ def test_the_filter_averages_every_fringe_of_the_band(pixels, bandwidth, errors)
 @pytest.mark.parametrize("pixel", ["point", "zoh"])
 def test_gradients_are_those_of_the_definition(pixel):
     pupil = pupil_of(own.disc(10), height=rough((10, 10)), number=4.0)
-    camera = dict(focal_length=FOCAL, pixel_pitch=3.45e-6, shape=(3, 4), sensor="integrated", pixel=pixel)
-    factors = [x.clone().requires_grad_() for x in (pupil.amplitude, pupil.height * 1e6, pupil.path * 1e6)]
+    camera = dict(
+        focal_length=FOCAL, pixel_pitch=3.45e-6, shape=(3, 4), sensor="integrated", pixel=pixel
+    )
+    factors = [
+        x.clone().requires_grad_() for x in (pupil.amplitude, pupil.height * 1e6, pupil.path * 1e6)
+    ]
 
     def light(amplitude, height, path):
         changed = pupil._replace(amplitude=0.9 * amplitude, height=height * 1e-6, path=path * 1e-6)
         return psf(changed, **camera, angle=(2e-5, 1e-5), precision="double").intensity
 
     assert torch.autograd.gradcheck(light, factors, atol=1e-7)
-    _, slope = torch.func.jvp(light, tuple(x.detach() for x in factors), tuple(torch.ones_like(x) for x in factors))
+    _, slope = torch.func.jvp(
+        light, tuple(x.detach() for x in factors), tuple(torch.ones_like(x) for x in factors)
+    )
     weight = torch.rand_like(slope)
     grads = torch.autograd.grad((light(*factors) * weight).sum(), factors)
-    assert float((slope * weight).sum()) == pytest.approx(sum(float(g.sum()) for g in grads), rel=1e-8)
+    assert float((slope * weight).sum()) == pytest.approx(
+        sum(float(g.sum()) for g in grads), rel=1e-8
+    )
 
 
 def test_what_the_samples_cannot_carry_is_refused_with_the_samples_to_write():
-    pupil, camera = pupil_of(own.disc(100), number=4.0), dict(focal_length=FOCAL, pixel_pitch=3.45e-6, shape=(256, 200))
+    pupil, camera = (
+        pupil_of(own.disc(100), number=4.0),
+        dict(focal_length=FOCAL, pixel_pitch=3.45e-6, shape=(256, 200)),
+    )
     pupil = pupil._replace(diameter=torch.tensor(FOCAL / 4, dtype=torch.float64))
-    known = {"angle": (0.0, 0.0), "pixel": "point", "sensor": "integrated", "pupil": pupil, "direction": None}
+    known = {
+        "angle": (0.0, 0.0),
+        "pixel": "point",
+        "sensor": "integrated",
+        "pupil": pupil,
+        "direction": None,
+    }
     with pytest.raises(ParameterError) as refused:
         psf.hooks.preflight(**camera, **known)
     text = str(refused.value)
@@ -148,7 +187,9 @@ def test_what_the_samples_cannot_carry_is_refused_with_the_samples_to_write():
     pitch = float(text.split('optics.pitch="')[1].split(" um")[0]) * 1e-6
     assert samples * pitch == pytest.approx(FOCAL / 4, rel=1e-9)
     assert samples % 2 == 0
-    finer = pupil._replace(height=torch.zeros(samples, samples), pitch=torch.tensor(pitch, dtype=torch.float64))
+    finer = pupil._replace(
+        height=torch.zeros(samples, samples), pitch=torch.tensor(pitch, dtype=torch.float64)
+    )
     assert psf.hooks.preflight(**camera, **{**known, "pupil": finer}) == []
     coarser = torch.tensor(pitch * samples / (samples - 2), dtype=torch.float64)
     fewer = pupil._replace(height=torch.zeros(samples - 2, samples - 2), pitch=coarser)
@@ -157,7 +198,9 @@ def test_what_the_samples_cannot_carry_is_refused_with_the_samples_to_write():
 
 
 def test_points_further_apart_than_wavelength_times_f_number_are_refused():
-    """The sum of points is the light up to that pitch; beyond it, 2.3 times at f/4, 16.9 times at f/1.4."""
+    """The sum of points is the light up to that pitch; beyond it, 2.3 times at f/4, 16.9 times
+    at f/1.4.
+    """
     bands = (640e-9, 532e-9)
     for number, refused in ((8.0, False), (6.4, True), (4.0, True), (1.4, True)):
         pupil = pupil_of(own.disc(160), bands, number=number)
@@ -178,7 +221,9 @@ def test_points_further_apart_than_wavelength_times_f_number_are_refused():
 
 
 def test_a_narrow_stop_on_a_wide_grid_is_not_taken_for_a_fast_lens():
-    """f/16 on a grid of f/4: points 3.45 um apart are fine enough, whether the diameter is named or not."""
+    """f/16 on a grid of f/4: points 3.45 um apart are fine enough, whether the diameter is named
+    or not.
+    """
     wide = own.disc(120)
     v = (np.arange(120) - 59.5) / 60
     narrow = wide * (v[:, None] ** 2 + v**2 <= 1 / 16)
@@ -188,14 +233,18 @@ def test_a_narrow_stop_on_a_wide_grid_is_not_taken_for_a_fast_lens():
 
 
 def test_light_that_the_pupil_does_not_pass_is_an_error():
-    """Also behind a grey filter, where the window holds less than all light but more than the pupil passes."""
+    """Also behind a grey filter, where the window holds less than all light but more than the
+    pupil passes.
+    """
     pupil = pupil_of(own.disc(160), number=1.4)
     camera = dict(focal_length=FOCAL, pixel_pitch=3.45e-6, shape=(9, 9), sensor="point_as_printed")
     for grey in (1.0, 0.1):
         with pytest.raises(ValueError, match="pupil passes only"):
             psf(pupil._replace(amplitude=grey * pupil.amplitude), **camera)
     whole = psf(
-        pupil._replace(amplitude=0.1 * pupil.amplitude), **{**camera, "sensor": "integrated"}, precision="double"
+        pupil._replace(amplitude=0.1 * pupil.amplitude),
+        **{**camera, "sensor": "integrated"},
+        precision="double",
     )
     assert 0.0095 < float(whole.intensity.sum()) <= 0.01
 
@@ -213,18 +262,26 @@ def test_a_very_fast_lens_is_said_to_be_beyond_scalar_theory():
 def test_a_grid_of_a_spot_that_misses_peaks_is_told_by_how_much():
     """Points 1.2 times half of wavelength x f-number apart: four of them about an Airy pattern."""
     number, pitch = 4.0, 1.2 * 532e-9 * 4.0 / 2
-    pupil = pupil_of(own.disc(160), number=number)._replace(diameter=torch.tensor(FOCAL / number, dtype=torch.float64))
+    pupil = pupil_of(own.disc(160), number=number)._replace(
+        diameter=torch.tensor(FOCAL / number, dtype=torch.float64)
+    )
     known = {"angle": (0.0, 0.0), "pixel": "point", "direction": None, "sensor": "point"}
     camera = dict(focal_length=FOCAL, shape=(8, 8))
     told = psf.hooks.preflight(pupil=pupil, pixel_pitch=pitch, **camera, **known)
-    between = psf(pupil, pixel_pitch=pitch, **camera, angle=(0.5 * pitch / FOCAL, 0.5 * pitch / FOCAL))
+    between = psf(
+        pupil, pixel_pitch=pitch, **camera, angle=(0.5 * pitch / FOCAL, 0.5 * pitch / FOCAL)
+    )
     lost = 1 - float(between.intensity.max() / between.clear_peak)
     assert told == [note for note in told if f"up to {lost:.0%} too low" in note] != []
     assert psf.hooks.preflight(pupil=pupil, pixel_pitch=pitch / 1.21, **camera, **known) == []
 
 
 def test_the_pupil_names_its_clear_diameter():
-    for aperture, diameter, expected in (("inscribed", 3e-3, 3e-3), ("inscribed", 9e-3, 5e-3), ("clipped", 6e-3, 5e-3)):
+    for aperture, diameter, expected in (
+        ("inscribed", 3e-3, 3e-3),
+        ("inscribed", 9e-3, 5e-3),
+        ("clipped", 6e-3, 5e-3),
+    ):
         stop = optics.stop(samples=50, pitch=1e-4, diameter=diameter, aperture=aperture)
         bands = optics_bands()
         pupil = optics.pupil(torch.zeros(50, 50), 0.46 + 0 * bands.centres, bands, stop)
@@ -242,14 +299,18 @@ def optics_bands():
 @pytest.mark.parametrize(("number", "pixel"), [(13.6, 2.9e-6), (4.0, 3.45e-6), (1.4, 6e-6)])
 def test_the_lens_band_of_a_psf_does_not_depend_on_its_sampling(number, pixel):
     pupil = pupil_of(own.disc(256), number=number)
-    camera = dict(focal_length=FOCAL, pixel_pitch=pixel, shape=(5, 5), sensor="integrated", precision="double")
+    camera = dict(
+        focal_length=FOCAL, pixel_pitch=pixel, shape=(5, 5), sensor="integrated", precision="double"
+    )
     found = psf(pupil, **camera)
     area = float(pupil.aperture.sum()) * float(pupil.pitch) ** 2
     expected = math.sqrt(4 * area / math.pi) * pixel / (532e-9 * FOCAL)
     assert float(cut_off(found)) == pytest.approx(expected, rel=1e-9)
     assert found.averaged.tolist() == [1.0]
     lens = round_lens(found.cut_off, found.averaged)
-    assert float(found.clear_peak) == pytest.approx(float(lens.peak) * math.pi / 4 * expected**2, rel=3e-3)
+    assert float(found.clear_peak) == pytest.approx(
+        float(lens.peak) * math.pi / 4 * expected**2, rel=3e-3
+    )
 
 
 def test_random_cameras_hold_no_more_light_than_the_pupil_passes():

@@ -28,7 +28,9 @@ def _one_thread():
 
 
 def make(n=128, wavelengths=(GREEN,), height=None, path=None, diameter=DIAMETER, shape=None):
-    """Inscribed disc of ``n`` samples; height and path are functions of (v, u) in units of the pupil's radius."""
+    """Inscribed disc of ``n`` samples; height and path are functions of (v, u) in units of the
+    pupil's radius.
+    """
     rows, columns = shape or (n, n)
     v, u = ((torch.arange(k, dtype=torch.float64) - (k - 1) / 2) / (n / 2) for k in (rows, columns))
     v, u = torch.meshgrid(v, u, indexing="ij")
@@ -74,13 +76,19 @@ def test_clear_pupil_is_the_airy_pattern(wavelength):
 
 
 def test_first_dark_ring_stands_at_1_22_lambda_f_over_d():
-    fine = psf(make(720), focal_length=FOCAL, pixel_pitch=0.02e-6, shape=(1, 1201)).intensity[0, 0].double()
+    fine = (
+        psf(make(720), focal_length=FOCAL, pixel_pitch=0.02e-6, shape=(1, 1201))
+        .intensity[0, 0]
+        .double()
+    )
     dark = (int(fine[600 + 300 :].argmin()) + 300) * 0.02e-6
     assert dark == pytest.approx(1.2197 * GREEN * FOCAL / DIAMETER, rel=2e-3)
 
 
 def rough(v, u):
-    return 1e-6 * torch.rand(v.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    return 1e-6 * torch.rand(
+        v.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(3)
+    )
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
@@ -97,23 +105,35 @@ def test_all_light_lands_in_one_alias_free_window(precision):
 
 def centroid(image):
     y, x = (torch.arange(n, dtype=torch.float64) - n // 2 for n in image.shape)
-    return float((image.sum(1) * y).sum() / image.sum()), float((image.sum(0) * x).sum() / image.sum())
+    return float((image.sum(1) * y).sum() / image.sum()), float(
+        (image.sum(0) * x).sum() / image.sum()
+    )
 
 
 def test_a_tilt_towards_plus_y_moves_the_spot_to_plus_y():
     slope = 10.0 * PIXEL / FOCAL * DIAMETER / 2
-    y, x = centroid(psf(make(256, path=lambda v, u: slope * v), shape=(65, 65), **SENSOR).intensity[0].double())
+    y, x = centroid(
+        psf(make(256, path=lambda v, u: slope * v), shape=(65, 65), **SENSOR).intensity[0].double()
+    )
     assert (y, x) == pytest.approx((10, 0), abs=0.1)
-    y, x = centroid(psf(make(256, path=lambda v, u: slope * u), shape=(65, 65), **SENSOR).intensity[0].double())
+    y, x = centroid(
+        psf(make(256, path=lambda v, u: slope * u), shape=(65, 65), **SENSOR).intensity[0].double()
+    )
     assert (y, x) == pytest.approx((0, 10), abs=0.1)
 
 
 def test_an_angle_is_a_shift_by_f_n_to_a_fraction_of_a_pixel():
     pupil = make(128, height=rough, diameter=128 * 20e-6)
     plain = psf(pupil, shape=(31, 31), **SENSOR).intensity
-    moved = psf(pupil, shape=(31, 31), angle=(3 * PIXEL / FOCAL, -5 * PIXEL / FOCAL), **SENSOR).intensity
-    torch.testing.assert_close(moved[:, 3:, :-5], plain[:, :-3, 5:], rtol=0, atol=1e-6 * float(plain.max()))
-    tilted = pupil._replace(path=make(128, path=lambda v, u: 0.3 * PIXEL / FOCAL * 64 * 20e-6 * v).path)
+    moved = psf(
+        pupil, shape=(31, 31), angle=(3 * PIXEL / FOCAL, -5 * PIXEL / FOCAL), **SENSOR
+    ).intensity
+    torch.testing.assert_close(
+        moved[:, 3:, :-5], plain[:, :-3, 5:], rtol=0, atol=1e-6 * float(plain.max())
+    )
+    tilted = pupil._replace(
+        path=make(128, path=lambda v, u: 0.3 * PIXEL / FOCAL * 64 * 20e-6 * v).path
+    )
     part = psf(pupil, shape=(31, 31), angle=(0.3 * PIXEL / FOCAL, 0.0), **SENSOR).intensity
     other = psf(tilted, shape=(31, 31), **SENSOR).intensity
     torch.testing.assert_close(part, other, rtol=0, atol=1e-6 * float(plain.max()))
@@ -121,7 +141,9 @@ def test_an_angle_is_a_shift_by_f_n_to_a_fraction_of_a_pixel():
 
 @pytest.mark.parametrize("waves", [0.25, 0.5, 1.0, 1.5, 2.0])
 def test_defocus_dims_the_axis_by_sinc_squared(waves):
-    result = psf(make(1080, path=lambda v, u: waves * GREEN * (v**2 + u**2)), shape=(1, 1), **SENSOR)
+    result = psf(
+        make(1080, path=lambda v, u: waves * GREEN * (v**2 + u**2)), shape=(1, 1), **SENSOR
+    )
     ratio = float(result.intensity[0, 0, 0] / result.clear_peak[0])
     assert ratio == pytest.approx(float(torch.sinc(torch.tensor(waves)) ** 2), abs=3e-4)
 
@@ -134,9 +156,15 @@ def test_a_small_aberration_dims_the_axis_by_exp_of_minus_its_variance():
 
 
 def test_pillars_wear_the_sinc_envelope_of_their_square():
-    """Drawn as 8 x 8 finer samples, what midpoints miss falls to 1/64; with the envelope nothing is missed."""
+    """Drawn as 8 x 8 finer samples, what midpoints miss falls to 1/64; with the envelope nothing
+    is missed.
+    """
     pupil = make(48, height=rough, diameter=48 * 80e-6)
-    fine = Pupil(*(p.repeat_interleave(8, 0).repeat_interleave(8, 1) for p in pupil[:4]), *pupil[4:6], pupil.pitch / 8)
+    fine = Pupil(
+        *(p.repeat_interleave(8, 0).repeat_interleave(8, 1) for p in pupil[:4]),
+        *pupil[4:6],
+        pupil.pitch / 8,
+    )
     truth = psf(fine, shape=(200, 200), precision="double", **SENSOR).intensity
     held = psf(pupil, shape=(200, 200), pixel="zoh", precision="double", **SENSOR).intensity
     plain = psf(pupil, shape=(200, 200), precision="double", **SENSOR).intensity
@@ -148,13 +176,17 @@ def test_pillars_wear_the_sinc_envelope_of_their_square():
 def test_integrated_pixels_are_the_mean_over_their_square(wavelength):
     pupil = make(128, (wavelength,))
     result = psf(pupil, shape=(15, 15), sensor="integrated", precision="double", **SENSOR)
-    fine = psf(pupil, focal_length=FOCAL, pixel_pitch=PIXEL / 25, shape=(375, 375), precision="double").intensity[0]
+    fine = psf(
+        pupil, focal_length=FOCAL, pixel_pitch=PIXEL / 25, shape=(375, 375), precision="double"
+    ).intensity[0]
     fine = torch.roll(fine, (0, 0), (0, 1)) * 625
     mean = torch.nn.functional.avg_pool2d(fine[None], 25)[0]
     # 25 midpoints a side: their own error is (1/25)^2 / 24 of the curvature
     torch.testing.assert_close(result.intensity[0], mean, rtol=0, atol=1.5e-3 * float(mean.max()))
     assert float(result.intensity[0, 7, 7]) == pytest.approx(float(result.clear_peak[0]), rel=1e-12)
-    assert float(result.clear_peak[0]) < 0.97 * float(psf(pupil, shape=(1, 1), **SENSOR).clear_peak[0])
+    assert float(result.clear_peak[0]) < 0.97 * float(
+        psf(pupil, shape=(1, 1), **SENSOR).clear_peak[0]
+    )
 
 
 CASES = [
@@ -169,13 +201,21 @@ CASES = [
 @pytest.mark.parametrize("params", CASES)
 @pytest.mark.parametrize("shape", [(1, 1), (32, 33), (7, 128)])
 def test_the_node_agrees_with_its_reference(shape, params):
-    pupil = make(60, (420e-9, 650e-9), height=rough, path=lambda v, u: 3e-6 * (v**2 + u**3), diameter=60 * 40e-6)
+    pupil = make(
+        60,
+        (420e-9, 650e-9),
+        height=rough,
+        path=lambda v, u: 3e-6 * (v**2 + u**3),
+        diameter=60 * 40e-6,
+    )
     pupil = Pupil(*(p.float() for p in pupil[:4]), *pupil[4:])
     truth = psf.hooks.reference(pupil, shape=shape, **SENSOR, **params)
     result = psf(pupil, shape=shape, **SENSOR, **params)
     double = psf(pupil, shape=shape, precision="double", **SENSOR, **params)
     assert result.intensity.dtype == torch.float32
-    assert double.intensity.dtype == truth.intensity.dtype == result.clear_peak.dtype == torch.float64
+    assert (
+        double.intensity.dtype == truth.intensity.dtype == result.clear_peak.dtype == torch.float64
+    )
     peak = float(psf.hooks.reference(pupil, shape=(65, 65), **SENSOR).intensity.max())
     assert float((result.intensity - truth.intensity).abs().max()) < psf.rtol * peak
     assert float((double.intensity - truth.intensity).abs().max()) < 1e-12 * peak
@@ -198,9 +238,13 @@ def test_any_shape_and_any_height_is_finite_and_right(rows, columns, y, x, scale
     height = torch.rand(rows, columns) * scale
     ones = torch.ones(rows, columns)
     bands = torch.tensor([GREEN]).double()
-    pupil = Pupil(ones, ones, height, 0 * ones, bands / GREEN * 0.46, bands, torch.tensor(1e-5).double())
+    pupil = Pupil(
+        ones, ones, height, 0 * ones, bands / GREEN * 0.46, bands, torch.tensor(1e-5).double()
+    )
     result, truth = (f(pupil, shape=(y, x), **SENSOR).intensity for f in (psf, psf.hooks.reference))
-    assert float((result - truth).abs().max()) <= 3e-6 * float(psf(pupil, shape=(1, 1), **SENSOR).clear_peak)
+    assert float((result - truth).abs().max()) <= 3e-6 * float(
+        psf(pupil, shape=(1, 1), **SENSOR).clear_peak
+    )
 
 
 @pytest.mark.parametrize("method", ["direct", "folded", "bluestein", "kaiser_bessel", "fused"])
@@ -245,7 +289,8 @@ def test_a_window_beyond_the_alias_free_field_is_refused_with_numbers():
     pupil = make(64, diameter=64 * 30e-6)  # half the field: 550 nm 0.11 m / 60 um = 1.008 mm
     psf(pupil, shape=(601, 601), **SENSOR)
     with pytest.raises(
-        ValueError, match=r"reaches 1\.16 mm from the spot along x.*550 nm.*30 um carries only 1\.01 mm"
+        ValueError,
+        match=r"reaches 1\.16 mm from the spot along x.*550 nm.*30 um carries only 1\.01 mm",
     ):
         psf(pupil, shape=(601, 801), **SENSOR)
     with pytest.raises(ValueError, match="along y"):
@@ -273,7 +318,13 @@ def test_check_reads_the_energy_in_the_window():
 
 def test_a_direction_adds_to_the_angle():
     pupil = make(64, diameter=64 * 30e-6)
-    together = psf(pupil, torch.tensor([1e-4, 2e-4], dtype=torch.float64), shape=(20, 20), angle=(1e-4, 0.0), **SENSOR)
+    together = psf(
+        pupil,
+        torch.tensor([1e-4, 2e-4], dtype=torch.float64),
+        shape=(20, 20),
+        angle=(1e-4, 0.0),
+        **SENSOR,
+    )
     plain = psf(pupil, shape=(20, 20), angle=(2e-4, 2e-4), **SENSOR)
     assert torch.equal(together.intensity, plain.intensity)
 
@@ -317,7 +368,9 @@ print(int(peak.split()[1]) / 2**20)
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads the peak of a process from /proc")
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="reads the peak of a process from /proc"
+)
 def test_31_bands_at_full_size_stay_under_1_2_gigabytes():
     done = subprocess.run([sys.executable, "-c", FULL], capture_output=True, text=True, check=True)
     assert float(done.stdout) < 1.2

@@ -1,4 +1,6 @@
-"""What a PSF refuses, at its borders: one pixel within the alias-free field, and light just above what passes."""
+"""What a PSF refuses, at its borders: one pixel within the alias-free field, and light just
+above what passes.
+"""
 
 import re
 
@@ -6,11 +8,12 @@ import pytest
 import torch
 
 from neusee.nodes import doe, optics
-from neusee.nodes.optics._psf_limits import refuse_gained_light
+from neusee.nodes.optics._psf import refuse_gained_light
 from neusee.nodes.values import Bands
 
 FOCAL, PIXEL, WAVELENGTH = 50e-3, 3e-6, 500e-9
-PITCH = 60e-6  #: m, of the pupil: its PSF repeats beyond 500 nm 50 mm / (2 60 um) = 208.33 um, or 69.44 pixels
+#: m, of the pupil: its PSF repeats beyond 500 nm 50 mm / (2 60 um) = 208.33 um, or 69.44 pixels
+PITCH = 60e-6
 ACROSS = 9  #: pixels of a window along its other axis
 
 
@@ -22,11 +25,15 @@ def pupil(samples=64, pitch=PITCH):
 
 
 def psf(lens, pixels, axis="x", offset=0.0):
-    """Return the PSF of a window of ``pixels`` along ``axis``, whose spot is ``offset`` pixels behind pixel n // 2."""
+    """Return the PSF of a window of ``pixels`` along ``axis``, whose spot is ``offset`` pixels
+    behind pixel n // 2.
+    """
     tilt = offset * PIXEL / FOCAL
     along = {"y": ((pixels, ACROSS), (tilt, 0.0)), "x": ((ACROSS, pixels), (0.0, tilt))}
     shape, angle = along[axis]
-    return optics.psf(lens, focal_length=FOCAL, pixel_pitch=PIXEL, shape=shape, angle=angle, sensor="integrated")
+    return optics.psf(
+        lens, focal_length=FOCAL, pixel_pitch=PIXEL, shape=shape, angle=angle, sensor="integrated"
+    )
 
 
 @pytest.mark.parametrize("axis", ["y", "x"])
@@ -54,13 +61,17 @@ def test_a_window_ends_where_the_furthest_pixel_reaches_the_alias(axis, pixels, 
 
 def written(error):
     """Return the samples and the pitch (m) that an error says to write."""
-    samples, pitch = re.search(r'optics\.samples=(\d+) optics\.pitch="(\S+) um"', str(error)).groups()
+    samples, pitch = re.search(
+        r'optics\.samples=(\d+) optics\.pitch="(\S+) um"', str(error)
+    ).groups()
     return int(samples), float(pitch) * 1e-6
 
 
 @pytest.mark.parametrize("samples", [63, 64])
 @pytest.mark.parametrize("pixels", [140, 141, 151, 171, 201])
-def test_the_samples_to_write_are_the_fewest_that_carry_the_window_with_the_same_middle(samples, pixels):
+def test_the_samples_to_write_are_the_fewest_that_carry_the_window_with_the_same_middle(
+    samples, pixels
+):
     with pytest.raises(ValueError, match="along x") as refused:
         psf(pupil(samples), pixels)
     enough, pitch = written(refused.value)

@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 from torch.testing import assert_close
 
 from neusee.nodes import doe, optics
-from neusee.nodes.optics._phase_screen import screen
-from neusee.nodes.optics._phase_steps import phase_steps
+from neusee.nodes.optics._pupil import phase_steps
 from neusee.nodes.optics._pupil_grid import PupilGrid, axes, inside, polar, pupil_grid
-from neusee.nodes.optics._zernike import combine, noll, surface
+from neusee.nodes.optics._zernike import combine, noll, screen, surface
 from neusee.nodes.values import Bands, Dirt
 
 LENS = {"pitch": 10e-6, "diameter": 2e-3}
@@ -25,18 +24,24 @@ def bands(*nanometres):
 
 
 def stop(samples, **params):
-    """Return a stop; one that is wider than the grid is narrowed, as these tests of the pupil ask for."""
+    """Return a stop; one that is wider than the grid is narrowed, as these tests of the pupil
+    ask for.
+    """
     return optics.stop(samples=samples, **{"aperture": "inscribed"} | LENS | params)
 
 
-def pupil(height=None, dirt=None, wavelengths=(450, 550, 650), pitch=10e-6, diameter=2e-3, **params):
+def pupil(
+    height=None, dirt=None, wavelengths=(450, 550, 650), pitch=10e-6, diameter=2e-3, **params
+):
     height = torch.zeros(200, 200) if height is None else height
     line, grid = bands(*wavelengths), stop(len(height), pitch=pitch, diameter=diameter)
     return optics.pupil(height, doe.material(line), line, grid, dirt, **params)
 
 
 def field(p):
-    turns = (p.index[:, None, None] * p.height.double() + p.path.double()) / p.wavelengths[:, None, None]
+    turns = (p.index[:, None, None] * p.height.double() + p.path.double()) / p.wavelengths[
+        :, None, None
+    ]
     return torch.polar(p.amplitude.double().expand_as(turns), 2 * math.pi * turns)
 
 
@@ -67,7 +72,9 @@ def test_every_user_of_the_stop_sees_the_same_one(samples, pitch, diameter, aper
     try:
         grid = pupil_grid(samples, pitch, diameter, aperture)
     except ValueError:
-        assert diameter < math.sqrt(2) * pitch or (aperture == "held" and diameter > samples * pitch)
+        assert diameter < math.sqrt(2) * pitch or (
+            aperture == "held" and diameter > samples * pitch
+        )
         return
     assert aperture == "clipped" or grid.diameter <= grid.samples * grid.pitch * (1 + 1e-12)
     line = bands(550)
@@ -89,7 +96,10 @@ def test_clear_pupil_is_clear():
 def test_defocus_dims_the_axis_by_sinc_squared(waves):
     """Peak to valley W at 550 nm is W * 550 / lambda at lambda; intensity sinc(W)**2."""
     found = on_axis(pupil(defocus=waves))
-    wanted = [float(torch.sinc(torch.tensor(waves * 550 / w, dtype=torch.float64))) ** 2 for w in (450, 550, 650)]
+    wanted = [
+        float(torch.sinc(torch.tensor(waves * 550 / w, dtype=torch.float64))) ** 2
+        for w in (450, 550, 650)
+    ]
     assert found.tolist() == pytest.approx(wanted, abs=2e-3)
 
 
@@ -135,7 +145,9 @@ def test_zernikes_are_orthonormal():
     nodes, weights = (torch.from_numpy(x) for x in np.polynomial.legendre.leggauss(16))
     radius = ((nodes + 1) / 2).sqrt()[:, None]
     azimuth = torch.arange(40, dtype=torch.float64)[None, :] * (2 * math.pi / 40)
-    every = torch.stack([combine({j: 1.0}, radius * azimuth.sin(), radius * azimuth.cos()) for j in range(1, 46)])
+    every = torch.stack(
+        [combine({j: 1.0}, radius * azimuth.sin(), radius * azimuth.cos()) for j in range(1, 46)]
+    )
     gram = torch.einsum("iab,jab,a->ij", every, every, weights / 2) / 40
     assert_close(gram, torch.eye(45, dtype=torch.float64), rtol=0, atol=1e-12)
 
@@ -174,7 +186,9 @@ def test_relief_learns_through_the_pupil():
     line = bands(500, 600)
 
     def axis(h):
-        p = optics.pupil(h * 1e-6, doe.material(line), line, stop(8, pitch=1e-4, diameter=8e-4), defocus=0.3)
+        p = optics.pupil(
+            h * 1e-6, doe.material(line), line, stop(8, pitch=1e-4, diameter=8e-4), defocus=0.3
+        )
         return on_axis(p)
 
     assert torch.autograd.gradcheck(axis, (height,))
@@ -191,7 +205,9 @@ def test_shapes_that_do_not_belong_together_are_refused():
     with pytest.raises(ValueError, match="from one `bands` or `line` step"):
         optics.pupil(torch.zeros(4, 4), index[:1], line, stop(4))
     with pytest.raises(ValueError, match="from one `stop` step"):
-        optics.pupil(torch.zeros(4, 4), index, line, stop(4), Dirt(torch.ones(5, 5), torch.zeros(5, 5)))
+        optics.pupil(
+            torch.zeros(4, 4), index, line, stop(4), Dirt(torch.ones(5, 5), torch.zeros(5, 5))
+        )
 
 
 def check(p, **params):
@@ -274,7 +290,9 @@ def test_everything_is_made_where_the_relief_is():
     line = Bands(*(x.to("meta") for x in bands(500, 600)))
     aberrations = {5: 1e-8, 8: 1e-8}
     height = torch.zeros(8, 8, device="meta")
-    p = optics.pupil(height, doe.material(line), line, stop(8), defocus=1.0, aberrations=aberrations)
+    p = optics.pupil(
+        height, doe.material(line), line, stop(8), defocus=1.0, aberrations=aberrations
+    )
     assert {x.device.type for x in p} == {"meta"}
 
 
@@ -283,16 +301,22 @@ def test_a_height_of_one_wave_turns_the_phase_once_and_at_twice_the_wavelength_n
     turns = optics.mask_turns(pupil(height, wavelengths=(450, 900)), 0, step=4)
     assert turns.shape == (50, 50)
     assert_close(turns, torch.ones(50, 50, dtype=torch.float64), rtol=1e-6, atol=0)
-    assert float(optics.mask_turns(pupil(height, wavelengths=(450, 900)), 1).mean()) == pytest.approx(0.485, abs=0.01)
+    assert float(
+        optics.mask_turns(pupil(height, wavelengths=(450, 900)), 1).mean()
+    ) == pytest.approx(0.485, abs=0.01)
 
 
 def test_phase_steps_on_a_thick_plate_are_exact():
     """10 mm are 8600 turns, of which float32 holds the steps to 5e-4 turn alone."""
     grid = stop(64, pitch=30e-6)
     height = doe.half_rings(grid, waves=(3.0,)) + 10e-3
-    median, share = phase_steps(p := optics.pupil(height, doe.material(bands(532)), bands(532), grid))
+    median, share = phase_steps(
+        p := optics.pupil(height, doe.material(bands(532)), bands(532), grid)
+    )
     turns = p.index * height.double() / p.wavelengths
     lit = p.aperture > 0
-    steps = torch.cat([(turns.diff(dim=d)[lit.narrow(d, 1, 63) & lit.narrow(d, 0, 63)]).abs() for d in (0, 1)])
+    steps = torch.cat(
+        [(turns.diff(dim=d)[lit.narrow(d, 1, 63) & lit.narrow(d, 0, 63)]).abs() for d in (0, 1)]
+    )
     assert median == pytest.approx(float(steps.median()), rel=1e-6)
     assert share == float((steps > 0.5).double().mean())

@@ -1,4 +1,6 @@
-"""The grid of the pupil: areas and light of a clipped stop by quadrature, samples on the rim, and what is refused."""
+"""The grid of the pupil: areas and light of a clipped stop by quadrature, samples on the rim,
+and what is refused.
+"""
 
 import math
 
@@ -7,10 +9,18 @@ import torch
 from scipy.integrate import quad
 
 from neusee.nodes import ParameterError, optics
-from neusee.nodes.optics._pupil_grid import clear_area, clear_diameter, gaussian_over, inside, polar, pupil_grid
+from neusee.nodes.optics._pupil_grid import (
+    clear_area,
+    clear_diameter,
+    gaussian_over,
+    inside,
+    polar,
+    pupil_grid,
+)
 
 SPAN = 8e-3  #: m, width of the grid
-WIDTHS = [0.3, 0.9, 1.0, 1.05, 1.3, 1.41, 1.42, 3.0]  #: diameters of the stop over the width of the grid
+#: diameters of the stop over the width of the grid
+WIDTHS = [0.3, 0.9, 1.0, 1.05, 1.3, 1.41, 1.42, 3.0]
 
 
 def clipped(width):
@@ -18,7 +28,9 @@ def clipped(width):
 
 
 def opened(width, law):
-    """Return the integral of a law (x, y) over the disc that the square cuts: four times a quadrant, row by row."""
+    """Return the integral of a law (x, y) over the disc that the square cuts: four times a
+    quadrant, row by row.
+    """
     radius, half = width * SPAN / 2, SPAN / 2
 
     def row(y):
@@ -49,7 +61,9 @@ def test_the_clear_diameter_is_cut_by_the_grid():
 
 
 def test_samples_on_the_rim_are_inside_and_the_axis_is_in_the_middle():
-    """A disc of two pitches on 3 x 3 samples holds a cross; the corner of an even grid is half a pitch away."""
+    """A disc of two pitches on 3 x 3 samples holds a cross; the corner of an even grid is half a
+    pitch away.
+    """
     cross = inside(pupil_grid(3, 1e-3, 2e-3))
     assert cross.tolist() == [[False, True, False], [True, True, True], [False, True, False]]
     radius, azimuth = polar(pupil_grid(4, 1e-3, 4e-3))
@@ -76,4 +90,6 @@ def test_a_wider_aperture_is_refused_with_the_samples_that_hold_it():
             pupil_grid(100, 1e-5, diameter)
         assert pupil_grid(samples, 1e-5, diameter).diameter == diameter
         stretched = pupil_grid(100, 1e-5, diameter, "stretched")
-        assert (stretched.samples * stretched.pitch, stretched.diameter) == pytest.approx((diameter, diameter))
+        assert (stretched.samples * stretched.pitch, stretched.diameter) == pytest.approx(
+            (diameter, diameter)
+        )

@@ -19,18 +19,24 @@ def watts(bands=BANDS, **light):
 
 
 def test_lux_are_the_luminance_of_a_lambertian_white_through_the_f_number():
-    """In the image, luminance L gives pi L / (4 N^2) lux; the lumens of equal energy are 683 lm/W times y-bar."""
+    """In the image, luminance L gives pi L / (4 N^2) lux; the lumens of equal energy are 683
+    lm/W times y-bar.
+    """
     import colour
 
     eye = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
     per_watt = 683 * integrate.trapezoid(eye.values[:, 1], eye.wavelengths)  # of 1 W in each nm
     lux_on_sensor = math.pi * (1000 / math.pi) / (4 * 5.0**2)
-    assert watts(illuminance=1000.0, kind="E") == pytest.approx(lux_on_sensor / per_watt * 10, rel=1e-9)
+    assert watts(illuminance=1000.0, kind="E") == pytest.approx(
+        lux_on_sensor / per_watt * 10, rel=1e-9
+    )
 
 
 def test_luminance_is_illuminance_over_pi_and_the_lens_passes_its_share():
     assert watts(luminance=50.0) == pytest.approx(watts(illuminance=50.0 * math.pi), rel=1e-12)
-    assert watts(luminance=50.0, lens_transmittance=0.25) == pytest.approx(0.25 * watts(luminance=50.0), rel=1e-12)
+    assert watts(luminance=50.0, lens_transmittance=0.25) == pytest.approx(
+        0.25 * watts(luminance=50.0), rel=1e-12
+    )
 
 
 def test_the_light_of_all_bands_does_not_depend_on_their_number():
@@ -78,4 +84,6 @@ def test_what_has_no_meaning_is_refused_by_name(tmp_path):
 
 def test_gradient():
     lux = torch.tensor(3.0, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda x: optics.white_irradiance(BANDS, STOP, **LENS, illuminance=x) * 1e3, (lux,))
+    assert torch.autograd.gradcheck(
+        lambda x: optics.white_irradiance(BANDS, STOP, **LENS, illuminance=x) * 1e3, (lux,)
+    )

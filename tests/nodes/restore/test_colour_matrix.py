@@ -16,7 +16,9 @@ LEVEL = torch.full((31,), 3e-4, dtype=torch.float64)
 
 
 def sampled(distribution):
-    return torch.tensor(np.interp(CENTRES.numpy() * 1e9, distribution.wavelengths, distribution.values))
+    return torch.tensor(
+        np.interp(CENTRES.numpy() * 1e9, distribution.wavelengths, distribution.values)
+    )
 
 
 OBSERVER = science.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]

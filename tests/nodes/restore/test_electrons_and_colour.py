@@ -39,8 +39,12 @@ def test_colour_is_a_matrix_at_every_pixel():
     channels, matrix = torch.rand(2, 3, 4, 5), torch.rand(3, 3, dtype=torch.float64)
     found = colour(channels, matrix)
     assert found.dtype == torch.float32
-    torch.testing.assert_close(found.double(), colour.hooks.reference(channels, matrix), rtol=1e-5, atol=1e-6)
-    assert torch.autograd.gradcheck(lambda c: colour(c, matrix), (torch.rand(3, 2, 2).double().requires_grad_(),))
+    torch.testing.assert_close(
+        found.double(), colour.hooks.reference(channels, matrix), rtol=1e-5, atol=1e-6
+    )
+    assert torch.autograd.gradcheck(
+        lambda c: colour(c, matrix), (torch.rand(3, 2, 2).double().requires_grad_(),)
+    )
     with pytest.raises(ValueError, match="do not fit"):
         colour(torch.rand(4, 2, 2), matrix)
 
@@ -48,4 +52,11 @@ def test_colour_is_a_matrix_at_every_pixel():
 def test_electrons_are_within_the_stated_error_of_exact_fractions():
     raw, gain = torch.arange(65536, dtype=torch.float32), 1 / 0.37
     found = electrons(raw, gain=gain, offset=0.0).tolist()
-    assert max(abs(Fraction(x) - n / Fraction(gain)) / (n / Fraction(gain)) for n, x in enumerate(found) if n) <= 1.2e-7
+    assert (
+        max(
+            abs(Fraction(x) - n / Fraction(gain)) / (n / Fraction(gain))
+            for n, x in enumerate(found)
+            if n
+        )
+        <= 1.2e-7
+    )

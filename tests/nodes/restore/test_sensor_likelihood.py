@@ -1,4 +1,6 @@
-"""The likelihood of measured electrons against SciPy, and measurements against the moments of their distribution."""
+"""The likelihood of measured electrons against SciPy, and measurements against the moments of
+their distribution.
+"""
 
 import dataclasses
 
@@ -10,9 +12,18 @@ from scipy import stats
 from neusee.nodes.restore import MeasuringSensor, clipped, measuring_sensor
 
 SENSOR = MeasuringSensor(
-    well=25500.0, gain=1 / 0.37, bits=16, offset=390.0, read_noise=10.5, dark=0.25, distribution="gaussian", spread=1.0
+    well=25500.0,
+    gain=1 / 0.37,
+    bits=16,
+    offset=390.0,
+    read_noise=10.5,
+    dark=0.25,
+    distribution="gaussian",
+    spread=1.0,
 )
-EXPECTED = np.array([-30.0, 0.0, 3.0, 250.0, 8000.0, 24000.0, 25000.0, 25110.0, 25400.0, 26500.0, 40000.0])
+EXPECTED = np.array(
+    [-30.0, 0.0, 3.0, 250.0, 8000.0, 24000.0, 25000.0, 25110.0, 25400.0, 26500.0, 40000.0]
+)
 READING = {
     "charge": {
         "mean": "additive",
@@ -41,18 +52,26 @@ def tensor(values):
 def test_a_known_pixel_has_the_density_of_the_normal_distribution():
     measured = EXPECTED + np.linspace(-3, 3, EXPECTED.size) * sigma(EXPECTED)
     found = SENSOR.surprise(tensor(EXPECTED), tensor(measured), torch.ones(EXPECTED.size))
-    np.testing.assert_allclose(found, -stats.norm.logpdf(measured, EXPECTED, sigma(EXPECTED)), rtol=1e-13)
+    np.testing.assert_allclose(
+        found, -stats.norm.logpdf(measured, EXPECTED, sigma(EXPECTED)), rtol=1e-13
+    )
 
 
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-12), (torch.float32, 2e-4)])
 def test_a_clipped_pixel_has_the_upper_tail_of_the_normal_distribution(dtype, rtol):
-    found = SENSOR.surprise(tensor(EXPECTED).to(dtype), torch.zeros(()).to(dtype), torch.zeros(EXPECTED.size))
+    found = SENSOR.surprise(
+        tensor(EXPECTED).to(dtype), torch.zeros(()).to(dtype), torch.zeros(EXPECTED.size)
+    )
     z = (SENSOR.level - EXPECTED) / sigma(EXPECTED)
     np.testing.assert_allclose(found, -stats.norm.logsf(z), rtol=rtol, atol=1e-30)
 
 
 def test_the_level_is_the_least_number_that_is_marked_as_clipped():
-    for sensor in (SENSOR, dataclasses.replace(SENSOR, bits=12), dataclasses.replace(SENSOR, well=9000.3)):
+    for sensor in (
+        SENSOR,
+        dataclasses.replace(SENSOR, bits=12),
+        dataclasses.replace(SENSOR, well=9000.3),
+    ):
         raw = torch.arange(2**sensor.bits, dtype=torch.float64)
         marked = clipped(raw, full_well=sensor.well, gain=sensor.gain, bits=sensor.bits)
         first = int(marked.nonzero()[0])
@@ -80,7 +99,9 @@ def test_the_slope_is_that_of_finite_differences(known, floor, spread):
 @pytest.mark.parametrize("known", [0.0, 1.0])
 def test_the_slope_is_finite_for_every_expectation(dtype, known):
     expected = torch.tensor([-1e6, 0.0, 1e3, 1e6, 1e8], dtype=dtype, requires_grad=True)
-    slope = SENSOR.surprise_slope(expected, torch.full_like(expected, 100.0), torch.full_like(expected, known))
+    slope = SENSOR.surprise_slope(
+        expected, torch.full_like(expected, 100.0), torch.full_like(expected, known)
+    )
     (curvature,) = torch.autograd.grad(slope.sum(), expected)
     assert slope.isfinite().all()
     assert curvature.isfinite().all()
@@ -110,7 +131,9 @@ def test_the_slope_passes_the_transforms_of_torch_func(known):
 def test_measurements_have_the_mean_and_the_variance_of_the_likelihood(distribution, expected):
     sensor = dataclasses.replace(SENSOR, distribution=distribution)
     count = 200_000
-    drawn = sensor.measured(torch.full((count,), expected), torch.Generator().manual_seed(3)).double()
+    drawn = sensor.measured(
+        torch.full((count,), expected), torch.Generator().manual_seed(3)
+    ).double()
     whole = torch.tensor(expected + sensor.dark, dtype=torch.float64)
     variance = float(sensor.variance(whole))
     assert abs(float(drawn.mean() - whole)) < 4 * (variance / count) ** 0.5

@@ -8,7 +8,11 @@ from neusee.nodes.restore import colour, colour_matrix, white_level
 from neusee.nodes.values import Bands, Psf
 
 NM = np.array([450.0, 550.0, 650.0])
-BANDS = Bands(torch.tensor(NM * 1e-9), torch.full((3,), 1e-7, dtype=torch.float64), torch.ones(3, dtype=torch.float64))
+BANDS = Bands(
+    torch.tensor(NM * 1e-9),
+    torch.full((3,), 1e-7, dtype=torch.float64),
+    torch.ones(3, dtype=torch.float64),
+)
 LIGHT = torch.tensor([0.8, 1.0, 0.6], dtype=torch.float64)
 RESPONSES = torch.tensor([[0.0, 0.3, 0.9], [0.1, 1.0, 0.2], [0.9, 0.1, 0.0]], dtype=torch.float64)
 SENSOR = {"full_well": 20000.0, "quantum_efficiency": 0.5, "pixel_pitch": 3e-6, "exposure": 0.02}
@@ -30,7 +34,14 @@ def spread(share=1.0):
 def level(signal, clipped=None, share=1.0, **how):
     none = torch.zeros(signal.shape, dtype=torch.bool)
     return white_level(
-        signal, none if clipped is None else clipped, spread(share), BANDS, LIGHT, RESPONSES, **SENSOR, **how
+        signal,
+        none if clipped is None else clipped,
+        spread(share),
+        BANDS,
+        LIGHT,
+        RESPONSES,
+        **SENSOR,
+        **how,
     )
 
 
@@ -68,7 +79,9 @@ def test_a_frame_that_is_clipped_everywhere_still_has_a_level():
 
 
 def test_the_restored_picture_gives_the_white_and_not_the_blurred_frame():
-    """By hand: the 99.5 % quantile of the largest colour is 1, in a picture whose frame is blurred to a third of it."""
+    """By hand: the 99.5 % quantile of the largest colour is 1, in a picture whose frame is
+    blurred to a third of it.
+    """
     rng = np.random.default_rng(4)
     reflectance = torch.from_numpy(rng.uniform(0.02, 1.0, (50, 60)))
     sharp = torch.from_numpy(electrons_of_white(3e-3))[:, None, None] * reflectance
@@ -82,4 +95,6 @@ def test_the_restored_picture_gives_the_white_and_not_the_blurred_frame():
     without = level(frame.clone(), clipped, restored=sharp)
     shown = colour(sharp, colour_matrix(BANDS, LIGHT, RESPONSES, without, **PIXEL)).amax(0)
     assert np.quantile(shown[~clipped[0]].numpy(), 0.995) == pytest.approx(1.0, rel=1e-5)
-    assert torch.equal(level(frame.clone(), restored=sharp, white=0.7), level(frame.clone(), white=0.7))
+    assert torch.equal(
+        level(frame.clone(), restored=sharp, white=0.7), level(frame.clone(), white=0.7)
+    )

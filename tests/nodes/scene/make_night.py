@@ -1,4 +1,5 @@
-"""Draw recipes/samples/night.exr again, bit for bit: a wet street at night, scene-linear, for high dynamic range.
+"""Draw recipes/samples/night.exr again, bit for bit: a wet street at night, scene-linear, for high
+dynamic range.
 
     python tests/nodes/scene/make_night.py recipes/samples/night.exr
 
@@ -44,7 +45,9 @@ def sky(y: np.ndarray) -> np.ndarray:
 def houses(y: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Two rows of houses with windows, some of them lit."""
     result = np.zeros((SIZE, SIZE, 3))
-    for block, (left, right, roof) in enumerate(((0, 92, 40), (92, 150, 84), (236, 296, 96), (296, 384, 28))):
+    for block, (left, right, roof) in enumerate(
+        ((0, 92, 40), (92, 150, 84), (236, 296, 96), (296, 384, 28))
+    ):
         wall = (x >= left) & (x < right) & (y >= roof) & (y < HORIZON)
         result[wall] = 0.012 * STONE
         column, row = (x - left - 8) % 20, (y - roof - 12) % 26
@@ -71,30 +74,43 @@ def lamps(y: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def road(y: np.ndarray, x: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Wet asphalt: what stands above it, mirrored, drawn out towards the viewer and broken up by ripples."""
+    """Wet asphalt: what stands above it, mirrored, drawn out towards the viewer and broken up by
+    ripples.
+    """
     depth = np.maximum(y - HORIZON, 0.0)
     grain = scattered(y, x) - 0.5
     rows = np.arange(SIZE)
     total = np.zeros((SIZE, SIZE, 3))
-    for step in range(25):  # the slopes of the ripples smear the mirror image upwards and a little sideways
+    # the slopes of the ripples smear the mirror image upwards and a little sideways
+    for step in range(25):
         slope = (step - 12) / 12.0
-        source = np.clip(HORIZON - 1 - depth * (1.0 + 0.55 * slope) - 6.0 * grain, 0, HORIZON - 1).astype(int)
+        source = np.clip(
+            HORIZON - 1 - depth * (1.0 + 0.55 * slope) - 6.0 * grain, 0, HORIZON - 1
+        ).astype(int)
         across = np.clip(rows[None, :] + slope * 2.0 * grain + 0.0 * y, 0, SIZE - 1).astype(int)
         total += upper[source, across] * (1.0 - slope * slope)
     gloss = 0.030 + 0.10 / (1.0 + depth / 24.0)
     asphalt = 0.010 * (1.0 + 0.8 * grain)
     pools = sum(
-        (0.0010 * p / (1.0 + ((x - c) * (x - c) + 6.0 * depth * depth) / 2500.0) for c, _, p, _ in LAMPS), 0.0 * x
+        (
+            0.0010 * p / (1.0 + ((x - c) * (x - c) + 6.0 * depth * depth) / 2500.0)
+            for c, _, p, _ in LAMPS
+        ),
+        0.0 * x,
     )
     marks = (np.abs(x - SIZE / 2) < 2.0 + depth / 30.0) & (depth % 44.0 < 4.0 + depth / 6.0)
     paint = np.where(marks, 5.0, 1.0)
     lit = (pools * (0.5 + 0.5 * grain))[..., None] * SODIUM
-    return gloss[..., None] * total / 16.0 + (asphalt[..., None] * SKY + lit * 0.35) * paint[..., None]
+    return (
+        gloss[..., None] * total / 16.0 + (asphalt[..., None] * SKY + lit * 0.35) * paint[..., None]
+    )
 
 
 def scattered(y: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Noise in [0, 1) from whole numbers alone, wider across than along."""
-    cell = (np.floor(x / 3) * 374761393 + np.floor(y / 2) * 668265263).astype(np.uint64) & np.uint64(0xFFFFFFFF)
+    cell = (np.floor(x / 3) * 374761393 + np.floor(y / 2) * 668265263).astype(
+        np.uint64
+    ) & np.uint64(0xFFFFFFFF)
     cell = ((cell ^ (cell >> np.uint64(13))) * np.uint64(1274126177)) & np.uint64(0xFFFFFFFF)
     return ((cell ^ (cell >> np.uint64(16))) & np.uint64(0xFFFF)).astype(np.float64) / 65536.0
 

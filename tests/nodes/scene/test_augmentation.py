@@ -1,4 +1,6 @@
-"""Changes of photographs: the eight symmetries of NumPy, stops of light, and a saturation by its formula."""
+"""Changes of photographs: the eight symmetries of NumPy, stops of light, and a saturation by its
+formula.
+"""
 
 from dataclasses import replace
 
@@ -50,7 +52,14 @@ def test_what_is_drawn_stays_in_its_limits_and_nothing_changes_nothing():
     drawn = [Change.drawn((1, n), True, 2.0, 0.3) for n in range(300)]
     assert {x.quarters for x in drawn} == {0, 1, 2, 3}
     assert -2 <= min(x.stops for x in drawn) < -1.9 < -0.1 < max(x.stops for x in drawn) <= 0
-    assert 0.7 <= min(x.saturation for x in drawn) < 0.72 < 1.28 < max(x.saturation for x in drawn) <= 1.3
+    assert (
+        0.7
+        <= min(x.saturation for x in drawn)
+        < 0.72
+        < 1.28
+        < max(x.saturation for x in drawn)
+        <= 1.3
+    )
     assert Change.drawn((1, 5), True, 2.0, 0.3) == drawn[5]
     none = Change.drawn((1, 5), False, 0.0, 0.0)
     assert none == Change()
@@ -76,4 +85,6 @@ def test_the_factor_of_size_is_drawn_by_its_logarithm_and_changes_no_other_value
     logs = np.log([x.enlarged for x in drawn]) / np.log(4.0)
     assert 0 <= logs.min() < 0.02 < 0.98 < logs.max() <= 1
     assert abs(logs.mean() - 0.5) < 0.06  # 0.014 is its deviation
-    assert [replace(x, enlarged=1.0) for x in drawn] == [Change.drawn((1, n), True, 2.0, 0.3) for n in range(400)]
+    assert [replace(x, enlarged=1.0) for x in drawn] == [
+        Change.drawn((1, n), True, 2.0, 0.3) for n in range(400)
+    ]

@@ -1,4 +1,6 @@
-"""A photograph that is changed under its name is read again, in the process that has read it before."""
+"""A photograph that is changed under its name is read again, in the process that has read it
+before.
+"""
 
 import os
 
@@ -17,7 +19,9 @@ def settled(monkeypatch):
 
 
 def save(path, seed, moment):
-    """Write a photograph of noise, without compression and so of equal size, with a stated time of modification."""
+    """Write a photograph of noise, without compression and so of equal size, with a stated time
+    of modification.
+    """
     values = np.random.default_rng(seed).integers(0, 256, (40, 50, 3), dtype=np.uint8)
     Image.fromarray(values).save(path, compress_level=0)
     os.utime(path, ns=(moment, moment))
@@ -42,7 +46,9 @@ def test_a_photograph_that_was_changed_just_now_is_not_kept(tmp_path):
     for seed in (1, 2, 3):
         values = save(path, seed, 10**18)
         found = crop_photograph(path, (40, 50), 3, 0)
-        np.testing.assert_array_equal(np.rint(255 * encoded(found.numpy())), values.transpose(2, 0, 1))
+        np.testing.assert_array_equal(
+            np.rint(255 * encoded(found.numpy())), values.transpose(2, 0, 1)
+        )
 
 
 def encoded(linear):
@@ -55,5 +61,9 @@ def test_the_part_of_a_photograph_that_an_evaluation_shows_is_a_parameter(tmp_pa
     path = tmp_path / "one.png"
     save(path, 4, 10**18)
     for number in (0, 5):
-        assert photograph(file=path, shape=shape, crop=(7, number)).equal(crop_photograph(path, shape, 7, number))
-    assert not photograph(file=path, shape=(20, 30), crop=(7, 0)).equal(photograph(file=path, shape=(20, 30)))
+        assert photograph(file=path, shape=shape, crop=(7, number)).equal(
+            crop_photograph(path, shape, 7, number)
+        )
+    assert not photograph(file=path, shape=(20, 30), crop=(7, 0)).equal(
+        photograph(file=path, shape=(20, 30))
+    )

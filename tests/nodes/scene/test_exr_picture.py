@@ -12,7 +12,9 @@ from neusee.nodes.scene import exr
 
 OpenEXR = pytest.importorskip("OpenEXR")
 DATA = Path(__file__).parents[3] / "../shared/data/exr"
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the OpenEXR sample pictures are not beside the project")
+needs_data = pytest.mark.skipif(
+    not DATA.is_dir(), reason="the OpenEXR sample pictures are not beside the project"
+)
 AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
 
 
@@ -35,7 +37,11 @@ def test_without_primaries_values_are_srgb(tmp_path):
 
 
 def test_names_do_not_depend_on_their_order_in_the_file(tmp_path):
-    channels = {"Z": np.ones((2, 3), np.float32), "A": np.ones((2, 3), np.float32), **planes(1.0, 2.0, 3.0)}
+    channels = {
+        "Z": np.ones((2, 3), np.float32),
+        "A": np.ones((2, 3), np.float32),
+        **planes(1.0, 2.0, 3.0),
+    }
     assert exr(file=saved(tmp_path, channels))[:, 0, 0].tolist() == [1.0, 2.0, 3.0]
 
 
@@ -43,14 +49,21 @@ def test_ap0_as_colour_science_says(tmp_path):
     import colour
 
     rgb = np.array([0.4, 0.2, 0.1])
-    result = exr(file=saved(tmp_path, planes(*rgb), chromaticities=AP0), negatives="keep")[:, 0, 0].numpy()
+    result = exr(file=saved(tmp_path, planes(*rgb), chromaticities=AP0), negatives="keep")[
+        :, 0, 0
+    ].numpy()
     spaces = colour.RGB_COLOURSPACES["ACES2065-1"], colour.RGB_COLOURSPACES["sRGB"]
     expected = colour.RGB_to_RGB(rgb, *spaces, chromatic_adaptation_transform="Bradford")
     np.testing.assert_allclose(result, expected, atol=2e-4)
 
 
 @pytest.mark.parametrize(
-    "primaries", [AP0, (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3), (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.31, 0.32)]
+    "primaries",
+    [
+        AP0,
+        (1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1 / 3, 1 / 3),
+        (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.31, 0.32),
+    ],
 )
 def test_white_stays_white(tmp_path, primaries):
     path = saved(tmp_path, planes(0.5, 0.5, 0.5), chromaticities=primaries)
@@ -77,7 +90,9 @@ XYZ_TO_SRGB = [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -
 
 def test_channels_x_y_and_z_are_cie_xyz(tmp_path):
     xyz = np.array([0.3, 0.4, 0.2])
-    path = saved(tmp_path, dict(zip("XYZ", (np.full((2, 3), v, np.float32) for v in xyz), strict=True)))
+    path = saved(
+        tmp_path, dict(zip("XYZ", (np.full((2, 3), v, np.float32) for v in xyz), strict=True))
+    )
     assert exr.hooks.preflight(file=path) == []
     result = exr(file=path, negatives="keep")[:, 1, 2].numpy()
     np.testing.assert_allclose(result, XYZ_TO_SRGB @ xyz, atol=3e-4)
@@ -94,14 +109,21 @@ def test_channels_x_y_and_z_are_cie_xyz(tmp_path):
 def test_the_white_of_xyz_in_the_header_becomes_the_white_of_srgb(tmp_path, header, white):
     x, y = white
     xyz = (x / y, 1.0, (1 - x - y) / y)
-    path = saved(tmp_path, dict(zip("XYZ", (np.full((2, 3), v, np.float32) for v in xyz), strict=True)), **header)
+    path = saved(
+        tmp_path,
+        dict(zip("XYZ", (np.full((2, 3), v, np.float32) for v in xyz), strict=True)),
+        **header,
+    )
     np.testing.assert_allclose(exr(file=path, negatives="keep").numpy(), 1.0, atol=1e-3)
 
 
 def test_the_part_with_the_picture_is_found_or_chosen_by_name(tmp_path):
     about = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     depth = OpenEXR.Part({**about, "name": "depth"}, {"Z": np.ones((2, 3), np.float32)})
-    left, right = (OpenEXR.Part({**about, "name": n}, planes(v, v, v)) for n, v in (("left", 0.25), ("right", 0.5)))
+    left, right = (
+        OpenEXR.Part({**about, "name": n}, planes(v, v, v))
+        for n, v in (("left", 0.25), ("right", 0.5))
+    )
     OpenEXR.File([depth, right]).write(str(tmp_path / "a.exr"))
     assert float(exr(file=tmp_path / "a.exr").max()) == 0.5
     OpenEXR.File([depth, left, right]).write(str(tmp_path / "b.exr"))
@@ -162,7 +184,9 @@ def test_carrots_as_colour_science_says():
 
 
 @needs_data
-@pytest.mark.parametrize(("name", "peak"), [("Desk", 233.75), ("GoldenGate", 685.5), ("BrightRings", 1025.0)])
+@pytest.mark.parametrize(
+    ("name", "peak"), [("Desk", 233.75), ("GoldenGate", 685.5), ("BrightRings", 1025.0)]
+)
 def test_bright_light_survives(name, peak):
     scene = exr(file=DATA / f"{name}.exr")
     assert float(scene.max()) == peak
@@ -171,7 +195,9 @@ def test_bright_light_survives(name, peak):
 
 def drawn():
     """The script that draws the sample, as a module."""
-    spec = importlib.util.spec_from_file_location("make_night", Path(__file__).with_name("make_night.py"))
+    spec = importlib.util.spec_from_file_location(
+        "make_night", Path(__file__).with_name("make_night.py")
+    )
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module.night()

@@ -1,4 +1,6 @@
-"""Spectral cubes: files, layouts, interpolation, what is refused; and spectral OpenEXR out and in."""
+"""Spectral cubes: files, layouts, interpolation, what is refused; and spectral OpenEXR out and
+in.
+"""
 
 import numpy as np
 import pytest
@@ -34,14 +36,18 @@ def test_interpolates_linearly(tmp_path):
     wanted = eleven(405, 695, 7)
     result = hyperspectral(wanted, file=path, start=400 * NM, stop=700 * NM, layout="band y x")
     assert result.shape == (7, 3, 2)
-    torch.testing.assert_close(result[:, 0, 0].double(), (wanted.centres / NM - 400) / 400, atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        result[:, 0, 0].double(), (wanted.centres / NM - 400) / 400, atol=1e-6, rtol=0
+    )
 
 
 def test_band_axis_is_last_unless_said(tmp_path):
     cube = np.random.default_rng(1).random((4, 5, 11))
     ends = {"start": 400 * NM, "stop": 700 * NM}
     one = hyperspectral(eleven(), file=npy(tmp_path, cube), **ends)
-    two = hyperspectral(eleven(), file=npy(tmp_path, np.moveaxis(cube, -1, 0)), layout="band y x", **ends)
+    two = hyperspectral(
+        eleven(), file=npy(tmp_path, np.moveaxis(cube, -1, 0)), layout="band y x", **ends
+    )
     assert torch.equal(one, two)
     np.testing.assert_allclose(one.numpy(), np.moveaxis(cube, -1, 0), atol=1e-7)
 
@@ -90,14 +96,18 @@ def test_refusals_before_the_run(tmp_path):
         with pytest.raises(ParameterError, match=words):
             hyperspectral.hooks.preflight(file=tmp_path / name, start=400 * NM, stop=700 * NM)
     with pytest.raises(ParameterError, match="complex"):
-        hyperspectral.hooks.preflight(file=npy(tmp_path, np.ones((2, 2, 3), complex)), start=400 * NM, stop=700 * NM)
+        hyperspectral.hooks.preflight(
+            file=npy(tmp_path, np.ones((2, 2, 3), complex)), start=400 * NM, stop=700 * NM
+        )
 
 
 def test_a_complex_cube_of_matlab_is_refused_although_its_header_says_double(tmp_path):
     from scipy.io import savemat
 
     savemat(tmp_path / "a.mat", {"cube": np.full((2, 2, 3), 0.5 + 0.25j)})
-    with pytest.raises(ParameterError, match=r"a\.mat holds complex values: save the cube as real numbers of light"):
+    with pytest.raises(
+        ParameterError, match=r"a\.mat holds complex values: save the cube as real numbers of light"
+    ):
         hyperspectral.hooks.preflight(file=tmp_path / "a.mat", start=400 * NM, stop=700 * NM)
 
 
@@ -109,7 +119,10 @@ def test_values_that_are_not_finite_are_refused(tmp_path):
 
 @settings(max_examples=25, deadline=None)
 @given(
-    count=st.integers(1, 40), y=st.integers(1, 9), x=st.integers(1, 9), kind=st.sampled_from(["emissive", "reflective"])
+    count=st.integers(1, 40),
+    y=st.integers(1, 9),
+    x=st.integers(1, 9),
+    kind=st.sampled_from(["emissive", "reflective"]),
 )
 def test_spectral_exr_comes_back_bit_for_bit(tmp_path_factory, count, y, x, kind):
     path = tmp_path_factory.mktemp("exr") / "s.exr"

@@ -1,4 +1,6 @@
-"""Large pictures: the same light as in one piece, in bands of rows, and within the memory that is stated."""
+"""Large pictures: the same light as in one piece, in bands of rows, and within the memory that
+is stated.
+"""
 
 import os
 import subprocess
@@ -10,8 +12,9 @@ import torch
 from PIL import Image
 
 from neusee.nodes import ParameterError, input_files
-from neusee.nodes.scene import _large_picture, exr, photograph
-from neusee.nodes.scene._crop_to_frame import framed
+from neusee.nodes.scene import _picture_scaling as _large_picture
+from neusee.nodes.scene import exr, photograph
+from neusee.nodes.scene._picture_scaling import framed
 
 SIZES = [
     ((101, 67), (8, 8)), ((101, 67), (30, 50)), ((67, 101), (67, 100)), ((50, 60), (75, 75)), ((50, 60), (50, 60)),
@@ -32,16 +35,22 @@ def test_bands_of_rows_give_the_light_of_the_whole_picture(monkeypatch, size, sh
     codes = np.random.default_rng(0).random((*size, 3), dtype=np.float32)
     result = _large_picture.linear_light(codes, light, shape)
     assert result.dtype == torch.float32
-    torch.testing.assert_close(result.double(), framed(light(codes).double(), shape), rtol=0, atol=2e-7)
+    torch.testing.assert_close(
+        result.double(), framed(light(codes).double(), shape), rtol=0, atol=2e-7
+    )
 
 
-@pytest.mark.parametrize(("node", "name"), [(photograph, "a.png"), (exr, "a.exr"), (exr, "grey.exr")])
+@pytest.mark.parametrize(
+    ("node", "name"), [(photograph, "a.png"), (exr, "a.exr"), (exr, "grey.exr")]
+)
 def test_a_file_gives_the_same_light_in_bands(monkeypatch, tmp_path, node, name):
     values = np.random.default_rng(0).random((40, 60, 3), dtype=np.float32) - 0.1 * (node is exr)
     if node is exr:
         import OpenEXR
 
-        channels = {c: values[..., i].copy() for i, c in enumerate("RGB" if name == "a.exr" else "Y")}
+        channels = {
+            c: values[..., i].copy() for i, c in enumerate("RGB" if name == "a.exr" else "Y")
+        }
         OpenEXR.File({}, channels).write(str(tmp_path / name))
     else:
         Image.fromarray((255 * values).astype(np.uint8)).save(tmp_path / name)
@@ -57,7 +66,9 @@ def test_a_file_gives_the_same_light_in_bands(monkeypatch, tmp_path, node, name)
 
 @pytest.mark.slow
 def test_a_picture_at_the_limit_takes_less_than_one_and_a_half_gigabytes(tmp_path):
-    """64 million pixels, at the size of the file and for a scene of 8 x 8 pixels: 3.4 GB and minutes before."""
+    """64 million pixels, at the size of the file and for a scene of 8 x 8 pixels: 3.4 GB and
+    minutes before.
+    """
     side = 8000
     assert side * side == input_files.PIXELS
     Image.new("RGB", (side, side), (90, 120, 200)).save(tmp_path / "a.png", compress_level=1)
@@ -74,12 +85,15 @@ assert picture.shape == (3, *(shape or (8000, 8000)))
 for channel, code in zip(picture[:, :8, :8], (90, 120, 200)):  # the curve of sRGB, IEC 61966-2-1
     assert float((channel - ((code / 255 + 0.055) / 1.055) ** 2.4).abs().max()) < 1e-6
 """
-    kept = {"MALLOC_MMAP_THRESHOLD_": str(1 << 30)}  # glibc keeps what is freed, as it does now and then by itself
-    for size, memory in (("whole", {}), ("whole", kept), ("small", kept)):  # a process each
+    # glibc keeps what is freed, as it does now and then by itself
+    kept = {"MALLOC_MMAP_THRESHOLD_": str(1 << 30)}
+    for size in ("whole", "small"):  # a process each
         words = [sys.executable, "-c", code, tmp_path / "a.png", size]
-        done = subprocess.run(words, capture_output=True, text=True, env={**os.environ, **memory})
+        done = subprocess.run(words, capture_output=True, text=True, env={**os.environ, **kept})
         assert done.returncode == 0, done.stderr
         assert float(done.stdout) < 1.5e9
     Image.new("1", (side + 1, side)).save(tmp_path / "b.png", compress_level=1)
-    with pytest.raises(ParameterError, match=r"b\.png has 8001 x 8000 pixels, more than the limit of 64 million"):
+    with pytest.raises(
+        ParameterError, match=r"b\.png has 8001 x 8000 pixels, more than the limit of 64 million"
+    ):
         photograph.hooks.preflight(file=tmp_path / "b.png")

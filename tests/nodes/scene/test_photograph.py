@@ -9,7 +9,7 @@ from PIL import Image
 
 from neusee.nodes import ParameterError
 from neusee.nodes.scene import photograph
-from neusee.nodes.scene._crop_to_frame import covering, framed
+from neusee.nodes.scene._picture_scaling import covering, framed
 
 
 def saved(folder, array, name="a.png", **how):
@@ -42,7 +42,10 @@ def test_decodes_every_8_bit_code_by_the_closed_form(tmp_path):
 
 def test_usual_form_agrees_with_reference(tmp_path):
     path = saved(tmp_path, random8(31, 23, 3))
-    usual, slow = photograph(file=path, shape=(12, 12)), photograph.hooks.reference(file=path, shape=(12, 12))
+    usual, slow = (
+        photograph(file=path, shape=(12, 12)),
+        photograph.hooks.reference(file=path, shape=(12, 12)),
+    )
     torch.testing.assert_close(usual.double(), slow, rtol=photograph.rtol, atol=1e-7)
 
 
@@ -58,7 +61,9 @@ def test_grey_becomes_three_equal_channels(tmp_path, kind):
     top = np.iinfo(kind).max
     codes = (np.linspace(0, 1, 12).reshape(3, 4) * top).astype(kind)
     result = photograph(file=saved(tmp_path, codes))
-    np.testing.assert_allclose(result.numpy(), np.repeat(linear(codes / top)[None], 3, 0), atol=3e-7)
+    np.testing.assert_allclose(
+        result.numpy(), np.repeat(linear(codes / top)[None], 3, 0), atol=3e-7
+    )
 
 
 def test_palette_is_its_colours(tmp_path):
@@ -66,7 +71,9 @@ def test_palette_is_its_colours(tmp_path):
     image.save(tmp_path / "p.png")
     expected = linear(np.asarray(image.convert("RGB")) / 255)
     assert photograph.hooks.preflight(file=tmp_path / "p.png") == []
-    np.testing.assert_allclose(photograph(file=tmp_path / "p.png").permute(1, 2, 0).numpy(), expected, atol=3e-7)
+    np.testing.assert_allclose(
+        photograph(file=tmp_path / "p.png").permute(1, 2, 0).numpy(), expected, atol=3e-7
+    )
 
 
 @pytest.mark.parametrize("turned", range(1, 9))
@@ -89,7 +96,9 @@ def test_turns_upright_by_exif(tmp_path, turned, bits):
         values = _photograph._words(words(tmp_path, np.asarray(held).astype(np.uint16)), turned)
         assert np.array_equal(values, upright)
     else:
-        np.testing.assert_allclose(photograph(file=path).permute(1, 2, 0).numpy(), linear(upright / 255), atol=3e-7)
+        np.testing.assert_allclose(
+            photograph(file=path).permute(1, 2, 0).numpy(), linear(upright / 255), atol=3e-7
+        )
         assert len(photograph.hooks.preflight(file=path)) == (turned != 1)
 
 
@@ -103,7 +112,9 @@ def test_one_pixel_is_a_picture(tmp_path):
     path = saved(tmp_path, np.full((1, 1, 3), 128, np.uint8))
     assert photograph(file=path).shape == (3, 1, 1)
     assert photograph.hooks.preflight(file=path, shape=(3, 2)) != []
-    torch.testing.assert_close(photograph(file=path, shape=(3, 2)), torch.full((3, 3, 2), float(linear(128 / 255))))
+    torch.testing.assert_close(
+        photograph(file=path, shape=(3, 2)), torch.full((3, 3, 2), float(linear(128 / 255)))
+    )
 
 
 def _float_tiff(folder):
@@ -151,8 +162,13 @@ def test_a_foreign_profile_is_named(tmp_path):
 
     lab = ImageCms.ImageCmsProfile(ImageCms.createProfile("XYZ")).tobytes()
     srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
-    assert "profile" in photograph.hooks.preflight(file=saved(tmp_path, random8(4, 4, 3), icc_profile=lab))[0]
-    assert photograph.hooks.preflight(file=saved(tmp_path, random8(4, 4, 3), icc_profile=srgb)) == []
+    assert (
+        "profile"
+        in photograph.hooks.preflight(file=saved(tmp_path, random8(4, 4, 3), icc_profile=lab))[0]
+    )
+    assert (
+        photograph.hooks.preflight(file=saved(tmp_path, random8(4, 4, 3), icc_profile=srgb)) == []
+    )
 
 
 @settings(max_examples=40, deadline=None)

@@ -1,4 +1,6 @@
-"""A folder of photographs: list_photographs in one order, cut by the seed alone, what is broken said."""
+"""A folder of photographs: list_photographs in one order, cut by the seed alone, what is broken
+said.
+"""
 
 import numpy as np
 import pytest
@@ -11,7 +13,12 @@ from neusee.nodes.scene import choose_photograph, crop_photograph, list_photogra
 @pytest.fixture
 def folder(tmp_path):
     rng = np.random.default_rng(1)
-    for name, size in (("b/two.png", (30, 40)), ("a.JPG", (50, 24)), ("b/.hidden.png", (8, 8)), ("c.png", (20, 20))):
+    for name, size in (
+        ("b/two.png", (30, 40)),
+        ("a.JPG", (50, 24)),
+        ("b/.hidden.png", (8, 8)),
+        ("c.png", (20, 20)),
+    ):
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         image = Image.fromarray(rng.integers(0, 256, (*size, 3), dtype=np.uint8))
@@ -49,7 +56,11 @@ def test_crops_are_the_same_in_any_order_and_differ_by_seed_and_index(folder):
     first = {i: crop_photograph(path, (8, 8), 5, i) for i in range(6)}
     for i in reversed(range(6)):
         assert torch.equal(crop_photograph(path, (8, 8), 5, i), first[i])
-    others = [crop_photograph(path, (8, 8), 6, 0), crop_photograph(path, (8, 8), 5, (1, 0)), *list(first.values())[1:]]
+    others = [
+        crop_photograph(path, (8, 8), 6, 0),
+        crop_photograph(path, (8, 8), 5, (1, 0)),
+        *list(first.values())[1:],
+    ]
     assert not any(torch.equal(first[0], x) for x in others)
 
 

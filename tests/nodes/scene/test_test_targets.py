@@ -14,7 +14,12 @@ KINDS = ["flat", "edge", "slanted_edge", "siemens", "points"]
 
 
 @settings(max_examples=60, deadline=None)
-@given(kind=st.sampled_from(KINDS), y=st.integers(1, 90), x=st.integers(1, 90), ends=st.tuples(*[st.floats(0, 1)] * 2))
+@given(
+    kind=st.sampled_from(KINDS),
+    y=st.integers(1, 90),
+    x=st.integers(1, 90),
+    ends=st.tuples(*[st.floats(0, 1)] * 2),
+)
 def test_any_shape_stays_between_low_and_high(kind, y, x, ends):
     low, high = sorted(ends)
     result = targets(kind=kind, shape=(y, x), low=low, high=high)
@@ -37,13 +42,18 @@ def test_slanted_edge_is_the_area_beyond_the_line():
     beyond = (offsets[None, :] * math.cos(tilt) + offsets[:, None] * math.sin(tilt) > 0).double()
     counted = beyond.reshape(9, fine, 9, fine).mean((1, 3))
     torch.testing.assert_close(result, counted, atol=2e-3, rtol=0)
-    torch.testing.assert_close(result + result.flip(0, 1), torch.ones(9, 9, dtype=torch.float64), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        result + result.flip(0, 1), torch.ones(9, 9, dtype=torch.float64), atol=1e-6, rtol=0
+    )
 
 
 def test_star_has_36_cycles_and_mean_grey():
     star = targets(kind="siemens", shape=(257, 257))[0].double()
     angle = torch.linspace(0, 2 * math.pi, 3601, dtype=torch.float64)[:-1]
-    y, x = (128 + 100 * torch.sin(angle)).round().long(), (128 + 100 * torch.cos(angle)).round().long()
+    y, x = (
+        (128 + 100 * torch.sin(angle)).round().long(),
+        (128 + 100 * torch.cos(angle)).round().long(),
+    )
     spectrum = torch.fft.rfft(star[y, x] - 0.5).abs()
     assert int(spectrum.argmax()) == 36
     assert abs(float(star[128, 128]) - 0.5) < 1e-6

@@ -8,7 +8,13 @@ from scipy import stats
 
 from neusee.nodes import ErrorBound, TensorStats
 from neusee.nodes.sensor import dark_current, digitize, photon_noise, read_noise
-from neusee.nodes.sensor._draw_limits import SURE, amplitude_error_drawn, chi_square_limit, poisson_rms, rare_events
+from neusee.nodes.sensor._noise import (
+    SURE,
+    amplitude_error_drawn,
+    chi_square_limit,
+    poisson_rms,
+    rare_events,
+)
 
 RARE = 1e-4
 
@@ -33,7 +39,8 @@ def test_unequal_events_are_no_more_often_above_the_limit(seed):
     counts = torch.ones(1, dtype=torch.float64)
     for chance in chances.tolist():
         counts = (
-            torch.nn.functional.pad(counts, (0, 1)) * (1 - chance) + torch.nn.functional.pad(counts, (1, 0)) * chance
+            torch.nn.functional.pad(counts, (0, 1)) * (1 - chance)
+            + torch.nn.functional.pad(counts, (1, 0)) * chance
         )
     limit = rare_events(float(chances.sum()))
     assert float(counts[limit + 1 :].sum()) <= RARE
@@ -43,13 +50,17 @@ def test_unequal_events_are_no_more_often_above_the_limit(seed):
 def test_rounding_changes_as_many_numbers_as_the_quantile_says(rms, pixels):
     flips = rms - rms**2
     expected = math.sqrt(rms**2 + float(stats.poisson.isf(RARE, flips * pixels)) / pixels)
-    assert digitize.hooks.rounding_error(rms, result=facts_of(pixels)) == pytest.approx(expected, rel=1e-12)
+    assert digitize.hooks.rounding_error(rms, result=facts_of(pixels)) == pytest.approx(
+        expected, rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("rms", [0.5, 0.7, 40.0])
 def test_a_larger_error_changes_the_mean_square_by_a_quarter_at_most(rms):
     expected = math.sqrt(rms**2 + float(stats.poisson.isf(RARE, 0.25 * 400)) / 400)
-    assert digitize.hooks.rounding_error(rms, result=facts_of(20, 20)) == pytest.approx(expected, rel=1e-12)
+    assert digitize.hooks.rounding_error(rms, result=facts_of(20, 20)) == pytest.approx(
+        expected, rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("pixels", [1, 30, 1000])
@@ -68,7 +79,8 @@ def test_poisson_noise_is_above_its_limit_in_fewer_than_one_of_ten_thousand_draw
     """Rare counts in few pixels: the rms of all draws is too small for one draw up to 30 times."""
     pixels, draws = 40, 20_000
     counts = torch.poisson(
-        torch.full((draws, pixels), mean, dtype=torch.float64), generator=torch.Generator().manual_seed(1)
+        torch.full((draws, pixels), mean, dtype=torch.float64),
+        generator=torch.Generator().manual_seed(1),
     )
     rms = counts.square().mean(1).sqrt()
     limit = poisson_rms(mean, pixels)
@@ -93,13 +105,21 @@ def test_the_noise_of_other_light_is_below_its_limit_wherever_the_error_is(wide,
 
 def test_the_stated_error_of_one_draw_is_above_that_of_all_draws():
     photons = ErrorBound(0.5, TensorStats((50,), "float32", 10.0, 100.0, 1.0, 50, True))
-    how = {"quantum_efficiency": 0.5, "distribution": "gaussian", "mean_shift": 0.0, "mean": "additive",
-           "drawn_in": "electrons"}  # fmt: skip
+    how = {
+        "quantum_efficiency": 0.5,
+        "distribution": "gaussian",
+        "mean_shift": 0.0,
+        "mean": "additive",
+        "drawn_in": "electrons",
+    }
     one = photon_noise.hooks.propagate_draw(photons, result=facts_of(50), **how)
     every = photon_noise.hooks.propagate_error(photons, result=facts_of(50), **how)
     assert every < one < 6 * every
     assert (
-        photon_noise.hooks.propagate_draw(photons, result=facts_of(50), **how | {"distribution": "poisson"}) == math.inf
+        photon_noise.hooks.propagate_draw(
+            photons, result=facts_of(50), **how | {"distribution": "poisson"}
+        )
+        == math.inf
     )
 
 
@@ -116,8 +136,16 @@ def test_the_stated_error_of_one_draw_is_above_that_of_all_draws():
 )
 def test_one_draw_of_omitted_noise_is_below_its_limit(node, params, pixels):
     light = torch.zeros(2000, pixels, dtype=torch.float64)
-    added = node(light, **params, full_well=None, rng=torch.Generator().manual_seed(3)).square().mean(1).sqrt()
-    usual = math.hypot(params.get("mean", params.get("offset")), params.get("read_noise", params.get("mean", 0) ** 0.5))
+    added = (
+        node(light, **params, full_well=None, rng=torch.Generator().manual_seed(3))
+        .square()
+        .mean(1)
+        .sqrt()
+    )
+    usual = math.hypot(
+        params.get("mean", params.get("offset")),
+        params.get("read_noise", params.get("mean", 0) ** 0.5),
+    )
     factor = node.hooks.skip_draw(facts_of(pixels), full_well=None, **params)
     assert float(added.max()) <= factor * usual
     assert factor * usual <= 3.0 * float(added.max())

@@ -27,7 +27,9 @@ def test_saturating_light_of_one_wavelength_frees_a_full_well():
     one = torch.zeros(5, 2, 2, dtype=torch.float64)
     one[3] = saturation(BANDS, **SENSOR)[3]
     photons = expose(one, BANDS, torch.ones(1, 5), **SHUTTER)
-    torch.testing.assert_close(photons * 0.56, torch.full_like(photons, 25500.0), rtol=1e-6, atol=0.0)
+    torch.testing.assert_close(
+        photons * 0.56, torch.full_like(photons, 25500.0), rtol=1e-6, atol=0.0
+    )
 
 
 def test_agrees_with_its_reference():
@@ -37,7 +39,10 @@ def test_agrees_with_its_reference():
     assert found.shape == exact.shape == (3, 4, 3)
     again = expose(scene(4, 3), BANDS, RESPONSES, **SHUTTER)
     torch.testing.assert_close(
-        again.double(), expose.hooks.reference(scene(4, 3), BANDS, RESPONSES, **SHUTTER), rtol=1e-6, atol=0
+        again.double(),
+        expose.hooks.reference(scene(4, 3), BANDS, RESPONSES, **SHUTTER),
+        rtol=1e-6,
+        atol=0,
     )
 
 
@@ -57,7 +62,9 @@ def test_a_batch_passes():
 
 def test_gradient():
     light = scene(2, 2, dtype=torch.float64).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: expose(x * 1e-3, BANDS, RESPONSES, **SHUTTER), (light,))
+    assert torch.autograd.gradcheck(
+        lambda x: expose(x * 1e-3, BANDS, RESPONSES, **SHUTTER), (light,)
+    )
 
 
 @pytest.mark.parametrize("strength", [0.0, 0.7, 3.0])
@@ -70,18 +77,28 @@ def test_level_fills_the_brightest_channel_to_the_strength(strength):
 
 @pytest.mark.parametrize("share", [0.01, 0.3, 0.9])
 def test_a_level_is_off_by_as_much_as_stated_where_the_brightest_pixel_is(share):
-    """The level divides by the brightest pixel: of an image too bright by a share it is off by more than that share."""
+    """The level divides by the brightest pixel: of an image too bright by a share it is off by
+    more than that share.
+    """
     bright = scene(6, 6, dtype=torch.float64)
-    found, low, high = (level(bright * k, BANDS, RESPONSES, strength=0.7, **SENSOR) for k in (1, 1 + share, 1 - share))
+    found, low, high = (
+        level(bright * k, BANDS, RESPONSES, strength=0.7, **SENSOR)
+        for k in (1, 1 + share, 1 - share)
+    )
     off = max(float((found - true).abs().max()) for true in (low, high))
     image = ErrorBound(0.1, TensorStats.of(bright), share)
-    told = level.hooks.propagate_error(image, None, None, result=TensorStats.of(found), strength=0.7, **SENSOR)
+    told = level.hooks.propagate_error(
+        image, None, None, result=TensorStats.of(found), strength=0.7, **SENSOR
+    )
     assert told == pytest.approx(off, rel=1e-9)
 
 
 def test_nothing_is_known_of_a_level_where_the_brightest_pixel_may_be_dark():
     image, found = ErrorBound(0.1, TensorStats.of(scene(2, 2)), 1.0), TensorStats.of(torch.ones(5))
-    assert level.hooks.propagate_error(image, None, None, result=found, strength=0.7, **SENSOR) == math.inf
+    assert (
+        level.hooks.propagate_error(image, None, None, result=found, strength=0.7, **SENSOR)
+        == math.inf
+    )
 
 
 def test_a_scene_in_lux_has_the_level_of_its_white_and_no_other():
@@ -94,14 +111,18 @@ def test_a_scene_in_lux_has_the_level_of_its_white_and_no_other():
     zero = torch.zeros((), dtype=torch.float64)
     with pytest.raises(ParameterError, match="the brightness of the scene is not known"):
         level(scene(6, 6), BANDS, RESPONSES, zero, **SENSOR)
-    bound = level.hooks.propagate_error(ErrorBound(0.1), result=TensorStats.of(factor), strength=None)
+    bound = level.hooks.propagate_error(
+        ErrorBound(0.1), result=TensorStats.of(factor), strength=None
+    )
     assert bound == 0.0
 
 
 def test_level_per_band_lets_each_band_reach_the_strength():
     factor = level(scene(6, 6), BANDS, RESPONSES, strength=0.7, rule="per_band", **SENSOR)
     peaks = (scene(6, 6) * factor[:, None, None]).amax((-2, -1))
-    torch.testing.assert_close(peaks.double(), 0.7 * saturation(BANDS, **SENSOR), rtol=1e-6, atol=0.0)
+    torch.testing.assert_close(
+        peaks.double(), 0.7 * saturation(BANDS, **SENSOR), rtol=1e-6, atol=0.0
+    )
     assert "each band alone" in level.hooks.preflight(strength=0.7, rule="per_band")[0]
     assert "saturates" in level.hooks.preflight(strength=2.0, rule="channel_sum")[0]
 
@@ -109,7 +130,9 @@ def test_level_per_band_lets_each_band_reach_the_strength():
 @pytest.mark.parametrize("rule", ["channel_sum", "per_band"])
 @pytest.mark.parametrize("value", [0.0, 1e-40])
 def test_a_dark_scene_has_a_finite_level(rule, value):
-    factor = level(torch.full((5, 2, 2), value), BANDS, RESPONSES, strength=0.7, rule=rule, **SENSOR)
+    factor = level(
+        torch.full((5, 2, 2), value), BANDS, RESPONSES, strength=0.7, rule=rule, **SENSOR
+    )
     assert torch.isfinite(factor).all()
     assert (value > 0) == bool(factor.any())
 
@@ -134,7 +157,10 @@ def test_bands_must_agree():
 def test_checks():
     assert expose.hooks.check(torch.ones(3, 2, 2))[0].ok
     assert not expose.hooks.check(torch.tensor([-1.0, 1.0]))[0].ok
-    assert "1 from the scene" in add_photons.hooks.check(torch.full((3, 1, 1), 4.0), torch.ones(3, 1, 1), [])[0].text
+    assert (
+        "1 from the scene"
+        in add_photons.hooks.check(torch.full((3, 1, 1), 4.0), torch.ones(3, 1, 1), [])[0].text
+    )
 
 
 def channels(light, weights):
@@ -151,7 +177,10 @@ def test_channels_give_the_photons_and_the_level_of_all_bands():
         found = [expose(x, BANDS, RESPONSES, factor, **SHUTTER) for x in (summed, light)]
         torch.testing.assert_close(*found, rtol=1e-12, atol=0)
         torch.testing.assert_close(
-            expose.hooks.reference(summed, BANDS, RESPONSES, factor, **SHUTTER), found[1], rtol=1e-12, atol=0
+            expose.hooks.reference(summed, BANDS, RESPONSES, factor, **SHUTTER),
+            found[1],
+            rtol=1e-12,
+            atol=0,
         )
 
 
@@ -190,13 +219,19 @@ def test_gradients_through_channels():
     summed = channels(scene(3, 3, dtype=torch.float64), weights)
 
     def photons(planes, factor):
-        return expose(summed._replace(planes=planes * 1e-3), BANDS, RESPONSES, factor.expand(5), **SHUTTER)
+        return expose(
+            summed._replace(planes=planes * 1e-3), BANDS, RESPONSES, factor.expand(5), **SHUTTER
+        )
 
     assert torch.autograd.gradcheck(photons, (planes.requires_grad_(), factor.requires_grad_()))
 
 
 def test_nodes_say_which_inputs_may_be_channels():
-    assert (expose.accepts_channel_sums, expose.needs_band_invariant, level.accepts_channel_sums) == (
+    assert (
+        expose.accepts_channel_sums,
+        expose.needs_band_invariant,
+        level.accepts_channel_sums,
+    ) == (
         ("irradiance",),
         ("level",),
         ("plain_image",),

@@ -1,4 +1,6 @@
-"""A frame is read as the numbers that a file holds, in every format, and refused if it does not fit."""
+"""A frame is read as the numbers that a file holds, in every format, and refused if it does not
+fit.
+"""
 
 import struct
 import zlib
@@ -27,7 +29,11 @@ def png8(path, values):
 def exr(path, values):
     import OpenEXR
 
-    planes = {"RGB": values.astype(np.float32)} if values.shape[-1] == 3 else {"Y": values[..., 0].astype(np.float32)}
+    planes = (
+        {"RGB": values.astype(np.float32)}
+        if values.shape[-1] == 3
+        else {"Y": values[..., 0].astype(np.float32)}
+    )
     OpenEXR.File({"type": OpenEXR.scanlineimage}, planes).write(str(path))
 
 
@@ -47,7 +53,9 @@ def test_the_numbers_of_every_format_are_unchanged(name, tmp_path):
     bits, write = WRITERS[name]
     values = numbers(2**bits - 1)
     write(tmp_path / name, values)
-    found = frame(THREE, file=tmp_path / name, shape=SHAPE, bits=bits, curve="linear" if bits == 8 else None)
+    found = frame(
+        THREE, file=tmp_path / name, shape=SHAPE, bits=bits, curve="linear" if bits == 8 else None
+    )
     assert found.dtype == torch.float32
     np.testing.assert_array_equal(found.numpy(), values.transpose(2, 0, 1))
 
@@ -87,7 +95,10 @@ def test_an_array_that_does_not_fit_is_refused_before_the_run(case, tmp_path):
     values, message = BAD[case]
     np.save(tmp_path / "bad.npy", values)
     given = {"file": tmp_path / "bad.npy", "shape": SHAPE, "bits": 12}
-    for call in (lambda: frame.hooks.preflight(responses=THREE, **given), lambda: frame(THREE, **given)):
+    for call in (
+        lambda: frame.hooks.preflight(responses=THREE, **given),
+        lambda: frame(THREE, **given),
+    ):
         with pytest.raises(ParameterError, match=message) as error:
             call()
         assert error.value.parameter == "file"
@@ -95,13 +106,22 @@ def test_an_array_that_does_not_fit_is_refused_before_the_run(case, tmp_path):
 
 
 FILES = {
-    "palette.png": (lambda path: Image.new("P", SHAPE[::-1]).save(path), "has a palette, transparency"),
-    "alpha.png": (lambda path: Image.new("RGBA", SHAPE[::-1]).save(path), "has a palette, transparency"),
+    "palette.png": (
+        lambda path: Image.new("P", SHAPE[::-1]).save(path),
+        "has a palette, transparency",
+    ),
+    "alpha.png": (
+        lambda path: Image.new("RGBA", SHAPE[::-1]).save(path),
+        "has a palette, transparency",
+    ),
     "text.png": (lambda path: path.write_text("no picture"), "no PNG file, whatever its name says"),
     "cut.tif": (lambda path: path.write_bytes(b"II*\0garbage"), "cannot be read as grey or RGB"),
     "cut.npy": (lambda path: path.write_bytes(b"\x93NUMPY\x01"), "damaged or no picture"),
     "cut.exr": (lambda path: path.write_bytes(b"v/1\x01cut"), "damaged or no picture"),
-    "shot.jpg": (lambda path: Image.new("RGB", SHAPE[::-1]).save(path), "no frame that can be read: give .png"),
+    "shot.jpg": (
+        lambda path: Image.new("RGB", SHAPE[::-1]).save(path),
+        "no frame that can be read: give .png",
+    ),
     "eight.png": (lambda path: png8(path, numbers(255)), "has 8 bits, but sensor.bits is 12"),
 }
 
@@ -148,16 +168,40 @@ def tiff_with_profile(name):
 
 
 SIGNS = {
-    "eight.png": (8, lambda path: png8(path, numbers(255)), "has 8 bits, as pictures with a tone curve"),
+    "eight.png": (
+        8,
+        lambda path: png8(path, numbers(255)),
+        "has 8 bits, as pictures with a tone curve",
+    ),
     "eight.tif": (8, WRITERS["d.tiff"][1], "has 8 bits"),
     "eight.npy": (8, np.save, "has 8 bits"),
     "bytes.npy": (12, lambda path, x: np.save(path, x.astype(np.uint8)), "has 8 bits"),
-    "stretched.npy": (16, lambda path, x: np.save(path, x.astype(np.uint16) * 257), "only multiples of 257"),
-    "moved.npy": (16, lambda path, x: np.save(path, x.astype(np.uint16) * 256), "only multiples of 256"),
+    "stretched.npy": (
+        16,
+        lambda path, x: np.save(path, x.astype(np.uint16) * 257),
+        "only multiples of 257",
+    ),
+    "moved.npy": (
+        16,
+        lambda path, x: np.save(path, x.astype(np.uint16) * 256),
+        "only multiples of 256",
+    ),
     "srgb.png": (16, with_chunk(b"sRGB", b"\0"), "says of itself that it is sRGB encoded"),
-    "gamma.png": (16, with_chunk(b"gAMA", struct.pack(">I", 45455)), r"a tone curve with the gamma 2\.2"),
-    "code.png": (16, with_chunk(b"cICP", bytes([1, 13, 0, 1])), "transfer characteristic 13 of ITU-T H.273"),
-    "profile.png": (16, with_chunk(b"iCCP", b"Display P3\0\0" + zlib.compress(b"x")), "colour profile Display P3"),
+    "gamma.png": (
+        16,
+        with_chunk(b"gAMA", struct.pack(">I", 45455)),
+        r"a tone curve with the gamma 2\.2",
+    ),
+    "code.png": (
+        16,
+        with_chunk(b"cICP", bytes([1, 13, 0, 1])),
+        "transfer characteristic 13 of ITU-T H.273",
+    ),
+    "profile.png": (
+        16,
+        with_chunk(b"iCCP", b"Display P3\0\0" + zlib.compress(b"x")),
+        "colour profile Display P3",
+    ),
     "profile.tif": (16, tiff_with_profile(b"sRGB IEC61966-2.1"), "has a colour profile"),
 }
 
@@ -165,7 +209,11 @@ SIGNS = {
 @pytest.mark.parametrize("name", SIGNS)
 def test_a_file_with_a_sign_of_a_tone_curve_needs_a_statement(name, tmp_path):
     bits, write, sign = SIGNS[name]
-    write(tmp_path / name, numbers(255)) if name.endswith("npy") or name == "eight.tif" else write(tmp_path / name)
+    (
+        write(tmp_path / name, numbers(255))
+        if name.endswith("npy") or name == "eight.tif"
+        else write(tmp_path / name)
+    )
     given = {"responses": THREE, "file": tmp_path / name, "shape": SHAPE, "bits": bits}
     with pytest.raises(ParameterError, match=sign) as error:
         frame.hooks.preflight(**given)
@@ -178,7 +226,8 @@ def test_a_file_with_a_sign_of_a_tone_curve_needs_a_statement(name, tmp_path):
 LINEAR = {
     "plain.png": WRITERS["a.png"][1],
     "linear.png": lambda path, x: with_chunk(b"gAMA", struct.pack(">I", 100000))(path),
-    "moved.npy": lambda path, x: np.save(path, (x.astype(np.uint16) // 16) * 16),  # 12 bits at the upper end
+    # 12 bits at the upper end
+    "moved.npy": lambda path, x: np.save(path, (x.astype(np.uint16) // 16) * 16),
     "linear.tif": lambda path, x: tiff_with_profile(b"Linear sRGB")(path),
 }
 

@@ -33,12 +33,16 @@ def test_a_dark_current_by_time_is_that_of_the_exposure_times_the_rate():
     facts = TensorStats.of(torch.full((3, 3), 100.0))
     bound = dark_current.hooks.skip_bound
     params = {"full_well": None, "mean_of": "sensor"}
-    assert bound(facts, mean=ElectronsPerSecond(50.0), exposure=0.1, **params) == bound(facts, mean=5.0, **params)
+    assert bound(facts, mean=ElectronsPerSecond(50.0), exposure=0.1, **params) == bound(
+        facts, mean=5.0, **params
+    )
     with pytest.raises(ParameterError, match="50 e-/s needs the exposure"):
         dark_current.hooks.preflight(mean=ElectronsPerSecond(50.0), exposure=None)
 
 
-@pytest.mark.parametrize(("text", "read"), [("0.02 e-", 0.02), ("0.02 e-/s", (0.02,)), ("3 ke-/s", (3000.0,))])
+@pytest.mark.parametrize(
+    ("text", "read"), [("0.02 e-", 0.02), ("0.02 e-/s", (0.02,)), ("3 ke-/s", (3000.0,))]
+)
 def test_a_dark_current_is_read_with_its_unit(text, read):
     found = dark_current.params(mean=text).mean
     assert found == read
@@ -68,19 +72,27 @@ def test_c1_and_c2_in_both_readings(drawn_in, distribution):
     literal, _ = moments(1e4, mean="literal", **how)
     assert added == pytest.approx(1.2 * 5600, rel=1e-3)
     assert literal == pytest.approx(0.2 * 5600, rel=1e-3)
-    assert variance == pytest.approx(0.81 * 5600 * (1.0 if drawn_in == "electrons" else 0.56), rel=0.02)
+    assert variance == pytest.approx(
+        0.81 * 5600 * (1.0 if drawn_in == "electrons" else 0.56), rel=0.02
+    )
 
 
 @pytest.mark.parametrize("mean", ["additive", "literal"])
 @pytest.mark.parametrize("drawn_in", ["electrons", "photons"])
 @pytest.mark.parametrize(("photons", "less"), [(4.0, 4.0), (100.0, 10.0), (1e4, 100.0), (1e6, 1.0)])
-def test_with_the_same_draws_other_light_has_a_noise_that_is_off_by_no_more_than_stated(photons, less, drawn_in, mean):
+def test_with_the_same_draws_other_light_has_a_noise_that_is_off_by_no_more_than_stated(
+    photons, less, drawn_in, mean
+):
     how = {"drawn_in": drawn_in, "mean": mean, "mean_shift": 0.0, "distribution": "gaussian"}
     light = torch.full((N,), photons, dtype=torch.float64)
-    found, true = (photon_noise(x, quantum_efficiency=0.56, rng=seeded(), **how) for x in (light, light - less))
+    found, true = (
+        photon_noise(x, quantum_efficiency=0.56, rng=seeded(), **how) for x in (light, light - less)
+    )
     off = float((found - true).square().mean().sqrt())
     given = ErrorBound(less, TensorStats.of(light))
-    told = photon_noise.hooks.propagate_error(given, result=TensorStats.of(found), quantum_efficiency=0.56, **how)
+    told = photon_noise.hooks.propagate_error(
+        given, result=TensorStats.of(found), quantum_efficiency=0.56, **how
+    )
     assert off <= told <= 4 * off
 
 
@@ -117,7 +129,9 @@ def test_never_negative_always_finite(photons, distribution, drawn_in, mean, dty
 @pytest.mark.parametrize("distribution", ["gaussian", "poisson"])
 def test_gradient_is_finite_in_the_dark_and_follows_the_mean(distribution):
     photons = torch.tensor([0.0, 1e-40, 1e4]).requires_grad_()
-    photon_noise(photons, quantum_efficiency=0.5, distribution=distribution, rng=seeded()).sum().backward()
+    photon_noise(
+        photons, quantum_efficiency=0.5, distribution=distribution, rng=seeded()
+    ).sum().backward()
     assert torch.isfinite(photons.grad).all()
     assert float(photons.grad[2]) == pytest.approx(0.5, abs=0.05)
 
@@ -136,7 +150,9 @@ def test_dark_current_is_poisson():
 
 
 def test_read_noise_has_a_pedestal_and_a_spread():
-    found = read_noise(torch.zeros(N, dtype=torch.float64), offset=390.0, read_noise=10.5, rng=seeded())
+    found = read_noise(
+        torch.zeros(N, dtype=torch.float64), offset=390.0, read_noise=10.5, rng=seeded()
+    )
     assert float(found.mean()) == pytest.approx(390, abs=0.15)
     assert float(found.std()) == pytest.approx(10.5, rel=0.01)
 
@@ -165,7 +181,8 @@ def test_bounds_are_true_and_not_far(node, params, scale):
         node.hooks.skip_bound(TensorStats.of(electrons), full_well=None, **params),
         change(electrons, node, **params),
     )
-    # The largest of 16 sampled rms values lies above the true one by a few of its own errors, 1/sqrt(2 * draws).
+    # The largest of 16 sampled rms values lies above the true one by a few of its own errors,
+    # 1/sqrt(2 * draws).
     assert found <= bound * (1 + 5 / math.sqrt(800) + (2.0 if params.get("mean") == 0.002 else 0.0))
     assert params.get("mean") == 0.002 or bound < 1.1 * found
 
@@ -199,25 +216,33 @@ def test_another_precision_draws_the_same_numbers(dtype):
     electrons = torch.full((64,), 100.0)
     single = read_noise(electrons, offset=0.0, read_noise=1.0, rng=seeded())
     other = read_noise(electrons.to(dtype), offset=0.0, read_noise=1.0, rng=seeded())
-    torch.testing.assert_close(other.double(), single.double(), rtol=torch.finfo(dtype).eps, atol=1e-4)
+    torch.testing.assert_close(
+        other.double(), single.double(), rtol=torch.finfo(dtype).eps, atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("distribution", ["gaussian", "poisson"])
 def test_the_noise_of_light_is_the_same_in_single_and_double(distribution):
     photons = torch.linspace(0, 1e4, 500)
     how = {"quantum_efficiency": 0.56, "distribution": distribution}
-    single, double = (photon_noise(photons.to(d), rng=seeded(), **how) for d in (torch.float32, torch.float64))
+    single, double = (
+        photon_noise(photons.to(d), rng=seeded(), **how) for d in (torch.float32, torch.float64)
+    )
     torch.testing.assert_close(single.double(), double, rtol=1e-6, atol=1e-2)
 
 
-@pytest.mark.parametrize("shape", [(3, 100, 217), (65536 + 5,), (3 * 32768 + 15,), (1, 65536), (2, 256, 129)])
+@pytest.mark.parametrize(
+    "shape", [(3, 100, 217), (65536 + 5,), (3 * 32768 + 15,), (1, 65536), (2, 256, 129)]
+)
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
 def test_parts_that_stay_in_cache_are_the_whole_to_the_last_bit(shape, dtype):
     """With a gradient all is computed at once, without one by parts."""
     x = (torch.rand(shape, generator=torch.Generator().manual_seed(1)) * 300 - 2).to(dtype)
     makers = [
         lambda rng: photon_noise(x, quantum_efficiency=0.56, spread=1.2, mean_shift=0.1, rng=rng),
-        lambda rng: photon_noise(x, quantum_efficiency=0.56, distribution="poisson", drawn_in="photons", rng=rng),
+        lambda rng: photon_noise(
+            x, quantum_efficiency=0.56, distribution="poisson", drawn_in="photons", rng=rng
+        ),
         lambda rng: dark_current(x.mT if x.ndim > 1 else x, mean=0.3, rng=rng),
         lambda rng: read_noise(x.mT if x.ndim > 1 else x, offset=3.0, read_noise=2.0, rng=rng),
     ]

@@ -1,4 +1,6 @@
-"""The photon-transfer curve: slope = gain, intercept = read noise, within sampling error (EMVA 1288)."""
+"""The photon-transfer curve: slope = gain, intercept = read noise, within sampling error (EMVA
+1288).
+"""
 
 import math
 
@@ -8,15 +10,25 @@ import torch
 from neusee.nodes.sensor import photon_transfer
 from neusee.nodes.units import read_quantity
 
-TABLE = {"full_well": 25500.0, "quantum_efficiency": 0.56, "offset": 390.0, "read_noise": 10.5, "dark": 0.002}
+TABLE = {
+    "full_well": 25500.0,
+    "quantum_efficiency": 0.56,
+    "offset": 390.0,
+    "read_noise": 10.5,
+    "dark": 0.002,
+}
 
 
 def curve(pixels=40_000, levels=40, **how):
-    return photon_transfer(**{**TABLE, **how}, pixels=pixels, levels=levels, rng=torch.Generator().manual_seed(5))
+    return photon_transfer(
+        **{**TABLE, **how}, pixels=pixels, levels=levels, rng=torch.Generator().manual_seed(5)
+    )
 
 
 def fit(points):
-    """Weighted straight line of variance against signal: slope, intercept and their standard errors."""
+    """Weighted straight line of variance against signal: slope, intercept and their standard
+    errors.
+    """
     x, y, expected = points.T
     weight = 1.0 / (expected * math.sqrt(1 / 20_000)) ** 2
     design = torch.stack([x, torch.ones_like(x)], 1)
@@ -39,7 +51,8 @@ def test_slope_is_the_gain_and_intercept_the_read_noise(gain, unit, rounding, di
     slope = read_quantity(f"{gain} {unit}", "DN/e-")
     points = curve(gain=slope, rounding=rounding, distribution=distribution)
     below = points[:, 0] < 0.8 * min(25110 * slope, 65535 - 390 * slope)
-    bright = below & (points[:, 0] / slope > 20) | (points[:, 0] == 0)  # under 20 e- a Gaussian is cut at 0
+    # under 20 e- a Gaussian is cut at 0
+    bright = below & (points[:, 0] / slope > 20) | (points[:, 0] == 0)
     best, error = fit(points[bright])
     floor = slope**2 * (10.5**2 + 0.002) + (1 / 6 if rounding == "dithered_floor" else 1 / 12)
     assert abs(float(best[0]) - slope) < 4 * float(error[0])
@@ -68,7 +81,10 @@ def test_the_smallest_experiment(levels, pixels):
     points = curve(gain=1 / 0.37, levels=levels, pixels=pixels)
     assert points.shape == (levels, 3)
     assert torch.isfinite(points).all()
-    assert "no flat" in photon_transfer.hooks.check(points, full_well=25500.0, gain=1 / 0.37)[0].text or levels > 2
+    assert (
+        "no flat" in photon_transfer.hooks.check(points, full_well=25500.0, gain=1 / 0.37)[0].text
+        or levels > 2
+    )
 
 
 def test_check_judges_the_slope():

@@ -16,7 +16,8 @@ def test_saturation_irradiance():
     papers = torch.tensor([2.692e-2, 1.958e-2, 1.538e-2], dtype=torch.float64)
     found = saturation(BANDS, **SENSOR)
     torch.testing.assert_close(found, papers, rtol=1.6e-3, atol=0.0)
-    # The paper's h = 6.63e-34 and c = 3e8 against CODATA: 0.13 %, and then to the last digit printed.
+    # The paper's h = 6.63e-34 and c = 3e8 against CODATA: 0.13 %, and then to the last digit
+    # printed.
     rounded = found * (6.63e-34 * 3e8) / (6.62607015e-34 * 299792458)
     torch.testing.assert_close(rounded, papers, rtol=4e-4, atol=0.0)
 
@@ -36,10 +37,20 @@ def test_a_sensor_without_read_noise_has_a_finite_range():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("exposure", "0 s"), ("full_well", "0 e-"), ("quantum_efficiency", 0.0), ("quantum_efficiency", 1.1)],
+    [
+        ("exposure", "0 s"),
+        ("full_well", "0 e-"),
+        ("quantum_efficiency", 0.0),
+        ("quantum_efficiency", 1.1),
+    ],
 )
 def test_what_would_divide_by_zero_is_refused(name, value):
-    given = {"full_well": "25500 e-", "quantum_efficiency": 0.56, "pixel_pitch": "2.9 um", "exposure": "0.1 s"}
+    given = {
+        "full_well": "25500 e-",
+        "quantum_efficiency": 0.56,
+        "pixel_pitch": "2.9 um",
+        "exposure": "0.1 s",
+    }
     assert saturation.params(**given).exposure == 0.1
     with pytest.raises(ValidationError, match=name):
         saturation.params(**{**given, name: value})

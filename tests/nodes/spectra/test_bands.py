@@ -19,7 +19,9 @@ def test_31_bands_have_both_ends_as_centres():
     result = bands(start=400 * NM, stop=700 * NM, count=31)
     expected = torch.arange(400, 701, 10, dtype=torch.float64) * NM
     torch.testing.assert_close(result.centres, expected, atol=1e-18, rtol=0)
-    torch.testing.assert_close(result.widths, torch.full((31,), 10 * NM, dtype=torch.float64), atol=1e-18, rtol=0)
+    torch.testing.assert_close(
+        result.widths, torch.full((31,), 10 * NM, dtype=torch.float64), atol=1e-18, rtol=0
+    )
     assert torch.equal(result.weights, torch.ones(31, dtype=torch.float64))
 
 
@@ -55,7 +57,10 @@ def test_refuses_widths_that_belong_to_no_filter():
 def test_filters_are_read_from_a_recipe():
     read = filters.params(centres=["500 nm", "0.45 um"], widths=["10 nm"])
     assert read.centres == pytest.approx((500 * NM, 450 * NM))
-    for wrong in ({"centres": [], "widths": ["10 nm"]}, {"centres": ["500 nm"], "widths": ["0 nm"]}):
+    for wrong in (
+        {"centres": [], "widths": ["10 nm"]},
+        {"centres": ["500 nm"], "widths": ["0 nm"]},
+    ):
         with pytest.raises(ValueError, match=r"at least|greater than"):
             filters.params(**wrong)
 
@@ -120,5 +125,7 @@ def test_refuses_bands_below_100_nm():
 
 
 def test_the_mean_of_a_line_counts_its_bands_by_their_energy():
-    sampled = Bands(torch.tensor([500 * NM, 510 * NM]), torch.full((2,), 10 * NM), torch.tensor([3.0, 1.0]))
+    sampled = Bands(
+        torch.tensor([500 * NM, 510 * NM]), torch.full((2,), 10 * NM), torch.tensor([3.0, 1.0])
+    )
     assert mean_wavelength(sampled) == pytest.approx(502.5 * NM, rel=1e-6)

@@ -1,4 +1,6 @@
-"""A camera of one's own: sensitivities from a CSV file, averaged over bands, and what is refused before the run."""
+"""A camera of one's own: sensitivities from a CSV file, averaged over bands, and what is refused
+before the run.
+"""
 
 import numpy as np
 import pytest
@@ -10,7 +12,13 @@ from neusee.nodes.values import Bands
 from neusee.workflows import RecipeError, Store, load
 
 HEAD = "wavelength,red,green,blue\n"
-ROWS = [(400, 0, 0, 41.5), (447.5, -0.2, 10, 100), (550, 20, 90.25, 5), (601, 80, 30, 0), (700, 2, 0, 0)]
+ROWS = [
+    (400, 0, 0, 41.5),
+    (447.5, -0.2, 10, 100),
+    (550, 20, 90.25, 5),
+    (601, 80, 30, 0),
+    (700, 2, 0, 0),
+]
 
 
 def write(folder, rows=ROWS, name="mine.csv", head=HEAD):
@@ -20,7 +28,9 @@ def write(folder, rows=ROWS, name="mine.csv", head=HEAD):
 
 
 def mean(low, high, x, y):
-    """Average a polygon over an interval: the trapezium rule with every corner is exact; 0 beyond the ends."""
+    """Average a polygon over an interval: the trapezium rule with every corner is exact; 0
+    beyond the ends.
+    """
     if high == low:
         return float(np.interp(low, x, y, left=0, right=0))
     low_inside, high_inside = max(low, x[0]), min(high, x[-1])
@@ -33,13 +43,17 @@ def test_a_file_is_averaged_over_each_band(tmp_path, width):
     centres = np.array([380.0, 399.9, 447.5, 488.1, 601.2, 699.0, 810.0])
     numbers = np.array(ROWS, float)
     sides = [(c - width / 2, c + width / 2) for c in centres]
-    exact = np.array([[mean(*side, numbers[:, 0], column) for side in sides] for column in numbers[:, 1:].T])
+    exact = np.array(
+        [[mean(*side, numbers[:, 0], column) for side in sides] for column in numbers[:, 1:].T]
+    )
     in_metres = torch.tensor(centres, dtype=torch.float64) * 1e-9
     sampled = Bands(in_metres, torch.full_like(in_metres, width * 1e-9), torch.ones_like(in_metres))
     found = responses(sampled, camera=write(tmp_path))
     assert found.dtype == torch.float64
     np.testing.assert_allclose(found.numpy(), np.maximum(exact, 0) / 100, rtol=0, atol=1e-11)
-    assert responses.hooks.check(found, sampled, camera=write(tmp_path))[0].text.startswith("mine.csv: peaks at 601.2")
+    assert responses.hooks.check(found, sampled, camera=write(tmp_path))[0].text.startswith(
+        "mine.csv: peaks at 601.2"
+    )
 
 
 def test_a_recipe_takes_the_file_and_a_changed_file_is_another_result(tmp_path):
@@ -59,7 +73,12 @@ def test_a_recipe_takes_the_file_and_a_changed_file_is_another_result(tmp_path):
 
 def test_a_known_camera_is_a_name_in_every_folder(tmp_path):
     for name in ("CIE 1931", "Nikon 5100", "Sigma SDMerill"):
-        assert load("first_light", [f"sensor.camera={name}"], tmp_path).steps["responses"].params["camera"] == name
+        assert (
+            load("first_light", [f"sensor.camera={name}"], tmp_path)
+            .steps["responses"]
+            .params["camera"]
+            == name
+        )
 
 
 def test_light_that_the_file_does_not_see_is_told_with_the_number(tmp_path):
@@ -94,8 +113,12 @@ def test_what_is_no_camera_is_refused_before_the_run(tmp_path, rows, said):
         load("first_light", ["sensor.camera=mine.csv"], tmp_path)
 
 
-@pytest.mark.parametrize(("name", "hint"), [("Foo", ""), ("Nikon 510", "; did you mean Nikon 5100?")])
+@pytest.mark.parametrize(
+    ("name", "hint"), [("Foo", ""), ("Nikon 510", "; did you mean Nikon 5100?")]
+)
 def test_a_camera_that_is_neither_known_nor_a_file_is_refused_with_both(tmp_path, name, hint):
     with pytest.raises(RecipeError, match="no such file: ") as error:
         load("first_light", [f"sensor.camera={name}"], tmp_path)
-    assert f"{tmp_path / name}; must be 'CIE 1931', 'Nikon 5100' or 'Sigma SDMerill'{hint}" in str(error.value)
+    assert f"{tmp_path / name}; must be 'CIE 1931', 'Nikon 5100' or 'Sigma SDMerill'{hint}" in str(
+        error.value
+    )

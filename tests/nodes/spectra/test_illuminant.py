@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from neusee.nodes import ParameterError
 from neusee.nodes.spectra import bands, illuminant, illuminate, line, responses
-from neusee.nodes.spectra._spectral_tables import Table, light, observer, to_srgb
+from neusee.nodes.spectra._cie_tables import Table, light, observer, to_srgb
 from neusee.nodes.values import Bands
 
 NM = 1e-9
@@ -36,7 +36,9 @@ def test_daylight_of_6504_kelvin_is_d65():
 def test_illuminant_a_is_planck_at_2848_kelvin_with_its_old_constant():
     """CIE 15: A follows Planck's law at 2848 K with c2 = 1.435e-2 m K, that is 2856 K today."""
     planck = FINE.centres**-5 / (torch.exp(1.435e-2 / (2848 * FINE.centres)) - 1)
-    torch.testing.assert_close(illuminant(FINE, kind="A"), planck / planck.mean(), rtol=1e-3, atol=0)
+    torch.testing.assert_close(
+        illuminant(FINE, kind="A"), planck / planck.mean(), rtol=1e-3, atol=0
+    )
 
 
 def test_equal_energy_is_flat():
@@ -67,7 +69,11 @@ def test_bands_up_to_the_ends_of_a_table_have_light_and_bands_beyond_have_none(f
 
 
 def test_lines_of_a_lamp_keep_their_energy_in_wide_bands():
-    fine = illuminant(bands(start=405.5 * NM, stop=694.5 * NM, count=290), kind="FL11").reshape(29, 10).mean(1)
+    fine = (
+        illuminant(bands(start=405.5 * NM, stop=694.5 * NM, count=290), kind="FL11")
+        .reshape(29, 10)
+        .mean(1)
+    )
     wide = illuminant(bands(start=410 * NM, stop=690 * NM, count=29), kind="FL11")
     torch.testing.assert_close(fine / fine.mean(), wide / wide.mean(), rtol=1e-6, atol=1e-6)
 
@@ -98,7 +104,10 @@ def test_a_band_in_the_dark_of_an_led_is_refused():
 
 @settings(max_examples=30, deadline=None)
 @given(
-    count=st.integers(1, 8), y=st.integers(1, 5), x=st.integers(1, 5), scale=st.sampled_from([0.0, 1e-38, 1.0, 1e30])
+    count=st.integers(1, 8),
+    y=st.integers(1, 5),
+    x=st.integers(1, 5),
+    scale=st.sampled_from([0.0, 1e-38, 1.0, 1e30]),
 )
 def test_illuminate_once_and_twice(count, y, x, scale):
     reflectance = torch.rand(count, y, x, generator=torch.Generator().manual_seed(x)) * scale
@@ -106,9 +115,14 @@ def test_illuminate_once_and_twice(count, y, x, scale):
     for times, factor in (("once", power), ("twice", power**2)):
         result = illuminate(reflectance, power, times=times)
         assert result.dtype == torch.float32
-        torch.testing.assert_close(result.double(), factor[:, None, None] * reflectance.double(), rtol=1e-6, atol=1e-44)
         torch.testing.assert_close(
-            result.double(), illuminate.hooks.reference(reflectance, power, times=times), rtol=1e-6, atol=1e-44
+            result.double(), factor[:, None, None] * reflectance.double(), rtol=1e-6, atol=1e-44
+        )
+        torch.testing.assert_close(
+            result.double(),
+            illuminate.hooks.reference(reflectance, power, times=times),
+            rtol=1e-6,
+            atol=1e-44,
         )
     assert "squared" in illuminate.hooks.preflight(times="twice")[0]
 
@@ -129,7 +143,12 @@ def test_cie_responses_are_the_matching_functions_over_their_largest():
     thin = Bands(FINE.centres, torch.zeros_like(FINE.centres), FINE.weights)
     np.testing.assert_allclose(responses(thin).numpy(), expected, atol=1e-9)
     assert float(cmfs.values.max()) == pytest.approx(1.7830, abs=1e-4)
-    wide = np.array([expected[:, i - 5 : i + 6] @ np.array([0.5, *[1] * 9, 0.5]) / 10 for i in range(10, 291, 10)]).T
+    wide = np.array(
+        [
+            expected[:, i - 5 : i + 6] @ np.array([0.5, *[1] * 9, 0.5]) / 10
+            for i in range(10, 291, 10)
+        ]
+    ).T
     np.testing.assert_allclose(responses(SCENE).numpy()[:, 1:-1], wide, atol=1e-9)
 
 
@@ -150,10 +169,17 @@ def test_a_laser_between_samples_sees_the_mean_of_the_lines_between_them(camera,
     sub = line(wavelength=at * NM)
     result = responses(sub, camera=camera)
     for b in range(5):
-        low, high = float(sub.centres[b] - sub.widths[b] / 2), float(sub.centres[b] + sub.widths[b] / 2)
+        low, high = (
+            float(sub.centres[b] - sub.widths[b] / 2),
+            float(sub.centres[b] + sub.widths[b] / 2),
+        )
         steps = bands(start=low, stop=high, count=20001)
-        points = responses(Bands(steps.centres, torch.zeros_like(steps.centres), steps.weights), camera=camera)
-        torch.testing.assert_close(result[:, b], torch.trapezoid(points, dx=1 / 20000), rtol=1e-6, atol=1e-9)
+        points = responses(
+            Bands(steps.centres, torch.zeros_like(steps.centres), steps.weights), camera=camera
+        )
+        torch.testing.assert_close(
+            result[:, b], torch.trapezoid(points, dx=1 / 20000), rtol=1e-6, atol=1e-9
+        )
 
 
 @settings(max_examples=50, deadline=None)
@@ -163,15 +189,22 @@ def test_means_over_bands_add_up_to_the_whole_integral(edges):
     if float(edges.diff().min()) < 1e-3:
         return
     table = Table(
-        torch.tensor([400.0, 450.0, 520.0, 700.0], dtype=torch.float64) * NM, torch.rand(2, 4, dtype=torch.float64)
+        torch.tensor([400.0, 450.0, 520.0, 700.0], dtype=torch.float64) * NM,
+        torch.rand(2, 4, dtype=torch.float64),
     )
     parts = Bands((edges[1:] + edges[:-1]) / 2 * NM, edges.diff() * NM, edges[1:] * 0 + 1)
-    whole = Bands((edges[:1] + edges[-1:]) / 2 * NM, (edges[-1:] - edges[:1]) * NM, edges[:1] * 0 + 1)
+    whole = Bands(
+        (edges[:1] + edges[-1:]) / 2 * NM, (edges[-1:] - edges[:1]) * NM, edges[:1] * 0 + 1
+    )
     total = (table.over(parts) * parts.widths).sum(1)
-    torch.testing.assert_close(total, (table.over(whole) * whole.widths)[:, 0], rtol=1e-9, atol=1e-18)
+    torch.testing.assert_close(
+        total, (table.over(whole) * whole.widths)[:, 0], rtol=1e-9, atol=1e-18
+    )
 
 
 def test_white_reflectance_is_white_on_any_bands():
     for samples in (SCENE, FINE, bands(start=450 * NM, stop=650 * NM, count=5)):
         matrix = to_srgb(samples.centres)
-        torch.testing.assert_close(matrix.sum(1), torch.ones(3, dtype=torch.float64), rtol=1e-12, atol=0)
+        torch.testing.assert_close(
+            matrix.sum(1), torch.ones(3, dtype=torch.float64), rtol=1e-12, atol=0
+        )

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from neusee.nodes.scene import hyperspectral
 from neusee.nodes.spectra import bands, lift_lmmse, lift_mallett
-from neusee.nodes.spectra._spectral_tables import to_srgb
+from neusee.nodes.spectra._cie_tables import to_srgb
 
 NM = 1e-9
 SCENE = bands(start=400 * NM, stop=700 * NM, count=31)
@@ -30,7 +30,9 @@ def back(cube, samples=SCENE):
 
 
 @pytest.mark.skipif(not CAVE.is_file(), reason="the CAVE scene is not beside the project")
-@pytest.mark.parametrize(("lift", "psnr", "mrae"), [(lift_lmmse, 33.3, 0.147), (lift_mallett, 31.0, 0.185)])
+@pytest.mark.parametrize(
+    ("lift", "psnr", "mrae"), [(lift_lmmse, 33.3, 0.147), (lift_mallett, 31.0, 0.185)]
+)
 def test_measured_scene_is_recovered_as_well_as_known(lift, psnr, mrae):
     truth = hyperspectral(SCENE, file=CAVE, start=400 * NM, stop=700 * NM).double()
     off = lift(back(truth), SCENE) - truth
@@ -42,7 +44,9 @@ def test_measured_scene_is_recovered_as_well_as_known(lift, psnr, mrae):
 @pytest.mark.parametrize("lift", LIFTS)
 def test_usual_form_agrees_with_reference(lift):
     rgb = colours().float()
-    torch.testing.assert_close(lift(rgb, SCENE).double(), lift.hooks.reference(rgb, SCENE), rtol=lift.rtol, atol=1e-6)
+    torch.testing.assert_close(
+        lift(rgb, SCENE).double(), lift.hooks.reference(rgb, SCENE), rtol=lift.rtol, atol=1e-6
+    )
 
 
 def test_mallett_is_the_basis_of_colour_science():
@@ -69,7 +73,9 @@ def test_lmmse_reproduces_colours_on_other_bands(samples):
     assert lift_mallett(rgb, other).shape == (count, 9, 7)
 
 
-@pytest.mark.parametrize(("lift", "first", "limit"), [(lift_mallett, 0, 0.01), (lift_lmmse, 2, 0.13)])
+@pytest.mark.parametrize(
+    ("lift", "first", "limit"), [(lift_mallett, 0, 0.01), (lift_lmmse, 2, 0.13)]
+)
 def test_white_is_nearly_flat(lift, first, limit):
     """White paint absorbs violet, and so does the LMMSE white: 0.62 at 400 nm, 0.84 at 410 nm."""
     cube = lift(torch.ones(3, 1, 1), SCENE)[:, 0, 0]
@@ -79,7 +85,11 @@ def test_white_is_nearly_flat(lift, first, limit):
 
 @pytest.mark.parametrize("lift", LIFTS)
 @settings(max_examples=30, deadline=None)
-@given(y=st.integers(1, 9), x=st.integers(1, 9), scale=st.sampled_from([0.0, 1e-40, 1e-6, 1.0, 1e3, 1e30]))
+@given(
+    y=st.integers(1, 9),
+    x=st.integers(1, 9),
+    scale=st.sampled_from([0.0, 1e-40, 1e-6, 1.0, 1e3, 1e30]),
+)
 def test_any_shape_and_brightness_gives_no_negative_light(lift, y, x, scale):
     rgb = (torch.rand(3, y, x, generator=torch.Generator().manual_seed(y + x)) * 2 - 0.5) * scale
     cube = lift(rgb, SCENE)
@@ -125,7 +135,9 @@ def test_lmmse_refuses_bands_that_cannot_carry_colour():
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads the peak of a process from /proc")
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="reads the peak of a process from /proc"
+)
 def test_full_size_holds_one_cube_and_no_second():
     """In a process of its own, which has no freed memory of other tests to use again."""
     code = """

@@ -1,11 +1,13 @@
-"""The components of a clipped linear lift without a search: as few as allowed, and every stated error is a bound."""
+"""The components of a clipped linear lift without a search: as few as allowed, and every stated
+error is a bound.
+"""
 
 import pytest
 import torch
 
 from neusee.nodes.spectra import _linear_lift as lifts
 from neusee.nodes.spectra import bands, lift_lmmse, lift_lmmse_mixture
-from neusee.nodes.spectra._linear_planes import linear_planes
+from neusee.nodes.spectra._low_rank_cube import linear_planes
 
 SCENE = bands(start=400e-9, stop=700e-9, count=31)
 
@@ -35,12 +37,16 @@ def test_stated_errors_are_bounds_and_not_loose(seed, within):
         assert bool((left.abs().amax(1) <= found.residual_max[k] * (1 + 1e-6)).all())
         rms = left.square().mean(1).sqrt()
         assert bool((rms <= found.residual_rms[k] * (1 + 1e-6)).all())
-        assert float(found.residual_rms[k].max()) <= 1.5 * float(rms.max()) + 1e-5 * float(cube.max())
+        assert float(found.residual_rms[k].max()) <= 1.5 * float(rms.max()) + 1e-5 * float(
+            cube.max()
+        )
 
 
 def test_a_looser_error_takes_no_more_components():
     picture, matrix = drawn(1, negative=0.0)
-    counts = [len(linear_planes(picture, matrix, within).planes) for within in (1e-4, 1e-2, 1e-1, 0.5)]
+    counts = [
+        len(linear_planes(picture, matrix, within).planes) for within in (1e-4, 1e-2, 1e-1, 0.5)
+    ]
     assert counts[0] == 3
     assert counts == sorted(counts, reverse=True)
     assert counts[-1] == 1

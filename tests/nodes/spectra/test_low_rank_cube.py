@@ -1,4 +1,6 @@
-"""A cube as few planes: exact where it can be, bounds that hold and are not loose, every extreme."""
+"""A cube as few planes: exact where it can be, bounds that hold and are not loose, every
+extreme.
+"""
 
 import statistics
 
@@ -7,7 +9,15 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.spectra import bands, compress, illuminate, lift_lmmse, lift_mallett, responses, rows
+from neusee.nodes.spectra import (
+    bands,
+    compress,
+    illuminate,
+    lift_lmmse,
+    lift_mallett,
+    responses,
+    rows,
+)
 from neusee.nodes.spectra._linear_lift import _estimator
 from neusee.nodes.values import Bands, LowRankCube
 
@@ -34,7 +44,9 @@ def left(mixture, cube, r, norm=largest):
 
 
 def drawn(seed):
-    """A cube of random rank and decay, with or without bright points, noise and darkness below zero."""
+    """A cube of random rank and decay, with or without bright points, noise and darkness below
+    zero.
+    """
     g = seeded(seed)
     count, y, x = (int(n) for n in torch.randint(1, 40, (3,), generator=g))
     cube = torch.zeros(count, y, x, dtype=torch.float64)
@@ -59,7 +71,12 @@ def looseness(seed):
     assert found.residual_max.shape == (len(found.planes) + 1, len(cube))
     target = max(within, 9 * torch.finfo(found.planes.dtype).eps) * float(cube.abs().max())
     assert len(found.planes) == len(cube) or float(found.residual_rms[-1].max()) <= target
-    assert bool((left(found, cube, len(found.planes), lambda x: x.abs().amax(0)) <= found.residual_map.double()).all())
+    assert bool(
+        (
+            left(found, cube, len(found.planes), lambda x: x.abs().amax(0))
+            <= found.residual_map.double()
+        ).all()
+    )
     ratios = []
     for r in range(len(found.planes) + 1):
         true = left(found, cube, r)
@@ -68,7 +85,8 @@ def looseness(seed):
         ratios += (found.residual_max[r][lit] / true[lit]).tolist()
         rms = left(found, cube, r, lambda x: x.square().mean((1, 2)).sqrt())
         assert bool((rms <= found.residual_rms[r] * (1 + 1e-9)).all())
-        floor = 1e-6 * float(cube.double().square().mean().sqrt()) * len(cube) ** 0.5  # the root of what float64 holds
+        # the root of what float64 holds
+        floor = 1e-6 * float(cube.double().square().mean().sqrt()) * len(cube) ** 0.5
         assert bool((found.residual_rms[r] <= 1.01 * rms + floor).all())
     return ratios
 
@@ -89,11 +107,14 @@ def test_bounds_hold_over_a_thousand_draws_and_are_not_loose():
 @pytest.mark.parametrize("rank", [1, 3, 6])
 def test_a_product_of_few_planes_has_as_many(rank, dtype):
     """One plane is a grey scene; three are a linear lift of colours."""
-    cube = torch.tensordot(rand(31, rank, dtype=torch.float64) - 0.3, rand(rank, 65, 66, dtype=torch.float64), 1)
+    cube = torch.tensordot(
+        rand(31, rank, dtype=torch.float64) - 0.3, rand(rank, 65, 66, dtype=torch.float64), 1
+    )
     found = compress(cube.to(dtype))
     assert len(found.planes) == rank
     assert found.planes.dtype == dtype
-    rounding = 2 * len(cube) * torch.finfo(dtype).eps  # of a sum over the bands, there and back; 47 eps were seen
+    # of a sum over the bands, there and back; 47 eps were seen
+    rounding = 2 * len(cube) * torch.finfo(dtype).eps
     assert float(found.residual_max[-1].max()) < rounding * float(cube.abs().max())
 
 
@@ -136,7 +157,11 @@ def test_noise_of_full_rank_keeps_all_planes():
 def test_small_and_odd_shapes(shape):
     cube = rand(*shape)
     found = compress(cube)
-    assert float(left(found, cube, len(found.planes)).max()) <= float(found.residual_max[-1].max()) <= 1e-6
+    assert (
+        float(left(found, cube, len(found.planes)).max())
+        <= float(found.residual_max[-1].max())
+        <= 1e-6
+    )
     assert found.planes.shape[1:] == shape[1:]
 
 
@@ -150,7 +175,10 @@ def test_darkness_is_one_plane_of_nothing():
 
 @pytest.mark.parametrize("scale", [1e-300, 1e-160, 1e160, 1e300])
 def test_squares_neither_vanish_nor_overflow(scale):
-    cube = torch.tensordot(rand(5, 2, dtype=torch.float64), rand(2, 8, 9, dtype=torch.float64), 1) * scale
+    cube = (
+        torch.tensordot(rand(5, 2, dtype=torch.float64), rand(2, 8, 9, dtype=torch.float64), 1)
+        * scale
+    )
     found = compress(cube, within=1e-9)
     assert len(found.planes) == 2
     assert float(found.residual_max[-1].max()) <= 1e-9 * float(cube.max())
@@ -179,7 +207,9 @@ def test_half_precision_gives_planes_in_single():
 
 
 def test_the_gradient_of_the_planes_reaches_the_cube():
-    cube = (rand(4, 1, 1, dtype=torch.float64) * rand(1, 3, 3, dtype=torch.float64)).requires_grad_()
+    cube = (
+        rand(4, 1, 1, dtype=torch.float64) * rand(1, 3, 3, dtype=torch.float64)
+    ).requires_grad_()
     found = compress(cube)
     found.planes.sum().backward()
     torch.testing.assert_close(cube.grad, found.basis.sum(1)[:, None, None].expand_as(cube))
@@ -191,8 +221,15 @@ def test_the_check_says_how_many():
 
 
 @settings(max_examples=20, deadline=None)
-@given(st.integers(1, 8), st.integers(1, 9), st.integers(1, 9), st.integers(0, 99), st.sampled_from([0.0, 1e-6, 1e-2]))
-@example(6, 2, 3, 41, 1e-2)  # one pixel is off by more than the root mean square, which alone is promised
+@given(
+    st.integers(1, 8),
+    st.integers(1, 9),
+    st.integers(1, 9),
+    st.integers(0, 99),
+    st.sampled_from([0.0, 1e-6, 1e-2]),
+)
+# one pixel is off by more than the root mean square, which alone is promised
+@example(6, 2, 3, 41, 1e-2)
 def test_any_shape_keeps_its_bound(count, y, x, seed, within):
     cube = rand(count, y, x, seed=seed) - 0.2
     found = compress(cube, within=within)
@@ -208,7 +245,9 @@ def test_light_falls_on_a_mixture_as_on_the_cube(times):
     assert isinstance(found, LowRankCube)
     for r in range(len(found.planes) + 1):
         assert bool((left(found, lit, r) <= found.residual_max[r] * (1 + 1e-9)).all())
-    for one, exact in zip(found, illuminate.hooks.reference(mixed, power, times=times), strict=True):
+    for one, exact in zip(
+        found, illuminate.hooks.reference(mixed, power, times=times), strict=True
+    ):
         torch.testing.assert_close(one, exact)
     assert "basis images for 5 bands" in illuminate.hooks.check(found)[0].text
 
@@ -224,7 +263,10 @@ def test_rows_are_photons_of_each_channel_and_wells():
     assert found.shape == (4, 31)
     torch.testing.assert_close(found[:3], seen * SCENE.centres, rtol=1e-15, atol=0)
     torch.testing.assert_close(found[3], SCENE.centres, rtol=0, atol=0)
-    assert rows.hooks.check(found)[0].text == "4 weighted sums over 31 bands; the matrix of weights has rank 4"
+    assert (
+        rows.hooks.check(found)[0].text
+        == "4 weighted sums over 31 bands; the matrix of weights has rank 4"
+    )
     assert torch.equal(rows(SCENE, seen, well=False), found[:3])
     with pytest.raises(ValueError, match="same `bands` step"):
         rows(Bands(*(v[:5] for v in SCENE)), seen)
@@ -247,7 +289,9 @@ def test_a_lift_to_planes_is_the_lift_whether_clipped_or_not(lift, within):
         assert bool((lost <= found.residual_max[-1] + 1e-6).all())
         assert float(found.residual_rms[-1].max()) <= within * float(cube.max())
         assert len(found.planes) == len(compress(cube, within=within).planes)
-        assert len(found.planes) == len(lift.low_rank_form.hooks.reference(colours, SCENE, within=within).planes)
+        assert len(found.planes) == len(
+            lift.low_rank_form.hooks.reference(colours, SCENE, within=within).planes
+        )
     assert "basis images for 31 bands" in lift.low_rank_form.hooks.check(found)[0].text
 
 

@@ -1,4 +1,6 @@
-"""MST++: its published shape, its checkpoints, and that nobody looks at an untrained one by mistake."""
+"""MST++: its published shape, its checkpoints, and that nobody looks at an untrained one by
+mistake.
+"""
 
 import pytest
 import torch
@@ -23,7 +25,9 @@ def made_up():
     for i, (name, tensor) in enumerate(names.items()):
         count = torch.arange(tensor.numel(), dtype=torch.float64)
         inputs = max(tensor.numel() / tensor.shape[0], 1)
-        state[name] = (torch.cos(0.7 * (i + 1) * count + i) / inputs**0.5).float().reshape(tensor.shape)
+        state[name] = (
+            (torch.cos(0.7 * (i + 1) * count + i) / inputs**0.5).float().reshape(tensor.shape)
+        )
     return state
 
 
@@ -137,7 +141,8 @@ def test_untrained_weights_come_from_the_given_stream_alone(picture):
     torch.manual_seed(1)
     before = torch.get_rng_state()
     one, same, other = (
-        lift_mst_plus_plus(picture, SCENE, untrained="allow", rng=generator(seed)) for seed in (0, 0, 1)
+        lift_mst_plus_plus(picture, SCENE, untrained="allow", rng=generator(seed))
+        for seed in (0, 0, 1)
     )
     assert torch.equal(one, same)
     assert not torch.equal(one, other)
@@ -147,7 +152,9 @@ def test_untrained_weights_come_from_the_given_stream_alone(picture):
 def test_radiometry_survives(picture):
     """Scaling and lifting the light by a constant scales and lifts the spectra."""
     usual = lift_mst_plus_plus(picture.double(), SCENE, untrained="allow", rng=generator())
-    brighter = lift_mst_plus_plus(7 * picture.double() + 100, SCENE, untrained="allow", rng=generator())
+    brighter = lift_mst_plus_plus(
+        7 * picture.double() + 100, SCENE, untrained="allow", rng=generator()
+    )
     lit = usual > 0
     torch.testing.assert_close(brighter[lit], (7 * usual + 100)[lit], rtol=1e-9, atol=1e-9)
 
@@ -162,7 +169,9 @@ def test_any_size(shape):
 
 
 def test_a_picture_of_one_value_is_a_flat_spectrum():
-    cube = lift_mst_plus_plus(torch.full((3, 4, 4), 0.25), SCENE, untrained="allow", rng=generator())
+    cube = lift_mst_plus_plus(
+        torch.full((3, 4, 4), 0.25), SCENE, untrained="allow", rng=generator()
+    )
     assert torch.equal(cube, torch.full((31, 4, 4), 0.25))
 
 
@@ -174,6 +183,16 @@ def test_gradient_reaches_the_picture_and_not_the_weights(picture):
 
 def test_refuses_other_bands(picture):
     with pytest.raises(ValueError, match="31 bands from 400 to 700 nm"):
-        lift_mst_plus_plus(picture, bands(start=400 * NM, stop=700 * NM, count=16), untrained="allow", rng=generator())
+        lift_mst_plus_plus(
+            picture,
+            bands(start=400 * NM, stop=700 * NM, count=16),
+            untrained="allow",
+            rng=generator(),
+        )
     with pytest.raises(ValueError, match="380 to 680"):
-        lift_mst_plus_plus(picture, bands(start=380 * NM, stop=680 * NM, count=31), untrained="allow", rng=generator())
+        lift_mst_plus_plus(
+            picture,
+            bands(start=380 * NM, stop=680 * NM, count=31),
+            untrained="allow",
+            rng=generator(),
+        )

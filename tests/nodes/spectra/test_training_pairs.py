@@ -1,4 +1,6 @@
-"""Pictures with known spectra: blacks that no one sees, reflectances in [0, 1], files, and one rendering for all."""
+"""Pictures with known spectra: blacks that no one sees, reflectances in [0, 1], files, and one
+rendering for all.
+"""
 
 import csv
 from pathlib import Path
@@ -9,9 +11,9 @@ import torch
 
 from neusee.nodes import ParameterError
 from neusee.nodes.spectra import bands, grain, leaves, lift_lmmse, metamers, reflectances, render
+from neusee.nodes.spectra._cie_tables import paints, to_srgb
 from neusee.nodes.spectra._metamers import metameric_blacks
-from neusee.nodes.spectra._mst_lift_node import lift_pictures, start_mst_plus_plus
-from neusee.nodes.spectra._spectral_tables import paints, to_srgb
+from neusee.nodes.spectra._mst_plus_plus import lift_pictures, start_mst_plus_plus
 
 NM = 1e-9
 SCENE = bands(start=400 * NM, stop=700 * NM, count=31)
@@ -48,7 +50,10 @@ def test_a_metameric_black_has_no_colour(measured):
 
 @pytest.mark.parametrize("strength", [0.5, 2.0, 10.0])
 def test_blacks_change_the_spectrum_and_not_the_colour(measured, strength):
-    plain, other = drawn(measured, count=400, blacks=0.0), drawn(measured, count=400, blacks=strength)
+    plain, other = (
+        drawn(measured, count=400, blacks=0.0),
+        drawn(measured, count=400, blacks=strength),
+    )
     colour = render(plain.T[..., None], SCENE)
     off = (render(other.T[..., None], SCENE) - colour).abs()
     assert float((off / colour.abs().amax(0)).max()) < 1e-6
@@ -60,7 +65,9 @@ def test_blacks_change_the_spectrum_and_not_the_colour(measured, strength):
 def test_a_spectrum_at_the_rim_has_no_room_and_stays():
     known = torch.rand(20, 31, dtype=torch.float64, generator=generator())
     known[:10] = 1.0
-    found = metamers(known, SCENE, count=200, mixed=1, thickness=(1.0, 1.0), blacks=5.0, rng=generator())
+    found = metamers(
+        known, SCENE, count=200, mixed=1, thickness=(1.0, 1.0), blacks=5.0, rng=generator()
+    )
     white = (found > 1 - 1e-9).all(1)
     assert 0.2 < float(white.double().mean()) < 0.8
     assert float(found.min()) >= 0
@@ -86,14 +93,18 @@ def test_leaves_of_any_size_are_reflectances(measured, shape):
 def test_a_picture_is_that_of_its_number_alone(measured):
     torch.manual_seed(1)
     before = torch.get_rng_state()
-    one, same, other = (leaves(drawn(measured), SCENE, shape=(16, 16), rng=generator(s)) for s in (3, 3, 4))
+    one, same, other = (
+        leaves(drawn(measured), SCENE, shape=(16, 16), rng=generator(s)) for s in (3, 3, 4)
+    )
     assert torch.equal(one, same)
     assert not torch.equal(one, other)
     assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_leaves_hold_their_own_spectra_at_scales_of_all_kinds(measured):
-    """Without texture, shade and daylights a pixel inside a leaf is the leaf's spectrum, darkened."""
+    """Without texture, shade and daylights a pixel inside a leaf is the leaf's spectrum,
+    darkened.
+    """
     spectra = drawn(measured)
     how = {"texture": 0.0, "shade": 0.0, "daylights": 0.0, "darkest": 1.0}
     cube = leaves(spectra, SCENE, shape=(64, 64), rng=generator(2), **how).flatten(1).T.double()
@@ -106,7 +117,10 @@ def test_leaves_hold_their_own_spectra_at_scales_of_all_kinds(measured):
 def test_another_daylight_moves_white_along_the_daylights():
     white = torch.ones(4, 31, dtype=torch.float64)
     how = {"texture": 0.0, "shade": 0.0, "darkest": 1.0, "shape": (2, 2)}
-    seen = [render(leaves(white, SCENE, daylights=1.0, rng=generator(s), **how), SCENE)[:, 0, 0] for s in range(20)]
+    seen = [
+        render(leaves(white, SCENE, daylights=1.0, rng=generator(s), **how), SCENE)[:, 0, 0]
+        for s in range(20)
+    ]
     warmth = [float(c[0] / c[2]) for c in seen]
     assert min(warmth) < 0.8
     assert max(warmth) > 1.3
@@ -117,7 +131,9 @@ def test_another_daylight_moves_white_along_the_daylights():
 def test_rendering_is_the_one_that_the_lifts_undo(measured):
     cube = leaves(drawn(measured), SCENE, shape=(16, 16), rng=generator())
     colour = render(cube, SCENE)
-    torch.testing.assert_close(colour.double(), render.hooks.reference(cube, SCENE), rtol=render.rtol, atol=1e-6)
+    torch.testing.assert_close(
+        colour.double(), render.hooks.reference(cube, SCENE), rtol=render.rtol, atol=1e-6
+    )
     again = render(lift_lmmse(colour.double(), SCENE), SCENE)
     lit = lift_lmmse(colour.double(), SCENE).amin(0) > 0
     assert float((again - colour)[:, lit].abs().max()) < 1e-6
@@ -128,7 +144,9 @@ def test_rendering_is_the_one_that_the_lifts_undo(measured):
 
 def test_grain_has_the_deviation_that_is_asked_for():
     dark, white = torch.zeros(3, 200, 200), torch.ones(3, 200, 200)
-    assert float(grain(dark, read=0.01, shot=0.02, rng=generator()).std()) == pytest.approx(0.01, rel=0.02)
+    assert float(grain(dark, read=0.01, shot=0.02, rng=generator()).std()) == pytest.approx(
+        0.01, rel=0.02
+    )
     bright = grain(white, read=0.01, shot=0.02, rng=generator()) - white
     assert float(bright.std()) == pytest.approx((0.01**2 + 0.02**2) ** 0.5, rel=0.02)
     assert torch.equal(grain(white, read=0.0, shot=0.0, rng=generator()), white)
@@ -140,14 +158,17 @@ def test_a_network_starts_at_the_linear_estimate(measured):
     linear = lift_matrix(measured, SCENE.centres)
     net = start_mst_plus_plus(generator(), linear)
     rgb = torch.rand(2, 3, 8, 8, generator=generator(1))
-    low, span = rgb.amin((1, 2, 3), keepdim=True), rgb.amax((1, 2, 3), keepdim=True) - rgb.amin((1, 2, 3), keepdim=True)
+    low, span = (
+        rgb.amin((1, 2, 3), keepdim=True),
+        rgb.amax((1, 2, 3), keepdim=True) - rgb.amin((1, 2, 3), keepdim=True),
+    )
     wanted = torch.einsum("bc,ncyx->nbyx", linear.float(), (rgb - low) / span) * span + low
     torch.testing.assert_close(lift_pictures(net, rgb), wanted, rtol=1e-4, atol=1e-5)
     lift_pictures(net, rgb).square().sum().backward()
     assert float(net.conv_out.weight.grad.abs().max()) > 0
 
 
-# --- files ----------------------------------------------------------------------------------------------------------
+# --- files ----------------------------------------------------------------------------------------
 
 
 def written(tmp_path, kind, wavelengths, values):
@@ -156,14 +177,22 @@ def written(tmp_path, kind, wavelengths, values):
         with path.open("w", newline="") as file:
             rows = csv.writer(file)
             rows.writerow(["wavelength", *(f"paint {i}" for i in range(len(values)))])
-            rows.writerows([w, *column] for w, column in zip(wavelengths, np.asarray(values).T, strict=True))
+            rows.writerows(
+                [w, *column] for w, column in zip(wavelengths, np.asarray(values).T, strict=True)
+            )
     elif kind == "npz":
         np.savez(path, wavelengths=wavelengths, reflectances=values)
     else:
         from scipy.io import savemat
 
         step = wavelengths[1] - wavelengths[0]
-        savemat(path, {"S_mine": [[wavelengths[0], step, len(wavelengths)]], "sur_mine": np.asarray(values).T})
+        savemat(
+            path,
+            {
+                "S_mine": [[wavelengths[0], step, len(wavelengths)]],
+                "sur_mine": np.asarray(values).T,
+            },
+        )
     return path
 
 
@@ -175,7 +204,9 @@ def test_own_files_join_the_sets(tmp_path, measured, kind):
     assert reflectances.hooks.preflight(files=(path,)) == []
     found = reflectances(SCENE, files=(path,))
     assert found.shape == (len(measured) + 2, 31)
-    np.testing.assert_allclose(found[-2], np.interp(np.arange(400, 701, 10), wavelengths, values[0]), atol=1e-12)
+    np.testing.assert_allclose(
+        found[-2], np.interp(np.arange(400, 701, 10), wavelengths, values[0]), atol=1e-12
+    )
     alone = reflectances(SCENE, sets=(), files=(path,))
     assert torch.equal(alone, found[-2:])
 
@@ -189,7 +220,9 @@ def test_own_files_join_the_sets(tmp_path, measured, kind):
         ([[0.5, 0.6, 0.7]], [0.4, 0.55, 0.7], "in nm"),
     ],
 )
-def test_a_file_that_holds_no_reflectances_is_refused_before_the_run(tmp_path, values, wavelengths, words):
+def test_a_file_that_holds_no_reflectances_is_refused_before_the_run(
+    tmp_path, values, wavelengths, words
+):
     path = written(tmp_path, "csv", wavelengths, values)
     with pytest.raises(ParameterError, match=words) as error:
         reflectances.hooks.preflight(files=(path,))
@@ -215,7 +248,10 @@ def test_complex_reflectances_are_refused_and_no_part_of_them_is_dropped(tmp_pat
         np.savez(path, wavelengths=np.linspace(400, 700, 31), reflectances=values)
     else:
         savemat(path, {"S_mine": [[400.0, 10.0, 31.0]], "sur_mine": values.T})
-    with pytest.raises(ParameterError, match=rf"mine\.{kind} cannot be read as reflectances \(its values are complex"):
+    with pytest.raises(
+        ParameterError,
+        match=rf"mine\.{kind} cannot be read as reflectances \(its values are complex",
+    ):
         reflectances.hooks.preflight(sets=(), files=(path,))
 
 

@@ -1,4 +1,6 @@
-"""A command of a few lines with a recipe, an option, a table and a page, whose answer the tests keep and ask for."""
+"""A command of a few lines with a recipe, an option, a table and a page, whose answer the tests
+keep and ask for.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,9 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-from neusee.workflows.answers import installed_program, repeated_command, typed_command
+from neusee.workflows.answers import repeated_command
+from neusee.workflows.answers import repeated_command as installed_program
+from neusee.workflows.answers import repeated_command as typed_command
 from neusee.workflows.report.study_folder import StudyReport, StudyRun, as_json
 from neusee.workflows.report.study_page import Section, said
 from neusee.workflows.store.shared_folder import Disk
@@ -26,11 +30,18 @@ class PlainReport:
 
 
 class Place:
-    """A program, a recipe with an option and a table, a cache and a folder of results, all of a test's own."""
+    """A program, a recipe with an option and a table, a cache and a folder of results, all of a
+    test's own.
+    """
 
     def __init__(self, root: Path, monkeypatch) -> None:
         self.root, self.work, self.program = root, root / "work", root / "program"
-        self.words, self.terminal, self.warns, self.out = list(WORDS), list(TERMINAL), False, Path("runs")
+        self.words, self.terminal, self.warns, self.out = (
+            list(WORDS),
+            list(TERMINAL),
+            False,
+            Path("runs"),
+        )
         self.report: PlainReport | StudyReport = PlainReport()
         self.says_only = False  #: whether the command writes no folder
         self.computed = 0  #: how often the command was computed
@@ -51,12 +62,16 @@ class Place:
         monkeypatch.setenv("HOME", str(root / "home"))
         for name in ("XDG_CONFIG_HOME", "NEUSEE_RECIPES", "NEUSEE_CACHE_SECRET"):
             monkeypatch.delenv(name, raising=False)
-        monkeypatch.setattr(sys, "path", [str(root / "site-packages"), str(root / "modules"), *sys.path])
+        monkeypatch.setattr(
+            sys, "path", [str(root / "site-packages"), str(root / "modules"), *sys.path]
+        )
         real = installed_program.program_state
         monkeypatch.setattr(repeated_command, "program_state", lambda: real(self.program))
-        monkeypatch.setattr(repeated_command, "_own_code", lambda: ())  # the tests themselves are code of their own
+        # the tests themselves are code of their own
+        monkeypatch.setattr(repeated_command, "_own_code", lambda: ())
         monkeypatch.setattr(repeated_command, "_NATIVE", ())
-        ignored = typed_command.IGNORED | {"PYTEST_CURRENT_TEST"}  # which changes between a fixture and its test
+        # which changes between a fixture and its test
+        ignored = typed_command.IGNORED | {"PYTEST_CURRENT_TEST"}
         monkeypatch.setattr(typed_command, "IGNORED", ignored)
         monkeypatch.setattr(repeated_command, "_TICK", 0)
         monkeypatch.setattr(repeated_command, "_IMPORTED", 0)
@@ -65,7 +80,9 @@ class Place:
     def with_a_real_page(self) -> None:
         """Write the page of a study from here on."""
         self.words.append("page=real")
-        self.report = StudyReport("Mine", "Lead.", [Section("N", "Text.", ("a",), [[1.5]])], {"curve": b"PNG"})
+        self.report = StudyReport(
+            "Mine", "Lead.", [Section("N", "Text.", ("a",), [[1.5]])], {"curve": b"PNG"}
+        )
 
     @property
     def disk(self) -> Disk:
@@ -73,13 +90,17 @@ class Place:
 
     def recipe(self) -> SimpleNamespace:
         """Read the recipe, its option and a file that is not there, as a command does."""
-        text = (self.work / "mine.yaml").read_text() + (self.work / "laser" / "green.yaml").read_text()
+        text = (self.work / "mine.yaml").read_text() + (
+            self.work / "laser" / "green.yaml"
+        ).read_text()
         try:
             text += (self.work / "wanted.txt").read_text()
         except FileNotFoundError:
             text += "\n"
         values = {"safety.damage.file": Path("table.csv")}
-        return SimpleNamespace(name="mine", config=SimpleNamespace(to_yaml=lambda: text, values=values))
+        return SimpleNamespace(
+            name="mine", config=SimpleNamespace(to_yaml=lambda: text, values=values)
+        )
 
     def ask(self, meanwhile=lambda: None) -> str:
         """Return what the command prints: its stored answer, or a new one, which is kept."""

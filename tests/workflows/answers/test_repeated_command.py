@@ -1,4 +1,6 @@
-"""A stored answer is given only while everything that decided it is as it was, and is what the command would say."""
+"""A stored answer is given only while everything that decided it is as it was, and is what the
+command would say.
+"""
 
 import json
 import os
@@ -9,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.answers import installed_program, repeated_command, stored_answer
+from neusee.workflows.answers import repeated_command, stored_answer
+from neusee.workflows.answers import repeated_command as installed_program
 from neusee.workflows.report.run_crate import CRATE
 
 
@@ -41,7 +44,9 @@ def exchange(place, name):
 CHANGES = {
     "a word": lambda p, m: p.words.append("a.c=2"),
     "the order of words": lambda p, m: p.words.reverse(),
-    "a word is split": lambda p, m: p.words.__setitem__(slice(None), ["safety", "mine.yaml", "a.b", "=1"]),
+    "a word is split": lambda p, m: p.words.__setitem__(
+        slice(None), ["safety", "mine.yaml", "a.b", "=1"]
+    ),
     "the working folder": lambda p, m: m.setattr(os, "getcwd", lambda: "/elsewhere"),
     "a variable of neusee": lambda p, m: m.setenv("NEUSEE_CACHE_VERIFY", "never"),
     "the budget": lambda p, m: m.setenv("NEUSEE_CACHE_BUDGET", "1 TB"),
@@ -57,35 +62,50 @@ CHANGES = {
     "an option of Python": lambda p, m: m.setitem(sys._xoptions, "dev", True),
     "the search path of modules": lambda p, m: m.setattr(sys, "path", [*sys.path, "/more"]),
     "the machine": lambda p, m: m.setattr(os, "uname", lambda: ("Linux", "other")),
-    "the recipe, of the same size and time": lambda p, m: rewrite(p.work / "mine.yaml", "title: MINE\n"),
+    "the recipe, of the same size and time": lambda p, m: rewrite(
+        p.work / "mine.yaml", "title: MINE\n"
+    ),
     "the recipe becomes a link": lambda p, m: exchange(p, "work/mine.yaml"),
     "an option": lambda p, m: rewrite(p.work / "laser" / "green.yaml", "wavelength: 533 nm\n"),
     "an option is gone": lambda p, m: (p.work / "laser" / "red.yaml").symlink_to("green.yaml"),
     "a new option beside the recipe": lambda p, m: hide(p, "work/sensor/neusee.yaml"),
     "a new recipe beside the recipe": lambda p, m: hide(p, "work/safety_pointer.yaml"),
-    "a new option of the user": lambda p, m: hide(p, "home/.config/neusee/recipes/laser/green.yaml"),
+    "a new option of the user": lambda p, m: hide(
+        p, "home/.config/neusee/recipes/laser/green.yaml"
+    ),
     "an option of the user is no file any more": lambda p, m: (
         (p.root / "home/.config/neusee/recipes/laser/red.yaml").unlink(),
         (p.root / "home/.config/neusee/recipes/laser/red.yaml").mkdir(),
     ),
     "a file that was missing": lambda p, m: hide(p, "work/wanted.txt"),
-    "a link to nothing where a file was missing": lambda p, m: (p.work / "wanted.txt").symlink_to("nowhere"),
+    "a link to nothing where a file was missing": lambda p, m: (p.work / "wanted.txt").symlink_to(
+        "nowhere"
+    ),
     "an input file, of the same size and time": lambda p, m: rewrite(p.work / "table.csv", "1,3\n"),
     "an input file is gone": lambda p, m: (p.work / "table.csv").unlink(),
-    "a pipe in place of an input file": lambda p, m: ((p.work / "table.csv").unlink(), os.mkfifo(p.work / "table.csv")),
-    "a source file, of the same size and time": lambda p, m: rewrite(p.program / "nodes" / "physics.py", "c = 4e8\n"),
+    "a pipe in place of an input file": lambda p, m: (
+        (p.work / "table.csv").unlink(),
+        os.mkfifo(p.work / "table.csv"),
+    ),
+    "a source file, of the same size and time": lambda p, m: rewrite(
+        p.program / "nodes" / "physics.py", "c = 4e8\n"
+    ),
     "a new source file": lambda p, m: hide(p, "program/nodes/more.py"),
-    "a source file is renamed": lambda p, m: (p.program / "nodes/physics.py").rename(p.program / "nodes/optics.py"),
+    "a source file is renamed": lambda p, m: (p.program / "nodes/physics.py").rename(
+        p.program / "nodes/optics.py"
+    ),
     "a template": lambda p, m: rewrite(p.program / "workflows" / "page.html.j2", "<b>\n"),
     "the version of neusee": lambda p, m: rewrite(p.program / "__init__.py", "version = 2\n"),
     "a package is installed": lambda p, m: hide(p, "site-packages/scipy-1.13.dist-info/METADATA"),
-    "another version of a package": lambda p, m: (p.root / "site-packages" / "torch-2.6.dist-info").rename(
-        p.root / "site-packages" / "torch-2.7.dist-info"
-    ),
+    "another version of a package": lambda p, m: (
+        p.root / "site-packages" / "torch-2.6.dist-info"
+    ).rename(p.root / "site-packages" / "torch-2.7.dist-info"),
     "a package is installed again": lambda p, m: reinstall(p),
     "a module that hides a package": lambda p, m: hide(p, "modules/scipy.py"),
     "a folder that hides a package": lambda p, m: hide(p, "modules/colour/__init__.py"),
-    "a graphics device": lambda p, m: m.setattr(installed_program, "_devices", lambda: ["nvidia0", "driver 600"]),
+    "a graphics device": lambda p, m: m.setattr(
+        installed_program, "_devices", lambda: ["nvidia0", "driver 600"]
+    ),
 }
 
 
@@ -107,7 +127,14 @@ def test_what_has_changed_is_computed_anew(place, monkeypatch, change):
         lambda p, m: hide(p, "work/notes.txt"),
         lambda p, m: hide(p, "runs/other/recipe.yaml"),
     ],
-    ids=["depth of shells", "no secret", "time of a file", "bytecode", "a file that nobody reads", "another run"],
+    ids=[
+        "depth of shells",
+        "no secret",
+        "time of a file",
+        "bytecode",
+        "a file that nobody reads",
+        "another run",
+    ],
 )
 def test_what_decides_nothing_costs_nothing(place, monkeypatch, change):
     change(place, monkeypatch)
@@ -122,9 +149,15 @@ def test_a_repeated_command_writes_the_same_folder_with_its_own_date(place):
     third = place.work / text.rpartition(" ")[2].removesuffix("/report.html")
     assert third != first
     assert os.readlink(place.work / "runs" / "latest") == third.name
-    names = sorted(path.relative_to(first).as_posix() for path in first.rglob("*") if path.is_file())
-    assert names == sorted(path.relative_to(third).as_posix() for path in third.rglob("*") if path.is_file())
-    document, again = (json.loads((folder / "provenance.json").read_text()) for folder in (first, third))
+    names = sorted(
+        path.relative_to(first).as_posix() for path in first.rglob("*") if path.is_file()
+    )
+    assert names == sorted(
+        path.relative_to(third).as_posix() for path in third.rglob("*") if path.is_file()
+    )
+    document, again = (
+        json.loads((folder / "provenance.json").read_text()) for folder in (first, third)
+    )
     assert again["seconds"] != document["seconds"]
     assert again | {"date": 0, "seconds": 0} == document | {"date": 0, "seconds": 0}
     page = (third / "report.html").read_text()
@@ -147,7 +180,7 @@ def test_the_folder_of_an_earlier_run_is_not_needed(place):
     assert (place.work / "runs" / "latest" / "figures" / "curve.png").read_bytes() == b"PNG"
 
 
-# --- answers that are not kept ---------------------------------------------------------------------------------------
+# --- answers that are not kept --------------------------------------------------------------------
 
 
 def doubtful(place, monkeypatch, meanwhile=lambda: None):
@@ -162,7 +195,8 @@ def test_a_new_command_is_kept(place, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name", ["work/mine.yaml", "work/laser/green.yaml", "work/table.csv", "program/nodes/physics.py"]
+    "name",
+    ["work/mine.yaml", "work/laser/green.yaml", "work/table.csv", "program/nodes/physics.py"],
 )
 def test_a_file_that_changes_while_the_command_runs_is_not_kept(place, monkeypatch, name):
     def change():
@@ -183,7 +217,7 @@ def test_a_command_with_a_warning_is_not_kept(place, monkeypatch):
 
 
 def test_a_command_that_has_printed_a_warning_is_not_kept(place, monkeypatch):
-    from neusee.workflows.cli.interruption import print_warning
+    from neusee.workflows.cli.command_frame import print_warning
 
     assert doubtful(place, monkeypatch, lambda: print_warning("something is odd"))
 
@@ -196,7 +230,11 @@ def test_a_recipe_that_runs_code_of_its_own_is_not_kept(place, monkeypatch):
 def test_code_of_its_own_is_found_among_the_modules():
     found = list(repeated_command._own_code())
     assert __name__ in found or any(name.startswith("test") for name in found)
-    assert not [name for name in found if name.partition(".")[0] in ("neusee", "torch", "numpy", "json", "pytest")]
+    assert not [
+        name
+        for name in found
+        if name.partition(".")[0] in ("neusee", "torch", "numpy", "json", "pytest")
+    ]
 
 
 def test_a_file_format_that_is_read_without_python_is_not_kept(place, monkeypatch):
@@ -211,7 +249,9 @@ def test_a_folder_as_an_input_is_not_kept(place, monkeypatch):
 
 
 def test_a_recipe_in_the_folder_of_the_cache_is_not_kept(place, monkeypatch):
-    monkeypatch.setattr(type(place), "disk", property(lambda self: repeated_command.Disk(self.work)))
+    monkeypatch.setattr(
+        type(place), "disk", property(lambda self: repeated_command.Disk(self.work))
+    )
     assert doubtful(place, monkeypatch)
 
 
@@ -240,7 +280,9 @@ def test_a_folder_of_results_that_cannot_be_written_is_left_to_the_command(place
 def forge(place, **changed):
     """Write the stored answer again with other fields, under a seal that is right."""
     disk, name = place.disk, place.stored.stem
-    stored_answer.write_answer(disk, name, replace(stored_answer.read_answer(disk, name), **changed))
+    stored_answer.write_answer(
+        disk, name, replace(stored_answer.read_answer(disk, name), **changed)
+    )
 
 
 @pytest.mark.parametrize("where", ["..", "/tmp", "runs/../..", "", "runs2"])
@@ -249,7 +291,9 @@ def test_an_answer_that_names_another_folder_of_results_is_not_given(place, wher
     assert place.again()
 
 
-@pytest.mark.parametrize("document", [b"", b"[]", b"{}{", b"\xff", b'{"seconds": "long", "date": 3, "versions": 1}'])
+@pytest.mark.parametrize(
+    "document", [b"", b"[]", b"{}{", b"\xff", b'{"seconds": "long", "date": 3, "versions": 1}']
+)
 def test_an_answer_with_a_document_that_is_none_is_not_given(place, document):
     files = dict(stored_answer.read_answer(place.disk, place.stored.stem).files)
     forge(place, files=files | {"provenance.json": document})
@@ -257,7 +301,9 @@ def test_an_answer_with_a_document_that_is_none_is_not_given(place, document):
     assert not list((place.work / "runs").glob(".*.part"))
 
 
-@pytest.mark.parametrize("words", [["--out", "there"], ["--out=there"], ["--out", "there/"], ["--out", "./there"]])
+@pytest.mark.parametrize(
+    "words", [["--out", "there"], ["--out=there"], ["--out", "there/"], ["--out", "./there"]]
+)
 def test_a_named_folder_of_results_is_used_again(place, words):
     place.words += words
     place.out = Path("there")

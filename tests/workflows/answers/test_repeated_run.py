@@ -1,4 +1,6 @@
-"""A run whose results are all in the cache is given again as it was, and only while each of these results is there."""
+"""A run whose results are all in the cache is given again as it was, and only while each of
+these results is there.
+"""
 
 import json
 import os
@@ -9,19 +11,21 @@ import pytest
 import torch
 
 from neusee.nodes import node
-from neusee.workflows.answers import repeated_command, stored_results
-from neusee.workflows.answers.repeated_run import FOLDER, TOOK, RunResults
+from neusee.workflows.answers import repeated_command
+from neusee.workflows.answers import witnesses as stored_results
+from neusee.workflows.answers.results_folder import FOLDER, TOOK, RunResults
 from neusee.workflows.answers.stored_answer import read_answer
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step
-from neusee.workflows.report import run_html
+from neusee.workflows.report import run_folder as run_html
 from neusee.workflows.report.run_crate import CRATE
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store import metadata
 from neusee.workflows.store.result_store import Store
 
 MARK = Location("<script>.yaml", 3, 1)
-FURTHER, SMALL = "ab" + "0" * 30, "cd" + "0" * 30  #: results for which a run asks, one missing and one small
+#: results for which a run asks, one missing and one small
+FURTHER, SMALL = "ab" + "0" * 30, "cd" + "0" * 30
 
 
 @node()
@@ -57,7 +61,9 @@ class Runs:
         return Store(self.place.root / "cache")
 
     def __call__(self):
-        """Return what the command prints: its stored answer, or that of a run, which is kept if it can be."""
+        """Return what the command prints: its stored answer, or that of a run, which is kept if
+        it can be.
+        """
         command = self.command()
         text = command.answer()
         if text is not None:
@@ -128,13 +134,24 @@ def test_the_folder_of_a_run_is_the_same_but_for_time_and_memory(runs):
     second = newest(runs)
     assert second != first
     assert text.startswith(f"runs/{second.name}/report.html in 0.")
-    names = sorted(path.relative_to(first).as_posix() for path in first.rglob("*") if path.is_file())
-    assert names == sorted(path.relative_to(second).as_posix() for path in second.rglob("*") if path.is_file())
-    assert {"report.html", "recipe.yaml", "data/outputs.safetensors", "figures/graph.png"} <= set(names)
+    names = sorted(
+        path.relative_to(first).as_posix() for path in first.rglob("*") if path.is_file()
+    )
+    assert names == sorted(
+        path.relative_to(second).as_posix() for path in second.rglob("*") if path.is_file()
+    )
+    assert {"report.html", "recipe.yaml", "data/outputs.safetensors", "figures/graph.png"} <= set(
+        names
+    )
     for name in set(names) - {CRATE, "report.html", "provenance.json"}:
         assert (first / name).read_bytes() == (second / name).read_bytes(), name
     old, new = (json.loads((folder / "provenance.json").read_text()) for folder in (first, second))
-    assert {name for name in old if old[name] != new[name]} <= {"started", "seconds", "facts", "timing"}
+    assert {name for name in old if old[name] != new[name]} <= {
+        "started",
+        "seconds",
+        "facts",
+        "timing",
+    }
     assert list(old) == list(new)
     facts = dict(new["facts"])
     assert facts["engine"] == f"{new['seconds']:.3f} s"
@@ -156,7 +173,7 @@ def test_the_document_of_a_run_is_printed_with_its_own_time(runs):
     assert printed == {"report": f"runs/{newest(runs).name}/report.html", **kept}
 
 
-# --- what a run rests on ----------------------------------------------------------------------------------------------
+# --- what a run rests on --------------------------------------------------------------------------
 
 
 def spoil(path):
@@ -193,7 +210,10 @@ def compute_anew(runs):
     about = metadata.read(runs.place.disk, path.stem)
     path.unlink()
     path.with_suffix(".json").unlink()
-    kept = {name: about[name] for name in ("step", "seconds", "date", "device", "origin", "facts", "checks")}
+    kept = {
+        name: about[name]
+        for name in ("step", "seconds", "date", "device", "origin", "facts", "checks")
+    }
     assert runs.store.put(path.stem, torch.full((2000,), 4.0, dtype=torch.float64), kept)
 
 
@@ -235,12 +255,16 @@ def test_a_result_or_file_of_the_cache_that_is_not_as_it_was_ends_the_answer(run
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["a value is damaged", "a picture is damaged", "small results are gone"])
+@pytest.mark.parametrize(
+    "name", ["a value is damaged", "a picture is damaged", "small results are gone"]
+)
 def test_after_damage_the_run_goes_its_ordinary_way_and_is_kept_again(runs, name):
     first = newest(runs)
     CHANGES[name](runs)
     assert runs.again()
-    assert runs.again() is (name == "a value is damaged"), "a step was computed, and a run that computes is not kept"
+    assert runs.again() is (name == "a value is damaged"), (
+        "a step was computed, and a run that computes is not kept"
+    )
     assert not runs.again()
     for name in ("data/outputs.safetensors", "metrics.csv"):
         assert (newest(runs) / name).read_bytes() == (first / name).read_bytes()
@@ -276,7 +300,9 @@ def test_a_run_that_computes_warns_or_misses_is_not_kept(place):
 
 def test_a_page_that_is_not_made_of_its_document_is_not_kept(runs, monkeypatch):
     runs.words = ["run", "another"]
-    monkeypatch.setattr(run_html, "page", lambda doc, pictures, real=run_html.page: real(doc, pictures) + "<!-- -->")
+    monkeypatch.setattr(
+        run_html, "page", lambda doc, pictures, real=run_html.page: real(doc, pictures) + "<!-- -->"
+    )
     assert runs.again()
     assert runs.again()
 

@@ -1,4 +1,6 @@
-"""A stored answer that is damaged, forged, of another format or half written is a missing answer and nothing else."""
+"""A stored answer that is damaged, forged, of another format or half written is a missing answer
+and nothing else.
+"""
 
 import errno
 import json
@@ -12,17 +14,31 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.answers import answer_upkeep, stored_answer
-from neusee.workflows.answers.stored_answer import Answer, packed, read_answer, unpacked, write_answer
+from neusee.workflows.answers import stored_answer
+from neusee.workflows.answers import stored_answer as answer_upkeep
+from neusee.workflows.answers.stored_answer import (
+    Answer,
+    packed,
+    read_answer,
+    unpacked,
+    write_answer,
+)
 from neusee.workflows.answers.witnesses import Witnesses
-from neusee.workflows.keys import seal
-from neusee.workflows.keys.seal import NotRead, OtherFormat, Unsigned, seal_file
+from neusee.workflows.keys import sealed_files as seal
+from neusee.workflows.keys.sealed_files import NotRead, OtherFormat, Unsigned, seal_file
 from neusee.workflows.store.shared_folder import Disk
 
 NAME, OTHER = "ab" + "0" * 30, "ab" + "1" * 30
 FILES = {"report.html": b"<p>\n\0", "figures/a.png": b"", "limits.csv": b"1,2\n"}
 ANSWER = Answer(
-    "s", Witnesses({"/a": "1"}, ["/b"], {"/c": "2"}, {}), "text", False, "runs", "mine_safety", "8" * 8, FILES
+    "s",
+    Witnesses({"/a": "1"}, ["/b"], {"/c": "2"}, {}),
+    "text",
+    False,
+    "runs",
+    "mine_safety",
+    "8" * 8,
+    FILES,
 )
 
 
@@ -62,7 +78,9 @@ def test_every_damaged_byte_and_every_shorter_file_is_a_missing_answer():
             unpacked(NAME, each)
 
 
-@pytest.mark.parametrize("raw", [b"", b"\n\n", b"{}\n{}\n", b"\x80PK" * 99, sealed()[:-1], sealed() + b"x"])
+@pytest.mark.parametrize(
+    "raw", [b"", b"\n\n", b"{}\n{}\n", b"\x80PK" * 99, sealed()[:-1], sealed() + b"x"]
+)
 def test_a_damaged_answer_is_missing_and_moved_aside(disk, stored, raw):
     stored.write_bytes(raw)
     assert read_answer(disk, NAME) is None
@@ -113,7 +131,12 @@ def test_a_damaged_answer_is_missing_and_moved_aside(disk, stored, raw):
         {"stored": {"files": {"files/ab/x.png": 0}}},
         {"stored": {"files": {}, "taken": {"figures/a.png": "files/ab/x.png"}}},
         {"stored": {"files": {"files/ab/x.png": "0"}, "taken": {"../evil.png": "files/ab/x.png"}}},
-        {"stored": {"files": {"files/ab/x.png": "0"}, "taken": {"/tmp/evil.png": "files/ab/x.png"}}},
+        {
+            "stored": {
+                "files": {"files/ab/x.png": "0"},
+                "taken": {"/tmp/evil.png": "files/ab/x.png"},
+            }
+        },
         {"stored": {"files": {"files/ab/x.png": "0"}, "taken": {"a/../../evil": "files/ab/x.png"}}},
     ],
     ids=str,
@@ -197,7 +220,7 @@ def test_an_answer_that_is_too_large_is_not_kept(disk, monkeypatch):
     assert not (disk.root / "answers").exists()
 
 
-# --- writing that fails -----------------------------------------------------------------------------------------------
+# --- writing that fails ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("fault", ["full", "refused", "no folder"])
@@ -235,7 +258,9 @@ WRITER = """
 
 
 def writer(disk, text):
-    code = textwrap.dedent(WRITER).replace("Disk(sys.argv[1])", "Disk(__import__('pathlib').Path(sys.argv[1]))")
+    code = textwrap.dedent(WRITER).replace(
+        "Disk(sys.argv[1])", "Disk(__import__('pathlib').Path(sys.argv[1]))"
+    )
     return subprocess.Popen([sys.executable, "-c", code, str(disk.root), text])
 
 
@@ -259,7 +284,7 @@ def test_two_processes_at_once_leave_a_whole_answer_at_any_time(disk, stored):
     assert seen <= {"text", "aaaa", "bbbb"}
 
 
-# --- upkeep -----------------------------------------------------------------------------------------------------------
+# --- upkeep ---------------------------------------------------------------------------------------
 
 
 def many(disk, count):

@@ -1,4 +1,6 @@
-"""Commands in processes of their own: the repeated command imports no torch, and says and writes the same."""
+"""Commands in processes of their own: the repeated command imports no torch, and says and writes
+the same.
+"""
 
 import json
 import os
@@ -8,6 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from tests.workflows.forked_commands import Commands
 
 ROOT = Path(__file__).parents[3]
 LIGHT = """
@@ -26,27 +30,48 @@ QUICK = ("safety.draws=100", "safety.protection={filter: 1e-2}")
 
 
 class Terminal:
-    """A working folder, a home and a cache, in which commands run in processes of their own."""
+    """A working folder, a home and a cache, in which commands run in processes of their own.
 
-    def __init__(self, root):
+    Those that may import torch are forks of one that has it at hand.
+    """
+
+    def __init__(self, root, forks):
+        self.forks = forks
         self.folder, self.cache, home = root / "work", root / "cache", root / "home"
-        for folder in (home, self.cache, self.folder / "runs"):  # made while a command runs, they would be a change
+        # made while a command runs, they would be a change
+        for folder in (home, self.cache, self.folder / "runs"):
             folder.mkdir(parents=True)
-        self.env = {**os.environ, "NEUSEE_CACHE": str(self.cache), "HOME": str(home), "OMP_NUM_THREADS": "1"}
+        self.env = {
+            **os.environ,
+            "NEUSEE_CACHE": str(self.cache),
+            "HOME": str(home),
+            "OMP_NUM_THREADS": "1",
+        }
         self.env |= {"PYTHONPATH": str(ROOT / ".src"), "PYTEST_CURRENT_TEST": ""}
 
     def __call__(self, *words, light=False):
         """Run a command; ``light`` refuses the import of torch and other large packages."""
-        start = [sys.executable, "-c", LIGHT] if light else [sys.executable, "-c", LIGHT.replace("sys.meta_path", "#")]
-        done = subprocess.run(
-            [*start, *words], cwd=self.folder, env=self.env, capture_output=True, text=True, check=False
-        )
+        if light:
+            command = [sys.executable, "-c", LIGHT, *words]
+            done = subprocess.run(
+                command, cwd=self.folder, env=self.env, capture_output=True, text=True, check=False
+            )
+        else:
+            code = LIGHT.replace("sys.meta_path", "#")
+            done = self.forks(*words, cwd=self.folder, env=self.env, code=code)
         return done.returncode, done.stdout, done.stderr
 
 
+@pytest.fixture(scope="module")
+def forks():
+    found = Commands(variables={"PYTHONPATH": str(ROOT / ".src")})
+    yield found
+    found.close()
+
+
 @pytest.fixture
-def neusee(tmp_path):
-    return Terminal(tmp_path)
+def neusee(tmp_path, forks):
+    return Terminal(tmp_path, forks)
 
 
 RUN = """# A frame that a user took.
@@ -88,7 +113,9 @@ def test_a_repeated_estimate_is_the_same_without_torch_and_a_new_option_ends_it(
     assert repeated | {"report": 0} == document | {"report": 0}
     assert refuses(neusee(*words, "--help", light=True))
     (neusee.folder / "optics").mkdir()
-    (neusee.folder / "optics" / "lens_only.yaml").write_text((ROOT / "recipes/optics/lens_only.yaml").read_text())
+    (neusee.folder / "optics" / "lens_only.yaml").write_text(
+        (ROOT / "recipes/optics/lens_only.yaml").read_text()
+    )
     assert refuses(neusee(*words, light=True)), "an option beside the recipe hides a packaged one"
 
 
@@ -103,12 +130,18 @@ def test_a_recipe_with_a_mistake_or_code_of_its_own_has_no_stored_answer(neusee)
         assert neusee("safety", *words)[0] == code
         assert refuses(neusee("safety", *words, light=True))
     assert not (neusee.cache / "answers").exists()
-    for words in (("validate", "first_light"), ("validate", "first_light", "--json"), ("config", "first_light")):
+    for words in (
+        ("validate", "first_light"),
+        ("validate", "first_light", "--json"),
+        ("config", "first_light"),
+    ):
         first = neusee(*words)
         assert first[0] == 0
         assert neusee(*words, light=True) == first
     (neusee.folder / "sensor").mkdir()
-    (neusee.folder / "sensor" / "neusee.yaml").write_text((ROOT / "recipes/sensor/neusee.yaml").read_text())
+    (neusee.folder / "sensor" / "neusee.yaml").write_text(
+        (ROOT / "recipes/sensor/neusee.yaml").read_text()
+    )
     assert refuses(neusee("config", "first_light", light=True))
 
 
@@ -120,7 +153,9 @@ def picture(neusee, level):
 
 @pytest.mark.slow
 def test_a_run_from_the_cache_is_given_again_until_anything_changes(neusee):
-    (neusee.folder / "mine.yaml").write_text(f"{RUN}defaults: [size: small]\n".replace("size: {shape: [16, 16]}\n", ""))
+    (neusee.folder / "mine.yaml").write_text(
+        f"{RUN}defaults: [size: small]\n".replace("size: {shape: [16, 16]}\n", "")
+    )
     (neusee.folder / "size").mkdir()
     (neusee.folder / "size" / "small.yaml").write_text("size: {shape: [16, 16]}\n")
     picture(neusee, 200)
@@ -148,7 +183,9 @@ def test_a_run_from_the_cache_is_given_again_until_anything_changes(neusee):
     assert other["steps"][0]["key"] != first["steps"][0]["key"]
     changes = {
         "a frame": lambda: picture(neusee, 201),
-        "an option": lambda: (neusee.folder / "size/small.yaml").write_text("size: {shape: [16, 14]}\n"),
+        "an option": lambda: (neusee.folder / "size/small.yaml").write_text(
+            "size: {shape: [16, 14]}\n"
+        ),
         "the recipe": lambda: (neusee.folder / "mine.yaml").write_text(
             f"{RUN}seed: 3\n".replace("16, 16", "16, 12"),
         ),
@@ -162,7 +199,9 @@ def test_a_run_from_the_cache_is_given_again_until_anything_changes(neusee):
         if name == "a module that hides a package":
             break
         seen.add(kept(*words)["steps"][0]["key"])
-    assert len(seen) == 4, "frame, option and recipe each give another result; the environment does not"
+    assert len(seen) == 4, (
+        "frame, option and recipe each give another result; the environment does not"
+    )
 
 
 @pytest.mark.slow
@@ -184,11 +223,14 @@ def test_a_run_with_a_node_of_the_user_is_never_given_again(neusee):
 
 @pytest.mark.slow
 def test_plan_and_why_are_given_again_until_the_cache_says_something_else(neusee):
-    (neusee.folder / "mine.yaml").write_text(RUN.replace("16, 16", "48, 48"))  # large enough for a file of its own
+    # large enough for a file of its own
+    (neusee.folder / "mine.yaml").write_text(RUN.replace("16, 16", "48, 48"))
     picture(neusee, 200)
     plan, why = ("plan", "mine.yaml"), ("why", "frame", "mine.yaml")
     assert neusee(*plan)[0] == 0
-    assert refuses(neusee(*plan, light=True)), "a step would run, and its time and the free memory count"
+    assert refuses(neusee(*plan, light=True)), (
+        "a step would run, and its time and the free memory count"
+    )
     assert neusee("run", "mine.yaml")[0] == 0
     for words in (plan, why, (*plan, "--json")):
         first = neusee(*words)
@@ -196,7 +238,9 @@ def test_plan_and_why_are_given_again_until_the_cache_says_something_else(neusee
         assert neusee(*words, light=True) == first
     assert "0 of 1 steps would run" in neusee(*plan, light=True)[1]
     assert neusee("run", "mine.yaml", "size.shape=[8, 8]")[0] == 0
-    assert refuses(neusee(*why, light=True)), "the journal has one more result, with which this one is compared"
+    assert refuses(neusee(*why, light=True)), (
+        "the journal has one more result, with which this one is compared"
+    )
     for words in (plan, why):
         assert neusee(*words)[0] == 0
     key = json.loads((neusee.folder / "runs/latest/provenance.json").read_text())["steps"][0]["key"]

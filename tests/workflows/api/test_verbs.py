@@ -48,7 +48,9 @@ def test_an_option_is_the_same_in_every_verb_that_has_it(name):
 
 def test_run_takes_a_name_a_file_or_a_recipe_and_changes_in_both_forms(tmp_path):
     recipe = neusee.load("laser_free", doe="axicon", **SMALL)
-    (tmp_path / "mine.yaml").write_text((Path(neusee.__file__).parent / "recipes" / "laser_free.yaml").read_text())
+    (tmp_path / "mine.yaml").write_text(
+        (Path(neusee.__file__).parent / "recipes" / "laser_free.yaml").read_text()
+    )
     every = [
         neusee.run(recipe, outputs="lsr[mask]"),
         neusee.run("laser_free", changes={"doe": "axicon", **SMALL}, outputs=["lsr[mask]"]),
@@ -61,15 +63,20 @@ def test_run_takes_a_name_a_file_or_a_recipe_and_changes_in_both_forms(tmp_path)
 @pytest.mark.parametrize("verb", ["run", "train", "calibrate", "study"])
 def test_a_recipe_that_is_read_takes_no_changes(verb):
     more = {"kind": "accuracy"} if verb == "study" else {}
-    with pytest.raises(TypeError, match="laser_free is loaded already: pass the name of the recipe"):
+    with pytest.raises(
+        TypeError, match="laser_free is loaded already: pass the name of the recipe"
+    ):
         getattr(neusee, verb)(neusee.load("laser_free"), changes={"doe": "axicon"}, **more)
 
 
 @pytest.mark.parametrize(
-    ("verb", "more"), [("sweep", {"axes": {"doe": ["flat"]}}), ("evaluate", {"pipelines": "flat+none"})]
+    ("verb", "more"),
+    [("sweep", {"axes": {"doe": ["flat"]}}), ("evaluate", {"pipelines": "flat+none"})],
 )
 def test_a_verb_that_reads_a_recipe_anew_asks_for_its_name(verb, more):
-    with pytest.raises(TypeError, match=f"{verb} loads the recipe several times: pass the name or file"):
+    with pytest.raises(
+        TypeError, match=f"{verb} loads the recipe several times: pass the name or file"
+    ):
         getattr(neusee, verb)(neusee.load("laser_free"), **more)
 
 
@@ -89,7 +96,13 @@ def test_sweep_takes_changes_as_values_and_as_words():
 def test_evaluate_takes_pipelines_as_a_text():
     told = []
     folder = neusee.evaluate(
-        "first_light", pipelines="flat+none", changes=SMALL, scenes=1, strengths=[0, 10], small=11, progress=told.append
+        "first_light",
+        pipelines="flat+none",
+        changes=SMALL,
+        scenes=1,
+        strengths=[0, 10],
+        small=11,
+        progress=told.append,
     )
     assert folder.parent == Path("runs")
     assert json.loads((folder / "provenance.json").read_text())["strengths"] == [0.0, 10.0]
@@ -112,20 +125,33 @@ def test_calibrate_study_and_train_hand_their_options_to_their_rooms(monkeypatch
     monkeypatch.setattr(lift_run, "train_lift", room("lift"))
     recipe, progress, watch = neusee.load("train_small"), print, lambda *found: None
     store = neusee.Store("there")
-    assert neusee.calibrate(recipe, store=store, out="o", progress=progress, draws=200) == Path("made/calibrate")
-    assert asked["calibrate"] == ((recipe, store, Path("o"), (), progress), {"walkers": 64, "move": "de", "draws": 200})
-    assert neusee.study(recipe, kind="leave-out", store=store, out="o", progress=progress) == Path("made/study")
+    assert neusee.calibrate(recipe, store=store, out="o", progress=progress, draws=200) == Path(
+        "made/calibrate"
+    )
+    assert asked["calibrate"] == (
+        (recipe, store, Path("o"), (), progress),
+        {"walkers": 64, "move": "de", "draws": 200},
+    )
+    assert neusee.study(recipe, kind="leave-out", store=store, out="o", progress=progress) == Path(
+        "made/study"
+    )
     assert asked["study"] == (("leave-out", recipe, store, Path("o"), (), progress), {})
-    assert neusee.train(recipe, store=store, out="o", progress=progress, watch=watch) == Path("made/train")
+    assert neusee.train(recipe, store=store, out="o", progress=progress, watch=watch) == Path(
+        "made/train"
+    )
     assert asked["train"][0][:5] == (recipe, store, Path("o"), (), progress)
     assert asked["train"][0][5:8] == (tuple(recipe.training.learnt), "cpu", watch)
     losses = []
     lift = neusee.load("train_lift")
-    assert neusee.train(lift, store=store, watch=lambda *found: losses.append(found)) == Path("made/lift")
+    assert neusee.train(lift, store=store, watch=lambda *found: losses.append(found)) == Path(
+        "made/lift"
+    )
     asked["lift"][0][-1](0, 7, {"MRAE": 0.5})
     assert losses == [(0, 7, {"MRAE": 0.5})]
 
 
 def test_an_unknown_kind_of_study_is_refused_with_those_there_are():
-    with pytest.raises(ValueError, match="there is no study 'acuracy': write one of accuracy, stability, leave-out"):
+    with pytest.raises(
+        ValueError, match="there is no study 'acuracy': write one of accuracy, stability, leave-out"
+    ):
         neusee.study("laser_free", kind="acuracy")

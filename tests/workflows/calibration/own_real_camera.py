@@ -1,8 +1,9 @@
 """A real camera in NumPy alone: it shares no line with the project, whose calibration it judges.
 
-A lens that vignettes, a lamp that flickers from frame to frame and drifts from level to level, pixels that differ in
-gain, offset and read noise, hot pixels, a well of its own, and a converter. What a camera may do to its numbers
-afterwards (smoothing, lag, compression, interpolation of colours) is planted by name.
+A lens that vignettes, a lamp that flickers from frame to frame and drifts from level to level,
+pixels that differ in gain, offset and read noise, hot pixels, a well of its own, and a converter.
+What a camera may do to its numbers afterwards (smoothing, lag, compression, interpolation of
+colours) is planted by name.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ class Shot:
 
 @dataclass
 class RealCamera:
-    """A monochrome camera on a test bench; by default nothing is wrong with it and little is real."""
+    """A monochrome camera on a test bench; by default nothing is wrong with it and little is
+    real.
+    """
 
     seed: int
     size: tuple[int, int] = (128, 128)  #: (y, x)
@@ -67,7 +70,8 @@ class RealCamera:
     sharpening: float = 0.0
     lag: float = 0.0  #: share of a frame that stays in the next one
     quality: int = 0  #: of the compression of ITU-T T.81; 0 for none
-    mosaic: tuple[float, float, float] | None = None  #: efficiency of red, green and blue over `efficiency`
+    #: efficiency of red, green and blue over `efficiency`
+    mosaic: tuple[float, float, float] | None = None
     demosaiced: bool = False  #: green of a mosaic, interpolated between four neighbours
     median: bool = False
 
@@ -87,12 +91,18 @@ class RealCamera:
         self._read *= self.read_noise / np.sqrt(np.mean(self._read**2))
         self._wells = self.well * (1 + self.well_spread * rng.standard_normal(self.size))
         hot = rng.random(self.size) < self.hot
-        self._current = self.current + hot * self.hot_current * np.exp(0.7 * rng.standard_normal(self.size))
+        self._current = self.current + hot * self.hot_current * np.exp(
+            0.7 * rng.standard_normal(self.size)
+        )
         self.hot_pixels = hot
-        shots = [Shot(f"dark_{1e3 * t:g}ms", 0.0, t, self._exposed(0.0, t)) for t in self.dark_times]
+        shots = [
+            Shot(f"dark_{1e3 * t:g}ms", 0.0, t, self._exposed(0.0, t)) for t in self.dark_times
+        ]
         for i in range(self.lit):
             photons = self.brightest * self.well / self.efficiency * (i + 1) / self.lit
-            shots.append(Shot(f"lit_{i:02d}", photons, self.exposure, self._exposed(photons, self.exposure)))
+            shots.append(
+                Shot(f"lit_{i:02d}", photons, self.exposure, self._exposed(photons, self.exposure))
+            )
         return shots
 
     def _exposed(self, photons: float, time: float) -> np.ndarray:
@@ -135,7 +145,9 @@ class RealCamera:
         top = 2**self.bits - 1
         numbers = np.clip(np.rint(signal), 0, top)
         if self.quality:
-            numbers = np.clip(np.rint(_compressed(numbers, self.quality, 2.0 ** (self.bits - 8))), 0, top)
+            numbers = np.clip(
+                np.rint(_compressed(numbers, self.quality, 2.0 ** (self.bits - 8))), 0, top
+            )
         return numbers.astype(np.uint16) << self.shift
 
     def without(self, **changed: object) -> RealCamera:
@@ -152,13 +164,17 @@ def _box(picture: np.ndarray) -> np.ndarray:
 
 def _green(picture: np.ndarray) -> np.ndarray:
     """Keep the pixels of a checkerboard, and take the mean of four neighbours for the others."""
-    four = np.mean([np.roll(picture, step, (0, 1)) for step in ((0, 1), (0, -1), (1, 0), (-1, 0))], 0)
+    four = np.mean(
+        [np.roll(picture, step, (0, 1)) for step in ((0, 1), (0, -1), (1, 0), (-1, 0))], 0
+    )
     rows, columns = np.indices(picture.shape)
     return np.where((rows + columns) % 2, picture, four)
 
 
 def _compressed(picture: np.ndarray, quality: int, scale: float) -> np.ndarray:
-    """Round the cosines of blocks of 8 x 8 pixels as JPEG does; ``scale`` is the step of a number of 8 bits."""
+    """Round the cosines of blocks of 8 x 8 pixels as JPEG does; ``scale`` is the step of a
+    number of 8 bits.
+    """
     factor = 5000 / quality if quality < 50 else 200 - 2 * quality
     steps = np.maximum(1, np.floor((LUMINANCE * factor + 50) / 100)) * scale
     k = np.arange(8)

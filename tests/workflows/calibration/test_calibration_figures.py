@@ -10,16 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neusee.workflows.calibration import calibration_figures, corner_figure, picture_sections
+from neusee.workflows.calibration import calibration_figures
+from neusee.workflows.calibration import calibration_figures as corner_figure
+from neusee.workflows.calibration import calibration_figures as picture_sections
 from neusee.workflows.calibration.calibration_page import CalibrationResult
 from neusee.workflows.calibration.emcee_sampler import Chains
 from neusee.workflows.calibration.identifiability import identify
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
+from neusee.workflows.calibration.log_posterior import SensorPosterior, find_mode, initial_theta
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 
-_spec = importlib.util.spec_from_file_location("cameras", Path(__file__).parents[2] / "nodes/calibrate/cameras.py")
+_spec = importlib.util.spec_from_file_location(
+    "cameras", Path(__file__).parents[2] / "nodes/calibrate/cameras.py"
+)
 cameras = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(cameras)
 
@@ -61,7 +64,10 @@ def test_numbers_of_many_pairs_can_be_read_at_the_width_of_the_page():
         figure = corner_figure.corners.__wrapped__(draws, names, [1.0] * count)
         shrunk = min(1.0, 1140 / (100 * figure.get_size_inches()[0]))
         axis = figure.axes[-1].xaxis
-        assert min(text.get_fontsize() for text in (axis.label, *axis.get_ticklabels())) * shrunk >= 8.9
+        assert (
+            min(text.get_fontsize() for text in (axis.label, *axis.get_ticklabels())) * shrunk
+            >= 8.9
+        )
 
 
 def test_a_single_draw_does_not_squeeze_a_panel_of_pairs():
@@ -87,17 +93,25 @@ def test_a_panel_of_a_pair_has_contours_that_hold_their_shares_of_the_draws():
 
 
 def test_the_curve_compares_the_levels_with_what_the_levels_alone_determine(tmp_path, monkeypatch):
-    """A correction for what frames may hide is no residual, and scatter is part of the prediction."""
-    file, rng = cameras.tabled(1, tmp_path / "levels.csv", pixels=200_000, lamp=0.005), np.random.default_rng(1)
+    """A correction for what frames may hide is no residual, and scatter is part of the
+    prediction.
+    """
+    file, rng = (
+        cameras.tabled(1, tmp_path / "levels.csv", pixels=200_000, lamp=0.005),
+        np.random.default_rng(1),
+    )
     rows = list(csv.DictReader(file.read_text().splitlines()))
     lit = [row for row in rows if float(row["photons"]) > 0]
-    lit[3]["photons"] = f"{0.95 * float(lit[3]['photons']):.3f}"  # this level is brighter than is stated
+    # this level is brighter than is stated
+    lit[3]["photons"] = f"{0.95 * float(lit[3]['photons']):.3f}"
     with file.open("w", newline="") as opened:
         writer = csv.DictWriter(opened, rows[0])
         writer.writeheader()
         writer.writerows(rows)
     fixed = ["camera.scatter=0.02", "steps.prior.with.scatter=null"]
-    problem = SensorPosterior.of(load("calibrate_camera", [f"table.file={file}", *fixed]), Store(tmp_path / "store"))
+    problem = SensorPosterior.of(
+        load("calibrate_camera", [f"table.file={file}", *fixed]), Store(tmp_path / "store")
+    )
     mode = find_mode(problem, initial_theta(problem))
     draws = mode.draw(1000, rng).reshape(4, 50, 5, -1)
     walk = Chains(draws, np.zeros(draws.shape[:-1]), 0.5, 1.0, 50, True)
@@ -105,7 +119,9 @@ def test_the_curve_compares_the_levels_with_what_the_levels_alone_determine(tmp_
     corrected = replace(walk, draws=problem.theta(values | {"gain": values["gain"] * 1.05}))
     result = CalibrationResult(problem, mode, identify(problem, mode), corrected, [], walk=walk)
     shown = {}
-    monkeypatch.setattr(calibration_figures, "transfer", lambda *given: shown.update(given=given) or b"png")
+    monkeypatch.setattr(
+        calibration_figures, "transfer", lambda *given: shown.update(given=given) or b"png"
+    )
     section = picture_sections.curve_section(result)
     measured, predicted, used, label, means = shown["given"]
     assert label == "not used: above 70% of saturation, or clipped"
@@ -127,7 +143,9 @@ def test_the_distances_of_the_means_have_a_panel_of_their_own():
     predicted = np.tile(levels[:, None], (1, 50, 1)) * np.linspace(0.98, 1.02, 50)[:, None]
     away, used = np.where(np.arange(12) < 9, 0.5, np.nan), np.arange(12) < 9
     away[2] = 6.0
-    panel = calibration_figures.transfer.__wrapped__(levels, predicted, used, "not used", away).axes[2]
+    panel = calibration_figures.transfer.__wrapped__(
+        levels, predicted, used, "not used", away
+    ).axes[2]
     assert panel.get_ylim()[1] > 6.0
     assert panel.get_ylabel().startswith("mean")
     assert panel.get_xlabel() == "mean (DN)"

@@ -1,4 +1,6 @@
-"""Calibration as recipes: the packaged one, and measurements in files, which count by their content."""
+"""Calibration as recipes: the packaged one, and measurements in files, which count by their
+content.
+"""
 
 import numpy as np
 import pytest
@@ -62,7 +64,8 @@ def test_the_packaged_sensor_comes_back_from_its_frames(tmp_path):
         assert error < 0.005 * truth
     levels = result.values["levels"]
     assert len(levels.mean) == 15
-    assert set(levels.cell_level.tolist()) == {14}  # only what fills the well is counted number by number
+    # only what fills the well is counted number by number
+    assert set(levels.cell_level.tolist()) == {14}
     again = run(load("calibrate"), Store(tmp_path))
     assert states(again)["least_squares"] == "cached"
     assert "run" not in states(again).values()
@@ -78,7 +81,9 @@ def test_one_level_changed_is_one_level_taken_again(tmp_path):
 
 
 def test_the_run_has_a_page_without_an_empty_table(tmp_path):
-    done = simulate(load("calibrate"), Store(tmp_path / "store"), tmp_path / "runs", ["neusee", "run"])
+    done = simulate(
+        load("calibrate"), Store(tmp_path / "store"), tmp_path / "runs", ["neusee", "run"]
+    )
     page = (done.folder / "report.html").read_text()
     assert done.document["table"]["rows"] == []
     assert [e["ok"] for e in done.document["expected"]] == [True] * 3
@@ -93,7 +98,9 @@ def test_values_of_packaged_options_that_no_step_asks_for_are_left_out():
     assert "pixel_pitch" not in recipe_text(recipe)
 
 
-@pytest.mark.parametrize("change", ["sensor.pixel_pitch=3 um", "+sensor.color=3", "reading.level=per_band"])
+@pytest.mark.parametrize(
+    "change", ["sensor.pixel_pitch=3 um", "+sensor.color=3", "reading.level=per_band"]
+)
 def test_but_none_may_be_changed_in_vain(change):
     with pytest.raises(RecipeError, match="unknown"):
         load("calibrate", [change])
@@ -101,10 +108,21 @@ def test_but_none_may_be_changed_in_vain(change):
 
 def test_files_are_found_beside_the_recipe_and_give_the_camera(measured):
     recipe = load("mine.yaml", folder=measured)
-    assert recipe.steps["frames[dark]"].params["files"] == (measured / "dark/a.png", measured / "dark/b.png")
-    assert recipe.steps["frames[dim]"].params["files"] == (measured / "dim/a.png", measured / "dim/b.png")
-    assert recipe.steps["frames[bright]"].params["files"] == (measured / "bright/a.png", measured / "bright/b.png")
-    assert recipe.config["measured.bright.files"].value == [str(measured / f"bright/{n}.png") for n in "ab"]
+    assert recipe.steps["frames[dark]"].params["files"] == (
+        measured / "dark/a.png",
+        measured / "dark/b.png",
+    )
+    assert recipe.steps["frames[dim]"].params["files"] == (
+        measured / "dim/a.png",
+        measured / "dim/b.png",
+    )
+    assert recipe.steps["frames[bright]"].params["files"] == (
+        measured / "bright/a.png",
+        measured / "bright/b.png",
+    )
+    assert recipe.config["measured.bright.files"].value == [
+        str(measured / f"bright/{n}.png") for n in "ab"
+    ]
     found = run(recipe, Store(measured / "store")).values["camera"]
     assert abs(float(found.gain) - 40) < 4 * float(found.gain_error)
     assert float(found.gain_error) < 2
@@ -118,7 +136,11 @@ def test_one_number_in_one_file_changes_its_level_alone(measured, name):
     numbers[3, 5] ^= 1
     Image.fromarray(numbers).save(measured / name / "b.png")
     again = states(run(load("mine.yaml", folder=measured), store))
-    assert {n for n, state in again.items() if state == "run"} >= {f"level[{name}]", "levels", "camera"}
+    assert {n for n, state in again.items() if state == "run"} >= {
+        f"level[{name}]",
+        "levels",
+        "camera",
+    }
     assert not [n for n, s in again.items() if s == "run" and "[" in n and f"[{name}]" not in n]
 
 
@@ -155,7 +177,10 @@ def test_missing_files_are_told_with_their_place(measured):
         ("calibrate.descriptor", "  file     a file; required"),
         (
             "calibrate.frames",
-            "  files    files: a path, a folder, a pattern such as dark/*.png, or a list of these; required",
+            (
+                "  files    files: a path, a folder, a pattern such as dark/*.png, or a list of"
+                " these; required"
+            ),
         ),
     ],
 )

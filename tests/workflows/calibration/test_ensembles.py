@@ -4,7 +4,7 @@ import emcee
 import numpy as np
 import pytest
 
-from neusee.workflows.calibration.ensembles import Walk, walk_until
+from neusee.workflows.calibration.emcee_sampler import Walk, walk_until
 
 WALKERS, FREE = 16, 3
 MOVES = {
@@ -17,7 +17,9 @@ MOVES = {
 def weigh(samples):
     """A bent law with an edge, weighed by walker: of each the same bits, whoever is beside it."""
     found = [-0.5 * (x[0] ** 2 + 4.0 * (x[1] - x[0] ** 2) ** 2 + abs(x[2])) for x in samples]
-    return np.array([log if x[2] > -1.0 else -np.inf for x, log in zip(samples, found, strict=True)])
+    return np.array(
+        [log if x[2] > -1.0 else -np.inf for x, log in zip(samples, found, strict=True)]
+    )
 
 
 def start(seed):

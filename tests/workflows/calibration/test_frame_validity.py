@@ -1,4 +1,6 @@
-"""Frames of a camera in NumPy through ``neusee calibrate``: refused before any draw, or with wider intervals."""
+"""Frames of a camera in NumPy through ``neusee calibrate``: refused before any draw, or with
+wider intervals.
+"""
 
 import importlib.util
 import json
@@ -13,6 +15,8 @@ import torch
 from neusee.nodes.calibrate import FrameTest, Hidden, open_errors
 from neusee.workflows.calibration.emcee_sampler import Chains
 from neusee.workflows.calibration.frame_validity import (
+    IntervalEstimate,
+    ModelSpread,
     frame_checks,
     hidden_checks,
     hidden_faults,
@@ -23,9 +27,8 @@ from neusee.workflows.calibration.frame_validity import (
     widened_models,
 )
 from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.model_spread import IntervalEstimate, ModelSpread
 from neusee.workflows.cli import app
-from neusee.workflows.recipe.distributions.joint import Z_90
+from neusee.workflows.recipe.distributions.joint_distribution import Z_90
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 
@@ -63,19 +66,27 @@ def in_files(folder, camera):
     for name, photons, exposure, frames in camera.levels():
         file = f"{name.replace(' ', '_')}.npy"
         np.save(folder / file, frames.astype(np.uint16))
-        rows.append(f"  {file[:-4]}: {{files: {file}, photons: {photons:.6f}, exposure: {exposure:.6g} s}}")
-    (folder / "mine.yaml").write_text("\n".join(["# Frames in files.", "measured:", *rows, FRAMES + PRIOR]))
+        rows.append(
+            f"  {file[:-4]}: {{files: {file}, photons: {photons:.6f}, exposure: {exposure:.6g} s}}"
+        )
+    (folder / "mine.yaml").write_text(
+        "\n".join(["# Frames in files.", "measured:", *rows, FRAMES + PRIOR])
+    )
 
 
 def described(folder, camera):
     lines = ["v 4.0", f"n {camera.bits} {camera.size} {camera.size}"]
     for name, photons, exposure, frames in camera.levels():
-        lines.append(f"b {exposure * 1e9:.3f} {photons:.4f}" if photons else f"d {exposure * 1e9:.3f}")
+        lines.append(
+            f"b {exposure * 1e9:.3f} {photons:.4f}" if photons else f"d {exposure * 1e9:.3f}"
+        )
         for i, frame in enumerate(frames):
             np.save(folder / f"{name.replace(' ', '_')}_{i}.npy", frame[None].astype(np.uint16))
             lines.append(f"i {name.replace(' ', '_')}_{i}.npy")
     (folder / "set.txt").write_text("\n".join(lines))
-    steps = "steps:\n  levels: {node: calibrate.descriptor, with: {file: set.txt, scatter: steady}}\n"
+    steps = (
+        "steps:\n  levels: {node: calibrate.descriptor, with: {file: set.txt, scatter: steady}}\n"
+    )
     (folder / "mine.yaml").write_text("# A descriptor.\n" + steps + PRIOR)
 
 
@@ -89,7 +100,8 @@ def test_mixed_frames_are_refused_before_any_draw(write, tmp_path, monkeypatch, 
     assert ended.value.code == 3
     printed = capsys.readouterr()
     assert (
-        "frames, refused: white noise: the noise of neighbouring pixels correlates by 0.0" in printed.out + printed.err
+        "frames, refused: white noise: the noise of neighbouring pixels correlates by 0.0"
+        in printed.out + printed.err
     )
     (folder,) = (x for x in (tmp_path / "runs").iterdir() if x.is_dir() and not x.is_symlink())
     document = json.loads((folder / "posterior.json").read_text())
@@ -132,22 +144,35 @@ def test_intervals_grow_by_the_errors_that_may_follow(tmp_path):
     chains = Chains(draws, np.zeros((4, 500, 20)), 0.3, 10.0, 500, True)
     assert widened(problem, chains, [], 1) is chains
     after = problem.parameters(widened(problem, chains, WIDER, 1).draws)
-    logs = {name: after[name].log() - math.log(params[name]) for name in ("gain", "quantum_efficiency")}
+    logs = {
+        name: after[name].log() - math.log(params[name]) for name in ("gain", "quantum_efficiency")
+    }
     logs["noise"] = after["temporal_dark_noise"].log() - math.log(params["temporal_dark_noise"])
     assert float(logs["gain"].std()) == pytest.approx(0.013, rel=0.03)
-    torch.testing.assert_close(logs["gain"], -logs["quantum_efficiency"])  # their product is measured
+    # their product is measured
+    torch.testing.assert_close(logs["gain"], -logs["quantum_efficiency"])
     assert float(logs["noise"].std()) == pytest.approx(math.hypot(0.013, 0.008), rel=0.03)
     assert float(after["dark_signal"].std()) < 1e-9  # DN
-    mixed = FrameTest("c", 1.0, 4.0, "passed", "", hidden=(Hidden("mixing", 0.03, 0.004, 0.02, gain=1.0),))
-    moved = problem.parameters(widened(problem, chains, [mixed], 1).draws)["gain"].log() - math.log(params["gain"])
-    assert abs(float(moved.mean())) < 4 * float(moved.std()) / math.sqrt(moved.numel())  # nothing is corrected
+    mixed = FrameTest(
+        "c", 1.0, 4.0, "passed", "", hidden=(Hidden("mixing", 0.03, 0.004, 0.02, gain=1.0),)
+    )
+    moved = problem.parameters(widened(problem, chains, [mixed], 1).draws)["gain"].log() - math.log(
+        params["gain"]
+    )
+    # nothing is corrected
+    assert abs(float(moved.mean())) < 4 * float(moved.std()) / math.sqrt(moved.numel())
     assert float(moved.std()) == pytest.approx(open_errors(mixed.hidden)["gain"], rel=0.03)
 
 
 def test_a_camera_that_is_known_to_have_no_mixing_hides_none(tmp_path):
-    known = SensorPosterior.of(load("calibrate_camera", ["steps.prior.with.mixing=none"]), Store(tmp_path / "store"))
+    known = SensorPosterior.of(
+        load("calibrate_camera", ["steps.prior.with.mixing=none"]), Store(tmp_path / "store")
+    )
     assert known.coordinates.prior.may_hide == ("lag", "pattern")
-    hidden = Hidden("mixing", 0.01, 0.004, 0.02, gain=1.0), Hidden("lag", 0.01, 0.004, 0.02, gain=1.0, positive=True)
+    hidden = (
+        Hidden("mixing", 0.01, 0.004, 0.02, gain=1.0),
+        Hidden("lag", 0.01, 0.004, 0.02, gain=1.0, positive=True),
+    )
     passed = [FrameTest(h.fault, 1.0, 4.0, "passed", "", hidden=(h,)) for h in hidden]
     assert hidden_faults(passed, known.coordinates.prior.may_hide) == [hidden[1]]
     found = replace(passed[0], verdict="widened")  # what the frames show counts, whatever is known
@@ -159,10 +184,16 @@ def test_stated_intervals_grow_as_the_draws_do():
     models = [ModelSpread(name, (one,), one) for name in ("gain", "temporal_dark_noise", "bend")]
     gain, noise, bend = (model.stated for model in widened_models(models, WIDER, ()))
     assert math.log(gain.high / 2) == pytest.approx(math.hypot(0.02, Z_90 * 0.013))
-    assert math.log(2 / noise.low) == pytest.approx(math.hypot(0.02, Z_90 * math.hypot(0.013, 0.008)))
+    assert math.log(2 / noise.low) == pytest.approx(
+        math.hypot(0.02, Z_90 * math.hypot(0.013, 0.008))
+    )
     assert bend == one
-    mixed = FrameTest("c", 1.0, 4.0, "passed", "", hidden=(Hidden("mixing", 0.03, 0.004, 0.02, gain=1.0),))
+    mixed = FrameTest(
+        "c", 1.0, 4.0, "passed", "", hidden=(Hidden("mixing", 0.03, 0.004, 0.02, gain=1.0),)
+    )
     gain = widened_models(models, [mixed], ("mixing",))[0].stated
     assert gain.value == 2.0
-    assert math.log(gain.high / 2) == pytest.approx(math.hypot(0.02, Z_90 * open_errors(mixed.hidden)["gain"]))
+    assert math.log(gain.high / 2) == pytest.approx(
+        math.hypot(0.02, Z_90 * open_errors(mixed.hidden)["gain"])
+    )
     assert widened_models(models, [mixed], ())[0].stated == one

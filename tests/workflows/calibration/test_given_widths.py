@@ -1,4 +1,6 @@
-"""The density that guides the walkers of a real camera, a wrong guide, and a wrong model of well or converter."""
+"""The density that guides the walkers of a real camera, a wrong guide, and a wrong model of well
+or converter.
+"""
 
 import importlib.util
 from dataclasses import replace
@@ -9,16 +11,17 @@ import pytest
 from scipy.stats import multivariate_t
 
 from neusee.workflows.calibration import emcee_sampler
-from neusee.workflows.calibration.given_widths import GivenWidths
+from neusee.workflows.calibration.camera_density import GivenWidths
 from neusee.workflows.calibration.identifiability import identify
 from neusee.workflows.calibration.importance_sampling import draw_guide
-from neusee.workflows.calibration.log_posterior import SensorPosterior
+from neusee.workflows.calibration.log_posterior import SensorPosterior, search_mode
 from neusee.workflows.calibration.posterior_checks import checks, importance_samples
-from neusee.workflows.calibration.posterior_mode import search_mode
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 
-_spec = importlib.util.spec_from_file_location("plain", Path(__file__).parents[2] / "benchmarks" / "plain_camera.py")
+_spec = importlib.util.spec_from_file_location(
+    "plain", Path(__file__).parents[2] / "benchmarks" / "plain_camera.py"
+)
 plain = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(plain)
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -40,14 +43,17 @@ def test_the_density_given_the_widths_is_that_of_another_library(camera):
         law = multivariate_t(step[i], np.linalg.inv(root[i] @ root[i].T), df=20)
         z = (samples[i, ~others.at] - others.theta[~others.at]) / others.unit
         off.append(law.logpdf(z) - others.log_density(samples[[i]], (step[[i]], root[[i]]))[0])
-    # what `Mixture` leaves out as well, so that a mixture of both is one density; and the units of the coordinates
+    # what `Mixture` leaves out as well, so that a mixture of both is one density; and the units of
+    # the coordinates
     constant = np.log(np.abs(others.unit)).sum() - 0.5 * len(others.unit) * np.log(np.pi)
     assert off == pytest.approx([constant, constant], abs=1e-9)
 
 
 @pytest.mark.parametrize("change", [(0.0, 0.0, 0.0), (1.0, 0.3, 2.0), (-2.0, -0.3, -2.0)])
 def test_all_other_parameters_are_drawn_as_the_widths_imply(camera, change):
-    """Far from the mode of the widths too, weights of the posterior hardly differ: with a wide drift, and with none."""
+    """Far from the mode of the widths too, weights of the posterior hardly differ: with a wide
+    drift, and with none.
+    """
     problem, mode = camera
     others = GivenWidths(problem, mode)
     widths = np.repeat(mode.theta[None, others.at] + change, 1000, 0)
@@ -70,7 +76,9 @@ def test_a_proposal_has_the_ratio_of_its_densities(camera):
 
 @pytest.mark.slow
 def test_walkers_whose_guide_gives_a_wrong_ratio_fail_the_checks(camera, tmp_path, monkeypatch):
-    """The factor of Metropolis and Hastings left out: R-hat, tau and effective size all look right."""
+    """The factor of Metropolis and Hastings left out: R-hat, tau and effective size all look
+    right.
+    """
     problem, mode = camera
     law = importance_samples(problem, mode, 1)
     right = law.guide.density
@@ -86,12 +94,14 @@ def test_walkers_whose_guide_gives_a_wrong_ratio_fail_the_checks(camera, tmp_pat
     for density, mark in ((right, "pass"), (Wrong(), "fail")):
         guide = law.guide._replace(density=density)
         chains = emcee_sampler.sample(problem, mode, tmp_path / f"{mark}.h5", seed=1, guide=guide)
-        found = {c.name: c.mark for c in checks(problem, mode, told, replace(chains, long=True), law)}
+        found = {
+            c.name: c.mark for c in checks(problem, mode, told, replace(chains, long=True), law)
+        }
         assert found[name] == mark
         assert found["ensembles agree"] == "pass"
 
 
-# --- the well before the read noise, and numbers that are cut ---------------------------------------------------------
+# --- the well before the read noise, and numbers that are cut -------------------------------------
 
 
 def pixels_alike(folder, camera, *changes):
@@ -104,10 +114,14 @@ def of_mode(problem):
     return {name: float(x) for name, x in problem.parameters(mode.theta).items()}, mode
 
 
-def test_a_well_before_the_read_noise_is_refused_in_a_sentence_and_described_without_its_saturated_levels(tmp_path):
+def test_a_well_before_the_read_noise_is_refused_in_a_sentence_and_described_without_its_saturated_levels(
+    tmp_path,
+):
     """Before, the search stopped at a gain of 18 DN/e-, and walkers walked from there."""
     camera = plain.PlainCamera(well=9000.0)
-    with pytest.raises(ValueError, match=r"none of \d+ searches ends at a mode .* set share: 0.7 in the step of"):
+    with pytest.raises(
+        ValueError, match=r"none of \d+ searches ends at a mode .* set share: 0.7 in the step of"
+    ):
         search_mode(pixels_alike(tmp_path, camera))
     problem = pixels_alike(tmp_path, camera, "steps.sufficient.with.share=0.7")
     found, mode = of_mode(problem)
@@ -117,15 +131,20 @@ def test_a_well_before_the_read_noise_is_refused_in_a_sentence_and_described_wit
 
 
 def test_a_well_at_the_edge_of_what_a_number_allows_is_a_mode(tmp_path):
-    """A number of the highest level needs a well above 4094.5 DN; the search stopped beside the mode, five times.
+    """A number of the highest level needs a well above 4094.5 DN; the search stopped beside the
+    mode, five times.
 
     All coordinates but the well climb as a normal distribution does in which the well is known.
     """
     camera = plain.PlainCamera(
-        gain=0.28060026336017463, quantum_efficiency=0.4869228126458359, temporal_dark_noise=12.654416007552552,
-        dark_current=40.76179425444259, dark_signal=0.28060026336017463 * 228.42966898792622,
-        full=14880.76151056754 - 228.42966898792622, first=0.0,
-    )  # fmt: skip
+        gain=0.28060026336017463,
+        quantum_efficiency=0.4869228126458359,
+        temporal_dark_noise=12.654416007552552,
+        dark_current=40.76179425444259,
+        dark_signal=0.28060026336017463 * 228.42966898792622,
+        full=14880.76151056754 - 228.42966898792622,
+        first=0.0,
+    )
     recipe = plain.frames_recipe(camera, [46, 2], tmp_path, size=48, lit=10, darks=4)
     priors = {
         "gain": "[0.25 DN/e-, 1.1]",
@@ -140,13 +159,17 @@ def test_a_well_at_the_edge_of_what_a_number_allows_is_a_mode(tmp_path):
     mode = search_mode(problem)
     assert mode.settled
     at = problem.names.index("full_well")
-    nearby = mode.theta + 1e-2 * np.sqrt(mode.covariance.diagonal()) * np.eye(6) * np.array([[[1]], [[-1]]])
+    nearby = mode.theta + 1e-2 * np.sqrt(mode.covariance.diagonal()) * np.eye(6) * np.array(
+        [[[1]], [[-1]]]
+    )
     assert (problem.log_posterior(nearby.reshape(-1, 6)) < mode.log).all()
     assert problem.log_posterior(mode.theta[None] - 1e-4 * np.eye(6)[[at]]) == -np.inf
 
 
 def test_hot_pixels_do_not_end_the_search(tmp_path):
-    """A coarse dark level had a variance of 0 between its ends, and the search ended with `SVD did not converge`."""
+    """A coarse dark level had a variance of 0 between its ends, and the search ended with `SVD
+    did not converge`.
+    """
     stacks = []
 
     class Hot(plain.PlainCamera):
@@ -163,11 +186,14 @@ def test_hot_pixels_do_not_end_the_search(tmp_path):
     assert found["gain"] == pytest.approx(0.25, rel=0.1)
 
 
-def test_a_converter_that_cuts_is_calibrated_right_and_the_wrong_choice_moves_the_offset_alone(tmp_path):
+def test_a_converter_that_cuts_is_calibrated_right_and_the_wrong_choice_moves_the_offset_alone(
+    tmp_path,
+):
     camera = plain.PlainCamera(truncates=True)
     right, mode = of_mode(pixels_alike(tmp_path, camera, "rounding=truncation"))
     wrong, _ = of_mode(pixels_alike(tmp_path, camera, "rounding=nearest"))
-    assert right["offset"] == pytest.approx(240.0, abs=4 * 1.7)  # 1.7 e- follow from 1 % of the gain
+    # 1.7 e- follow from 1 % of the gain
+    assert right["offset"] == pytest.approx(240.0, abs=4 * 1.7)
     assert 0.25 * (right["offset"] - wrong["offset"]) == pytest.approx(0.5, abs=0.02)
     for name in ("gain", "read_noise", "quantum_efficiency", "dark_current"):
         at = list(right).index(name)
@@ -193,6 +219,8 @@ def test_bad_guesses_of_the_recipe_end_at_the_same_mode(recipe, tmp_path):
     right, mode = of_mode(SensorPosterior.of(load(recipe, small), Store(tmp_path / "store")))
     sd = dict(zip(right, mode.covariance.diagonal() ** 0.5, strict=True))
     for guess in GUESSES[recipe]:
-        found, _ = of_mode(SensorPosterior.of(load(recipe, [*small, *guess]), Store(tmp_path / "store")))
+        found, _ = of_mode(
+            SensorPosterior.of(load(recipe, [*small, *guess]), Store(tmp_path / "store"))
+        )
         for name in ("gain", "quantum_efficiency"):
             assert abs(np.log(found[name] / right[name])) < 0.3 * sd[name], (guess, name)

@@ -1,4 +1,6 @@
-"""Frames that tell too little, or of sensors far from the usual: what is said before and after anything is drawn."""
+"""Frames that tell too little, or of sensors far from the usual: what is said before and after
+anything is drawn.
+"""
 
 import math
 
@@ -8,13 +10,16 @@ import torch
 
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.identifiability import identify
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import LaplaceFit, find_mode, initial_theta
+from neusee.workflows.calibration.log_posterior import (
+    LaplaceFit,
+    SensorPosterior,
+    find_mode,
+    initial_theta,
+)
 from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.calibration.independent_draws import walk_draws
-from neusee.workflows.studies.calibration.simulated_sensors import SensorSimulator
+from neusee.workflows.studies.calibration.posterior_tests import SensorSimulator, walk_draws
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -56,7 +61,9 @@ def test_short_darks_alone_give_an_upper_limit_of_the_dark_current(fitted):
     assert not told.refused
     assert told.kinds == dict.fromkeys(problem.names, "estimate") | {"dark_current": "upper"}
     assert sum(s < 3 for s in told.strengths) == 1
-    assert told.directions == ["dark current: only an upper limit: no dark was exposed for long enough"]
+    assert told.directions == [
+        "dark current: only an upper limit: no dark was exposed for long enough"
+    ]
     drawn = walk_draws(problem, mode, 1).samples
     limit = float(np.quantile(problem.parameters(drawn)["dark_current"].numpy(), 0.95))
     assert truth["dark_current"] < limit < 100 * truth["dark_current"]
@@ -98,12 +105,18 @@ def test_a_free_fano_factor_is_one_direction_that_frames_do_not_know(fitted):
     problem, truth, mode, told = fitted(RIDGE)
     assert [s < 3 for s in told.strengths] == [False] * 5 + [True] * 2
     assert told.strengths[-1] < 0.1
-    assert told.directions[0] == "dark current: not from these frames: no value in electrons without the gain"
+    assert (
+        told.directions[0]
+        == "dark current: not from these frames: no value in electrons without the gain"
+    )
     said = told.directions[1]
     assert "only together" in said
-    assert all(word in said for word in ("gain", "offset", "read noise", "full well", "quantum efficiency"))
+    assert all(
+        word in said for word in ("gain", "offset", "read noise", "full well", "quantum efficiency")
+    )
     both = mode.covariance.diagonal() ** 0.5
-    assert both[problem.names.index("gain")] < 0.1  # the slope of the photon-transfer curve itself is known
+    # the slope of the photon-transfer curve itself is known
+    assert both[problem.names.index("gain")] < 0.1
     assert away(problem, truth, mode) < 5
 
 
@@ -142,7 +155,9 @@ def test_a_coarse_read_noise_lies_within_its_interval(fitted):
 
 
 def test_a_read_noise_below_the_numbers_is_an_upper_limit(fitted):
-    """Of a dark current that leaves an electron in a pixel of twenty, numbers tell even so: electrons are counted."""
+    """Of a dark current that leaves an electron in a pixel of twenty, numbers tell even so:
+    electrons are counted.
+    """
     problem, truth, mode, told = fitted(QUIET[0])
     assert told.kinds["read_noise"] == "upper"
     assert "read noise: only an upper limit: the converter is too coarse for it" in told.directions
@@ -151,7 +166,9 @@ def test_a_read_noise_below_the_numbers_is_an_upper_limit(fitted):
 
 
 def test_the_law_is_not_fooled_by_numbers_that_do_not_scatter(fitted, tmp_path):
-    """By mean and variance alone the read noise would be 3 sigma off: one twelfth does not hold there."""
+    """By mean and variance alone the read noise would be 3 sigma off: one twelfth does not hold
+    there.
+    """
     problem, truth, _, _ = fitted(*QUIET)
     found = problem.likelihood(problem.theta(truth)[None])
     assert float(found.deviance.sum()) < float(found.degrees_of_freedom.sum()) + 5 * math.sqrt(
@@ -161,28 +178,36 @@ def test_the_law_is_not_fooled_by_numbers_that_do_not_scatter(fitted, tmp_path):
     assert float(problem.likelihood(problem.theta(noisier)[None]).log) < float(found.log) - 20
 
 
-# --- where walkers start ----------------------------------------------------------------------------------------------
+# --- where walkers start --------------------------------------------------------------------------
 
 
 def starts(problem, mode, tmp_path):
     runs = [
-        emcee_sampler.start_ensemble(problem, mode, tmp_path / "none.h5", i, 1, 64, emcee_sampler.move("de"))
+        emcee_sampler.start_ensemble(
+            problem, mode, tmp_path / "none.h5", i, 1, 64, emcee_sampler.move("de")
+        )
         for i in range(4)
     ]
     return np.concatenate([run.initial_theta for run in runs])
 
 
 def test_walkers_start_by_the_law_about_the_peak_never_by_the_prior(fitted, tmp_path):
-    problem, _, mode, _ = fitted("~levels.full", "~steps.prior.with.full_well", "sensor.dark_current=0.2 e-")
+    problem, _, mode, _ = fitted(
+        "~levels.full", "~steps.prior.with.full_well", "sensor.dark_current=0.2 e-"
+    )
     found = starts(problem, mode, tmp_path)
     assert len(np.unique(found, axis=0)) == 256
     z = (found - mode.theta) @ np.linalg.inv(np.linalg.cholesky(mode.covariance)).T
     assert np.abs(z.mean(0)).max() < 5 / 256**0.5
     assert np.abs(np.cov(z.T) - np.eye(len(problem.names))).max() < 0.4
-    prior = problem.whitened(problem.theta(problem.coordinates.draw(256, torch.Generator().manual_seed(0))))
+    prior = problem.whitened(
+        problem.theta(problem.coordinates.draw(256, torch.Generator().manual_seed(0)))
+    )
     assert problem.whitened(found).std(0).max() < 0.1 * prior.std(0).min()
     assert (problem.log_posterior(found) > mode.log - 30).all()
-    bad = problem.log_posterior(problem.theta(problem.coordinates.draw(256, torch.Generator().manual_seed(0))))
+    bad = problem.log_posterior(
+        problem.theta(problem.coordinates.draw(256, torch.Generator().manual_seed(0)))
+    )
     assert np.median(bad) < mode.log - 1e4
 
 
@@ -191,7 +216,7 @@ def test_walkers_start_within_the_number_of_the_full_well(fitted, tmp_path):
     assert (problem.log_posterior(starts(problem, mode, tmp_path)) > mode.log - 50).all()
 
 
-# --- the edge of the well ---------------------------------------------------------------------------------------------
+# --- the edge of the well -------------------------------------------------------------------------
 
 
 def test_numbers_at_the_end_of_the_converter_do_not_show_the_well(fitted):
@@ -205,18 +230,22 @@ def test_coarse_darks_do_not_show_the_well(fitted):
 
 
 def test_the_search_does_not_end_at_the_edge_of_the_wells_number(tmp_path):
-    """A gain of 1 % beside the truth is 20 standard deviations; a half number of the well is two."""
+    """A gain of 1 % beside the truth is 20 standard deviations; a half number of the well is
+    two.
+    """
     simulator = SensorSimulator(load("calibrate", SEEN), Store(tmp_path), 128, walk_draws, "")
     seed = stream_seed(simulator.recipe.seed, "calibration study 22")
     truth = simulator.truth(seed)
     problem = simulator.problem(truth, seed)
-    z = problem.whitened(problem.theta(truth)) + 0.1 * np.random.default_rng([seed, 1]).standard_normal(6)
+    z = problem.whitened(problem.theta(truth)) + 0.1 * np.random.default_rng(
+        [seed, 1]
+    ).standard_normal(6)
     theta = problem.theta(problem.coordinates.from_whitened(torch.from_numpy(z)))
     theta[4] = math.log(float(problem.levels.cell_value[0]))
     assert find_mode(problem, theta).log > problem.log_posterior(problem.theta(truth)[None])[0] - 1
 
 
-# --- eight decades ----------------------------------------------------------------------------------------------------
+# --- eight decades --------------------------------------------------------------------------------
 
 
 def scaled(by, unit="DN/e-"):
@@ -246,19 +275,32 @@ def test_peak_and_limits_do_not_care_for_the_unit(fitted, decades, unit):
     assert away(problem, truth, mode) < 5.5
     assert told.kinds["full_well"] in ("estimate", "none")
     assert np.isfinite(mode.covariance).all()
-    assert bool((np.linalg.eigvalsh(mode.covariance / np.outer(*[mode.covariance.diagonal() ** 0.5] * 2)) > 0).all())
+    assert bool(
+        (
+            np.linalg.eigvalsh(mode.covariance / np.outer(*[mode.covariance.diagonal() ** 0.5] * 2))
+            > 0
+        ).all()
+    )
 
 
 @pytest.mark.parametrize("decades", [-4, 4])
-def test_places_are_the_same_in_another_unit_but_for_what_an_electron_and_a_photon_are(tmp_path, decades):
+def test_places_are_the_same_in_another_unit_but_for_what_an_electron_and_a_photon_are(
+    tmp_path, decades
+):
     samples = []
     for d in (0, decades):
         recipe = load("calibrate", [*SEEN, *scaled(10.0**d)])
         problem = SensorPosterior.of(recipe, Store(tmp_path))
-        samples.append(problem.theta({name: float(recipe.steps["density"].params[name]) for name in problem.names}))
+        samples.append(
+            problem.theta(
+                {name: float(recipe.steps["density"].params[name]) for name in problem.names}
+            )
+        )
     moved = dict(zip(problem.names, samples[1] - samples[0], strict=True))
     step = -decades * math.log(10)
-    assert moved == pytest.approx(dict.fromkeys(moved, 0.0) | {"gain": step, "quantum_efficiency": step}, abs=1e-9)
+    assert moved == pytest.approx(
+        dict.fromkeys(moved, 0.0) | {"gain": step, "quantum_efficiency": step}, abs=1e-9
+    )
 
 
 def test_a_peak_is_a_normal_law():

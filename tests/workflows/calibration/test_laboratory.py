@@ -1,4 +1,6 @@
-"""What a laboratory states: mistakes are told where they stand, and draws have the uncertainty of the light."""
+"""What a laboratory states: mistakes are told where they stand, and draws have the uncertainty
+of the light.
+"""
 
 from types import SimpleNamespace
 
@@ -9,7 +11,12 @@ import torch
 from neusee.nodes.calibrate import Laboratory
 from neusee.workflows.calibration.emcee_sampler import Chains
 from neusee.workflows.calibration.identifiability import Identifiability
-from neusee.workflows.calibration.laboratory import RELATIVE, laboratory_of, with_laboratory, without_efficiency
+from neusee.workflows.calibration.laboratory import (
+    RELATIVE,
+    laboratory_of,
+    with_laboratory,
+    without_efficiency,
+)
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.recipe.loading import load
 
@@ -22,14 +29,27 @@ def told(*changes):
 
 def test_statements_become_uncertainties_and_no_statement_none():
     found = laboratory_of(
-        told("photons={relative_uncertainty: 0.03, degrees_of_freedom: 12, distribution: rectangular}",
-             "lamp={centroid: 525 nm, centroid_uncertainty: 2 nm, efficiency_per_nm: -0.004, drift: 0.01}",
-             "temperature={value: 25 °C, uncertainty: 0.5 K, coefficients: {gain: 1e-3}}")
-    )  # fmt: skip
-    assert found.light == [("rectangular", 0.03), ("normal", 0.01), ("normal", pytest.approx(0.008))]
-    assert (found.photons_freedom, found.temperature, dict(found.coefficients)) == (12, 0.5, {"gain": 1e-3})
+        told(
+            "photons={relative_uncertainty: 0.03, degrees_of_freedom: 12, distribution: rectangular}",
+            "lamp={centroid: 525 nm, centroid_uncertainty: 2 nm, efficiency_per_nm: -0.004, drift: 0.01}",
+            "temperature={value: 25 °C, uncertainty: 0.5 K, coefficients: {gain: 1e-3}}",
+        )
+    )
+    assert found.light == [
+        ("rectangular", 0.03),
+        ("normal", 0.01),
+        ("normal", pytest.approx(0.008)),
+    ]
+    assert (found.photons_freedom, found.temperature, dict(found.coefficients)) == (
+        12,
+        0.5,
+        {"gain": 1e-3},
+    )
     assert (
-        load("calibrate_camera", ["traceability.temperature.value=298.15 K"]).traceability.temperature.text == "25 °C"
+        load(
+            "calibrate_camera", ["traceability.temperature.value=298.15 K"]
+        ).traceability.temperature.text
+        == "25 °C"
     )
     assert laboratory_of(load("calibrate_camera")) == Laboratory()
 
@@ -79,7 +99,9 @@ def test_draws_of_the_efficiency_alone_move_with_the_light_and_the_temperature_m
 
 
 def test_relative_light_leaves_no_efficiency():
-    known = Identifiability({"gain": "estimate", "quantum_efficiency": "estimate"}, [], [9.0, 8.0], "")
+    known = Identifiability(
+        {"gain": "estimate", "quantum_efficiency": "estimate"}, [], [9.0, 8.0], ""
+    )
     found = without_efficiency(known)
     assert found.told == ("gain",)
     assert found.directions == [RELATIVE]

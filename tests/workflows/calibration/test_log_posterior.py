@@ -1,4 +1,6 @@
-"""The posterior of a sensor: its peak, what is not told, draws that go on to the last bit, checks that can fail."""
+"""The posterior of a sensor: its peak, what is not told, draws that go on to the last bit,
+checks that can fail.
+"""
 
 import importlib
 import json
@@ -10,9 +12,8 @@ import pytest
 
 from neusee.workflows.calibration import emcee_sampler
 from neusee.workflows.calibration.identifiability import identify
-from neusee.workflows.calibration.log_posterior import SensorPosterior
+from neusee.workflows.calibration.log_posterior import SensorPosterior, find_mode, initial_theta
 from neusee.workflows.calibration.posterior_checks import checks, importance_samples
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
 from neusee.workflows.cli import app
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
@@ -34,7 +35,9 @@ def mode(found):
     return find_mode(found, initial_theta(found))
 
 
-@pytest.mark.parametrize("words", [(), (SEEN,), ("reading=as_printed",), (SEEN, "sensor.read_noise=2 e-")])
+@pytest.mark.parametrize(
+    "words", [(), (SEEN,), ("reading=as_printed",), (SEEN, "sensor.read_noise=2 e-")]
+)
 def test_the_peak_is_where_the_frames_were_made(store, words):
     p = problem(store, *words)
     best, params = mode(p), p.recipe.steps[p.step].params
@@ -52,7 +55,8 @@ def test_the_width_at_the_peak_is_that_of_the_posterior(store):
     p = problem(store, "reading=as_printed")
     law = importance_samples(p, mode(p), 1)
     assert law.tail < 0.7
-    dark = p.names.index("dark_current")  # hardly told from 0, so that its logarithm has a long lower tail
+    # hardly told from 0, so that its logarithm has a long lower tail
+    dark = p.names.index("dark_current")
     peak, whole = np.sqrt(mode(p).covariance.diagonal()), law.sd()
     np.testing.assert_allclose(np.delete(peak, dark), np.delete(whole, dark), rtol=0.15)
     assert 1.1 < whole[dark] / peak[dark] < 2.0
@@ -63,7 +67,8 @@ def test_what_no_frame_tells_is_said_in_words(store):
     told = identify(p, mode(p))
     assert told.kinds["full_well"] == "lower"
     well = "full well: only a lower limit: no frame is saturated by the well"
-    dark = "dark current: only an upper limit: no dark was exposed for long enough"  # for so few pixels
+    # for so few pixels
+    dark = "dark current: only an upper limit: no dark was exposed for long enough"
     assert sorted(told.directions) == [dark, well]
     assert told.estimated == ("gain", "offset", "read_noise", "quantum_efficiency")
     seen = problem(store, SEEN)
@@ -106,15 +111,23 @@ def test_what_is_stopped_goes_on_to_the_last_bit(store, tmp_path, monkeypatch):
 
 
 def test_what_has_ended_draws_nothing_more(store, tmp_path, monkeypatch):
-    """It ended because tau had settled since the round before, which is not seen of the last round alone."""
-    for name, value in {"_FIRST": 40, "_TAUS": 0.0, "_BURN": 0.0, "_SURELY": 1e9, "_CHANGE": 0.2}.items():
+    """It ended because tau had settled since the round before, which is not seen of the last
+    round alone.
+    """
+    for name, value in {
+        "_FIRST": 40,
+        "_TAUS": 0.0,
+        "_BURN": 0.0,
+        "_SURELY": 1e9,
+        "_CHANGE": 0.2,
+    }.items():
         monkeypatch.setattr(emcee_sampler, name, value)
     p = problem(store, SEEN)
     best = mode(p)
-    first = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16, wanted=1)
+    first = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16, effective_size=1)
     assert first.long
     monkeypatch.setattr(emcee.moves.DEMove, "get_proposal", None)
-    again = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16, wanted=1)
+    again = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16, effective_size=1)
     assert again.long
     assert again.steps == first.steps
     assert np.array_equal(again.draws, first.draws)
@@ -126,7 +139,9 @@ def test_draws_that_cannot_be_kept_are_drawn_and_said(store, tmp_path, monkeypat
     (tmp_path / "file").write_text("no folder")
     p, said = problem(store, SEEN), []
     best = mode(p)
-    found = emcee_sampler.sample(p, best, tmp_path / "file" / "c.h5", seed=3, walkers=16, progress=said.append)
+    found = emcee_sampler.sample(
+        p, best, tmp_path / "file" / "c.h5", seed=3, walkers=16, progress=said.append
+    )
     kept = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16)
     assert np.array_equal(found.draws, kept.draws)
     assert sum("an interruption would lose them" in line for line in said) == 1
@@ -139,7 +154,9 @@ def test_a_damaged_file_of_draws_is_drawn_anew(store, tmp_path, monkeypatch):
     best = mode(p)
     first = emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16)
     (tmp_path / "c.h5").write_bytes((tmp_path / "c.h5").read_bytes()[:3000])
-    assert np.array_equal(emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16).draws, first.draws)
+    assert np.array_equal(
+        emcee_sampler.sample(p, best, tmp_path / "c.h5", seed=3, walkers=16).draws, first.draws
+    )
 
 
 @pytest.fixture(scope="module")
@@ -176,7 +193,10 @@ def test_good_draws_pass_and_each_fault_is_found(drawn):
     assert marks(drawn, log=chains.log - 10.0)["the best draw is near the mode"] == "fail"
     assert marks(drawn, draws=chains.draws[:, :20])["draws are numerous enough"] == "fail"
     narrow = chains.flat.mean(0) + 0.8 * (chains.draws - chains.flat.mean(0))
-    assert marks(drawn, draws=narrow)["importance sampling agrees with the chains"] in ("fail", "warn")
+    assert marks(drawn, draws=narrow)["importance sampling agrees with the chains"] in (
+        "fail",
+        "warn",
+    )
 
 
 def test_draws_too_narrow_fail_where_importance_sampling_can_tell(drawn, monkeypatch):
@@ -240,7 +260,10 @@ def test_the_whole_command_finds_the_sensor_and_draws_nothing_twice(here, capsys
         assert low <= row["nominal"] <= high, name
     gain = document["parameters"]["gain"]
     assert abs(document["least_squares"]["gain"]["value"] - gain["mean"]) < 0.1 * gain["mean"]
-    assert "Beside the least squares of EMVA 1288" in (here / "runs" / "latest" / "report.html").read_text()
+    assert (
+        "Beside the least squares of EMVA 1288"
+        in (here / "runs" / "latest" / "report.html").read_text()
+    )
     data = importlib.import_module("arviz").from_netcdf(here / "runs" / "latest" / "posterior.nc")
     assert set(data.posterior) == set(document["parameters"])
     monkeypatch.setattr(emcee.moves.DEMove, "get_proposal", None)  # nothing is drawn again

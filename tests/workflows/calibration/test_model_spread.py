@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from neusee.workflows.calibration.model_spread import width_of_mean
+from neusee.workflows.calibration.frame_validity import width_of_mean
 
 
 @pytest.mark.parametrize("terms", [1, 2, 3])
@@ -11,9 +11,12 @@ def test_the_width_is_that_of_the_mean_of_two_least_squares(terms):
     x = np.linspace(0.05, 1, 14)
     scatter = 0.02 + 0.1 * x
     powers = x[:, None] ** np.arange(terms + 1) / scatter[:, None]
-    fewer, more = (np.linalg.pinv(powers[:, :count])[0] / scatter for count in (terms, terms + 1))  # of the first value
+    # of the first value
+    fewer, more = (np.linalg.pinv(powers[:, :count])[0] / scatter for count in (terms, terms + 1))
     width = np.linalg.norm((fewer + more) / 2 * scatter)
-    assert width_of_mean(np.linalg.norm(fewer * scatter), np.linalg.norm(more * scatter)) == pytest.approx(width)
+    assert width_of_mean(
+        np.linalg.norm(fewer * scatter), np.linalg.norm(more * scatter)
+    ) == pytest.approx(width)
     assert width < 0.99 * np.linalg.norm(more * scatter)
 
 

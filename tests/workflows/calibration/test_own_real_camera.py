@@ -1,4 +1,6 @@
-"""Real cameras from folders of frames, by a simulator of its own: honest values, and nothing that is corrected."""
+"""Real cameras from folders of frames, by a simulator of its own: honest values, and nothing
+that is corrected.
+"""
 
 import json
 import math
@@ -53,8 +55,14 @@ def calibrated(camera, folder):
 
 
 def judged(result, camera):
-    """The distance of each stated value from the truth in combined standard uncertainties of its budget."""
-    truth = {"gain": camera.gain, "quantum_efficiency": camera.efficiency, "temporal_dark_noise": camera.read_noise}
+    """The distance of each stated value from the truth in combined standard uncertainties of its
+    budget.
+    """
+    truth = {
+        "gain": camera.gain,
+        "quantum_efficiency": camera.efficiency,
+        "temporal_dark_noise": camera.read_noise,
+    }
     budgets = {budget.key: budget for budget in result.budgets}
     return {name: (budgets[name].value - x) / budgets[name].combined for name, x in truth.items()}
 
@@ -64,7 +72,9 @@ def failed(result):
 
 
 def test_a_well_below_the_converter_moves_no_gain(tmp_path):
-    """Neighbours of saturated levels correlate; a correction by them moved this gain by 10 % and 4 deviations."""
+    """Neighbours of saturated levels correlate; a correction by them moved this gain by 10 % and
+    4 deviations.
+    """
     result, told = calibrated(UNEVEN, tmp_path)
     assert not failed(result)
     assert max(map(abs, judged(result, UNEVEN).values())) < 3
@@ -86,14 +96,22 @@ def test_a_posterior_that_is_moved_away_from_its_levels_is_refused(tmp_path, mon
 
     monkeypatch.setattr(emcee_sampler, "sample", moved)
     result, _ = calibrated(UNEVEN.without(seed=2), tmp_path)
-    (check,) = (check for check in result.checks if check.name == "the posterior agrees with its least squares")
+    (check,) = (
+        check
+        for check in result.checks
+        if check.name == "the posterior agrees with its least squares"
+    )
     assert check.mark == "fail"
     assert "refused" in check.found
 
 
 @pytest.mark.parametrize(
     "fault",
-    [{"smoothing": 0.05}, pytest.param({"lag": 0.05}, marks=SLOW), pytest.param({"demosaiced": True}, marks=SLOW)],
+    [
+        {"smoothing": 0.05},
+        pytest.param({"lag": 0.05}, marks=SLOW),
+        pytest.param({"demosaiced": True}, marks=SLOW),
+    ],
     ids=str,
 )
 def test_frames_with_a_fault_are_refused_with_a_word_and_without_a_value(fault, tmp_path):
@@ -123,7 +141,9 @@ def test_the_sensor_group_has_a_full_well_with_its_uncertainty(tmp_path, monkeyp
         app.main(["calibrate", "lab", "--sensor", "mine"])
     printed = capsys.readouterr()
     assert ended.value.code == 0, printed.err
-    assert printed.out.startswith("dark: exposure 5 ms, from 5ms of the name"), "before any other line"
+    assert printed.out.startswith("dark: exposure 5 ms, from 5ms of the name"), (
+        "before any other line"
+    )
     joint = load("first_light", ["sensor=mine"], folder=tmp_path).uncertain.joint
     at = {name: index for index, name in enumerate(joint.names)}
     well, gain = at["sensor.full_well"], at["sensor.gain"]
@@ -137,8 +157,13 @@ def test_the_sensor_group_has_a_full_well_with_its_uncertainty(tmp_path, monkeyp
     assert np.isfinite(document["least_squares"]["gain"]["error"])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed",
+    [
+        pytest.param(0, marks=pytest.mark.slow),
+        *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2)),  # other numbers alone
+    ],
+)
 def test_clean_cameras_with_the_least_data_are_as_wide_as_statistics(seed, tmp_path):
     """Of 10 fitted levels of 2 frames of 640 x 640 pixels: 2.4 times as wide before."""
     camera = RealCamera(seed, size=(648, 648), lit=18, vignetting=0.1, flicker=0.001, prnu=0.01)

@@ -1,4 +1,6 @@
-"""The scatter of a lens from simulated pictures: coverage of the intervals, limits, and chains against weights."""
+"""The scatter of a lens from simulated pictures: coverage of the intervals, limits, and chains
+against weights.
+"""
 
 import numpy as np
 import pytest
@@ -7,13 +9,18 @@ from scipy.integrate import quad
 from scipy.stats import binom, chi2
 
 from neusee.nodes import calibrate
-from neusee.workflows.calibration import calibration_figures, emcee_sampler, importance_sampling, posterior_checks
+from neusee.workflows.calibration import (
+    calibration_figures,
+    emcee_sampler,
+    importance_sampling,
+    posterior_checks,
+)
+from neusee.workflows.calibration.calibration_figures import ring_radii
 from neusee.workflows.calibration.calibration_page import unit_of
 from neusee.workflows.calibration.identifiability import identify, identify_from_draws
 from neusee.workflows.calibration.importance_sampling import draw_guide, draw_samples, weights
-from neusee.workflows.calibration.picture_sections import ring_radii
+from neusee.workflows.calibration.log_posterior import find_mode, initial_theta
 from neusee.workflows.calibration.posterior_checks import importance_samples
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
 from tests.workflows.calibration.simulated_lenses import (
     CAMERA,
     LENS,
@@ -53,12 +60,16 @@ def told(problem, mode):
 
 
 def test_the_mean_of_a_ring_is_wing_and_scatter():
-    """Each expected mean against SciPy: the BSDF at the pixels, and what the lens scatters in all."""
+    """Each expected mean against SciPy: the BSDF at the pixels, and what the lens scatters in
+    all.
+    """
     rings = rings_of(picture(TRUTH, np.random.default_rng(1)))
     fixed = {**LENS, "gain": CAMERA["gain"], "read_noise": CAMERA["read_noise"]}
     found = calibrate.stray_light(rings, **TRUTH, **fixed).mean.numpy()
     b0, l, s = (TRUTH[name] for name in SHAPE)  # noqa: E741
-    total = quad(lambda v: 2 * np.pi * b0 * (1 + np.exp(2 * v) / l**2) ** (s / 2) * np.exp(2 * v), -20, 0)[0]
+    total = quad(
+        lambda v: 2 * np.pi * b0 * (1 + np.exp(2 * v) / l**2) ** (s / 2) * np.exp(2 * v), -20, 0
+    )[0]
     ring, weight, part = (x.numpy() for x in (rings.ring, rings.weight, rings.square))
     square = np.bincount(ring, weight * part) / np.bincount(ring, weight)
     radius = np.sqrt(square) * LENS["pixel_pitch"]
@@ -69,7 +80,8 @@ def test_the_mean_of_a_ring_is_wing_and_scatter():
         * (LENS["pixel_pitch"] / LENS["focal_length"]) ** 2
         * (1 + (radius / LENS["focal_length"] / l) ** 2) ** (s / 2)
     )
-    assert np.abs(found / (TRUTH["electrons"] * (core + veil)) - 1).max() < 3e-3  # a ring is one pixel wide
+    # a ring is one pixel wide
+    assert np.abs(found / (TRUTH["electrons"] * (core + veil)) - 1).max() < 3e-3
 
 
 def test_coordinates_are_one_to_one_and_their_density_is_that_of_the_prior():
@@ -77,8 +89,12 @@ def test_coordinates_are_one_to_one_and_their_density_is_that_of_the_prior():
     truth = {**TRUTH, "scatter": 0.005}
     place = coordinates.place(truth)
     back = coordinates.parameters(place)
-    assert all(float(back[name]) == pytest.approx(truth[name], rel=1e-12) for name in coordinates.names)
-    jacobian = torch.autograd.functional.jacobian(lambda x: coordinates.scaled(coordinates.parameters(x)), place)
+    assert all(
+        float(back[name]) == pytest.approx(truth[name], rel=1e-12) for name in coordinates.names
+    )
+    jacobian = torch.autograd.functional.jacobian(
+        lambda x: coordinates.scaled(coordinates.parameters(x)), place
+    )
     stretch = torch.linalg.det(jacobian).abs().log()
     flat = -0.5 * coordinates.whitened(back).square().sum()
     assert float(coordinates.log_prior(back)) == pytest.approx(float(flat + stretch), abs=1e-9)
@@ -86,7 +102,9 @@ def test_coordinates_are_one_to_one_and_their_density_is_that_of_the_prior():
 
 def test_a_lobe_within_the_saturated_pixels_gives_limits_and_no_value():
     narrow = {**TRUTH, "b0": 15.0 * 20**2.2, "l": 0.004 / 20, "s": -2.2}
-    problem, mode = fitted(narrow, prior=WIDE | {"b0": (15.0 * 20**2.2, 30.0), "l": (2e-4, 10.0)}, size=256)
+    problem, mode = fitted(
+        narrow, prior=WIDE | {"b0": (15.0 * 20**2.2, 30.0), "l": (2e-4, 10.0)}, size=256
+    )
     found = told(problem, mode)
     assert (found.kinds["l"], found.kinds["b0"]) == ("upper", "lower")
     assert "b0 and l only as b0 l^(-s): l lies within the saturated pixels" in found.directions
@@ -105,13 +123,16 @@ def test_parameters_have_their_units():
     assert [unit_of(name, {}) for name in ("b0", "l", "s", "electrons")] == ["1/sr", "", "", "e-"]
 
 
-@pytest.mark.parametrize("count", [pytest.param(50, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "count", [pytest.param(20, marks=pytest.mark.slow), pytest.param(200, marks=pytest.mark.long)]
+)
 def test_intervals_cover_the_truth(count, monkeypatch):
     """90 % intervals of b0, l and s, by the search that a user's run makes, from rings to interval.
 
-    Each camera has a lens from the prior, pixels of 4 to 6.5 um, light of 10 to 40 nm and a source between pixels. Two
-    statistics: how many intervals hold each truth, and the distance of all three from their mean, squared and in
-    standard deviations, which shows wrong widths in few cameras. Each bar raises a false alarm once in 10,000.
+    Each camera has a lens from the prior, pixels of 4 to 6.5 um, light of 10 to 40 nm and a source
+    between pixels. Two statistics: how many intervals hold each truth, and the distance of all
+    three from their mean, squared and in standard deviations, which shows wrong widths in few
+    cameras. Each bar raises a false alarm once in 10,000.
     """
     monkeypatch.setattr(importance_sampling, "DRAWS", 600)
     held, distance = np.zeros(3), 0.0
@@ -156,7 +177,11 @@ def test_what_one_surface_or_the_prior_cannot_explain_is_told(fault):
     problem = problem_of(rings, {**recipe_prior(), **prior})
     law = importance_samples(problem, find_mode(problem, initial_theta(problem)), 1)
     trend, surprise = posterior_checks._of_rings(problem, law, law.guide)
-    marks = {"none": ("pass", "pass"), "two surfaces": ("warn", "warn"), "a wrong prior": ("pass", "warn")}
+    marks = {
+        "none": ("pass", "pass"),
+        "two surfaces": ("warn", "warn"),
+        "a wrong prior": ("pass", "warn"),
+    }
     assert (trend.mark, surprise.mark) == marks[fault], (trend, surprise)
 
 
@@ -164,7 +189,9 @@ def test_what_one_surface_or_the_prior_cannot_explain_is_told(fault):
 def test_chains_agree_with_weighted_draws(tmp_path):
     problem, mode = fitted({**TRUTH, "b0": 40.0}, seed=3)
     guide = draw_guide(problem, mode, np.random.default_rng(2))
-    chains = emcee_sampler.sample(problem, mode, tmp_path / "draws.h5", seed=1, walkers=32, wanted=300, guide=guide)
+    chains = emcee_sampler.sample(
+        problem, mode, tmp_path / "draws.h5", seed=1, walkers=32, effective_size=300, guide=guide
+    )
     draws, weight = weighted(problem, mode, 1)
     mean = weight @ draws
     sd = np.sqrt(weight @ (draws - mean) ** 2)

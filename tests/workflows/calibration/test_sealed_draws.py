@@ -1,4 +1,6 @@
-"""The file of draws in a cache that somebody else changed: the same draws come out, and the file is written anew."""
+"""The file of draws in a cache that somebody else changed: the same draws come out, and the file
+is written anew.
+"""
 
 from types import SimpleNamespace
 
@@ -7,7 +9,7 @@ import numpy as np
 import pytest
 
 from neusee.workflows.calibration import emcee_sampler
-from neusee.workflows.keys.seal import seal_file
+from neusee.workflows.keys.sealed_files import seal_file
 
 h5py = pytest.importorskip("h5py")
 WALKERS = 8
@@ -34,7 +36,9 @@ def sampled(monkeypatch):
 
     def sampled(file):
         calls = []
-        weigh = SimpleNamespace(names=PROBLEM.names, log_posterior=lambda x: calls.append(0) or log_posterior(x))
+        weigh = SimpleNamespace(
+            names=PROBLEM.names, log_posterior=lambda x: calls.append(0) or log_posterior(x)
+        )
         return emcee_sampler.sample(weigh, MODE, file, seed=3, walkers=WALKERS).draws, len(calls)
 
     return sampled
@@ -87,10 +91,15 @@ def flipped(path):
 
 
 FORGERIES = {
-    **{change.__name__: forged(change) for change in (nan, none, negative, text, no_state, wrong_state, no_densities)},
+    **{
+        change.__name__: forged(change)
+        for change in (nan, none, negative, text, no_state, wrong_state, no_densities)
+    },
     "one bit": flipped,
     "no seal": lambda path: path.write_bytes(bytes(512) + path.read_bytes()[512:]),
-    "another file": lambda path: path.write_bytes(path.read_bytes().replace(b'"key":"draws"', b'"key":"other"')),
+    "another file": lambda path: path.write_bytes(
+        path.read_bytes().replace(b'"key":"draws"', b'"key":"other"')
+    ),
     "empty": lambda path: path.write_bytes(b""),
     "text": lambda path: path.write_text("no draws"),
 }
@@ -112,7 +121,13 @@ def test_changed_draws_are_drawn_anew_and_written_anew(tmp_path, sampled, how):
 def test_draws_are_read_with_the_right_secret_alone(tmp_path, sampled, monkeypatch):
     path = tmp_path / "draws.h5"
     sampled(path)
-    for secret, is_read in (("ours", False), ("ours", True), ("new, ours", True), ("other", False), ("other", True)):
+    for secret, is_read in (
+        ("ours", False),
+        ("ours", True),
+        ("new, ours", True),
+        ("other", False),
+        ("other", True),
+    ):
         monkeypatch.setenv("NEUSEE_CACHE_SECRET", secret)
         assert (sampled(path)[1] == 0) == is_read
 

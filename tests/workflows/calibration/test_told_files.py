@@ -8,7 +8,7 @@ import pytest
 
 from neusee.workflows.calibration import run_calibration
 from neusee.workflows.calibration.identifiability import Identifiability, withheld_electrons
-from neusee.workflows.recipe.distributions.joint import read_posterior
+from neusee.workflows.recipe.distributions.joint_distribution import read_posterior
 
 KINDS = {"gain": "estimate", "read_noise": "upper", "full_well": "none", "dark_current": "none"}
 
@@ -21,7 +21,10 @@ def result():
     flat = np.stack([x.reshape(-1) for x in draws.values()], -1)
     labels = tuple(f"log {name}" for name in KINDS)
     problem = SimpleNamespace(
-        names=tuple(KINDS), measured=None, coordinates=SimpleNamespace(labels=labels), recipe=SimpleNamespace(name="it")
+        names=tuple(KINDS),
+        measured=None,
+        coordinates=SimpleNamespace(labels=labels),
+        recipe=SimpleNamespace(name="it"),
     )
     known = Identifiability(KINDS, [], [], "")
     chains = SimpleNamespace(flat=flat, log=rng.normal(size=(2, 40, 8)))
@@ -41,7 +44,9 @@ def result():
 def test_files_have_draws_of_what_the_frames_tell_alone(result):
     with np.load(io.BytesIO(run_calibration._draws(result))) as draws:
         assert set(draws) == {"gain", "read_noise"}
-        assert np.allclose(np.sort(draws["read_noise"]), np.sort(result.draws["read_noise"].reshape(-1)))
+        assert np.allclose(
+            np.sort(draws["read_noise"]), np.sort(result.draws["read_noise"].reshape(-1))
+        )
     assert set(run_calibration._inference_data(result).posterior) == {"gain", "read_noise"}
     law = run_calibration._document(result)["gaussian"]
     assert law["coordinates"] == ["log gain", "log read_noise"]
@@ -53,14 +58,18 @@ def test_files_have_draws_of_what_the_frames_tell_alone(result):
 def test_a_recipe_that_takes_the_posterior_names_what_it_does_not_tell(result, tmp_path):
     (tmp_path / "draws.npz").write_bytes(run_calibration._draws(result))
     units = {"gain": "DN/e-", "read_noise": "e-", "full_well": "e-", "dark_current": "e- in 0.01 s"}
-    rows = "\n".join(f"  {name}: {{kind: {kind}, unit: {units[name]}}}" for name, kind in KINDS.items())
+    rows = "\n".join(
+        f"  {name}: {{kind: {kind}, unit: {units[name]}}}" for name, kind in KINDS.items()
+    )
     (tmp_path / "posterior.json").write_text(f"failed: 0\nparameters:\n{rows}\n")
     found = read_posterior(tmp_path)
     assert found.joint.names == ("gain", "read_noise")
     assert found.untold == ("full_well", "dark_current")
 
 
-@pytest.mark.parametrize(("gain", "left"), [("none", "none"), ("upper", "estimate"), ("estimate", "estimate")])
+@pytest.mark.parametrize(
+    ("gain", "left"), [("none", "none"), ("upper", "estimate"), ("estimate", "estimate")]
+)
 def test_without_a_gain_nothing_is_told_in_electrons(gain, left):
     kinds = {
         "gain": gain,
@@ -69,7 +78,9 @@ def test_without_a_gain_nothing_is_told_in_electrons(gain, left):
         "full_well": "lower",
         "dark_current": "none",
     }
-    sentences = withheld_electrons(kinds, ["full well: only a lower limit", "dark signal: whatever"])
+    sentences = withheld_electrons(
+        kinds, ["full well: only a lower limit", "dark signal: whatever"]
+    )
     assert kinds["read_noise"] == left
     assert kinds["dark_signal"] == "estimate"
     if gain != "none":

@@ -1,4 +1,6 @@
-"""Folders in which a cache fails, each in its own way: what a disk, a mount, a name or a permission may do."""
+"""Folders in which a cache fails, each in its own way: what a disk, a mount, a name or a
+permission may do.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ _state: dict[str, Any] = {"folder": "", "number": 0, "after": 0, "hooked": False
 
 
 def _hook(event: str, arguments: tuple[Any, ...]) -> None:
-    """Let each use of a file below the broken folder fail, once the given number of uses is over."""
+    """Let each use of a file below the broken folder fail, once the given number of uses is
+    over.
+    """
     if not _state["folder"] or event not in _EVENTS:
         return
     names = [os.fspath(name) for name in arguments[:2] if isinstance(name, str | os.PathLike)]
@@ -31,7 +35,9 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
 
 @contextmanager
 def broken(folder: Path, number: int, after: int = 0) -> Iterator[Path]:
-    """A folder below which every file answers with the error ``number``, from the use ``after`` on."""
+    """A folder below which every file answers with the error ``number``, from the use ``after``
+    on.
+    """
     if not _state["hooked"]:
         sys.addaudithook(_hook)
         _state["hooked"] = True
@@ -92,7 +98,9 @@ def _forbidden(folder: Path, mode: int) -> Iterator[Path]:
 
 @contextmanager
 def without_privileges() -> Iterator[None]:
-    """Let permissions hold for root too: without the capabilities that override them, in this thread and its own."""
+    """Let permissions hold for root too: without the capabilities that override them, in this
+    thread and its own.
+    """
     if os.geteuid() != 0:
         yield
         return

@@ -1,7 +1,7 @@
 """Recipes of a stranger who means harm: the text of each, the files beside it, and what it tries.
 
-A recipe is written into a folder of its own. Beside that folder there is one with a secret: a text, numbers and a
-picture. Code that runs would leave a file `ran` there.
+A recipe is written into a folder of its own. Beside that folder there is one with a secret: a text,
+numbers and a picture. Code that runs would leave a file `ran` there.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ SECRET = "a-secret-of-the-reader"
 NUMBER = 0.0625  #: grey of the secret picture
 SCRIPT = "<script>stranger()</script>"
 PICTURE = '<img src=x onerror="stranger()">'
-ESCAPE = "\\e[2J\\e]0;stranger\\a"  #: as YAML writes it in double quotes: clears the screen, names the window
+#: as YAML writes it in double quotes: clears the screen, names the window
+ESCAPE = "\\e[2J\\e]0;stranger\\a"
 
 STEPS = """
 steps:
@@ -65,7 +66,9 @@ def _weights(name: str) -> Callable[[Path], None]:
 
 
 def _object_array(folder: Path) -> None:
-    np.save(folder / "a.npy", np.array([[_Payload(folder.parent / "ran")]], object), allow_pickle=True)
+    np.save(
+        folder / "a.npy", np.array([[_Payload(folder.parent / "ran")]], object), allow_pickle=True
+    )
 
 
 def _object_table(folder: Path) -> None:
@@ -121,13 +124,19 @@ def picture(file: str) -> str:
 def cube(file: str) -> str:
     """Return a recipe that shows a cube of a file."""
     bands = "bands: {node: spectra.bands, with: {start: 400 nm, stop: 700 nm, count: 4}}"
-    raw = f"raw: {{node: scene.hyperspectral, from: bands, with: {{file: {file}, start: 400 nm, stop: 700 nm}}}}"
+    raw = (
+        f"raw: {{node: scene.hyperspectral, from: bands, with: {{file: {file}, start: 400 nm, stop:"
+        " 700 nm}}"
+    )
     return f"# A cube.\noutputs: [raw]\ntolerance: 0\nsteps:\n  {bands}\n  {raw}\n"
 
 
 def table(file: str) -> str:
     """Return a recipe that reads a table of frames."""
-    return f"# A table.\noutputs: [raw]\nsteps:\n  raw: {{node: calibrate.table, with: {{file: {file}}}}}\n"
+    return (
+        "# A table.\noutputs: [raw]\nsteps:\n  raw: {node: calibrate.table, with: {file:"
+        f" {file}}}}}\n"
+    )
 
 
 def network(settings: str) -> str:
@@ -239,7 +248,8 @@ HOSTILE: dict[str, Hostile] = {
     ),
     "photographs of a training": Hostile("train: {photographs: ../secret}\n" + PLAIN),
     "frames above": Hostile(
-        "# Frames.\noutputs: [raw]\nsteps:\n  raw: {node: calibrate.frames, with: {files: ../secret/*.png}}\n"
+        "# Frames.\noutputs: [raw]\nsteps:\n  raw: "
+        "{node: calibrate.frames, with: {files: ../secret/*.png}}\n"
     ),
     "spectra above": Hostile(
         "# Spectra.\noutputs: [raw]\nsteps:\n"

@@ -8,7 +8,7 @@ import torch
 from neusee.workflows.answers.stored_answer import Answer, write_answer
 from neusee.workflows.answers.witnesses import Witnesses
 from neusee.workflows.cli import cache_commands
-from neusee.workflows.store.byte_sizes import format_size
+from neusee.workflows.store.cache_settings import format_size
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 
@@ -21,9 +21,19 @@ def store(tmp_path):
     for i, key in enumerate(KEYS[:2]):
         value = torch.full((5000,), float(i))
         found.put(
-            key, value, {"step": f"s{i}", "recipe": "r", "seconds": i + 0.5, "date": f"2026-01-0{i + 1}T00:00:00"}
+            key,
+            value,
+            {
+                "step": f"s{i}",
+                "recipe": "r",
+                "seconds": i + 0.5,
+                "date": f"2026-01-0{i + 1}T00:00:00",
+            },
         )
-    found.put_receipt(KEYS[2], {"step": "n", "recipe": "r", "seconds": 0.1, "bytes": 7, "date": "2026-01-03T00:00:00"})
+    found.put_receipt(
+        KEYS[2],
+        {"step": "n", "recipe": "r", "seconds": 0.1, "bytes": 7, "date": "2026-01-03T00:00:00"},
+    )
     return found
 
 
@@ -45,13 +55,17 @@ def test_an_empty_store_is_listed(tmp_path):
 
 
 def test_a_sound_store_is_verified(store):
-    DerivedFiles(store).keep("ef" * 16, ".png", "picture", lambda path: path.write_bytes(b"x" * 980_000))
+    DerivedFiles(store).keep(
+        "ef" * 16, ".png", "picture", lambda path: path.write_bytes(b"x" * 980_000)
+    )
     assert cache_commands.verify_lines(store) == (["3 results, 1.02 MB, as written"], 0)
 
 
 @pytest.mark.parametrize("mode", ["always", "never"])
 def test_what_is_damaged_is_named_and_put_aside(store, mode):
-    picture = DerivedFiles(store).keep("ef" * 16, ".png", "picture", lambda path: path.write_bytes(b"x" * 1000))
+    picture = DerivedFiles(store).keep(
+        "ef" * 16, ".png", "picture", lambda path: path.write_bytes(b"x" * 1000)
+    )
     picture.chmod(0o644)
     picture.write_bytes(b"y" * 1000)
     for key, suffix, at in ((KEYS[0], "safetensors", -1), (KEYS[2], "json", 20)):
@@ -90,9 +104,13 @@ def test_room_is_made(store):
 def test_a_value_is_pinned_by_the_beginning_of_its_key(store):
     assert cache_commands.pin_lines(store, "AB0") == [f"pinned: {KEYS[0]}  s0"]
     assert store.pinned() == {KEYS[0]}
-    with pytest.raises(ValueError, match="'ab' must be the start of the key of one value: it matches ab000"):
+    with pytest.raises(
+        ValueError, match="'ab' must be the start of the key of one value: it matches ab000"
+    ):
         cache_commands.pin_lines(store, "ab")
-    with pytest.raises(ValueError, match="'cd' must be the start of the key of one value: it matches no key"):
+    with pytest.raises(
+        ValueError, match="'cd' must be the start of the key of one value: it matches no key"
+    ):
         cache_commands.pin_lines(store, "cd")
     with pytest.raises(ValueError, match="'ab1' must be the start of the key of one pinned value"):
         cache_commands.pin_lines(store, "ab1", pin=False)
@@ -102,7 +120,11 @@ def test_a_value_is_pinned_by_the_beginning_of_its_key(store):
 
 def test_the_answers_of_commands_are_listed_verified_and_removed(store):
     for name in ("ab" + "0" * 30, "cd" + "0" * 30):
-        write_answer(store.disk, name, Answer("s", Witnesses({}, [], {}, {}), "x" * 20_000, False, "o", "l", "k", {}))
+        write_answer(
+            store.disk,
+            name,
+            Answer("s", Witnesses({}, [], {}, {}), "x" * 20_000, False, "o", "l", "k", {}),
+        )
     sizes = [each.stat().st_size for each in (store.root / "answers").rglob("*.answer")]
     words = f"2 answers of commands of {format_size(sum(sizes))}"
     assert list(cache_commands.ls_lines(store))[-1].startswith(f"2 results, 40 kB, in {store.root}")
@@ -111,14 +133,22 @@ def test_the_answers_of_commands_are_listed_verified_and_removed(store):
     path = next((store.root / "answers").rglob("cd*.answer"))
     path.write_bytes(path.read_bytes()[:-1])
     lines, bad = cache_commands.verify_lines(store)
-    assert (bad, lines[0]) == (1, f"{'cd' + '0' * 30}  the answer of a command, which is not what was written")
+    assert (bad, lines[0]) == (
+        1,
+        f"{'cd' + '0' * 30}  the answer of a command, which is not what was written",
+    )
     assert cache_commands.gc_lines(store)[0].startswith("0 values and 0 files")
-    assert len(list((store.root / "answers").rglob("*.answer"))) == 1, "one that was used this week stays"
+    assert len(list((store.root / "answers").rglob("*.answer"))) == 1, (
+        "one that was used this week stays"
+    )
     assert cache_commands.gc_lines(store, "1 MB")[-1].startswith("0 values")
     assert re.fullmatch(
-        "1 answer of commands of 20.* kB would go", cache_commands.gc_lines(store, "60 kB", dry=True)[0]
+        "1 answer of commands of 20.* kB would go",
+        cache_commands.gc_lines(store, "60 kB", dry=True)[0],
     )
-    assert re.fullmatch("1 answer of commands of 20.* kB went", cache_commands.gc_lines(store, "60 kB")[0])
+    assert re.fullmatch(
+        "1 answer of commands of 20.* kB went", cache_commands.gc_lines(store, "60 kB")[0]
+    )
     assert not list((store.root / "answers").rglob("*.answer"))
 
 
@@ -126,7 +156,11 @@ def test_a_long_list_shows_its_newest_page_and_says_how_to_see_all(tmp_path, mon
     """The journal tells number and bytes; a result that is gone since is not shown."""
     store = Store(tmp_path)
     for i in range(60):
-        store.put(f"{i:032x}", torch.full((2000,), float(i)), {"step": f"s{i}", "date": f"2026-01-01T00:00:{i:02d}"})
+        store.put(
+            f"{i:032x}",
+            torch.full((2000,), float(i)),
+            {"step": f"s{i}", "date": f"2026-01-01T00:00:{i:02d}"},
+        )
     short = list(cache_commands.ls_lines(store))
     monkeypatch.setattr("neusee.workflows.store.journal._LATEST", 14_000)
     again = Store(tmp_path)
@@ -138,7 +172,7 @@ def test_a_long_list_shows_its_newest_page_and_says_how_to_see_all(tmp_path, mon
         "the newest 50; `neusee cache ls --all` lists all",
         f"60 results, 480 kB by the journal, in {store.root}",
     ]
-    assert len(list(cache_commands.ls_lines(again, whole=True))) == 62
+    assert len(list(cache_commands.ls_lines(again, every=True))) == 62
     for suffix in ("json", "safetensors"):
         (tmp_path / "00" / f"{59:032x}.{suffix}").unlink()
     assert not any("s59" in line for line in cache_commands.ls_lines(Store(tmp_path)))

@@ -12,7 +12,9 @@ import pytest
 
 from neusee.workflows.cli import app
 
-_SPEC = importlib.util.spec_from_file_location("cache_faults", Path(__file__).with_name("cache_faults.py"))
+_SPEC = importlib.util.spec_from_file_location(
+    "cache_faults", Path(__file__).with_name("cache_faults.py")
+)
 cache_faults = importlib.util.module_from_spec(_SPEC)
 _SPEC.loader.exec_module(cache_faults)
 
@@ -31,13 +33,23 @@ steps:
   saturated: {node: sensor.crop, from: {image: raw}, with: {shape: [8, 8]}}
 """
 CAMERA = [
-    "optics.samples=48", "optics.pitch=168 um", "optics.bands=3", "optics.window=[16, 16]", "scene.shape=[24, 24]",
+    "optics.samples=48",
+    "optics.pitch=168 um",
+    "optics.bands=3",
+    "optics.window=[16, 16]",
+    "scene.shape=[24, 24]",
     "sensor.shape=[16, 16]",
-]  # fmt: skip
+]
 LIFT = [
-    "patch.shape=[8, 8]", "patch.leaves=8", "train_lift.iterations=1", "train_lift.batch=1", "train_lift.keep=1",
-    "train_lift.warmup=1", "train_lift.validation_batches=1", "train_lift.ema_decay=0.5",
-]  # fmt: skip
+    "patch.shape=[8, 8]",
+    "patch.leaves=8",
+    "train_lift.iterations=1",
+    "train_lift.batch=1",
+    "train_lift.keep=1",
+    "train_lift.warmup=1",
+    "train_lift.validation_batches=1",
+    "train_lift.ema_decay=0.5",
+]
 COMMANDS = {
     "run": ["run", "mine.yaml"],
     "sweep": ["sweep", "mine.yaml", "sensor.gain=0.5 e-/DN,0.6 e-/DN"],
@@ -47,11 +59,26 @@ COMMANDS = {
     "train": ["train", "train_lift", *LIFT],
     "calibrate": ["calibrate", "calibrate", "flats.shape=[32, 32]", "--draws", "100", "--walkers", "16"],
 }  # fmt: skip
-FAST = {"sweep": ("a full disk", "a file in its place", "errors of the device"), "study": ("the folder /proc",)}
+FAST = {
+    "sweep": ("a full disk", "a file in its place", "errors of the device"),
+    "study": ("the folder /proc",),
+}
+#: one fault of each kind for commands that take seconds: every command uses the one store, and the
+#: run, the sweep and the study meet all faults
+SEVERAL = ("a disk that fills up", "a file in its place", "a device that breaks later")
+FEW = {
+    "evaluate": SEVERAL,
+    "train": SEVERAL,
+    "calibrate": ("a read-only mount", "a device that breaks later"),
+}
 CASES = [
-    pytest.param(command, fault, marks=() if command == "run" or fault in FAST.get(command, ()) else pytest.mark.slow)
+    pytest.param(
+        command,
+        fault,
+        marks=() if command == "run" or fault in FAST.get(command, ()) else pytest.mark.slow,
+    )
     for command in COMMANDS
-    for fault in cache_faults.FAULTS
+    for fault in FEW.get(command, cache_faults.FAULTS)
 ]
 
 
@@ -70,7 +97,9 @@ def call(tmp_path, monkeypatch, capfd):
 
 
 def shorten(command, monkeypatch):
-    """Cut what takes longer than what is tested: chains, pictures of an evaluation, costs of scenes."""
+    """Cut what takes longer than what is tested: chains, pictures of an evaluation, costs of
+    scenes.
+    """
     if command == "calibrate":
         from neusee.workflows.calibration import emcee_sampler
 
@@ -95,22 +124,29 @@ def test_a_cache_that_fails_costs_one_warning(command, fault, call, tmp_path, mo
     short = command == "calibrate"  # its chains are cut here, and its page says so
     assert code == (3 if short else 0), out + err
     told = [line for line in (out + err).splitlines() if line.startswith("warning")]
-    assert len([line for line in told if command != "sweep" or not line.startswith("warning:")]) == 1, told
+    assert (
+        len([line for line in told if command != "sweep" or not line.startswith("warning:")]) == 1
+    ), told
     assert str(cache) in told[0]
     assert re.search(r"cannot be (written|read) \(\[Errno \d+\] .*\): the run goes on", told[0])
     pages = list((tmp_path / "runs").glob("[!.l]*/provenance.json"))
     assert len(pages) == (command not in ("sweep", "train"))
     for page in pages:
-        assert json.loads(page.read_text())["warnings"] == [told[0].removeprefix("warning").removeprefix(":").strip()]
+        assert json.loads(page.read_text())["warnings"] == [
+            told[0].removeprefix("warning").removeprefix(":").strip()
+        ]
         assert re.search("cannot be (written|read)", page.with_name("report.html").read_text())
 
 
 def test_a_read_only_cache_is_read_and_told(call, tmp_path, monkeypatch):
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
-    command = [*COMMANDS["run"], 'outputs=["scene", "raw"]']  # an output is stored, however quickly it is computed
+    # an output is stored, however quickly it is computed
+    command = [*COMMANDS["run"], 'outputs=["scene", "raw"]']
     call(*command, "--quiet")
     with cache_faults.without_privileges():
-        folders = [path for path in (tmp_path / "cache", *(tmp_path / "cache").rglob("*")) if path.is_dir()]
+        folders = [
+            path for path in (tmp_path / "cache", *(tmp_path / "cache").rglob("*")) if path.is_dir()
+        ]
         for path in folders:
             path.chmod(0o555)
         code, out, err = call(*command, "sensor.gain=0.6 e-/DN", "--json")
@@ -125,14 +161,18 @@ def test_a_read_only_cache_is_read_and_told(call, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("mode", [0o555, 0o000])
-def test_results_that_may_not_be_written_are_refused_before_anything_runs(mode, call, tmp_path, monkeypatch):
+def test_results_that_may_not_be_written_are_refused_before_anything_runs(
+    mode, call, tmp_path, monkeypatch
+):
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
     (tmp_path / "closed").mkdir(mode=mode)
     with cache_faults.without_privileges():
         code, _, err = call(*COMMANDS["run"], "--out", "closed/deep/runs")
     assert code == 2
     assert err.startswith("--out: the folder ")
-    assert "cannot be written (Permission denied), so that closed/deep/runs cannot hold results" in err
+    assert (
+        "cannot be written (Permission denied), so that closed/deep/runs cannot hold results" in err
+    )
     assert not (tmp_path / "cache").exists()
 
 

@@ -1,4 +1,6 @@
-"""`neusee check` makes each call in other surroundings too, and ends with 3 where these decide a result."""
+"""`neusee check` makes each call in other surroundings too, and ends with 3 where these decide a
+result.
+"""
 
 import json
 import sys
@@ -7,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from neusee.workflows.cli.app import app
-from neusee.workflows.cli.new_command import KINDS
+from neusee.workflows.cli.project_commands import KINDS
 
 ZONE = """
 import time
@@ -44,14 +46,18 @@ def test_a_result_that_depends_on_the_time_zone_ends_a_check_with_three(here):
     found = CliRunner().invoke(app, ["check", "zoned_check.py"])
     assert found.exit_code == 3
     [line] = [line for line in found.output.splitlines() if "elsewhere" in line]
-    assert line == (
-        "  FAIL  elsewhere    zoned_check.py:10: in another time zone (TZ) the result differs by 13 of its largest "
-        "value: compute in UTC: calendar.timegm and time.gmtime, or datetime with tzinfo=timezone.utc"
+    assert (
+        line
+        == "  FAIL  elsewhere    zoned_check.py:10: in another time zone (TZ) the result differs by"
+        " 13 of its largest value: compute in UTC: calendar.timegm and time.gmtime, or datetime"
+        " with tzinfo=timezone.utc"
     )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [kind for kind, (_, commands) in KINDS.items() if "neusee check NAME.py" in commands])
+@pytest.mark.parametrize(
+    "kind", [kind for kind, (_, commands) in KINDS.items() if "neusee check NAME.py" in commands]
+)
 def test_what_neusee_new_writes_gives_the_same_bits_elsewhere(here, kind):
     name = f"new_{kind}_elsewhere"
     assert CliRunner().invoke(app, ["new", kind, name]).exit_code == 0

@@ -58,11 +58,22 @@ def neusee(here, capfd):
 
 def test_help_comes_at_once_and_without_torch():
     """And without typer, or any module that takes long to import."""
-    slow = {"torch", "pydantic", "rich", "typer", "click", "dataclasses", "inspect", "pathlib", "json", "subprocess"}
+    slow = {
+        "torch",
+        "pydantic",
+        "rich",
+        "typer",
+        "click",
+        "dataclasses",
+        "inspect",
+        "json",
+        "subprocess",
+    }
     code = (
-        "import sys\nbefore = set(sys.modules)\nfrom neusee.workflows.cli.app import main\n"
-        "try: main(['--help'])\nexcept SystemExit: pass\n"
-        f"assert not {slow | {'importlib.metadata', 'importlib.resources', 'logging'}!r} & (set(sys.modules) - before)"
+        "import sys\nbefore = set(sys.modules)\nfrom neusee.workflows.cli.app import main\ntry:"
+        " main(['--help'])\nexcept SystemExit: pass\nassert not"
+        f" {slow | {'importlib.metadata', 'importlib.resources', 'logging'}!r} & (set(sys.modules)"
+        " - before)"
     )
     bare, ours = (min(_seconds(text)[0] for _ in range(3)) for text in ("pass", code))
     assert ours < 5 * bare
@@ -70,10 +81,14 @@ def test_help_comes_at_once_and_without_torch():
 
 
 def _seconds(code):
-    """Processor time of Python for the code, which a busy machine hardly changes, and what the code prints."""
+    """Processor time of Python for the code, which a busy machine hardly changes, and what the
+    code prints.
+    """
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     env = {**os.environ, "COLUMNS": "80"}
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env)
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=env
+    )
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, found.stdout
 
@@ -177,7 +192,9 @@ def test_a_bad_word_is_one_line_and_exit_code_two(neusee, words, said):
 
 
 def test_tilde_and_plus_reach_the_recipe(neusee):
-    code, out, _ = neusee("config", "mine.yaml", "~mask.max_height", "+mask.max_height=2 um", "mask.waves=-1")
+    code, out, _ = neusee(
+        "config", "mine.yaml", "~mask.max_height", "+mask.max_height=2 um", "mask.waves=-1"
+    )
     assert code == 0
     assert "waves: -1" in out
     assert "max_height: 2 um" in out
@@ -222,7 +239,9 @@ def test_plan_computes_nothing_and_knows_what_is_stored(neusee, here):
     assert rows["made"][1] == "cpu"
     steps = {
         row["step"]: row
-        for row in json.loads(neusee("plan", "mine.yaml", "mask.max_height=1.3 um", "--json")[1])["steps"]
+        for row in json.loads(neusee("plan", "mine.yaml", "mask.max_height=1.3 um", "--json")[1])[
+            "steps"
+        ]
     }
     assert steps["cone"]["state"] == "stored"
     assert (steps["made"]["state"], steps["made"]["where"]) == ("run", "cpu")
@@ -230,9 +249,12 @@ def test_plan_computes_nothing_and_knows_what_is_stored(neusee, here):
 
 def test_plan_follows_what_would_be_left_out(neusee, here):
     text = RECIPE.replace("PROMISED", "0").replace(
-        "  made:", "  near:\n    node: sensor.dark_current\n    from: cone\n    with: {mean: 0 e-}\n  made:"
+        "  made:",
+        "  near:\n    node: sensor.dark_current\n    from: cone\n    with: {mean: 0 e-}\n  made:",
     )
-    (here / "mine.yaml").write_text(text.replace("from: cone\n    with: {material", "from: near\n    with: {material"))
+    (here / "mine.yaml").write_text(
+        text.replace("from: cone\n    with: {material", "from: near\n    with: {material")
+    )
     neusee("run", "mine.yaml", "--quiet")
     _, out, _ = neusee("plan", "mine.yaml")
     rows = {line.split()[0]: line for line in out.splitlines()}
@@ -245,7 +267,9 @@ def test_config_can_be_run_again(neusee, here):
     (here / "again.yaml").write_text(out)
     first = json.loads(neusee("run", "mine.yaml", "mask.waves=3", "--json")[1])
     second = json.loads(neusee("run", "again.yaml", "--json")[1])
-    assert {s["step"]: s["key"] for s in first["steps"]} == {s["step"]: s["key"] for s in second["steps"]}
+    assert {s["step"]: s["key"] for s in first["steps"]} == {
+        s["step"]: s["key"] for s in second["steps"]
+    }
     assert "argument 2" in out
 
 
@@ -285,7 +309,10 @@ def test_the_schema_is_json(neusee):
 def test_a_reader_that_goes_away_is_no_error(here):
     words = f"{sys.executable} -m neusee.workflows.cli recipes | head -n 1"
     found = subprocess.run(
-        ["bash", "-o", "pipefail", "-c", words], capture_output=True, text=True, env=dict(os.environ)
+        ["bash", "-o", "pipefail", "-c", words],
+        capture_output=True,
+        text=True,
+        env=dict(os.environ),
     )
     assert found.stdout.startswith("axicon")
     assert "Traceback" not in found.stderr

@@ -23,7 +23,10 @@ def runs(tmp_path):
     names = []
     for noise, psnr, source in (("10 e-", 30.0, "mine.yaml:7:77"), ("20 e-", 24.0, "argument 1")):
         steps = [{"step": "raw", "node": "sensor.raw", "state": "run", "key": noise}]
-        command, metrics = f"neusee run {noise}", [["quality", "psnr", "", psnr], ["lsr", "", 0, 0.5]]
+        command, metrics = (
+            f"neusee run {noise}",
+            [["quality", "psnr", "", psnr], ["lsr", "", 0, 0.5]],
+        )
         with new_run(tmp_path, "mine", noise) as folder:
             document = FACTS | {"steps": steps, "command": command, "metrics": metrics}
             folder.write("provenance.json", json.dumps(document))
@@ -64,7 +67,9 @@ def test_json_is_one_object_and_quiet_is_the_page(neusee, runs):
         ("lsr", 0.0, 0.0),
     ]
     assert found["largest"] == 0.2
-    assert neusee("compare", first, last, "--out", str(root), "--quiet")[1].endswith("report.html\n")
+    assert neusee("compare", first, last, "--out", str(root), "--quiet")[1].endswith(
+        "report.html\n"
+    )
 
 
 def test_a_limit_decides_the_exit_code(neusee, runs):
@@ -80,4 +85,6 @@ def test_a_limit_decides_the_exit_code(neusee, runs):
 def test_a_run_that_is_not_there_is_refused(words, neusee, runs):
     code, out, err = neusee("compare", *words, "--out", str(runs[0]))
     assert (code, out) == (2, "")
-    assert err == f"no run at nothing: give the name of a folder in {runs[0]}, a path, or `latest`\n"
+    assert (
+        err == f"no run at nothing: give the name of a folder in {runs[0]}, a path, or `latest`\n"
+    )

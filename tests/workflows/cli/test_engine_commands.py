@@ -89,7 +89,10 @@ def test_a_damaged_result_fails_the_verification(neusee, here):
         (("run", "mine.yaml", "--device", "cpu,cpu"), "names a device twice"),
         (("run", "mine.yaml", "--device", "gpu"), "--device gpu"),
         (("run", "mine.yaml", "--memory", "lots"), "--memory"),
-        (("sweep", "mine.yaml", "sensor.gain=0.5 e-/DN,0.6 e-/DN", "--on-error", "ignore"), "--on-error ignore"),
+        (
+            ("sweep", "mine.yaml", "sensor.gain=0.5 e-/DN,0.6 e-/DN", "--on-error", "ignore"),
+            "--on-error ignore",
+        ),
         (("sweep", "mine.yaml", "sensor.gian=0.5,0.6"), "did you mean sensor.gain?"),
         (("plan", "mine.yaml", "--devices", "nowhere.yaml"), "nowhere.yaml"),
     ],
@@ -110,7 +113,10 @@ def test_a_store_that_is_no_url_is_refused(neusee, monkeypatch):
 
 
 def test_a_sweep_writes_one_table_and_a_second_one_computes_nothing(neusee, here):
-    gains, wells = "sensor.gain=0.5 e-/DN,0.6 e-/DN,0.7 e-/DN", "sensor.capacity=linspace(100 e-, 200 e-, 2)"
+    gains, wells = (
+        "sensor.gain=0.5 e-/DN,0.6 e-/DN,0.7 e-/DN",
+        "sensor.capacity=linspace(100 e-, 200 e-, 2)",
+    )
     words = ("sweep", "mine.yaml", gains, wells)
     code, out, _ = neusee(*words)
     assert code == 0, out
@@ -145,7 +151,10 @@ def test_a_plan_says_what_is_refused_and_a_run_refuses_it_first(neusee, here):
     ("words", "step"),
     [
         (("--memory", "1 MB"), " needs "),
-        (("--memory", "12 GB", "scene=siemens", "scene.shape=[9000,9000]", "optics.pixel=zoh"), " needs "),
+        (
+            ("--memory", "12 GB", "scene=siemens", "scene.shape=[9000,9000]", "optics.pixel=zoh"),
+            " needs ",
+        ),
     ],
 )
 def test_what_cannot_fit_is_refused_on_an_empty_cache_before_any_work(neusee, here, words, step):
@@ -158,7 +167,9 @@ def test_what_cannot_fit_is_refused_on_an_empty_cache_before_any_work(neusee, he
     assert not list((here / "cache").glob("**/journal.jsonl"))
 
 
-@pytest.mark.parametrize("words", [("--memory", "20 GB", "scene.shape=[40000,40000]"), ("optics.bands=100000000",)])
+@pytest.mark.parametrize(
+    "words", [("--memory", "20 GB", "scene.shape=[40000,40000]"), ("optics.bands=100000000",)]
+)
 def test_what_no_machine_holds_is_refused_on_an_empty_cache_before_any_work(neusee, here, words):
     code, _, err = neusee("run", "first_light", *words)
     assert code == 2
@@ -168,7 +179,7 @@ def test_what_no_machine_holds_is_refused_on_an_empty_cache_before_any_work(neus
 
 
 def test_a_plan_of_what_never_ran_has_numbers_and_names_the_guesses(neusee, here, monkeypatch):
-    from neusee.workflows.engine import cost_laws
+    from neusee.workflows.engine import cost_model as cost_laws
 
     code, out, _ = neusee("plan", "first_light")
     assert code == 0
@@ -177,5 +188,9 @@ def test_a_plan_of_what_never_ran_has_numbers_and_names_the_guesses(neusee, here
     assert "while the steps run, of which the program itself holds" in out
     laws = {path: law for path, law in cost_laws.shipped().items() if path != "restore.wiener"}
     monkeypatch.setattr("neusee.workflows.engine.cost_model.shipped", lambda: laws)
-    line = next(line for line in neusee("plan", "first_light")[1].splitlines() if line.startswith("deconvolved"))
+    line = next(
+        line
+        for line in neusee("plan", "first_light")[1].splitlines()
+        if line.startswith("deconvolved")
+    )
     assert line.count("guess <") == 2  # the bytes of the result are known from its shape

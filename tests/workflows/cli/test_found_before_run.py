@@ -1,4 +1,6 @@
-"""What `neusee validate` and the start of `neusee run` refuse or note, by the command line, before any step runs."""
+"""What `neusee validate` and the start of `neusee run` refuse or note, by the command line,
+before any step runs.
+"""
 
 import re
 
@@ -6,13 +8,19 @@ import numpy as np
 import pytest
 
 from neusee.workflows.cli import app
-from neusee.workflows.recipe import known_before_run
+from neusee.workflows.recipe import step_checks as known_before_run
 
 OpenEXR = pytest.importorskip("OpenEXR")
 SMALL = (
-    "scene=siemens", "scene.shape=[48,48]", "sensor.shape=[40,40]", "optics.window=[32,32]", "optics.samples=64",
-    "optics.pitch=126 um", "optics.bands=3", "lasers.green.angle=[0.1 mrad, 0 mrad]",
-)  # fmt: skip
+    "scene=siemens",
+    "scene.shape=[48,48]",
+    "sensor.shape=[40,40]",
+    "optics.window=[32,32]",
+    "optics.samples=64",
+    "optics.pitch=126 um",
+    "optics.bands=3",
+    "lasers.green.angle=[0.1 mrad, 0 mrad]",
+)
 
 
 @pytest.fixture
@@ -36,7 +44,9 @@ def without_openexr(text):
 
 @pytest.fixture
 def refused(neusee, tmp_path):
-    """Call `validate` and `run` with the same changes; both must refuse with the same text, which this returns."""
+    """Call `validate` and `run` with the same changes; both must refuse with the same text,
+    which this returns.
+    """
 
     def refused(*words):
         code, out, err = neusee("validate", "first_light", *words)
@@ -55,14 +65,32 @@ def refused(neusee, tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ("sensor.shape=[800,800]", ("sensor.shape = [800, 800]", "larger than the image of 768 x 768", "enlarge")),
-        ("lasers.green.angle=[60 deg, 0 deg]", ("lasers.green.angle = ", "1.047 rad", "below 1", "57.3 deg")),
+        (
+            "sensor.shape=[800,800]",
+            ("sensor.shape = [800, 800]", "larger than the image of 768 x 768", "enlarge"),
+        ),
+        (
+            "lasers.green.angle=[60 deg, 0 deg]",
+            ("lasers.green.angle = ", "1.047 rad", "below 1", "57.3 deg"),
+        ),
         ("lasers.green.angle=[0 deg, 180 deg]", ("lasers.green.angle = ", "180 deg", "3.142 rad")),
-        ("lasers.green.angle=[10 mrad, 0 mrad]", ("lasers.green.angle = ", "2.21 mm", "carries only 1.91 mm")),
-        ("optics.focal_length=55 mm", ("optics.focal_length = 55 mm", "carries only 0.735 mm", "optics.samples=")),
+        (
+            "lasers.green.angle=[10 mrad, 0 mrad]",
+            ("lasers.green.angle = ", "2.21 mm", "carries only 1.91 mm"),
+        ),
+        (
+            "optics.focal_length=55 mm",
+            ("optics.focal_length = 55 mm", "carries only 0.735 mm", "optics.samples="),
+        ),
         ("optics.bands=100000000", ("optics.bands = 100000000", "limit of 100000", "fewer bands")),
-        ("expect.x={step: lsr[mask], at: [40], value: 1, rtol: 1}", ("expect.x.at = [40]", "lsr[mask] has 31 values")),
-        ("expect.x={step: lsr[mask], at: [0, 0], value: 1, rtol: 1}", ("expect.x.at = [0, 0]", "give 1 indices")),
+        (
+            "expect.x={step: lsr[mask], at: [40], value: 1, rtol: 1}",
+            ("expect.x.at = [40]", "lsr[mask] has 31 values"),
+        ),
+        (
+            "expect.x={step: lsr[mask], at: [0, 0], value: 1, rtol: 1}",
+            ("expect.x.at = [0, 0]", "give 1 indices"),
+        ),
         ("expect.x={step: lsr[mask], value: 1, rtol: 1}", ("expect.x.at = []", "must select one")),
         (
             "expect.x={step: psf[mask], at: [clear_peek, 2], value: 1, rtol: 1}",
@@ -80,20 +108,35 @@ def test_a_value_that_fails_after_the_optics_is_refused_at_its_place(refused, ch
 def test_a_result_that_no_memory_holds_is_refused_with_its_sizes(refused, monkeypatch):
     monkeypatch.setattr(known_before_run, "machine_memory", lambda: 8e9)
     err = refused("scene=siemens", "scene.shape=[20000,20000]", "optics.pixel=zoh")
-    assert "9.6 GB for a result of 3 x 20000 x 20000 values and one input, and this machine has 8 GB" in err
+    assert (
+        "9.6 GB for a result of 3 x 20000 x 20000 values and one input, and this machine has 8 GB"
+        in err
+    )
 
 
-def test_a_step_that_a_cheaper_form_replaces_or_that_nobody_needs_is_not_judged_by_its_size(neusee, monkeypatch):
+def test_a_step_that_a_cheaper_form_replaces_or_that_nobody_needs_is_not_judged_by_its_size(
+    neusee, monkeypatch
+):
     """All 31 bands of this scene take 0.5 GB, but only three planes of them are computed."""
     monkeypatch.setattr(known_before_run, "machine_memory", lambda: 2e8)
-    code, _, err = neusee("validate", "first_light", "scene=siemens", "scene.shape=[2048,2048]", "optics.pixel=zoh",
-                          "outputs=[raw]")  # fmt: skip
+    code, _, err = neusee(
+        "validate",
+        "first_light",
+        "scene=siemens",
+        "scene.shape=[2048,2048]",
+        "optics.pixel=zoh",
+        "outputs=[raw]",
+    )
     assert (code, err) == (0, "")
 
 
 def test_what_no_output_needs_is_noted(neusee):
     code, out, _ = neusee(
-        "validate", "first_light", "lasers.green.angle=[10 mrad, 0 mrad]", "outputs=[lsr]", "expect=null"
+        "validate",
+        "first_light",
+        "lasers.green.angle=[10 mrad, 0 mrad]",
+        "outputs=[lsr]",
+        "expect=null",
     )
     assert code == 0
     assert "carries only 1.91 mm" in out
@@ -123,16 +166,25 @@ def test_what_is_known_before_the_run_is_what_the_run_gives(tmp_path):
     for name in in_order({name: step.sources for name, step in recipe.steps.items()}, recipe.steps):
         known[name] = known_before_run._form(recipe.steps[name], known)
     found = {name: value for name, value in known.items() if value is not None}
-    assert {"raw[mask]", "truth", "psf[plain]", "spot[mask,green]", "lsr[mask]", "level"} <= found.keys()
+    assert {
+        "raw[mask]",
+        "truth",
+        "psf[plain]",
+        "spot[mask,green]",
+        "lsr[mask]",
+        "level",
+    } <= found.keys()
     results = run(recipe, Store(tmp_path / "store"), outputs=list(found)).values
-    assert {name: shapes(value) for name, value in found.items()} == {name: shapes(results[name]) for name in found}
+    assert {name: shapes(value) for name, value in found.items()} == {
+        name: shapes(results[name]) for name in found
+    }
 
 
 def shapes(value):
     return [tuple(part.shape) for part in (value if isinstance(value, tuple) else (value,))]
 
 
-# --- light that no channel sees ---------------------------------------------------------------------------------------
+# --- light that no channel sees -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -142,9 +194,10 @@ def test_a_laser_that_no_channel_sees_is_noted_with_the_response(neusee, wavelen
     code, out, _ = neusee("validate", "first_light", f"lasers.green.wavelength={wavelength}")
     assert code == 0
     (note,) = [line for line in out.splitlines() if "no channel" in line]
-    assert note == (
-        f"note     no channel of CIE 1931 sees 5 of 5 bands, {bands}: the largest relative response is 0, below 0.001, "
-        "so their light is missing from the picture; choose 375 to 720 nm"
+    assert (
+        note == f"note     no channel of CIE 1931 sees 5 of 5 bands, {bands}: the largest relative"
+        " response is 0, below 0.001, so their light is missing from the picture; choose 375 to"
+        " 720 nm"
     )
 
 
@@ -165,7 +218,7 @@ def test_inside_the_range_that_needs_no_table_every_wavelength_is_seen(camera):
     assert (table.values.max(1) / table.values.max())[inside].min() > 1e-3
 
 
-# --- input files ------------------------------------------------------------------------------------------------------
+# --- input files ----------------------------------------------------------------------------------
 
 
 def exr(path, channels, **header):
@@ -190,7 +243,10 @@ def cut(path):
 
 
 def bad_exr(folder, value):
-    exr(folder / "a.exr", {**{c: plane() for c in "RG"}, "B": np.where(np.eye(64) > 0, value, plane())})
+    exr(
+        folder / "a.exr",
+        {**{c: plane() for c in "RG"}, "B": np.where(np.eye(64) > 0, value, plane())},
+    )
 
 
 def cut_exr(folder):
@@ -210,11 +266,16 @@ def bomb_png(folder):
     import zlib
 
     def chunk(kind, data):
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
 
     head = struct.pack(">IIBBBBB", 12000, 12000, 8, 2, 0, 0, 0)
     (folder / "a.png").write_bytes(
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(b"\0" * 36001)) + chunk(b"IEND", b"")
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", head)
+        + chunk(b"IDAT", zlib.compress(b"\0" * 36001))
+        + chunk(b"IEND", b"")
     )
 
 
@@ -230,14 +291,34 @@ def claimed_exr(folder):
 SCENES = {
     "truncated JPEG": ("china", "a.jpg", lambda d: cut(picture(d, ".jpg")), "a.jpg is damaged"),
     "truncated PNG": ("china", "a.png", lambda d: cut(picture(d, ".png")), "a.png is damaged"),
-    "decompression bomb": ("china", "a.png", bomb_png, "12000 x 12000 pixels, more than the limit of 64 million"),
+    "decompression bomb": (
+        "china",
+        "a.png",
+        bomb_png,
+        "12000 x 12000 pixels, more than the limit of 64 million",
+    ),
     "folder": ("china", "a.png", lambda d: (d / "a.png").mkdir(), "is a folder, not a file"),
     "NaN": ("night", "a.exr", lambda d: bad_exr(d, np.nan), "64 values that are not finite"),
     "infinity": ("night", "a.exr", lambda d: bad_exr(d, np.inf), "64 values that are not finite"),
-    "truncated EXR": ("night", "a.exr", cut_exr, "a.exr is damaged (the pixels end earlier than the header says)"),
+    "truncated EXR": (
+        "night",
+        "a.exr",
+        cut_exr,
+        "a.exr is damaged (the pixels end earlier than the header says)",
+    ),
     "EXR header": ("night", "a.exr", claimed_exr, "100000 x 100000 pixels"),
-    "two channels": ("night", "a.exr", lambda d: exr(d / "a.exr", {c: plane() for c in "RG"}), "X, Y and Z, or Y"),
-    "several parts": ("night", "a.exr", lambda d: parts_exr(d, "left", "right"), "parts left, right: set part"),
+    "two channels": (
+        "night",
+        "a.exr",
+        lambda d: exr(d / "a.exr", {c: plane() for c in "RG"}),
+        "X, Y and Z, or Y",
+    ),
+    "several parts": (
+        "night",
+        "a.exr",
+        lambda d: parts_exr(d, "left", "right"),
+        "parts left, right: set part",
+    ),
 }
 
 
@@ -316,28 +397,64 @@ def grey(path, count=None, values=None):
     """Write a picture of random grey levels, or the first ``count`` bytes of this picture."""
     from PIL import Image
 
-    levels = np.random.default_rng(3).integers(0, 65535, (40, 40), np.uint16) if values is None else values
+    levels = (
+        np.random.default_rng(3).integers(0, 65535, (40, 40), np.uint16)
+        if values is None
+        else values
+    )
     Image.fromarray(levels).save(path)
     path.write_bytes(path.read_bytes()[:count])
 
 
 FILES = {
     "truncated PNG frame": (FRAMES, lambda path: grey(path, 900), "a.png is damaged"),
-    "truncated TIFF frame": (FRAMES.replace("png", "tif"), lambda path: grey(path, 2000), "a.tif is damaged"),
-    "colour frame": (FRAMES, lambda path: grey(path, values=np.zeros((4, 4, 3), np.uint8)), "not raw grey"),
-    "complex frame": (FRAMES.replace("png", "npy"), npy(1, np.complex64), "values of type complex64"),
+    "truncated TIFF frame": (
+        FRAMES.replace("png", "tif"),
+        lambda path: grey(path, 2000),
+        "a.tif is damaged",
+    ),
+    "colour frame": (
+        FRAMES,
+        lambda path: grey(path, values=np.zeros((4, 4, 3), np.uint8)),
+        "not raw grey",
+    ),
+    "complex frame": (
+        FRAMES.replace("png", "npy"),
+        npy(1, np.complex64),
+        "values of type complex64",
+    ),
     "NaN in a cube": (CUBE, npy(np.nan), "a.npy holds 1 values that are not finite"),
     "complex cube": (CUBE, npy(1, np.complex64), "values of type complex64"),
     "large cube": (CUBE, large_npy, "a.npy cannot be read"),
     "cube of two axes": (CUBE, npy(1, shape=(4, 4)), "save a cube with three axes"),
     "complex heights": (HEIGHT, npy(0, np.complex128, (4, 4)), "values of type complex128"),
     "NaN height": (HEIGHT, npy(np.nan, shape=(4, 4)), "every height must be finite"),
-    "bad cell": (TABLE, text(HEAD + "0,1,100,5,x1\n"), "a.csv:2: column variance: 'x1' is not valid"),
-    "semicolons": (TABLE, text(HEAD.replace(",", ";") + "0;1;100;5;6\n"), "separates its columns by semicolons"),
-    "tabs": (TABLE, text(HEAD.replace(",", "\t") + "0\t1\t100\t5\t6\n"), "separates its columns by tabs"),
+    "bad cell": (
+        TABLE,
+        text(HEAD + "0,1,100,5,x1\n"),
+        "a.csv:2: column variance: 'x1' is not valid",
+    ),
+    "semicolons": (
+        TABLE,
+        text(HEAD.replace(",", ";") + "0;1;100;5;6\n"),
+        "separates its columns by semicolons",
+    ),
+    "tabs": (
+        TABLE,
+        text(HEAD.replace(",", "\t") + "0\t1\t100\t5\t6\n"),
+        "separates its columns by tabs",
+    ),
     "no rows": (TABLE, text(HEAD), "has no line below the header"),
-    "bad reflectance": (REFLECTANCES, text("nm,a\n380,0.5\n780,high\n"), "a.csv:3: 'high' is not a number"),
-    "reflectances by ;": (REFLECTANCES, text("nm;a\n380;0.5\n780;0.5\n"), "separates its columns by semicolons"),
+    "bad reflectance": (
+        REFLECTANCES,
+        text("nm,a\n380,0.5\n780,high\n"),
+        "a.csv:3: 'high' is not a number",
+    ),
+    "reflectances by ;": (
+        REFLECTANCES,
+        text("nm;a\n380;0.5\n780;0.5\n"),
+        "separates its columns by semicolons",
+    ),
 }
 
 
@@ -367,7 +484,7 @@ def test_one_part_of_a_file_with_several_is_chosen_by_name(neusee, tmp_path):
     assert "a.exr has no part 'middle': name one of left, right" in err
 
 
-# --- limits -----------------------------------------------------------------------------------------------------------
+# --- limits ---------------------------------------------------------------------------------------
 
 LIMITED = """\
 # A limit.
@@ -383,12 +500,18 @@ outputs: [stop]
 def chain(link):
     """Twelve levels, each with nine references to the next: 9^12 values at the top."""
     levels = [f"  a{n}: {link.replace('#', str(n + 1))}" for n in range(12)]
-    return LIMITED.replace("{A}", "\n" + "\n".join(levels) + "\n  a12: x").replace("{S}", "{samples: 7}")
+    return LIMITED.replace("{A}", "\n" + "\n".join(levels) + "\n  a12: x").replace(
+        "{S}", "{samples: 7}"
+    )
 
 
 def many(count):
     rows = "".join(f"  s{n}: {{node: doe.flat, from: stop}}\n" for n in range(count))
-    return LIMITED.partition("  more")[0].replace("{A}", "{}").replace("{S}", "{samples: 7}") + rows + "outputs: [stop]"
+    return (
+        LIMITED.partition("  more")[0].replace("{A}", "{}").replace("{S}", "{samples: 7}")
+        + rows
+        + "outputs: [stop]"
+    )
 
 
 def product(one, other):
@@ -402,7 +525,10 @@ def product(one, other):
 
 
 LIMITS = {
-    "text": (chain('"' + "${a.a#}" * 9 + '"'), "a.a6   references expand this text to more than 100000 characters"),
+    "text": (
+        chain('"' + "${a.a#}" * 9 + '"'),
+        "a.a6   references expand this text to more than 100000 characters",
+    ),
     "list": (
         chain("[" + ", ".join(['"${a.a#}"'] * 9) + "]"),
         "references expand this value to more than 100000 values",
@@ -411,14 +537,25 @@ LIMITS = {
         chain("{" + ", ".join(f'k{i}: "${{a.a#}}"' for i in range(9)) + "}"),
         "references expand this value to more than 100000 values",
     ),
-    "each": (product(3000, 3000), "steps.s.each   makes 3000 p x 3000 q = 9000000 steps, more than the limit of 20000"),
-    "each, by two": (product(20, 1001), "makes 20 p x 1001 q = 20020 steps, more than the limit of 20000"),
-    "file": (many(100) + "#" * 4_000_000, "more than the limit of 4000000: split the recipe into groups"),
+    "each": (
+        product(3000, 3000),
+        "steps.s.each   makes 3000 p x 3000 q = 9000000 steps, more than the limit of 20000",
+    ),
+    "each, by two": (
+        product(20, 1001),
+        "makes 20 p x 1001 q = 20020 steps, more than the limit of 20000",
+    ),
+    "file": (
+        many(100) + "#" * 4_000_000,
+        "more than the limit of 4000000: split the recipe into groups",
+    ),
 }
 
 
 @pytest.mark.parametrize(("recipe", "said"), LIMITS.values(), ids=LIMITS)
-def test_a_recipe_that_grows_beyond_a_limit_is_refused_with_the_limit(neusee, tmp_path, recipe, said):
+def test_a_recipe_that_grows_beyond_a_limit_is_refused_with_the_limit(
+    neusee, tmp_path, recipe, said
+):
     (tmp_path / "mine.yaml").write_text(recipe)
     code, out, err = neusee("validate", "mine.yaml")
     assert (code, out) == (2, "")
@@ -427,7 +564,7 @@ def test_a_recipe_that_grows_beyond_a_limit_is_refused_with_the_limit(neusee, tm
 
 
 def test_the_limit_of_steps_counts_the_steps_and_their_copies(neusee, tmp_path, monkeypatch):
-    from neusee.workflows.recipe import step_declarations
+    from neusee.workflows.recipe import steps as step_declarations
 
     monkeypatch.setattr(step_declarations, "_MOST", 30)
     (tmp_path / "mine.yaml").write_text(many(29))
@@ -438,7 +575,7 @@ def test_the_limit_of_steps_counts_the_steps_and_their_copies(neusee, tmp_path, 
     assert "steps.s29   with this step the recipe has 31 steps, more than the limit of 30" in err
 
 
-# --- the folder of results --------------------------------------------------------------------------------------------
+# --- the folder of results ------------------------------------------------------------------------
 
 COMMANDS = (
     ("run", "first_light"), ("sweep", "first_light", "sensor.c2=0,1"), ("train", "train_small"),
@@ -453,15 +590,17 @@ def test_a_folder_that_cannot_hold_results_is_refused_before_any_work(neusee, tm
     for out in ("taken", "taken/runs"):
         code, said, err = neusee(*words, "--out", out)
         assert (code, said) == (2, "")
-        assert err == (
-            f"--out: {'taken' if out == 'taken' else tmp_path / 'taken'} is not a folder, so that no results can be "
-            f"written to {out}: name another folder with --out\n"
+        assert (
+            err == f"--out: {'taken' if out == 'taken' else tmp_path / 'taken'} is not a folder, so"
+            f" that no results can be written to {out}: name another folder with --out\n"
         )
     assert not (tmp_path / "cache").exists()
 
 
 def test_a_folder_that_the_system_does_not_let_us_write_is_refused(neusee, tmp_path, monkeypatch):
-    """As `os.mkdir` says it for a read-only file system; the rights of a folder do not bind the root of a machine."""
+    """As `os.mkdir` says it for a read-only file system; the rights of a folder do not bind the
+    root of a machine.
+    """
     import errno
     import tempfile
 
@@ -489,7 +628,7 @@ def test_the_check_of_the_folder_leaves_nothing(neusee, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-# --- words of the command line, and values of one's own recipe --------------------------------------------------------
+# --- words of the command line, and values of one's own recipe ------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -510,11 +649,14 @@ def test_a_value_with_a_space_needs_quotes(neusee, words, said):
 def test_a_file_of_ones_own_recipe_is_no_mistake_with_a_scene_that_has_no_file(neusee, tmp_path):
     picture(tmp_path, ".png")
     groups = (
-        "camera: neusee, scene: china, illuminant: daylight, lift: lmmse, laser: green, optics: small, sensor: small"
+        "camera: neusee, scene: china, illuminant: daylight, lift: lmmse, laser: green, optics:"
+        " small, sensor: small"
     )
     groups += ", doe: five_half_rings, flare: clean, restore: wiener, reading: coherent"
     defaults = "".join(f"  - {group}\n" for group in groups.split(", "))
-    (tmp_path / "mine.yaml").write_text(f"# Mine.\ndefaults:\n{defaults}scene: {{file: a.png}}\noutputs: [raw]\n")
+    (tmp_path / "mine.yaml").write_text(
+        f"# Mine.\ndefaults:\n{defaults}scene: {{file: a.png}}\noutputs: [raw]\n"
+    )
     assert "not used" not in neusee("validate", "mine.yaml")[1]
     code, out, _ = neusee("validate", "mine.yaml", "scene=siemens")
     assert code == 0
@@ -530,17 +672,26 @@ def test_a_file_of_ones_own_recipe_is_no_mistake_with_a_scene_that_has_no_file(n
 def test_the_guide_states_each_limit_as_the_program_has_it():
     from neusee.nodes import input_files
     from neusee.nodes.spectra import _bands
-    from neusee.workflows.recipe import step_declarations
+    from neusee.workflows.recipe import steps as step_declarations
     from neusee.workflows.recipe.text import references, yaml_values
     from neusee.workflows.recipe.text.composition import packaged
 
     text = (packaged() / "guide" / "recipes.md").read_text(encoding="utf-8")
-    stated = [int(number.replace(" ", "")) for number in re.findall(r"^\|[^|]+\| ([\d ]+) \|$", text, re.MULTILINE)]
+    stated = [
+        int(number.replace(" ", ""))
+        for number in re.findall(r"^\|[^|]+\| ([\d ]+) \|$", text, re.MULTILINE)
+    ]
     assert references._MOST_VALUES == references._MOST_CHARACTERS
     assert stated == [
-        step_declarations._MOST, yaml_values._LARGEST, references._MOST_VALUES, yaml_values._MOST_ALIASED,
-        _bands._MOST, input_files.PIXELS, input_files.VALUES, input_files.ROWS,
-    ]  # fmt: skip
+        step_declarations._MOST,
+        yaml_values._LARGEST,
+        references._MOST_VALUES,
+        yaml_values._MOST_ALIASED,
+        _bands._MOST,
+        input_files.PIXELS,
+        input_files.VALUES,
+        input_files.ROWS,
+    ]
 
 
 READS_A_VARIABLE = '''import os
@@ -558,10 +709,13 @@ def gain_of_day():
 def test_own_code_that_no_key_covers_ends_with_the_code_of_a_mistake(neusee, tmp_path):
     (tmp_path / "reads_a_variable.py").write_text(READS_A_VARIABLE)
     (tmp_path / "r.yaml").write_text(
-        "nodes: [reads_a_variable.py]\nsteps: {mine: {node: reads_a_variable.gain_of_day}}\noutputs: [mine]\n"
+        "nodes: [reads_a_variable.py]\nsteps: {mine: {node:"
+        " reads_a_variable.gain_of_day}}\noutputs: [mine]\n"
     )
     code, _, err = neusee("run", "r.yaml", "--out", "runs")
     assert code == 2
     assert re.search(
-        r"^\S*reads_a_variable.py:9: os.environ.get: .* depends=\[\"env:GAIN_OF_DAY\"\]", err, re.MULTILINE
+        r"^\S*reads_a_variable.py:9: os.environ.get: .* depends=\[\"env:GAIN_OF_DAY\"\]",
+        err,
+        re.MULTILINE,
     )

@@ -1,4 +1,6 @@
-"""What a command says when it is stopped or cannot write, and commands that can be pasted into a shell."""
+"""What a command says when it is stopped or cannot write, and commands that can be pasted into a
+shell.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +65,10 @@ def interrupted(*arguments, **options):
 
 
 STOPPED = {
-    "evaluate": (["evaluate", "first_light", "sensor.read_noise=20 e-"], "the points that are finished"),
+    "evaluate": (
+        ["evaluate", "first_light", "sensor.read_noise=20 e-"],
+        "the points that are finished",
+    ),
     "calibrate": (["calibrate", "calibrate", "flats.shape=[32, 32]"], "the draws"),
     "train": (["train", "train_small"], "no checkpoint is written yet"),
     "study": (["study", "stability", "night one.yaml"], "the parts that are finished"),
@@ -101,16 +106,21 @@ def stopping_at(path, call):
 
 
 def test_ctrl_c_in_a_training_names_the_checkpoint(neusee, here, monkeypatch):
-    from neusee.workflows.training.loop.checkpoint import StateFile
+    from neusee.workflows.training.loop.resumable_loop import StateFile
 
     def trained(recipe, out, **options):
-        StateFile(out / f"{recipe.name}_train_1a2b" / "state.pt").write({"stage": 1, "iteration": 40})
+        StateFile(out / f"{recipe.name}_train_1a2b" / "state.pt").write(
+            {"stage": 1, "iteration": 40}
+        )
         raise KeyboardInterrupt
 
     monkeypatch.setattr(verbs, "train", trained)
     code, _, err = neusee("train", "train_small", "--stage", "1")
     assert code == 130
-    assert "the training up to iteration 40 of stage 1 is kept in runs/train_small_train_1a2b; to go on: " in err
+    assert (
+        "the training up to iteration 40 of stage 1 is kept in runs/train_small_train_1a2b; to go"
+        " on: " in err
+    )
 
 
 def test_nothing_is_said_to_be_kept_by_a_cache_that_keeps_nothing(neusee, here, monkeypatch):
@@ -146,15 +156,21 @@ def test_a_folder_that_is_a_file_is_refused_before_anything_runs(command, neusee
     assert not (here / "cache").exists() or not list((here / "cache").glob("??/*.json"))
 
 
-@pytest.mark.parametrize("file", ["metrics.csv", "provenance.json", "report.html", "figures/graph.png"])
-def test_a_disk_that_is_full_in_the_midst_of_a_report_leaves_no_folder(file, neusee, here, monkeypatch):
+@pytest.mark.parametrize(
+    "file", ["metrics.csv", "provenance.json", "report.html", "figures/graph.png"]
+)
+def test_a_disk_that_is_full_in_the_midst_of_a_report_leaves_no_folder(
+    file, neusee, here, monkeypatch
+):
     from neusee.workflows.report.run_folder import RunFolder
 
     for method in ("write", "write_rows", "take"):
         monkeypatch.setattr(RunFolder, method, filling(getattr(RunFolder, method), file))
     code, out, err = neusee("run", "night one.yaml", "sensor.gain=0.6 e-/DN")
     assert code == 1
-    assert "the folder of results in runs cannot be written ([Errno 28] No space left on device" in err
+    assert (
+        "the folder of results in runs cannot be written ([Errno 28] No space left on device" in err
+    )
     assert "3 steps are finished, and results that take time are kept in the cache" in err
     again = shlex.split(err.strip().partition("to go on: ")[2])
     assert again == ["neusee", "run", "night one.yaml", "sensor.gain=0.6 e-/DN"]
@@ -186,7 +202,13 @@ def test_the_next_commands_work_when_pasted(neusee, here):
     assert code == 0
     shown = out.partition("\nnext\n")[2].splitlines()
     commands = [shlex.split(line, comments=True) for line in shown]
-    assert commands[0] == ["neusee", "run", "night one.yaml", "sensor.gain=0.6 e-/DN", "sensor.read_noise=20 e-"]
+    assert commands[0] == [
+        "neusee",
+        "run",
+        "night one.yaml",
+        "sensor.gain=0.6 e-/DN",
+        "sensor.read_noise=20 e-",
+    ]
     assert commands[1] == ["neusee", "plan", "night one.yaml", "sensor.gain=0.6 e-/DN"]
     for _, verb, *words in commands:
         checked = ("validate", *words) if verb == "run" else (verb, *words)
@@ -206,7 +228,13 @@ def test_the_first_line_repeats_the_command_as_a_shell_reads_it(neusee):
 
 def test_the_command_of_a_page_can_be_pasted():
     options = {"pipelines": "flat+none, axicon+none", "quick": True, "data": "", "scenes": 3}
-    assert option_words(options) == ["--pipelines", "flat+none, axicon+none", "--quick", "--scenes", "3"]
+    assert option_words(options) == [
+        "--pipelines",
+        "flat+none, axicon+none",
+        "--quick",
+        "--scenes",
+        "3",
+    ]
 
 
 def test_a_missing_extra_is_named(neusee, monkeypatch):
@@ -236,7 +264,10 @@ def test_every_long_command_prints_one_json_object(neusee, here, monkeypatch):
         assert out.count("\n") == 1
         document = json.loads(out, parse_constant=pytest.fail)
         assert key in document
-        assert shlex.split(document["command"])[: len(words) + 1] == ["neusee", *words] or words[0] == "validate"
+        assert (
+            shlex.split(document["command"])[: len(words) + 1] == ["neusee", *words]
+            or words[0] == "validate"
+        )
 
 
 def test_a_training_prints_one_json_object(neusee, monkeypatch):
@@ -249,7 +280,10 @@ def test_a_training_prints_one_json_object(neusee, monkeypatch):
     monkeypatch.setattr(verbs, "train", trained)
     code, out, _ = neusee("train", "train_small", "--json")
     assert code == 0
-    assert json.loads(out) == {"folder": "runs/train_small_train_1", "training": {"last": {"L1": None}}}
+    assert json.loads(out) == {
+        "folder": "runs/train_small_train_1",
+        "training": {"last": {"L1": None}},
+    }
 
 
 @pytest.mark.parametrize("verb", ["evaluate", "calibrate"])
@@ -280,7 +314,13 @@ def lines_of(capsys, *steps):
 
 
 def test_a_line_with_a_count_says_what_is_left(capsys):
-    found = lines_of(capsys, (1, "3 scenes"), (10, "scene 1 of 3 (a)"), (20, "scene 2 of 3 (b)"), (9, "scene 3 of 3"))
+    found = lines_of(
+        capsys,
+        (1, "3 scenes"),
+        (10, "scene 1 of 3 (a)"),
+        (20, "scene 2 of 3 (b)"),
+        (9, "scene 3 of 3"),
+    )
     assert found == [
         "3 scenes",
         "scene 1 of 3 (a); about 20 s left",
@@ -302,11 +342,16 @@ def test_a_study_that_goes_on_takes_the_rate_of_now(capsys):
 
 def test_a_count_at_the_end_of_a_line_counts(capsys):
     found = lines_of(capsys, (5, "dark[1/2] left out: 0.1 (1 of 3)"), (5, "psf: 0 (2 of 3)"))
-    assert found == ["dark[1/2] left out: 0.1 (1 of 3); about 10 s left", "psf: 0 (2 of 3); about 5 s left"]
+    assert found == [
+        "dark[1/2] left out: 0.1 (1 of 3); about 10 s left",
+        "psf: 0 (2 of 3); about 5 s left",
+    ]
 
 
 def test_a_count_that_begins_again_takes_its_own_rate(capsys):
-    found = lines_of(capsys, (5, "1/2 a"), (5, "2/2 b"), (60, "1/2 c"), (1, "x 64 of 200"), (1, "no count"))
+    found = lines_of(
+        capsys, (5, "1/2 a"), (5, "2/2 b"), (60, "1/2 c"), (1, "x 64 of 200"), (1, "no count")
+    )
     assert found == [
         "1/2 a; about 5 s left",
         "2/2 b",
@@ -317,7 +362,7 @@ def test_a_count_that_begins_again_takes_its_own_rate(capsys):
 
 
 def test_a_run_says_how_long_it_will_take(neusee, here):
-    from neusee.workflows.keys.seal import seal_record
+    from neusee.workflows.keys.sealed_files import seal_record
 
     assert "time " not in neusee("run", "night one.yaml")[1]
     journal = here / "cache" / "journal.jsonl"
@@ -329,7 +374,7 @@ def test_a_run_says_how_long_it_will_take(neusee, here):
 
 
 def test_a_live_table_says_what_is_left():
-    from neusee.workflows.graph.step_record import Event, StepRecord
+    from neusee.workflows.graph.recipe_graph import Event, StepRecord
     from neusee.workflows.recipe.loading import load
     from neusee.workflows.report.console import RunTable
 
@@ -347,13 +392,17 @@ def test_a_printed_command_goes_through_a_real_shell(neusee, here):
     line = out.partition("\nnext\n")[2].splitlines()[0]
     with contextlib.suppress(FileNotFoundError):
         found = subprocess.run(
-            ["sh", "-c", f"neusee() {{ printf '%s\\n' \"$@\"; }}; {line}"], capture_output=True, text=True
+            ["sh", "-c", f"neusee() {{ printf '%s\\n' \"$@\"; }}; {line}"],
+            capture_output=True,
+            text=True,
         )
         assert found.stdout.splitlines() == ["run", "night one.yaml", "sensor.read_noise=20 e-"]
 
 
 def test_one_list_is_printed_once(neusee, here):
-    wrong = "\n".join(f"  s{i}: {{node: sensor.qqqqqqqq, from: {{electrons: scene}}}}" for i in range(300))
+    wrong = "\n".join(
+        f"  s{i}: {{node: sensor.qqqqqqqq, from: {{electrons: scene}}}}" for i in range(300)
+    )
     (here / "wrong.yaml").write_text(f"{RECIPE}{wrong}\n")
     code, _, err = neusee("validate", "wrong.yaml")
     assert code == 2
@@ -365,7 +414,9 @@ def test_one_list_is_printed_once(neusee, here):
 
 
 def test_lines_of_steps_are_few_in_a_file(capsys):
-    """Lines of steps at 1, 2 … 400 s: printed after half a minute, and then each time after twice as long."""
+    """Lines of steps at 1, 2 … 400 s: printed after half a minute, and then each time after
+    twice as long.
+    """
     now = [0.0]
     show = FewLines(False, lambda: now[0])
     show("frames: 13 of 13 tests passed")

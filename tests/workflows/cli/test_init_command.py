@@ -3,8 +3,6 @@
 import os
 import re
 import shlex
-import subprocess
-import sys
 
 import pytest
 import typer
@@ -12,8 +10,9 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from neusee.workflows.cli.app import app
-from neusee.workflows.cli.init_command import FILES, NEXT
+from neusee.workflows.cli.project_commands import FILES, NEXT
 from neusee.workflows.recipe.loading import load
+from tests.workflows.forked_commands import Commands
 
 
 def init(*words):
@@ -25,7 +24,9 @@ def test_the_recipe_of_a_new_folder_has_no_mistake(tmp_path):
     assert (made.exit_code, made.output.count("written  ")) == (0, len(FILES))
     assert f"  cd {tmp_path / 'lab' / 'mine'}\n" in made.output
     folder = tmp_path / "lab" / "mine"
-    assert {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} == FILES.keys()
+    assert {
+        p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()
+    } == FILES.keys()
     assert not [path for path in folder.rglob("*.*") if "NAME" in path.read_text()]
     recipe = load(folder / "my_camera.yaml")
     assert recipe.steps["bloomed[mask]"].node.path == "blooming.blooming"
@@ -44,7 +45,9 @@ def test_every_command_of_the_readme_parses(tmp_path):
     for line in lines:
         name, command, rest = program.resolve_command(typer.Context(program), shlex.split(line))
         values = command.make_context(name, list(rest)).params
-        for word in (values.get("words") or [])[:1] + [values[key] for key in ("place",) if key in values]:
+        for word in (values.get("words") or [])[:1] + [
+            values[key] for key in ("place",) if key in values
+        ]:
             assert (tmp_path / word).is_file(), line
     for place in re.findall(r"^\| `([^`]+)` \|", text, re.MULTILINE):
         assert (tmp_path / place).exists() or place == "runs/"
@@ -55,7 +58,10 @@ def test_nothing_is_replaced(tmp_path):
     (tmp_path / "sensor" / "my_sensor.yaml").write_text("mine")
     found = init(tmp_path)
     assert found.exit_code == 2
-    assert f"sensor/my_sensor.yaml: there is such a file in {tmp_path} already, and none is replaced" in found.output
+    assert (
+        f"sensor/my_sensor.yaml: there is such a file in {tmp_path} already, and none is replaced"
+        in found.output
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["sensor"]
     assert (tmp_path / "sensor" / "my_sensor.yaml").read_text() == "mine"
 
@@ -65,7 +71,10 @@ def test_a_file_is_no_place_for_a_project(tmp_path):
     for place in (tmp_path / "file", tmp_path / "file" / "below"):
         found = init(place)
         assert found.exit_code == 2
-        assert f"{tmp_path / 'file'} is a file, so that no project can be made in {place}" in found.output
+        assert (
+            f"{tmp_path / 'file'} is a file, so that no project can be made in {place}"
+            in found.output
+        )
 
 
 @pytest.mark.slow
@@ -80,9 +89,12 @@ def test_a_new_folder_runs_and_passes_its_tests_and_takes_more(tmp_path):
         "neusee validate other_camera.yaml sensor=night_sensor",
         "pytest -q -p no:cacheprovider nodes tests sensor",
     ]
+    forks = Commands()
     for command in commands:
-        words = [sys.executable, "-m", *shlex.split(command)]
-        done = subprocess.run(words, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
+        program, *words = shlex.split(command)
+        code = f"import runpy\nrunpy.run_module({program!r}, run_name='__main__')"
+        done = forks(*words, cwd=tmp_path, env=env, code=code)
         assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+    forks.close()
     assert "5 passed" in done.stdout
     assert (tmp_path / "runs" / "latest" / "ro-crate-metadata.json").is_file()

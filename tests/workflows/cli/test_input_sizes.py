@@ -1,13 +1,15 @@
-"""Commands on files that need too much memory, or are no files: exit code 2 and one located sentence."""
+"""Commands on files that need too much memory, or are no files: exit code 2 and one located
+sentence.
+"""
 
 import os
 
 import numpy as np
 import pytest
 
-from neusee.nodes import input_size
+from neusee.nodes import input_files as input_size
 from neusee.workflows.cli import app
-from neusee.workflows.engine.memory_watch import limited
+from neusee.workflows.engine.memory_limits import limited
 from tests import file_bombs as bombs
 
 RECIPE = """# A picture.
@@ -38,8 +40,14 @@ def test_the_limit_of_a_command_holds_for_what_it_reads(neusee, tmp_path, comman
     code, said = neusee("exr", "a.exr", command, "--memory", "1.5 GB")
     assert code == 2
     assert "mine.yaml:4:43   steps.picture.with.file = a.exr" in said
-    assert "would need 1.76 GB of memory to read (7000 x 7000 pixels in 3 channels), more than the" in said
-    assert "are left of the limit of 1.5 GB: raise the limit by --memory, crop the file, or give another file" in said
+    assert (
+        "would need 1.76 GB of memory to read (7000 x 7000 pixels in 3 channels), more than the"
+        in said
+    )
+    assert (
+        "are left of the limit of 1.5 GB: raise the limit by --memory, crop the file, or give"
+        " another file" in said
+    )
 
 
 @pytest.mark.parametrize(("node", "name"), [("photograph", "a.png"), ("exr", "a.exr")])
@@ -55,7 +63,10 @@ def test_a_pipe_in_the_place_of_a_record_of_code_makes_no_run_wait(neusee, tmp_p
 
     Image.fromarray(np.arange(192, dtype=np.uint8).reshape(8, 8, 3)).save(tmp_path / "a.png")
     assert neusee("photograph", "a.png", "run", "--quiet")[0] == 0
-    records = [*(tmp_path / "cache").rglob("code.json"), *(tmp_path / "cache" / "code").glob("*.json")]
+    records = [
+        *(tmp_path / "cache").rglob("code.json"),
+        *(tmp_path / "cache" / "code").glob("*.json"),
+    ]
     assert records
     for path in records:
         path.unlink()
@@ -63,7 +74,7 @@ def test_a_pipe_in_the_place_of_a_record_of_code_makes_no_run_wait(neusee, tmp_p
     assert neusee("photograph", "a.png", "run", "--quiet")[0] == 0
 
 
-# --- the rule itself --------------------------------------------------------------------------------------------------
+# --- the rule itself ------------------------------------------------------------------------------
 
 
 def test_what_is_free_is_compared_where_no_limit_is_set(monkeypatch):
@@ -71,8 +82,10 @@ def test_what_is_free_is_compared_where_no_limit_is_set(monkeypatch):
     input_size.needs(50e6, "a.npy", "numbers")
     with pytest.raises(input_size.BeyondMemory) as refused:
         input_size.needs(3.7e9, "a.npy", "numbers")
-    assert str(refused.value) == (
-        "a.npy would need 3.7 GB of memory to read (numbers), more than the 50 MB that are free: "
+    assert (
+        str(refused.value)
+        == "a.npy would need 3.7 GB of memory to read (numbers), more than the 50 MB that are"
+        " free: "
         "free memory, crop the file, or give another file"
     )
 

@@ -1,4 +1,6 @@
-"""Ctrl-C at any moment ends any command with exit code 130 and one sentence, and keeps what is finished."""
+"""Ctrl-C at any moment ends any command with exit code 130 and one sentence, and keeps what is
+finished.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,12 @@ from pathlib import Path
 
 import pytest
 
+from tests.workflows.forked_commands import Commands
+
 LONGEST = 600.0  #: s after which a command counts as hanging
 
-#: presses Ctrl-C once, for the whole group of processes as a terminal does, at an event of Python's audit
+#: presses Ctrl-C once, for the whole group of processes as a terminal does, at an event of Python's
+#: audit
 PRESSING = """
 import os, signal, sys
 
@@ -83,13 +88,16 @@ outputs: [light, pressed]
 """
 
 
+def environment(folder: Path) -> dict[str, str]:
+    return {**os.environ, "NEUSEE_CACHE": str(folder / "cache"), "COLUMNS": "200"}
+
+
 def command(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     """Run a command of Python in a folder, in a group of processes of its own."""
-    environment = {**os.environ, "NEUSEE_CACHE": str(folder / "cache"), "COLUMNS": "200"}
     return subprocess.run(
         [sys.executable, *words],
         cwd=folder,
-        env=environment,
+        env=environment(folder),
         capture_output=True,
         text=True,
         timeout=LONGEST,
@@ -97,9 +105,28 @@ def command(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.fixture(scope="module")
+def forked():
+    """The same in a fork of a process that has torch at hand."""
+    forks = Commands()
+
+    def forked(folder: Path, option: str, code: str, *words: str):
+        assert option == "-c"
+        return forks(*words, cwd=folder, env=environment(folder), code=code, session=True)
+
+    yield forked
+    forks.close()
+
+
 def stopped(done: subprocess.CompletedProcess[str]) -> None:
-    """Check that a command ended as after Ctrl-C: with its exit code, one sentence and no traceback."""
-    said = [line for line in done.stderr.splitlines() if line.strip() and line not in ("pressed", "never pressed")]
+    """Check that a command ended as after Ctrl-C: with its exit code, one sentence and no
+    traceback.
+    """
+    said = [
+        line
+        for line in done.stderr.splitlines()
+        if line.strip() and line not in ("pressed", "never pressed")
+    ]
     assert "never pressed" not in done.stderr
     assert done.returncode == 130, done.stderr
     assert "Traceback" not in done.stderr + done.stdout
@@ -110,21 +137,52 @@ QUICK = {
     "validate, at an import": (["validate", "laser_free"], "import", "pydantic"),
     "validate, while a recipe is read": (["validate", "laser_free"], "open", "laser_free.yaml"),
 }
-#: settings with which a safety estimate takes seconds
-SMALL = ["safety.draws=100", "optics.samples=640", "wide.window=[401, 401]", "safety.sensor.shape=[101, 101]",
-         "safety.protection.mask=null", "safety.protection.stop=null"]  # fmt: skip
+#: a run and an estimate that end soon
+PLAIN = """# A target, digitized.
+outputs: [raw]
+tolerance: 0
+steps:
+  scene: {node: scene.targets, with: {kind: siemens, shape: [8, 8]}}
+  raw: {node: sensor.digitize, from: {electrons: scene}, with: {gain: 0.5 e-/DN}}
+"""
+PULSE = """# A pulse, 20 m away.
+defaults: [camera: lens_only, optics: lens_only, doe: flat]
+lasers:
+  long: {wavelength: 532 nm, pulse_energy: 1 mJ, pulse_duration: 1 us, repetition_rate: 10 Hz, divergence: 1 mrad,
+         distance: 20 m}
+safety:
+  lens: {focal_length: 50 mm, diameter: 12 mm, transmittance: 0.9, focus: laser}
+  sensor: {pixel_pitch: 3.45 um, shape: [1536, 2048], quantum_efficiency: 0.65, full_well: 10500 e-, exposure: 10 ms}
+  damage: none
+outputs: [laser_lsr]
+"""
 SLOW = {
-    "run, at the import of torch": (["run", "laser_free"], "import", "torch"),
-    "run, while the report is written": (["run", "laser_free", "outputs=[lsr]"], "open", "provenance.json"),
-    "sweep": (["sweep", "laser_free", "optics.bands=3,4", "outputs=[lsr]"], "import", "neusee.workflows.sweeps"),
+    "run, while the report is written": (["run", "plain.yaml"], "open", "provenance.json"),
+    "sweep": (
+        ["sweep", "laser_free", "optics.bands=3,4", "outputs=[lsr]"],
+        "import",
+        "neusee.workflows.sweeps",
+    ),
     "train": (["train", "train_small"], "import", "neusee.workflows.training.run_training"),
     "study": (["study", "stability", "laser_free"], "import", "neusee.workflows.studies.stability"),
     "safety": (["safety", "safety_pointer"], "import", "neusee.workflows.safety.run_safety"),
-    "safety, while it writes": (["safety", "safety_pointer", *SMALL], "open", "provenance.json"),
-    "calibrate": (["calibrate", "calibrate"], "import", "neusee.workflows.calibration.run_calibration"),
-    "restore": (["restore", "frame.png", "--camera", "first_light"], "import", "neusee.workflows.recipe.loading"),
+    "safety, while it writes": (["safety", "pulse.yaml"], "open", "provenance.json"),
+    "calibrate": (
+        ["calibrate", "calibrate"],
+        "import",
+        "neusee.workflows.calibration.run_calibration",
+    ),
+    "restore": (
+        ["restore", "frame.png", "--camera", "first_light"],
+        "import",
+        "neusee.workflows.recipe.loading",
+    ),
     "handbook": (["handbook"], "import", "neusee.workflows.handbook"),
-    "evaluate": (["evaluate", "first_light"], "import", "neusee.workflows.evaluation.run_evaluation"),
+    "evaluate": (
+        ["evaluate", "first_light"],
+        "import",
+        "neusee.workflows.evaluation.run_evaluation",
+    ),
     "nodes": (["nodes"], "import", "neusee.nodes.optics"),
     "cache": (["cache", "list"], "import", "neusee.workflows.store.result_store"),
 }
@@ -138,10 +196,17 @@ def test_ctrl_c_before_the_work_is_one_sentence(moment, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("moment", SLOW)
-def test_ctrl_c_ends_every_command_with_one_sentence(moment, tmp_path):
+def test_ctrl_c_ends_every_command_with_one_sentence(moment, tmp_path, forked):
     words, event, word = SLOW[moment]
     (tmp_path / "frame.png").write_bytes(b"no picture")
-    stopped(command(tmp_path, "-c", PRESSING, event, word, *words))
+    (tmp_path / "plain.yaml").write_text(PLAIN)
+    (tmp_path / "pulse.yaml").write_text(PULSE)
+    stopped(forked(tmp_path, "-c", PRESSING, event, word, *words))
+
+
+@pytest.mark.slow
+def test_ctrl_c_at_the_import_of_torch_is_one_sentence(tmp_path):
+    stopped(command(tmp_path, "-c", PRESSING, "import", "torch", "run", "laser_free"))
 
 
 @pytest.fixture
@@ -152,11 +217,15 @@ def here(tmp_path):
     return tmp_path
 
 
-def test_ctrl_c_in_a_step_keeps_the_finished_steps(here):
-    stopped(command(here, "-c", LISTENING, "run", "pressing.yaml"))
-    again = command(here, "-c", LISTENING, "run", "pressing.yaml")
+def test_ctrl_c_in_a_step_keeps_the_finished_steps(here, forked):
+    stopped(forked(here, "-c", LISTENING, "run", "pressing.yaml"))
+    again = forked(here, "-c", LISTENING, "run", "pressing.yaml")
     assert again.returncode == 0, again.stderr
-    rows = {line.split()[0]: line for line in again.stdout.splitlines() if line.startswith("  ") and line.split()}
+    rows = {
+        line.split()[0]: line
+        for line in again.stdout.splitlines()
+        if line.startswith("  ") and line.split()
+    }
     assert "cached" in rows["light"]
     assert "run" in rows["pressed"]
 
@@ -169,19 +238,19 @@ def test_ctrl_c_in_a_step_keeps_the_finished_steps(here):
         ["study", "uncertainty", "pressing.yaml", "numbers.one=normal(1, 0.1)", "--workers", "2"],
     ],
 )
-def test_ctrl_c_reaches_no_worker_of_a_command(here, words):
-    done = command(here, "-c", LISTENING, *words)
+def test_ctrl_c_reaches_no_worker_of_a_command(here, words, forked):
+    done = forked(here, "-c", LISTENING, *words)
     stopped(done)
 
 
-def test_a_program_that_ignores_the_signal_goes_on(here):
+def test_a_program_that_ignores_the_signal_goes_on(here, forked):
     """A script that runs the program in the background lets the shell decide."""
     ignoring = (
         "import runpy, signal\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\n"
         "runpy.run_module('neusee', run_name='__main__')"
     )
     (here / "pressing.py").write_text(NODES.replace("time.sleep(30)", "pass"))
-    done = command(here, "-c", ignoring, "run", "pressing.yaml", "--quiet")
+    done = forked(here, "-c", ignoring, "run", "pressing.yaml", "--quiet")
     assert done.returncode == 0, done.stderr
 
 
@@ -216,13 +285,16 @@ def test_ctrl_c_ends_a_check_whose_node_hangs_and_its_processes(tmp_path):
     (tmp_path / "hanging.py").write_text(HANGING)
     words = [sys.executable, "-c", LISTENING, "check", "hanging.py"]
     pipe = subprocess.PIPE
-    with subprocess.Popen(words, cwd=tmp_path, stdout=pipe, stderr=pipe, text=True, start_new_session=True) as checking:
+    with subprocess.Popen(
+        words, cwd=tmp_path, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    ) as checking:
         called = tmp_path / "hanging.pid"
         until = time.monotonic() + LONGEST
         while not called.exists() and checking.poll() is None and time.monotonic() < until:
             time.sleep(0.05)
         elsewhere = int(called.read_text())
-        assert elsewhere != checking.pid  # a node that would end or stop the check is called in another process first
+        # a node that would end or stop the check is called in another process first
+        assert elsewhere != checking.pid
         os.killpg(checking.pid, signal.SIGINT)
         out, err = checking.communicate(timeout=LONGEST)
     stopped(subprocess.CompletedProcess(words, checking.returncode, out, err))

@@ -1,4 +1,6 @@
-"""Each named limit of input files and recipes: just below it a recipe is valid, just above it is refused with it."""
+"""Each named limit of input files and recipes: just below it a recipe is valid, just above it is
+refused with it.
+"""
 
 import math
 
@@ -7,7 +9,7 @@ import pytest
 import torch
 
 from neusee.nodes import input_files
-from neusee.nodes.calibrate._frames import _damaged_frames
+from neusee.nodes.calibrate import _frame_files as _damaged_frames
 from neusee.workflows.cli import app
 
 HEAD = "# A limit.\noutputs: [{step}]\nfile: {{file: {file}}}\nsteps:\n"
@@ -48,7 +50,7 @@ def recipe(step, file, n=4):
     return (HEAD + RECIPES[step]).format(step=step, file=file, n=n)
 
 
-# --- files, with limits that are lowered for the test -----------------------------------------------------------------
+# --- files, with limits that are lowered for the test ---------------------------------------------
 
 
 def picture(path, n):
@@ -66,7 +68,9 @@ def exr(path, n):
 def spectral(path, n):
     import OpenEXR
 
-    OpenEXR.File({}, {f"S0.{w},0nm": np.full((4, n), 0.5, np.float32) for w in (400, 500, 600, 700)}).write(str(path))
+    OpenEXR.File(
+        {}, {f"S0.{w},0nm": np.full((4, n), 0.5, np.float32) for w in (400, 500, 600, 700)}
+    ).write(str(path))
 
 
 def npy(shape, kind=np.float32, value=1):
@@ -93,14 +97,63 @@ def reflectances(path, n):
     path.write_text("nm,a\n" + "".join(f"{380 + 10 * i},0.5\n" for i in range(n)))
 
 
-#: by name: step, file, writer, size at the limit, name of the limit, its value, and what is said one above it
+#: by name: step, file, writer, size at the limit, name of the limit, its value, and what is said
+#: one above it
 FILES = {
-    "PNG": ("photograph", "a.png", picture, 40, "PIXELS", 1600, "a.png has 41 x 40 pixels, more than the limit of"),
-    "JPEG": ("photograph", "a.jpg", picture, 40, "PIXELS", 1600, "a.jpg has 41 x 40 pixels, more than the limit of"),
-    "EXR": ("exr", "a.exr", exr, 40, "PIXELS", 1600, "a.exr has 41 x 40 pixels, more than the limit of"),
-    "cube": ("cube", "a.npy", npy((4, 5)), 4, "VALUES", 80, "a.npy has 4 x 5 x 5 values, more than the limit of"),
-    "MATLAB": ("cube", "a.mat", matlab, 5, "VALUES", 80, "a.mat has 4 x 6 x 4 values, more than the limit of"),
-    "spectra": ("cube", "a.exr", spectral, 5, "VALUES", 80, "a.exr has 4 x 4 x 6 values, more than the limit of"),
+    "PNG": (
+        "photograph",
+        "a.png",
+        picture,
+        40,
+        "PIXELS",
+        1600,
+        "a.png has 41 x 40 pixels, more than the limit of",
+    ),
+    "JPEG": (
+        "photograph",
+        "a.jpg",
+        picture,
+        40,
+        "PIXELS",
+        1600,
+        "a.jpg has 41 x 40 pixels, more than the limit of",
+    ),
+    "EXR": (
+        "exr",
+        "a.exr",
+        exr,
+        40,
+        "PIXELS",
+        1600,
+        "a.exr has 41 x 40 pixels, more than the limit of",
+    ),
+    "cube": (
+        "cube",
+        "a.npy",
+        npy((4, 5)),
+        4,
+        "VALUES",
+        80,
+        "a.npy has 4 x 5 x 5 values, more than the limit of",
+    ),
+    "MATLAB": (
+        "cube",
+        "a.mat",
+        matlab,
+        5,
+        "VALUES",
+        80,
+        "a.mat has 4 x 6 x 4 values, more than the limit of",
+    ),
+    "spectra": (
+        "cube",
+        "a.exr",
+        spectral,
+        5,
+        "VALUES",
+        80,
+        "a.exr has 4 x 4 x 6 values, more than the limit of",
+    ),
     "heights": (
         "height",
         "a.npy",
@@ -110,14 +163,48 @@ FILES = {
         16,
         "a.npy has 4 x 5 values, more than the limit of",
     ),
-    "frames": ("frames", "a.npy", npy((4,), np.uint16), 4, "VALUES", 16, "a.npy has 20 values, more than the limit of"),
-    "FITS": ("frames", "a.fits", fits, 4, "VALUES", 16, "a.fits has 20 values, more than the limit of"),
-    "table": ("levels", "a.csv", table, 8, "ROWS", 8, "a.csv has more than 8 rows: give a shorter table"),
-    "reflectances": ("spectra", "a.csv", reflectances, 41, "ROWS", 41, "a.csv has more than 41 rows"),
+    "frames": (
+        "frames",
+        "a.npy",
+        npy((4,), np.uint16),
+        4,
+        "VALUES",
+        16,
+        "a.npy has 20 values, more than the limit of",
+    ),
+    "FITS": (
+        "frames",
+        "a.fits",
+        fits,
+        4,
+        "VALUES",
+        16,
+        "a.fits has 20 values, more than the limit of",
+    ),
+    "table": (
+        "levels",
+        "a.csv",
+        table,
+        8,
+        "ROWS",
+        8,
+        "a.csv has more than 8 rows: give a shorter table",
+    ),
+    "reflectances": (
+        "spectra",
+        "a.csv",
+        reflectances,
+        41,
+        "ROWS",
+        41,
+        "a.csv has more than 41 rows",
+    ),
 }
 
 
-@pytest.mark.parametrize(("step", "file", "write", "n", "limit", "most", "said"), FILES.values(), ids=FILES)
+@pytest.mark.parametrize(
+    ("step", "file", "write", "n", "limit", "most", "said"), FILES.values(), ids=FILES
+)
 def test_a_file_at_the_limit_is_read_and_a_larger_one_is_refused(
     validate, tmp_path, monkeypatch, step, file, write, n, limit, most, said
 ):
@@ -138,7 +225,7 @@ def test_a_file_at_the_limit_is_read_and_a_larger_one_is_refused(
 def test_arrays_and_tables_at_the_shipped_limits(tmp_path):
     """Headers of 10^9 values on a disk that stores no zeros, and 10^6 rows."""
     from neusee.nodes import ParameterError
-    from neusee.nodes.scene._cube_files import size_and_type
+    from neusee.nodes.scene._hyperspectral import size_and_type
 
     def cube(*shape):
         with (tmp_path / "a.npy").open("wb") as file:
@@ -148,7 +235,9 @@ def test_arrays_and_tables_at_the_shipped_limits(tmp_path):
         return tmp_path / "a.npy"
 
     assert size_and_type(cube(1000, 1000, 1000), None)[0] == (1000, 1000, 1000)
-    with pytest.raises(ParameterError, match=r"1 x 1 x 1000000001 values, more than the limit of 1000 million"):
+    with pytest.raises(
+        ParameterError, match=r"1 x 1 x 1000000001 values, more than the limit of 1000 million"
+    ):
         size_and_type(cube(1, 1, 10**9 + 1), None)
     (tmp_path / "a.csv").write_bytes(b"a\n" + b"1\n" * 1_000_000)
     assert sum(1 for _ in input_files.csv_rows(tmp_path / "a.csv")) == 1_000_001
@@ -158,7 +247,7 @@ def test_arrays_and_tables_at_the_shipped_limits(tmp_path):
         sum(1 for _ in input_files.csv_rows(tmp_path / "a.csv"))
 
 
-# --- recipes, at the limits that ship ---------------------------------------------------------------------------------
+# --- recipes, at the limits that ship -------------------------------------------------------------
 
 PLAIN = (HEAD + STOP).format(step="stop", file="x", n=4).replace("file: {file: x}\n", "")
 
@@ -181,7 +270,9 @@ def referred(n):
 
 LIMITS = [
     pytest.param(bands, 100_000, "100001 bands exceed the limit of 100000", id="bands"),
-    pytest.param(padded, 4_000_000, "more than the limit of 4000000", id="bytes", marks=pytest.mark.slow),
+    pytest.param(
+        padded, 4_000_000, "more than the limit of 4000000", id="bytes", marks=pytest.mark.slow
+    ),
 ]
 
 
@@ -195,13 +286,15 @@ def test_a_recipe_at_the_limit_is_valid_and_a_larger_one_is_refused(validate, ma
 
 
 def test_a_text_of_references_at_the_limit_is_expanded_and_a_longer_one_is_refused(validate):
-    """The expanded text is no number of samples, which is said of the text of 100 000 characters alone."""
+    """The expanded text is no number of samples, which is said of the text of 100 000 characters
+    alone.
+    """
     limit = "references expand this text to more than 100000 characters"
     assert limit not in validate(referred(100_000))[1]
     assert limit in validate(referred(100_001))[1]
 
 
-# --- FITS frames and network weights, opened before the run -----------------------------------------------------------
+# --- FITS frames and network weights, opened before the run ---------------------------------------
 
 
 def image(path, values, cut=None):
@@ -242,9 +335,9 @@ def test_right_fits_frames_are_no_mistake(validate, tmp_path, kind):
     values = np.arange(64 * 64, dtype=np.uint16).reshape(64, 64) + 40_000
     part = {"extension": fits.ImageHDU, "compressed": fits.CompImageHDU}.get(kind, fits.PrimaryHDU)
     made = part(values.astype(np.float32) if kind == "scaled" else values)
-    fits.HDUList([made] if isinstance(made, fits.PrimaryHDU) else [fits.PrimaryHDU(), made]).writeto(
-        tmp_path / "a.fits"
-    )
+    fits.HDUList(
+        [made] if isinstance(made, fits.PrimaryHDU) else [fits.PrimaryHDU(), made]
+    ).writeto(tmp_path / "a.fits")
     assert validate(recipe("frames", "a.fits"))[0] == 0
 
 
@@ -272,10 +365,19 @@ def weights(path, change=None, metadata=None):
 
 
 WEIGHTS = {
-    "NaN": (lambda path: weights(path, float("nan")), "holds 1 values that are not finite (NaN or infinity): train"),
+    "NaN": (
+        lambda path: weights(path, float("nan")),
+        "holds 1 values that are not finite (NaN or infinity): train",
+    ),
     "infinity": (lambda path: weights(path, float("-inf")), "holds 1 values that are not finite"),
-    "options": (lambda path: weights(path, None, {"neusee.options": "{broken"}), "has damaged options ('{broken')"),
-    "cut": (lambda path: (weights(path), path.write_bytes(path.read_bytes()[:-9])), "is not a safetensors file"),
+    "options": (
+        lambda path: weights(path, None, {"neusee.options": "{broken"}),
+        "has damaged options ('{broken')",
+    ),
+    "cut": (
+        lambda path: (weights(path), path.write_bytes(path.read_bytes()[:-9])),
+        "is not a safetensors file",
+    ),
     "shape": (lambda path: weights_of_width(path, 8), "this network (width 4) has"),
 }
 
@@ -307,11 +409,13 @@ def test_a_height_network_and_a_lift_refuse_weights_that_are_not_finite(tmp_path
 
     from neusee.nodes import ParameterError, doe, spectra
     from neusee.nodes.doe._unet_height_map import HeightNet
-    from neusee.nodes.spectra._mst_lift_node import start_mst_plus_plus
+    from neusee.nodes.spectra._mst_plus_plus import start_mst_plus_plus
 
     nets = {"height": HeightNet(4), "lift": start_mst_plus_plus(torch.Generator().manual_seed(0))}
     for name, net in nets.items():
-        tensors = {key: value.detach().clone().contiguous() for key, value in net.state_dict().items()}
+        tensors = {
+            key: value.detach().clone().contiguous() for key, value in net.state_dict().items()
+        }
         save_file(tensors, tmp_path / f"{name}.safetensors")
         next(iter(tensors.values())).view(-1)[0] = float("nan")
         save_file(tensors, tmp_path / f"{name}_nan.safetensors")

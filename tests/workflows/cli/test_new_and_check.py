@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from neusee.workflows.cli.app import app
-from neusee.workflows.cli.new_command import KINDS
+from neusee.workflows.cli.project_commands import KINDS
 
 
 def new(*words):
@@ -24,7 +24,9 @@ def test_each_start_passes_its_own_test(tmp_path):
         assert "NAME" not in written.output
     env = {**os.environ, "NEUSEE_CACHE": str(tmp_path / "cache")}
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "."]
-    ran = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
+    ran = subprocess.run(
+        command, cwd=tmp_path, env=env, capture_output=True, text=True, check=False
+    )
     assert ran.returncode == 0, ran.stdout
     assert f"{len(KINDS) + 1} passed" in ran.stdout  # the network has two
     assert not [path for path in tmp_path.rglob("*.py") if "NAME" in path.read_text()]
@@ -44,7 +46,10 @@ def test_nothing_is_replaced(tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["lens", "mine"], "there is no start of a lens: write one of node, network, mask, recipe, sensor"),
+        (
+            ["lens", "mine"],
+            "there is no start of a lens: write one of node, network, mask, recipe, sensor",
+        ),
         (["node", "my-node"], "my-node is no name: use small letters, digits and _"),
         (["node", "class"], "class is no name"),
         (["node", "../mine"], "../mine is no name"),

@@ -1,4 +1,6 @@
-"""Every number of a command has a least and a greatest value, so that one that slipped is refused before any work."""
+"""Every number of a command has a least and a greatest value, so that one that slipped is
+refused before any work.
+"""
 
 from __future__ import annotations
 
@@ -9,10 +11,11 @@ import pytest
 import typer
 from typer.models import OptionInfo
 
-from neusee.workflows.cli.typer_program import program
+from neusee.workflows.cli.program_options import program
 
 WITHOUT_GREATEST = {"fail_above"}  #: a limit that may be infinite, which is its default
-REFUSED_IN_WORDS = {"equal_protection"}  #: by the evaluation, which says what to write: its own tests try 0, 2 and nan
+#: by the evaluation, which says what to write: its own tests try 0, 2 and nan
+REFUSED_IN_WORDS = {"equal_protection"}
 
 
 def options(app: typer.Typer) -> Iterator[tuple[str, str, Any, OptionInfo]]:

@@ -1,4 +1,6 @@
-"""Mistakes in tables of one's own: each is located in the recipe or the file, and the exit code is 2."""
+"""Mistakes in tables of one's own: each is located in the recipe or the file, and the exit code
+is 2.
+"""
 
 import numpy as np
 import pytest
@@ -26,7 +28,11 @@ KINDS = {
     "laser": ("spectra.line_table", "{}", "file"),
     "mask": ("doe.pixelwise", "stop", "file"),
 }
-CAMERA, LIGHT, GLASS = "wavelength (nm),QE (%)\n", "wavelength (nm),power (W/nm)\n", "wavelength (um),n (1)\n"
+CAMERA, LIGHT, GLASS = (
+    "wavelength (nm),QE (%)\n",
+    "wavelength (nm),power (W/nm)\n",
+    "wavelength (um),n (1)\n",
+)
 LASER, SELLMEIER = "wavelength (nm),power (mW)\n", "B (1),C (um^2),from (nm),to (nm)\n"
 FOUR = "400,1\n500,2\n600,3\n700,2\n"
 
@@ -34,30 +40,66 @@ FOUR = "400,1\n500,2\n600,3\n700,2\n"
 MISTAKES = {
     "no file": ("camera", None, "no such file: "),
     "no header": ("camera", FOUR, "mine.csv:1: the first row holds numbers: begin with a header"),
-    "percent as fraction": ("camera", "wavelength (nm),QE (1)\n" + FOUR, "mine.csv:3, column 2, QE (1): 2 1 is more"),
-    "more than 100 %": ("camera", CAMERA + "400,60\n700,101\n", "mine.csv:3, column 2, QE (%): 101 % is more than one"),
+    "percent as fraction": (
+        "camera",
+        "wavelength (nm),QE (1)\n" + FOUR,
+        "mine.csv:3, column 2, QE (1): 2 1 is more",
+    ),
+    "more than 100 %": (
+        "camera",
+        CAMERA + "400,60\n700,101\n",
+        "mine.csv:3, column 2, QE (%): 101 % is more than one",
+    ),
     "two units": (
         "camera",
         "wavelength (nm),R (%),G (1),B (1)\n400,1,1,1\n700,2,2,2\n",
         "the units %, 1: give all the same",
     ),
-    "QE without unit": ("camera", "wavelength (nm),QE\n" + FOUR, "QE needs the unit (1), (%) or (A/W)"),
-    "two channels": ("camera", "wavelength (nm),a (1),b (1)\n400,1,1\n700,1,1\n", "3 columns in place of 4 for red"),
+    "QE without unit": (
+        "camera",
+        "wavelength (nm),QE\n" + FOUR,
+        "QE needs the unit (1), (%) or (A/W)",
+    ),
+    "two channels": (
+        "camera",
+        "wavelength (nm),a (1),b (1)\n400,1,1\n700,1,1\n",
+        "3 columns in place of 4 for red",
+    ),
     "unsorted": (
         "camera",
         CAMERA + "500,5\n400,6\n",
         "mine.csv:3: 400 nm follows 500 nm: list the wavelengths in rising",
     ),
-    "twice": ("glass", GLASS + "0.4,1.5\n0.5,1.49\n0.5,1.48\n", "mine.csv:4: 500 nm stands there again: keep one row"),
+    "twice": (
+        "glass",
+        GLASS + "0.4,1.5\n0.5,1.49\n0.5,1.48\n",
+        "mine.csv:4: 500 nm stands there again: keep one row",
+    ),
     "NaN": (
         "light",
         LIGHT + "# lamp\n350,1\n500,nan\n800,1\n",
         "mine.csv:4: nan is NaN or infinite (column 2, power (W/nm))",
     ),
-    "text": ("light", LIGHT + "350,1\n800,n/a\n", "mine.csv:3: 'n/a' is not a number (column 2, power (W/nm))"),
-    "short row": ("light", LIGHT + "350,1\n800\n", "mine.csv:3: 1 column in place of 2, the number of headings"),
-    "semicolons": ("light", "wavelength (nm);power (W/nm)\n350;1\n", "separates its columns by semicolons: separate"),
-    "wavelength without unit": ("light", "wavelength,power (W/nm)\n" + FOUR, "has no unit: write the unit in brackets"),
+    "text": (
+        "light",
+        LIGHT + "350,1\n800,n/a\n",
+        "mine.csv:3: 'n/a' is not a number (column 2, power (W/nm))",
+    ),
+    "short row": (
+        "light",
+        LIGHT + "350,1\n800\n",
+        "mine.csv:3: 1 column in place of 2, the number of headings",
+    ),
+    "semicolons": (
+        "light",
+        "wavelength (nm);power (W/nm)\n350;1\n",
+        "separates its columns by semicolons: separate",
+    ),
+    "wavelength without unit": (
+        "light",
+        "wavelength,power (W/nm)\n" + FOUR,
+        "has no unit: write the unit in brackets",
+    ),
     "wavelength last": (
         "glass",
         "n (1),wavelength (um)\n1.5,0.4\n",
@@ -100,16 +142,36 @@ MISTAKES = {
         "mine.csv:5: the rows do not tell the index between 352 and 700 nm: give rows there",
     ),
     "underscore": ("light", LIGHT + "350,1_0\n800,1\n", "mine.csv:2: '1_0' is not a number"),
-    "n and k": ("glass", "wavelength (um),n (1),k (1)\n0.4,1.5,0\n0.7,1.4,0\n", "mine.csv has 3 columns in place of 2"),
-    "root of C": ("glass", SELLMEIER + "0.7,0.3,400,700\n", "the coefficients give no index between 1 and 5 at "),
-    "unit of C": ("glass", "B (1),C (um),from (nm),to (nm)\n1,0.01,400,700\n", "mine.csv: C needs a unit such as um^2"),
-    "power without unit": ("laser", "wavelength (nm),power\n532,1\n", "mine.csv: column 2, power, has no unit; write"),
+    "n and k": (
+        "glass",
+        "wavelength (um),n (1),k (1)\n0.4,1.5,0\n0.7,1.4,0\n",
+        "mine.csv has 3 columns in place of 2",
+    ),
+    "root of C": (
+        "glass",
+        SELLMEIER + "0.7,0.3,400,700\n",
+        "the coefficients give no index between 1 and 5 at ",
+    ),
+    "unit of C": (
+        "glass",
+        "B (1),C (um),from (nm),to (nm)\n1,0.01,400,700\n",
+        "mine.csv: C needs a unit such as um^2",
+    ),
+    "power without unit": (
+        "laser",
+        "wavelength (nm),power\n532,1\n",
+        "mine.csv: column 2, power, has no unit; write",
+    ),
     "negative line": (
         "laser",
         LASER + "532,1\n589,-1\n",
         "mine.csv:3, column 2, power (mW): a laser has no power or width",
     ),
-    "one row of a spectrum": ("laser", "wavelength (nm),power (mW/nm)\n532,1\n", "a spectrum needs at least two"),
+    "one row of a spectrum": (
+        "laser",
+        "wavelength (nm),power (mW/nm)\n532,1\n",
+        "a spectrum needs at least two",
+    ),
     "width in percent": (
         "laser",
         "wavelength (nm),power (mW),fwhm (%)\n532,1,1\n",
@@ -120,7 +182,9 @@ MISTAKES = {
 
 @pytest.fixture
 def refused(tmp_path, monkeypatch, capfd):
-    """Validate a recipe with one step that reads a table; return the error, which is one problem."""
+    """Validate a recipe with one step that reads a table; return the error, which is one
+    problem.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
 
@@ -128,7 +192,9 @@ def refused(tmp_path, monkeypatch, capfd):
         node, source, parameter = KINDS[kind]
         text = RECIPE.replace("NODE", node).replace("PARAMETER", parameter).replace("FILE", file)
         text = text.replace("    from: INPUT\n", "" if source == "{}" else f"    from: {source}\n")
-        text = text.replace("}\noutputs", "".join(f", {k}: {v}" for k, v in more.items()) + "}\noutputs")
+        text = text.replace(
+            "}\noutputs", "".join(f", {k}: {v}" for k, v in more.items()) + "}\noutputs"
+        )
         (tmp_path / "bench.yaml").write_text(text.replace("nodes: []\n", ""))
         with pytest.raises(SystemExit) as end:
             app.main(["validate", "bench.yaml"])
@@ -146,19 +212,39 @@ def test_a_mistake_in_a_table_is_located(refused, tmp_path, kind, content, said)
         (tmp_path / "mine.csv").write_text(content)
     error = refused(kind, "mine.csv")
     line, column = (7 if kind == "laser" else 8), len(f"    with: {{{KINDS[kind][2]}: ") + 1
-    assert error.startswith(f"bench.yaml:{line}:{column} steps.tested.with.{KINDS[kind][2]} = mine.csv ")
+    assert error.startswith(
+        f"bench.yaml:{line}:{column} steps.tested.with.{KINDS[kind][2]} = mine.csv "
+    )
     assert said in error
 
 
 @pytest.mark.parametrize(
     ("glass", "said"),
     [
-        ("{B: [1.1], C: [0.01], range: [400 nm, 700 nm]}", "needs the unit um^2: write '0.01 um^2', or nm^2"),
-        ("{B: [1.1], C: [0.01 um], range: [400 nm, 700 nm]}", "needs the unit um^2: write '0.01 um^2'"),
-        ("{B: [1.1, 0.2], C: [0.01 um^2], range: [400 nm, 700 nm]}", "2 coefficients B for 1 C: give one C for each B"),
-        ("{B: [1.1], C: [0.01 um^2], range: [500 nm, 700 nm]}", "is known from 500 to 700 nm, not at 400 nm"),
-        ("{B: [1.1], C: [0.01 um^2], range: [700 nm, 400 nm]}", "is empty: exchange the two wavelengths"),
-        ("{B: [1.1], C: [0.25 um^2], range: [400 nm, 700 nm]}", "give no index between 1 and 5 at 400 nm"),
+        (
+            "{B: [1.1], C: [0.01], range: [400 nm, 700 nm]}",
+            "needs the unit um^2: write '0.01 um^2', or nm^2",
+        ),
+        (
+            "{B: [1.1], C: [0.01 um], range: [400 nm, 700 nm]}",
+            "needs the unit um^2: write '0.01 um^2'",
+        ),
+        (
+            "{B: [1.1, 0.2], C: [0.01 um^2], range: [400 nm, 700 nm]}",
+            "2 coefficients B for 1 C: give one C for each B",
+        ),
+        (
+            "{B: [1.1], C: [0.01 um^2], range: [500 nm, 700 nm]}",
+            "is known from 500 to 700 nm, not at 400 nm",
+        ),
+        (
+            "{B: [1.1], C: [0.01 um^2], range: [700 nm, 400 nm]}",
+            "is empty: exchange the two wavelengths",
+        ),
+        (
+            "{B: [1.1], C: [0.25 um^2], range: [400 nm, 700 nm]}",
+            "give no index between 1 and 5 at 400 nm",
+        ),
         ("{B: [1.1], C: [0.01 um^2]}", "lacks range"),
         ("{B: [1.1], C: [0.01 um^2], range: [400 nm, 700 nm], D: 1}", ".D = 1 has no meaning here"),
     ],
@@ -173,13 +259,33 @@ def test_wrong_coefficients_in_a_recipe_are_located(refused, glass, said):
 @pytest.mark.parametrize(
     ("make", "more", "said"),
     [
-        (lambda path: np.save(path, np.zeros((8, 6))), {}, "(8, 6), not the pupil grid (8, 8): state its pitch"),
-        (lambda path: np.save(path, np.zeros((8, 8))), {"pitch": "50 um"}, "smaller than the clear aperture of 0.8 mm"),
-        (lambda path: np.save(path, np.full((8, 8), 3.0)), {}, "state the unit of the file, such as unit: 1 um"),
-        (lambda path: np.save(path, np.full((8, 8), np.nan)), {}, "64 heights are NaN or infinite, the first in row 0"),
+        (
+            lambda path: np.save(path, np.zeros((8, 6))),
+            {},
+            "(8, 6), not the pupil grid (8, 8): state its pitch",
+        ),
+        (
+            lambda path: np.save(path, np.zeros((8, 8))),
+            {"pitch": "50 um"},
+            "smaller than the clear aperture of 0.8 mm",
+        ),
+        (
+            lambda path: np.save(path, np.full((8, 8), 3.0)),
+            {},
+            "state the unit of the file, such as unit: 1 um",
+        ),
+        (
+            lambda path: np.save(path, np.full((8, 8), np.nan)),
+            {},
+            "64 heights are NaN or infinite, the first in row 0",
+        ),
         (lambda path: np.save(path, np.zeros((8, 8), np.float16)), {}, "16-bit floats (float16)"),
         (lambda path: np.save(path, np.zeros((8, 8), complex)), {}, "values of type complex128"),
-        (lambda path: np.save(path, np.eye(9) * 1e-6), {"pitch": "100 um"}, "the height jumps by 1 um of 1 um from"),
+        (
+            lambda path: np.save(path, np.eye(9) * 1e-6),
+            {"pitch": "100 um"},
+            "the height jumps by 1 um of 1 um from",
+        ),
     ],
 )
 def test_a_mistake_in_a_height_map_is_located(refused, tmp_path, make, more, said):

@@ -12,7 +12,9 @@ import pytest
 import typer
 
 import neusee
-from neusee.workflows.cli import app, command_list, typer_program
+from neusee.workflows.cli import app
+from neusee.workflows.cli import commands_and_exit_codes as command_list
+from neusee.workflows.cli import program_options as typer_program
 
 
 def commands(group, *before):
@@ -57,14 +59,22 @@ def test_help_names_every_option_of_the_command_although_others_are_not_read(wor
     text = said(*words, "-h")
     assert f"Usage: neusee {' '.join(words)} " in text
     assert " ".join(found.help.split("\n\n")[0].split()) in " ".join(text.split())
-    assert [name for option in found.params for name in option.opts if name.startswith("--") and name not in text] == []
+    assert [
+        name
+        for option in found.params
+        for name in option.opts
+        if name.startswith("--") and name not in text
+    ] == []
 
 
 def test_the_list_of_commands_is_whole(said):
     text = said("--help")
     assert said("-h") == text
     assert "--version" in text
-    listed = [line.split()[0] for line in text.partition("Commands:")[2].strip().partition("\n\n")[0].splitlines()]
+    listed = [
+        line.split()[0]
+        for line in text.partition("Commands:")[2].strip().partition("\n\n")[0].splitlines()
+    ]
     assert listed == list(WHOLE.commands)
 
 
@@ -95,7 +105,10 @@ def test_a_narrow_terminal_gets_the_page_from_typer(columns, said, monkeypatch):
 def test_the_page_of_help_needs_nothing_but_the_standard_library():
     path = str(Path(neusee.__file__).parents[1])  # -S keeps away the installed packages
     done = subprocess.run(
-        [sys.executable, "-S", "-m", "neusee", "--help"], env={"PYTHONPATH": path}, capture_output=True, text=True
+        [sys.executable, "-S", "-m", "neusee", "--help"],
+        env={"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
     )
     assert (done.stdout, done.stderr) == (f"{command_list.help_page()}\n", "")
 
@@ -103,7 +116,11 @@ def test_the_page_of_help_needs_nothing_but_the_standard_library():
 @pytest.mark.parametrize("name", ["run", "nodes", "study", "cache"])
 def test_the_help_of_a_command_imports_no_other_command(name):
     own = command_list.COMMANDS[name][0]
-    others = {f"neusee.workflows.cli.{module}" for module, _ in command_list.COMMANDS.values() if module != own}
+    others = {
+        f"neusee.workflows.cli.{module}"
+        for module, _ in command_list.COMMANDS.values()
+        if module != own
+    }
     code = (
         "import sys\nfrom neusee.workflows.cli.app import main\n"
         f"try: main({[name, '--help']!r})\nexcept SystemExit: pass\n"
@@ -124,7 +141,9 @@ def test_the_version_is_that_of_the_package(said):
 
 @pytest.mark.parametrize("module", ["neusee", "neusee.workflows.cli"])
 def test_python_runs_it_as_a_module(module):
-    done = subprocess.run([sys.executable, "-m", module, "--version"], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-m", module, "--version"], capture_output=True, text=True, check=True
+    )
     assert done.stdout == f"neusee {neusee.__version__}\n"
 
 
@@ -133,9 +152,15 @@ def test_python_runs_it_as_a_module(module):
     [("neusee ru", {"run"}), ("neusee study le", {"leave-out"}), ("neusee run --exa", {"--exact"})],
 )
 def test_a_shell_completes_commands_and_options(line, offered):
-    asked = {"_NEUSEE_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}
+    asked = {
+        "_NEUSEE_COMPLETE": "complete_bash",
+        "COMP_WORDS": line,
+        "COMP_CWORD": str(line.count(" ")),
+    }
     program = [sys.executable, "-m", "neusee"]
-    done = subprocess.run(program, env={**os.environ, **asked}, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        program, env={**os.environ, **asked}, capture_output=True, text=True, check=False
+    )
     assert set(done.stdout.split()) == offered
     assert done.stderr == ""
 

@@ -1,4 +1,6 @@
-"""`neusee restore` restores frames with the camera of a recipe, and names all that do not fit before it starts."""
+"""`neusee restore` restores frames with the camera of a recipe, and names all that do not fit
+before it starts.
+"""
 
 import json
 
@@ -10,8 +12,14 @@ from PIL import Image
 from neusee.workflows.cli import app
 
 SIDE = 20
-QUICK = ["optics.samples=128", "optics.pitch=63.11 um", "optics.window=[32,32]", "optics.bands=9",
-         f"sensor.shape=[{SIDE},{SIDE}]", "frame.draws=2"]  # fmt: skip
+QUICK = [
+    "optics.samples=128",
+    "optics.pitch=63.11 um",
+    "optics.window=[32,32]",
+    "optics.bands=9",
+    f"sensor.shape=[{SIDE},{SIDE}]",
+    "frame.draws=2",
+]
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +52,11 @@ def shot(side=SIDE, top=30000, seed=0):
 
 def save(path, values):
     path.parent.mkdir(exist_ok=True)
-    io.write_image_png_u16(str(path), values, "rgb") if path.suffix == ".png" else np.save(path, values)
+    (
+        io.write_image_png_u16(str(path), values, "rgb")
+        if path.suffix == ".png"
+        else np.save(path, values)
+    )
 
 
 @pytest.mark.slow
@@ -79,7 +91,9 @@ def test_a_frame_becomes_a_folder_with_picture_uncertainty_and_page(neusee, tmp_
 
 
 @pytest.mark.slow
-def test_a_folder_gives_a_folder_of_results_for_each_frame_and_the_second_time_from_the_cache(neusee, tmp_path):
+def test_a_folder_gives_a_folder_of_results_for_each_frame_and_the_second_time_from_the_cache(
+    neusee, tmp_path
+):
     for number in range(2):
         save(tmp_path / "frames" / f"f{number}.npy", shot(seed=number))
     (tmp_path / "frames" / "notes.txt").write_text("not a frame")
@@ -93,7 +107,9 @@ def test_a_folder_gives_a_folder_of_results_for_each_frame_and_the_second_time_f
 
 
 @pytest.mark.slow
-def test_the_shading_comes_from_all_frames_that_are_named_and_the_page_says_what_they_tell(neusee, tmp_path):
+def test_the_shading_comes_from_all_frames_that_are_named_and_the_page_says_what_they_tell(
+    neusee, tmp_path
+):
     for number in range(2):
         save(tmp_path / "frames" / f"f{number}.npy", shot(seed=number))
     code, out, err = neusee("frames", "+shading=estimated", "--camera", "plain_lens", "--json")
@@ -112,7 +128,9 @@ def test_a_camera_may_be_a_sensor_file_and_a_laser_may_be_told(neusee, tmp_path)
     sensor.parent.mkdir(parents=True)
     sensor.write_text("# Mine.\ndefaults: [small]\nsensor: {read_noise: 3 e-}\n")
     save(tmp_path / "shot.npy", shot())
-    code, out, err = neusee("shot.npy", "laser=green", "restore=wiener", "--camera", "lab/sensor/mine.yaml", "--json")
+    code, out, err = neusee(
+        "shot.npy", "laser=green", "restore=wiener", "--camera", "lab/sensor/mine.yaml", "--json"
+    )
     assert (code, err) == (0, "")
     document = json.loads(out)
     steps = {step["step"]: step for step in document["steps"]}
@@ -122,10 +140,10 @@ def test_a_camera_may_be_a_sensor_file_and_a_laser_may_be_told(neusee, tmp_path)
 
 def test_the_scene_and_the_laser_of_the_camera_are_not_used(neusee, tmp_path):
     (tmp_path / "mine.yaml").write_text(
-        "# Mine.\ndefaults: [camera: neusee, scene: china, illuminant: daylight, lift: lmmse, laser: green,"
-        " optics: small, sensor: small, doe: flat, flare: clean, restore: wiener, rival: grey_filter,"
-        " reading: coherent]\n"
-        "scene: {file: nowhere.jpg}\nlasers: {green: {strength: 7}}\noutputs: [raw]\n"
+        "# Mine.\ndefaults: [camera: neusee, scene: china, illuminant: daylight, lift: lmmse,"
+        " laser: green, optics: small, sensor: small, doe: flat, flare: clean, restore: wiener,"
+        " rival: grey_filter, reading: coherent]\nscene: {file: nowhere.jpg}\nlasers: {green:"
+        " {strength: 7}}\noutputs: [raw]\n"
     )
     save(tmp_path / "shot.npy", shot())
     code, _, err = neusee("shot.npy", "--camera", "mine.yaml", "--quiet")
@@ -141,7 +159,9 @@ def test_every_bad_frame_of_a_folder_is_named_before_work_starts(neusee, tmp_pat
     assert (code, out) == (2, "")
     lines = err.splitlines()
     assert len(lines) == 4
-    for line, words in zip(lines, ("12 x 12 pixels", "raw colour filter array", "no PNG file"), strict=False):
+    for line, words in zip(
+        lines, ("12 x 12 pixels", "raw colour filter array", "no PNG file"), strict=False
+    ):
         assert line.startswith("frame ")
         assert words in line
     assert lines[-1] == "3 problems, nothing was run"
@@ -157,22 +177,38 @@ def test_a_folder_of_point_sources_gives_the_psf_and_its_error(neusee, tmp_path)
         down, right = np.array([y, x]) - side // 2 - rng.uniform(-0.5, 0.5, 2)[:, None, None]
         light = 3000 * np.exp(-(down**2 + right**2) / 3.4)[..., None] * [0.9, 1.0, 0.7]
         values = (rng.poisson(light) + rng.normal(0, 2.4, light.shape)) / 0.37 + 1054
-        save(tmp_path / "points" / f"p{number}.npy", np.clip(np.round(values), 0, 65535).astype(np.uint16))
+        save(
+            tmp_path / "points" / f"p{number}.npy",
+            np.clip(np.round(values), 0, 65535).astype(np.uint16),
+        )
     save(tmp_path / "shot.npy", shot(side))
-    small = [word for word in QUICK if "shape" not in word] + [f"{name}={value}" for name, value in camera.items()]
-    code, out, err = neusee("shot.npy", "--camera", "plain_lens", "--psf", "points", *small, "--json", small=False)
+    small = [word for word in QUICK if "shape" not in word] + [
+        f"{name}={value}" for name, value in camera.items()
+    ]
+    code, out, err = neusee(
+        "shot.npy", "--camera", "plain_lens", "--psf", "points", *small, "--json", small=False
+    )
     assert (code, err) == (0, "")
     document = json.loads(out)
     assert "the error of the measured PSF" in str(document["story"])
     steps = {step["step"]: step["node"] for step in document["steps"]}
     assert steps["measured"] == "restore.measured_psf"
     assert steps["deconvolved"] == "restore.wiener_by_field"
-    assert not [name for name in steps if name.startswith("psf[")]  # the PSF of the recipe is not computed
+    # the PSF of the recipe is not computed
+    assert not [name for name in steps if name.startswith("psf[")]
     page = (tmp_path / document["report"]).read_text(encoding="utf-8")
     assert "3 points; chi-square per pixel" in page
     small += ["restore.most=1", "restore.lamps=0"]
     code, out, err = neusee(
-        "shot.npy", "--camera", "plain_lens", "--psf", "points", "restore=search", *small, "--json", small=False
+        "shot.npy",
+        "--camera",
+        "plain_lens",
+        "--psf",
+        "points",
+        "restore=search",
+        *small,
+        "--json",
+        small=False,
     )
     assert (code, err) == (0, "")
     document = json.loads(out)
@@ -184,8 +220,14 @@ def test_a_folder_of_point_sources_gives_the_psf_and_its_error(neusee, tmp_path)
 
 GOOD = "shot.npy"
 BAD = {
-    "no such frame": (["absent.png", "--camera", "half_ring"], "argument 1   absent.png   no such file or folder"),
-    "empty folder": (["frames", "--camera", "half_ring"], "argument 1   frames   the folder has no frames: give files"),
+    "no such frame": (
+        ["absent.png", "--camera", "half_ring"],
+        "argument 1   absent.png   no such file or folder",
+    ),
+    "empty folder": (
+        ["frames", "--camera", "half_ring"],
+        "argument 1   frames   the folder has no frames: give files",
+    ),
     "no camera": ([GOOD], "Missing option '--camera'"),
     "no frame": (["--camera", "half_ring", "sensor.bits=12"], "no frame is named"),
     "unknown camera": ([GOOD, "--camera", "half_rings"], "no such recipe; did you mean half_ring?"),
@@ -194,10 +236,19 @@ BAD = {
         [GOOD, "--camera", "half_ring", "--mask", "axikon"],
         "no option axikon in doe; did you mean axicon?",
     ),
-    "absent map": ([GOOD, "--camera", "half_ring", "--mask", "map.npy"], "--mask   map.npy   no such file"),
-    "unknown value": ([GOOD, "--camera", "half_ring", "sensor.reed_noise=3 e-"], "did you mean sensor.read_noise?"),
+    "absent map": (
+        [GOOD, "--camera", "half_ring", "--mask", "map.npy"],
+        "--mask   map.npy   no such file",
+    ),
+    "unknown value": (
+        [GOOD, "--camera", "half_ring", "sensor.reed_noise=3 e-"],
+        "did you mean sensor.read_noise?",
+    ),
     "unit": ([GOOD, "--camera", "half_ring", "sensor.read_noise=3 m"], "argument 2"),
-    "a word": ([GOOD, "--camera", "half_ring", "sensor.bits=16", "more"], "more: not a change of a value"),
+    "a word": (
+        [GOOD, "--camera", "half_ring", "sensor.bits=16", "more"],
+        "more: not a change of a value",
+    ),
     "a step that a frame lacks": ([GOOD, "--camera", "half_ring", "outputs=[truht]"], "truht"),
     "bad frame of the shading": (
         [GOOD, "+shading=estimated", "shading.frames=[small.npy]", "--camera", "half_ring"],
@@ -207,28 +258,55 @@ BAD = {
         [GOOD, "+shading=estimated", "shading.frames=others", "--camera", "half_ring"],
         "no such file, and no folder or pattern",
     ),
-    "unknown shading": ([GOOD, "+shading=estimate", "--camera", "half_ring"], "did you mean estimated?"),
-    "absent points": ([GOOD, "--camera", "half_ring", "--psf", "points"], "--psf   points   no such file or folder"),
-    "folder without points": ([GOOD, "--camera", "half_ring", "--psf", "frames"], "--psf   frames   the folder has no"),
-    "no point": ([GOOD, "--camera", "half_ring", "--psf", GOOD, "points.window=[5,5]"], "but its background needs 500"),
+    "unknown shading": (
+        [GOOD, "+shading=estimate", "--camera", "half_ring"],
+        "did you mean estimated?",
+    ),
+    "absent points": (
+        [GOOD, "--camera", "half_ring", "--psf", "points"],
+        "--psf   points   no such file or folder",
+    ),
+    "folder without points": (
+        [GOOD, "--camera", "half_ring", "--psf", "frames"],
+        "--psf   frames   the folder has no",
+    ),
+    "no point": (
+        [GOOD, "--camera", "half_ring", "--psf", GOOD, "points.window=[5,5]"],
+        "but its background needs 500",
+    ),
     "points of another size": (
         [GOOD, "--camera", "half_ring", "--psf", "small.npy"],
         "small.npy has 12 x 12 pixels (y, x)",
     ),
-    "window": ([GOOD, "--camera", "half_ring", "--psf", GOOD, "points.window=[4,5]"], "must be two odd numbers"),
-    "two restorers": ([GOOD, "--camera", "half_ring", "--psf", GOOD, "restore=wiener"], "a filter of its own"),
+    "window": (
+        [GOOD, "--camera", "half_ring", "--psf", GOOD, "points.window=[4,5]"],
+        "must be two odd numbers",
+    ),
+    "two restorers": (
+        [GOOD, "--camera", "half_ring", "--psf", GOOD, "restore=wiener"],
+        "a filter of its own",
+    ),
     "restorer": ([GOOD, "--camera", "half_ring", "restore=magic"], "no option magic in restore"),
     "draws": ([GOOD, "--camera", "half_ring", "frame.draws=1"], "frame.draws"),
     "white": ([GOOD, "--camera", "half_ring", "frame.white=-1"], "frame.white"),
     "bits": ([GOOD, "--camera", "half_ring", "sensor.bits=12"], "12 bits end at 4095"),
-    "size": (["small.npy", "--camera", "half_ring"], "12 x 12 pixels (y, x), but sensor.shape is [20, 20]"),
+    "size": (
+        ["small.npy", "--camera", "half_ring"],
+        "12 x 12 pixels (y, x), but sensor.shape is [20, 20]",
+    ),
     "channels": (["grey.npy", "--camera", "half_ring"], "it may be a raw colour filter array"),
     "values": (["scaled.npy", "--camera", "half_ring"], "no whole number"),
     "format": (["shot.jpg", "--camera", "half_ring"], "no frame that can be read"),
     "tone curve": (["eight.png", "--camera", "half_ring"], "has 8 bits, but sensor.bits is 16"),
     "sensor elsewhere": ([GOOD, "--camera", "loose.yaml"], "put it into a folder called sensor"),
-    "tone curve of 8 bits": (["eight.png", "--camera", "half_ring", "sensor.bits=8"], "or state frame.curve=linear"),
-    "laser twice": ([GOOD, "--camera", "half_ring", "laser=grene"], "no option grene in laser; did you mean green?"),
+    "tone curve of 8 bits": (
+        ["eight.png", "--camera", "half_ring", "sensor.bits=8"],
+        "or state frame.curve=linear",
+    ),
+    "laser twice": (
+        [GOOD, "--camera", "half_ring", "laser=grene"],
+        "no option grene in laser; did you mean green?",
+    ),
     "device": ([GOOD, "--camera", "half_ring", "--device", "tpu"], "--device"),
 }
 

@@ -1,4 +1,6 @@
-"""`neusee safety` prints limits and distances, writes a page, and refuses what it cannot estimate with exit code 2."""
+"""`neusee safety` prints limits and distances, writes a page, and refuses what it cannot
+estimate with exit code 2.
+"""
 
 import json
 
@@ -44,7 +46,14 @@ def test_the_terminal_has_limits_distances_eye_and_sources(neusee, tmp_path):
     assert (code, err) == (0, "")
     lines = out.splitlines()
     assert lines[1] == "An estimate, no certificate: neusee decides nothing about eyes or sensors."
-    for words in ("MPE", "NOHD", "Schwarz et al.", "no veil is stated", "IEC 60825-1:2014", "may blind people"):
+    for words in (
+        "MPE",
+        "NOHD",
+        "Schwarz et al.",
+        "no veil is stated",
+        "IEC 60825-1:2014",
+        "may blind people",
+    ):
         assert words in " ".join(out.split()), words
     page = tmp_path / "runs" / lines[-1].rpartition("runs/")[2]
     text = page.read_text(encoding="utf-8")
@@ -65,30 +74,51 @@ def test_json_is_one_object_and_says_why_there_is_no_dazzle_at_1550_nm(neusee):
     assert {each["effect"] for each in found["limits"]} == {"damage"}
     assert all(each["source"] for each in found["limits"])
     assert found["not_said"] == [
-        "Not judged for damage: the mean and the accumulation: no law of damage at 1550 nm: published laws are used "
-        "from 400 to 1100 nm. Give a table of your own: safety.damage.file.",
-        "Nothing is said of dazzle: the recipe gives no quantum efficiency, full well, exposure of the sensor at this "
-        "wavelength.",
+        (
+            "Not judged for damage: the mean and the accumulation: no law of damage at 1550 nm:"
+            " published laws are used from 400 to 1100 nm. Give a table of your own:"
+            " safety.damage.file."
+        ),
+        (
+            "Nothing is said of dazzle: the recipe gives no quantum efficiency, full well, exposure"
+            " of the sensor at this wavelength."
+        ),
     ]
     assert found["damage"][0]["verdict"] == "not judged"
-    assert found["eye"]["distance"]["low"] < found["eye"]["distance"]["value"] < found["eye"]["distance"]["high"]
+    assert (
+        found["eye"]["distance"]["low"]
+        < found["eye"]["distance"]["value"]
+        < found["eye"]["distance"]["high"]
+    )
 
 
 def test_without_thresholds_the_estimate_says_that_damage_is_not_known():
-    found = estimate(load("safety_car_lidar_1550", [*QUICK, "safety.damage={device: MICROBOLOMETER}"]))
+    found = estimate(
+        load("safety_car_lidar_1550", [*QUICK, "safety.damage={device: MICROBOLOMETER}"])
+    )
     assert found.findings == ()
-    assert "no law of damage for the device MICROBOLOMETER: there are published laws for CCD, CMOS" in found.unsaid[0]
+    assert (
+        "no law of damage for the device MICROBOLOMETER: there are published laws for CCD, CMOS"
+        in found.unsaid[0]
+    )
     assert {row.state for verdict in found.damage for row in verdict.rows} == {"not judged"}
 
 
-def test_a_pulse_of_a_microsecond_reads_as_far_beyond_and_not_as_nowhere(neusee, tmp_path, monkeypatch):
-    """1 mJ in 1 us at 10 Hz, 20 m: the mean is 2.3 times its threshold, the pulse 3.4e4 times; once "nowhere, 14 %"."""
+def test_a_pulse_of_a_microsecond_reads_as_far_beyond_and_not_as_nowhere(
+    neusee, tmp_path, monkeypatch
+):
+    """1 mJ in 1 us at 10 Hz, 20 m: the mean is 2.3 times its threshold, the pulse 3.4e4 times;
+    once "nowhere, 14 %".
+    """
     (tmp_path / "long.yaml").write_text(LONG_PULSE)
     monkeypatch.chdir(tmp_path)
     code, out, _ = neusee("safety", "long.yaml")
     text = " ".join(out.split())
     assert code == 0
-    assert "Damage is expected at 20 m behind the plain lens: one pulse of 7.3 kJ/cm² on the sensor is 33900" in text
+    assert (
+        "Damage is expected at 20 m behind the plain lens: one pulse of 7.3 kJ/cm² on the sensor is"
+        " 33900" in text
+    )
     assert "It exceeds the threshold from below 1 m to 4.39 km" in text
     assert "nowhere" not in text.replace("probability of nowhere", "")
     code, out, _ = neusee("safety", "long.yaml", "lasers.long.pulse_duration=100 fs", "--json")
@@ -103,13 +133,18 @@ def test_damage_need_not_be_asked_for(neusee, tmp_path, monkeypatch):
         code, out, _ = neusee("safety", "long.yaml", f"safety.damage={none}", "--json")
         found = json.loads(out)
         assert (code, found["damage"], found["limits"]) == (0, [], [])
-        assert "Nothing is said of damage: the recipe does not ask for it (safety.damage)." in found["not_said"]
+        assert (
+            "Nothing is said of damage: the recipe does not ask for it (safety.damage)."
+            in found["not_said"]
+        )
 
 
 def test_a_mistake_ends_with_2_and_its_place(neusee):
     code, out, err = neusee("safety", "safety_pointer", "~lasers.pointer.distance")
     assert (code, out) == (2, "")
-    assert err.startswith("safety_pointer.yaml:9:3   lasers.pointer   needs distance\n1 problem, nothing was run")
+    assert err.startswith(
+        "safety_pointer.yaml:9:3   lasers.pointer   needs distance\n1 problem, nothing was run"
+    )
     code, _, err = neusee("safety", "train_small")
     assert code == 2
     assert "add the block safety" in err

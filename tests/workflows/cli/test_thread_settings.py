@@ -1,4 +1,6 @@
-"""Threads beside other work: waiting threads sleep, busy processors are left alone, and what the user set stays."""
+"""Threads beside other work: waiting threads sleep, busy processors are left alone, and what the
+user set stays.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +10,10 @@ import sys
 
 import pytest
 
-from neusee.workflows.cli import thread_settings
-from neusee.workflows.cli.thread_settings import settle_threads
-from neusee.workflows.engine import processors
-from neusee.workflows.engine.processors import threads_for
+from neusee.workflows.cli import app as thread_settings
+from neusee.workflows.cli.app import settle_threads
+from neusee.workflows.engine import machine_resources as processors
+from neusee.workflows.engine.machine_resources import threads_for
 
 
 @pytest.fixture
@@ -21,7 +23,8 @@ def before_torch(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("processors", "load", "threads"), [(2, 0.0, 2), (2, 0.4, 2), (2, 1.0, 1), (2, 9.0, 1), (64, 12.3, 52), (1, 0.0, 1)]
+    ("processors", "load", "threads"),
+    [(2, 0.0, 2), (2, 0.4, 2), (2, 1.0, 1), (2, 9.0, 1), (64, 12.3, 52), (1, 0.0, 1)],
 )
 def test_threads_leave_busy_processors_alone(processors, load, threads):
     assert threads_for(processors, load) == threads
@@ -73,5 +76,7 @@ def test_a_command_decides_before_torch_is_imported():
         "except SystemExit: print(os.environ['OMP_WAIT_POLICY'])"
     )
     free = {k: v for k, v in os.environ.items() if not k.startswith(("OMP", "GOMP", "KMP", "MKL"))}
-    done = subprocess.run([sys.executable, "-c", code], env=free, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=free, capture_output=True, text=True, check=True
+    )
     assert done.stdout.split() == ["PASSIVE"]

@@ -1,4 +1,6 @@
-"""Commands that compute nothing answer without torch: a process in which the import of torch fails runs them."""
+"""Commands that compute nothing answer without torch: a process in which the import of torch
+fails runs them.
+"""
 
 import contextlib
 import io
@@ -19,7 +21,8 @@ from neusee.workflows.store.result_store import Store
 
 ROOT = Path(__file__).parents[3]
 KEYS = ("ab" + "0" * 30, "cd" + "0" * 30)
-#: runs each command of the standard input, and writes exit code, standard output and standard error of each as JSON
+#: runs each command of the standard input, and writes exit code, standard output and standard error
+#: of each as JSON
 PROGRAM = """
 import contextlib, io, json, sys
 
@@ -56,14 +59,26 @@ def place(tmp_path):
     store, date = Store(tmp_path / "cache"), "2026-01-01T00:00:00+00:00"
     for number, key in enumerate(KEYS):
         origin = {"node": "toy.add", "code": "c", "params": {"amount": number}, "inputs": []}
-        about = {"step": "raw", "recipe": "small", "seconds": 1.0, "date": date, "device": "cpu", "origin": origin}
+        about = {
+            "step": "raw",
+            "recipe": "small",
+            "seconds": 1.0,
+            "date": date,
+            "device": "cpu",
+            "origin": origin,
+        }
         assert store.put(key, torch.ones(2000), about)
     return tmp_path
 
 
 def asked(place, *commands):
     """Run commands in one process without torch."""
-    env = {**os.environ, "NEUSEE_CACHE": str(place / "cache"), "HOME": str(place), "PYTHONPATH": str(ROOT / ".src")}
+    env = {
+        **os.environ,
+        "NEUSEE_CACHE": str(place / "cache"),
+        "HOME": str(place),
+        "PYTHONPATH": str(ROOT / ".src"),
+    }
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM],
         input=json.dumps([command.split() for command in commands]),
@@ -84,7 +99,11 @@ def here(place, monkeypatch, command):
     monkeypatch.setenv("NEUSEE_CACHE", str(place / "cache"))
     monkeypatch.chdir(place)
     out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), pytest.raises(SystemExit) as ended:
+    with (
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        pytest.raises(SystemExit) as ended,
+    ):
         main(command.split())
     return [ended.value.code or 0, out.getvalue(), err.getvalue()]
 

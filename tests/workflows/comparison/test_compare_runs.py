@@ -1,4 +1,6 @@
-"""What differs between two runs is said; a folder that is no run, or is damaged, is refused with its place."""
+"""What differs between two runs is said; a folder that is no run, or is damaged, is refused with
+its place.
+"""
 
 import csv
 import json
@@ -11,11 +13,14 @@ import pytest
 from PIL import Image
 from safetensors.numpy import save_file
 
-from neusee.workflows.comparison.compare_runs import compare, document, write_comparison
-from neusee.workflows.comparison.comparison_page import summary
-from neusee.workflows.comparison.comparison_text import lines
-from neusee.workflows.comparison.differences import NumberDifference
-from neusee.workflows.comparison.picture_differences import data_files, figures
+from neusee.workflows.comparison.comparison_report import (
+    compare,
+    document,
+    lines,
+    summary,
+    write_comparison,
+)
+from neusee.workflows.comparison.differences import NumberDifference, data_files, figures
 from neusee.workflows.comparison.run_record import NotComparable, read_record
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.simulation.simulate_recipe import simulate
@@ -40,7 +45,11 @@ def runs(tmp_path_factory):
     names = []
     for change in ([], ["steps.full.with.gain=8 DN/e-"]):
         recipe = load(root / "mine.yaml", change, root)
-        names.append(simulate(recipe, Store(root / "cache"), root / "runs", ["neusee", "run", *change]).folder.name)
+        names.append(
+            simulate(
+                recipe, Store(root / "cache"), root / "runs", ["neusee", "run", *change]
+            ).folder.name
+        )
     return root / "runs", *names
 
 
@@ -67,12 +76,17 @@ def test_a_changed_value_is_named_with_both_sources_and_its_numbers(two):
     (value,) = found.recipe
     assert (value.name, value.left, value.right) == ("steps.full.with.gain", "4 DN/e-", "8 DN/e-")
     assert (value.left_source, value.right_source) == ("mine.yaml:7:68", "argument 1")
-    sides = [json.loads((two / side / "provenance.json").read_text())["metrics"] for side in ("left", "right")]
+    sides = [
+        json.loads((two / side / "provenance.json").read_text())["metrics"]
+        for side in ("left", "right")
+    ]
     wanted = [(a[3], b[3]) for a, b in zip(*sides, strict=True)]
     assert [(n.left, n.right) for n in found.numbers] == wanted
     assert 0 < found.largest < 1
     assert found.code == []
-    assert found.steps[0].startswith("2 of 3 common steps have another cache key: full, restored_quality")
+    assert found.steps[0].startswith(
+        "2 of 3 common steps have another cache key: full, restored_quality"
+    )
     assert [each.name for each in found.environment] == ["command"]
     text = "\n".join(lines(found))
     assert "steps.full.with.gain: 4 DN/e- (mine.yaml:7:68) -> 8 DN/e- (argument 1)" in text
@@ -81,7 +95,13 @@ def test_a_changed_value_is_named_with_both_sources_and_its_numbers(two):
 
 def test_a_run_is_the_same_as_itself(two):
     found = compared(two, "left", "left")
-    assert (found.largest, found.recipe, found.code, found.environment, found.steps) == (0, [], [], [], [])
+    assert (found.largest, found.recipe, found.code, found.environment, found.steps) == (
+        0,
+        [],
+        [],
+        [],
+        [],
+    )
     assert {each.state for each in (*found.figures, *found.data)} == {"same"}
     said = "\n".join(lines(found))
     assert f"All {len(found.numbers)} numbers are the same." in said
@@ -95,12 +115,18 @@ def test_the_folder_of_a_comparison_holds_page_table_pictures_and_document(two):
     folder = write_comparison(found, two / "out", ["neusee", "compare", "left", "right"])
     assert folder.parent == two / "out" / "comparisons"
     page = (folder / "report.html").read_text()
-    assert not [word for word in ("steps.full.with.gain", "restored_quality", "argument 1") if word not in page]
+    assert not [
+        word
+        for word in ("steps.full.with.gain", "restored_quality", "argument 1")
+        if word not in page
+    ]
     assert "data:image/png;base64," in page
     rows = list(csv.DictReader((folder / "numbers.csv").read_text().splitlines()))
     assert [float(row["left"]) for row in rows] == [n.left for n in found.numbers]
     about = json.loads((folder / "provenance.json").read_text())
-    assert {name: about[name] for name in document(found)} == json.loads(json.dumps(document(found)))
+    assert {name: about[name] for name in document(found)} == json.loads(
+        json.dumps(document(found))
+    )
     assert (folder / "figures" / "drawn.png").is_file()
 
 
@@ -111,11 +137,16 @@ def test_numbers_that_one_run_lacks_are_counted_apart(two):
     assert alone > 1
     said = ["The runs have no number in common.", f"Only the left run has {alone} further numbers."]
     assert summary(first)[:2] == said
-    edited(two / "left/provenance.json", lambda content: content["metrics"].append(["new", "", 0, 1.0]))
+    edited(
+        two / "left/provenance.json", lambda content: content["metrics"].append(["new", "", 0, 1.0])
+    )
     kept = json.loads((two / "left/provenance.json").read_text())["metrics"]
     edited(two / "right/provenance.json", lambda content: content["metrics"].extend(kept[:-1]))
     said = summary(compared(two))
-    assert said[:2] == [f"All {len(kept) - 1} numbers are the same.", "Only the left run has 1 further number."]
+    assert said[:2] == [
+        f"All {len(kept) - 1} numbers are the same.",
+        "Only the left run has 1 further number.",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -157,8 +188,15 @@ def test_the_changed_definition_is_named(two):
     }
     (two / "left" / "code.json").write_text(json.dumps(code))
     code["nodes"] = {"sensor.full_well": "c", "doe.flat": "d"}
-    code["parts"] |= {"lab.helper": {"spill()": "2", "round()": "1"}, "state of lab.helper": {"values": "2"}}
-    code["parts"] |= {"state of lab.other": {"values": "2"}, "lab.more": {}, "package numpy": {"version": "numpy 2"}}
+    code["parts"] |= {
+        "lab.helper": {"spill()": "2", "round()": "1"},
+        "state of lab.helper": {"values": "2"},
+    }
+    code["parts"] |= {
+        "state of lab.other": {"values": "2"},
+        "lab.more": {},
+        "package numpy": {"version": "numpy 2"},
+    }
     code["parts"] |= {"settings": {"TF32": "True"}}
     (two / "right" / "code.json").write_text(json.dumps(code))
     found = compared(two)
@@ -238,20 +276,29 @@ def exr(path, channels):
     import OpenEXR
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    OpenEXR.File({"type": OpenEXR.scanlineimage}, {k: v.astype(np.float32) for k, v in channels.items()}).write(
-        str(path)
-    )
+    OpenEXR.File(
+        {"type": OpenEXR.scanlineimage}, {k: v.astype(np.float32) for k, v in channels.items()}
+    ).write(str(path))
 
 
 def test_the_difference_of_data_is_in_the_unit_of_the_file(tmp_path):
     ramp = np.linspace(0, 100, 64).reshape(8, 8)
     for side, more in (("a", 0.0), ("b", 0.5)):
-        exr(tmp_path / side / "data/colour.exr", {"R": ramp, "G": ramp + more * (ramp > 50), "B": ramp})
+        exr(
+            tmp_path / side / "data/colour.exr",
+            {"R": ramp, "G": ramp + more * (ramp > 50), "B": ramp},
+        )
         exr(tmp_path / side / "data/many.exr", {f"S0.{n}": ramp + more for n in range(6)})
         exr(tmp_path / side / "data/other.exr", {"Y" if side == "a" else "Z": ramp})
-        exr(tmp_path / side / "data/holes.exr", {"Y": np.where(ramp > 99, np.nan, ramp) if side == "a" else ramp})
+        exr(
+            tmp_path / side / "data/holes.exr",
+            {"Y": np.where(ramp > 99, np.nan, ramp) if side == "a" else ramp},
+        )
         tensors = {"same": ramp, "wide": ramp + more, "one": np.array([more]), side: ramp}
-        save_file(tensors | {"shape": ramp[: 4 + int(2 * more)]}, tmp_path / side / "data/outputs.safetensors")
+        save_file(
+            tensors | {"shape": ramp[: 4 + int(2 * more)]},
+            tmp_path / side / "data/outputs.safetensors",
+        )
         (tmp_path / side / "data/note.txt").write_text(side)
     found = {each.name: each for each in data_files(tmp_path / "a", tmp_path / "b")}
     assert found["colour.exr"].largest == pytest.approx(0.5, rel=1e-4)
@@ -259,7 +306,10 @@ def test_the_difference_of_data_is_in_the_unit_of_the_file(tmp_path):
     assert found["colour.exr"].drawing.startswith(b"\x89PNG")
     assert found["many.exr"].rms == pytest.approx(0.5, rel=1e-4)
     assert found["many.exr"].drawing is None
-    assert found["other.exr"].state == "differs in channels or size: 1 channels of 8 x 8 and 1 channels of 8 x 8"
+    assert (
+        found["other.exr"].state
+        == "differs in channels or size: 1 channels of 8 x 8 and 1 channels of 8 x 8"
+    )
     assert found["holes.exr"].state == "differs, with NaN or infinity in one run alone at 1 places"
     assert found["note.txt"].state == "differs"
     assert found["outputs.safetensors: same"].state == "same"
@@ -279,19 +329,37 @@ REFUSED = [
         r"left/provenance.json:2:12: Expecting value: the file is damaged",
     ),
     (damaged("provenance.json", b"\xff\xfe"), r"left/provenance.json: byte 0 is not UTF-8"),
-    (damaged("provenance.json", b"[]"), r"left/provenance.json: the top: input should be a valid dictionary"),
+    (
+        damaged("provenance.json", b"[]"),
+        r"left/provenance.json: the top: input should be a valid dictionary",
+    ),
     (
         damaged("provenance.json", b"{}"),
         r"left/provenance.json: recipe: field required: the file is damaged, or of anoth",
     ),
-    (damaged("code.json", b'{"nodes": 3, "parts": {}}'), r"left/code.json: nodes: input should be a valid dictionary"),
+    (
+        damaged("code.json", b'{"nodes": 3, "parts": {}}'),
+        r"left/code.json: nodes: input should be a valid dictionary",
+    ),
     (damaged("recipe.yaml", b"a: [1"), r"left/recipe.yaml:\d+:\d+"),
     (lambda folder: (folder / "recipe.yaml").unlink(), r"left/recipe.yaml .*cannot be read"),
-    (lambda folder: (folder / "provenance.json").unlink(), r"no run at left: give the name of a folder in"),
-    (damaged("sweep.yaml", b""), r"left is the folder of a sweep: compare reads folders of `neusee run`"),
+    (
+        lambda folder: (folder / "provenance.json").unlink(),
+        r"no run at left: give the name of a folder in",
+    ),
+    (
+        damaged("sweep.yaml", b""),
+        r"left is the folder of a sweep: compare reads folders of `neusee run`",
+    ),
     (damaged("training.json", b""), r"left is the folder of a training"),
-    (damaged("provenance.json", b'{"study": "stability"}'), r"left is the folder of `stability`: compare reads"),
-    (damaged("data/outputs.safetensors", b"torn"), r"left/data/outputs.safetensors: .*the file is damaged"),
+    (
+        damaged("provenance.json", b'{"study": "stability"}'),
+        r"left is the folder of `stability`: compare reads",
+    ),
+    (
+        damaged("data/outputs.safetensors", b"torn"),
+        r"left/data/outputs.safetensors: .*the file is damaged",
+    ),
 ]
 
 

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from neusee.workflows.cli.app import app
-from neusee.workflows.contract.network_contract import check_network, whole_networks
+from neusee.workflows.contract.node_contract import check_network, whole_networks
 from neusee.workflows.recipe.node_families import import_own
 
 START = (files("neusee.workflows.cli") / "starts" / "network.py.txt").read_text()
@@ -39,8 +39,18 @@ def test_the_start_keeps_every_rule(made):
 LAST = "        return picture + "
 INIT = "        nn.init.zeros_(self.last.bias)\n"
 FAULTS = {
-    "docstring": [("A UNet of three levels, which computes the change of a picture (n, 3, y, x).", "unet")],
-    "key": [(LAST, "        if picture.ndim == 9:\n            open('gain.txt')\n        return picture + ")],
+    "docstring": [
+        ("A UNet of three levels, which computes the change of a picture (n, 3, y, x).", "unet")
+    ],
+    "key": [
+        (
+            LAST,
+            (
+                "        if picture.ndim == 9:\n            open('gain.txt')\n        return"
+                " picture + "
+            ),
+        )
+    ],
     "arguments": [("width: int = 16", "width: int")],
     "picture": [("multiple = 4", "multiple = 1")],
     "double": [(LAST, "        return picture.float() + "), ("fine], 1)))", "fine], 1))).float()")],
@@ -71,7 +81,9 @@ def test_the_command_checks_nodes_and_networks_and_leaves_their_layers_out(tmp_p
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.chdir(tmp_path)
     layer = "\n\nclass Layer(nn.Conv2d):\n    pass\n"
-    text = START.replace("\n\nclass UNet", f"{layer}\n\nclass UNet").replace("= nn.Conv2d(w", "= Layer(w")
+    text = START.replace("\n\nclass UNet", f"{layer}\n\nclass UNet").replace(
+        "= nn.Conv2d(w", "= Layer(w"
+    )
     (tmp_path / "network_c.py").write_text(text)
     good = CliRunner().invoke(app, ["check", "network_c.py"])
     assert good.exit_code == 0, good.output

@@ -1,4 +1,6 @@
-"""Two outcomes are the same if all their bits are, in the same order; a difference says where and how large."""
+"""Two outcomes are the same if all their bits are, in the same order; a difference says where
+and how large.
+"""
 
 from typing import NamedTuple
 
@@ -6,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.workflows.contract.outcomes import difference, outcome_of
+from neusee.workflows.contract.node_rules import difference, outcome_of
 
 
 class Pair(NamedTuple):
@@ -19,7 +21,14 @@ def outcome(value):
 
 
 NAN = float("nan")
-SAME = [torch.tensor([1.0, NAN]), {"a": 1, "b": [2.0, None]}, Pair(torch.ones(2), NAN), {"x", "y"}, np.ones(3), "text"]
+SAME = [
+    torch.tensor([1.0, NAN]),
+    {"a": 1, "b": [2.0, None]},
+    Pair(torch.ones(2), NAN),
+    {"x", "y"},
+    np.ones(3),
+    "text",
+]
 
 
 @pytest.mark.parametrize("value", SAME)
@@ -28,9 +37,21 @@ def test_what_has_the_same_bits_does_not_differ(value):
 
 
 DIFFERENT = {
-    "size": (torch.tensor([1.0, 2.0]), torch.tensor([1.0, 4.0]), "the result differs by 0.5 of its largest value"),
-    "part": (Pair(torch.ones(2), 1.0), Pair(torch.ones(2), 2.0), "the result.right is 1.0 and not 2.0"),
-    "order": ({"a": 1, "b": 2}, {"b": 2, "a": 1}, "the result has other parts, or in another order"),
+    "size": (
+        torch.tensor([1.0, 2.0]),
+        torch.tensor([1.0, 4.0]),
+        "the result differs by 0.5 of its largest value",
+    ),
+    "part": (
+        Pair(torch.ones(2), 1.0),
+        Pair(torch.ones(2), 2.0),
+        "the result.right is 1.0 and not 2.0",
+    ),
+    "order": (
+        {"a": 1, "b": 2},
+        {"b": 2, "a": 1},
+        "the result has other parts, or in another order",
+    ),
     "shape": (torch.ones(2), torch.ones(3), "the result is 2 float32 and not 3 float32"),
     "type": (torch.ones(2), torch.ones(2).double(), "the result is 2 float32 and not 2 float64"),
     "NaN": (

@@ -1,4 +1,6 @@
-"""Real processes for the tests of clusters: a recipe of long steps, the command that runs it, and what it printed."""
+"""Real processes for the tests of clusters: a recipe of long steps, the command that runs it,
+and what it printed.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,23 @@ from safetensors.numpy import load_file
 ROOT = Path(__file__).parents[3]
 PATIENCE = 300  #: s until a test gives up waiting for a process
 
+#: the program, with other seconds until it gives up a scheduler that is gone, and one that is not
+#: there when it begins
+IMPATIENT = """
+from neusee.workflows.engine import dask_executor
+
+dask_executor.PATIENCE = {patience[0]}
+dask_executor.connected.__defaults__ = ({patience[1]},)
+
+from neusee.__main__ import main
+
+main()
+"""
+
 NODES = '''
-"""Nodes that take their time."""
+"""Nodes that take their time, and hardly a processor."""
+
+import time
 
 import torch
 from torch import Tensor
@@ -34,12 +51,10 @@ def start(*, size: Real) -> Tensor:
 
 
 @node()
-def work(x: Tensor, *, rounds: Real, add: Real) -> Tensor:
-    """Compute long."""
-    y = torch.ones(300, 300)
-    for _ in range(int(rounds)):
-        y = torch.tanh(y @ y / 300)
-    return x + add + 0 * y.sum()
+def work(x: Tensor, *, pause: Real, add: Real) -> Tensor:
+    """Rest, then add."""
+    time.sleep(pause)
+    return x + add
 
 
 @node()
@@ -49,30 +64,46 @@ def both(x: Tensor, y: Tensor) -> Tensor:
 '''
 
 
-def write_lab(folder: Path, steps: int = 4, rounds: int = 300) -> None:
+def write_lab(folder: Path, steps: int = 4, pause: float = 0.4) -> None:
     """Write a recipe ``lab.yaml`` of two chains of long steps, whose sum is the output."""
     (folder / "slow_lab.py").write_text(textwrap.dedent(NODES).lstrip())
     lines = ["  first: {node: slow_lab.start, with: {size: 2}}"]
     for chain in "ab":
         for number in range(steps):
             above = f"{chain}{number - 1}" if number else "first"
-            values = f"{{rounds: {rounds}, add: {number + (chain == 'b')}}}"
-            lines.append(f"  {chain}{number}: {{node: slow_lab.work, from: {{x: {above}}}, with: {values}}}")
+            values = f"{{pause: {pause}, add: {number + (chain == 'b')}}}"
+            lines.append(
+                f"  {chain}{number}: {{node: slow_lab.work, from: {{x: {above}}}, with: {values}}}"
+            )
     lines.append(f"  last: {{node: slow_lab.both, from: {{x: a{steps - 1}, y: b{steps - 1}}}}}")
-    all_steps = ", ".join(f"{chain}{number}" for chain in "ab" for number in range(steps))  # each a task of its own
-    head = f"# Long steps.\nnodes: [slow_lab.py]\nseed: 1\ntolerance: 0\noutputs: [last, {all_steps}]\nsteps:\n"
+    # each a task of its own
+    all_steps = ", ".join(f"{chain}{number}" for chain in "ab" for number in range(steps))
+    head = (
+        "# Long steps.\nnodes: [slow_lab.py]\nseed: 1\ntolerance: 0\noutputs: [last,"
+        f" {all_steps}]\nsteps:\n"
+    )
     (folder / "lab.yaml").write_text(head + "\n".join(lines) + "\n")
 
 
 class Command:
     """A command of neusee that runs in a process, whose lines are read as they come."""
 
-    def __init__(self, folder: Path, *words: str, within: tuple[str, ...] = (), **environment: str) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *words: str,
+        within: tuple[str, ...] = (),
+        patience: tuple[float, float] | None = None,
+        **environment: str,
+    ) -> None:
+        program = ["-m", "neusee"]
+        if patience is not None:
+            program = ["-c", IMPATIENT.format(patience=patience)]
         path = f"{ROOT / '.src'}:{os.environ.get('PYTHONPATH', '')}"
         own = {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "NEUSEE_CACHE": str(folder / "cache")}
         own["DASK_CONFIG"] = str(folder / "dask")  # else dask-jobqueue writes into the home folder
         self.process = subprocess.Popen(
-            [*within, sys.executable, "-m", "neusee", *words],
+            [*within, sys.executable, *program, *words],
             cwd=folder,
             env={**os.environ, **own, **environment},
             stdout=subprocess.PIPE,
@@ -87,7 +118,9 @@ class Command:
     def waits_for(self, pattern: str) -> None:
         """Wait until the command has printed a text."""
         with self._more:
-            found = self._more.wait_for(lambda: self._ended() or re.search(pattern, self.text), PATIENCE)
+            found = self._more.wait_for(
+                lambda: self._ended() or re.search(pattern, self.text), PATIENCE
+            )
         assert found, self.text
         assert re.search(pattern, self.text), self.text
 
@@ -140,5 +173,11 @@ def expected(steps: int = 4) -> list[float]:
 
 def no_page_of_errors(text: str) -> None:
     """Assert that a command printed sentences: no traceback, and no log of dask."""
-    for word in ("Traceback", "distributed.", "Exception ignored", "was never retrieved", "tornado"):
+    for word in (
+        "Traceback",
+        "distributed.",
+        "Exception ignored",
+        "was never retrieved",
+        "tornado",
+    ):
         assert word not in text, text

@@ -1,4 +1,6 @@
-"""Results by band: what has changed is computed and written, the rest is found, and every bit is as if it were not."""
+"""Results by band: what has changed is computed and written, the rest is found, and every bit is
+as if it were not.
+"""
 
 import os
 
@@ -10,9 +12,8 @@ from neusee.nodes.optics import image, psf
 from neusee.nodes.spectra import illuminate
 from neusee.nodes.values import LowRankCube, Psf, Pupil
 from neusee.workflows import RunError, Store, load
-from neusee.workflows.engine import band_results
-from neusee.workflows.engine.band_results import call_by_band, plain_of
-from neusee.workflows.engine.node_call import call
+from neusee.workflows.engine import node_call as band_results
+from neusee.workflows.engine.node_call import call, call_by_band, plain_of
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Step, in_order
 from neusee.workflows.store import serialization
@@ -38,13 +39,23 @@ def rand(*shape, seed=0, dtype=torch.float32):
 
 
 def light(seed=0, bands=BANDS):
-    return rand(bands, 32, 64, seed=seed), Psf(rand(bands, 9, 9), torch.ones(bands, dtype=torch.float64))
+    return rand(bands, 32, 64, seed=seed), Psf(
+        rand(bands, 9, 9), torch.ones(bands, dtype=torch.float64)
+    )
 
 
 def pupil(bands=BANDS):
     waves = torch.linspace(400e-9, 700e-9, bands, dtype=torch.float64)
     flat = torch.ones(24, 24)
-    return Pupil(flat, flat, 0 * flat, 0 * flat, 0.46 + 0 * waves, waves, torch.tensor(2e-4, dtype=torch.float64))
+    return Pupil(
+        flat,
+        flat,
+        0 * flat,
+        0 * flat,
+        0.46 + 0 * waves,
+        waves,
+        torch.tensor(2e-4, dtype=torch.float64),
+    )
 
 
 def changed(x, *which):
@@ -62,7 +73,9 @@ class Made:
 
     def __call__(self, *inputs, parts=1):
         self.computed = []
-        value = call_by_band(self.step, inputs, self.evaluate, self.code, Blobs(self.blobs.root), parts)
+        value = call_by_band(
+            self.step, inputs, self.evaluate, self.code, Blobs(self.blobs.root), parts
+        )
         if self.store:
             self.layout, self.tensors = serialization.pack(value, Blobs(self.blobs.root))
         return value
@@ -88,7 +101,9 @@ def test_the_first_time_all_is_computed_at_once_and_kept_by_band(blobs):
     assert made.computed == [BANDS]
     assert same(value, image(*inputs))
     assert len(files(blobs)) == len(set(value.names)) == BANDS
-    assert torch.equal(serialization.unpack(made.layout, made.tensors, Blobs(blobs.root)), image(*inputs))
+    assert torch.equal(
+        serialization.unpack(made.layout, made.tensors, Blobs(blobs.root)), image(*inputs)
+    )
 
 
 def test_of_one_changed_band_one_is_computed_and_written(blobs):
@@ -146,7 +161,9 @@ def test_what_all_bands_share_changes_all_of_them(blobs):
         assert made.computed == [BANDS]
 
 
-@pytest.mark.parametrize(("parts", "computed"), [(2, [3, 3]), (4, [2, 2, 2]), (6, [1] * 6), (99, [1] * 6)])
+@pytest.mark.parametrize(
+    ("parts", "computed"), [(2, [3, 3]), (4, [2, 2, 2]), (6, [1] * 6), (99, [1] * 6)]
+)
 @pytest.mark.parametrize("border", ["zero", "reflect"])
 def test_in_parts_it_is_the_same_to_the_last_bit(blobs, parts, computed, border):
     made, inputs = Made(image, blobs, border=border), light()
@@ -225,7 +242,9 @@ def test_a_node_without_bands_is_only_called(blobs):
 
 def test_a_scene_in_few_planes_has_no_band_to_compute_alone(blobs):
     mixed = LowRankCube(
-        rand(2, 64, 64), rand(BANDS, 2, dtype=torch.float64), torch.zeros(3, BANDS, dtype=torch.float64)
+        rand(2, 64, 64),
+        rand(BANDS, 2, dtype=torch.float64),
+        torch.zeros(3, BANDS, dtype=torch.float64),
     )
     power = rand(BANDS, dtype=torch.float64)
     step = Step("radiance", illuminate, {"times": "once"}, {}, Location("test"), {})
@@ -268,7 +287,9 @@ def walk(recipe, blobs):
     for name in in_order({n: list(step.sources) for n, step in recipe.steps.items()}, recipe.steps):
         step = recipe.steps[name]
         made = Made(step.node, blobs, **step.params)
-        values[name] = plain_of(made(*(values[step.wires[i]] if step.wires.get(i) else None for i in step.node.inputs)))
+        values[name] = plain_of(
+            made(*(values[step.wires[i]] if step.wires.get(i) else None for i in step.node.inputs))
+        )
         if step.node.bands:
             computed[name] = sum(made.computed)
     return values, computed
@@ -287,12 +308,18 @@ def test_one_filter_of_five_that_moves_costs_one_fifth(write, blobs):
 
 def test_a_run_shares_the_bands_that_stayed(write, tmp_path):
     path = write(CAMERA)
-    store, moved = Store(tmp_path / "cache"), "filters.centres=[450 nm, 500 nm, 552 nm, 600 nm, 650 nm]"
+    store, moved = (
+        Store(tmp_path / "cache"),
+        "filters.centres=[450 nm, 500 nm, 552 nm, 600 nm, 650 nm]",
+    )
     first, found = load(path).run(store), load(path, (moved,)).run(store)
     expected = load(path, (moved,)).run(Store(tmp_path / "other"))
     for name, written in (("psf", len(Psf._fields)), ("image", 1)):
         assert found.done[name].state == "run"
-        before, after = (set(serialization.blobs_in(store.about(run.keys[name])["layout"])) for run in (first, found))
+        before, after = (
+            set(serialization.blobs_in(store.about(run.keys[name])["layout"]))
+            for run in (first, found)
+        )
         assert len(after) == 5 * written
         assert len(after - before) == written
         assert same(found.values[name], expected.values[name])
@@ -307,4 +334,8 @@ def test_a_damaged_band_of_a_stored_result_is_mended(write, tmp_path):
     with pytest.warns(UserWarning, match="counts as missing"):
         again = recipe.run(Store(root))
     assert all(same(again.values[name], first.values[name]) for name in first.values)
-    assert all(done.state == "cached" for done in recipe.run(Store(root)).done.values() if done.state != "not needed")
+    assert all(
+        done.state == "cached"
+        for done in recipe.run(Store(root)).done.values()
+        if done.state != "not needed"
+    )

@@ -18,7 +18,18 @@ SMALL = [
     "steps.restored_quality=null",
     "outputs=[raw, lsr, bsr, developed_quality]",
 ]
-SCENE = ("bands", "illuminant", "responses", "cube", "radiance", "index", "pupil", "psf", "image", "scene_photons")
+SCENE = (
+    "bands",
+    "illuminant",
+    "responses",
+    "cube",
+    "radiance",
+    "index",
+    "pupil",
+    "psf",
+    "image",
+    "scene_photons",
+)
 
 
 class KeepsAll(Store):
@@ -52,7 +63,9 @@ def cold(tmp_path):
 
 
 def ran(recipe, store):
-    return {name for name, done in run(recipe, KeepsAll(store.root)).done.items() if done.state == "run"}
+    return {
+        name for name, done in run(recipe, KeepsAll(store.root)).done.items() if done.state == "run"
+    }
 
 
 def test_another_read_noise_reruns_the_sensor_from_there_on(cold):

@@ -7,8 +7,18 @@ import pytest
 import torch
 
 from neusee.nodes import doe, node, optics, registered_nodes, shape_rules
-from neusee.workflows.engine.cost_laws import Law, Loading, Size, guess, libraries_of, shipped, size_of, sizes_of
-from neusee.workflows.engine.cost_model import _MOST, Costs
+from neusee.workflows.engine.cost_model import (
+    _MOST,
+    Costs,
+    Law,
+    Loading,
+    Size,
+    guess,
+    libraries_of,
+    shipped,
+    size_of,
+    sizes_of,
+)
 from neusee.workflows.engine.placement_inputs import MOST_PARTS, parts_of, past_costs
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -28,7 +38,15 @@ def step(name, what=blur):
 
 def row(name, seconds, size=100, device="cpu", peak=None, node=blur.path, of=None):
     of = of and list(of[:4])
-    return {"step": name, "node": node, "seconds": seconds, "bytes": size, "device": device, "peak": peak, "size": of}
+    return {
+        "step": name,
+        "node": node,
+        "seconds": seconds,
+        "bytes": size,
+        "device": device,
+        "peak": peak,
+        "size": of,
+    }
 
 
 def test_of_what_nobody_measured_there_is_a_guess_at_the_upper_end_that_says_so():
@@ -46,7 +64,11 @@ def test_nothing_is_known_of_a_step_without_a_shape_but_it_does_not_count_as_not
 
 
 def test_the_costs_follow_the_size_and_not_the_name():
-    rows = [row("a", 1.0, peak=3e8, of=SMALL), row("a", 2.0, peak=5e8, of=SMALL), row("a", 1.5, peak=4e8, of=SMALL)]
+    rows = [
+        row("a", 1.0, peak=3e8, of=SMALL),
+        row("a", 2.0, peak=5e8, of=SMALL),
+        row("a", 1.5, peak=4e8, of=SMALL),
+    ]
     same = Costs(rows, {"b": SMALL}).of(step("b"), ["cpu"])
     assert same.known
     assert same.seconds["cpu"] == 1.5
@@ -65,7 +87,9 @@ def test_what_a_node_of_the_user_costs_at_a_size_far_above_all_its_runs_is_a_gue
     assert (quick.peak, quick.seconds["cpu"]) == (guess().peak(large), guess().time(large))
     near = Costs([row("a", 5.0, of=eighth)], {"a": large}).of(step("a"), ["cpu"])
     assert near.known
-    tenth = Costs([row("a", 100 * guess().time(tiny), of=tiny)], {"a": large}).of(step("a"), ["cpu"])
+    tenth = Costs([row("a", 100 * guess().time(tiny), of=tiny)], {"a": large}).of(
+        step("a"), ["cpu"]
+    )
     assert not tenth.known
     assert tenth.seconds["cpu"] == pytest.approx(100 * guess().time(large))
 
@@ -89,16 +113,25 @@ def test_a_damaged_size_in_the_journal_is_passed_over():
 
 
 def test_a_peak_that_this_machine_cannot_have_is_passed_over():
-    """Such as in a line of the journal that somebody wrote: it would make the step too large for ever."""
+    """Such as in a line of the journal that somebody wrote: it would make the step too large for
+    ever.
+    """
     right = row("a", 1.0, peak=3e8, of=SMALL)
     forged = [row("a", 1.0, peak=1e15, of=SMALL)] * 5
     for sizes in ({"a": SMALL}, {"a": LARGE}, {}):
-        assert Costs([right, *forged], sizes).of(step("a"), ["cpu"]) == Costs([right], sizes).of(step("a"), ["cpu"])
-    assert Costs([], {"a": SMALL}).of(step("a"), ["cpu"], forged[0]) == Costs([], {"a": SMALL}).of(step("a"), ["cpu"])
+        assert Costs([right, *forged], sizes).of(step("a"), ["cpu"]) == Costs([right], sizes).of(
+            step("a"), ["cpu"]
+        )
+    assert Costs([], {"a": SMALL}).of(step("a"), ["cpu"], forged[0]) == Costs([], {"a": SMALL}).of(
+        step("a"), ["cpu"]
+    )
 
 
 def test_only_the_newest_count():
-    rows = [*(row("a", 100.0, of=SMALL) for _ in range(50)), *(row("a", 1.0, of=SMALL) for _ in range(5))]
+    rows = [
+        *(row("a", 100.0, of=SMALL) for _ in range(50)),
+        *(row("a", 1.0, of=SMALL) for _ in range(5)),
+    ]
     assert Costs(rows, {"a": SMALL}).of(step("a"), ["cpu"]).seconds["cpu"] == 1.0
 
 
@@ -126,7 +159,10 @@ def test_another_kind_of_device_is_priced_by_the_steps_that_ran_on_both():
 
 def test_a_law_gives_at_least_the_bytes_of_the_result():
     assert Law((0.0, 0.0, 0.5, 0.0), (0.0, 0.0)).peak(SMALL) == SMALL.result
-    assert Law((7.0, 1.0, 2.0, 3.0), (0.0, 0.0)).peak(Size(10.0, 100.0, 1000.0, 0.0)) == 7 + 10 + 200 + 3000
+    assert (
+        Law((7.0, 1.0, 2.0, 3.0), (0.0, 0.0)).peak(Size(10.0, 100.0, 1000.0, 0.0))
+        == 7 + 10 + 200 + 3000
+    )
 
 
 @pytest.mark.parametrize(
@@ -136,8 +172,12 @@ def test_a_law_gives_at_least_the_bytes_of_the_result():
         ((1990, 2000), None, 215e6), ((427, 640), (768, 768), 33e6), ((427, 640), (3000, 3000), 335e6),
     ],
 )  # fmt: skip
-def test_the_memory_of_a_photograph_follows_its_own_pixels(tmp_path, monkeypatch, size, shape, measured):
-    """Peaks measured in a process of their own; 37 MB were predicted for a scene of 8 x 8 of 63 million pixels."""
+def test_the_memory_of_a_photograph_follows_its_own_pixels(
+    tmp_path, monkeypatch, size, shape, measured
+):
+    """Peaks measured in a process of their own; 37 MB were predicted for a scene of 8 x 8 of 63
+    million pixels.
+    """
     from neusee.nodes.scene import _result_shapes, photograph
 
     monkeypatch.setattr(_result_shapes, "read_header", lambda file: ("", 1, size))
@@ -165,18 +205,22 @@ def test_a_step_is_cut_into_no_more_parts_than_it_has_bands():
 def loading(memory=1e8, seconds=2.0):
     """The laws of a machine on which two nodes load the same library."""
     loads = Loading(("a library that no machine has",), memory, seconds)
-    return {path: Law((1e6, 1.0, 1.0, 0.0), (0.5, 0.0), loads=loads) for path in (blur.path, "optics.psf")}
+    return {
+        path: Law((1e6, 1.0, 1.0, 0.0), (0.5, 0.0), loads=loads)
+        for path in (blur.path, "optics.psf")
+    }
 
 
 def test_a_library_costs_the_first_step_that_loads_it_and_counts_once_in_the_program(monkeypatch):
-    for module in ("cost_model", "cost_laws"):
-        monkeypatch.setattr(f"neusee.workflows.engine.{module}.shipped", loading)
+    monkeypatch.setattr("neusee.workflows.engine.cost_model.shipped", loading)
     names = {"a": blur, "b": optics.psf, "c": blur}
     costs = Costs([], dict.fromkeys(names, SMALL))
     found = costs.in_turn(((name, step(name, each), None) for name, each in names.items()), ["cpu"])
     assert [found[name].seconds["cpu"] for name in names] == [2.5, 0.5, 0.5]
     assert found["a"].peak - found["b"].peak == 1e8
-    assert found["a"].work == found["b"].work, "the program holds the library, so no schedule counts it again"
+    assert found["a"].work == found["b"].work, (
+        "the program holds the library, so no schedule counts it again"
+    )
     assert libraries_of([blur.path, "optics.psf", "sensor.crop"]) == 1e8
     monkeypatch.setitem(sys.modules, "a library that no machine has", sys)
     assert libraries_of([blur.path, "optics.psf"]) == 0.0
@@ -185,13 +229,18 @@ def test_a_library_costs_the_first_step_that_loads_it_and_counts_once_in_the_pro
 
 def test_what_a_step_took_with_its_library_is_not_charged_for_the_library_again(monkeypatch):
     monkeypatch.setattr("neusee.workflows.engine.cost_model.shipped", loading)
-    found = Costs([row("a", 2.6, peak=3e8, of=SMALL)], {"a": SMALL}).in_turn([("a", step("a"), None)], ["cpu"])
+    found = Costs([row("a", 2.6, peak=3e8, of=SMALL)], {"a": SMALL}).in_turn(
+        [("a", step("a"), None)], ["cpu"]
+    )
     assert found["a"].seconds["cpu"] == 2.6
     assert found["a"].peak == 3e8
 
 
 def test_the_range_of_a_step_that_ran_is_that_of_its_runs_and_of_a_law_that_of_the_law():
-    rows = [row("a", seconds, peak=peak, of=SMALL) for seconds, peak in ((1.0, 3e8), (2.0, 4e8), (3.0, 6e8))]
+    rows = [
+        row("a", seconds, peak=peak, of=SMALL)
+        for seconds, peak in ((1.0, 3e8), (2.0, 4e8), (3.0, 6e8))
+    ]
     memory, time = Costs(rows, {"a": SMALL}).of(step("a"), ["cpu"]).spread
     assert time == (0.5, 1.5)
     assert memory == (0.75, 1.5)
@@ -204,7 +253,10 @@ def test_the_result_of_a_step_without_a_rule_is_no_larger_than_the_largest_known
     at = Location("t.yaml", 1, 1)
     known = Step("known", optics.stop, {"samples": 8, "pitch": 1e-5, "diameter": 8e-5}, {}, at, {})
     flat = Step("flat", doe.flat, {}, {"stop": "known"}, at, {})
-    own = [Step(f"own{i}", blur, {}, {"x": "flat" if i == 0 else f"own{i - 1}"}, at, {}) for i in range(5)]
+    own = [
+        Step(f"own{i}", blur, {}, {"x": "flat" if i == 0 else f"own{i - 1}"}, at, {})
+        for i in range(5)
+    ]
     recipe = Recipe("t", "", 1, 0.0, ("own4",), {s.name: s for s in (known, flat, *own)})
     sizes = sizes_of(recipe, list(recipe.steps))
     assert not any(sizes[s.name].known for s in own)
@@ -214,12 +266,16 @@ def test_the_result_of_a_step_without_a_rule_is_no_larger_than_the_largest_known
 
 
 def test_a_guess_needs_the_most_that_a_shipped_node_needs_for_its_size():
-    """The ratio of peak to inputs and result, of the nodes that declare no further work, bounds what a guess needs."""
+    """The ratio of peak to inputs and result, of the nodes that declare no further work, bounds
+    what a guess needs.
+    """
     for path in shipped():
         importlib.import_module(f"neusee.nodes.{path.partition('.')[0]}")  # registers the nodes
     works = {each.path for each in registered_nodes() if each.hooks.work is not None}
     ratios = {
-        path: law.peak(LARGE) / (LARGE.inputs + LARGE.result) for path, law in shipped().items() if path not in works
+        path: law.peak(LARGE) / (LARGE.inputs + LARGE.result)
+        for path, law in shipped().items()
+        if path not in works
     }
     bound = guess().peak(LARGE) / (LARGE.inputs + LARGE.result)
     assert max(ratios.values()) < bound < 3 * max(ratios.values())
@@ -228,10 +284,18 @@ def test_a_guess_needs_the_most_that_a_shipped_node_needs_for_its_size():
 def test_costs_follow_the_journal_and_read_each_line_once(tmp_path, monkeypatch):
     store, seen = Store(tmp_path), []
     learn = Costs.learn
-    monkeypatch.setattr(Costs, "learn", lambda self, rows: (seen.append(len(rows)), learn(self, rows))[1])
+    monkeypatch.setattr(
+        Costs, "learn", lambda self, rows: (seen.append(len(rows)), learn(self, rows))[1]
+    )
 
     def put(n, seconds):
-        about = {"step": "a", "recipe": "r", "origin": {"node": "toy.a"}, "seconds": seconds, "device": "cpu"}
+        about = {
+            "step": "a",
+            "recipe": "r",
+            "origin": {"node": "toy.a"},
+            "seconds": seconds,
+            "device": "cpu",
+        }
         date = f"2026-11-26 00:00:{n:02d}"
         store.put(f"{n:032x}", 1.0, {**about, "bytes": 1, "peak": None, "size": None, "date": date})
 
@@ -248,6 +312,8 @@ def test_costs_follow_the_journal_and_read_each_line_once(tmp_path, monkeypatch)
 
 def test_only_the_newest_runs_of_a_step_are_kept():
     costs = Costs([row("a", float(n), of=SMALL) for n in range(1000)])
-    assert {len(rows) for rows in (*costs._nodes.values(), *costs._steps.values())} <= set(range(_MOST, 2 * _MOST + 1))
+    assert {len(rows) for rows in (*costs._nodes.values(), *costs._steps.values())} <= set(
+        range(_MOST, 2 * _MOST + 1)
+    )
     newest = Costs([row("a", float(n), of=SMALL) for n in range(900, 1000)], {"a": SMALL})
     assert costs.with_sizes({"a": SMALL}).of(step("a"), ["cpu"]) == newest.of(step("a"), ["cpu"])

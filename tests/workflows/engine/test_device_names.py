@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neusee.nodes import node
-from neusee.workflows.engine.device_names import check_devices
+from neusee.workflows.engine.local_executor import check_devices
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -25,7 +25,10 @@ def one() -> torch.Tensor:
 
 
 REFUSED = [
-    ("cpu,cpu", "cpu,cpu: names a device twice (cpu): name each device once; cpu:0,cpu:1 are two lanes"),
+    (
+        "cpu,cpu",
+        "cpu,cpu: names a device twice (cpu): name each device once; cpu:0,cpu:1 are two lanes",
+    ),
     ("cpu,cpu:0", "names a device twice (cpu and cpu:0 are one device)"),
     ("meta", "meta: a tensor there has a shape and no values: write cpu or cuda"),
     ("gpu", "gpu: Expected one of cpu, cuda"),
@@ -35,7 +38,9 @@ REFUSED = [
 
 @pytest.mark.parametrize(("device", "said"), REFUSED)
 def test_a_device_that_cannot_compute_is_refused_before_any_step(tmp_path, device, said):
-    recipe = Recipe("r", "", 1, 0.0, ("one",), {"one": Step("one", one, {}, {}, Location("a.yaml", 1, 1), {})})
+    recipe = Recipe(
+        "r", "", 1, 0.0, ("one",), {"one": Step("one", one, {}, {}, Location("a.yaml", 1, 1), {})}
+    )
     RAN.clear()
     with pytest.raises(ValueError, match=re.escape(said)):
         run(recipe, Store(tmp_path), device=device)

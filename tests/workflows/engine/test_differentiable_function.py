@@ -1,4 +1,6 @@
-"""A recipe as a function: the same bits as a run, with gradients, computing no more than it must."""
+"""A recipe as a function: the same bits as a run, with gradients, computing no more than it
+must.
+"""
 
 import math
 from dataclasses import replace
@@ -75,7 +77,9 @@ def store(tmp_path):
 
 
 def step(name, what, wires=None, **params):
-    return Step(name, what, dict(what.params(**params)), wires or {}, Location("test.yaml", 1, 1), {})
+    return Step(
+        name, what, dict(what.params(**params)), wires or {}, Location("test.yaml", 1, 1), {}
+    )
 
 
 def camera(tolerance=0.0, **params):
@@ -159,7 +163,9 @@ def test_a_given_step_may_itself_be_an_output(store):
 
 def test_noise_is_the_same_at_every_call(store):
     function = as_function(camera(), "image[a].gain", store=store)
-    assert torch.equal(function({"image[a].gain": 2.0})["loss"], function({"image[a].gain": 2.0})["loss"])
+    assert torch.equal(
+        function({"image[a].gain": 2.0})["loss"], function({"image[a].gain": 2.0})["loss"]
+    )
 
 
 @pytest.mark.parametrize("gain", [1e-6, 1.0, 1e6])
@@ -177,7 +183,9 @@ def test_the_ladder_stands_as_in_a_run(store, gain):
 
 
 def test_a_free_bound_parameter_moves_the_verdict(store):
-    function = as_function(camera(tolerance=1e-3), "noise[a].sigma", store=store, outputs=("noise[a]",))
+    function = as_function(
+        camera(tolerance=1e-3), "noise[a].sigma", store=store, outputs=("noise[a]",)
+    )
     clean, noisy = (function({"noise[a].sigma": number(s)})["noise[a]"] for s in (0.0, 1e3))
     assert CALLS.count("noise") == 1
     assert not torch.equal(clean, noisy)
@@ -206,17 +214,20 @@ def test_theta_must_be_what_was_asked_for(store, theta):
 def test_an_error_names_the_step(store):
     function = as_function(camera(), "height", store=store)
     with pytest.raises(
-        RunError, match=r"image\[a\] .*RuntimeError(?s:.*)inputs: scene \(64,\) float64, psf \(63,\) float64"
+        RunError,
+        match=r"image\[a\] .*RuntimeError(?s:.*)inputs: scene \(64,\) float64, psf \(63,\) float64",
     ):
         function({"height": torch.ones(63, dtype=torch.float64)})
 
 
 def test_a_chain_of_ten_thousand_steps(store):
-    steps = [step("s0", height, n=4)] + [step(f"s{i}", psf, {"height": f"s{i - 1}"}) for i in range(1, 10_000)]
+    steps = [step("s0", height, n=4)] + [
+        step(f"s{i}", psf, {"height": f"s{i - 1}"}) for i in range(1, 10_000)
+    ]
     recipe = Recipe("test", "", 1, 0.0, ("s9999",), {s.name: s for s in steps})
-    assert as_function(recipe, "s9990", store=store)({"s9990": torch.zeros(4, dtype=torch.float64)})["s9999"].shape == (
-        4,
-    )
+    assert as_function(recipe, "s9990", store=store)(
+        {"s9990": torch.zeros(4, dtype=torch.float64)}
+    )["s9999"].shape == (4,)
     assert CALLS == ["psf"] * 9
 
 
@@ -230,14 +241,18 @@ def test_the_ends_of_a_picture_are_those_of_its_facts(values):
 
 
 def test_torch_func_follows_it_backwards_as_autograd_does(store):
-    """A given value is a view of a larger tensor: it is settled, although what `torch.func` follows owns no memory."""
+    """A given value is a view of a larger tensor: it is settled, although what `torch.func`
+    follows owns no memory.
+    """
     function = as_function(camera(), "height", outputs=["loss"], store=store)
     given = torch.linspace(-1.0, 1.0, 128, dtype=torch.float64)[::2]
     found, pull = torch.func.vjp(lambda x: function({"height": x})["loss"], given)
     leaf = given.clone().requires_grad_()
     expected = function({"height": leaf})["loss"]
     assert torch.equal(found, expected.detach())
-    torch.testing.assert_close(pull(torch.ones_like(found))[0], torch.autograd.grad(expected, leaf)[0])
+    torch.testing.assert_close(
+        pull(torch.ones_like(found))[0], torch.autograd.grad(expected, leaf)[0]
+    )
 
 
 def test_torch_func_follows_a_parameter(store):
@@ -248,10 +263,13 @@ def test_torch_func_follows_a_parameter(store):
 
     gain = torch.tensor(2.0, dtype=torch.float64)
     leaf = gain.clone().requires_grad_()
-    torch.testing.assert_close(torch.func.grad(loss)(gain), torch.autograd.grad(loss(leaf), leaf)[0])
+    torch.testing.assert_close(
+        torch.func.grad(loss)(gain), torch.autograd.grad(loss(leaf), leaf)[0]
+    )
 
 
-WIDE = [*SMALL[:-1], "sensor.shape=[48, 48]", "scene.shape=[56, 56]"]  # too wide for an exact restoration
+# too wide for an exact restoration
+WIDE = [*SMALL[:-1], "sensor.shape=[48, 48]", "scene.shape=[56, 56]"]
 
 
 def camera_and_height(store, output, exact=False):
@@ -259,16 +277,22 @@ def camera_and_height(store, output, exact=False):
     recipe = load("first_light", WIDE if output == "restored" else SMALL, doe="axicon")
     recipe = replace(recipe, exact=exact)
     function = as_function(recipe, "fabricated", outputs=[output], store=store)
-    return lambda height: function({"fabricated": height})[output], run(recipe, store, ["fabricated"])["fabricated"]
+    return lambda height: function({"fabricated": height})[output], run(
+        recipe, store, ["fabricated"]
+    )["fabricated"]
 
 
-@pytest.mark.filterwarnings("ignore:`torch.jit.script`", "ignore:There is a performance drop")  # of torch
+# of torch
+@pytest.mark.filterwarnings("ignore:`torch.jit.script`", "ignore:There is a performance drop")
 @pytest.mark.parametrize("output", ["lsr[mask]", "raw[mask]", "restored"])
 def test_torch_func_follows_the_camera_backwards_and_forwards(output, store):
     result, height = camera_and_height(store, output)
     rng = torch.Generator().manual_seed(1)
     found, pull = torch.func.vjp(result, height)
-    weight, push = torch.rand(found.shape, dtype=found.dtype, generator=rng), 1e-9 * torch.rand(96, 96, generator=rng)
+    weight, push = (
+        torch.rand(found.shape, dtype=found.dtype, generator=rng),
+        1e-9 * torch.rand(96, 96, generator=rng),
+    )
     leaf = height.clone().requires_grad_()
     expected = result(leaf)
     assert torch.equal(found, expected.detach())
@@ -282,17 +306,21 @@ def test_torch_func_follows_the_camera_backwards_and_forwards(output, store):
     assert off < 1e-2 * abs(float(terms[1].sum()))
 
 
-@pytest.mark.filterwarnings("ignore:`torch.jit.script`", "ignore:There is a performance drop")  # of torch
+# of torch
+@pytest.mark.filterwarnings("ignore:`torch.jit.script`", "ignore:There is a performance drop")
 @pytest.mark.parametrize("output", ["lsr[mask]", "raw[mask]"])
 def test_torch_func_follows_the_exact_camera_for_several_masks(output, store):
     result, height = camera_and_height(store, output, exact=True)
     masks = torch.stack([height, 1.1 * height, 0 * height])
     found = torch.func.vmap(result, randomness="same")(masks)
     assert not torch.equal(found[0], found[1])
-    torch.testing.assert_close(found, torch.stack([result(mask) for mask in masks]), rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        found, torch.stack([result(mask) for mask in masks]), rtol=1e-6, atol=0
+    )
 
 
-@pytest.mark.filterwarnings("ignore:`torch.jit.script`", "ignore:There is a performance drop")  # of torch
+# of torch
+@pytest.mark.filterwarnings("ignore:`torch.jit.script`", "ignore:There is a performance drop")
 def test_a_psf_has_no_second_derivative_in_any_mode(store):
     result, height = camera_and_height(store, "lsr[mask]")
     push = torch.ones_like(height)
@@ -305,21 +333,36 @@ def test_a_psf_has_no_second_derivative_in_any_mode(store):
         torch.func.grad(lambda x: slope(x).sum())(height)
 
 
-@pytest.mark.filterwarnings("ignore:`torch.jit.script`", "ignore:There is a performance drop")  # of torch
+# of torch
+@pytest.mark.filterwarnings("ignore:`torch.jit.script`", "ignore:There is a performance drop")
 @pytest.mark.parametrize(
     ("output", "exact", "step", "way"),
     [
         ("raw[mask]", False, r"image\[mask\]", "or take dataclasses.replace"),
-        ("restored", True, "deconvolved", "call the function for one tensor after another; recipes/guide"),
+        (
+            "restored",
+            True,
+            "deconvolved",
+            "call the function for one tensor after another; recipes/guide",
+        ),
     ],
 )
-def test_what_does_not_pass_a_transform_is_told_with_its_place_and_a_way(output, exact, step, way, store):
+def test_what_does_not_pass_a_transform_is_told_with_its_place_and_a_way(
+    output, exact, step, way, store
+):
     result, height = camera_and_height(store, output, exact)
-    with pytest.raises(RunError, match=rf"\.yaml:\d+:\d+   {step}.*torch\.func\.vmap does not pass .*{way}"):
+    with pytest.raises(
+        RunError, match=rf"\.yaml:\d+:\d+   {step}.*torch\.func\.vmap does not pass .*{way}"
+    ):
         torch.func.vmap(result, randomness="same")(torch.stack([height, height]))
 
 
 def test_a_mistake_under_a_transform_stays_what_it_is(store):
     function = as_function(camera(), "height", outputs=["loss"], store=store)
-    with pytest.raises(RunError, match=r"(?s)^(?!.*does not pass).*inputs: scene \(64,\) float64, psf \(63,\) float64"):
-        torch.func.vjp(lambda x: function({"height": x})["loss"], torch.ones(63, dtype=torch.float64))
+    with pytest.raises(
+        RunError,
+        match=r"(?s)^(?!.*does not pass).*inputs: scene \(64,\) float64, psf \(63,\) float64",
+    ):
+        torch.func.vjp(
+            lambda x: function({"height": x})["loss"], torch.ones(63, dtype=torch.float64)
+        )

@@ -1,4 +1,6 @@
-"""Work is handed out when its inputs are ready, to the lane it was meant for or an idle one of its kind."""
+"""Work is handed out when its inputs are ready, to the lane it was meant for or an idle one of
+its kind.
+"""
 
 import pytest
 
@@ -90,7 +92,12 @@ def test_what_another_process_holds_is_looked_at_again_while_the_rest_goes_on(la
 
 def test_steps_that_only_feed_one_another_are_one_chain():
     works = [work("a"), work("b", "a"), work("c", "b"), work("d", "a"), work("e", "c", "d")]
-    assert [[w.key for w in chain] for chain in chains_of(works, True)] == [["a"], ["b", "c"], ["d"], ["e"]]
+    assert [[w.key for w in chain] for chain in chains_of(works, True)] == [
+        ["a"],
+        ["b", "c"],
+        ["d"],
+        ["e"],
+    ]
     assert ran(works, Fake({"a": "cpu"}), True) == ["a", "b", "c", "d", "e"]
 
 

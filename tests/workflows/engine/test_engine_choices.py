@@ -1,4 +1,6 @@
-"""What the engine decides for itself: what to keep, what to read, who computes, where, and whether there is room."""
+"""What the engine decides for itself: what to keep, what to read, who computes, where, and
+whether there is room.
+"""
 
 import subprocess
 import sys
@@ -11,7 +13,7 @@ import torch
 from neusee.nodes import node
 from neusee.workflows.engine import step_job
 from neusee.workflows.engine.local_executor import program_memory
-from neusee.workflows.engine.memory_use import process_memory
+from neusee.workflows.engine.machine_resources import process_memory
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -124,7 +126,11 @@ DEAR = {"a": (slow, {}, {}), "b": (add, {"x": "a"}, {}), "m": (mean, {"x": "b"},
 
 def test_what_is_quicker_to_compute_than_to_keep_is_not_kept_but_remembered(store):
     first = run(recipe("m", **CHEAP), Dear(store.root))
-    assert {name: done.kept for name, done in first.done.items()} == {"a": False, "b": False, "m": True}
+    assert {name: done.kept for name, done in first.done.items()} == {
+        "a": False,
+        "b": False,
+        "m": True,
+    }
     fresh = Store(store.root)
     assert not fresh.has(first.keys["a"])
     assert fresh.about(first.keys["a"])["facts"]["sum"] == BIG
@@ -152,8 +158,14 @@ def test_what_is_asked_for_is_always_kept(store):
     [(BIG, None, False), (4 * BIG, None, True), (BIG, 400_000_000, True)],
     ids=["small", "large", "little room"],
 )
-def test_a_small_value_that_a_verdict_alone_asks_for_is_kept_only_where_it_pays(store, n, room, kept):
-    steps = {"a": (shaped, {}, {"n": n}), "g": (glow, {"x": "a"}, {"amount": 0.5}), "m": (mean, {"x": "g"}, {})}
+def test_a_small_value_that_a_verdict_alone_asks_for_is_kept_only_where_it_pays(
+    store, n, room, kept
+):
+    steps = {
+        "a": (shaped, {}, {"n": n}),
+        "g": (glow, {"x": "a"}, {"amount": 0.5}),
+        "m": (mean, {"x": "g"}, {}),
+    }
     first = run(recipe("m", **steps), Dear(store.root), memory=room and process_memory() + room)
     assert first.done["g"].state == "run"
     assert CALLS == ["make", "mean"]  # the value stays in memory between verdict and use
@@ -199,10 +211,15 @@ def test_a_stored_value_is_computed_again_where_reading_takes_longer(store):
     assert result.values["m"] == 4
     assert states(result) == {"a": "run", "b": "run", "m": "run"}
     CALLS.clear()
-    assert states(run(recipe("m", **changed, n=(mean, {"x": "b"}, {})), Store(store.root)))["m"] == "cached"
+    assert (
+        states(run(recipe("m", **changed, n=(mean, {"x": "b"}, {})), Store(store.root)))["m"]
+        == "cached"
+    )
 
 
-def test_branches_run_side_by_side_on_two_lanes_and_give_the_same_bits(store, tmp_path, monkeypatch):
+def test_branches_run_side_by_side_on_two_lanes_and_give_the_same_bits(
+    store, tmp_path, monkeypatch
+):
     steps = {
         "a": (slow, {}, {"seconds": 0.05}),
         "b": (slow, {}, {"seconds": 0.051}),
@@ -230,7 +247,11 @@ def test_a_failure_on_one_lane_keeps_what_the_other_finished(store):
     def broken(x=None):
         raise ValueError("no light")
 
-    steps = {"a": (slow, {}, {}), "b": (add, {"x": "a"}, {"k": "no number"}), "c": (slow, {}, {"seconds": 0.5})}
+    steps = {
+        "a": (slow, {}, {}),
+        "b": (add, {"x": "a"}, {"k": "no number"}),
+        "c": (slow, {}, {"seconds": 0.5}),
+    }
     with pytest.raises(RunError, match="b \\("):
         run(recipe("b c", **steps), store, device="cpu:0,cpu:1")
     CALLS.clear()
@@ -239,7 +260,11 @@ def test_a_failure_on_one_lane_keeps_what_the_other_finished(store):
 
 
 def test_memory_that_cannot_do_is_refused_before_anything_runs(store):
-    steps = {"a": (slow, {}, {"seconds": 0.0}), "b": (add, {"x": "a"}, {}), "m": (mean, {"x": "b"}, {})}
+    steps = {
+        "a": (slow, {}, {"seconds": 0.0}),
+        "b": (add, {"x": "a"}, {}),
+        "m": (mean, {"x": "b"}, {}),
+    }
     run(recipe("m", **steps), store)
     CALLS.clear()
     other = {**steps, "a": (slow, {}, {"seconds": 0.001})}

@@ -1,4 +1,6 @@
-"""Runs on a cache that somebody else changed: the same values come out, and the run after it finds them again."""
+"""Runs on a cache that somebody else changed: the same values come out, and the run after it
+finds them again.
+"""
 
 import random
 import signal
@@ -9,12 +11,12 @@ import torch
 
 from neusee.nodes import node
 from neusee.nodes.values import Psf
-from neusee.workflows.engine.dask_worker import kinds_of, work_here
+from neusee.workflows.engine.dask_executor import kinds_of, work_here
 from neusee.workflows.engine.runner import run
 from neusee.workflows.engine.step_job import StepJob
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.keys.seal import seal_record, signature, unseal_record
+from neusee.workflows.keys.sealed_files import seal_record, signature, unseal_record
 from neusee.workflows.store.result_store import Store
 
 CALLS: list[str] = []
@@ -68,15 +70,24 @@ TRUTH = torch.arange(20_000.0).reshape(2, 100, 100).mul(PEAK).sum(0).double()
 FORGERIES = {
     "type": lambda about: {"layout": {"class": "os:system", "items": [{"value": "true"}]}},
     "function": lambda about: {
-        "layout": {"class": "neusee.nodes._node:_imported", "items": [{"value": "os"}, {"value": "system"}]}
+        "layout": {
+            "class": "neusee.nodes._node:_imported",
+            "items": [{"value": "os"}, {"value": "system"}],
+        }
     },
     "other kind of value": lambda about: {"layout": {"value": "text"}},
     "other type": lambda about: {
         "layout": {"class": "neusee.nodes.values:Dirt", "items": [{"tensor": 0}] * 2},
     },
     "kind of layout": lambda about: {"layout": {"quantised": {"bits": 4}}},
-    "no facts": lambda about: dict.fromkeys(("checks", "seconds", "bytes", "date", "device", "peak")),
-    "strange facts": lambda about: {"facts": {"shape": [1], "x": 7}, "error": [1.0, 2.0], "versions": {}},
+    "no facts": lambda about: dict.fromkeys(
+        ("checks", "seconds", "bytes", "date", "device", "peak")
+    ),
+    "strange facts": lambda about: {
+        "facts": {"shape": [1], "x": 7},
+        "error": [1.0, 2.0],
+        "versions": {},
+    },
     "other origin": lambda about: {"origin": {"node": None}},
     "huge peak": lambda about: {"peak": 1e30},
     "text": lambda about: {"seconds": "long", "bytes": "many"},
@@ -116,7 +127,11 @@ def test_a_run_on_a_forged_journal_plans_as_if_it_were_not_there(tmp_path):
     with (tmp_path / "journal.jsonl").open("ab") as file:
         for row in rows:
             for _ in range(20):
-                bad = {rng.choice(["peak", "bytes", "seconds"]): rng.choice([1e30, "x", -5, None, [], float("nan")])}
+                bad = {
+                    rng.choice(["peak", "bytes", "seconds"]): rng.choice(
+                        [1e30, "x", -5, None, [], float("nan")]
+                    )
+                }
                 file.write(b"\n" + seal_record("journal", {**row, **bad}))
     for path in tmp_path.glob("??/*.json"):
         path.unlink()
@@ -137,7 +152,7 @@ def test_a_secret_that_is_set_later_is_no_failure(tmp_path, monkeypatch):
     assert CALLS == []
 
 
-# --- on a worker ------------------------------------------------------------------------------------------------------
+# --- on a worker ----------------------------------------------------------------------------------
 
 
 def test_a_worker_knows_the_type_of_each_input():
@@ -145,7 +160,9 @@ def test_a_worker_knows_the_type_of_each_input():
     assert kinds_of(work) == {"p": Psf, "a": torch.Tensor, "b": torch.Tensor}
 
 
-@pytest.mark.parametrize(("caller", "worker", "same"), [("", "one", False), ("one", "", False), ("one", "two", False)])
+@pytest.mark.parametrize(
+    ("caller", "worker", "same"), [("", "one", False), ("one", "", False), ("one", "two", False)]
+)
 def test_a_worker_with_another_secret_says_so(tmp_path, monkeypatch, caller, worker, same):
     monkeypatch.setenv("NEUSEE_CACHE_SECRET", caller)
     signed = signature("worker", "", b"")

@@ -1,4 +1,6 @@
-"""On an accelerator: the same physics, steps on both devices, and memory that was measured there."""
+"""On an accelerator: the same physics, steps on both devices, and memory that was measured
+there.
+"""
 
 import pytest
 import torch
@@ -31,7 +33,9 @@ def test_the_optics_agree_with_those_of_the_cpu(tmp_path):
     outputs = ("psf[mask]", "image[mask]", "lsr[mask]")
     there = run(small(), Store(tmp_path / "gpu"), outputs, device="cuda:0")
     here = run(small(), Store(tmp_path / "cpu"), outputs)
-    assert there.keys["image[mask]"] == here.keys["image[mask]"], "the device is no part of a key without noise"
+    assert there.keys["image[mask]"] == here.keys["image[mask]"], (
+        "the device is no part of a key without noise"
+    )
     for name in ("psf[mask]", "image[mask]"):
         a, b = there.values[name], here.values[name]
         a, b = (a.intensity.cpu(), b.intensity) if name.startswith("psf") else (a.cpu(), b)
@@ -50,14 +54,18 @@ def test_a_cpu_beside_the_accelerator_gives_what_the_accelerator_gives(tmp_path)
 
 
 def test_a_step_goes_where_its_hint_says(tmp_path):
-    result = run(small("steps.image.device=cpu"), Store(tmp_path), ("image[mask]",), device="cuda:0,cpu")
+    result = run(
+        small("steps.image.device=cpu"), Store(tmp_path), ("image[mask]",), device="cuda:0,cpu"
+    )
     assert result.done["image[mask]"].device == "cpu"
     assert result.done["psf[mask]"].device == "cuda:0"
 
 
 def test_every_output_of_a_whole_recipe_is_computed_there(tmp_path):
     """Also the numbers at its end, such as the brightest pixel, which once mixed both devices."""
-    words = [word for word in SMALL if not word.startswith(("restore", "steps.restored", "outputs"))]
+    words = [
+        word for word in SMALL if not word.startswith(("restore", "steps.restored", "outputs"))
+    ]
     there = run(load("first_light", words), Store(tmp_path / "gpu"), device="cuda:0")
     here = run(load("first_light", words), Store(tmp_path / "cpu"))
     assert there.values.keys() == here.values.keys()

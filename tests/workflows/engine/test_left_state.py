@@ -1,6 +1,8 @@
-"""A step that leaves something in a module, where another step reads it: both are computed in each run, and it is said.
+"""A step that leaves something in a module, where another step reads it: both are computed in each
+run, and it is said.
 
-Keys of own steps also have the names of files and the order of mappings, which their nodes may read.
+Keys of own steps also have the names of files and the order of mappings, which their nodes may
+read.
 """
 
 import sys
@@ -12,7 +14,7 @@ import torch
 from neusee.nodes import own_modules
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
-from neusee.workflows.keys import tainted_code
+from neusee.workflows.keys import user_code as tainted_code
 from neusee.workflows.keys.cache_key import is_private
 from neusee.workflows.store.result_store import Store
 
@@ -67,13 +69,18 @@ TOLD = {
 HONEST = {
     "a memo of a function": ("@lru_cache\ndef memo(x):\n    return 2 * x", "memo(by)", "memo(1.0)"),
     "a constant that is made at the first call": (
-        "TABLE = None\n\n\ndef table():\n    global TABLE\n    if TABLE is None:\n        TABLE = np.ones(3)\n"
-        "    return TABLE",
+        (
+            "TABLE = None\n\n\ndef table():\n    global TABLE\n    if TABLE is None:\n        TABLE"
+            " = np.ones(3)\n    return TABLE"
+        ),
         "table()",
         "float(table()[0])",
     ),
     "a cached property": (
-        "class Lens:\n    @cached_property\n    def gain(self):\n        return 2.0\n\n\nLENS = Lens()",
+        (
+            "class Lens:\n    @cached_property\n    def gain(self):\n        return 2.0\n\n\nLENS ="
+            " Lens()"
+        ),
         "LENS.gain",
         "LENS.gain",
     ),
@@ -113,8 +120,9 @@ def lab(tmp_path, request, monkeypatch):
         (tmp_path / f"{name}.py").write_text(textwrap.dedent(code))
         (tmp_path / f"{names[1]}.py").write_text(HELPER)
         (tmp_path / "told.yaml").write_text(
-            f"nodes: [./{name}.py]\nseed: 1\ntolerance: 1e-3\noutputs: [one, two]\nsteps:\n"
-            f"  one: {{node: {name}.first, with: {{by: {by}}}}}\n  two: {{node: {name}.third, with: {{by: 1.0}}}}\n"
+            f"nodes: [./{name}.py]\nseed: 1\ntolerance: 1e-3\noutputs: [one, two]\nsteps:\n  one:"
+            f" {{node: {name}.first, with: {{by: {by}}}}}\n  two: {{node: {name}.third, with: {{by:"
+            " 1.0}}\n"
         )
         result = run(load("told.yaml", [], tmp_path), Store(tmp_path / "cache"))
         return float(result["two"][0]), result
@@ -140,7 +148,9 @@ def test_what_no_argument_decides_is_stored(lab, kind):
 
 def test_a_memo_that_is_declared_is_stored_and_one_that_is_not_is_named(lab):
     memo = ("SEEN = {}", "SEEN[by] = 2 * by", "float(len(SEEN) > -1)")
-    with pytest.warns(UserWarning, match=r"one .*leaves.* told_\d+.SEEN, which .*\"unaffected:SEEN\""):
+    with pytest.warns(
+        UserWarning, match=r"one .*leaves.* told_\d+.SEEN, which .*\"unaffected:SEEN\""
+    ):
         lab(memo)
     _, result = lab(memo, declared="depends=['unaffected:SEEN']")
     assert not any(map(is_private, result.keys.values()))
@@ -189,7 +199,11 @@ def test_the_name_of_a_file_counts_for_own_nodes(own, tmp_path, kind):
     for number in (2, 3):
         (tmp_path / "link.txt").unlink(missing_ok=True)
         (tmp_path / "link.txt").symlink_to(f"dark_{number}.txt")
-        given = {"name": f"dark_{number}.txt", "folder": f"run_{number}/dark.txt", "link": "link.txt"}[kind]
+        given = {
+            "name": f"dark_{number}.txt",
+            "folder": f"run_{number}/dark.txt",
+            "link": "link.txt",
+        }[kind]
         parts = ("file: Path", FILES[kind], f"file: {given}")
         assert own(*parts) == (number, "run")
         assert own(*parts) == (number, "cached")
@@ -204,7 +218,7 @@ def test_the_order_of_a_mapping_counts_for_own_nodes(own):
 
 def test_the_folder_of_the_recipe_does_not_count(own, tmp_path):
     """The key has the path below the folder of the recipe."""
-    from neusee.workflows.keys.written_params import written
+    from neusee.workflows.keys.cache_key import written
 
     (tmp_path / "dark.txt").write_text("1")
     own("file: Path", "1", "file: dark.txt")

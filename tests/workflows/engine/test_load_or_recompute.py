@@ -12,9 +12,13 @@ INF = float("inf")
 
 @st.composite
 def graphs(draw):
-    """A few values, each with its sources, the price to load it (inf: not stored) and to compute it."""
+    """A few values, each with its sources, the price to load it (inf: not stored) and to compute
+    it.
+    """
     n = draw(st.integers(1, 6))
-    sources = {i: tuple(draw(st.sets(st.integers(0, i - 1), max_size=3)) if i else ()) for i in range(n)}
+    sources = {
+        i: tuple(draw(st.sets(st.integers(0, i - 1), max_size=3)) if i else ()) for i in range(n)
+    }
     prices = st.floats(0.001, 10.0)
     load = {i: draw(st.one_of(st.just(INF), prices)) for i in range(n)}
     compute = {i: draw(prices) for i in range(n)}
@@ -23,7 +27,9 @@ def graphs(draw):
 
 
 def price(targets, sources, load, compute, computed):
-    """What it costs to compute ``computed`` and to load what else is needed; inf where that cannot be."""
+    """What it costs to compute ``computed`` and to load what else is needed; inf where that
+    cannot be.
+    """
     need = set(targets).union(*(sources[i] for i in computed))
     return sum(compute[i] for i in computed) + sum(load[i] for i in need - computed)
 
@@ -43,15 +49,21 @@ def walked(targets, sources, load, again):
 @settings(max_examples=300, deadline=None)
 def test_the_choice_is_the_cheapest_of_all(graph):
     targets, sources, load, compute = graph
-    again = cheaper_to_recompute(targets, sources.__getitem__, load.__getitem__, compute.__getitem__)
+    again = cheaper_to_recompute(
+        targets, sources.__getitem__, load.__getitem__, compute.__getitem__
+    )
     ours = price(targets, sources, load, compute, walked(targets, sources, load, again))
-    subsets = itertools.chain.from_iterable(itertools.combinations(sources, k) for k in range(len(sources) + 1))
+    subsets = itertools.chain.from_iterable(
+        itertools.combinations(sources, k) for k in range(len(sources) + 1)
+    )
     best = min(price(targets, sources, load, compute, set(s)) for s in subsets)
     assert ours <= best * (1 + 1e-6) + 1e-6
 
 
 def test_what_is_not_stored_is_never_named():
-    again = cheaper_to_recompute([1], {0: (), 1: (0,)}.__getitem__, {0: INF, 1: 5.0}.__getitem__, lambda i: 1.0)
+    again = cheaper_to_recompute(
+        [1], {0: (), 1: (0,)}.__getitem__, {0: INF, 1: 5.0}.__getitem__, lambda i: 1.0
+    )
     assert again == {1}
 
 

@@ -9,10 +9,16 @@ import pytest
 import torch
 
 from neusee.nodes import node
-from neusee.workflows.engine import memory_use, memory_watch
+from neusee.workflows.engine import machine_resources as memory_use
+from neusee.workflows.engine import memory_limits as memory_watch
 from neusee.workflows.engine.local_executor import program_memory
-from neusee.workflows.engine.memory_use import PeakMemory, free_memory, process_memory, process_peak
-from neusee.workflows.engine.memory_watch import MemoryLimit, guarded, limited
+from neusee.workflows.engine.machine_resources import (
+    PeakMemory,
+    free_memory,
+    process_memory,
+    process_peak,
+)
+from neusee.workflows.engine.memory_limits import MemoryLimit, guarded, limited
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -35,7 +41,9 @@ def _():
 
 @node()
 def hoard(x: torch.Tensor) -> torch.Tensor:
-    """Take far more memory than the rule of its shape tells, one piece after each look at it, until told to stop."""
+    """Take far more memory than the rule of its shape tells, one piece after each look at it,
+    until told to stop.
+    """
     held = []
     for _ in range(150):
         held.append(torch.ones(5_000_000))
@@ -55,18 +63,23 @@ def recipe():
     return Recipe("t", "", 1, 0.0, ("b",), steps)
 
 
-def test_a_step_that_takes_more_than_the_limit_is_stopped_by_name_and_the_finished_work_stays(tmp_path, monkeypatch):
+def test_a_step_that_takes_more_than_the_limit_is_stopped_by_name_and_the_finished_work_stays(
+    tmp_path, monkeypatch
+):
     seen = []
 
     def look():
-        seen.append(process_memory())  # not the peak of the process: an earlier test may have held more
+        # not the peak of the process: an earlier test may have held more
+        seen.append(process_memory())
         LOOKED.set()
         return seen[-1]
 
     monkeypatch.setattr(memory_watch, "process_memory", look)
     store = Store(tmp_path)
     limit = program_memory() + 300 * MB
-    with pytest.raises(RunError, match=r"b \(.*hoard\): MemoryLimit: the process holds .* the limit is ") as caught:
+    with pytest.raises(
+        RunError, match=r"b \(.*hoard\): MemoryLimit: the process holds .* the limit is "
+    ) as caught:
         run(recipe(), store, memory=limit)
     assert caught.value.step == "b"
     assert limit < max(seen) < limit + 100 * MB  # of pieces of 20 MB
@@ -100,8 +113,8 @@ def test_an_error_that_comes_too_late_for_the_step_is_raised_at_its_end():
 
 TRACED = """
 import sys, threading
-from neusee.workflows.engine import memory_watch
-from neusee.workflows.engine.memory_watch import MemoryLimit, guarded, limited
+from neusee.workflows.engine import memory_limits
+from neusee.workflows.engine.memory_limits import MemoryLimit, guarded, limited
 
 def step():
     return lambda: here
@@ -109,7 +122,7 @@ def step():
 try:
     with limited(1e15), guarded():
         here = threading.get_ident()
-        memory_watch._inside[here] = True  # told to stop when the step has ended
+        memory_limits._inside[here] = True  # told to stop when the step has ended
 except MemoryLimit:
     sys.settrace(lambda *_: None)
     step()
@@ -118,13 +131,18 @@ except MemoryLimit:
 
 
 def test_nothing_is_left_to_be_delivered_to_a_thread_that_was_told_too_late():
-    """What is left makes every call of CPython 3.11 slow, and hangs a program that is traced, as by a debugger."""
-    found = subprocess.run([sys.executable, "-c", TRACED], capture_output=True, text=True, check=True, timeout=300)
+    """What is left makes every call of CPython 3.11 slow, and hangs a program that is traced, as
+    by a debugger.
+    """
+    found = subprocess.run(
+        [sys.executable, "-c", TRACED], capture_output=True, text=True, check=True, timeout=300
+    )
     assert found.stdout == "went on\n"
 
 
 def test_the_peak_of_the_process_is_not_forgotten_when_a_step_is_measured():
-    block = mmap.mmap(-1, process_peak() - process_memory() + 200 * MB)  # returned at once when it is closed
+    # returned at once when it is closed
+    block = mmap.mmap(-1, process_peak() - process_memory() + 200 * MB)
     for _ in range(len(block) // MB):
         block.write(b"1" * MB)
     before = process_peak()

@@ -1,4 +1,6 @@
-"""Many runs in one process leave nothing behind: no memory, files, threads, handlers, filters or figures."""
+"""Many runs in one process leave nothing behind: no memory, files, threads, handlers, filters or
+figures.
+"""
 
 from __future__ import annotations
 
@@ -41,13 +43,13 @@ COUNTED = (
     "temporary",
 )
 NAMES = 5000  #: bytes a run of names that Python's own look-up cache keeps for a while
-LOOSE = 2e6  #: bytes that come and go in fifteen runs; their results are 4.2 MB
-WARM, RUNS, TIMES = 20, 15, 3
+LOOSE = 1.4e6  #: bytes that come and go in ten runs; their results are 2.8 MB
+WARM, RUNS, TIMES = 12, 10, 2
 
 
 @pytest.fixture(scope="module")
 def grown(tmp_path_factory):
-    """What ``growing.py`` held after the first runs, and after each further fifteen."""
+    """What ``growing.py`` held after the first runs, and after each further ten."""
     folder = tmp_path_factory.mktemp("growth")
     recipe, rest = folder / "mine.yaml", folder / "tmp"
     recipe.write_text(RECIPE)
@@ -65,7 +67,9 @@ def grown(tmp_path_factory):
 
 
 def steady(seen: list[int]) -> int:
-    """The least growth in a window: what is kept on purpose comes once, in one of them; a leak is in all."""
+    """The least growth in a window: what is kept on purpose comes once, in one of them; a leak
+    is in all.
+    """
     return min(after - before for before, after in itertools.pairwise(seen))
 
 

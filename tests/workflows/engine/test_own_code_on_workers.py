@@ -1,4 +1,6 @@
-"""Own nodes on a worker: their code has the digest of the caller, whatever else each of both has imported."""
+"""Own nodes on a worker: their code has the digest of the caller, whatever else each of both has
+imported.
+"""
 
 import os
 import pickle
@@ -43,7 +45,7 @@ WORKER = """
 import importlib, pickle, sys
 for module in sys.argv[3:]:
     importlib.import_module(module)
-from neusee.workflows.engine.dask_worker import _Here
+from neusee.workflows.engine.dask_executor import _Here
 work = pickle.load(open(sys.argv[1], "rb"))
 code = _Here(sys.argv[2], 0.0).code_for(work)
 print(work.step.node.path if code else "differs")
@@ -82,7 +84,9 @@ def on_a_worker(job, *modules):
     """Return the name of the node of a job in a new process, or that its code differs there."""
     path = f"{ROOT / '.src'}:{job.parent}"
     words = [sys.executable, "-c", WORKER, str(job), str(job.parent / "store"), *modules]
-    done = subprocess.run(words, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path})
+    done = subprocess.run(
+        words, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}
+    )
     return done.stdout.strip() or done.stderr
 
 
@@ -96,7 +100,9 @@ def test_a_worker_lacks_modules_that_the_caller_imported(lab, tmp_path):
 
 
 def test_a_worker_that_served_other_recipes_has_modules_that_the_caller_lacks(lab, tmp_path):
-    (tmp_path / "mine.yaml").write_text(RECIPE.format(nodes=f"other: {lab}.two", family="other", name="two"))
+    (tmp_path / "mine.yaml").write_text(
+        RECIPE.format(nodes=f"other: {lab}.two", family="other", name="two")
+    )
     job = job_of(load("mine.yaml", (), tmp_path), tmp_path)
     assert f"{lab}.one" not in sys.modules
     assert on_a_worker(job, f"{lab}.one", "neusee.nodes.metrics") == "other.two"
@@ -112,8 +118,8 @@ def test_a_changed_helper_is_refused(lab, tmp_path):
 def test_what_dask_draws_beside_a_step_is_no_draw_of_the_step(monkeypatch):
     sizeof = pytest.importorskip("dask.sizeof")
     monkeypatch.setattr(sizeof, "random", random)  # a worker in this process may have changed it
-    from neusee.workflows.engine.dask_worker import _chance_of_its_own
-    from neusee.workflows.observation.shared_generators import SharedGenerators
+    from neusee.workflows.engine.dask_executor import _chance_of_its_own
+    from neusee.workflows.observation.random_generators import SharedGenerators
 
     many = {number: number for number in range(1000)}
     before = SharedGenerators()

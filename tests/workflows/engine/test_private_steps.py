@@ -1,4 +1,6 @@
-"""A step that reached what its key does not cover, and all that follows from it, is used in its run alone."""
+"""A step that reached what its key does not cover, and all that follows from it, is used in its
+run alone.
+"""
 
 import sys
 import textwrap
@@ -8,7 +10,7 @@ import pytest
 from neusee.nodes import own_modules
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
-from neusee.workflows.keys import tainted_code
+from neusee.workflows.keys import user_code as tainted_code
 from neusee.workflows.keys.cache_key import is_private
 from neusee.workflows.store.result_store import Store
 
@@ -44,8 +46,13 @@ FOLLOWER = """
 
 @pytest.fixture
 def lab(tmp_path, request):
-    """A folder with two files of nodes whose names no other test has, and the recipe that uses them."""
-    names = {kind: f"{kind}_{abs(hash(request.node.nodeid)) % 10**9}" for kind in ("reader", "follower", "plain")}
+    """A folder with two files of nodes whose names no other test has, and the recipe that uses
+    them.
+    """
+    names = {
+        kind: f"{kind}_{abs(hash(request.node.nodeid)) % 10**9}"
+        for kind in ("reader", "follower", "plain")
+    }
     plain = READER[: READER.index("    @node()\n    def table")]
     texts = {"reader": READER, "follower": FOLLOWER, "plain": plain}
     for kind, name in names.items():
@@ -77,7 +84,11 @@ def test_a_tainted_step_and_all_that_follow_are_not_stored(lab):
     store = Store(lab / "cache")
     result = run(load("lab.yaml", [], lab), store)
     assert result["last"].tolist() == [40.0] * 3
-    assert [is_private(result.keys[name]) for name in ("first", "read", "last")] == [False, True, True]
+    assert [is_private(result.keys[name]) for name in ("first", "read", "last")] == [
+        False,
+        True,
+        True,
+    ]
     (lab / "dark.txt").write_text("100")
     again = run(load("lab.yaml", [], lab), store)
     assert again["last"].tolist() == [400.0] * 3
@@ -137,8 +148,9 @@ def test_what_a_module_reads_when_it_is_imported_taints_its_nodes(lab):
         .partition(".")[0]
     )
     (lab / "own.yaml").write_text(
-        f"nodes: [./{plain}.py, ./{name}.py]\nseed: 1\ntolerance: 1e-3\noutputs: [last]\nsteps:\n"
-        f"  first: {{node: {plain}.even, with: {{size: 2}}}}\n  last: {{node: {name}.amplified, from: first}}\n"
+        f"nodes: [./{plain}.py, ./{name}.py]\nseed: 1\ntolerance: 1e-3\noutputs: [last]\nsteps:\n "
+        f" first: {{node: {plain}.even, with: {{size: 2}}}}\n  last: {{node: {name}.amplified,"
+        " from: first}\n"
     )
     result = run(load("own.yaml", [], lab), Store(lab / "cache"))
     assert result["last"].tolist() == [6.0] * 3
@@ -148,7 +160,9 @@ def test_what_a_module_reads_when_it_is_imported_taints_its_nodes(lab):
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_a_step_that_a_worker_taints_is_computed_by_the_caller(lab):
-    """The worker sees what the step reads, keeps nothing of it, and the caller computes the rest."""
+    """The worker sees what the step reads, keeps nothing of it, and the caller computes the
+    rest.
+    """
     pytest.importorskip("distributed")
     from neusee.workflows.engine.dask_cluster import cluster
 
@@ -156,7 +170,11 @@ def test_a_step_that_a_worker_taints_is_computed_by_the_caller(lab):
     with cluster("dask:1", store) as executor:
         result = run(load("lab.yaml", [], lab), store, executor=executor)
     assert result["last"].tolist() == [40.0] * 3
-    assert [is_private(result.keys[name]) for name in ("first", "read", "last")] == [False, True, True]
+    assert [is_private(result.keys[name]) for name in ("first", "read", "last")] == [
+        False,
+        True,
+        True,
+    ]
     assert {key for key, _ in store.entries()} == {result.keys["first"]}
 
 
@@ -168,9 +186,15 @@ LOG = """
 
 @pytest.mark.filterwarnings("ignore:.*which its cache key does not cover")
 @pytest.mark.parametrize("declared", [True, False])
-def test_a_step_that_adds_to_a_log_is_stored_if_it_states_that_its_result_does_not_depend_on_it(lab, declared):
+def test_a_step_that_adds_to_a_log_is_stored_if_it_states_that_its_result_does_not_depend_on_it(
+    lab, declared
+):
     (file,) = lab.glob("reader_*.py")
-    free = 'depends=["dark.txt", "unaffected:log.txt"]' if declared else 'depends=["dark.txt", "unaffected:file"]'
+    free = (
+        'depends=["dark.txt", "unaffected:log.txt"]'
+        if declared
+        else 'depends=["dark.txt", "unaffected:file"]'
+    )
     text = file.read_text().replace('\n    with open(f"{name}.txt")', LOG.format(folder=lab))
     file.write_text(text.replace("@node()\ndef table", f"@node({free})\ndef table"))
     result = run(load("lab.yaml", [], lab), Store(lab / "cache"))

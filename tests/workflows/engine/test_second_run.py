@@ -1,4 +1,6 @@
-"""The second run of the default recipe: from the cache, and hardly slower than its largest import."""
+"""The second run of the default recipe: from the cache, and hardly slower than its largest
+import.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""SLURM by one command, with a stand-in that starts each job script as a process of this machine."""
+"""SLURM by one command, with a stand-in that starts each job script as a process of this
+machine.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ import time
 import pytest
 
 from neusee.workflows.cli import app
-from neusee.workflows.engine.slurm_options import SlurmOptions
+from neusee.workflows.engine.dask_cluster import SlurmOptions
 from tests.workflows.engine.cluster_processes import (
     PATIENCE,
     Command,
@@ -70,7 +72,11 @@ def slurm(lab):
 
     def start(*words: str, **environment: str) -> Command:
         path = f"{lab / 'bin'}:{os.environ['PATH']}"
-        begun.append(Command(lab, "run", "lab.yaml", *words, PATH=path, QUEUE=str(lab / "queue"), **environment))
+        begun.append(
+            Command(
+                lab, "run", "lab.yaml", *words, PATH=path, QUEUE=str(lab / "queue"), **environment
+            )
+        )
         return begun[-1]
 
     yield start
@@ -93,7 +99,14 @@ def jobs_are_gone(lab):
 
 
 def test_options_of_a_job():
-    words = ["queue=gpu", "cores=4", "memory=16 GB", "walltime=02:00:00", "wait=30", "directive=--gres=gpu:1"]
+    words = [
+        "queue=gpu",
+        "cores=4",
+        "memory=16 GB",
+        "walltime=02:00:00",
+        "wait=30",
+        "directive=--gres=gpu:1",
+    ]
     found = SlurmOptions.read([*words, "directive=--exclusive", "prologue=module load cuda"])
     assert (found.queue, found.cores, found.wait) == ("gpu", 4, 30.0)
     assert found.directive == ("--gres=gpu:1", "--exclusive")
@@ -151,7 +164,16 @@ def test_the_package_is_named_where_it_is_missing(lab, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_one_command_submits_computes_and_cancels(lab, slurm):
-    options = ("--job", "queue=gpu", "--job", "cores=1", "--job", "directive=--gres=gpu:1", "--job", "walltime=10")
+    options = (
+        "--job",
+        "queue=gpu",
+        "--job",
+        "cores=1",
+        "--job",
+        "directive=--gres=gpu:1",
+        "--job",
+        "walltime=10",
+    )
     code, text = slurm("--executor", "slurm:2", *options).end()
     assert code == 0, text
     no_page_of_errors(text)
@@ -173,9 +195,12 @@ def test_what_sbatch_refuses_is_one_sentence(lab, slurm):
 
 @pytest.mark.slow
 def test_without_a_worker_the_queue_is_told(lab, slurm):
-    code, text = slurm("--executor", "slurm:2", "--job", "wait=0.1", PENDING="1").end()
+    code, text = slurm("--executor", "slurm:2", "--job", "wait=0.02", PENDING="1").end()
     assert code == 1
-    assert "no worker came within 0.1 min; squeue says: 2 PENDING (Resources)\nfailed: 0 steps" in text
+    assert (
+        "no worker came within 0.02 min; squeue says: 2 PENDING (Resources)\nfailed: 0 steps"
+        in text
+    )
     assert len(list((lab / "queue").glob("*/cancelled"))) == 2
     no_page_of_errors(text)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from neusee.nodes import node
-from neusee.workflows.engine.step_order import shortest_first
+from neusee.workflows.engine.runner import shortest_first
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 
@@ -20,13 +20,22 @@ def one_in_order(*inputs: float) -> float:
 def recipe(**sources: str) -> Recipe:
     here = Location("small.yaml", 1, 1)
     steps = {
-        name: Step(name, one_in_order, {}, {f"i{n}": s for n, s in enumerate(read.split())}, here, {})
+        name: Step(
+            name, one_in_order, {}, {f"i{n}": s for n, s in enumerate(read.split())}, here, {}
+        )
         for name, read in sources.items()
     }
     return Recipe("small", "small", 0, 0.0, tuple(steps), steps)
 
 
-GRAPH = {"scene": "", "psf": "", "image": "scene psf", "restored": "image", "quality": "restored", "peak": "psf"}
+GRAPH = {
+    "scene": "",
+    "psf": "",
+    "image": "scene psf",
+    "restored": "image",
+    "quality": "restored",
+    "peak": "psf",
+}
 SECONDS = {"scene": 0.1, "psf": 0.5, "image": 0.3, "restored": 2.0, "quality": 0.1, "peak": 0.01}
 
 

@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 import torch
 
-from neusee.workflows.engine.memory_use import process_memory
-from neusee.workflows.engine.memory_watch import MemoryLimit, limited
+from neusee.workflows.engine.machine_resources import process_memory
+from neusee.workflows.engine.memory_limits import MemoryLimit, limited
 from neusee.workflows.engine.step_process import ProcessEnded, call_in_fork
 from neusee.workflows.keys.user_code import OwnCode
 from neusee.workflows.observation import kernel_layer
-from neusee.workflows.observation.own_call import call_observed
+from neusee.workflows.observation.observed_call import call_observed
 
 NONE = frozenset()
 OWN = OwnCode(frozenset({__name__}), frozenset({__name__}), frozenset(), frozenset())
@@ -40,7 +40,16 @@ def value_of(function, variables=NONE):
 
 def test_value_comes_back_bit_for_bit():
     shared = torch.randn(5, 7)
-    sent = Pair(shared, {"half": shared.half(), "same": shared, "c": shared + 1j, "empty": torch.empty(0, 3), "n": 1.5})
+    sent = Pair(
+        shared,
+        {
+            "half": shared.half(),
+            "same": shared,
+            "c": shared + 1j,
+            "empty": torch.empty(0, 3),
+            "n": 1.5,
+        },
+    )
     found = value_of(lambda: sent)
     assert type(found) is Pair
     assert found.words["n"] == 1.5
@@ -74,9 +83,23 @@ def test_nothing_that_the_call_changes_stays():
         sys.path.append("/nowhere")
         return len(KEPT)
 
-    before = (os.getcwd(), sys.getrecursionlimit(), getcontext().prec, np.get_printoptions(), torch.add, [*sys.path])
+    before = (
+        os.getcwd(),
+        sys.getrecursionlimit(),
+        getcontext().prec,
+        np.get_printoptions(),
+        torch.add,
+        [*sys.path],
+    )
     assert value_of(change) == 1
-    now = (os.getcwd(), sys.getrecursionlimit(), getcontext().prec, np.get_printoptions(), torch.add, [*sys.path])
+    now = (
+        os.getcwd(),
+        sys.getrecursionlimit(),
+        getcontext().prec,
+        np.get_printoptions(),
+        torch.add,
+        [*sys.path],
+    )
     assert now == before
     assert KEPT == []
     assert "NEUSEE_TEST_LEFT" not in os.environ
@@ -91,7 +114,9 @@ def test_error_has_its_kind_and_its_words():
         value_of(fail)
 
 
-@pytest.mark.parametrize(("number", "words"), [(signal.SIGKILL, "SIGKILL: killed"), (signal.SIGSEGV, "crashed")])
+@pytest.mark.parametrize(
+    ("number", "words"), [(signal.SIGKILL, "SIGKILL: killed"), (signal.SIGSEGV, "crashed")]
+)
 def test_process_that_dies_is_an_error_with_its_reason(number, words):
     with pytest.raises(ProcessEnded, match=words):
         value_of(lambda: [faulthandler.disable(), os.kill(os.getpid(), number)])
@@ -148,11 +173,13 @@ def test_memory_limit_holds_in_the_fork():
 
 
 def test_peak_memory_is_that_of_the_fork():
-    returned = call_in_fork(lambda: call_observed(lambda: float(torch.ones(1 << 25).sum()), OWN), NONE)
+    returned = call_in_fork(
+        lambda: call_observed(lambda: float(torch.ones(1 << 25).sum()), OWN), NONE
+    )
     assert returned.peak is None or returned.peak > 100e6
 
 
-# --- observed ---------------------------------------------------------------------------------------------------------
+# --- observed -------------------------------------------------------------------------------------
 
 
 @pytest.mark.skipif(bool(kernel_layer.missing()), reason="the kernel watches nothing here")
@@ -177,7 +204,7 @@ def test_fork_that_died_leaves_no_half_answer(tmp_path):
     assert found == []
 
 
-# --- variables of the environment -------------------------------------------------------------------------------------
+# --- variables of the environment -----------------------------------------------------------------
 
 
 @pytest.fixture
@@ -203,7 +230,9 @@ def library(tmp_path, monkeypatch):
 
 
 def test_library_does_not_find_a_variable_that_no_key_has(library):
-    returned = call_in_fork(lambda: [library.of_python("ASKED_FOR"), library.of_c("ASKED_FOR")], NONE)
+    returned = call_in_fork(
+        lambda: [library.of_python("ASKED_FOR"), library.of_c("ASKED_FOR")], NONE
+    )
     assert returned.value == [None, None]
     assert [*returned.asked.of_libraries] == ["ASKED_FOR"]
     assert "ASKED_FOR" not in value_of(library.all_names)
@@ -212,13 +241,21 @@ def test_library_does_not_find_a_variable_that_no_key_has(library):
 
 
 def test_library_finds_a_declared_variable_and_those_that_decide_nothing(library):
-    asked = lambda: [library.of_python("ASKED_FOR"), library.of_c("ASKED_FOR"), library.of_python("HOME")]  # noqa: E731
+    def asked():
+        return [
+            library.of_python("ASKED_FOR"),
+            library.of_c("ASKED_FOR"),
+            library.of_python("HOME"),
+        ]
+
     assert value_of(asked, frozenset({"ASKED_FOR"})) == ["5", b"5", os.environ.get("HOME")]
 
 
 def test_own_code_finds_each_variable_and_is_noted(monkeypatch):
     monkeypatch.setenv("ASKED_FOR", "5")
-    returned = call_in_fork(lambda: (os.environ["ASKED_FOR"], os.getenv("NEVER_SET"), os.getenv("HOME")), NONE)
+    returned = call_in_fork(
+        lambda: (os.environ["ASKED_FOR"], os.getenv("NEVER_SET"), os.getenv("HOME")), NONE
+    )
     assert returned.value[:2] == ("5", None)
     assert [*returned.asked.of_own_code] == ["ASKED_FOR", "NEVER_SET"]
 

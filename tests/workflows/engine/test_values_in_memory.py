@@ -1,10 +1,12 @@
-"""A value in memory goes when no step needs it, but not while it is the only copy and copies are asked for."""
+"""A value in memory goes when no step needs it, but not while it is the only copy and copies are
+asked for.
+"""
 
 from collections import Counter
 from types import SimpleNamespace
 
+from neusee.workflows.engine.execution import ValuesInMemory
 from neusee.workflows.engine.step_job import Outcome
-from neusee.workflows.engine.values_in_memory import ValuesInMemory
 
 
 def outcome(key, kept=False, waits=False):
@@ -15,7 +17,11 @@ def test_values_go_when_unused_unless_they_are_only_here():
     stored = {"written"}
     values = ValuesInMemory(SimpleNamespace(has=stored.__contains__), later={"pending"})
     values["read"] = "READ"  # from the store
-    for each in (outcome("alone"), outcome("kept", kept=True), outcome("pending", kept=True, waits=True)):
+    for each in (
+        outcome("alone"),
+        outcome("kept", kept=True),
+        outcome("pending", kept=True, waits=True),
+    ):
         values.add(each)
     for key in ("written", "unwritten"):  # of two writes in the background, the second failed
         values.add(outcome(key, kept=True, waits=True))

@@ -1,4 +1,5 @@
-"""The table of truths: what must rerun, what must not, through whole runs in processes of their own.
+"""The table of truths: what must rerun, what must not, through whole runs in processes of their
+own.
 
 Every process sees a family of nodes as it stands on disk at that time. What ran is read from a file
 to which each node's function adds its name, so that no report of the engine is taken on trust.
@@ -58,7 +59,9 @@ LAYOUT = {
         '    ran("measure")\n'
         "    return x.sum() + float(offset.read_text())\n"
     ),
-    "truth_more.py": "TWO = 2.0\nOFFSET = 1.0\nUNUSED = 5.0\n\n\ndef scaled(x):\n    return x * TWO\n",
+    "truth_more.py": (
+        "TWO = 2.0\nOFFSET = 1.0\nUNUSED = 5.0\n\n\ndef scaled(x):\n    return x * TWO\n"
+    ),
     "truth_log.py": (
         "import os\n\n__depends__ = ('unaffected:os.environ', 'unaffected:open')\n\n\n"
         "def ran(name):\n"
@@ -66,7 +69,12 @@ LAYOUT = {
         '        file.write(name + "\\n")\n'
     ),
 }
-ALL, SENSOR, NETWORK, MEASURE = "scene sensor network measure", "sensor network measure", "network measure", "measure"
+ALL, SENSOR, NETWORK, MEASURE = (
+    "scene sensor network measure",
+    "sensor network measure",
+    "network measure",
+    "measure",
+)
 NONE = ""
 #: level 2, gain 10: scene 4, sensor 41, weights 1 1 1 and bias 0: 123, offset 0.5
 TRUE = 123.5
@@ -77,7 +85,11 @@ class Lab:
 
     def __init__(self, folder: Path, server: Any) -> None:
         self.folder, self.server, self.store = folder / "nodes", server, folder / "cache"
-        self.log, self.offset, self.weights = folder / "ran.txt", folder / "offset.txt", folder / "weights.pt"
+        self.log, self.offset, self.weights = (
+            folder / "ran.txt",
+            folder / "offset.txt",
+            folder / "weights.pt",
+        )
         self.level, self.gain = 2.0, 10.0
         for name, text in LAYOUT.items():
             (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -103,7 +115,13 @@ class Lab:
             ["measure", "measure", {"offset": {"file": self.offset}}, {"x": "network"}],
         ]
         first = f"import os; os.environ['TRUTH_LOG'] = {str(self.log)!r}"
-        job = {"folder": self.folder, "family": "truth", "store": self.store, "steps": steps, "first": first}
+        job = {
+            "folder": self.folder,
+            "family": "truth",
+            "store": self.store,
+            "steps": steps,
+            "first": first,
+        }
         return {**job, "outputs": ["measure"]}
 
     def run(self, server: Any = None) -> tuple[float, str]:
@@ -140,8 +158,13 @@ def weight(value):
 
 TRUTHS = {
     # what must rerun, from the first step that it reaches
-    "body of the first node": (edit("truth/_heads", "scaled(level)", "scaled(level) + 1"), 153.5, ALL),
-    "body of the last node": (edit("truth/_ends", "x.sum()", "2 * x.sum()"), 246.5, NETWORK),  # one module, one digest
+    "body of the first node": (
+        edit("truth/_heads", "scaled(level)", "scaled(level) + 1"),
+        153.5,
+        ALL,
+    ),
+    # one module, one digest
+    "body of the last node": (edit("truth/_ends", "x.sum()", "2 * x.sum()"), 246.5, NETWORK),
     "body of a helper": (edit("truth_more", "x * TWO", "x * TWO + 1"), 153.5, ALL),
     "constant of a helper": (edit("truth_more", "TWO = 2.0", "TWO = 3.0"), 183.5, ALL),
     "constant of a node": (edit("truth_more", "OFFSET = 1.0", "OFFSET = 2.0"), 126.5, ALL),
@@ -154,10 +177,26 @@ TRUTHS = {
     # what must not
     "nothing": (lambda lab: None, TRUE, NONE),
     "comment": (edit("truth/_heads", "import torch\n", "import torch  # of course\n"), TRUE, NONE),
-    "comment in a helper": (edit("truth_more", "    return", "    # twice\n    return"), TRUE, NONE),
-    "docstring of a node": (edit("truth/_heads", "Make light.", "Make light, much of it."), TRUE, NONE),
-    "docstring of a module": (edit("truth/_heads", "Where light begins.", "It begins here."), TRUE, NONE),
-    "docstring, a new one": (edit("truth_more", "    return", '    """Twice."""\n    return'), TRUE, NONE),
+    "comment in a helper": (
+        edit("truth_more", "    return", "    # twice\n    return"),
+        TRUE,
+        NONE,
+    ),
+    "docstring of a node": (
+        edit("truth/_heads", "Make light.", "Make light, much of it."),
+        TRUE,
+        NONE,
+    ),
+    "docstring of a module": (
+        edit("truth/_heads", "Where light begins.", "It begins here."),
+        TRUE,
+        NONE,
+    ),
+    "docstring, a new one": (
+        edit("truth_more", "    return", '    """Twice."""\n    return'),
+        TRUE,
+        NONE,
+    ),
     "blank lines": (edit("truth_more", "\n\n\ndef", "\n\n\n\n\n\ndef"), TRUE, NONE),
     "layout": (edit("truth_more", "x * TWO", "(x *\n            TWO)"), TRUE, NONE),
     "source touched": (lambda lab: os.utime(lab.folder / "truth_more.py"), TRUE, NONE),
@@ -176,7 +215,10 @@ def test_what_may_have_changed_runs_again_and_nothing_else(lab, change):
 
 
 BACK_AND_FORTH = {
-    "helper": (edit("truth_more", "x * TWO", "TWO + x * TWO"), edit("truth_more", "TWO + x * TWO", "x * TWO")),
+    "helper": (
+        edit("truth_more", "x * TWO", "TWO + x * TWO"),
+        edit("truth_more", "TWO + x * TWO", "x * TWO"),
+    ),
     "constant": (
         edit("truth_more", "OFFSET = 1.0", "OFFSET = 9.0"),
         edit("truth_more", "OFFSET = 9.0", "OFFSET = 1.0"),
@@ -226,7 +268,9 @@ def test_processes_agree_on_keys_and_share_results(lab, others):
 
 
 def test_equal_tensors_of_two_processes_make_equal_keys(lab, others, tmp_path):
-    """Each process saves its own weights and makes its own keys, in a folder and a store of its own."""
+    """Each process saves its own weights and makes its own keys, in a folder and a store of its
+    own.
+    """
     found = []
     for i, (server, value) in enumerate(zip([*others, *others], (1.5, 1.5, 1.5, 2.5), strict=True)):
         folder = tmp_path / f"copy{i}"
@@ -252,5 +296,8 @@ def test_a_moved_project_keeps_its_results(lab, tmp_path):
         (tmp_path / "elsewhere").mkdir(exist_ok=True)
         shutil.move(tmp_path / name, tmp_path / "elsewhere" / name)
     lab.folder = tmp_path / "elsewhere" / "nodes"
-    lab.offset, lab.weights = tmp_path / "elsewhere" / "offset.txt", tmp_path / "elsewhere" / "weights.pt"
+    lab.offset, lab.weights = (
+        tmp_path / "elsewhere" / "offset.txt",
+        tmp_path / "elsewhere" / "weights.pt",
+    )
     assert lab.run() == (TRUE, NONE)

@@ -1,4 +1,6 @@
-"""Workers do each piece of work once, and what they cannot do stays with the caller, also after kill -9."""
+"""Workers do each piece of work once, and what they cannot do stays with the caller, also after
+kill -9.
+"""
 
 import os
 import signal
@@ -11,7 +13,8 @@ import warnings
 import pytest
 import torch
 
-from neusee.workflows.engine import memory_watch, worker_processes
+from neusee.workflows.engine import memory_limits as memory_watch
+from neusee.workflows.engine import worker_processes
 from neusee.workflows.engine.worker_processes import shared, shared_in_order, workers_for
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="workers are forks")
@@ -26,7 +29,11 @@ def test_every_piece_is_done_once_by_another_process():
 @pytest.mark.parametrize("workers", [1, 2, 3])
 def test_results_come_in_order_and_with_the_bits_of_this_process(workers):
     def work(number):
-        return torch.rand(1000, generator=torch.Generator().manual_seed(number)).exp().sum(0, keepdim=True)
+        return (
+            torch.rand(1000, generator=torch.Generator().manual_seed(number))
+            .exp()
+            .sum(0, keepdim=True)
+        )
 
     found = list(shared_in_order(work, 9, workers))
     assert torch.equal(torch.cat(found), torch.cat([work(n) for n in range(9)]))
@@ -121,7 +128,8 @@ def test_workers_have_one_thread():
 def test_the_memory_of_a_worker_is_watched_beside_a_run_of_this_process():
     def work(number):
         with memory_watch.limited(1e6 if number else 1e15), memory_watch.guarded():
-            for _ in range(30_000 if number else 1):  # until the watch stops it, which a busy machine may do late
+            # until the watch stops it, which a busy machine may do late
+            for _ in range(30_000 if number else 1):
                 time.sleep(0.01)
 
     with memory_watch.limited(1e15), memory_watch.guarded():  # the thread that looks is in no fork
@@ -142,7 +150,9 @@ def test_workers_end_with_a_process_that_is_killed():
         "def work(n):\n    print(os.getpid(), flush=True)\n    time.sleep(60)\n"
         "list(shared(work, range(2), 2))"
     )
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True
+    ) as process:
         pids = [int(process.stdout.readline()) for _ in range(2)]
         process.kill()
     ends = time.monotonic() + 60.0

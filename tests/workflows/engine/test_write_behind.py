@@ -1,4 +1,6 @@
-"""Large results are written beside the next steps, and a run that has ended has written all of them."""
+"""Large results are written beside the next steps, and a run that has ended has written all of
+them.
+"""
 
 import importlib.util
 import os
@@ -11,17 +13,26 @@ from pathlib import Path
 import pytest
 import torch
 
-from neusee.workflows.engine import write_behind
+from neusee.workflows.engine import step_job as write_behind
 from neusee.workflows.engine.runner import run
-from neusee.workflows.engine.write_behind import WriteBehind
+from neusee.workflows.engine.step_job import WriteBehind
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
 
-SPEC = importlib.util.spec_from_file_location("engine_toys", Path(__file__).with_name("test_engine_choices.py"))
+SPEC = importlib.util.spec_from_file_location(
+    "engine_toys", Path(__file__).with_name("test_engine_choices.py")
+)
 toys = importlib.util.module_from_spec(SPEC)
 sys.modules["engine_toys"] = toys  # the engine looks there for the code of a node
 SPEC.loader.exec_module(toys)
-add, make, mean, slow, recipe, states = toys.add, toys.make, toys.mean, toys.slow, toys.recipe, toys.states
+add, make, mean, slow, recipe, states = (
+    toys.add,
+    toys.make,
+    toys.mean,
+    toys.slow,
+    toys.recipe,
+    toys.states,
+)
 N = 1 << 19
 
 
@@ -40,14 +51,20 @@ class Slow(Store):
         return super().put(key, value, about)
 
 
-STEPS = {"a": (make, {}, {"n": N}), "b": (slow, {"x": "a"}, {"seconds": 0.1}), "m": (mean, {"x": "b"}, {})}
+STEPS = {
+    "a": (make, {}, {"n": N}),
+    "b": (slow, {"x": "a"}, {"seconds": 0.1}),
+    "m": (mean, {"x": "b"}, {}),
+}
 
 
 def niceness():
     return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere priorities belong to processes, not to threads")
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="elsewhere priorities belong to processes, not to threads"
+)
 def test_who_writes_yields_to_who_computes():
     found, before, later = [], niceness(), WriteBehind()
 

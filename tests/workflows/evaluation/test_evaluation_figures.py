@@ -5,14 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from neusee.workflows.evaluation import evaluation_figures
+from neusee.workflows.evaluation import evaluation_page as evaluation_figures
 from neusee.workflows.evaluation.confidence_intervals import METRICS, MetricTable
 
 
 def table(*scenes):
-    """A table in which scene ``i`` has the value ``scenes[i]`` at every strength, for each metric."""
+    """A table in which scene ``i`` has the value ``scenes[i]`` at every strength, for each
+    metric.
+    """
     values = np.repeat(np.asarray(scenes, dtype=float)[:, None], 3, axis=1)
-    return MetricTable((0.0, 1e3, 1e6), {name: values for name in (*METRICS, "l1 small")}, np.arange(len(scenes)))
+    return MetricTable(
+        (0.0, 1e3, 1e6), {name: values for name in (*METRICS, "l1 small")}, np.arange(len(scenes))
+    )
 
 
 @pytest.mark.parametrize("scenes", [(0.05, 0.11), (0.08, 0.08, 0.08)])

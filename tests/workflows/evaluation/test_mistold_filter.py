@@ -1,4 +1,6 @@
-"""Restorers that are told optics or laser with an error: the camera stays, and what the filter knows moves."""
+"""Restorers that are told optics or laser with an error: the camera stays, and what the filter
+knows moves.
+"""
 
 import csv
 from pathlib import Path
@@ -7,19 +9,30 @@ import pytest
 
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
-from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
+from neusee.workflows.evaluation.evaluation_points import (
+    EvaluationPoints,
+    PointRequest,
+    errors_of,
+    mistold,
+)
+from neusee.workflows.evaluation.evaluation_result import told_with_errors
 from neusee.workflows.evaluation.evaluation_scenes import scenes
-from neusee.workflows.evaluation.mistold_filter import errors_of, mistold
-from neusee.workflows.evaluation.mistold_points import told_with_errors
 from neusee.workflows.evaluation.pipelines import CASES, compose_pipelines, read_pipelines
 from neusee.workflows.evaluation.run_evaluation import evaluate
 from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.graph.told_copies import TOLD
+from neusee.workflows.graph.recipe_graph import TOLD
 from neusee.workflows.recipe.blocks.evaluate_block import Mismatch
 from neusee.workflows.store.result_store import Store
 
-SMALL = ["optics.samples=96", "optics.pitch=84.15 um", "optics.bands=5", "optics.window=[24, 24]",
-         "scene.shape=[32, 32]", "sensor.shape=[24, 24]", "scene=siemens"]  # fmt: skip
+SMALL = [
+    "optics.samples=96",
+    "optics.pitch=84.15 um",
+    "optics.bands=5",
+    "optics.window=[24, 24]",
+    "scene.shape=[32, 32]",
+    "sensor.shape=[24, 24]",
+    "scene=siemens",
+]
 HERE = Path()
 HALF = 0.5 * 2.9e-6 / 0.11
 
@@ -47,7 +60,9 @@ BY_HAND = {
 
 @pytest.mark.slow
 def test_the_camera_stays_and_the_filter_is_told_what_another_camera_would_know(store):
-    """Each error is that of a recipe written by hand with this parameter, of which only the knowledge is taken."""
+    """Each error is that of a recipe written by hand with this parameter, of which only the
+    knowledge is taken.
+    """
     recipe = green()
     errors = errors_of(recipe, Mismatch())
     assert list(errors) == list(BY_HAND)
@@ -55,24 +70,34 @@ def test_the_camera_stays_and_the_filter_is_told_what_another_camera_would_know(
     for text, error in errors.items():
         wrong = mistold(recipe, error)
         names = {wire for wire in wrong.steps["deconvolved"].sources if wire.startswith(TOLD)}
-        assert names == ({f"{TOLD}psf[mask]"} if "defocus" in text else set()) | {f"{TOLD}laser_photons[mask,beam]"}
+        assert names == ({f"{TOLD}psf[mask]"} if "defocus" in text else set()) | {
+            f"{TOLD}laser_photons[mask,beam]"
+        }
         found = run(wrong, store, ["raw[mask]", "restored", *names])
         other = run(green(BY_HAND[text]), store, [name.removeprefix(TOLD) for name in names])
         assert bool((found["raw[mask]"] == true["raw[mask]"]).all())
         assert not bool((found["restored"] == true["restored"]).all())
         for name in names:
-            mine, hand = (getattr(x, "intensity", x) for x in (found[name], other[name.removeprefix(TOLD)]))
+            mine, hand = (
+                getattr(x, "intensity", x) for x in (found[name], other[name.removeprefix(TOLD)])
+            )
             assert float((mine - hand).abs().max()) <= 1e-6 * float(hand.abs().max())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("error", [{"line[beam].wavelength": 20e-9}, {"direction[beam].angle": (HALF, HALF)}])
+@pytest.mark.parametrize(
+    "error", [{"line[beam].wavelength": 20e-9}, {"direction[beam].angle": (HALF, HALF)}]
+)
 def test_a_laser_in_watts_that_is_mistold_is_that_of_a_recipe_by_hand(error, store):
-    """A Gaussian beam without a stated divergence: how much light the lens collects depends on the wavelength."""
+    """A Gaussian beam without a stated divergence: how much light the lens collects depends on
+    the wavelength.
+    """
     light = "power: 5 mW, waist: 1 mm, distance: 100 m"
     recipe, (place, by) = green(light=light), *error.items()
-    hand = {"line[beam].wavelength": "lasers.beam.wavelength=552 nm",
-            "direction[beam].angle": BY_HAND["direction 0.5 px off"]}  # fmt: skip
+    hand = {
+        "line[beam].wavelength": "lasers.beam.wavelength=552 nm",
+        "direction[beam].angle": BY_HAND["direction 0.5 px off"],
+    }
     name = "laser_photons[mask,beam]"
     wrong = mistold(recipe, {place: by})
     told = run(wrong, store, [TOLD + name, name])
@@ -80,7 +105,9 @@ def test_a_laser_in_watts_that_is_mistold_is_that_of_a_recipe_by_hand(error, sto
     assert float((told[TOLD + name] - expected).abs().max()) <= 1e-6 * float(expected.max())
     assert float((told[TOLD + name] - told[name]).abs().max()) > 1e-3 * float(expected.max())
     if "wavelength" in place:
-        collected, told_power = (run(wrong, store, [step])[step] for step in ("light[beam]", f"{TOLD}light[beam]"))
+        collected, told_power = (
+            run(wrong, store, [step])[step] for step in ("light[beam]", f"{TOLD}light[beam]")
+        )
         assert collected != told_power
 
 
@@ -105,28 +132,45 @@ def test_what_is_copied_is_what_the_error_changes():
     recipe = green()
     for text, error in errors_of(recipe, Mismatch()).items():
         wrong = mistold(recipe, error)
-        copies = {name.removeprefix(TOLD).partition("[")[0] for name in wrong.steps if name.startswith(TOLD)}
+        copies = {
+            name.removeprefix(TOLD).partition("[")[0]
+            for name in wrong.steps
+            if name.startswith(TOLD)
+        }
         glare = {"laser_psf", "spot", "laser_photons"}
         line = {"line", "light", "wavefront", "laser_index", "laser_pupil", "laser_responses"}
-        own = {"direction": {"direction"}, "wavelength": line, "defocus": {"pupil", "psf", "laser_pupil"}}
-        assert copies == glare | own[text.partition(" ")[0]]
-        assert {name: step for name, step in wrong.steps.items() if name in recipe.steps and name != "deconvolved"} == {
-            name: step for name, step in recipe.steps.items() if name != "deconvolved"
+        own = {
+            "direction": {"direction"},
+            "wavelength": line,
+            "defocus": {"pupil", "psf", "laser_pupil"},
         }
+        assert copies == glare | own[text.partition(" ")[0]]
+        assert {
+            name: step
+            for name, step in wrong.steps.items()
+            if name in recipe.steps and name != "deconvolved"
+        } == {name: step for name, step in recipe.steps.items() if name != "deconvolved"}
 
 
 @pytest.mark.slow
 def test_points_are_those_of_the_recipe_with_the_error(store):
     """The direction that a scene draws, moved by half a pixel, and the strength of the point."""
-    (pipeline,) = composed("flat+wiener", "+evaluate.mismatch={wavelength: 0 nm, defocus: 0 waves, scenes: 1}")
+    (pipeline,) = composed(
+        "flat+wiener", "+evaluate.mismatch={wavelength: 0 nm, defocus: 0 waves, scenes: 1}"
+    )
     shown, _ = scenes(load("first_light", SMALL), store, None, 2, list(CASES))
     bench = EvaluationPoints(store, 16)
     (found,) = told_with_errors(bench, [pipeline], shown, (0.0, 1e5), lambda _: None)
     assert found.true == bench.point(pipeline, PointRequest(shown[0], 1e5))
     assert found.wrong["psnr"] != found.true["psnr"]
     angle = shown[0].angle(pipeline.recipe("violet"))
-    line = f"wavelength: 405 nm, fwhm: 10 nm, strength: 1e5, angle: [{angle[0]!r} rad, {angle[1]!r} rad]"
-    by_hand = load("first_light", [*SMALL, "doe=flat", f"lasers={{beam: {{{line}}}}}", f"seed={shown[0].seed}"])
+    line = (
+        f"wavelength: 405 nm, fwhm: 10 nm, strength: 1e5, angle: [{angle[0]!r} rad, {angle[1]!r}"
+        " rad]"
+    )
+    by_hand = load(
+        "first_light", [*SMALL, "doe=flat", f"lasers={{beam: {{{line}}}}}", f"seed={shown[0].seed}"]
+    )
     wrong = mistold(by_hand, {"direction[beam].angle": (HALF, HALF)})
     expected = run(wrong, store, ["restored_quality"])["restored_quality"]
     assert found.wrong["psnr"] == pytest.approx(float(expected.psnr), abs=1e-3)
@@ -140,7 +184,12 @@ def test_an_evaluation_has_the_rows_and_a_recipe_can_leave_them_out(store, tmp_p
     rows = list(csv.DictReader((folder / "mistold.csv").read_text().splitlines()))
     assert [(row["pipeline"], row["told"]) for row in rows] == [
         ("flat+wiener", told)
-        for told in ("exactly", "direction 0.5 px off", "wavelength 2 nm off", "defocus 0.1 waves off")
+        for told in (
+            "exactly",
+            "direction 0.5 px off",
+            "wavelength 2 nm off",
+            "defocus 0.1 waves off",
+        )
     ]
     assert "What the restorer is not told" in next(folder.glob("*.html")).read_text()
     folder = evaluate("first_light", lines, [*SMALL, "+evaluate.mismatch=null"], **run_it)
@@ -148,7 +197,8 @@ def test_an_evaluation_has_the_rows_and_a_recipe_can_leave_them_out(store, tmp_p
 
 
 @pytest.mark.parametrize(
-    ("text", "said"), [("{pixel: 1}", "pixels"), ("{wavelength: -2 nm}", "greater than"), ("{scenes: 0}", "greater")]
+    ("text", "said"),
+    [("{pixel: 1}", "pixels"), ("{wavelength: -2 nm}", "greater than"), ("{scenes: 0}", "greater")],
 )
 def test_a_mistake_in_the_block_is_told_with_its_place(text, said):
     with pytest.raises(RecipeError, match=said):

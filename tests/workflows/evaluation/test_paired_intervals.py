@@ -1,4 +1,6 @@
-"""Intervals between pipelines on the same pictures: they hold the truth as often as closed forms say."""
+"""Intervals between pipelines on the same pictures: they hold the truth as often as closed forms
+say.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +11,15 @@ import pytest
 from scipy.special import ndtr, ndtri
 from scipy.stats import t as student
 
-from neusee.workflows.evaluation import paired_intervals
-from neusee.workflows.evaluation.confidence_intervals import MetricTable, mean
-from neusee.workflows.evaluation.paired_intervals import gain, gains_by_strength, less, ratio
+from neusee.workflows.evaluation import confidence_intervals as paired_intervals
+from neusee.workflows.evaluation.confidence_intervals import (
+    MetricTable,
+    gain,
+    gains_by_strength,
+    less,
+    mean,
+    ratio,
+)
 
 PHOTOGRAPHS, PICTURES, TIMES = 12, 4, 400
 ROOM = 3 * math.sqrt(0.95 * 0.05 / TIMES)  #: three standard errors of the share that is counted
@@ -26,18 +34,26 @@ def quick(monkeypatch):
 
 def alike(rng, between=1.0, within=0.5):
     """Differences of pictures of which four have a photograph in common, with the true mean 0."""
-    return np.repeat(between * rng.standard_normal(PHOTOGRAPHS), PICTURES) + within * rng.standard_normal(len(OWNER))
+    return np.repeat(
+        between * rng.standard_normal(PHOTOGRAPHS), PICTURES
+    ) + within * rng.standard_normal(len(OWNER))
 
 
 def share_held(intervals, truth):
     return float(np.mean([x.low <= truth <= x.high for x in intervals]))
 
 
-def test_the_interval_over_photographs_covers_and_the_one_over_pictures_fails_as_its_closed_form_says(quick):
-    """Over pictures the standard error lacks a factor: 1.96 of them hold 71 % of the means, in closed form."""
+def test_the_interval_over_photographs_covers_and_the_one_over_pictures_fails_as_its_closed_form_says(
+    quick,
+):
+    """Over pictures the standard error lacks a factor: 1.96 of them hold 71 % of the means, in
+    closed form.
+    """
     rng, zero = np.random.default_rng(1), np.zeros(len(OWNER))
     drawn = [alike(rng) for _ in range(TIMES)]
-    assert share_held([less(zero, x, OWNER, 1) for x in drawn], 0.0) == pytest.approx(0.95, abs=ROOM)
+    assert share_held([less(zero, x, OWNER, 1) for x in drawn], 0.0) == pytest.approx(
+        0.95, abs=ROOM
+    )
     lacking = math.sqrt((1.0 + 0.25) / (PICTURES * 1.0 + 0.25))
     wanted = 2 * ndtr(ndtri(0.975) * lacking) - 1
     assert wanted == pytest.approx(0.71, abs=0.01)
@@ -46,7 +62,9 @@ def test_the_interval_over_photographs_covers_and_the_one_over_pictures_fails_as
 
 
 def test_the_interval_of_a_skewed_gain_covers_its_closed_form(quick):
-    """Errors of lognormal photographs: the true ratio of the means is exp of half the difference of the variances."""
+    """Errors of lognormal photographs: the true ratio of the means is exp of half the difference
+    of the variances.
+    """
     rng, held = np.random.default_rng(2), []
     truth = 1 - 0.9 * math.exp((0.7**2 - 0.5**2) / 2)
     for _ in range(TIMES):
@@ -63,7 +81,11 @@ def test_the_interval_of_a_gain_is_that_of_fieller():
     values = 0.5 * reference + 0.3 + 0.1 * rng.standard_normal(300)
     q = student.ppf(0.975, 299) ** 2 / 300
     (vv, vr), (_, rr) = np.cov(values, reference)
-    a, b, c = reference.mean() ** 2 - q * rr, values.mean() * reference.mean() - q * vr, values.mean() ** 2 - q * vv
+    a, b, c = (
+        reference.mean() ** 2 - q * rr,
+        values.mean() * reference.mean() - q * vr,
+        values.mean() ** 2 - q * vv,
+    )
     roots = [(b + sign * math.sqrt(b * b - a * c)) / a for sign in (1, -1)]
     found = gain(values, reference, np.arange(300), 1)
     width = roots[0] - roots[1]
@@ -81,7 +103,9 @@ def test_a_mean_of_several_pictures_of_a_photograph_is_that_of_the_means_of_phot
 
 
 def test_five_skewed_photographs_hold_the_truth_and_reach_beyond_student(quick):
-    """Student's interval of five lognormal values holds 92.4 % (1000 samples of `bench_intervals.py`)."""
+    """Student's interval of five lognormal values holds 92.4 % (1000 samples of
+    `bench_intervals.py`).
+    """
     rng, held, truth = np.random.default_rng(6), [], math.exp(0.125)
     least = student.ppf(0.975, 4) / math.sqrt(5)
     for k in range(TIMES):
@@ -106,4 +130,6 @@ def test_draws_repeat_and_equal_pipelines_have_no_difference():
 def test_a_gain_at_a_strength_takes_the_scenes_that_have_it():
     x = np.array([[1.0, 2.0], [1.0, 2.0], [3.0, math.nan]])
     one, half = (MetricTable((0.0, 1.0), {"l1 small": k * x}, np.arange(3.0)) for k in (1.0, 0.5))
-    assert [interval.mean for interval in gains_by_strength(half, one, 1)] == pytest.approx([0.5, 0.5])
+    assert [interval.mean for interval in gains_by_strength(half, one, 1)] == pytest.approx(
+        [0.5, 0.5]
+    )

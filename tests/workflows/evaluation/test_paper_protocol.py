@@ -1,10 +1,11 @@
-"""The protocol of the paper: wavelengths by the law of the recipe, every photograph, and tables that survive a kill."""
+"""The protocol of the paper: wavelengths by the law of the recipe, every photograph, and tables
+that survive a kill.
+"""
 
 from __future__ import annotations
 
 import csv
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -20,9 +21,8 @@ from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.evaluation import evaluation_scenes
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
+from neusee.workflows.evaluation.evaluation_result import _points, _variant
 from neusee.workflows.evaluation.evaluation_scenes import photographs, scenes, wavelengths
-from neusee.workflows.evaluation.measured_points import _points
-from neusee.workflows.evaluation.mistold_points import _variant
 from neusee.workflows.evaluation.pipelines import (
     DRAWN,
     SIX,
@@ -52,7 +52,9 @@ def folder(tmp_path_factory):
     folder, rng = tmp_path_factory.mktemp("photographs"), np.random.default_rng(2)
     for name in "abc":
         coarse = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
-        Image.fromarray(coarse).resize((32, 32), Image.Resampling.BICUBIC).save(folder / f"{name}.png")
+        Image.fromarray(coarse).resize((32, 32), Image.Resampling.BICUBIC).save(
+            folder / f"{name}.png"
+        )
     return folder
 
 
@@ -68,7 +70,11 @@ def drawn(store, folder, count=None, *more):
 def test_the_recipe_is_the_protocol_of_the_paper():
     recipe = load("paper_protocol")
     assert recipe.evaluation.scenes == "all"
-    assert recipe.steps["truth"].params["shape"] == recipe.steps["scene"].params["shape"] == (2048, 2048)
+    assert (
+        recipe.steps["truth"].params["shape"]
+        == recipe.steps["scene"].params["shape"]
+        == (2048, 2048)
+    )
     assert list(SIX) == ["violet", "blue", "cyan", "green", "yellow", "red", "none"]
     assert all(400e-9 <= metres <= 700e-9 for metres in SIX.values() if metres)
 
@@ -77,7 +83,8 @@ def test_every_photograph_is_in_one_scene(store, folder):
     shown = drawn(store, folder)
     assert sorted(scene.name for scene in shown) == ["a.png", "b.png", "c.png"]
     assert photographs(drawn(store, folder, 7)) == [0, 1, 2, 0, 1, 2, 0]
-    assert photographs(drawn(store, None, 3)) == [0, 1, 2]  # of one scene, lasers and noise are what is drawn
+    # of one scene, lasers and noise are what is drawn
+    assert photographs(drawn(store, None, 3)) == [0, 1, 2]
 
 
 def test_wavelengths_follow_the_law_and_are_the_same_for_every_pipeline(store, folder):
@@ -87,7 +94,9 @@ def test_wavelengths_follow_the_law_and_are_the_same_for_every_pipeline(store, f
     assert found == wavelengths(pipeline("half_ring+wiener"), shown)
     assert len(set(found)) == 500
     assert kstest(np.array(found) * 1e9, "uniform", (400, 300)).pvalue > 0.01
-    narrow = wavelengths(pipeline("flat+none", "lasers.drawn.wavelength=normal(550 nm, 1 nm)"), shown)
+    narrow = wavelengths(
+        pipeline("flat+none", "lasers.drawn.wavelength=normal(550 nm, 1 nm)"), shown
+    )
     assert np.std(narrow) == pytest.approx(1e-9, rel=0.15)
 
 
@@ -97,24 +106,41 @@ def test_a_point_with_a_drawn_wavelength_is_a_run_with_that_wavelength(tmp_path,
     mask = pipeline("five_half_rings+none", *fixed)
     (metres,) = wavelengths(mask, [scene])
     found = EvaluationPoints(store, 16).point(mask, PointRequest(scene, 1e4))
-    laser = f"lasers={{beam: {{wavelength: {metres!r} m, fwhm: 10 nm, strength: 1e4, angle: null}}}}"
-    own, inputs = [*fixed, laser, f"seed={scene.seed}"], Inputs.of(mask.recipe(DRAWN), mask.pipeline.outputs)
+    laser = (
+        f"lasers={{beam: {{wavelength: {metres!r} m, fwhm: 10 nm, strength: 1e4, angle: null}}}}"
+    )
+    own, inputs = (
+        [*fixed, laser, f"seed={scene.seed}"],
+        Inputs.of(mask.recipe(DRAWN), mask.pipeline.outputs),
+    )
     for name in ("dark_current", "offset", "read_noise"):
         own.append(f"sensor.{name}={scene.draw(inputs)[f'sensor.{name}']!r} e-")
-    recipe = load("paper_protocol", [*SMALL, *own, f"scene.file={scene.path}", "doe=five_half_rings"])
+    recipe = load(
+        "paper_protocol", [*SMALL, *own, f"scene.file={scene.path}", "doe=five_half_rings"]
+    )
     wanted = run(recipe, Store(tmp_path), mask.pipeline.outputs)
     assert found["l1"] == float(wanted["developed_quality[mask]"].l1)
     assert found["peak"] == float(wanted["peak[mask]"].irradiance)
 
 
 def test_a_restorer_that_is_told_an_error_of_zero_sees_the_drawn_values(store, folder):
-    """Before, the copies of its steps hid the laws, so that the camera had other values than beside it."""
-    scene, bench, true = drawn(store, folder)[0], EvaluationPoints(store, 16), pipeline("half_ring+wiener")
+    """Before, the copies of its steps hid the laws, so that the camera had other values than
+    beside it.
+    """
+    scene, bench, true = (
+        drawn(store, folder)[0],
+        EvaluationPoints(store, 16),
+        pipeline("half_ring+wiener"),
+    )
     same = _variant(true, "nothing", {"pupil[mask].defocus": 0.0})
-    assert bench.point(same, PointRequest(scene, 1e3)) == bench.point(true, PointRequest(scene, 1e3))
+    assert bench.point(same, PointRequest(scene, 1e3)) == bench.point(
+        true, PointRequest(scene, 1e3)
+    )
 
 
-def test_a_photograph_that_cannot_be_decoded_costs_its_scene_and_no_other(store, folder, monkeypatch):
+def test_a_photograph_that_cannot_be_decoded_costs_its_scene_and_no_other(
+    store, folder, monkeypatch
+):
     usual = evaluation_scenes.crop_photograph
 
     def damaged(path, *rest):
@@ -124,7 +150,9 @@ def test_a_photograph_that_cannot_be_decoded_costs_its_scene_and_no_other(store,
 
     monkeypatch.setattr(evaluation_scenes, "crop_photograph", damaged)
     shown, said = drawn(store, folder), list[str]()
-    points, kept, broken = _points(EvaluationPoints(store, 16), [pipeline("flat+none")], shown, (0.0,), said.append)
+    points, kept, broken = _points(
+        EvaluationPoints(store, 16), [pipeline("flat+none")], shown, (0.0,), said.append
+    )
     assert sorted(scene.name for scene in kept) == ["a.png", "c.png"]
     assert len(points["flat+none"]) == 2
     assert [path.name for path, _ in broken] == ["b.png"]
@@ -133,16 +161,19 @@ def test_a_photograph_that_cannot_be_decoded_costs_its_scene_and_no_other(store,
 
 
 def test_a_laser_without_a_law_is_refused():
-    with pytest.raises(EvaluationRefused, match=r"evaluate\.lasers is drawn, but no law says which wavelength"):
+    with pytest.raises(
+        EvaluationRefused, match=r"evaluate\.lasers is drawn, but no law says which wavelength"
+    ):
         refuse_fixed_laser(load("paper_protocol", [*SMALL, "laser=green"]))
     with pytest.raises(EvaluationRefused, match=r"evaluate\.scenes"):
         read_settings("paper_protocol", [*SMALL, "evaluate.scenes=some"], HERE)
 
 
-# --- the whole --------------------------------------------------------------------------------------------------------
+# --- the whole ------------------------------------------------------------------------------------
 
+#: imports what takes seconds once, and forks for each run: store, and pictures before the kill
 _PROGRAM = """
-import os, signal, sys
+import json, os, signal, sys
 from pathlib import Path
 import neusee
 from neusee.workflows.evaluation import evaluation_scenes
@@ -150,38 +181,67 @@ from neusee.workflows.evaluation.evaluation_points import EvaluationPoints
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
 
-real, last, seen = EvaluationPoints._measure, int(sys.argv[3]), []
+import colour, matplotlib.figure
+import neusee.workflows.evaluation.run_evaluation
 
-def measured(self, *point):
-    if len(seen) == last:
-        os.kill(os.getpid(), signal.SIGKILL)
-    seen.append(1)
-    return real(self, *point)
+real = EvaluationPoints._measure
 
-EvaluationPoints._measure = measured
-print(neusee.evaluate("paper_protocol", changes=sys.argv[4:], data=sys.argv[1], store=Store(Path(sys.argv[2])),
-    pipelines="flat+none, five_half_rings+none, five_half_rings+wiener", strengths=[0, 100], small=16,
-    equal_protection=1e-4, out=sys.argv[2] + "_runs"))
+def evaluated(store, last):
+    seen = []
+
+    def measured(self, *point):
+        if len(seen) == last:
+            os.kill(os.getpid(), signal.SIGKILL)
+        seen.append(1)
+        return real(self, *point)
+
+    EvaluationPoints._measure = measured
+    return str(neusee.evaluate("paper_protocol", changes=sys.argv[3:], data=sys.argv[1], store=Store(Path(store)),
+        pipelines="flat+none, five_half_rings+none, five_half_rings+wiener", strengths=[0, 100], small=16,
+        equal_protection=1e-4, out=store + "_runs"))
+
+ends = []
+for number, (store, last) in enumerate(json.loads(sys.argv[2])):
+    if not (child := os.fork()):
+        Path(f"out{number}").write_text(evaluated(store, last))
+        sys.stderr.flush()
+        os._exit(0)
+    ends.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+print(json.dumps(ends))
 """
 
 
-def protocol(folder, store, last):
-    words = [sys.executable, "-c", _PROGRAM, str(folder), str(store), str(last), *SMALL]
-    return subprocess.run(words, capture_output=True, text=True, cwd=store.parent, env=dict(os.environ), check=False)
+def protocols(place, folder, *runs):
+    """Return how each run of the protocol ended: its exit code, and the folder that it wrote."""
+    runs = [(str(place / name), last) for name, last in runs]
+    done = subprocess.run(
+        [sys.executable, "-c", _PROGRAM, str(folder), json.dumps(runs), *SMALL],
+        capture_output=True,
+        text=True,
+        cwd=place,
+    )
+    assert done.returncode == 0, done.stderr
+    wrote = [place / f"out{number}" for number in range(len(runs))]
+    return json.loads(done.stdout.splitlines()[-1]), [
+        path.read_text() if path.is_file() else done.stderr for path in wrote
+    ]
 
 
 @pytest.mark.slow
 def test_a_killed_protocol_goes_on_and_its_tables_have_the_same_bytes(tmp_path, folder):
-    """SIGKILL before the sixth picture and before the twenty-third; nothing depends on the clock."""
+    """SIGKILL before the sixth picture and before the twenty-third; nothing depends on the
+    clock.
+    """
     count = 3 * 2 * 6  # scenes, strengths, and pipelines, half of them at equal protection
-    killed = [protocol(folder, tmp_path / "killed", last) for last in (5, 17)]
-    assert [done.returncode for done in killed] == [-signal.SIGKILL] * 2
-    ended, whole = (protocol(folder, tmp_path / name, 1000) for name in ("killed", "whole"))
-    assert (ended.returncode, whole.returncode) == (0, 0), ended.stderr + whole.stderr
-    first, second = (tmp_path / done.stdout.split()[-1] for done in (ended, whole))
+    runs = ("killed", 5), ("killed", 17), ("killed", 1000), ("whole", 1000)
+    ends, wrote = protocols(tmp_path, folder, *runs)
+    assert ends == [-signal.SIGKILL, -signal.SIGKILL, 0, 0], wrote[-1]
+    first, second = (tmp_path / path.split()[-1] for path in wrote[2:])
     tables = sorted(path.name for path in second.glob("*.csv"))
     assert tables == ["mistold.csv", "points.csv", "protection.csv", "suppression.csv", "table.csv"]
-    assert [(first / name).read_bytes() for name in tables] == [(second / name).read_bytes() for name in tables]
+    assert [(first / name).read_bytes() for name in tables] == [
+        (second / name).read_bytes() for name in tables
+    ]
     figures = sorted((second / "figures").glob("*.png"))
     assert [path.name for path in figures] == [
         "cases.png",
@@ -190,7 +250,9 @@ def test_a_killed_protocol_goes_on_and_its_tables_have_the_same_bytes(tmp_path, 
         "strengths.png",
         "wavelengths.png",
     ]
-    assert [(first / "figures" / path.name).read_bytes() for path in figures] == [path.read_bytes() for path in figures]
+    assert [(first / "figures" / path.name).read_bytes() for path in figures] == [
+        path.read_bytes() for path in figures
+    ]
     said = [json.loads((path / "provenance.json").read_text()) for path in (first, second)]
     assert [document["computed"] for document in said] == [count - 5 - 17, count]
     with (second / "points.csv").open() as file:
@@ -205,10 +267,21 @@ def test_a_killed_protocol_goes_on_and_its_tables_have_the_same_bytes(tmp_path, 
 
 @pytest.mark.slow
 def test_the_figure_has_six_lasers_and_the_pictures_of_the_sensors(store, folder):
-    from neusee.workflows.evaluation.comparison_pictures import panels
+    from neusee.workflows.evaluation.evaluation_result import panels
 
-    each = [pipeline("flat+none"), pipeline("five_half_rings+none"), pipeline("five_half_rings+wiener")]
-    shown = panels(EvaluationPoints(store, 16), each, replace(drawn(store, folder)[0]), [100.0], SIX)
+    each = [
+        pipeline("flat+none"),
+        pipeline("five_half_rings+none"),
+        pipeline("five_half_rings+wiener"),
+    ]
+    shown = panels(
+        EvaluationPoints(store, 16), each, replace(drawn(store, folder)[0]), [100.0], SIX
+    )
     assert [panel.case for panel in shown] == list(SIX)
     assert [panel.strength for panel in shown] == [*[pytest.approx(1e4)] * 6, 0.0]
-    assert list(shown[0].pictures) == ["truth", "plain lens", "five_half_rings, sensor", "five_half_rings+wiener"]
+    assert list(shown[0].pictures) == [
+        "truth",
+        "plain lens",
+        "five_half_rings, sensor",
+        "five_half_rings+wiener",
+    ]

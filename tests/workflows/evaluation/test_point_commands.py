@@ -1,4 +1,6 @@
-"""The command that an evaluation prints gives its numbers: it is run, and its numbers are compared to the last bit."""
+"""The command that an evaluation prints gives its numbers: it is run, and its numbers are
+compared to the last bit.
+"""
 
 import csv
 import shlex
@@ -13,11 +15,20 @@ from typer.testing import CliRunner
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
 from neusee.workflows.evaluation.equal_protection import protect
-from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
+from neusee.workflows.evaluation.evaluation_points import (
+    EvaluationPoints,
+    PointCommands,
+    PointRequest,
+)
 from neusee.workflows.evaluation.evaluation_scenes import photographs, scenes
-from neusee.workflows.evaluation.pipelines import CASES, Pipeline, compose_pipelines, named_apart, read_pipelines
-from neusee.workflows.evaluation.point_commands import PointCommands
-from neusee.workflows.protection.equal_shade import EqualProtection
+from neusee.workflows.evaluation.pipelines import (
+    CASES,
+    Pipeline,
+    compose_pipelines,
+    named_apart,
+    read_pipelines,
+)
+from neusee.workflows.protection.equal_rivals import EqualProtection
 from neusee.workflows.store.result_store import Store
 
 SMALL = ["optics.samples=96", "optics.pitch=84.15 um", "optics.bands=3", "optics.window=[24, 24]"]
@@ -34,7 +45,9 @@ def store(tmp_path_factory):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch, store):
-    """Photographs that are larger and smaller than a scene, in a folder whose name a shell would split."""
+    """Photographs that are larger and smaller than a scene, in a folder whose name a shell would
+    split.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NEUSEE_CACHE", str(store.root))
     place = tmp_path / "my photographs"
@@ -62,23 +75,33 @@ def assert_same(pipeline, found, run):
     assert run["peak[mask]", "irradiance"] == pytest.approx(found["peak"], rel=1e-7)
 
 
-@pytest.mark.parametrize(("name", "law"), [("five_half_rings+none", []), ("flat+wiener", LAW)])
-def test_the_command_of_a_point_gives_its_numbers(store, folder, name, law):
+#: of a photograph that is larger than a scene, and of a smaller one
+@pytest.mark.parametrize(
+    ("name", "law", "place"), [("five_half_rings+none", [], 0), ("flat+wiener", LAW, 1)]
+)
+def test_the_command_of_a_point_gives_its_numbers(store, folder, name, law, place):
     changes = [*SMALL, *law]
     each = compose_pipelines("first_light", changes, read_pipelines(name, folder), folder.parent)
     shown, _ = scenes(load("first_light", changes), store, folder, 2, list(CASES))
     bench = EvaluationPoints(store, 16)
-    listed = PointCommands("first_light", changes, folder.parent, bench).commands(each, shown, (0.0, 1e4))
-    for place, strength in ((0, 1e4), (1, 1e4)):
-        found = bench.point(each[0], PointRequest(shown[place], strength))
-        assert_same(each[0], found, numbers_of(listed[each[0].name][place][strength]))
+    listed = PointCommands("first_light", changes, folder.parent, bench).commands(
+        each, shown, (0.0, 1e4)
+    )
+    found = bench.point(each[0], PointRequest(shown[place], 1e4))
+    assert_same(each[0], found, numbers_of(listed[each[0].name][place][1e4]))
     commands = [command for scene in listed[each[0].name] for command in scene.values()]
     assert len(set(commands)) == 4
 
 
-def test_the_command_behind_a_filter_of_equal_protection_has_its_filter_and_its_exposure(store, folder):
-    bare = compose_pipelines("first_light", SMALL, read_pipelines("flat+none", folder), folder.parent)
-    each = protect("first_light", SMALL, bare, EqualProtection(0.01, "filter"), store, folder.parent, print)
+def test_the_command_behind_a_filter_of_equal_protection_has_its_filter_and_its_exposure(
+    store, folder
+):
+    bare = compose_pipelines(
+        "first_light", SMALL, read_pipelines("flat+none", folder), folder.parent
+    )
+    each = protect(
+        "first_light", SMALL, bare, EqualProtection(0.01, "filter"), store, folder.parent, print
+    )
     shown, _ = scenes(load("first_light", SMALL), store, None, 1, list(CASES))
     bench = EvaluationPoints(store, 16)
     listed = PointCommands("first_light", SMALL, folder.parent, bench).commands(each, shown, (1e4,))
@@ -86,10 +109,16 @@ def test_the_command_behind_a_filter_of_equal_protection_has_its_filter_and_its_
     assert_same(each[0], found, numbers_of(listed[each[0].name][0][1e4]))
 
 
-def test_where_a_random_part_of_the_camera_has_the_seed_of_the_evaluation_there_is_no_wrong_command(store, folder):
-    """Grease on the window is the same in all scenes: a run with the seed of a scene would have another window."""
+def test_where_a_random_part_of_the_camera_has_the_seed_of_the_evaluation_there_is_no_wrong_command(
+    store, folder
+):
+    """Grease on the window is the same in all scenes: a run with the seed of a scene would have
+    another window.
+    """
     dirty = [*SMALL, "flare=dirty_windshield"]
-    each = compose_pipelines("first_light", dirty, read_pipelines("flat+none", folder), folder.parent)
+    each = compose_pipelines(
+        "first_light", dirty, read_pipelines("flat+none", folder), folder.parent
+    )
     shown, _ = scenes(load("first_light", dirty), store, folder, 2, list(CASES))
     listed = PointCommands("first_light", dirty, folder.parent, EvaluationPoints(store, 16))
     first, second = listed.commands(each, shown, (1e4,))[each[0].name]
@@ -97,17 +126,23 @@ def test_where_a_random_part_of_the_camera_has_the_seed_of_the_evaluation_there_
     assert second[1e4] == ""
 
 
-# --- names ------------------------------------------------------------------------------------------------------------
+# --- names ----------------------------------------------------------------------------------------
 
 
 def test_two_files_of_one_name_are_two_masks(tmp_path):
-    """Optics and filters are kept by the name of a mask, which two files in different folders must not share."""
+    """Optics and filters are kept by the name of a mask, which two files in different folders
+    must not share.
+    """
     for below in ("a", "b"):
         (tmp_path / below).mkdir()
         np.save(tmp_path / below / "m.npy", np.zeros((4, 4)))
     text = "pixelwise@a/m.npy+none, pixelwise@b/m.npy+wiener, pixelwise@b/m.npy+none"
     found = read_pipelines(text, tmp_path)
-    assert [p.front for p in found] == ["pixelwise@a/m.npy", "pixelwise@b/m.npy", "pixelwise@b/m.npy"]
+    assert [p.front for p in found] == [
+        "pixelwise@a/m.npy",
+        "pixelwise@b/m.npy",
+        "pixelwise@b/m.npy",
+    ]
     assert [p.name for p in found][2] == "pixelwise@b/m.npy+none"
     (alone,) = named_apart([Pipeline("pixelwise", "none", tmp_path / "a" / "m.npy")])
     assert alone.front == "pixelwise@m.npy"
@@ -123,12 +158,16 @@ def test_equal_photographs_count_as_one_whatever_their_names(store, folder):
     assert owners["a.png"] == owners["copy.png"] != owners["it's.png"]
 
 
-def test_a_changed_file_or_code_is_another_point_and_a_renamed_file_is_the_same(store, folder, tmp_path):
+def test_a_changed_file_or_code_is_another_point_and_a_renamed_file_is_the_same(
+    store, folder, tmp_path
+):
     np.save(tmp_path / "m.npy", np.full((96, 96), 1e-7))
 
     def key(name="m.npy"):
         text = f"pixelwise@{tmp_path / name}+none"
-        (pipeline,) = compose_pipelines("first_light", SMALL, read_pipelines(text, folder), folder.parent)
+        (pipeline,) = compose_pipelines(
+            "first_light", SMALL, read_pipelines(text, folder), folder.parent
+        )
         shown, _ = scenes(load("first_light", SMALL), store, folder, 1, list(CASES))
         return EvaluationPoints(store, 16).key(pipeline, PointRequest(shown[0], 1e4))
 

@@ -1,4 +1,6 @@
-"""The protocol of the paper: points are runs, intervals those of closed forms, what was stopped goes on."""
+"""The protocol of the paper: points are runs, intervals those of closed forms, what was stopped
+goes on.
+"""
 
 import csv
 import json
@@ -12,17 +14,21 @@ import torch
 from PIL import Image
 from typer.testing import CliRunner
 
-from neusee.nodes.bicubic_resize import resize
 from neusee.nodes.metrics import quality
+from neusee.nodes.resampling import resize
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
 from neusee.workflows.engine.runner import run
 from neusee.workflows.evaluation import evaluation_points
-from neusee.workflows.evaluation.confidence_intervals import mean, metric_table
+from neusee.workflows.evaluation.confidence_intervals import gain, mean, metric_table
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
 from neusee.workflows.evaluation.evaluation_scenes import refuse_directions, scenes
-from neusee.workflows.evaluation.paired_intervals import gain
-from neusee.workflows.evaluation.pipelines import CASES, EvaluationRefused, compose_pipelines, read_pipelines
+from neusee.workflows.evaluation.pipelines import (
+    CASES,
+    EvaluationRefused,
+    compose_pipelines,
+    read_pipelines,
+)
 from neusee.workflows.evaluation.run_evaluation import evaluate
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
@@ -61,7 +67,10 @@ def by_hand(tmp_path, scene, pipeline, strength, more=()):
     laser = "lasers={}"
     if scene.case != "none" and strength:
         metres = CASES[scene.case]
-        laser = f"lasers={{beam: {{wavelength: {metres * 1e9:g} nm, fwhm: 10 nm, strength: {strength}, angle: null}}}}"
+        laser = (
+            f"lasers={{beam: {{wavelength: {metres * 1e9:g} nm, fwhm: 10 nm, strength: {strength},"
+            " angle: null}}"
+        )
     words = [f"doe={line.mask}", laser, f"seed={scene.seed}", f"scene.file={scene.path}"]
     words += [f"restore={line.restorer}"] if line.restorer != "none" else []
     recipe = load("first_light", [*SMALL, *words, *more])
@@ -74,7 +83,9 @@ def by_hand(tmp_path, scene, pipeline, strength, more=()):
 def test_a_point_is_a_run_with_its_values_to_the_last_bit(tmp_path, store, name, strength):
     rng = np.random.default_rng(1)
     for i in range(2):
-        Image.fromarray(rng.integers(0, 256, (32, 32, 3), dtype=np.uint8)).save(tmp_path / f"{i}.png")
+        Image.fromarray(rng.integers(0, 256, (32, 32, 3), dtype=np.uint8)).save(
+            tmp_path / f"{i}.png"
+        )
     (pipeline,) = pipelines(name)
     shown, _ = scenes(load("first_light", SMALL), store, tmp_path, 2, list(CASES))
     scene = shown[1]
@@ -92,8 +103,12 @@ def test_a_point_is_a_run_with_its_values_to_the_last_bit(tmp_path, store, name,
 
 
 def test_what_a_recipe_has_laws_for_is_drawn_for_each_scene(tmp_path, store):
-    """The paper's sampling: a run with the drawn values, the same for all masks and strengths of a scene."""
-    Image.fromarray(np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)).save(tmp_path / "0.png")
+    """The paper's sampling: a run with the drawn values, the same for all masks and strengths of
+    a scene.
+    """
+    Image.fromarray(np.random.default_rng(1).integers(0, 256, (32, 32, 3), dtype=np.uint8)).save(
+        tmp_path / "0.png"
+    )
     laws = {
         "sensor.c1": "uniform(0, 0.25)",
         "sensor.background": "uniform(0.3, 0.7)",
@@ -107,9 +122,12 @@ def test_what_a_recipe_has_laws_for_is_drawn_for_each_scene(tmp_path, store):
             recipe = pipeline.recipe(scene.case)
             seen.append(scene.draw(Inputs.of(recipe, pipeline.pipeline.outputs)))
             units = {
-                name: f"{value!r} e-" if name == "sensor.offset" else repr(value) for name, value in seen[-1].items()
+                name: f"{value!r} e-" if name == "sensor.offset" else repr(value)
+                for name, value in seen[-1].items()
             }
-            wanted = by_hand(tmp_path, scene, pipeline, 1e4, [f"{name}={text}" for name, text in units.items()])
+            wanted = by_hand(
+                tmp_path, scene, pipeline, 1e4, [f"{name}={text}" for name, text in units.items()]
+            )
             found = bench.point(pipeline, PointRequest(scene, 1e4))
             assert found["l1"] == float(wanted[pipeline.pipeline.quality].l1)
             assert found["peak"] == float(wanted["peak[mask]"].irradiance)
@@ -137,7 +155,8 @@ def test_what_several_points_share_is_computed_once(store, monkeypatch):
         for pipeline in each:
             bench.values(pipeline, PointRequest(shown[0], strength))
     assert called.count("image[plain].channels") == called.count("level") == 1
-    assert called.count("laser_psf[mask,beam]") == called.count("image[mask].channels") == 2  # one a mask
+    # one a mask
+    assert called.count("laser_psf[mask,beam]") == called.count("image[mask].channels") == 2
     assert called.count("spot[mask,beam]") == called.count("raw[mask]") == 4
 
 
@@ -165,13 +184,16 @@ def test_the_same_point_of_another_order_is_the_same(store, tmp_path):
     each = pipelines("five_half_rings+none")
     shown, _ = scenes(load("first_light", SMALL), store, None, 3, list(CASES))
     wanted = [PointRequest(scene, 1e4) for scene in shown]
-    one, other = EvaluationPoints(Store(tmp_path / "one"), 24), EvaluationPoints(Store(tmp_path / "other"), 24)
+    one, other = (
+        EvaluationPoints(Store(tmp_path / "one"), 24),
+        EvaluationPoints(Store(tmp_path / "other"), 24),
+    )
     ahead = [one.point(each[0], w) for w in wanted]
     back = [other.point(each[0], w) for w in reversed(wanted)]
     assert ahead == back[::-1]
 
 
-# --- statistics -------------------------------------------------------------------------------------------------------
+# --- statistics -----------------------------------------------------------------------------------
 
 
 def test_an_interval_is_that_of_students_table():
@@ -210,15 +232,18 @@ def test_the_interval_of_a_gain_is_that_of_the_delta_method():
 
 
 def test_a_scene_without_a_laser_counts_at_no_strength_but_none():
-    point = dict.fromkeys(("l1", "psnr", "ssim", "l1 small", "psnr small", "ssim small", "saturated", "peak", "above"))
+    point = dict.fromkeys(
+        ("l1", "psnr", "ssim", "l1 small", "psnr small", "ssim small", "saturated", "peak", "above")
+    )
     found = metric_table(
-        [{0.0: {**point, "l1": 1.0}, 10.0: {**point, "l1": 3.0}}, {0.0: {**point, "l1": 5.0}}], (0.0, 10.0)
+        [{0.0: {**point, "l1": 1.0}, 10.0: {**point, "l1": 3.0}}, {0.0: {**point, "l1": 5.0}}],
+        (0.0, 10.0),
     )
     assert found.scenes("l1").tolist() == [2.0, 5.0]
     assert found.at("l1", 1).mean == 3.0
 
 
-# --- what cannot be ---------------------------------------------------------------------------------------------------
+# --- what cannot be -------------------------------------------------------------------------------
 
 
 def test_every_mistake_is_said_before_anything_runs(tmp_path):
@@ -230,7 +255,9 @@ def test_every_mistake_is_said_before_anything_runs(tmp_path):
     assert f"no such file: {tmp_path / 'gone.npy'}" in said[1]
     assert said[2] == "flat+none is listed twice: remove one"
     (tmp_path / "net.safetensors").write_bytes(b"nothing")
-    words = "falt+none, flat+wener, flat+nafnet@net.safetensors, flat+unet, flat@net.safetensors+none"
+    words = (
+        "falt+none, flat+wener, flat+nafnet@net.safetensors, flat+unet, flat@net.safetensors+none"
+    )
     asked = read_pipelines(words, tmp_path)
     with pytest.raises(EvaluationRefused) as error:
         compose_pipelines("first_light", SMALL, asked, tmp_path)
@@ -251,8 +278,12 @@ def test_weights_of_another_network_are_refused(tmp_path):
     from safetensors.torch import save_file
 
     save_file({"first.weight": torch.zeros(3)}, tmp_path / "net.safetensors")
-    with pytest.raises(EvaluationRefused, match=r"flat\+nafnet@net.safetensors: .*this network \(width 16\) has"):
-        compose_pipelines("first_light", SMALL, read_pipelines("flat+nafnet@net.safetensors", tmp_path), tmp_path)
+    with pytest.raises(
+        EvaluationRefused, match=r"flat\+nafnet@net.safetensors: .*this network \(width 16\) has"
+    ):
+        compose_pipelines(
+            "first_light", SMALL, read_pipelines("flat+nafnet@net.safetensors", tmp_path), tmp_path
+        )
 
 
 @pytest.mark.parametrize(
@@ -261,7 +292,10 @@ def test_weights_of_another_network_are_refused(tmp_path):
         (["--data", "nowhere"], "--data nowhere: this folder does not exist"),
         (["--data", "empty"], "--data empty: the folder contains no readable PNG or JPEG file"),
         (["--strengths", "0,lots"], "--strengths: lots is no number"),
-        (["--strengths", "-1"], "--strengths: write finite multiples of saturation that are not negative"),
+        (
+            ["--strengths", "-1"],
+            "--strengths: write finite multiples of saturation that are not negative",
+        ),
         (["--reference", "flat+wiener"], "--reference flat+wiener is not evaluated: write one of"),
         (["--pipelines", "flat"], "flat: write MASK+RESTORER"),
     ],
@@ -270,16 +304,20 @@ def test_an_argument_that_cannot_be_ends_with_one_line(tmp_path, monkeypatch, op
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "store"))
-    done = CliRunner().invoke(app, ["evaluate", "first_light", *SMALL, "--pipelines", "flat+none", *options])
+    done = CliRunner().invoke(
+        app, ["evaluate", "first_light", *SMALL, "--pipelines", "flat+none", *options]
+    )
     assert done.exit_code == 2
     assert said in done.stderr
     assert not (tmp_path / "runs").exists()
 
 
-# --- the whole --------------------------------------------------------------------------------------------------------
+# --- the whole ------------------------------------------------------------------------------------
 
 
-def test_an_evaluation_writes_its_folder_and_goes_on_where_it_was_stopped(tmp_path, store, photographs, monkeypatch):
+def test_an_evaluation_writes_its_folder_and_goes_on_where_it_was_stopped(
+    tmp_path, store, photographs, monkeypatch
+):
     how = {"data": photographs, "count": 6, "strengths": (0, 1e4), "small": 16, "store": store}
     asked = read_pipelines(BARE, HERE)
     real, seen = EvaluationPoints._numbers, []
@@ -307,7 +345,8 @@ def test_an_evaluation_writes_its_folder_and_goes_on_where_it_was_stopped(tmp_pa
     assert page.count("<img") == 4
     assert "broken.jpg" in page
     assert "<th>PSNR (dB)</th>" in page
-    assert " ±\N{NO-BREAK SPACE}" in page  # a number may stand above its interval, so that the wide table fits
+    # a number may stand above its interval, so that the wide table fits
+    assert " ±\N{NO-BREAK SPACE}" in page
     assert "\N{NO-BREAK SPACE}±" not in page
     with (folder / "table.csv").open() as file:
         first, second = csv.DictReader(file)
@@ -318,7 +357,9 @@ def test_an_evaluation_writes_its_folder_and_goes_on_where_it_was_stopped(tmp_pa
     with (folder / "suppression.csv").open() as file:
         curves = list(csv.DictReader(file))
     assert len(curves) == 2 * 5
-    assert all(float(r["lsr"]) == pytest.approx(1.0, rel=1e-4) for r in curves if r["mask"] == "flat")
+    assert all(
+        float(r["lsr"]) == pytest.approx(1.0, rel=1e-4) for r in curves if r["mask"] == "flat"
+    )
 
 
 def test_a_scene_keeps_its_picture_no_longer_than_it_is_used(store):
@@ -332,7 +373,10 @@ def test_a_drawn_direction_beyond_the_reach_of_the_pupil_is_refused_before_work(
     """Before, the evaluation of `first_light` as shipped ended in its second scene."""
     shown, _ = scenes(load("first_light"), store, None, 3, list(CASES))
     first, *_ = compose_pipelines("first_light", [], read_pipelines("flat+none", HERE), HERE)
-    with pytest.raises(EvaluationRefused, match=r"scene 2 \(blue\): .*carries only 1.61 mm.*\n.*smaller sensor.shape"):
+    with pytest.raises(
+        EvaluationRefused,
+        match=r"scene 2 \(blue\): .*carries only 1.61 mm.*\n.*smaller sensor.shape",
+    ):
         refuse_directions(first, shown)
     room = ["sensor.shape=[512,512]", "scene.shape=[576,576]"]
     fitting, *_ = compose_pipelines("first_light", room, read_pipelines("flat+none", HERE), HERE)

@@ -1,4 +1,6 @@
-"""What `neusee why` says of a change that is not in the source: settings, versions, files, variables, loaded values."""
+"""What `neusee why` says of a change that is not in the source: settings, versions, files,
+variables, loaded values.
+"""
 
 import importlib
 import sys
@@ -8,11 +10,12 @@ import torch
 
 import neusee.nodes
 from neusee.workflows.engine.runner import run
-from neusee.workflows.explain import code_changes
+from neusee.workflows.explain import change_causes as code_changes
 from neusee.workflows.explain.why_rerun import why_lines
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.keys import code_digest, module_origin, process_settings
+from neusee.workflows.keys import code_digest, module_origin
+from neusee.workflows.keys import loaded_state as process_settings
 from neusee.workflows.store.result_store import Store
 
 NODE = """import os
@@ -38,14 +41,25 @@ class Lab:
     def __init__(self, folder):
         self.folder, self.store = folder / "beside", Store(folder / "cache")
         self.folder.mkdir()
-        for name, text in {"__init__.py": NODE, "_part.py": "TABLE = {'a': 2.0}\n", "table.csv": "3.0"}.items():
+        for name, text in {
+            "__init__.py": NODE,
+            "_part.py": "TABLE = {'a': 2.0}\n",
+            "table.csv": "3.0",
+        }.items():
             (self.folder / name).write_text(text)
 
     def recipe(self, again=True):
         if again:
             forget()
         node = importlib.import_module("neusee.nodes.beside").value
-        return Recipe("beside", "", 1, 0.0, ("s",), {"s": Step("s", node, {"k": 1.0}, {}, Location("b", 1, 1), {})})
+        return Recipe(
+            "beside",
+            "",
+            1,
+            0.0,
+            ("s",),
+            {"s": Step("s", node, {"k": 1.0}, {}, Location("b", 1, 1), {})},
+        )
 
     def causes(self, again=True):
         """What differs from the stored result."""
@@ -81,7 +95,9 @@ def lab(tmp_path, monkeypatch):
 
 def test_a_setting(lab):
     torch.set_default_dtype(torch.float64)
-    assert lab.causes() == ["default dtype torch.float32 -> torch.float64, a setting of this process"]
+    assert lab.causes() == [
+        "default dtype torch.float32 -> torch.float64, a setting of this process"
+    ]
 
 
 def test_autocast(lab):
@@ -104,7 +120,9 @@ def test_the_version_of_python(lab, monkeypatch):
 def test_the_version_of_a_package(lab, monkeypatch):
     real = module_origin.version_of
     monkeypatch.setattr(module_origin, "_fixed", {})
-    monkeypatch.setattr(module_origin, "version_of", lambda top: real(top) + ("9" if top == "safetensors" else ""))
+    monkeypatch.setattr(
+        module_origin, "version_of", lambda top: real(top) + ("9" if top == "safetensors" else "")
+    )
     now = real("safetensors")
     assert lab.causes() == [f"{now} -> {now}9, an installed package"]
 
@@ -122,7 +140,11 @@ def test_a_variable_of_the_environment(lab, monkeypatch):
 def test_declarations_that_come_and_go(lab):
     (lab.folder / "more.csv").write_text("1.0")
     lab.edit("__init__.py", '"table.csv").read_text()', '"more.csv").read_text()')
-    lab.edit("__init__.py", 'depends=["table.csv", "env:BESIDE"]', 'depends=["more.csv", "unaffected:os"]')
+    lab.edit(
+        "__init__.py",
+        'depends=["table.csv", "env:BESIDE"]',
+        'depends=["more.csv", "unaffected:os"]',
+    )
     found = lab.causes()
     assert "file more.csv is declared now" in found
     assert "file table.csv is declared no more" in found
@@ -132,7 +154,9 @@ def test_declarations_that_come_and_go(lab):
 
 def test_a_package_that_is_used_no_longer(lab):
     lab.edit("__init__.py", "import safetensors\n", "import xxhash\n")
-    assert {"package xxhash is used now", "package safetensors is no longer used"} <= {*lab.causes()}
+    assert {"package xxhash is used now", "package safetensors is no longer used"} <= {
+        *lab.causes()
+    }
 
 
 def test_a_value_that_was_changed_in_memory(lab):
@@ -140,7 +164,10 @@ def test_a_value_that_was_changed_in_memory(lab):
     sys.modules["neusee.nodes.beside._part"].TABLE["a"] = 5.0
     found = [line.strip() for line in why_lines(recipe, lab.store, "s")]
     what = "a constant, a table, a default or a function"
-    assert f"s: a value that neusee/nodes/beside/_part.py holds was changed while the program ran: {what}" in found
+    assert (
+        "s: a value that neusee/nodes/beside/_part.py holds was changed while the program ran:"
+        f" {what}" in found
+    )
 
 
 def test_a_value_of_the_function_around_a_node(lab):
@@ -160,7 +187,10 @@ def test_code_that_was_edited_after_its_import(lab):
     lab.edit("_part.py", "2.0", "2.5")
     with pytest.warns(UserWarning, match=r"_part.py was edited after its import"):
         found = why_lines(recipe, lab.store, "s")
-    assert found[1].strip() == "s: the loaded code of beside.value is not that of its file any more: restart Python"
+    assert (
+        found[1].strip()
+        == "s: the loaded code of beside.value is not that of its file any more: restart Python"
+    )
 
 
 def test_a_package_with_other_files_under_its_version_is_told():

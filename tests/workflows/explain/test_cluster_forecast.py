@@ -43,7 +43,13 @@ def recipe(devices=("", "", "", "")):
     wires = {"a": (), "b": ("a",), "c": ("a",), "d": ("b", "c")}
     steps = {
         name: Step(
-            name, change if reads else make, {}, {"x": reads} if reads else {}, Location("r.yaml", 1, 1), {}, device
+            name,
+            change if reads else make,
+            {},
+            {"x": reads} if reads else {},
+            Location("r.yaml", 1, 1),
+            {},
+            device,
         )
         for (name, reads), device in zip(wires.items(), devices, strict=True)
     }
@@ -60,7 +66,10 @@ def test_every_figure_that_was_asked_for_is_told(machines):
     assert lines == [
         "4 steps on 3 devices: A host and two cards.",
         "",
-        "makespan     3.01 s; where they were measured, one after another, 40 s: 13.3 times as long",
+        (
+            "makespan     3.01 s; where they were measured, one after another, 40 s: 13.3 times as"
+            " long"
+        ),
         "transferred  200 MB in 2 copies",
         "",
         "device  busy  steps  memory    of",
@@ -80,15 +89,24 @@ def test_every_figure_that_was_asked_for_is_told(machines):
 
 
 def test_a_hint_is_followed(machines):
-    on = {s.task: s.device for s in simulated(recipe(("cpu", "gpu", "cuda:1", "mps")), costs(), machines).slots}
+    on = {
+        s.task: s.device
+        for s in simulated(recipe(("cpu", "gpu", "cuda:1", "mps")), costs(), machines).slots
+    }
     assert on["a"] == "cpu"
     assert on["b"] != "cpu"
     assert on["c"] == "cuda:1"
 
 
 def test_speed_goes_by_the_family_of_the_node(machines):
-    fast = replace(machines, speeds={**machines.speeds, "cuda:1": {"default": 1.0, change.path.split(".")[0]: 100.0}})
-    ends = {s.task: (s.device, round(s.end - s.start, 9)) for s in simulated(recipe(), costs(), fast).slots}
+    fast = replace(
+        machines,
+        speeds={**machines.speeds, "cuda:1": {"default": 1.0, change.path.split(".")[0]: 100.0}},
+    )
+    ends = {
+        s.task: (s.device, round(s.end - s.start, 9))
+        for s in simulated(recipe(), costs(), fast).slots
+    }
     assert ends["d"] == ("cuda:1", 0.1)
 
 
@@ -97,8 +115,8 @@ def test_a_step_is_cut_where_it_can_be_and_refused_where_it_cannot(machines):
     cards = replace(machines, cluster=replace(machines.cluster, devices=machines.devices[1:]))
     lines = cluster_lines(recipe(), large, cards)
     assert lines[1:] == [
-        "refused: b does not fit: its inputs, result and results kept there need 3,200,000,000 B (3.2 GB) on "
-        "cuda:1, which has 1,000,000,000 B (1 GB)"
+        "refused: b does not fit: its inputs, result and results kept there need 3,200,000,000 B"
+        " (3.2 GB) on cuda:1, which has 1,000,000,000 B (1 GB)"
     ]
     banded = recipe()
     steps = {**banded.steps, "b": replace(banded.steps["b"], node=_banded(change))}
@@ -116,17 +134,27 @@ def _banded(what):
 
 def test_a_long_critical_path_loses_its_middle(machines):
     steps = {
-        f"s{i}": Step(f"s{i}", change if i else make, {}, {"x": f"s{i - 1}"} if i else {}, Location("r.yaml", 1, 1), {})
+        f"s{i}": Step(
+            f"s{i}",
+            change if i else make,
+            {},
+            {"x": f"s{i - 1}"} if i else {},
+            Location("r.yaml", 1, 1),
+            {},
+        )
         for i in range(10_000)
     }
     long = Recipe("r", "", 1, 0.0, ("s9999",), steps)
-    lines = cluster_lines(long, {name: Estimate({"cpu": 0.01}, 0.0, 0.0, False) for name in steps}, machines)
+    lines = cluster_lines(
+        long, {name: Estimate({"cpu": 0.01}, 0.0, 0.0, False) for name in steps}, machines
+    )
     assert any("… 9976 more …" in line for line in lines)
     assert len(lines) < 50
     assert lines[-1].endswith("s23 and 9976 more")
 
 
 def test_nothing_to_run_is_no_mistake(machines):
-    assert cluster_lines(recipe(), {}, machines)[2] == (
-        "makespan     0 s; where they were measured, one after another, 0 s"
+    assert (
+        cluster_lines(recipe(), {}, machines)[2]
+        == "makespan     0 s; where they were measured, one after another, 0 s"
     )

@@ -4,10 +4,16 @@ import json
 
 import pytest
 
-from neusee.workflows.engine.cost_laws import shipped
+from neusee.workflows.engine.cost_model import shipped
 from neusee.workflows.engine.local_executor import lanes_of
-from neusee.workflows.explain.forecast_table import forecast_rows, memory_text, seconds_text, table_lines
-from neusee.workflows.explain.run_forecast import forecast, planned
+from neusee.workflows.explain.run_forecast import (
+    forecast,
+    forecast_rows,
+    memory_text,
+    planned,
+    seconds_text,
+    table_lines,
+)
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 
@@ -62,7 +68,9 @@ def test_each_step_of_a_plan_has_the_range_of_its_law(tmp_path):
     json.dumps(list(rows.values()), allow_nan=False)
 
 
-def test_a_guess_is_written_with_its_upper_end_and_what_is_known_is_not_called_a_guess(tmp_path, monkeypatch):
+def test_a_guess_is_written_with_its_upper_end_and_what_is_known_is_not_called_a_guess(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr("neusee.workflows.engine.cost_model.shipped", dict)
     plan = planned(load("first_light", []), Store(tmp_path), lanes_of(["cpu"], 10**12))
     rows = [row for row in forecast_rows(plan, Store(tmp_path)) if row["step"] == "psf[mask]"]

@@ -11,8 +11,7 @@ import neusee.nodes
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.runner import run
 from neusee.workflows.explain import change_causes, stored_origin, why_rerun
-from neusee.workflows.explain.change_causes import Comparison, Pair
-from neusee.workflows.explain.code_changes import edits
+from neusee.workflows.explain.change_causes import Comparison, Pair, edits
 from neusee.workflows.explain.stored_origin import why_key_lines
 from neusee.workflows.explain.why_rerun import explained, why_lines
 from neusee.workflows.graph.diagnostics import Location
@@ -22,8 +21,11 @@ from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 
 MODULES = {
-    "trial/__init__.py": "from neusee.nodes.trial._light import add, bright, flat, gather, noise, photograph\n",
-    "trial/_light.py": '''
+    "trial/__init__.py": (
+        "from neusee.nodes.trial._light import add, bright, flat, gather, noise, photograph\n"
+    ),
+    "trial/_light.py": (
+        '''
 from pathlib import Path
 
 import torch
@@ -75,7 +77,8 @@ def noise(light: Tensor, *, sigma: Electrons, rng: torch.Generator) -> Tensor:
 @noise.skip_bound
 def _(light, *, sigma: float) -> float:
     return sigma / light.max
-''',
+'''
+    ),
     "trial/_helper.py": "FALL = 2.0\n\n\ndef half(x):\n    return x / 2\n",
 }
 
@@ -103,7 +106,9 @@ outputs: [restored]
 
 
 class Trial:
-    """A package of nodes and a recipe that a test may edit; every call sees them as a new process would."""
+    """A package of nodes and a recipe that a test may edit; every call sees them as a new
+    process would.
+    """
 
     def __init__(self, folder):
         self.folder, self.cache = folder, folder / "cache"
@@ -149,7 +154,9 @@ class Trial:
         head, *causes, beside = self.why(step, *arguments)
         assert head.startswith(f"{step} (trial.")
         assert beside.startswith("  compared with")
-        return [line.strip() for line in causes if "depending on the values of the inputs" not in line]
+        return [
+            line.strip() for line in causes if "depending on the values of the inputs" not in line
+        ]
 
 
 def forget():
@@ -161,18 +168,25 @@ def forget():
 
 @pytest.fixture
 def trial(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # edits within one second would be missed by Python itself
+    # edits within one second would be missed by Python itself
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     monkeypatch.setattr(neusee.nodes, "__path__", [*neusee.nodes.__path__, str(tmp_path / "nodes")])
     yield Trial(tmp_path)
     forget()
 
 
 CHANGES = {
-    "a value": (["sensor.read_noise=20 e-"], "restored <- raw <- read: sensor.read_noise 10.5 -> 20 e- (argument 2)"),
+    "a value": (
+        ["sensor.read_noise=20 e-"],
+        "restored <- raw <- read: sensor.read_noise 10.5 -> 20 e- (argument 2)",
+    ),
     "a plain number": (["sensor.gain=4"], "restored <- raw: sensor.gain 3 -> 4 (argument 2)"),
     "a quantity in the unit it is written in": (
         ["scene.wavelength=0.6 um"],
-        "restored <- raw <- read <- all <- spot[red] <- light: scene.wavelength 0.55 -> 0.6 um (argument 2)",
+        (
+            "restored <- raw <- read <- all <- spot[red] <- light: scene.wavelength 0.55 -> 0.6 um"
+            " (argument 2)"
+        ),
     ),
     "a list": (
         ["sensor.at=[1 mm, 3 mm]"],
@@ -199,7 +213,10 @@ CHANGES = {
         ["+lasers.blue={amount: 3}"],
         "restored <- raw <- read <- all: reads spot[blue] now",
     ),
-    "an item less": (["~lasers.green"], "restored <- raw <- read <- all: reads spot[green] no more"),
+    "an item less": (
+        ["~lasers.green"],
+        "restored <- raw <- read <- all: reads spot[green] no more",
+    ),
     "an input less": (["~steps.restored.from.more"], "restored: reads photo no more"),
     "another source": (
         ["steps.restored.from.more=light"],
@@ -217,7 +234,9 @@ def test_a_change_is_told_from_its_root(trial, change):
     trial.run()
     arguments, said = CHANGES[change]
     assert said in trial.causes("restored", *arguments)
-    assert trial.why("restored", *arguments)[0].startswith("restored (trial.add): not stored, so it would run")
+    assert trial.why("restored", *arguments)[0].startswith(
+        "restored (trial.add): not stored, so it would run"
+    )
 
 
 def test_a_change_in_the_recipe_s_file_says_its_line(trial):
@@ -230,10 +249,14 @@ def test_a_change_in_the_recipe_s_file_says_its_line(trial):
 def test_another_node_at_a_step(trial):
     trial.run()
     trial.edit(
-        "mine.yaml", 'photo: {node: trial.photograph, with: {file: "${scene.file}"}}', "photo: {node: trial.bright}"
+        "mine.yaml",
+        'photo: {node: trial.photograph, with: {file: "${scene.file}"}}',
+        "photo: {node: trial.bright}",
     )
     trial.edit("mine.yaml", ", file: a.bin", "")
-    assert trial.causes("restored") == ["restored <- photo: trial.photograph -> trial.bright (mine.yaml:13:17)"]
+    assert trial.causes("restored") == [
+        "restored <- photo: trial.photograph -> trial.bright (mine.yaml:13:17)"
+    ]
 
 
 def test_many_items_are_told_in_one(trial):
@@ -246,14 +269,20 @@ def test_many_items_are_told_in_one(trial):
 
 def test_a_source_that_is_null(trial):
     trial.run()
-    trial.edit("mine.yaml", 'photo: {node: trial.photograph, with: {file: "${scene.file}"}}', "photo: null")
+    trial.edit(
+        "mine.yaml", 'photo: {node: trial.photograph, with: {file: "${scene.file}"}}', "photo: null"
+    )
     trial.edit("mine.yaml", ", file: a.bin", "")
-    assert trial.causes("restored") == ["restored: reads photo no more: it is null (mine.yaml:13:10)"]
+    assert trial.causes("restored") == [
+        "restored: reads photo no more: it is null (mine.yaml:13:10)"
+    ]
 
 
 def test_a_mapping_says_the_entries_that_differ(trial):
     trial.edit(
-        "mine.yaml", 'trial.photograph, with: {file: "${scene.file}"}', "trial.bright, with: {sources: {1: 2, 3: 4}}"
+        "mine.yaml",
+        'trial.photograph, with: {file: "${scene.file}"}',
+        "trial.bright, with: {sources: {1: 2, 3: 4}}",
     )
     trial.edit("mine.yaml", ", file: a.bin", "")
     trial.run()
@@ -277,10 +306,14 @@ def test_nought_has_a_unit_too(trial):
 def test_a_file_of_another_content(trial):
     trial.run()
     trial.write("a.bin", "b")
-    assert trial.causes("restored") == ["restored <- photo: file a.bin: other content (scene.file, mine.yaml:3:60)"]
+    assert trial.causes("restored") == [
+        "restored <- photo: file a.bin: other content (scene.file, mine.yaml:3:60)"
+    ]
     trial.write("a.bin", "a")
     shutil.copy(trial.folder / "a.bin", trial.folder / "a.png")
-    assert trial.causes("photo", "scene.file=a.png") == ["photo: file a.png: .png, not .bin (scene.file, argument 2)"]
+    assert trial.causes("photo", "scene.file=a.png") == [
+        "photo: file a.png: .png, not .bin (scene.file, argument 2)"
+    ]
 
 
 def test_two_changes_are_both_told_the_nearest_first(trial):
@@ -294,7 +327,10 @@ def test_two_changes_are_both_told_the_nearest_first(trial):
 CODE = {
     "a node's own function": (
         ("_light.py", "return light + sigma * torch", "return light + 2 * sigma * torch"),
-        "restored <- raw <- read: code of noise() in neusee/nodes/trial/_light.py changed (line 46)",
+        (
+            "restored <- raw <- read: code of noise() in neusee/nodes/trial/_light.py changed"
+            " (line 46)"
+        ),
     ),
     "a helper": (
         ("_helper.py", "x / 2", "x / 4"),
@@ -343,7 +379,9 @@ def test_a_function_that_is_gone(trial):
     trial.edit("nodes/trial/_helper.py", "FALL = 2.0\n", "FALL = 2.0\nNEVER = 1\n")
     trial.run()
     trial.edit("nodes/trial/_helper.py", "NEVER = 1\n", "")
-    assert trial.causes("photo") == ["photo: constant NEVER was removed from neusee/nodes/trial/_helper.py"]
+    assert trial.causes("photo") == [
+        "photo: constant NEVER was removed from neusee/nodes/trial/_helper.py"
+    ]
 
 
 @pytest.mark.parametrize("damage", [None, "", "{", "[]", '{"a": 1}', '{"a": {"b": [1]}}', "\x00"])
@@ -368,7 +406,9 @@ def test_the_definitions_are_written_once_and_a_comment_adds_none(trial):
     assert len(names) == 1
     trial.edit("nodes/trial/_helper.py", "FALL = 2.0", "FALL = 2.0  # of course")
     trial.run("scene.value=9")
-    assert {path.name: path.stat().st_mtime_ns for path in (trial.cache / "code").iterdir()} == names
+    assert {
+        path.name: path.stat().st_mtime_ns for path in (trial.cache / "code").iterdir()
+    } == names
     found = json.loads(next((trial.cache / "code").iterdir()).read_text())
     assert set(found["neusee.nodes.trial._helper"]) == {"constant FALL", "half()"}
 
@@ -418,8 +458,12 @@ def test_the_nearest_earlier_result_is_the_one_with_the_fewest_causes(trial):
     trial.run()
     trial.run("scene.value=9", "sensor.gain=4")
     trial.run("scene.value=7", "sensor.gain=5")
-    assert trial.causes("restored", "scene.value=9") == ["restored <- raw: sensor.gain 4 -> 3 (mine.yaml:6:9)"]
-    assert trial.why("restored", "scene.value=9")[-1].startswith("  compared with the nearest of 3 earlier results, ")
+    assert trial.causes("restored", "scene.value=9") == [
+        "restored <- raw: sensor.gain 4 -> 3 (mine.yaml:6:9)"
+    ]
+    assert trial.why("restored", "scene.value=9")[-1].startswith(
+        "  compared with the nearest of 3 earlier results, "
+    )
 
 
 def test_every_item_of_a_step_is_told(trial):
@@ -456,7 +500,9 @@ def test_a_cached_run_looks_nothing_up(trial, monkeypatch):
 def test_a_value_that_was_not_kept_is_said_to_have_been_made(trial):
     key = trial.run().keys["raw"]
     about = {
-        name: value for name, value in trial.store.about(key).items() if name not in ("payload", "tensors", "layout")
+        name: value
+        for name, value in trial.store.about(key).items()
+        if name not in ("payload", "tensors", "layout")
     }
     for path in (trial.cache / key[:2]).glob(f"{key}.*"):
         path.unlink()
@@ -467,7 +513,12 @@ def test_a_value_that_was_not_kept_is_said_to_have_been_made(trial):
     assert f"but its value was not kept, key {key[:8]}" in head
     assert rest == ["  no earlier result to compare with: the first result of this step"]
     recipe, told, store = trial.load(), {}, trial.store
-    run(recipe, store, ["raw"], explained(recipe, store, lambda event: told.update({event.step: event.done})))
+    run(
+        recipe,
+        store,
+        ["raw"],
+        explained(recipe, store, lambda event: told.update({event.step: event.done})),
+    )
     assert told["raw"].why == "computed before, but its value is not stored"
 
 
@@ -484,8 +535,11 @@ def test_results_that_were_removed_are_passed_over(trial):
     second = trial.run("sensor.gain=5").keys["raw"]
     for path in trial.cache.glob(f"{second[:2]}/{second}.*"):
         path.unlink()
-    if (brief := trial.cache / "brief.jsonl").exists():  # where a result is that was computed faster than written
-        brief.write_text("\n".join(line for line in brief.read_text().split("\n") if second not in line[:60]))
+    # where a result is that was computed faster than written
+    if (brief := trial.cache / "brief.jsonl").exists():
+        brief.write_text(
+            "\n".join(line for line in brief.read_text().split("\n") if second not in line[:60])
+        )
     *_, beside = trial.why("raw", "sensor.gain=4")
     assert beside.startswith(f"  compared with the nearest of 2 earlier results, {first[:8]} of ")
 
@@ -496,9 +550,14 @@ def test_a_run_compares_few_results(trial, monkeypatch):
     seen = []
     own = change_causes.Comparison.own
     monkeypatch.setattr(
-        change_causes.Comparison, "own", lambda self, label, *a: seen.append(label) or own(self, label, *a)
+        change_causes.Comparison,
+        "own",
+        lambda self, label, *a: seen.append(label) or own(self, label, *a),
     )
-    assert trial.told("sensor.gain=50", "sensor.read_noise=50 e-")["raw"] == "sensor.gain 11 -> 50 (argument 2)"
+    assert (
+        trial.told("sensor.gain=50", "sensor.read_noise=50 e-")["raw"]
+        == "sensor.gain 11 -> 50 (argument 2)"
+    )
     assert seen.count("raw") == why_rerun._AT_ONCE
 
 
@@ -523,7 +582,7 @@ def test_a_key_that_is_none_or_many_is_refused(trial):
         why_key_lines(trial.store, "")
 
 
-# --- long chains ----------------------------------------------------------------------------------------------------
+# --- long chains ----------------------------------------------------------------------------------
 
 
 class DerivedFiles:
@@ -549,7 +608,10 @@ def test_a_chain_of_ten_thousand_steps_is_walked_without_recursion(tmp_path, toy
     length, shelf = 10_000, DerivedFiles(tmp_path, {})
     recipe = chain(length, 2.0, toy.add)
     before = resolve(chain(length, 1.0, toy.add), list(recipe.steps), shelf)
-    shelf.abouts = {key: {"step": before.makers[key], "origin": before.origins[key]} for key in before.keys.values()}
+    shelf.abouts = {
+        key: {"step": before.makers[key], "origin": before.origins[key]}
+        for key in before.keys.values()
+    }
     after = resolve(recipe, list(recipe.steps), shelf)
     last = f"s{length - 1}"
     roots = Comparison(shelf, recipe, after).roots(Pair(last, after.keys[last], before.keys[last]))
@@ -574,7 +636,9 @@ def test_results_that_are_gone_are_said_to_be(tmp_path, toy):
 def test_code_of_a_module_that_was_edited_after_its_import_is_not_remembered(trial, monkeypatch):
     monkeypatch.setattr(sys, "dont_write_bytecode", False)
     trial.load()
-    (trial.folder / "nodes/trial/_helper.py").write_text(MODULES["trial/_helper.py"].replace("2", "25"))
+    (trial.folder / "nodes/trial/_helper.py").write_text(
+        MODULES["trial/_helper.py"].replace("2", "25")
+    )
     code = Code(trial.cache / "code.json")
     with pytest.warns(UserWarning, match="edited after its import"):
         code.digest("neusee.nodes.trial._light")
@@ -583,9 +647,13 @@ def test_code_of_a_module_that_was_edited_after_its_import_is_not_remembered(tri
 
 
 PACKAGED = {
-    "sensor.read_noise=20 e-": "well[mask] <- read[mask]: sensor.read_noise 10.5 -> 20 e- (argument 2)",
+    "sensor.read_noise=20 e-": (
+        "well[mask] <- read[mask]: sensor.read_noise 10.5 -> 20 e- (argument 2)"
+    ),
     "optics.bands=25": "scene_photons[mask] <- bands: optics.bands 31 -> 25 (argument 2)",
-    "doe=axicon": "pupil[mask] <- fabricated <- height: doe.half_rings -> doe.axicon (doe/axicon.yaml:5:11)",
+    "doe=axicon": (
+        "pupil[mask] <- fabricated <- height: doe.half_rings -> doe.axicon (doe/axicon.yaml:5:11)"
+    ),
     "sensor.shape=[320, 320]": "raw[mask]: sensor.shape [640, 640] -> [320, 320] (argument 2)",
     "seed=8": "digital[mask]: seed 7 -> 8 (argument 2)",
 }
@@ -593,11 +661,18 @@ PACKAGED = {
 
 @pytest.mark.parametrize("change", PACKAGED)
 def test_a_packaged_recipe_s_changes_are_told_in_its_own_words(tmp_path, change):
-    shelf, recipe, other = DerivedFiles(tmp_path, {}), load("first_light"), load("first_light", [change], first=2)
+    shelf, recipe, other = (
+        DerivedFiles(tmp_path, {}),
+        load("first_light"),
+        load("first_light", [change], first=2),
+    )
     said = PACKAGED[change]
     step = said.replace(":", " ").split()[0]
     before = resolve(recipe, needed(recipe, [step]), shelf)
-    shelf.abouts = {key: {"step": before.makers[key], "origin": origin} for key, origin in before.origins.items()}
+    shelf.abouts = {
+        key: {"step": before.makers[key], "origin": origin}
+        for key, origin in before.origins.items()
+    }
     after = resolve(other, needed(other, [step]), shelf)
     roots = Comparison(shelf, other, after).roots(Pair(step, after.keys[step], before.keys[step]))
     assert [f"{stored_origin._chain(roots.chain(text))}: {text}" for text in roots.found] == [said]

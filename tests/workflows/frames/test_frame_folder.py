@@ -1,4 +1,6 @@
-"""Folders of frames of a camera in NumPy: found by names, headers or a table, and what is wrong with them is told."""
+"""Folders of frames of a camera in NumPy: found by names, headers or a table, and what is wrong
+with them is told.
+"""
 
 import json
 import shutil
@@ -107,7 +109,13 @@ def test_without_photons_the_exposures_tell_the_light(tmp_path):
     as_series(tmp_path)
     found = find_levels(tmp_path)
     assert found.light == "exposure"
-    assert [level.light for level in found.levels if not level.dark] == [0.001, 0.002, 0.003, 0.004, 0.005]
+    assert [level.light for level in found.levels if not level.dark] == [
+        0.001,
+        0.002,
+        0.003,
+        0.004,
+        0.005,
+    ]
 
 
 def one_frame(folder):
@@ -132,7 +140,11 @@ def no_exposure(folder):
 
 
 def wrong_name(folder):
-    for a, b in (("flat_2000ph_1ms_0", "x"), ("flat_8000ph_1ms_0", "flat_2000ph_1ms_0"), ("x", "flat_8000ph_1ms_0")):
+    for a, b in (
+        ("flat_2000ph_1ms_0", "x"),
+        ("flat_8000ph_1ms_0", "flat_2000ph_1ms_0"),
+        ("x", "flat_8000ph_1ms_0"),
+    ):
         (folder / f"{a}.png").rename(folder / f"{b}.png")
 
 
@@ -161,7 +173,9 @@ def bright_darks(folder):
 
 
 def missing_file(folder):
-    (folder / "frames.csv").write_text("file,exposure,photons\nnone.png,1 ms,0\ndark_1ms_0.png,1,0\n")
+    (folder / "frames.csv").write_text(
+        "file,exposure,photons\nnone.png,1 ms,0\ndark_1ms_0.png,1,0\n"
+    )
 
 
 @pytest.mark.parametrize(
@@ -171,14 +185,26 @@ def missing_file(folder):
         (other_size, ["flat_2000ph_1ms_0.png: 8 x 8 pixels, but 13 files have 10 x 8 pixels"]),
         (eight_bits, ["flat_2000ph_1ms_0.png: 8 bits, but 13 files have 16 bits"]),
         (no_darks, ["no dark frames: cover the lens"]),
-        (no_exposure, ["flat_2000ph_0.png: the exposure is unknown: name files such as dark_10ms_1.png"]),
-        (wrong_name, ["flat_2000ph_1ms_0.png and flat_2000ph_1ms_1.png count as one level", "flat_8000ph"]),
+        (
+            no_exposure,
+            ["flat_2000ph_0.png: the exposure is unknown: name files such as dark_10ms_1.png"],
+        ),
+        (
+            wrong_name,
+            ["flat_2000ph_1ms_0.png and flat_2000ph_1ms_1.png count as one level", "flat_8000ph"],
+        ),
         (no_photons, ["flat_1ms_0.png, flat_1ms_1.png: no photons, which 8 other lit files have"]),
         (few_levels, ["2 lit levels: take 4 or more"]),
         (colour, ["flat_2000ph_1ms_0.png is PNG with pixels of kind RGB, not raw grey"]),
         (other_time, ["flat_2000ph_1ms_0.png: its name says 0.001 s, its header 0.02 s"]),
         (bright_darks, ["dark frames have means up to 690 DN"]),
-        (missing_file, ["frames.csv:2: no such file: none.png", "frames.csv:3: exposure 1: write a time with a unit"]),
+        (
+            missing_file,
+            [
+                "frames.csv:2: no such file: none.png",
+                "frames.csv:3: exposure 1: write a time with a unit",
+            ],
+        ),
     ],
     ids=lambda each: each.__name__ if callable(each) else "",
 )
@@ -189,21 +215,34 @@ def test_each_mistake_of_a_folder_is_told_with_its_file_and_what_to_do(mistake, 
         find_levels(tmp_path)
     for text in words:
         assert text in str(refused.value)
-    assert len(str(refused.value).splitlines()) == len(words), "one line for each reason, and no other"
+    assert len(str(refused.value).splitlines()) == len(words), (
+        "one line for each reason, and no other"
+    )
 
 
 def test_an_empty_folder_is_told_how_to_name_files(tmp_path, capsys):
     assert typed(["calibrate", str(tmp_path)]) == 2
     told = capsys.readouterr().err
-    assert told.startswith(f"nothing was drawn: {tmp_path}: no frames: name files such as dark_10ms_1.png")
+    assert told.startswith(
+        f"nothing was drawn: {tmp_path}: no frames: name files such as dark_10ms_1.png"
+    )
 
 
 def written_by(camera, folder, relative=False):
-    """16-bit PNG files of the camera in NumPy; ``relative``: the names tell the light in the exposure only."""
+    """16-bit PNG files of the camera in NumPy; ``relative``: the names tell the light in the
+    exposure only.
+    """
     for _, photons, time, frames in camera.levels():
         for number, frame in enumerate(frames):
-            told = f"lit_{photons / 1000:.5f}ms" if relative else f"lit_{photons:.6g}ph_{1e3 * time:g}ms"
-            png(folder / f"{told if photons else f'dark_{1e3 * time:.5g}ms'}_{number}.png", frame.astype(np.uint16))
+            told = (
+                f"lit_{photons / 1000:.5f}ms"
+                if relative
+                else f"lit_{photons:.6g}ph_{1e3 * time:g}ms"
+            )
+            png(
+                folder / f"{told if photons else f'dark_{1e3 * time:.5g}ms'}_{number}.png",
+                frame.astype(np.uint16),
+            )
 
 
 def typed(words):
@@ -223,7 +262,9 @@ def working(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_folder_becomes_a_sensor_with_its_uncertainty(working, capsys):
-    """From frames of known truth to a sensor group, whose values and correlations a recipe takes."""
+    """From frames of known truth to a sensor group, whose values and correlations a recipe
+    takes.
+    """
     written_by(Camera(seed=3, size=64, darks=3, lit=10, faults={"lamp": 0.003}), working / "lab")
     light = "traceability.photons={relative_uncertainty: 0.02, certificate: '4711'}"
     assert typed(["calibrate", "lab", light, "--sensor", "mine"]) == 0, capsys.readouterr().err
@@ -233,18 +274,27 @@ def test_a_folder_becomes_a_sensor_with_its_uncertainty(working, capsys):
     for name, truth in {"gain": 0.125, "quantum_efficiency": 0.5, "read_noise": 8.0}.items():
         at = place[f"sensor.{name}"]
         assert abs(joint.mean[at] - truth) < 4 * joint.sd[at], name
-    assert 0.98 * 0.02 * 0.495 < joint.sd[place["sensor.quantum_efficiency"]] < 0.02, "2 % of the light and more"
-    assert joint.sd[place["sensor.gain"]] < 0.04 * 0.125, "chance, and faults that frames of 64 x 64 pixels may hide"
+    assert 0.98 * 0.02 * 0.495 < joint.sd[place["sensor.quantum_efficiency"]] < 0.02, (
+        "2 % of the light and more"
+    )
+    assert joint.sd[place["sensor.gain"]] < 0.04 * 0.125, (
+        "chance, and faults that frames of 64 x 64 pixels may hide"
+    )
     correlation = joint.factor @ joint.factor.T
-    # nine tenths of both widths are what so few pixels may hide, which ties the two values less than chance does
+    # nine tenths of both widths are what so few pixels may hide, which ties the two values less
+    # than chance does
     assert correlation[place["sensor.gain"], place["sensor.read_noise"]] < -0.3
 
     (results,) = (path for path in (working / "runs").iterdir() if path.name != "latest")
-    assert (results / "sensor" / "mine.yaml").read_text() == (working / "sensor" / "mine.yaml").read_text()
+    assert (results / "sensor" / "mine.yaml").read_text() == (
+        working / "sensor" / "mine.yaml"
+    ).read_text()
     budget = json.loads((results / "budget.json").read_text())
     efficiency = budget["quantities"]["quantum_efficiency"]
     parts = {source["source"]: source.get("contribution") for source in efficiency["sources"]}
-    assert parts["photometric calibration of the light"] == pytest.approx(0.02 * efficiency["value"])
+    assert parts["photometric calibration of the light"] == pytest.approx(
+        0.02 * efficiency["value"]
+    )
     assert parts["temperature"] is None
     assert "temperature" in efficiency["not stated"]
     assert budget["traceability"]["instrument"] == "not stated"
@@ -252,14 +302,21 @@ def test_a_folder_becomes_a_sensor_with_its_uncertainty(working, capsys):
     for name, row in budget["quantities"].items():
         if name not in ("bend", "twist", "lamp"):  # the interval of a wide lamp is not symmetric
             low, high = (posterior["stated"][name][end] for end in ("low", "high"))
-            assert row["combined standard uncertainty"] == pytest.approx((high - low) / 2 / 1.645, rel=0.02), name
-    lone = [typed(["calibrate", "calibrate", "--sensor", "mine"]), typed(["calibrate", "lab", "--sensor", "My sensor"])]
+            assert row["combined standard uncertainty"] == pytest.approx(
+                (high - low) / 2 / 1.645, rel=0.02
+            ), name
+    lone = [
+        typed(["calibrate", "calibrate", "--sensor", "mine"]),
+        typed(["calibrate", "lab", "--sensor", "My sensor"]),
+    ]
     assert lone == [2, 2]
 
 
 @pytest.mark.slow
 def test_gain_and_noise_are_tied_where_the_frames_hide_nothing(working, capsys):
-    """A camera that cannot mix pixels or frames has the widths and the correlation of chance alone."""
+    """A camera that cannot mix pixels or frames has the widths and the correlation of chance
+    alone.
+    """
     written_by(Camera(seed=3, size=64, darks=3, lit=10, faults={"lamp": 0.003}), working / "lab")
     raw = ["steps.prior.with.mixing=none", "steps.prior.with.lag=none"]
     assert typed(["calibrate", "lab", *raw, "--sensor", "raw"]) == 0, capsys.readouterr().err
@@ -271,7 +328,11 @@ def test_gain_and_noise_are_tied_where_the_frames_hide_nothing(working, capsys):
 
 @pytest.mark.slow
 def test_light_that_is_known_up_to_a_factor_tells_everything_but_the_efficiency(working, capsys):
-    written_by(Camera(seed=4, size=64, darks=3, lit=10, faults={"lamp": 0.003}), working / "lab", relative=True)
+    written_by(
+        Camera(seed=4, size=64, darks=3, lit=10, faults={"lamp": 0.003}),
+        working / "lab",
+        relative=True,
+    )
     assert typed(["calibrate", "lab"]) == 0, capsys.readouterr().err
     (results,) = (path for path in (working / "runs").iterdir() if path.name != "latest")
     posterior = json.loads((results / "posterior.json").read_text())

@@ -1,4 +1,6 @@
-"""Exposure and light by the names of files: what laboratories write, and what is doubtful and said to be."""
+"""Exposure and light by the names of files: what laboratories write, and what is doubtful and
+said to be.
+"""
 
 from pathlib import Path
 
@@ -8,9 +10,7 @@ from PIL import Image, PngImagePlugin
 
 from neusee.nodes.calibrate import frame_header
 from neusee.workflows.cli import app
-from neusee.workflows.frames.frame_folder import FolderRefused, find_levels
-from neusee.workflows.frames.frame_names import read_name
-from neusee.workflows.frames.frame_table import read_table
+from neusee.workflows.frames.frame_folder import FolderRefused, find_levels, read_name, read_table
 from tests.workflows.frames.test_frame_folder import by_name, by_table, png, shots
 
 LAB = Path("lab")
@@ -58,18 +58,27 @@ def test_a_name_without_an_exposure_says_none(name):
 
 @pytest.mark.parametrize(
     ("name", "photons"),
-    [("flat_5000ph_10ms", 5000.0), ("flat_ph5000_10ms", 5000.0), ("5000_photons_a", 5000.0), ("photons_1p5e3", 1500.0)],
+    [
+        ("flat_5000ph_10ms", 5000.0),
+        ("flat_ph5000_10ms", 5000.0),
+        ("5000_photons_a", 5000.0),
+        ("photons_1p5e3", 1500.0),
+    ],
 )
 def test_light_is_read_in_both_orders(name, photons):
     assert said(name).photons == photons
 
 
 @pytest.mark.parametrize("name", ["dark-1-200s-1", "dark_1_200s_1", "dark1-200s"])
-def test_a_number_before_seconds_that_may_be_a_fraction_is_refused_with_what_to_write(name, tmp_path):
+def test_a_number_before_seconds_that_may_be_a_fraction_is_refused_with_what_to_write(
+    name, tmp_path
+):
     by_name(tmp_path)
     for number in (1, 2):
         (tmp_path / f"dark_2ms_{number - 1}.png").rename(tmp_path / f"{name}_{number}.png")
-    with pytest.raises(FolderRefused, match=r"may be 1/200 s, or number 1 of 200 s: write 5ms or 200s"):
+    with pytest.raises(
+        FolderRefused, match=r"may be 1/200 s, or number 1 of 200 s: write 5ms or 200s"
+    ):
         find_levels(tmp_path)
 
 
@@ -113,7 +122,9 @@ def test_a_table_takes_fractions(tmp_path):
     table.write_text(table.read_text().replace("2 ms", "1/500 s"))
     assert {row.exposure for row in read_table(table)} == {0.001, 0.002}
     table.write_text("file,exposure\nshot0.npy,1/500\n")
-    with pytest.raises(ValueError, match=r"frames\.csv:2: exposure 1/500: write a time with a unit"):
+    with pytest.raises(
+        ValueError, match=r"frames\.csv:2: exposure 1/500: write a time with a unit"
+    ):
         read_table(table)
 
 

@@ -9,7 +9,9 @@ NAMES = ("axicon", "flat", "vortex")
 
 def mistakes(count, among=NAMES):
     return [
-        Diagnostic(Location("argument 2"), f"doe={n:03}", f"no option {n} in doe; {nearest(str(n), among)}")
+        Diagnostic(
+            Location("argument 2"), f"doe={n:03}", f"no option {n} in doe; {nearest(str(n), among)}"
+        )
         for n in range(count)
     ]
 

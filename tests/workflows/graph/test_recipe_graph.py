@@ -57,7 +57,9 @@ def _chain(toy, last):
 
     def value(data, *path):
         items = {k: value(v, *path, k) for k, v in data.items()} if isinstance(data, dict) else data
-        items = [value(v, *path, n) for n, v in enumerate(data)] if isinstance(data, list) else items
+        items = (
+            [value(v, *path, n) for n, v in enumerate(data)] if isinstance(data, list) else items
+        )
         mark = Location("chain.yaml", 1 + len(path), 1)
         return Value(items, mark, mark, path)
 
@@ -144,7 +146,9 @@ def test_only_what_the_outputs_need_is_ordered(read):
     assert needed(recipe, ["psf[mask]"]) == ["bumps", "pupil[mask]", "psf[mask]"]
     order = needed(recipe, recipe.outputs)
     assert "all" not in order
-    assert all(order.index(s) < order.index(name) for name in order for s in recipe.steps[name].sources)
+    assert all(
+        order.index(s) < order.index(name) for name in order for s in recipe.steps[name].sources
+    )
 
 
 def test_a_step_knows_its_sources():

@@ -59,7 +59,9 @@ def test_the_packaged_options_are_offered():
 def errors(of_toys):
     jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
     validator = jsonschema.Draft202012Validator(of_toys)
-    return lambda text: [e.message for e in validator.iter_errors(parse(text, Location("f.yaml", 1, 1)).plain)]
+    return lambda text: [
+        e.message for e in validator.iter_errors(parse(text, Location("f.yaml", 1, 1)).plain)
+    ]
 
 
 def test_the_schema_is_a_schema(of_toys):
@@ -95,5 +97,9 @@ def test_a_mistake_is_one_error(errors, step):
 
 def test_every_packaged_file_is_right(errors):
     folder = Path(neusee.recipes.__path__[0])
-    wrong = {p.name: found for p in folder.rglob("*.yaml") if (found := errors(p.read_text(encoding="utf-8")))}
+    wrong = {
+        p.name: found
+        for p in folder.rglob("*.yaml")
+        if (found := errors(p.read_text(encoding="utf-8")))
+    }
     assert wrong == {}

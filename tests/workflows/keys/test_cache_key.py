@@ -17,25 +17,27 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys import code_digest
-from neusee.workflows.keys.cache_key import digest, key_of, plain, stream_seed
+from neusee.workflows.keys.cache_key import digest, file_digest, key_of, plain, stream_seed
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.input_file_digest import file_digest
 from neusee.workflows.store.result_store import Store
 
 MARK = Location("trial.yaml", 1, 1)
 LAYOUT = {
-    "trial/__init__.py": "from neusee.nodes.trial._head import head\nfrom neusee.nodes.trial._tail import tail\n",
-    "trial/_head.py": (
-        '"""Head."""\n'
-        "import torch\nfrom neusee.nodes import node\nfrom neusee.nodes.trial_constants import ONE\n"
-        "from ._helper import half\n\n\n"
-        '@node()\ndef head(*, start: float):\n    """Begin."""\n'
-        "    return torch.full((3,), half(2 * start) + ONE)\n"
+    "trial/__init__.py": (
+        "from neusee.nodes.trial._head import head\nfrom neusee.nodes.trial._tail import tail\n"
     ),
-    "trial/_helper.py": "from .. import trial_more\n\n\ndef half(x):\n    return x / trial_more.TWO\n",
+    "trial/_head.py": (
+        '"""Head."""\nimport torch\nfrom neusee.nodes import node\nfrom'
+        " neusee.nodes.trial_constants import ONE\nfrom ._helper import half\n\n\n@node()\ndef"
+        ' head(*, start: float):\n    """Begin."""\n    return torch.full((3,), half(2 * start) +'
+        " ONE)\n"
+    ),
+    "trial/_helper.py": (
+        "from .. import trial_more\n\n\ndef half(x):\n    return x / trial_more.TWO\n"
+    ),
     "trial/_tail.py": (
-        "from pathlib import Path\nfrom neusee.nodes import node\n\n\n"
-        "@node()\ndef tail(x, *, factor: float, file: Path):\n    return x * factor + float(file.read_text())\n"
+        "from pathlib import Path\nfrom neusee.nodes import node\n\n\n@node()\ndef tail(x, *,"
+        " factor: float, file: Path):\n    return x * factor + float(file.read_text())\n"
     ),
     "trial_constants.py": "ONE = 1.0\nOTHER = 7.0\n",
     "trial_more.py": "TWO = 2.0\n",
@@ -58,7 +60,9 @@ class Trial:
         (self.folder / name).write_text(text.replace(old, new))
 
     def run(self) -> tuple[float, str, str]:
-        """First number of the result, and what became of the two steps, as a new process would see it."""
+        """First number of the result, and what became of the two steps, as a new process would
+        see it.
+        """
         forget()
         module = importlib.import_module("neusee.nodes.trial")
         head = Step("head", module.head, {"start": 2.0}, {}, MARK, {})
@@ -78,7 +82,8 @@ def forget():
 @pytest.fixture
 def trial(tmp_path, monkeypatch):
     (tmp_path / "nodes").mkdir()
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # edits within one second would be missed by Python itself
+    # edits within one second would be missed by Python itself
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     monkeypatch.setattr(neusee.nodes, "__path__", [*neusee.nodes.__path__, str(tmp_path / "nodes")])
     yield Trial(tmp_path / "nodes", tmp_path / "cache")
     forget()
@@ -88,16 +93,32 @@ FRESH, TAIL, NONE = ("run", "run"), ("cached", "run"), ("not needed", "cached")
 EDITS = {
     "nothing": (None, NONE, 30.5),
     "body of the node": (("trial/_tail.py", "x * factor", "2 * x * factor"), TAIL, 60.5),
-    "body of the node before": (("trial/_head.py", "half(2 * start)", "half(4 * start)"), FRESH, 50.5),
+    "body of the node before": (
+        ("trial/_head.py", "half(2 * start)", "half(4 * start)"),
+        FRESH,
+        50.5,
+    ),
     "helper": (("trial/_helper.py", "x / ", "2 * x / "), FRESH, 50.5),
     "constant": (("trial_constants.py", "ONE = 1.0", "ONE = 2.0"), FRESH, 40.5),
     "constant of a helper": (("trial_more.py", "TWO = 2.0", "TWO = 1.0"), FRESH, 50.5),
     "comment": (("trial/_head.py", "import torch", "import torch  # of course"), NONE, 30.5),
-    "comment in a helper": (("trial/_helper.py", "    return", "    # half\n    return"), NONE, 30.5),
+    "comment in a helper": (
+        ("trial/_helper.py", "    return", "    # half\n    return"),
+        NONE,
+        30.5,
+    ),
     "docstring": (("trial/_head.py", "Begin.", "Begin, at last."), NONE, 30.5),
-    "docstring of the module": (("trial/_head.py", '"""Head."""', '"""The head of it all."""'), NONE, 30.5),
+    "docstring of the module": (
+        ("trial/_head.py", '"""Head."""', '"""The head of it all."""'),
+        NONE,
+        30.5,
+    ),
     "blank lines": (("trial/_head.py", "\n\n\n", "\n\n\n\n\n"), NONE, 30.5),
-    "quotes and brackets": (("trial/_helper.py", "x / trial_more.TWO", "(x / (trial_more.TWO))"), NONE, 30.5),
+    "quotes and brackets": (
+        ("trial/_helper.py", "x / trial_more.TWO", "(x / (trial_more.TWO))"),
+        NONE,
+        30.5,
+    ),
 }
 
 
@@ -162,12 +183,20 @@ def test_a_loaded_module_keeps_the_digest_of_the_code_that_runs(trial):
 
 
 def test_an_edit_of_the_rule_for_a_shape_computes_nothing_again(trial):
-    """The rule hangs on a node of the family, and the second node imports the family, which imports the rule."""
+    """The rule hangs on a node of the family, and the second node imports the family, which
+    imports the rule.
+    """
     rule = "@head.shape\ndef _(*, start):\n    return torch.empty((3,), device='meta')\n"
     head = "import torch\nfrom neusee.nodes.trial._head import head\n\n\n"
     (trial.folder / "trial/_result_shapes.py").write_text(head + rule)
-    trial.edit("trial/__init__.py", "from neusee.nodes.trial._head", "from . import _result_shapes\nfrom ._head")
-    trial.edit("trial/_tail.py", "from pathlib", "from neusee.nodes.trial import head\nfrom pathlib")
+    trial.edit(
+        "trial/__init__.py",
+        "from neusee.nodes.trial._head",
+        "from . import _result_shapes\nfrom ._head",
+    )
+    trial.edit(
+        "trial/_tail.py", "from pathlib", "from neusee.nodes.trial import head\nfrom pathlib"
+    )
     first = trial.run()
     assert first[1:] == ("run", "run")
     trial.edit("trial/_result_shapes.py", "(3,)", "(4,)")
@@ -181,14 +210,19 @@ def test_no_rule_for_a_shape_is_in_the_digest_of_a_shipped_node(tmp_path):
     for _, each in all_nodes():
         code.digest(each.fn.__module__)
     code.save()
-    covered = {name for path in (tmp_path / "code").glob("*.json") for name in json.loads(path.read_text())}
+    covered = {
+        name for path in (tmp_path / "code").glob("*.json") for name in json.loads(path.read_text())
+    }
     assert "neusee.nodes.optics._psf" in covered
     assert [name for name in covered if name.endswith(("_result_shapes", "shape_rules"))] == []
 
 
 def test_only_what_is_imported_counts(trial):
     trial.run()
-    head, tail = (Code(trial.store / "code.json").digest(f"neusee.nodes.trial.{n}") for n in ("_head", "_tail"))
+    head, tail = (
+        Code(trial.store / "code.json").digest(f"neusee.nodes.trial.{n}")
+        for n in ("_head", "_tail")
+    )
     trial.edit("trial/_tail.py", "x * factor", "x * factor * 1")
     forget()
     again = Code(trial.store / "code.json")
@@ -230,7 +264,9 @@ CHAINS = {
 @pytest.mark.parametrize("line", CHAINS)
 def test_what_an_attribute_chain_reads_counts(trial, line):
     (trial.folder / "trial/_deep.py").write_text("from neusee.nodes import trial_more\n")
-    (trial.folder / "trial/_helper.py").write_text(f"{line}\ndef half(x):\n    return x / {CHAINS[line]}\n")
+    (trial.folder / "trial/_helper.py").write_text(
+        f"{line}\ndef half(x):\n    return x / {CHAINS[line]}\n"
+    )
     before = Code(trial.store / "code.json").digest("neusee.nodes.trial._helper")
     trial.edit("trial_more.py", "TWO = 2.0", "TWO = 1.0")
     forget()
@@ -239,7 +275,8 @@ def test_what_an_attribute_chain_reads_counts(trial, line):
 
 def test_a_chain_reruns_what_it_feeds(trial):
     text = (
-        "import neusee.nodes as n\nimport neusee.nodes.trial_more\n\n\ndef half(x):\n    return x / n.trial_more.TWO\n"
+        "import neusee.nodes as n\nimport neusee.nodes.trial_more\n\n\ndef half(x):\n    return x /"
+        " n.trial_more.TWO\n"
     )
     (trial.folder / "trial/_helper.py").write_text(text)
     assert trial.run() == (30.5, *FRESH)
@@ -261,14 +298,19 @@ WHOLE = {
 
 @pytest.mark.parametrize("line", WHOLE)
 def test_a_package_that_is_used_whole_is_refused_with_its_line(trial, line):
-    (trial.folder / "trial/_helper.py").write_text(f"{line}\n\n\ndef half(x):\n    return x / {WHOLE[line]}\n")
-    with pytest.raises(LookupError, match=r"_helper.py:5: the package of all nodes is used.*from its own module"):
+    (trial.folder / "trial/_helper.py").write_text(
+        f"{line}\n\n\ndef half(x):\n    return x / {WHOLE[line]}\n"
+    )
+    with pytest.raises(
+        LookupError, match=r"_helper.py:5: the package of all nodes is used.*from its own module"
+    ):
         Code(trial.store / "code.json").digest("neusee.nodes.trial._head")
 
 
 def test_an_import_that_is_not_used_and_a_name_of_the_package_are_fine(trial):
     text = (
-        "from neusee import nodes\nimport neusee\n\n\ndef half(x):\n    return x / 2 + 0 * len(nodes.Check.__name__)\n"
+        "from neusee import nodes\nimport neusee\n\n\ndef half(x):\n    return x / 2 + 0 *"
+        " len(nodes.Check.__name__)\n"
     )
     (trial.folder / "trial/_helper.py").write_text(text)
     assert trial.run() == (30.5, *FRESH)
@@ -295,7 +337,14 @@ print(*keys.values())
 @pytest.mark.slow
 def test_two_processes_make_the_same_keys(trial, tmp_path):
     def keys(hash_seed: str) -> str:
-        command = [sys.executable, "-B", "-c", SCRIPT, str(trial.folder), str(tmp_path / f"memo{hash_seed}")]
+        command = [
+            sys.executable,
+            "-B",
+            "-c",
+            SCRIPT,
+            str(trial.folder),
+            str(tmp_path / f"memo{hash_seed}"),
+        ]
         env = {**os.environ, "PYTHONHASHSEED": hash_seed}
         return subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout
 
@@ -324,8 +373,15 @@ def key(n, params=None, wires=None, keys=None, seed=1, name="s", device="cpu"):
 
 def test_a_name_or_a_seed_counts_for_noise_alone():
     x = {"wires": {"x": "x"}, "keys": {"x": "0" * 32}}
-    assert key(leaf, seed=1) == key(leaf, seed=2) == key(leaf, name="t") == key(leaf, device="cuda:0")
-    noise = {key(noisy, **x), key(noisy, **x, seed=2), key(noisy, **x, name="t"), key(noisy, **x, device="cuda:0")}
+    assert (
+        key(leaf, seed=1) == key(leaf, seed=2) == key(leaf, name="t") == key(leaf, device="cuda:0")
+    )
+    noise = {
+        key(noisy, **x),
+        key(noisy, **x, seed=2),
+        key(noisy, **x, name="t"),
+        key(noisy, **x, device="cuda:0"),
+    }
     assert len(noise) == 4
     assert key(noisy, **x, device="cuda:0") == key(noisy, **x, device="cuda:1")
 
@@ -335,11 +391,27 @@ def test_which_input_a_result_goes_to_counts():
     wires = [{"a": "p", "b": "q"}, {"a": "q", "b": "p"}, {"a": "p", "c": "q"}, {"a": "p"}]
     wires += [{"a": ("p", "q")}, {"a": ("q", "p")}, {"a": ("p",)}, {"a": ()}]
     assert len({key(pair, wires=w, keys=keys) for w in wires}) == len(wires)
-    assert key(pair, wires={"a": "p"}, keys=keys) == key(pair, wires={"a": "p", "b": None}, keys=keys)
+    assert key(pair, wires={"a": "p"}, keys=keys) == key(
+        pair, wires={"a": "p", "b": None}, keys=keys
+    )
 
 
 def test_parameters_count_to_the_last_bit():
-    values = [1.0, 1.0 + 2**-52, 1, True, "1.0", None, float("nan"), float("inf"), 0.0, -0.0, 5e-324, (1.0,), [[1.0]]]
+    values = [
+        1.0,
+        1.0 + 2**-52,
+        1,
+        True,
+        "1.0",
+        None,
+        float("nan"),
+        float("inf"),
+        0.0,
+        -0.0,
+        5e-324,
+        (1.0,),
+        [[1.0]],
+    ]
     values += [{1: 1.0}, {"1": 1.0}, {1: 2.0}, 1j, 0.1 + 0.2, 0.3]
     assert len({digest(plain(v)) for v in values}) == len(values)
     assert digest(plain({3: 1.0, 11: 2.0})) == digest(plain({11: 2.0, 3: 1.0}))
@@ -361,7 +433,7 @@ def test_a_file_is_read_once_when_its_stamp_can_be_trusted(tmp_path, monkeypatch
     young = file_digest(file)
     file.write_bytes(b"y" * 100)
     assert file_digest(file) != young
-    monkeypatch.setattr("neusee.workflows.keys.input_file_digest._SETTLED", 0)
+    monkeypatch.setattr("neusee.workflows.keys.cache_key._SETTLED", 0)
     old = file_digest(file)
     monkeypatch.setattr("builtins.open", lambda *a: pytest.fail("read again"))
     assert file_digest(file) == old
@@ -381,12 +453,19 @@ def on_fat(tmp_path, monkeypatch):
 
     def stat(path):
         true = os.stat(path)
-        return SimpleNamespace(st_dev=1, st_ino=10**15, st_size=true.st_size, st_mtime_ns=clock.stamp,
-                               st_ctime_ns=clock.stamp)  # fmt: skip
+        return SimpleNamespace(
+            st_dev=1,
+            st_ino=10**15,
+            st_size=true.st_size,
+            st_mtime_ns=clock.stamp,
+            st_ctime_ns=clock.stamp,
+        )
 
-    monkeypatch.setattr("neusee.workflows.keys.input_file_digest._files", {})
-    monkeypatch.setattr("neusee.workflows.keys.input_file_digest.os", SimpleNamespace(stat=stat))
-    monkeypatch.setattr("neusee.workflows.keys.input_file_digest.time", SimpleNamespace(time_ns=lambda: clock.now))
+    monkeypatch.setattr("neusee.workflows.keys.cache_key._files", {})
+    monkeypatch.setattr("neusee.workflows.keys.cache_key.os", SimpleNamespace(stat=stat))
+    monkeypatch.setattr(
+        "neusee.workflows.keys.cache_key.time", SimpleNamespace(time_ns=lambda: clock.now)
+    )
     return file, clock, write
 
 

@@ -1,7 +1,8 @@
-"""What a result depends on beside parameters: each kind is computed again, or refused by name; none is stale.
+"""What a result depends on beside parameters: each kind is computed again, or refused by name; none
+is stale.
 
-Each case writes a small package, runs its node, changes one thing, and runs it again. What a call of the node gives
-without any cache is the truth.
+Each case writes a small package, runs its node, changes one thing, and runs it again. What a call
+of the node gives without any cache is the truth.
 """
 
 import importlib
@@ -104,7 +105,10 @@ def register(name):
         return part
     return note
 """
-FILL = "from neusee.nodes.kinds._two import register\n\n\n@register('a')\ndef a(x):\n    return 2.0 * x\n"
+FILL = (
+    "from neusee.nodes.kinds._two import register\n\n\n@register('a')\ndef a(x):\n    return 2.0"
+    " * x\n"
+)
 PARTS = "from neusee.nodes.kinds import _fill\nfrom neusee.nodes.kinds._two import PARTS as part\n"
 PATH = "from pathlib import Path\npart = Path(__file__).parent / "
 READ = 'TABLE = json.loads((Path(__file__).parent / "table.json").read_text())\n'
@@ -148,7 +152,8 @@ EDITS = {
         {
             ONE: f"{HEAD}{FROM}\n\n@node()\n@part(2.0)\ndef value(*, k: float = 1.0):\n    return torch.tensor(k)\n",
             TWO: "from functools import wraps\n\n\ndef part(s):\n    def outer(f):\n        @wraps(f)\n"
-            "        def inner(**given):\n            return s * f(**given)\n        return inner\n    return outer\n",
+            "        def inner(**given):\n            return s * f(**given)\n        return "
+            "inner\n    return outer\n",
         },
         (TWO, "return s * f", "return 5 * s * f"),
     ),
@@ -270,7 +275,8 @@ EDITS = {
         {
             ONE: source(
                 "pick(Kind.A)",
-                "from neusee.nodes.kinds._two import Kind\n\n\ndef pick(kind):\n    match kind:\n        case Kind.B:\n"
+                "from neusee.nodes.kinds._two import Kind\n\n\ndef pick(kind):\n    match "
+                "kind:\n        case Kind.B:\n"
                 "            return 3.0\n        case _:\n            return 2.0\n",
             ),
             TWO: "from enum import Enum\n\n\nclass Kind(Enum):\n    A = 1\n    B = 2\n",
@@ -406,20 +412,30 @@ def test_a_helper_in_an_archive_is_refused_by_name(lab, inside, monkeypatch):
         file.writestr(name, "def part(x):\n    return 2.0 * x\n")
     monkeypatch.syspath_prepend(str(lab.folder / "lib" / "a.zip"))
     line = "from kinds_packed import part"
-    before = f"def part(x):\n    {line} as f\n    return f(x)\n" if inside == "in a function" else line
+    before = (
+        f"def part(x):\n    {line} as f\n    return f(x)\n" if inside == "in a function" else line
+    )
     lab.write(ONE, source("part(k)", before))
-    with pytest.raises(RunError, match=r"kinds_packed has no source file.*save the module as a file"):
+    with pytest.raises(
+        RunError, match=r"kinds_packed has no source file.*save the module as a file"
+    ):
         lab.run()
 
 
 def test_a_name_of_a_changing_object_that_the_node_does_not_reach_is_fine(lab):
     lab.write(ONE, source("part(k)", FROM))
-    lab.write(TWO, "import itertools\n\nCOUNT = itertools.count()\n\n\ndef part(x):\n    return 2.0 * x\n")
+    lab.write(
+        TWO, "import itertools\n\nCOUNT = itertools.count()\n\n\ndef part(x):\n    return 2.0 * x\n"
+    )
     assert lab.run()[:2] == (2.0, 2.0)
     lab.edit(TWO, "def part(x):", "def part(x, count=COUNT):")
     with pytest.raises(RunError, match=r"(part|COUNT) is or holds a count"):
         lab.run()
-    lab.edit(TWO, "import itertools", "import itertools\n__depends__ = ('unaffected:COUNT', 'unaffected:part')")
+    lab.edit(
+        TWO,
+        "import itertools",
+        "import itertools\n__depends__ = ('unaffected:COUNT', 'unaffected:part')",
+    )
     assert lab.run()[:2] == (2.0, 2.0)
 
 
@@ -513,10 +529,16 @@ def part(x):
     late = sys.intern and globals().get("__getattr__")
     return scale(x) * __OWN * Part.s * (late(0) if late else 1.0)
 """
-LOADED = "import torch\nS = 1.0\nTABLE = {'a': 1.0}\nTENSOR = torch.ones(())\n\n\nclass Part:\n    def of(self):\n        return 1.0\n\n\ndef part(x, f=1.0):\n    return x * f * S * TABLE['a'] * TENSOR * Part().of() + 0.5 * (torch.get_default_dtype() == torch.float64)\n"  # noqa: E501
+LOADED = "import torch\nS = 1.0\nTABLE = {'a': 1.0}\nTENSOR = torch.ones(())\n\n\nclass Part:\n    def of(self):\n        return 1.0\n\n\ndef part(x, f=1.0):\n    return x * f * S * TABLE['a'] * TENSOR * Part().of() + 0.5 * (torch.get_default_dtype() == torch.float64)\n"
 PATCHES = (
-    patched_constant, patched_function, patched_default, patched_table, patched_method, patched_tensor, default_dtype,
-)  # fmt: skip
+    patched_constant,
+    patched_function,
+    patched_default,
+    patched_table,
+    patched_method,
+    patched_tensor,
+    default_dtype,
+)
 
 
 @pytest.mark.parametrize("patch", PATCHES, ids=lambda patch: patch.__name__)
@@ -534,7 +556,9 @@ def test_what_changes_in_a_loaded_module_is_computed_again(lab, patch, monkeypat
 
 
 @pytest.mark.parametrize(
-    "patch", [late_registration, late_getattr, private_name, metaclass_attribute], ids=lambda patch: patch.__name__
+    "patch",
+    [late_registration, late_getattr, private_name, metaclass_attribute],
+    ids=lambda patch: patch.__name__,
 )
 def test_what_is_added_to_a_loaded_module_is_computed_again(lab, patch, monkeypatch):
     lab.write(ONE, source("part(k)", FROM))
@@ -555,7 +579,9 @@ def test_an_object_that_changes_is_noticed_under_each_of_its_names(lab):
 @pytest.mark.parametrize("setting", ["autocast", "denormal"])
 def test_a_setting_of_torch_that_changes_digits_counts(lab, setting):
     result = (
-        "(x @ x).double().sum()" if setting == "autocast" else "torch.tensor([1e-310], dtype=torch.float64) * 1e300"
+        "(x @ x).double().sum()"
+        if setting == "autocast"
+        else "torch.tensor([1e-310], dtype=torch.float64) * 1e300"
     )
     lab.write(ONE, source(result, "x = torch.linspace(0.0, 1.0, 4096).reshape(64, 64)"))
     first, truth, _ = lab.run()
@@ -647,10 +673,10 @@ def test_a_link_counts_by_what_it_leads_to(lab):
 def test_a_file_that_is_replaced_while_it_is_read_and_put_back_is_no_result(lab):
     lab.write(
         ONE,
-        f"{HEAD}import os\nfrom pathlib import Path\n\n\n@node(depends=['unaffected:os'])\n"
-        "def value(*, k: float, file: Path):\n    own = file.with_suffix('.own')\n    os.rename(file, own)\n"
-        "    file.write_text('9.0')\n    read = float(file.read_text())\n    os.rename(own, file)\n"
-        "    return torch.tensor(read)\n",
+        f"{HEAD}import os\nfrom pathlib import Path\n\n\n@node(depends=['unaffected:os'])\ndef"
+        " value(*, k: float, file: Path):\n    own = file.with_suffix('.own')\n    os.rename(file,"
+        " own)\n    file.write_text('9.0')\n    read = float(file.read_text())\n    os.rename(own,"
+        " file)\n    return torch.tensor(read)\n",
     )
     lab.write("input.txt", "2.0")
     step = Step("value", lab.node(), {"k": 1.0, "file": lab.folder / "input.txt"}, {}, MARK, {})
@@ -661,8 +687,8 @@ def test_a_file_that_is_replaced_while_it_is_read_and_put_back_is_no_result(lab)
 def test_two_nodes_of_one_factory_have_two_digests(lab):
     lab.write(
         ONE,
-        f"{HEAD}\n\ndef make(s):\n    @node()\n    def value(*, k: float = 1.0):\n        return torch.tensor(s * k)\n"
-        "    return value\n\n\nvalue = make(2.0)\nother = make(3.0)\n",
+        f"{HEAD}\n\ndef make(s):\n    @node()\n    def value(*, k: float = 1.0):\n        return"
+        " torch.tensor(s * k)\n    return value\n\n\nvalue = make(2.0)\nother = make(3.0)\n",
     )
     module = importlib.import_module("neusee.nodes.kinds")
     code = Code(lab.store / "code.json")
@@ -697,7 +723,9 @@ def test_a_package_counts_by_its_version(lab, monkeypatch):
     code = Code(lab.store / "code.json").of(lab.node())
     monkeypatch.setattr(module_origin, "_fixed", {})
     real = module_origin.version_of
-    monkeypatch.setattr(module_origin, "version_of", lambda top: real(top) + ("9" if top == "safetensors" else ""))
+    monkeypatch.setattr(
+        module_origin, "version_of", lambda top: real(top) + ("9" if top == "safetensors" else "")
+    )
     assert Code(lab.store / "code.json").of(lab.node()) != code
 
 
@@ -705,5 +733,7 @@ def test_a_module_without_a_file_is_refused(lab):
     lab.write(ONE, source("part(k)", HELPER))
     sys.modules["kinds_helper"] = types.ModuleType("kinds_helper")
     sys.modules["kinds_helper"].part = float
-    with pytest.raises(RunError, match=r"kinds_helper has no source file.*save the module as a file"):
+    with pytest.raises(
+        RunError, match=r"kinds_helper has no source file.*save the module as a file"
+    ):
         lab.run(again=False)

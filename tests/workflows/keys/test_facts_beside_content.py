@@ -1,9 +1,11 @@
-"""Times and rights of files, comments and numbers of lines: no key covers them, so code that reads them is refused."""
+"""Times and rights of files, comments and numbers of lines: no key covers them, so code that
+reads them is refused.
+"""
 
 import pytest
 
-from neusee.workflows.keys.declared_dependencies import refusal, uncovered
 from neusee.workflows.keys.source_summary import summarise
+from neusee.workflows.keys.user_code import refusal, uncovered
 
 STAMP = {
     "time": "def f(file):\n    return file.stat().st_mtime",
@@ -13,7 +15,9 @@ STAMP = {
     "time by getattr": "def f(file):\n    return getattr(file.stat(), 'st_' + 'mtime')",
     "time by attrgetter": "from operator import attrgetter\nAGE = attrgetter('st_atime')",
     "time by place": "def f(file):\n    return file.stat()[8]",
-    "time by a constant": "import stat\ndef f(file):\n    about = file.stat()\n    return about[stat.ST_MTIME]",
+    "time by a constant": (
+        "import stat\ndef f(file):\n    about = file.stat()\n    return about[stat.ST_MTIME]"
+    ),
     "all": "import os\ndef f(file):\n    return tuple(os.stat(file))",
     "a row": "import os\ndef f(file):\n    mode, *rest = os.stat(file)\n    return mode",
     "a text": "def f(file):\n    return f'{file.stat()}'",
@@ -33,7 +37,9 @@ SOURCE = {
     "source": "import inspect\nimport helper\ndef f():\n    return inspect.findsource(helper)",
     "stack": "import inspect\ndef f():\n    return inspect.stack()[0].lineno",
     "line": "import helper\ndef f():\n    return helper.gain.__code__.co_firstlineno",
-    "line by attrgetter": "from operator import attrgetter\nLINE = attrgetter('__code__.co_firstlineno')",
+    "line by attrgetter": (
+        "from operator import attrgetter\nLINE = attrgetter('__code__.co_firstlineno')"
+    ),
     "frame": "import sys\ndef f():\n    return sys._getframe().f_lineno",
     "traceback": "import traceback\ndef f():\n    return traceback.extract_stack()[-1].lineno",
     "words": "import tokenize\ndef f(file):\n    return tokenize.open(file)",
@@ -44,7 +50,9 @@ FREE = {
     "stack of arrays": "import numpy as np\ndef f(x):\n    return np.stack(x)",
     "group of a match": "import re\ndef f(text):\n    return re.match('a', text).group()",
     "owner of a camera": "def f(camera):\n    return camera.owner",
-    "a message": "import traceback\nimport logging\ndef f():\n    logging.info(traceback.format_exc())",
+    "a message": (
+        "import traceback\nimport logging\ndef f():\n    logging.info(traceback.format_exc())"
+    ),
     "a sentence": "def f():\n    raise ValueError('the field st_mtime is missing')",
     "tree of a formula": "import ast\ndef f(text):\n    return ast.parse(text)",
 }
@@ -98,5 +106,8 @@ def test_code_that_may_read_docstrings_is_found(kind):
 
 
 def test_named_attributes_are_no_docstrings():
-    code = "from operator import attrgetter\nGET = attrgetter('gain')\ndef f(x):\n    return getattr(x, 'gain')"
+    code = (
+        "from operator import attrgetter\nGET = attrgetter('gain')\ndef f(x):\n    return"
+        " getattr(x, 'gain')"
+    )
     assert not summarise(code.encode(), own=True).documents

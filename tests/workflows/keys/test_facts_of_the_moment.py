@@ -1,4 +1,6 @@
-"""Clocks, addresses and numbers of the machine are refused in own code, by whatever library they are read."""
+"""Clocks, addresses and numbers of the machine are refused in own code, by whatever library they
+are read.
+"""
 
 import pytest
 
@@ -6,7 +8,9 @@ from neusee.workflows.keys.source_summary import summarise
 
 MOMENT = {
     "pandas": "import pandas as pd\ndef f():\n    return pd.Timestamp.now().second",
-    "a class that is imported": "from pandas import Timestamp\ndef f():\n    return Timestamp.utcnow()",
+    "a class that is imported": (
+        "from pandas import Timestamp\ndef f():\n    return Timestamp.utcnow()"
+    ),
     "numpy": "import numpy as np\ndef f():\n    return np.datetime64('now')",
     "numpy, a day": "import numpy as np\ndef f():\n    return np.datetime64('to' + 'day')",
     "astropy": "from astropy.time import Time\ndef f():\n    return Time.now().mjd",
@@ -23,7 +27,9 @@ MOMENT = {
     "priority": "import os\ndef f():\n    return os.nice(0)",
     "terminal": "import shutil\ndef f():\n    return shutil.get_terminal_size().columns",
     "folder of temporary files": "import tempfile\ndef f():\n    return len(tempfile.gettempdir())",
-    "level of a log": "import logging\ndef f():\n    return logging.getLogger('lab').isEnabledFor(logging.INFO)",
+    "level of a log": (
+        "import logging\ndef f():\n    return logging.getLogger('lab').isEnabledFor(logging.INFO)"
+    ),
     "record of a log": "import logging\ndef f():\n    return logging.makeLogRecord({}).created",
     "flags": "import sys\ndef f():\n    return sys.flags.dev_mode",
     "words of the command": "import sys\ndef f():\n    return len(sys.orig_argv)",
@@ -41,7 +47,11 @@ FREE = {
 
 
 def found(code, own=True):
-    return [item for item in summarise(code.encode(), own=own).constructs if item.kind in ("state", "env")]
+    return [
+        item
+        for item in summarise(code.encode(), own=own).constructs
+        if item.kind in ("state", "env")
+    ]
 
 
 @pytest.mark.parametrize("fact", MOMENT)

@@ -1,4 +1,6 @@
-"""The order of a set of texts differs between processes: code that takes it is found by its form."""
+"""The order of a set of texts differs between processes: code that takes it is found by its
+form.
+"""
 
 import pytest
 
@@ -28,14 +30,18 @@ FREE = {
     "a range": "x = list(set(range(3)))",
     "membership": "x = 'a' in {'a', 'b'}",
     "a hash of a class": "class A:\n    def __hash__(self):\n        return hash((1, 'a'))",
-    "a part of a set of sets": "many = {x for x in y}\nfor one in sorted(many):\n    print(list(one))",
+    "a part of a set of sets": (
+        "many = {x for x in y}\nfor one in sorted(many):\n    print(list(one))"
+    ),
     "a table": "for x in {'a': 1}:\n    print(x)",
     "a function of that name": "def hash(x):\n    return 1\n\n\ny = hash('a')",
 }
 
 
 def found(code):
-    return [item.text for item in summarise(code.encode(), own=True).constructs if item.kind == "hash"]
+    return [
+        item.text for item in summarise(code.encode(), own=True).constructs if item.kind == "hash"
+    ]
 
 
 @pytest.mark.parametrize("kind", TAKEN)

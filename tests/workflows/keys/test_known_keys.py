@@ -1,4 +1,6 @@
-"""A key that is found among known keys is the key that would be computed anew, whatever has changed in between."""
+"""A key that is found among known keys is the key that would be computed anew, whatever has
+changed in between.
+"""
 
 import random
 from dataclasses import replace
@@ -9,9 +11,9 @@ import pytest
 from neusee.nodes import node
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Step
-from neusee.workflows.keys import known_keys
+from neusee.workflows.keys import code_digest as known_keys
 from neusee.workflows.keys.cache_key import key_of
-from neusee.workflows.keys.known_keys import KnownKeys
+from neusee.workflows.keys.code_digest import KnownKeys
 
 CODE = SimpleNamespace(of=lambda node, classes=(): f"code of {node.path}")
 
@@ -34,13 +36,24 @@ def step(by, node=joined, **wires):
 def computed(monkeypatch):
     """The names of the steps whose keys were computed."""
     names = []
-    monkeypatch.setattr(known_keys, "key_of", lambda step, *rest: names.append(step.name) or key_of(step, *rest))
+    monkeypatch.setattr(
+        known_keys, "key_of", lambda step, *rest: names.append(step.name) or key_of(step, *rest)
+    )
     return names
 
 
 @pytest.mark.parametrize(
     ("before", "after"),
-    [(0.0, -0.0), (1, 1.0), (1, True), (True, 1.0), ("1", 1), (0.25, 0.5), ((0.0,), (-0.0,)), ((1,), (True,))],
+    [
+        (0.0, -0.0),
+        (1, 1.0),
+        (1, True),
+        (True, 1.0),
+        ("1", 1),
+        (0.25, 0.5),
+        ((0.0,), (-0.0,)),
+        ((1,), (True,)),
+    ],
 )
 def test_values_that_are_equal_but_not_written_alike_have_keys_of_their_own(before, after):
     known = KnownKeys(CODE)

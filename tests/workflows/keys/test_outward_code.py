@@ -11,24 +11,42 @@ OUTWARD = {
     "an item": ("import lib\nlib.TABLE['a'] = 1", "lib.TABLE"),
     "an item of a name": ("from lib import TABLE\nTABLE['a'] = 1", "lib.TABLE"),
     "another name of a module": ("import numpy as np\nother = np\nother.mean = 1", "numpy.mean"),
-    "a loop over modules": ("import numpy as np\nimport torch\nfor m in (np, torch):\n    m.mean = 1", "torch.mean"),
+    "a loop over modules": (
+        "import numpy as np\nimport torch\nfor m in (np, torch):\n    m.mean = 1",
+        "torch.mean",
+    ),
     "in a function": ("import torch\ndef f():\n    part = torch.nn\n    part.x = 1", "torch.nn.x"),
     "an import in a function": ("def f():\n    import numpy\n    numpy.mean = 1", "numpy.mean"),
     "setattr": ("import torch\nsetattr(torch.Tensor, 'x', 1)", "torch.Tensor"),
     "vars": ("import numpy as np\nvars(np)['mean'] = 1", "numpy"),
     "getattr": ("import torch\ngetattr(torch, 'nn').x = 1", "torch"),
     "a method of a list": ("import lib\nlib.PARTS.append(1)", "lib.PARTS.append"),
-    "a variable of the environment": ("import os\nos.environ.setdefault('A', 'b')", "os.environ.setdefault"),
+    "a variable of the environment": (
+        "import os\nos.environ.setdefault('A', 'b')",
+        "os.environ.setdefault",
+    ),
     "a function for its effect": ("import lib\nlib.patch_all()", "lib.patch_all"),
     "a method whose result is used": ("import lib\nold = lib.NET.train(False)", "lib.NET.train"),
-    "a method that ends with _": ("import lib\nx = lib.NET.weight.fill_(2)", "lib.NET.weight.fill_"),
-    "an initialiser": ("import torch\nimport lib\ntorch.nn.init.ones_(lib.NET.weight)", "lib.NET.weight"),
+    "a method that ends with _": (
+        "import lib\nx = lib.NET.weight.fill_(2)",
+        "lib.NET.weight.fill_",
+    ),
+    "an initialiser": (
+        "import torch\nimport lib\ntorch.nn.init.ones_(lib.NET.weight)",
+        "lib.NET.weight",
+    ),
     "a setting": ("import numpy as np\nnp.set_printoptions(precision=3)", "numpy.set_printoptions"),
     "a decorator": ("from lib import register\n@register('a')\ndef f():\n    pass", "lib.register"),
     "a base class": ("from lib import Base\nclass A(Base):\n    pass", "lib.Base"),
     "a relative import": ("from . import lib\nlib.S = 1", ".lib.S"),
-    "a shared object of a library": ("import lib\nlib.get_registry()['a'] = 1", "lib.get_registry()"),
-    "warnings that are errors": ("import warnings\nwarnings.simplefilter('error')", "warnings.simplefilter"),
+    "a shared object of a library": (
+        "import lib\nlib.get_registry()['a'] = 1",
+        "lib.get_registry()",
+    ),
+    "warnings that are errors": (
+        "import warnings\nwarnings.simplefilter('error')",
+        "warnings.simplefilter",
+    ),
     "a hook of a node": (
         "from neusee.nodes.optics import psf\n@psf.check\ndef _(x):\n    pass",
         "neusee.nodes.optics.psf.check",
@@ -36,7 +54,9 @@ OUTWARD = {
 }
 QUIET = {
     "a new array": "import numpy as np\nx = np.zeros(3)\nx[0] = 1\nx.flags.writeable = False",
-    "an attribute of the object itself": "class A:\n    def f(self):\n        self.x = 1\n        self.y[0] = 2",
+    "an attribute of the object itself": (
+        "class A:\n    def f(self):\n        self.x = 1\n        self.y[0] = 2"
+    ),
     "a local list": "def f():\n    found = []\n    found.append(1)\n    return found",
     "a log": "import logging\nlogging.getLogger('x').info('y')",
     "a table of its own": "TABLE = {}\nTABLE['a'] = 1",

@@ -1,4 +1,6 @@
-"""Settings of a process that own code may read: they count for own nodes, where they are not the usual ones."""
+"""Settings of a process that own code may read: they count for own nodes, where they are not the
+usual ones.
+"""
 
 import json
 import locale
@@ -14,7 +16,7 @@ import pytest
 
 from neusee.nodes import own_modules, scene
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.process_settings import own_settings
+from neusee.workflows.keys.loaded_state import own_settings
 from neusee.workflows.recipe.node_families import import_own
 
 ROOT = Path(__file__).parents[3]
@@ -38,7 +40,9 @@ def own(tmp_path, monkeypatch):
 
     def digest(before="", node=None):
         sys.modules.pop("sets_own", None)
-        (tmp_path / "sets_own.py").write_text(NODE.format(before=before, name="value", result="torch.tensor(k)"))
+        (tmp_path / "sets_own.py").write_text(
+            NODE.format(before=before, name="value", result="torch.tensor(k)")
+        )
         mine = import_own("sets_own.py", tmp_path).value
         return Code(tmp_path / "code.json").of(node or mine)
 
@@ -135,9 +139,16 @@ def test_a_worker_has_the_keys_of_the_caller_where_a_file_patches_a_library(tmp_
     patch = "import numpy as np\nnp.mean = lambda x: 2.0\n"
     value = "torch.tensor(float(np.mean([k])))"
     (tmp_path / "cluster_a.py").write_text(NODE.format(before=before, name="value", result=value))
-    (tmp_path / "cluster_b.py").write_text(NODE.format(before=patch, name="other", result="torch.tensor(k)"))
+    (tmp_path / "cluster_b.py").write_text(
+        NODE.format(before=patch, name="other", result="torch.tensor(k)")
+    )
     (tmp_path / "r.yaml").write_text(RECIPE)
-    env = {**os.environ, "PYTHONPATH": str(ROOT / ".src"), "NEUSEE_CACHE": str(tmp_path / "cache"), "TZ": "Asia/Tokyo"}
+    env = {
+        **os.environ,
+        "PYTHONPATH": str(ROOT / ".src"),
+        "NEUSEE_CACHE": str(tmp_path / "cache"),
+        "TZ": "Asia/Tokyo",
+    }
     states = []
     for more in (["--executor", "dask:1"], []):
         command = [sys.executable, "-m", "neusee", "run", "r.yaml", "--json", *more]

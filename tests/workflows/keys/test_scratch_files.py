@@ -1,4 +1,6 @@
-"""Files that own code makes for itself, in a temporary folder or in memory, are no parameters and need none."""
+"""Files that own code makes for itself, in a temporary folder or in memory, are no parameters
+and need none.
+"""
 
 import pytest
 
@@ -65,7 +67,9 @@ NOT_MADE = {
 def found(body):
     lines = "".join(f"    {line}\n" for line in body.splitlines())
     code = f"{HEAD}\n\ndef value(x_of_no_path=0):\n    x = 1\n{lines}"
-    return [item.text for item in summarise(code.encode(), own=True).constructs if item.kind == "file"]
+    return [
+        item.text for item in summarise(code.encode(), own=True).constructs if item.kind == "file"
+    ]
 
 
 @pytest.mark.parametrize("kind", MADE)

@@ -1,4 +1,6 @@
-"""Files about code in a cache that somebody else changed: the keys stay right, and the files are written anew."""
+"""Files about code in a cache that somebody else changed: the keys stay right, and the files are
+written anew.
+"""
 
 import importlib
 import json
@@ -9,10 +11,13 @@ import pytest
 import neusee.nodes
 from neusee.workflows.keys import code_digest
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.code_memo import read_parts
-from neusee.workflows.keys.seal import seal_file, seal_record, unseal_file, unseal_record
+from neusee.workflows.keys.module_digest import read_parts
+from neusee.workflows.keys.sealed_files import seal_file, seal_record, unseal_file, unseal_record
 
-NODE = "import torch\nfrom neusee.nodes import node\n\n\n@node()\ndef value(*, k: float = 1.0):\n    return k * {}\n"
+NODE = (
+    "import torch\nfrom neusee.nodes import node\n\n\n@node()\ndef value(*, k: float = 1.0):\n   "
+    " return k * {}\n"
+)
 
 
 @pytest.fixture
@@ -27,7 +32,9 @@ def package(tmp_path, monkeypatch):
 
 
 def digest_of(package, factor):
-    """The digest of the node with a factor, as a new process finds it, and the number of sources that it parses."""
+    """The digest of the node with a factor, as a new process finds it, and the number of sources
+    that it parses.
+    """
     sys.modules.pop("neusee.nodes.sealed_trial", None)
     vars(neusee.nodes).pop("sealed_trial", None)
     (package / "sealed_trial.py").write_text(NODE.format(factor))
@@ -41,7 +48,9 @@ def digest_of(package, factor):
 
 
 def with_the_tree_of(first, second, raw):
-    """A memo, with a right checksum, that gives the second source the syntax digests of the first one."""
+    """A memo, with a right checksum, that gives the second source the syntax digests of the
+    first one.
+    """
     names, text = raw.partition(b"\n")[2].split(b"\n", 1)
     summaries = json.loads(text)
     own = [name for name, summary in summaries.items() if "value()" in summary[6]]
@@ -52,7 +61,9 @@ def with_the_tree_of(first, second, raw):
 
 @pytest.mark.parametrize("secret", ["", "ours"])
 def test_a_memo_of_another_writer_is_read_only_without_a_secret(package, monkeypatch, secret):
-    """Its summary of one source in place of another would make an old result the result of new code."""
+    """Its summary of one source in place of another would make an old result the result of new
+    code.
+    """
     memo = package / "cache" / "code.json"
     old, right = digest_of(package, 2.0)[0], digest_of(package, 3.0)[0]
     assert old != right
@@ -69,7 +80,9 @@ def test_a_memo_of_another_writer_is_read_only_without_a_secret(package, monkeyp
         assert digest_of(package, 3.0)[1] > 0
 
 
-def test_a_record_of_definitions_of_another_writer_is_not_read_and_written_anew(package, monkeypatch):
+def test_a_record_of_definitions_of_another_writer_is_not_read_and_written_anew(
+    package, monkeypatch
+):
     found, _ = digest_of(package, 2.0)
     root, path = package / "cache", package / "cache" / "code" / f"{found}.json"
     right = read_parts(root, found)

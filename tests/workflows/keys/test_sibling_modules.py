@@ -1,7 +1,8 @@
-"""Own files beside that of a node: one that changes what the node computes joins its key, any other one does not.
+"""Own files beside that of a node: one that changes what the node computes joins its key, any other
+one does not.
 
-Each case writes files as a recipe names them, runs the node of ``sib_a.py``, edits the other file, and runs again. What
-a call of the node gives without any cache is the truth.
+Each case writes files as a recipe names them, runs the node of ``sib_a.py``, edits the other file,
+and runs again. What a call of the node gives without any cache is the truth.
 """
 
 import importlib
@@ -24,7 +25,10 @@ MARK = Location("siblings.yaml", 1, 1)
 HEAD = "import numpy as np\nimport torch\nfrom neusee.nodes import node\n"
 NODE = "\n\n@node()\ndef {name}(*, k: float = 1.0):\n    return torch.tensor(float({result}))\n"
 COMMON = "sib_common.py"
-HIDDEN = "import argparse\n\nSEEN = argparse.Namespace(part=lambda: 1.0)\n\n\ndef register(f):\n    SEEN.part = f\n"
+HIDDEN = (
+    "import argparse\n\nSEEN = argparse.Namespace(part=lambda: 1.0)\n\n\ndef register(f):\n   "
+    " SEEN.part = f\n"
+)
 BASE = "class Base:\n    s = 0.0\n"
 
 
@@ -169,7 +173,8 @@ def test_a_file_that_is_added_and_patches_a_library_is_part_of_the_key(lab):
 APART = {
     "a node": "SCALE = 2.0\n",
     "a network": "from torch import nn\n\n\nclass Net(nn.Module):\n    def __init__(self):\n        super().__init__()"
-    "\n        self.part = nn.Linear(1, 1)\n        nn.init.zeros_(self.part.weight)\n        self.scale = 2.0\n",
+    "\n        self.part = nn.Linear(1, 1)\n        nn.init.zeros_(self.part.weight)\n        "
+    "self.scale = 2.0\n",
     "a memo of its own": "SEEN = {}\n\n\ndef part(x):\n    SEEN[x] = 2.0\n    return SEEN[x]\n",
     "a helper that only computes": "from sib_common import Base\n\n\ndef part():\n    return Base.s * 2.0\n",
     "warnings that are ignored": "import warnings\nwarnings.filterwarnings('ignore')\nSCALE = 2.0\n",
@@ -195,7 +200,9 @@ def digest_of(lab, node):
     return Code(lab.folder / "code.json").of(node)
 
 
-@pytest.mark.parametrize(("beside", "joins"), [("np.mean = lambda x: 2.0\n", True), ("S = 2.0\n", False)])
+@pytest.mark.parametrize(
+    ("beside", "joins"), [("np.mean = lambda x: 2.0\n", True), ("S = 2.0\n", False)]
+)
 def test_a_patched_library_counts_for_the_nodes_of_neusee_too(lab, beside, joins):
     lab.write("sib_a.py", source("k"))
     lab.write("sib_b.py", source("k", beside, "other"))
@@ -220,7 +227,10 @@ def test_a_changed_object_of_an_own_module_does_not_count_for_the_nodes_of_neuse
 def test_a_patch_that_rests_on_a_file_without_a_key_is_refused(lab):
     lab.write("sib_a.py", source("np.mean([k, k])"))
     lab.write("factor", "2.0")
-    read = f"from pathlib import Path\nfactor = float(Path({str(lab.folder)!r}, 'fac' + 'tor').read_text())\n"
+    read = (
+        f"from pathlib import Path\nfactor = float(Path({str(lab.folder)!r}, 'fac' +"
+        " 'tor').read_text())\n"
+    )
     lab.write("sib_b.py", source("k", f"{read}np.mean = lambda x: factor\n", "other"))
     with pytest.warns(UserWarning, match="sib_b reads"):
         node = lab.load("sib_b.py")

@@ -5,10 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.keys import code_memo, engine_digest, source_summary
+from neusee.workflows.keys import code_digest as engine_digest
+from neusee.workflows.keys import module_digest as code_memo
+from neusee.workflows.keys import source_summary
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.keys.source_summary import summarise
-from neusee.workflows.keys.syntax_pass import Syntax
+from neusee.workflows.keys.source_syntax import Syntax
 
 EVERYTHING = '''"""Words."""
 from __future__ import annotations
@@ -85,7 +87,9 @@ def changes(tree):
 def without_documents(tree):
     """Take the docstrings out of a tree, by the rule of Python itself, and return its dump."""
     for item in ast.walk(tree):
-        has_words = isinstance(item, ast.Module | ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)
+        has_words = isinstance(
+            item, ast.Module | ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+        )
         if has_words and ast.get_docstring(item, clean=False) is not None:
             item.body = item.body[1:]
     return ast.dump(tree)
@@ -105,7 +109,9 @@ def test_two_trees_have_one_text_exactly_if_python_dumps_them_alike():
     assert len(set(texts)) == len(texts) > 200
 
 
-@pytest.mark.parametrize("edit", [("Words.", "Others."), ("More words.", "M"), ("\nfor n", "\n\n# c\nfor  n")])
+@pytest.mark.parametrize(
+    "edit", [("Words.", "Others."), ("More words.", "M"), ("\nfor n", "\n\n# c\nfor  n")]
+)
 def test_words_and_layout_change_no_text_and_words_change_the_whole(edit):
     old, new = (summarise(text.encode()) for text in (EVERYTHING, EVERYTHING.replace(*edit)))
     assert old.tree == new.tree
@@ -113,12 +119,17 @@ def test_words_and_layout_change_no_text_and_words_change_the_whole(edit):
 
 
 def test_blocks_that_do_not_run_have_a_text_and_no_imports():
-    source = "if TYPE_CHECKING:\n    import a\nelse:\n    import b\nif __name__ == '__main__':\n    open('c.csv')\n"
+    source = (
+        "if TYPE_CHECKING:\n    import a\nelse:\n    import b\nif __name__ == '__main__':\n   "
+        " open('c.csv')\n"
+    )
     found = summarise(source.encode())
     assert [way[1] for way in found.imports] == ["b"]
     assert found.constructs == []
     assert found.tree != summarise(source.replace("import a", "import aa").encode()).tree
-    inside = "def f():\n    if typing.TYPE_CHECKING:\n        import a\n    else:\n        import b\n"
+    inside = (
+        "def f():\n    if typing.TYPE_CHECKING:\n        import a\n    else:\n        import b\n"
+    )
     assert [way[1] for way in summarise(inside.encode()).imports] == ["b"]
 
 
@@ -130,5 +141,6 @@ def test_a_source_of_the_program_is_parsed_once_and_then_read_from_the_memo(tmp_
     Code(tmp_path / "code.json")
     monkeypatch.setattr(engine_digest, "syntax_outline", lambda source: pytest.fail("parsed again"))
     assert engine_digest.outline(source) == first
-    assert ("neusee.workflows.keys.cache_key", ["digest"]) in first.imports
+    imports = {module: names for module, names, *_ in first.imports}
+    assert "digest" in imports["neusee.workflows.keys.cache_key"]
     assert first.digest == source_summary.summarise(source).tree

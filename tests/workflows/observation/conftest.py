@@ -29,7 +29,8 @@ def layer(request):
 
 @pytest.fixture
 def taints(tmp_path):
-    """What a function reaches that is not covered: pairs of a kind and a path, below the folder of the test if it is.
+    """What a function reaches that is not covered: pairs of a kind and a path, below the folder of
+    the test if it is.
 
     The key follows all modules, and knows the files that are given.
     """
@@ -37,7 +38,10 @@ def taints(tmp_path):
     def taints(function, *files, modules=lambda name: True):
         found = observed(function, Covered(frozenset(files), modules))[1]
         return [
-            (each.kind, os.path.relpath(each.what, tmp_path) if _in(each.what, tmp_path) else each.what)
+            (
+                each.kind,
+                os.path.relpath(each.what, tmp_path) if _in(each.what, tmp_path) else each.what,
+            )
             for each in found
         ]
 

@@ -44,7 +44,10 @@ DRAWS = {
     "numpy": (lambda: np.random.normal(), "numpy.random"),
     "numpy, then seeded": (lambda: [np.random.normal(), np.random.seed(3)], "numpy.random"),
     "numpy, put back": (lambda: put_back(np.random.normal), "numpy.random"),
-    "numpy, seeded and put back": (lambda: put_back(lambda: np.random.seed(3), np.random.normal), "numpy.random"),
+    "numpy, seeded and put back": (
+        lambda: put_back(lambda: np.random.seed(3), np.random.normal),
+        "numpy.random",
+    ),
     "weights of torch": (lambda: torch.nn.Linear(3, 2), "torch"),
     "torch, then seeded": (lambda: [torch.rand(3), torch.manual_seed(3)], "torch"),
     "torch in a fork": (lambda: forked(torch.rand), "torch"),
@@ -54,7 +57,10 @@ DRAWS = {
     "random": (random.random, "random"),
     "default_rng": (lambda: np.random.default_rng().normal(), "os.urandom"),
     "PCG64": (lambda: np.random.PCG64(), "os.urandom"),
-    "RandomState": (lambda: np.random.RandomState().normal(), "numpy.random.RandomState without a seed"),
+    "RandomState": (
+        lambda: np.random.RandomState().normal(),
+        "numpy.random.RandomState without a seed",
+    ),
     "torch generator": (lambda: torch.Generator().seed(), "/dev/urandom"),
     "Random": (lambda: random.Random().random(), "random.Random without a seed"),
     "SystemRandom": (lambda: random.SystemRandom().random(), "os.urandom"),
@@ -62,7 +68,10 @@ DRAWS = {
     "uuid4": (uuid.uuid4, "os.urandom"),
     "urandom": (lambda: os.urandom(3), "os.urandom"),
     "device": (lambda: Path("/dev/urandom").open("rb", buffering=0).close(), "/dev/urandom"),
-    "uuid of the kernel": (Path("/proc/sys/kernel/random/uuid").read_text, "/proc/sys/kernel/random/uuid"),
+    "uuid of the kernel": (
+        Path("/proc/sys/kernel/random/uuid").read_text,
+        "/proc/sys/kernel/random/uuid",
+    ),
 }
 
 
@@ -80,12 +89,20 @@ def test_chance_of_the_kernel_is_found_however_little_it_is(size, taints, watche
 
 
 SEEDED = {
-    "torch for all": lambda: [seeded(), torch.nn.Conv2d(1, 1, 3), torch.nn.functional.dropout(torch.ones(3))],
+    "torch for all": lambda: [
+        seeded(),
+        torch.nn.Conv2d(1, 1, 3),
+        torch.nn.functional.dropout(torch.ones(3)),
+    ],
     "torch for all, in a fork": lambda: forked(seeded),
     "torch for all, a fork in it": lambda: [seeded(), forked(torch.rand), torch.rand(3)],
     "layer without weights": lambda: torch.nn.utils.skip_init(torch.nn.Linear, 3, 2),
     "numpy for all": lambda: [np.random.seed(3), scipy.stats.norm.rvs(size=2)],
-    "numpy for all, put back": lambda: [np.random.seed(3), put_back(np.random.normal), np.random.normal()],
+    "numpy for all, put back": lambda: [
+        np.random.seed(3),
+        put_back(np.random.normal),
+        np.random.normal(),
+    ],
     "torch": lambda: torch.rand(3, generator=torch.Generator().manual_seed(3)),
     "numpy": lambda: np.random.default_rng(3).normal(),
     "legacy numpy": lambda: np.random.RandomState(3).normal(),
@@ -123,7 +140,9 @@ KEEPING = {
 
 @pytest.fixture
 def keeping(tmp_path, monkeypatch):
-    """What installs a package that keeps a generator, and returns what imports it and what draws from it."""
+    """What installs a package that keeps a generator, and returns what imports it and what draws
+    from it.
+    """
 
     def install(kind):
         name = f"keeping_{kind.replace(' ', '_')}"
@@ -140,30 +159,44 @@ def keeping(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", KEEPING)
-def test_a_generator_that_a_package_makes_at_its_import_is_none_until_a_step_draws(kind, keeping, taints, layer):
+def test_a_generator_that_a_package_makes_at_its_import_is_none_until_a_step_draws(
+    kind, keeping, taints, layer
+):
     load = keeping(kind)
     assert taints(load) == []
     assert taints(load) == []
-    assert taints(lambda: load().draw()) == [("random", f"a generator that {load().__name__} keeps")]
+    assert taints(lambda: load().draw()) == [
+        ("random", f"a generator that {load().__name__} keeps")
+    ]
     assert taints(load) == []
 
 
 @pytest.mark.parametrize("kind", KEEPING)
-def test_a_step_that_imports_a_package_and_draws_from_its_generator_is_found(kind, keeping, taints, layer):
+def test_a_step_that_imports_a_package_and_draws_from_its_generator_is_found(
+    kind, keeping, taints, layer
+):
     load = keeping(kind)
-    assert taints(lambda: load().draw()) == [("random", f"a generator that {load().__name__} keeps")]
+    assert taints(lambda: load().draw()) == [
+        ("random", f"a generator that {load().__name__} keeps")
+    ]
 
 
-def test_an_own_module_may_import_a_package_that_makes_a_generator(tmp_path, monkeypatch, keeping, taints, layer):
+def test_an_own_module_may_import_a_package_that_makes_a_generator(
+    tmp_path, monkeypatch, keeping, taints, layer
+):
     keeping("legacy numpy")
     (tmp_path / "keeping_own.py").write_text("import keeping_legacy_numpy\n")
     monkeypatch.syspath_prepend(tmp_path)
     assert taints(lambda: importlib.import_module("keeping_own")) == []
 
 
-def test_a_package_that_draws_without_a_seed_when_it_is_imported_is_found(keeping, taints, layer, monkeypatch):
+def test_a_package_that_draws_without_a_seed_when_it_is_imported_is_found(
+    keeping, taints, layer, monkeypatch
+):
     monkeypatch.setitem(
-        KEEPING, "drawn numbers", ("import numpy as np\nKEPT = np.random.RandomState().rand(3)", "KEPT")
+        KEEPING,
+        "drawn numbers",
+        ("import numpy as np\nKEPT = np.random.RandomState().rand(3)", "KEPT"),
     )
     load = keeping("drawn numbers")
     assert taints(load) == [("random", "a generator that keeping_drawn_numbers keeps")]
@@ -176,7 +209,10 @@ def test_names_of_tasks_that_dask_draws_are_none(taints, layer):
     def step():
         numbers = array.from_array(np.arange(16.0).reshape(4, 4), chunks=2)
         scaled = numbers.map_blocks(lambda block: 2 * block) @ numbers.T
-        return float(scaled.sum().compute(scheduler="threads")) + delayed(abs)(object.__sizeof__(3) - 100).compute()
+        return (
+            float(scaled.sum().compute(scheduler="threads"))
+            + delayed(abs)(object.__sizeof__(3) - 100).compute()
+        )
 
     assert taints(step) == []
 
@@ -197,11 +233,15 @@ def test_names_of_files_that_xarray_draws_are_none(tmp_path, taints, layer):
 
 def test_chance_that_dask_draws_and_a_name_that_a_step_draws_are_found(taints, layer):
     random = pytest.importorskip("dask.array").random
-    assert [kind for kind, _ in taints(lambda: random.default_rng().normal(size=3).compute())] == ["random"]
+    assert [kind for kind, _ in taints(lambda: random.default_rng().normal(size=3).compute())] == [
+        "random"
+    ]
     assert taints(lambda: [uuid.uuid4() for _ in range(2)]) == [("random", "os.urandom")]
 
 
-@pytest.mark.parametrize(("seed", "source"), [(np.random.seed, "numpy.random"), (torch.seed, "torch")])
+@pytest.mark.parametrize(
+    ("seed", "source"), [(np.random.seed, "numpy.random"), (torch.seed, "torch")]
+)
 def test_a_seed_that_the_system_gives_is_none(seed, source, taints, layer):
     assert ("random", source) in taints(seed)
 
@@ -227,13 +267,20 @@ def test_a_seed_that_another_thread_sets_is_none_of_the_step(taints):
 
     other = threading.Thread(target=disturb)
     other.start()
-    assert taints(lambda: [seeded(), started.set(), ended.wait(60), torch.rand(3)]) == [("random", "torch")]
+    assert taints(lambda: [seeded(), started.set(), ended.wait(60), torch.rand(3)]) == [
+        ("random", "torch")
+    ]
     other.join()
 
 
 def test_the_functions_of_torch_and_numpy_are_what_they_were(taints):
     def functions():
-        return [torch.random.default_generator, np.random.seed, np.random.mtrand.set_state, torch.cuda.manual_seed_all]
+        return [
+            torch.random.default_generator,
+            np.random.seed,
+            np.random.mtrand.set_state,
+            torch.cuda.manual_seed_all,
+        ]
 
     before = functions()
     taints(lambda: torch.manual_seed(3))
@@ -243,7 +290,12 @@ def test_the_functions_of_torch_and_numpy_are_what_they_were(taints):
 
 def test_a_draw_says_what_to_write_and_the_advice_works(taints):
     found = observed(lambda: torch.nn.Linear(3, 2), Covered(frozenset(), lambda name: True))[1]
-    for word in ("torch.manual_seed(seed)", "torch.nn.utils.skip_init(torch.nn.Linear, 3, 2)", "rng", "cache: false"):
+    for word in (
+        "torch.manual_seed(seed)",
+        "torch.nn.utils.skip_init(torch.nn.Linear, 3, 2)",
+        "rng",
+        "cache: false",
+    ):
         assert word in found[0].fix
     numpy = observed(np.random.normal, Covered(frozenset(), lambda name: True))[1]
     assert "np.random.seed(seed)" in numpy[0].fix

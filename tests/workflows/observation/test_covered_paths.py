@@ -17,7 +17,9 @@ from neusee.workflows.observation import covered_paths
     "path", [np.__file__, torch.__file__, os.__file__, neusee.nodes.optics.__file__, sys.executable]
 )
 def test_the_program_and_python_with_its_packages_are_installed(path):
-    assert covered_paths.is_installed(os.path.realpath(path)) or covered_paths.is_of_system(os.path.realpath(path))
+    assert covered_paths.is_installed(os.path.realpath(path)) or covered_paths.is_of_system(
+        os.path.realpath(path)
+    )
 
 
 def test_a_file_of_a_user_is_not_installed(tmp_path):
@@ -32,7 +34,9 @@ def test_a_file_of_a_user_is_not_installed(tmp_path):
         assert not covered_paths.is_of_system(str(path))
 
 
-def test_a_virtual_environment_in_the_folder_of_a_project_does_not_cover_the_project(tmp_path, monkeypatch):
+def test_a_virtual_environment_in_the_folder_of_a_project_does_not_cover_the_project(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     covered_paths.program.cache_clear()
     try:
@@ -57,7 +61,9 @@ def test_chance_is_no_part_of_the_system():
 
 def test_the_compiled_code_of_the_program_is_a_cache(monkeypatch, tmp_path):
     for home in (None, str(tmp_path)):
-        monkeypatch.setenv("XDG_CACHE_HOME", home) if home else monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+        monkeypatch.setenv("XDG_CACHE_HOME", home) if home else monkeypatch.delenv(
+            "XDG_CACHE_HOME", raising=False
+        )
         assert os.path.realpath(_cpp_library.folder()) in covered_paths.caches()
 
 

@@ -100,7 +100,10 @@ def of_raw_numbers(folder):
 
 
 def of_a_memory_map(folder):
-    with open(folder / "gain.csv", "rb") as file, mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ) as memory:
+    with (
+        open(folder / "gain.csv", "rb") as file,
+        mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ) as memory,
+    ):
         return bytes(memory)
 
 
@@ -166,7 +169,9 @@ READERS = {
     lambda folder: linecache.getlines(str(folder / "gain.csv")): "gain.csv",
     lambda folder: json.loads((folder / "gain.json").read_bytes()): "gain.json",
     lambda folder: tarfile.is_tarfile(folder / "gain.csv"): "gain.csv",
-    lambda folder: sqlite3.connect(folder / "gain.db").execute("select * from gain").connection.close(): "gain.db",
+    lambda folder: (
+        sqlite3.connect(folder / "gain.db").execute("select * from gain").connection.close()
+    ): "gain.db",
 }
 
 
@@ -206,7 +211,9 @@ def test_a_file_that_native_code_reads_is_found(name, data, taints, watched):
     assert ("file", f"data/{file}") in taints(lambda: read(data))
 
 
-def test_a_file_that_is_read_within_a_covered_folder_or_is_covered_itself_is_none(data, taints, layer):
+def test_a_file_that_is_read_within_a_covered_folder_or_is_covered_itself_is_none(
+    data, taints, layer
+):
     assert taints(lambda: of_a_join(data), data / "gain.csv") == []
     assert taints(lambda: [of_a_configuration(data), os.listdir(data)], data) == []
 
@@ -218,7 +225,11 @@ def test_a_covered_file_may_be_reached_by_its_folders_and_by_a_link(data, taints
 
 
 def test_a_folder_that_is_listed_is_found(data, taints, layer):
-    for step in (lambda: os.listdir(data), lambda: list(os.scandir(data)), lambda: glob.glob(f"{data}/*.csv")):
+    for step in (
+        lambda: os.listdir(data),
+        lambda: list(os.scandir(data)),
+        lambda: glob.glob(f"{data}/*.csv"),
+    ):
         assert ("folder", "data") in taints(step)
     assert ("folder", "data") in taints(lambda: list(data.iterdir()), data / "gain.csv")
 
@@ -246,7 +257,9 @@ def test_a_default_for_a_file_that_is_not_there_is_found(data, taints, layer):
     assert taints(step) == [("file", "data/missing.csv")]
 
 
-def test_a_text_of_several_lines_that_is_taken_for_a_name_is_none_if_there_is_no_such_file(data, taints, layer):
+def test_a_text_of_several_lines_that_is_taken_for_a_name_is_none_if_there_is_no_such_file(
+    data, taints, layer
+):
     text = data / "x, y\n1, 2\n"
     assert taints(text.exists) == []
 
@@ -274,7 +287,9 @@ def test_temporary_files_that_are_read_back_are_none(taints, layer):
     assert taints(step) == []
 
 
-def test_a_file_that_the_step_writes_anew_may_be_read_back_and_one_that_it_appends_to_may_not(data, taints, layer):
+def test_a_file_that_the_step_writes_anew_may_be_read_back_and_one_that_it_appends_to_may_not(
+    data, taints, layer
+):
     def anew():
         (data / "gain.csv").write_text("5")
         return (data / "gain.csv").read_text()

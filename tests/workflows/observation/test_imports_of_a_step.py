@@ -38,14 +38,26 @@ def test_an_installed_package_that_is_imported_late_is_none(module, taints, laye
 
 @pytest.fixture
 def configured(tmp_path, monkeypatch):
-    """An installed library that reads its settings, a cache and a table of its own while it is imported."""
-    site, settings, cache = tmp_path / "site", tmp_path / "settings.cfg", tmp_path / "cache" / "fonts.json"
+    """An installed library that reads its settings, a cache and a table of its own while it is
+    imported.
+    """
+    site, settings, cache = (
+        tmp_path / "site",
+        tmp_path / "settings.cfg",
+        tmp_path / "cache" / "fonts.json",
+    )
     (site / "configured_library-1.0.dist-info").mkdir(parents=True)
     (site / "own_table.txt").write_text("1")
     cache.parent.mkdir()
     cache.write_text("2")
-    code = "import pathlib\nhere = pathlib.Path(__file__)\ntable = (here.parent / 'own_table.txt').read_text()\n"
-    code += f"fonts = pathlib.Path({str(cache)!r}).read_text()\nsettings = pathlib.Path({str(settings)!r})\n"
+    code = (
+        "import pathlib\nhere = pathlib.Path(__file__)\ntable = (here.parent /"
+        " 'own_table.txt').read_text()\n"
+    )
+    code += (
+        f"fonts = pathlib.Path({str(cache)!r}).read_text()\nsettings ="
+        f" pathlib.Path({str(settings)!r})\n"
+    )
     code += "gain = settings.read_text() if settings.exists() else '0'\n"
     (site / "configured_library.py").write_text(code)
     monkeypatch.syspath_prepend(site)
@@ -55,13 +67,16 @@ def configured(tmp_path, monkeypatch):
 
 
 def test_settings_that_a_library_reads_when_it_is_imported_are_found(configured, taints, layer):
-    assert taints(lambda: importlib.import_module("configured_library").gain) == []  # there are none
+    # there are none
+    assert taints(lambda: importlib.import_module("configured_library").gain) == []
     del sys.modules["configured_library"]
     configured.write_text("# gain: 5\n\n  # no more\n")
     assert taints(lambda: importlib.import_module("configured_library").gain) == []
     del sys.modules["configured_library"]
     configured.write_text("# gain\n5")
-    assert taints(lambda: importlib.import_module("configured_library").gain) == [("file", "settings.cfg")]
+    assert taints(lambda: importlib.import_module("configured_library").gain) == [
+        ("file", "settings.cfg")
+    ]
 
 
 def test_declared_settings_of_a_library_are_none(configured, taints, layer):
@@ -88,7 +103,9 @@ def test_a_module_of_the_user_that_the_key_follows_is_none(folder, taints, layer
 
 def test_a_module_that_the_key_does_not_follow_is_found(folder, taints, layer):
     written(folder, "unknown", "x = 3")
-    found = taints(lambda: importlib.import_module("unknown"), modules=lambda name: name != "unknown")
+    found = taints(
+        lambda: importlib.import_module("unknown"), modules=lambda name: name != "unknown"
+    )
     assert ("import", "unknown") in found
 
 
@@ -127,9 +144,13 @@ def test_the_functions_of_python_are_what_they_were(taints, layer):
     def functions():
         bootstrap = importlib._bootstrap
         return (
-            bootstrap._find_and_load, bootstrap._call_with_frames_removed, os.urandom, random._urandom,
-            random.Random.seed, threading.Thread.start,
-        )  # fmt: skip
+            bootstrap._find_and_load,
+            bootstrap._call_with_frames_removed,
+            os.urandom,
+            random._urandom,
+            random.Random.seed,
+            threading.Thread.start,
+        )
 
     before = functions()
     assert taints(lambda: functions() == before) == []

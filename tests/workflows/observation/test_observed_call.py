@@ -1,4 +1,6 @@
-"""The observed call itself: its value, its exceptions, what its thread knows, and the death of its watcher."""
+"""The observed call itself: its value, its exceptions, what its thread knows, and the death of
+its watcher.
+"""
 
 import _thread
 import contextvars
@@ -55,7 +57,12 @@ def test_the_thread_of_the_step_computes_as_the_caller_would(layer):
     before = torch.get_num_threads()
 
     def modes():
-        return torch.is_grad_enabled(), torch.is_inference_mode_enabled(), torch.get_num_threads(), _word.get()
+        return (
+            torch.is_grad_enabled(),
+            torch.is_inference_mode_enabled(),
+            torch.get_num_threads(),
+            _word.get(),
+        )
 
     torch.set_num_threads(2)
     try:
@@ -165,12 +172,14 @@ def test_an_exception_that_another_thread_raises_in_the_caller_waits_for_the_ste
     thread = threading.Thread(target=call)
     thread.start()
     began.wait()
-    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread.ident), ctypes.py_object(TooLarge))
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(
+        ctypes.c_ulong(thread.ident), ctypes.py_object(TooLarge)
+    )
     thread.join(60)
     assert caught == [True]
 
 
-# --- the process that answers -----------------------------------------------------------------------------------------
+# --- the process that answers ---------------------------------------------------------------------
 
 
 def server():
@@ -226,7 +235,10 @@ def test_a_process_that_was_forked_has_a_watcher_of_its_own(tmp_path, taints, wa
     child = os.fork()
     if child == 0:
         try:
-            good = taints((tmp_path / "gain.csv").read_text) == [("file", "gain.csv")] and server() != first
+            good = (
+                taints((tmp_path / "gain.csv").read_text) == [("file", "gain.csv")]
+                and server() != first
+            )
             code.write_text("good" if good else "bad")
             kernel_layer.give_up()
         except BaseException:
@@ -239,7 +251,9 @@ def test_a_process_that_was_forked_has_a_watcher_of_its_own(tmp_path, taints, wa
 
 
 def test_the_watcher_ends_with_its_process_and_with_what_a_step_left_behind(tmp_path, watched):
-    """A process that a step started goes on after both, and its calls are answered until it ends."""
+    """A process that a step started goes on after both, and its calls are answered until it
+    ends.
+    """
     command = f"sleep 0.3; cat /etc/passwd >{tmp_path}/left; echo $? >{tmp_path}/code"
     child = os.fork()
     if child == 0:

@@ -66,7 +66,9 @@ def test_a_fork_is_found_and_so_is_what_it_reads(tmp_path, taints, layer):
 def test_a_connection_is_found_with_its_address(taints, layer):
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = server.getsockname()
-        assert ("network", f"127.0.0.1:{address[1]}") in taints(lambda: socket.create_connection(address).close())
+        assert ("network", f"127.0.0.1:{address[1]}") in taints(
+            lambda: socket.create_connection(address).close()
+        )
 
 
 def test_a_message_without_a_connection_is_found(taints, layer):

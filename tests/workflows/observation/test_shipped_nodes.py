@@ -2,14 +2,18 @@
 
 from ruamel.yaml import YAML
 
-from neusee.workflows.keys import module_owner
+from neusee.workflows.keys import cache_key as module_owner
 from neusee.workflows.recipe.node_families import all_nodes
-from neusee.workflows.recipe.text.option_groups import packaged
+from neusee.workflows.recipe.text.composition import packaged
 
 
 def test_no_node_that_ships_is_one_of_the_user(monkeypatch):
     monkeypatch.setattr(module_owner, "PROVEN", ("neusee.",))
-    modules = {name: node.fn.__module__ for name, node in all_nodes() if node.fn.__module__.startswith("neusee")}
+    modules = {
+        name: node.fn.__module__
+        for name, node in all_nodes()
+        if node.fn.__module__.startswith("neusee")
+    }
     assert len(modules) > 100
     assert [name for name, module in modules.items() if module_owner.is_own(module)] == []
     assert module_owner.is_own("neusee_of_another")

@@ -1,4 +1,6 @@
-"""Source of an own module that a step opens: its comments and lines are in no key, unless a message quotes them."""
+"""Source of an own module that a step opens: its comments and lines are in no key, unless a
+message quotes them.
+"""
 
 import ast
 import importlib

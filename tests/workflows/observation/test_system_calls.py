@@ -1,4 +1,6 @@
-"""The table of system calls and the filter that is made of it, on the calls that only native code makes."""
+"""The table of system calls and the filter that is made of it, on the calls that only native
+code makes.
+"""
 
 import ctypes
 import mmap
@@ -10,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.observation import seccomp_filter, system_calls
+from neusee.workflows.observation import system_calls
+from neusee.workflows.observation import system_calls as seccomp_filter
 from neusee.workflows.observation.system_calls import CALLS, Condition, machine, numbers
 
 libc = ctypes.CDLL(None, use_errno=True)
@@ -18,7 +21,8 @@ HEADERS = {
     "x86_64": Path("/usr/include/x86_64-linux-gnu/asm/unistd_64.h"),
     "aarch64": Path("/usr/include/asm-generic/unistd.h"),
 }
-OTHER_NAMES = {"newfstatat": "__NR3264_fstatat", "truncate": "__NR3264_truncate"}  #: in the header of aarch64
+#: in the header of aarch64
+OTHER_NAMES = {"newfstatat": "__NR3264_fstatat", "truncate": "__NR3264_truncate"}
 
 
 @pytest.mark.parametrize("name", HEADERS)
@@ -39,7 +43,10 @@ def run(program, number, arguments=(), arch=0xC000003E):
         code, then, otherwise, operand = program[place]
         place += 1
         if code == seccomp_filter.BPF_RET:
-            return {seccomp_filter.SECCOMP_RET_USER_NOTIF: "stop", seccomp_filter.SECCOMP_RET_ALLOW: "pass"}[operand]
+            return {
+                seccomp_filter.SECCOMP_RET_USER_NOTIF: "stop",
+                seccomp_filter.SECCOMP_RET_ALLOW: "pass",
+            }[operand]
         if code == seccomp_filter.BPF_LD_W_ABS:
             held = struct.unpack_from("<I", data, operand)[0]
             continue
@@ -59,11 +66,18 @@ def test_the_filter_stops_at_the_calls_of_the_table_alone(name):
         call = by_number.get(number)
         for value in (0, 1, 0x1000, 0x4000, 0x10000, 1 << 40):
             stops = call is not None and (call.when is None or holds(call.when, value))
-            assert run(program, number, [value] * 6, arch) == ("stop" if stops else "pass"), (number, value)
+            assert run(program, number, [value] * 6, arch) == ("stop" if stops else "pass"), (
+                number,
+                value,
+            )
 
 
 def holds(when: Condition, value):
-    return {"without": not value & when.mask, "zero": not value & 0xFFFFFFFF, "nonzero": value != 0}[when.test]
+    return {
+        "without": not value & when.mask,
+        "zero": not value & 0xFFFFFFFF,
+        "nonzero": value != 0,
+    }[when.test]
 
 
 def test_calls_of_other_conventions_stop_where_they_open_or_start_something():
@@ -90,10 +104,17 @@ def test_statx_and_the_state_of_an_open_file_differ(tmp_path, taints, watched):
     (tmp_path / "gain.csv").write_text("2")
     number, room = (332 if machine() == "x86_64" else 291), ctypes.create_string_buffer(256)
     path = os.fsencode(tmp_path / "gain.csv")
-    assert taints(lambda: libc.syscall(number, -100, path, 0, 0xFFF, room)) == [("file", "gain.csv")]
+    assert taints(lambda: libc.syscall(number, -100, path, 0, 0xFFF, room)) == [
+        ("file", "gain.csv")
+    ]
     with open(path) as file:
         assert (
-            taints(lambda: [libc.syscall(number, file.fileno(), b"", 0x1000, 0xFFF, room), os.fstat(file.fileno())])
+            taints(
+                lambda: [
+                    libc.syscall(number, file.fileno(), b"", 0x1000, 0xFFF, room),
+                    os.fstat(file.fileno()),
+                ]
+            )
             == []
         )
 
@@ -119,7 +140,9 @@ def test_shared_memory_with_a_name_is_unknown_and_without_one_is_none(taints, wa
 def test_a_handle_of_a_file_and_the_memory_of_a_process_are_unknown(taints, watched):
     number = 304 if machine() == "x86_64" else 265
     assert taints(lambda: libc.syscall(number, -100, 0, 0)) == [("unknown", "open_by_handle_at")]
-    assert taints(lambda: libc.process_vm_readv(os.getpid(), 0, 0, 0, 0, 0)) == [("unknown", "process_vm_readv")]
+    assert taints(lambda: libc.process_vm_readv(os.getpid(), 0, 0, 0, 0, 0)) == [
+        ("unknown", "process_vm_readv")
+    ]
 
 
 def test_a_path_that_cannot_be_read_is_unknown(taints, watched):
@@ -129,11 +152,16 @@ def test_a_path_that_cannot_be_read_is_unknown(taints, watched):
     assert found[1].startswith("openat")
 
 
-@pytest.mark.skipif(platform.machine() != "x86_64", reason="only a processor of this kind has calls of 32 bits")
+@pytest.mark.skipif(
+    platform.machine() != "x86_64", reason="only a processor of this kind has calls of 32 bits"
+)
 def test_a_call_of_32_bits_is_unknown(tmp_path, taints, watched):
     (tmp_path / "gain.csv").write_text("2")
     code = mmap.mmap(
-        -1, 4096, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | 0x40, mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC
+        -1,
+        4096,
+        mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS | 0x40,
+        mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC,
     )
     address = ctypes.addressof(ctypes.c_char.from_buffer(code))
     assert address < 1 << 32  # MAP_32BIT, so that a call of 32 bits can name the path
@@ -141,7 +169,9 @@ def test_a_call_of_32_bits_is_unknown(tmp_path, taints, watched):
     code[1024 : 1024 + len(path)] = path
     # push rbx; mov ebx, path; xor ecx, ecx; xor edx, edx; mov eax, 5 (open); int 0x80; pop rbx; ret
     code[:21] = (
-        b"\x53\xbb" + struct.pack("<I", address + 1024) + b"\x31\xc9\x31\xd2\xb8\x05\0\0\0\xcd\x80\x5b\xc3\x90\x90"
+        b"\x53\xbb"
+        + struct.pack("<I", address + 1024)
+        + b"\x31\xc9\x31\xd2\xb8\x05\0\0\0\xcd\x80\x5b\xc3\x90\x90"
     )
     opened = []
     found = taints(lambda: opened.append(ctypes.CFUNCTYPE(ctypes.c_int)(address)()))

@@ -1,4 +1,6 @@
-"""A table of a library that a step changes is compared by its entries, also where a class stands around a dict."""
+"""A table of a library that a step changes is compared by its entries, also where a class stands
+around a dict.
+"""
 
 from types import SimpleNamespace
 
@@ -31,6 +33,7 @@ def test_the_tables_of_a_module_are_its_attributes_alone():
 def test_what_a_package_imports_of_itself_at_the_first_use_is_no_change():
     from decimal import Decimal
 
-    assert _is_of_package(Decimal.from_float, "decimal") is False  # a bound method has no module of the package
+    # a bound method has no module of the package
+    assert _is_of_package(Decimal.from_float, "decimal") is False
     assert _is_of_package(Decimal, "decimal")
     assert not _is_of_package(lambda: 1, "decimal")

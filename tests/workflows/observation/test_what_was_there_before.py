@@ -1,4 +1,6 @@
-"""A step that adds to a file, makes or removes one may find out what was there before, which no key covers."""
+"""A step that adds to a file, makes or removes one may find out what was there before, which no
+key covers.
+"""
 
 import os
 import shutil
@@ -58,7 +60,9 @@ DEPENDING = {
     "a file that must be new": exclusive,
     "a touch": lambda folder: (folder / "mark").touch(),
     "a folder": lambda folder: try_to(os.mkdir, folder / "mark"),
-    "a folder or one that is there": lambda folder: try_to(lambda: (folder / "mark").mkdir(exist_ok=True)),
+    "a folder or one that is there": lambda folder: try_to(
+        lambda: (folder / "mark").mkdir(exist_ok=True)
+    ),
     "a symbolic link": lambda folder: try_to(os.symlink, "x", folder / "mark"),
     "a hard link": linked,
     "a removal": lambda folder: try_to(os.unlink, folder / "mark"),
@@ -160,4 +164,6 @@ def test_marks_of_an_open_file_are_found(tmp_path, taints, watched):
 
 
 def test_what_a_child_process_makes_is_found(tmp_path, taints, watched):
-    assert ("write", "mark") in taints(lambda: subprocess.run(["mkdir", str(tmp_path / "mark")], check=True))
+    assert ("write", "mark") in taints(
+        lambda: subprocess.run(["mkdir", str(tmp_path / "mark")], check=True)
+    )

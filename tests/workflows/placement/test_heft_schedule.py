@@ -1,4 +1,6 @@
-"""Placement: the published example, an exact search, and a referee who replays a thousand schedules."""
+"""Placement: the published example, an exact search, and a referee who replays a thousand
+schedules.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.workflows.placement.heft_schedule import Cluster, Device, Link, Task, TooLarge, heft
-from neusee.workflows.placement.task_priorities import Graph, frugal, upward
+from neusee.workflows.placement.tasks_and_devices import Graph, frugal, upward
 
 
 def helper(name):
@@ -41,7 +43,10 @@ def one(memory=math.inf, name="cpu"):
 
 def on(seconds, *names, **costs):
     """Tasks by name on ``cpu``; each reads the one before."""
-    return [Task(n, names[i - 1 : i] if i else (), {"cpu": seconds}, **costs) for i, n in enumerate(names)]
+    return [
+        Task(n, names[i - 1 : i] if i else (), {"cpu": seconds}, **costs)
+        for i, n in enumerate(names)
+    ]
 
 
 def placed(tasks, cluster, keep):
@@ -52,7 +57,7 @@ def placed(tasks, cluster, keep):
         return None, error
 
 
-# --- the published example ------------------------------------------------------------------------------------------
+# --- the published example ------------------------------------------------------------------------
 
 
 def test_heft_gives_every_slot_of_the_published_schedule():
@@ -97,7 +102,9 @@ def test_the_exact_search_finds_the_known_optimum():
 
 def test_tasks_that_tie_but_for_rounding_go_by_name():
     tasks, cluster = plans.published()
-    schedules = {heft(list(order), cluster).slots for order in (tasks, tasks[::-1], tasks[5:] + tasks[:5])}
+    schedules = {
+        heft(list(order), cluster).slots for order in (tasks, tasks[::-1], tasks[5:] + tasks[:5])
+    }
     assert len(schedules) == 1
 
 
@@ -121,7 +128,7 @@ def test_heft_lies_between_the_optimum_and_half_as_much_again(seed):
     assert best - 1e-6 <= schedule.makespan <= 1.5 * best
 
 
-# --- the referee ----------------------------------------------------------------------------------------------------
+# --- the referee ----------------------------------------------------------------------------------
 
 
 @settings(max_examples=1000, deadline=None)
@@ -136,19 +143,27 @@ def test_no_schedule_breaks_a_rule(seed):
 
 
 def test_the_thousand_schedules_are_no_easy_ones():
-    """Some must be refused, many be cut, and many end later than they would with all the memory there is."""
+    """Some must be refused, many be cut, and many end later than they would with all the memory
+    there is.
+    """
     count = Counter()
     for seed in range(300):
         tasks, cluster, keep = plans.crowded(seed)
-        free = heft(tasks, plans.sized(cluster, dict.fromkeys(plans.memory(cluster), math.inf)), keep)
-        count["short"] += any(free.peak[name] > memory for name, memory in plans.memory(cluster).items())
+        free = heft(
+            tasks, plans.sized(cluster, dict.fromkeys(plans.memory(cluster), math.inf)), keep
+        )
+        count["short"] += any(
+            free.peak[name] > memory for name, memory in plans.memory(cluster).items()
+        )
         schedule, _ = placed(tasks, cluster, keep)
         if schedule is None:
             count["refused"] += 1
             continue
         count["cut"] += any(slot.parts > 1 for slot in schedule.slots)
         count["later"] += schedule.makespan > free.makespan
-        count["sent again"] += len(schedule.moves) > len({(m.task, m.bytes, m.device) for m in schedule.moves})
+        count["sent again"] += len(schedule.moves) > len(
+            {(m.task, m.bytes, m.device) for m in schedule.moves}
+        )
     assert count["short"] > 100
     assert count["refused"] > 30
     assert count["cut"] > 20
@@ -173,7 +188,7 @@ def test_the_referee_sees_every_foul():
     assert plans.fouls(tasks, cluster, replace(good, moves=held_too_short))
 
 
-# --- memory ---------------------------------------------------------------------------------------------------------
+# --- memory ---------------------------------------------------------------------------------------
 
 
 def test_results_go_at_their_last_use_but_those_that_are_kept():
@@ -187,7 +202,9 @@ def test_a_task_that_does_not_fit_is_cut_into_as_few_parts_as_do():
     (task,) = on(1.0, "psf", bytes=10.0, work=90.0, parts=31)
     parts = {m: heft([task], one(float(m))).slots[0].parts for m in (100, 99, 55, 54, 40, 13)}
     assert parts == {100: 1, 99: 2, 55: 2, 54: 3, 40: 3, 13: 30}
-    with pytest.raises(TooLarge, match=r"psf does not fit: .* need 13 B on cpu in 31 parts, which has 12 B"):
+    with pytest.raises(
+        TooLarge, match=r"psf does not fit: .* need 13 B on cpu in 31 parts, which has 12 B"
+    ):
         heft([task], one(12.0))
 
 
@@ -213,7 +230,9 @@ def test_a_task_goes_where_there_is_memory():
 
 
 def depth_first(sources, i):
-    """Every order of the tree below task i that finishes one source, with all before it, before it begins the next."""
+    """Every order of the tree below task i that finishes one source, with all before it, before
+    it begins the next.
+    """
     below = [list(depth_first(sources, j)) for j in sources[i]]
     for places in permutations(range(len(below))):
         for orders in product(*(below[p] for p in places)):
@@ -235,7 +254,10 @@ def test_no_other_depth_first_order_of_a_tree_holds_less(seed):
     rng = random.Random(seed)
     readers = [rng.randint(max(0, i - 3), i - 1) for i in range(1, 8)]
     sources = [[str(j) for j, reader in enumerate(readers, 1) if reader == i] for i in range(8)]
-    costs = [{"bytes": rng.randint(0, 100), "work": rng.choice([0, rng.randint(0, 200)])} for _ in range(8)]
+    costs = [
+        {"bytes": rng.randint(0, 100), "work": rng.choice([0, rng.randint(0, 200)])}
+        for _ in range(8)
+    ]
     tasks = [Task(str(i), tuple(sources[i]), {"cpu": 1.0}, **costs[i]) for i in reversed(range(8))]
     graph = Graph(tasks, one())
     (root,) = (i for i, task in enumerate(tasks) if task.name == "0")
@@ -244,7 +266,9 @@ def test_no_other_depth_first_order_of_a_tree_holds_less(seed):
 
 
 def test_an_order_that_holds_less_is_found():
-    """Four branches, each of a large and a small result: breadth first holds four large ones, depth first one."""
+    """Four branches, each of a large and a small result: breadth first holds four large ones,
+    depth first one.
+    """
     tasks = [Task(f"big{i}", (), {"cpu": 1.0}, bytes=100.0) for i in range(4)]
     tasks += [Task(f"small{i}", (f"big{i}",), {"cpu": 1.0}, bytes=1.0) for i in range(4)]
     tasks.append(Task("sum", tuple(f"small{i}" for i in range(4)), {"cpu": 1.0}))
@@ -308,7 +332,10 @@ def test_more_memory_as_a_refusal_asks_for_is_enough_in_the_end(seed):
 @given(st.integers(0, 2**40))
 def test_what_one_device_can_run_alone_is_not_refused_where_there_are_more(seed):
     tasks, cluster, keep = plans.crowded(seed)
-    tasks = [replace(t, seconds={d.name: 1.0 + k for k, d in enumerate(cluster.devices)}, takes={}) for t in tasks]
+    tasks = [
+        replace(t, seconds={d.name: 1.0 + k for k, d in enumerate(cluster.devices)}, takes={})
+        for t in tasks
+    ]
     alone = [placed(tasks, Cluster((device,)), keep)[0] for device in cluster.devices]
     together, _ = placed(tasks, cluster, keep)
     assert together or not any(alone)
@@ -324,11 +351,14 @@ def test_a_refusal_tells_what_one_device_alone_would_need_if_that_is_less(seed):
 
 
 def test_a_refusal_says_bytes_as_people_read_them_too():
-    with pytest.raises(TooLarge, match=r"need 12,500,000,000 B \(12.5 GB\) on cpu, which has 8,000,000,000 B \(8 GB\)"):
+    with pytest.raises(
+        TooLarge,
+        match=r"need 12,500,000,000 B \(12.5 GB\) on cpu, which has 8,000,000,000 B \(8 GB\)",
+    ):
         heft(on(1.0, "stack", bytes=12.5e9), one(8e9))
 
 
-# --- transfers ------------------------------------------------------------------------------------------------------
+# --- transfers ------------------------------------------------------------------------------------
 
 
 def two(link):
@@ -353,14 +383,18 @@ def test_where_memory_is_short_a_copy_is_sent_again():
     ]
     cluster = two(Link(60.0, 0.0))
     assert heft(tasks, cluster).transferred == 60
-    small = replace(cluster, devices=(cluster.devices[0], replace(cluster.devices[1], memory=100.0)))
+    small = replace(
+        cluster, devices=(cluster.devices[0], replace(cluster.devices[1], memory=100.0))
+    )
     schedule = heft(tasks, small)
     assert schedule.transferred == 120
     assert plans.fouls(tasks, small, schedule) == []
 
 
 def test_links_go_by_kind_within_a_machine_and_by_network_between():
-    devices = tuple(Device(f"{m}/{n}", n[:4]) for m in ("a", "b") for n in ("cpu", "cuda:0", "cuda:1"))
+    devices = tuple(
+        Device(f"{m}/{n}", n[:4]) for m in ("a", "b") for n in ("cpu", "cuda:0", "cuda:1")
+    )
     cluster = Cluster(devices, {("cuda", "cuda"): Link(300.0)}, Link(20.0), Link(10.0, 1.0))
     assert cluster.link("a/cuda:0", "a/cuda:0").seconds(600) == 0
     assert cluster.link("a/cuda:0", "a/cuda:1").seconds(600) == 2
@@ -369,13 +403,15 @@ def test_links_go_by_kind_within_a_machine_and_by_network_between():
 
 
 def test_a_slow_link_keeps_a_chain_together():
-    chain = [replace(t, seconds={"cpu": 3.0, "cuda:0": 1.0}) for t in on(1.0, "a", "b", "c", bytes=100.0)]
+    chain = [
+        replace(t, seconds={"cpu": 3.0, "cuda:0": 1.0}) for t in on(1.0, "a", "b", "c", bytes=100.0)
+    ]
     pinned = [replace(chain[0], seconds={"cpu": 3.0}), *chain[1:]]
     assert {s.device for s in heft(pinned, two(Link(1e9))).slots[1:]} == {"cuda:0"}
     assert {s.device for s in heft(pinned, two(Link(10.0))).slots} == {"cpu"}
 
 
-# --- the account ----------------------------------------------------------------------------------------------------
+# --- the account ----------------------------------------------------------------------------------
 
 
 def test_the_critical_path_says_what_each_task_waited_for():
@@ -405,15 +441,21 @@ def test_utilisation_is_the_share_of_the_makespan():
     assert heft([], two(Link())).utilisation() == {"cpu": 0.0, "cuda:0": 0.0}
 
 
-# --- what cannot be placed ------------------------------------------------------------------------------------------
+# --- what cannot be placed ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("tasks", "message"),
     [
         ([Task("a", (), {"cuda:1": 1.0})], "a needs cuda:1; the cluster has cpu"),
-        ([Task("a", ("pfs",), {"cpu": 1.0}), Task("psf", (), {"cpu": 1.0})], "there is no task pfs; did you mean psf?"),
-        ([Task("a", ("b",), {"cpu": 1.0}), Task("b", ("a",), {"cpu": 1.0})], "depend on each other in a cycle"),
+        (
+            [Task("a", ("pfs",), {"cpu": 1.0}), Task("psf", (), {"cpu": 1.0})],
+            "there is no task pfs; did you mean psf?",
+        ),
+        (
+            [Task("a", ("b",), {"cpu": 1.0}), Task("b", ("a",), {"cpu": 1.0})],
+            "depend on each other in a cycle",
+        ),
         ([Task("a", (), {"cpu": 1.0}), Task("a", (), {"cpu": 1.0})], "two tasks have the name a"),
         ([Task("a", (), {"cpu": math.nan})], "a must take a finite time of 0 s or more"),
     ],
@@ -445,7 +487,8 @@ def test_placing_needs_no_torch():
     import sys
 
     code = (
-        "import sys; from neusee.workflows.placement import heft_schedule, machine_file; print('torch' in sys.modules)"
+        "import sys; from neusee.workflows.placement import heft_schedule, machine_file;"
+        " print('torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

@@ -1,4 +1,6 @@
-"""Machines from YAML: the examples, every device by name, and every mistake at once with its place."""
+"""Machines from YAML: the examples, every device by name, and every mistake at once with its
+place.
+"""
 
 from __future__ import annotations
 
@@ -90,17 +92,26 @@ def test_every_mistake_is_told_at_once_with_its_place(refused):
         "2:3 devices.a100: needs kind",
         "2:10 devices.a100.knd: unknown; did you mean kind?",
         "2:21 devices.a100.cuont: unknown; did you mean count?",
-        "2:39 devices.a100.memory: needs a unit: write a number and one of B, kB, MB, GB, TB, MiB, GiB, TiB",
+        (
+            "2:39 devices.a100.memory: needs a unit: write a number and one of B, kB, MB, GB, TB,"
+            " MiB, GiB, TiB"
+        ),
         "2:43 devices.a100.speed: needs default",
         "2:51 devices.a100.speed.optcs: unknown; did you mean optics?",
         "3:13 devices.b.kind: unknown kind of device; did you mean cuda?",
-        "3:27 devices.b.memory: has the wrong unit 'GBB': write a number and one of B, kB, MB, GB, TB, MiB, GiB, TiB",
+        (
+            "3:27 devices.b.memory: has the wrong unit 'GBB': write a number and one of B, kB, MB,"
+            " GB, TB, MiB, GiB, TiB"
+        ),
         "3:42 devices.b.count: must be a whole number of devices from 1 to 4096",
         "3:51 devices.b.node: must name at least one machine, and no machine twice",
         "4:6 devices.c: must be a mapping with kind, count, memory, speed, node, not a number",
         "6:3 links.cuda-cpu: needs bandwidth",
         "6:14 links.cuda-cpu.bandwith: unknown; did you mean bandwidth?",
-        "6:41 links.cuda-cpu.latency: needs a unit: write a number and one of s, ms, us, µs, μs, ns",
+        (
+            "6:41 links.cuda-cpu.latency: needs a unit: write a number and one of s, ms, us, µs,"
+            " μs, ns"
+        ),
         "7:3 links.cuda: must name two kinds, such as cuda-cuda or cpu-cuda",
         "7:21 links.cuda.bandwidth: must be above 0, such as 25 GB/s",
         "8:1 networks: unknown; did you mean network?",
@@ -116,9 +127,15 @@ ONE = "devices: {a: {kind: cpu, memory: 1 GB}}\n"
         ("links: {}", "1:1 : needs devices"),
         (
             "devices: {}",
-            "1:10 devices: must be a mapping of device groups, such as `a100: {kind: cuda, memory: 80 GB}`",
+            (
+                "1:10 devices: must be a mapping of device groups, such as `a100: {kind: cuda,"
+                " memory: 80 GB}`"
+            ),
         ),
-        (ONE + "links: 3", "2:8 links: must be a mapping of links, such as `cuda-cuda: {bandwidth: 300 GB/s}`"),
+        (
+            ONE + "links: 3",
+            "2:8 links: must be a mapping of links, such as `cuda-cuda: {bandwidth: 300 GB/s}`",
+        ),
         (
             ONE + "links: {cpu-cuda: {bandwidth: 1 GB/s}}",
             "2:9 links.cpu-cuda: there is no device of kind cuda; there are: cpu",
@@ -128,8 +145,10 @@ ONE = "devices: {a: {kind: cpu, memory: 1 GB}}\n"
             "2:39 links.cpu-cpu: given twice, first in line 2",
         ),
         (
-            "devices: {a: {kind: cpu, memory: 1 GB}, b: {kind: cuda, memory: 1 GB}}\n"
-            "links: {cpu-cuda: {bandwidth: 1 GB/s}, cuda-cpu: {bandwidth: 1 GB/s}}",
+            (
+                "devices: {a: {kind: cpu, memory: 1 GB}, b: {kind: cuda, memory: 1 GB}}\n"
+                "links: {cpu-cuda: {bandwidth: 1 GB/s}, cuda-cpu: {bandwidth: 1 GB/s}}"
+            ),
             "2:40 links.cuda-cpu: is the same as cpu-cuda",
         ),
         (
@@ -165,5 +184,7 @@ def test_three_examples_come_along_and_are_no_group_of_recipes():
 
 
 def test_a_name_that_is_no_file_gets_the_nearest_example():
-    with pytest.raises(RecipeError, match=r"no such file, and no example of that name; did you mean eight_a100\?"):
+    with pytest.raises(
+        RecipeError, match=r"no such file, and no example of that name; did you mean eight_a100\?"
+    ):
         read_machines("eight_a10")

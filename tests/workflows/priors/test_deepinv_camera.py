@@ -1,6 +1,8 @@
-"""A recipe's camera as a physics of deepinv: the tests of deepinv's own operators, a clipped likelihood, restorations.
+"""A recipe's camera as a physics of deepinv: the tests of deepinv's own operators, a clipped
+likelihood, restorations.
 
-Where torchvision is missing, a stand-in takes its place: see `tests/deepinv_without_torchvision.py`.
+Where torchvision is missing, a stand-in takes its place: see
+`tests/deepinv_without_torchvision.py`.
 """
 
 from __future__ import annotations
@@ -70,7 +72,9 @@ def test_the_norm_that_deepinv_computes_is_that_of_a_dense_matrix(double):
     patch = torch.zeros_like(double.mask)
     patch[1, 10:26, 8:24] = 1.0  # a camera with 256 pixels, so that the matrix is small
     double.update(mask=patch)
-    norm = double.compute_norm(torch.randn(1, *double.img_size).double(), 2000, 1e-9, verbose=False, squared=False)
+    norm = double.compute_norm(
+        torch.randn(1, *double.img_size).double(), 2000, 1e-9, verbose=False, squared=False
+    )
     rows = torch.zeros(256, *double.frame.shape[1:], dtype=torch.float64)
     rows[:, 1, 10:26, 8:24] = torch.eye(256, dtype=torch.float64).reshape(256, 16, 16)
     matrix = double.A_adjoint(rows)[:, 1].flatten(1)
@@ -100,29 +104,46 @@ def test_batches_types_and_transforms(physics):
     assert whole.shape == (3, *physics.frame.shape[1:])
     torch.testing.assert_close(torch.func.vmap(physics.A)(scenes), whole)
     torch.testing.assert_close(torch.func.jvp(physics.A, (scenes,), (scenes,))[1], whole)
-    torch.testing.assert_close(torch.func.vjp(physics.A, scenes)[1](whole)[0], physics.A_adjoint(whole))
+    torch.testing.assert_close(
+        torch.func.vjp(physics.A, scenes)[1](whole)[0], physics.A_adjoint(whole)
+    )
     slope = torch.func.grad(lambda x: 0.5 * (physics.A(x) - physics.frame).square().sum())(scenes)
-    torch.testing.assert_close(slope, physics.A_adjoint(whole - physics.frame), rtol=1e-4, atol=2e-5)
-    assert physics.A(scenes.double()).dtype == physics.A_adjoint(whole.double()).dtype == torch.float64
+    torch.testing.assert_close(
+        slope, physics.A_adjoint(whole - physics.frame), rtol=1e-4, atol=2e-5
+    )
+    assert (
+        physics.A(scenes.double()).dtype == physics.A_adjoint(whole.double()).dtype == torch.float64
+    )
     assert physics.double().A(scenes.double()).dtype == torch.float64
 
 
 def test_the_blur_is_that_of_the_recipe(double, recipe, store):
-    """A frame of the recipe without noise, from an independent sum over the scene of one channel's PSF."""
-    result = recipe.run(store, [f"{name}" for name in ("psf[mask]", "illuminant", "responses", "bands")])
-    share = np.array(result["responses"] * result["illuminant"] * result["bands"].centres, dtype=float)
-    kernel = np.tensordot(share[1] / share[1].sum(), result.numpy("psf[mask]").intensity.astype(float), 1)
+    """A frame of the recipe without noise, from an independent sum over the scene of one
+    channel's PSF.
+    """
+    result = recipe.run(
+        store, [f"{name}" for name in ("psf[mask]", "illuminant", "responses", "bands")]
+    )
+    share = np.array(
+        result["responses"] * result["illuminant"] * result["bands"].centres, dtype=float
+    )
+    kernel = np.tensordot(
+        share[1] / share[1].sum(), result.numpy("psf[mask]").intensity.astype(float), 1
+    )
     scene = torch.zeros(1, *double.img_size, dtype=torch.float64)
     top, left = double.blur.corner()
     scene[0, 1, top + 20, left + 15] = 1.0
     found = double.blur.seen(scene)[0, 1].numpy() * double.frame_unit / double.unit
-    placed = kernel[24 - 20 : 24 - 20 + 48, 24 - 15 : 24 - 15 + 40]  # the axis of the PSF at sample 24 of 48
+    # the axis of the PSF at sample 24 of 48
+    placed = kernel[24 - 20 : 24 - 20 + 48, 24 - 15 : 24 - 15 + 40]
     seen = placed[:44, :39]
     np.testing.assert_allclose(found[:44, :39], seen, atol=2e-3 * kernel.max())
 
 
 def test_a_frame_in_electrons_is_the_signal_where_it_did_not_clip(physics, recipe, store):
-    signal, clipped = (recipe.run(store, [name])[name] for name in ("signal[mask]", "clipped[mask]"))
+    signal, clipped = (
+        recipe.run(store, [name])[name] for name in ("signal[mask]", "clipped[mask]")
+    )
     found = physics.electrons(physics.frame)[0]
     torch.testing.assert_close(found[~clipped], signal[~clipped], rtol=1e-5, atol=0.01)
     assert not physics.frame[0][clipped].any()
@@ -139,7 +160,10 @@ def test_the_even_scene_has_the_mean_of_the_frame(double):
 
 def test_known_glare_is_taken_away_from_the_frame_and_added_to_its_noise(recipe, store):
     glare = torch.full((3, 64, 64), 500.0)
-    plain, with_glare = as_physics(recipe, store=store), as_physics(recipe, store=store, glare=glare)
+    plain, with_glare = (
+        as_physics(recipe, store=store),
+        as_physics(recipe, store=store, glare=glare),
+    )
     away = (plain.frame - with_glare.frame) * plain.frame_unit
     torch.testing.assert_close(away[0], 500.0 * plain.mask, rtol=1e-4, atol=0.01)
     for camera, electrons in ((plain, 0.25), (with_glare, 500.0)):
@@ -148,8 +172,11 @@ def test_known_glare_is_taken_away_from_the_frame_and_added_to_its_noise(recipe,
         measured = camera(dark, seed=1) * camera.frame_unit
         variance = electrons + 10.5**2 + 0.37**2 / 12
         assert float(measured.var()) == pytest.approx(variance, rel=0.05 if electrons > 1 else 0.02)
-        assert abs(float(measured.mean())) < 5 * (variance / measured.numel()) ** 0.5 + 0.15  # clipped at 0 e-: +0.1 e-
-    with pytest.raises(ValueError, match=r"glare \(64, 64\) must be \(channel, y, x\) with the 3 channels"):
+        # clipped at 0 e-: +0.1 e-
+        assert abs(float(measured.mean())) < 5 * (variance / measured.numel()) ** 0.5 + 0.15
+    with pytest.raises(
+        ValueError, match=r"glare \(64, 64\) must be \(channel, y, x\) with the 3 channels"
+    ):
         as_physics(recipe, store=store, glare=glare[0])
 
 
@@ -165,14 +192,15 @@ def test_noise_is_the_same_for_the_same_seed_and_the_mask_of_a_simulated_frame_i
     assert 0 < float((1 - mask).mean()) < 1
 
 
-# --- the likelihood ---------------------------------------------------------------------------------------------------
+# --- the likelihood -------------------------------------------------------------------------------
 
 
 def test_the_likelihood_is_the_sum_of_scipys_densities_and_tails(double):
     scenes = torch.rand(2, *double.img_size).double()
     y = double.frame.expand(2, -1, -1, -1)
     found = double.likelihood(scale=1.0).fn(scenes, y, double)
-    expected = (double.blur.seen(scenes) * double.frame_unit).numpy() + 0.002  # dark electrons of the recipe
+    # dark electrons of the recipe
+    expected = (double.blur.seen(scenes) * double.frame_unit).numpy() + 0.002
     measured, known = y.numpy() * double.frame_unit + 0.002, double.mask.bool().numpy()
     sigma = np.sqrt(np.maximum(expected, 0) + 10.5**2 + 0.37**2 / 12)
     level = (int(25500 / 0.37 - 0.5) if 25500 / 0.37 < 65535 else 65535) - 0.5
@@ -183,7 +211,10 @@ def test_the_likelihood_is_the_sum_of_scipys_densities_and_tails(double):
 
 @pytest.mark.parametrize("floor", [0.0, 0.2])
 def test_the_gradient_of_the_likelihood_is_that_of_finite_differences(double, floor):
-    likelihood, scene = double.likelihood(floor, scale=1.0), 0.3 + torch.rand(1, *double.img_size).double()
+    likelihood, scene = (
+        double.likelihood(floor, scale=1.0),
+        0.3 + torch.rand(1, *double.img_size).double(),
+    )
     way = torch.randn_like(scene)
 
     def value(t):
@@ -195,22 +226,30 @@ def test_the_gradient_of_the_likelihood_is_that_of_finite_differences(double, fl
 
 
 def test_a_dark_pixel_counts_as_in_the_least_squares_of_deepinv(double):
-    """At the scale that is taken by default, and with a floor above the whole frame, both gradients are equal."""
+    """At the scale that is taken by default, and with a floor above the whole frame, both
+    gradients are equal.
+    """
     double.update(mask=torch.ones_like(double.mask))
     scene = torch.rand(1, *double.img_size).double()
     found = double.likelihood(floor=1e3).grad(scene, double.frame, double)
-    torch.testing.assert_close(found, deepinv.optim.L2().grad(scene, double.frame, double), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(
+        found, deepinv.optim.L2().grad(scene, double.frame, double), rtol=1e-9, atol=1e-12
+    )
 
 
 def test_a_clipped_pixel_pulls_up_and_never_down(double):
     double.update(mask=torch.zeros_like(double.mask))
-    dark, bright = torch.zeros(1, *double.img_size).double(), torch.full((1, *double.img_size), 3e3).double()
+    dark, bright = (
+        torch.zeros(1, *double.img_size).double(),
+        torch.full((1, *double.img_size), 3e3).double(),
+    )
     likelihood = double.likelihood()
-    assert (double.blur.seen(likelihood.grad(dark, double.frame, double)) < 0).all()  # descent adds light
+    # descent adds light
+    assert (double.blur.seen(likelihood.grad(dark, double.frame, double)) < 0).all()
     assert float(likelihood.grad(bright, double.frame, double).abs().max()) < 1e-9
 
 
-# --- restoration ------------------------------------------------------------------------------------------------------
+# --- restoration ----------------------------------------------------------------------------------
 
 
 def test_eight_lines_restore_a_picture_better_than_the_raw_frame(store):
@@ -218,7 +257,9 @@ def test_eight_lines_restore_a_picture_better_than_the_raw_frame(store):
 
     recipe = load("first_light", laser="none", **SMALL)
     camera = as_physics(recipe, store=store)
-    restore = HQS(data_fidelity=L2(), prior=TVPrior(n_it_max=20), stepsize=30.0, lambda_reg=1e-4, max_iter=20)
+    restore = HQS(
+        data_fidelity=L2(), prior=TVPrior(n_it_max=20), stepsize=30.0, lambda_reg=1e-4, max_iter=20
+    )
     with torch.no_grad():
         picture = camera.colour(restore(camera.frame, camera, init=camera.even()))[0]
     truth = recipe.run(store, ["truth"])["truth"]
@@ -227,7 +268,9 @@ def test_eight_lines_restore_a_picture_better_than_the_raw_frame(store):
 
 
 def test_a_denoiser_with_weights_from_a_local_file_restores(physics, tmp_path):
-    """DRUNet with made-up weights: pretrained weights from a file take the same way, and no download happens."""
+    """DRUNet with made-up weights: pretrained weights from a file take the same way, and no
+    download happens.
+    """
     from deepinv.models import DRUNet
     from deepinv.optim import HQS, L2, PnP
 
@@ -247,7 +290,9 @@ def test_a_denoiser_with_weights_from_a_local_file_restores(physics, tmp_path):
 
 
 def test_the_clipped_likelihood_restores_light_that_a_mask_alone_does_not_see(store):
-    """A bright patch that clips everywhere within: the tail asks for light there, the mask for nothing."""
+    """A bright patch that clips everywhere within: the tail asks for light there, the mask for
+    nothing.
+    """
     from deepinv.optim import FISTA, L2, TVPrior
 
     camera = as_physics(load("first_light", laser="none", doe="flat", **SMALL), store=store)

@@ -12,7 +12,9 @@ def test_without_deepinv_the_error_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "deepinv", None)
     monkeypatch.setitem(sys.modules, "deepinv.optim", None)
     monkeypatch.delitem(sys.modules, "neusee.workflows.priors.deepinv_camera", raising=False)
-    with pytest.raises(ModuleNotFoundError, match=r'as_physics needs deepinv.*: pip install "neusee\[deepinv\]"'):
+    with pytest.raises(
+        ModuleNotFoundError, match=r'as_physics needs deepinv.*: pip install "neusee\[deepinv\]"'
+    ):
         as_physics(load("first_light"))
 
 

@@ -1,4 +1,6 @@
-"""Rivals of equal protection: equal peaks, the best of the candidates, and values that are those of the nodes."""
+"""Rivals of equal protection: equal peaks, the best of the candidates, and values that are those
+of the nodes.
+"""
 
 import math
 from dataclasses import replace
@@ -8,11 +10,15 @@ import pytest
 import torch
 
 from neusee.nodes import metrics
-from neusee.nodes.optics._lens_band import round_lens
+from neusee.nodes.optics._lens import round_lens
 from neusee.workflows import load
-from neusee.workflows.protection.camera_parts import ProtectionCamera
 from neusee.workflows.protection.equal_rivals import MEASURES, Candidate, best, quiet_picture
-from neusee.workflows.protection.front_optics import Front, FrontBench, FrontSettings
+from neusee.workflows.protection.protection_camera import (
+    Front,
+    FrontBench,
+    FrontSettings,
+    ProtectionCamera,
+)
 from neusee.workflows.protection.unknown_conditions import draw_conditions, usual_condition
 from neusee.workflows.store.result_store import Store
 
@@ -45,7 +51,9 @@ def test_every_rival_has_the_peak_of_the_mask(bench):
         assert float(peak) == pytest.approx(own, rel=1e-6)
         # pixels average less of a wider spot away
         whole = bench.camera.psf(False, 1.0, bench.camera.bands)
-        wider, lens = (round_lens(whole.cut_off * width, whole.averaged).peak for width in (diameter, 1.0))
+        wider, lens = (
+            round_lens(whole.cut_off * width, whole.averaged).peak for width in (diameter, 1.0)
+        )
         assert one.peak == pytest.approx(diameter**4 * float((wider / lens).max()), rel=0.06)
 
 
@@ -84,9 +92,15 @@ def test_a_quiet_picture_is_that_of_the_nodes(bench):
         dim = psf._replace(intensity=psf.intensity * grey)
         exact = metrics.filtered_picture(dim, *light, electrons=n, read_noise=10.5, prnu=0.01)
         values = quiet_picture(bench.measure(front, usual), grey, n, pixel)
-        assert values["error"] == pytest.approx(-10 * math.log10(float(exact.error.mean())), abs=2e-3)
-        assert values["information"] == pytest.approx(10 * math.log10(float(exact.information.mean())), abs=2e-3)
-        assert values["NEQ"] == pytest.approx(10 / math.log(10) * float(exact.log_neq.mean()), abs=1e-3)
+        assert values["error"] == pytest.approx(
+            -10 * math.log10(float(exact.error.mean())), abs=2e-3
+        )
+        assert values["information"] == pytest.approx(
+            10 * math.log10(float(exact.information.mean())), abs=2e-3
+        )
+        assert values["NEQ"] == pytest.approx(
+            10 / math.log(10) * float(exact.log_neq.mean()), abs=1e-3
+        )
 
 
 def test_the_best_rival_is_the_best_of_the_candidates_at_the_wanted_protection(bench):
@@ -95,7 +109,10 @@ def test_the_best_rival_is_the_best_of_the_candidates_at_the_wanted_protection(b
     measured = [Candidate(f, bench.measure(f, usual), bench.measure(f, usual).peak) for f in fronts]
     chosen = best(measured, 0.03, 100.0, pixel)
     for measure in MEASURES:
-        each = [quiet_picture(c.found, min(1, 0.03 / c.protection), 100.0, pixel)[measure] for c in measured]
+        each = [
+            quiet_picture(c.found, min(1, 0.03 / c.protection), 100.0, pixel)[measure]
+            for c in measured
+        ]
         assert chosen[measure][0] == max(each)
         assert chosen[measure][1].front == fronts[int(np.argmax(each))]
 
@@ -104,12 +121,16 @@ def test_dirt_and_defocus_cost_the_filter_that_does_not_know_them(bench):
     calm, pixel = usual_condition(), bench.camera.pixel(0.01, 0.02)
     (rough,) = draw_conditions(1, 3)
     for front in (Front(True), Front(False)):
-        one, other = (quiet_picture(bench.measure(front, c), 1.0, 1e4, pixel)["error"] for c in (calm, rough))
+        one, other = (
+            quiet_picture(bench.measure(front, c), 1.0, 1e4, pixel)["error"] for c in (calm, rough)
+        )
         assert other < one
 
 
 def test_another_mask_is_another_result(bench, store):
-    other = FrontBench(ProtectionCamera.of(load("axicon", [*SMALL, "doe.waves=3"]), store, 3), store, SETTINGS)
+    other = FrontBench(
+        ProtectionCamera.of(load("axicon", [*SMALL, "doe.waves=3"]), store, 3), store, SETTINGS
+    )
     steep, gentle = (one.measure(Front(True), usual_condition()).peak for one in (bench, other))
     assert gentle > 1.2 * steep
 
@@ -123,7 +144,9 @@ def test_the_colour_of_a_laser_is_relative_to_the_channel_that_responds_most(ben
 
 
 def test_the_lens_scatters_the_same_veil_behind_every_front(bench):
-    """The veil, without the core, by Harvey and Shack's law in the middle of a pixel; a stop passes less of it."""
+    """The veil, without the core, by Harvey and Shack's law in the middle of a pixel; a stop
+    passes less of it.
+    """
     usual = replace(usual_condition(), scatter=0.3)
     (surface,), line = usual.surfaces.values(), bench.camera.laser_line(550e-9)
     scale = bench.camera.lens["pixel_pitch"] / bench.camera.lens["focal_length"]
@@ -131,9 +154,12 @@ def test_the_lens_scatters_the_same_veil_behind_every_front(bench):
     law = surface["b0"] * (1 + (at / surface["l"]) ** 2) ** (surface["s"] / 2) * scale**2
     far = at > 20 * scale
     for masked, diameter in ((False, 1.0), (True, 1.0), (True, 0.5)):
-        whole, core = (one.intensity[0].double().numpy() for one in (
-            bench.camera.laser_psf(masked, diameter, line, usual, angle=(0.0, 0.0)),
-            bench.camera.psf(masked, diameter, line, usual, angle=(0.0, 0.0)),
-        ))  # fmt: skip
+        whole, core = (
+            one.intensity[0].double().numpy()
+            for one in (
+                bench.camera.laser_psf(masked, diameter, line, usual, angle=(0.0, 0.0)),
+                bench.camera.psf(masked, diameter, line, usual, angle=(0.0, 0.0)),
+            )
+        )
         veil = whole - (1 - usual.scatter) * core
         assert veil[far] == pytest.approx(diameter**2 * law[far], rel=0.03, abs=5e-10)

@@ -1,4 +1,6 @@
-"""Mistakes about lasers in watts, scenes in lux and dark currents by time: each is one located message."""
+"""Mistakes about lasers in watts, scenes in lux and dark currents by time: each is one located
+message.
+"""
 
 import pytest
 
@@ -14,7 +16,10 @@ lasers:
   mine: {wavelength: 532 nm, fwhm: 1 nm, angle: [0 mrad, 0 mrad], LIGHT}
 """
 GOOD = "power: 5 mW, divergence: 1 mrad, distance: 100 m"
-TRAIN = "pulse_energy: 1 uJ, pulse_duration: 5 ns, repetition_rate: 10 kHz, divergence: 1 mrad, distance: 100 m"
+TRAIN = (
+    "pulse_energy: 1 uJ, pulse_duration: 5 ns, repetition_rate: 10 kHz, divergence: 1 mrad,"
+    " distance: 100 m"
+)
 
 
 @pytest.fixture
@@ -25,12 +30,17 @@ def refused(write, tmp_path):
         write(MINE.replace("LIGHT", light) + more)
         with pytest.raises(RecipeError) as caught:
             load("mine.yaml", arguments, tmp_path)
-        return [" | ".join(filter(None, (str(p.mark), p.path, p.message))) for p in caught.value.diagnostics]
+        return [
+            " | ".join(filter(None, (str(p.mark), p.path, p.message)))
+            for p in caught.value.diagnostics
+        ]
 
     return refused
 
 
-@pytest.mark.parametrize("light", [GOOD, TRAIN, "strength: 100", f"{GOOD}, visibility: 5 km, haze: kim"])
+@pytest.mark.parametrize(
+    "light", [GOOD, TRAIN, "strength: 100", f"{GOOD}, visibility: 5 km, haze: kim"]
+)
 def test_what_is_whole_loads(light, write, tmp_path):
     write(MINE.replace("LIGHT", light))
     assert load("mine.yaml", (), tmp_path).outputs == ("raw[plain]", "raw[mask]")
@@ -90,12 +100,19 @@ def test_a_strength_at_a_wavelength_that_no_channel_sees_is_refused_at_the_stren
     words = "lasers.mine.wavelength=1064 nm", "sensor.camera=Nikon 5100"
     (line,) = refused("strength: 10", *words)
     assert line.startswith("mine.yaml:6:")
-    assert "strength = 10 | no channel of the camera sees 1064 nm, so no strength can saturate one: give power" in line
+    assert (
+        "strength = 10 | no channel of the camera sees 1064 nm, so no strength can saturate one:"
+        " give power" in line
+    )
 
 
 def test_the_strength_of_the_paper_needs_no_channel_that_sees_the_laser(write, tmp_path):
     write(MINE.replace("LIGHT", "strength: 10"))
-    words = "lasers.mine.wavelength=1064 nm", "sensor.camera=Nikon 5100", "reading.strength=irradiance"
+    words = (
+        "lasers.mine.wavelength=1064 nm",
+        "sensor.camera=Nikon 5100",
+        "reading.strength=irradiance",
+    )
     recipe = load("mine.yaml", words, tmp_path)
     assert any("no channel of Nikon 5100 sees 5 of 5 bands" in note for note in recipe.notes)
 

@@ -1,4 +1,6 @@
-"""A recipe that is checked after others of its graph is the recipe that is checked alone, with the same mistakes."""
+"""A recipe that is checked after others of its graph is the recipe that is checked alone, with
+the same mistakes.
+"""
 
 import random
 import shutil
@@ -11,7 +13,8 @@ import torch
 from neusee import recipes
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.step_shapes import alike
-from neusee.workflows.recipe import bound_steps, graph_cache
+from neusee.workflows.recipe import step_checks as bound_steps
+from neusee.workflows.recipe import step_checks as graph_cache
 from neusee.workflows.recipe.loading import check
 from neusee.workflows.recipe.text.composition import Composer, compose
 
@@ -38,7 +41,10 @@ def told(words, recipe="first_light"):
         recipe = check(compose(recipe, words, Path.cwd()))
     except RecipeError as error:
         return [str(each) for each in error.diagnostics]
-    steps = {name: (s.node.path, dict(s.params), dict(s.wires), s.device, s.mark) for name, s in recipe.steps.items()}
+    steps = {
+        name: (s.node.path, dict(s.params), dict(s.wires), s.device, s.mark)
+        for name, s in recipe.steps.items()
+    }
     known = [recipe.seed, recipe.tolerance, recipe.outputs, recipe.notes, recipe.expect]
     return [*steps.items(), *known, *recipe.config.settings.items()]
 
@@ -66,11 +72,19 @@ def test_a_check_after_others_says_what_a_check_alone_says(monkeypatch):
 
 def test_a_recipe_that_is_composed_after_others_is_the_recipe_composed_alone():
     composer = Composer("first_light", Path.cwd())
-    changes = [*(drawn(seed) for seed in range(40)), ["doe=axicn", "sensor.bits"], ["+doe=axicon"], ["~flare"], []]
+    changes = [
+        *(drawn(seed) for seed in range(40)),
+        ["doe=axicn", "sensor.bits"],
+        ["+doe=axicon"],
+        ["~flare"],
+        [],
+    ]
     for words in [*changes, *changes]:
         found, alone = composer.compose(words), compose("first_light", words, Path.cwd())
         assert found.root.plain == alone.root.plain
-        assert [str(each) for each in found.diagnostics] == [str(each) for each in alone.diagnostics]
+        assert [str(each) for each in found.diagnostics] == [
+            str(each) for each in alone.diagnostics
+        ]
         assert replace(found, root=alone.root, diagnostics=()) == replace(alone, diagnostics=())
 
 
@@ -78,7 +92,9 @@ def test_a_step_is_checked_again_only_where_a_value_that_it_reads_has_changed(mo
     checked = []
     remember = bound_steps.Attempt.remember
     monkeypatch.setattr(
-        bound_steps.Attempt, "remember", lambda self, name, *rest: (checked.append(name), remember(self, name, *rest))
+        bound_steps.Attempt,
+        "remember",
+        lambda self, name, *rest: (checked.append(name), remember(self, name, *rest)),
     )
     for noise in ("5 e-", "6 e-"):
         told([f"sensor.read_noise={noise}"])

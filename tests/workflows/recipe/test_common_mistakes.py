@@ -1,4 +1,6 @@
-"""Twenty mistakes that people make with the packaged camera, and what each is told, from arguments and from files."""
+"""Twenty mistakes that people make with the packaged camera, and what each is told, from
+arguments and from files.
+"""
 
 import subprocess
 import sys
@@ -36,7 +38,10 @@ def refused(write, tmp_path):
         write(MINE.replace(old, new) + more)
         with pytest.raises(RecipeError) as caught:
             load("mine.yaml", arguments, tmp_path)
-        return [" | ".join(filter(None, (str(p.mark), p.path, p.message))) for p in caught.value.diagnostics]
+        return [
+            " | ".join(filter(None, (str(p.mark), p.path, p.message)))
+            for p in caught.value.diagnostics
+        ]
 
     return refused
 
@@ -60,16 +65,25 @@ def test_1_a_misspelt_key(refused):
     assert refused(more="sensor: {quantum_eficiency: 0.6}\n") == [
         "mine.yaml:15:10 | sensor.quantum_eficiency | unknown; did you mean quantum_efficiency?"
     ]
-    assert refused("sensor.gian=3") == ["argument 1 | sensor.gian=3 | unknown; did you mean sensor.gain?"]
+    assert refused("sensor.gian=3") == [
+        "argument 1 | sensor.gian=3 | unknown; did you mean sensor.gain?"
+    ]
 
 
 def test_2_a_misspelt_group_or_option(refused):
-    assert refused(old="scene:", new="scen:") == ["mine.yaml:4:11 | scen: siemens | no group scen; did you mean scene?"]
-    assert refused("laser=gren") == ["argument 1 | laser=gren | no option gren in laser; did you mean green?"]
+    assert refused(old="scene:", new="scen:") == [
+        "mine.yaml:4:11 | scen: siemens | no group scen; did you mean scene?"
+    ]
+    assert refused("laser=gren") == [
+        "argument 1 | laser=gren | no option gren in laser; did you mean green?"
+    ]
 
 
 def test_3_a_misspelt_node(refused):
-    more = "steps: {dark: {node: NODE, each: arms, from: charge, with: {mean: '${sensor.dark_current}'}}}\n"
+    more = (
+        "steps: {dark: {node: NODE, each: arms, from: charge, with: {mean:"
+        " '${sensor.dark_current}'}}}\n"
+    )
     for node in ("sensor.dark_curent", "optics.dark_current", "sensr.dark_current"):
         (problem,) = refused(more=more.replace("NODE", node))
         assert problem.startswith("mine.yaml:15:22 | steps.dark.node | no ")
@@ -77,7 +91,9 @@ def test_3_a_misspelt_node(refused):
 
 
 def test_4_a_misspelt_step(refused):
-    assert refused(old="[raw]", new="[rwa]") == ["mine.yaml:14:11 | outputs.0 | no step rwa; did you mean raw?"]
+    assert refused(old="[raw]", new="[rwa]") == [
+        "mine.yaml:14:11 | outputs.0 | no step rwa; did you mean raw?"
+    ]
     assert refused("steps.drak.with.mean=1 e-") == [
         "argument 1 | steps.drak.with.mean=1 e- | unknown; did you mean steps.dark.with.mean?"
     ]
@@ -85,13 +101,15 @@ def test_4_a_misspelt_step(refused):
 
 def test_5_a_wrong_unit(refused):
     assert refused("sensor.pixel_pitch=3 s") == [
-        "argument 1 | sensor.pixel_pitch = 3 s | has the wrong unit 's': write one of m, cm, mm, um, µm, μm, nm, km"
+        "argument 1 | sensor.pixel_pitch = 3 s | has the wrong unit 's': write one of m, cm, mm,"
+        " um, µm, μm, nm, km"
     ]
 
 
 def test_6_no_unit(refused):
     assert refused(more="sensor: {pixel_pitch: 2.9}\n") == [
-        "mine.yaml:15:23 | sensor.pixel_pitch = 2.9 | needs a unit: write 2.9 um (one of m, cm, mm, um, µm, μm, nm, km)"
+        "mine.yaml:15:23 | sensor.pixel_pitch = 2.9 | needs a unit: write 2.9 um (one of m, cm, mm,"
+        " um, µm, μm, nm, km)"
     ]
 
 
@@ -111,13 +129,19 @@ def test_8_a_number_out_of_range(refused):
 
 
 def test_9_a_wrong_type(refused):
-    assert refused("sensor.bits=twelve") == ["argument 1 | sensor.bits = twelve | must be a whole number"]
-    assert refused("reading.rounding=down")[0].startswith("argument 1 | reading.rounding = down | must be 'nearest',")
+    assert refused("sensor.bits=twelve") == [
+        "argument 1 | sensor.bits = twelve | must be a whole number"
+    ]
+    assert refused("reading.rounding=down")[0].startswith(
+        "argument 1 | reading.rounding = down | must be 'nearest',"
+    )
 
 
 def test_10_a_missing_file(refused, tmp_path):
     (problem,) = refused("scene=china", "scene.file=chnia.jpg")
-    assert problem == f"argument 2 | scene.file = chnia.jpg | no such file: {tmp_path / 'chnia.jpg'}"
+    assert (
+        problem == f"argument 2 | scene.file = chnia.jpg | no such file: {tmp_path / 'chnia.jpg'}"
+    )
 
 
 def test_11_a_picture_that_is_none(refused, tmp_path):
@@ -138,7 +162,8 @@ def test_12_a_picture_of_the_wrong_depth(refused, tmp_path):
 
 def test_13_a_cycle(refused):
     more = (
-        "steps:\n  dark: {node: sensor.dark_current, each: arms, from: well, with: {mean: '${sensor.dark_current}'}}\n"
+        "steps:\n  dark: {node: sensor.dark_current, each: arms, from: well, with: {mean:"
+        " '${sensor.dark_current}'}}\n"
     )
     (problem,) = refused(more=more)
     assert problem.startswith("camera/neusee.yaml:")
@@ -150,10 +175,16 @@ def test_14_a_missing_producer(refused):
     more = "steps: {psf: {from: glass}, laser_psf: {from: psf}}\n"
     diagnostics = refused(more=more)
     assert diagnostics == [
-        "mine.yaml:15:21 | steps.psf.from.pupil | no step glass; check the name; "
-        "steps returning a Pupil: pupil[plain], pupil[mask], laser_pupil[plain,green], laser_pupil[mask,green]",
-        "mine.yaml:15:47 | steps.laser_psf.from.pupil | optics.psf needs a Pupil; psf returns a Psf; "
-        "steps returning a Pupil: pupil[plain], pupil[mask], laser_pupil[plain,green], laser_pupil[mask,green]",
+        (
+            "mine.yaml:15:21 | steps.psf.from.pupil | no step glass; check the name; steps"
+            " returning a Pupil: pupil[plain], pupil[mask], laser_pupil[plain,green],"
+            " laser_pupil[mask,green]"
+        ),
+        (
+            "mine.yaml:15:47 | steps.laser_psf.from.pupil | optics.psf needs a Pupil; psf returns a"
+            " Psf; steps returning a Pupil: pupil[plain], pupil[mask], laser_pupil[plain,green],"
+            " laser_pupil[mask,green]"
+        ),
     ]
 
 
@@ -163,30 +194,43 @@ def test_15_an_output_that_is_switched_off(refused):
 
 
 def test_16_a_key_that_stands_twice(refused):
-    assert refused(more="seed: 1\nseed: 2\n") == ["mine.yaml:16:1 | seed | given twice, first in line 15"]
+    assert refused(more="seed: 1\nseed: 2\n") == [
+        "mine.yaml:16:1 | seed | given twice, first in line 15"
+    ]
 
 
-def test_17_an_aperture_beyond_the_grid_stretches_the_grid_until_it_carries_no_window(accepted, refused):
+def test_17_an_aperture_beyond_the_grid_stretches_the_grid_until_it_carries_no_window(
+    accepted, refused
+):
     recipe = accepted("optics.diameter=11 mm")
-    assert any("aperture 11 mm" in note and "the pitch becomes 20.37 um" in note for note in recipe.notes)
+    assert any(
+        "aperture 11 mm" in note and "the pitch becomes 20.37 um" in note for note in recipe.notes
+    )
     lines = refused("optics.diameter=110 mm")
     assert all("a pupil pitch of 203.7 um" in line for line in lines)
-    assert not any("aperture" in note for note in accepted().notes)  # no note where nothing is changed
+    # no note where nothing is changed
+    assert not any("aperture" in note for note in accepted().notes)
 
 
 def test_18_no_light_of_the_laser_is_legal_and_no_exposure_is_not(accepted, refused):
     assert accepted("lasers.green.strength=0").steps["spot[mask,green]"].params["strength"] == 0
-    assert refused("sensor.exposure=0 s") == ["argument 1 | sensor.exposure = 0 s | must be greater than 0"]
+    assert refused("sensor.exposure=0 s") == [
+        "argument 1 | sensor.exposure = 0 s | must be greater than 0"
+    ]
 
 
 def test_19_one_pixel_is_legal_and_none_is_not(accepted, refused):
     assert accepted("sensor.shape=[1, 1]").steps["raw[mask]"].params["shape"] == (1, 1)
-    assert refused("sensor.shape=[0, 1]") == ["argument 1 | sensor.shape.0 = 0 | must be greater than or equal to 1"]
+    assert refused("sensor.shape=[0, 1]") == [
+        "argument 1 | sensor.shape.0 = 0 | must be greater than or equal to 1"
+    ]
 
 
 def test_19_one_wavelength_is_no_range(refused):
     (problem,) = refused("optics.shortest=550 nm", "optics.longest=550 nm")
-    assert problem.startswith("argument 1 | optics.shortest = 550 nm | start 550 nm must be below stop 550 nm")
+    assert problem.startswith(
+        "argument 1 | optics.shortest = 550 nm | start 550 nm must be below stop 550 nm"
+    )
 
 
 def test_20_a_steep_element_is_legal_before_the_run(accepted):
@@ -232,5 +276,8 @@ def test_a_mistake_is_told_as_fast_as_a_right_recipe_is_read(refused):
 
 
 def test_a_mistake_in_the_text_is_told_without_torch():
-    code = "import sys; from neusee.workflows.recipe.text.yaml_values import read; assert 'torch' not in sys.modules"
+    code = (
+        "import sys; from neusee.workflows.recipe.text.yaml_values import read; assert 'torch' not"
+        " in sys.modules"
+    )
     subprocess.run([sys.executable, "-c", code], check=True)

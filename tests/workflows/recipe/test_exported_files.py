@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.recipe.exported_files import NAMES
+from neusee.workflows.recipe.global_settings import NAMES
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.report import contents
 from neusee.workflows.report.data_exports import data_files
@@ -22,13 +22,17 @@ def test_the_names_are_those_of_the_files_of_a_run():
 def test_a_recipe_says_which_files_there_are():
     assert files() == files("exports=all") == [*contents.FILES, contents.OUTPUTS]
     assert files("exports=none") == []
-    assert files("exports=[outputs.safetensors, raw_mask.png]") == ["raw_mask.png", "outputs.safetensors"]
+    assert files("exports=[outputs.safetensors, raw_mask.png]") == [
+        "raw_mask.png",
+        "outputs.safetensors",
+    ]
     assert files("exports=raw_mask.png") == ["raw_mask.png"]
 
 
 def test_half_floats_are_another_file_under_another_key():
     (half,), (full,) = (
-        list(data_files(load("laser_free", [f"exports={n}"]))) for n in ("psf_mask.exr@half", "psf_mask.exr")
+        list(data_files(load("laser_free", [f"exports={n}"])))
+        for n in ("psf_mask.exr@half", "psf_mask.exr")
     )
     assert half.name == full.name
     assert half.kind != full.kind

@@ -1,4 +1,6 @@
-"""What is remembered of a graph never outlives what it hangs on: each answer is that of a fresh process."""
+"""What is remembered of a graph never outlives what it hangs on: each answer is that of a fresh
+process.
+"""
 
 import importlib.util
 import sys
@@ -7,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.recipe import graph_cache, loading
+from neusee.workflows.recipe import loading
+from neusee.workflows.recipe import step_checks as graph_cache
 from neusee.workflows.recipe.text import composition
 
 RECIPE = """\
@@ -39,8 +42,19 @@ def forget(monkeypatch):
 
 
 def summary(recipe):
-    steps = {n: (s.node, dict(s.params), dict(s.wires), s.mark, dict(s.param_marks)) for n, s in recipe.steps.items()}
-    return steps, recipe.outputs, recipe.config.settings, recipe.notes, recipe.absent, recipe.expect, recipe.seed
+    steps = {
+        n: (s.node, dict(s.params), dict(s.wires), s.mark, dict(s.param_marks))
+        for n, s in recipe.steps.items()
+    }
+    return (
+        steps,
+        recipe.outputs,
+        recipe.config.settings,
+        recipe.notes,
+        recipe.absent,
+        recipe.expect,
+        recipe.seed,
+    )
 
 
 @pytest.mark.parametrize(
@@ -74,7 +88,8 @@ def test_a_recipe_is_the_same_whether_its_graph_is_known_or_not(read, forget, ch
 
 
 @pytest.mark.parametrize(
-    "change", ["lasers.red.of=dimm", "sensor.gains=3", "sensor.noise=5", "+lasers.blue={strength: 3}"]
+    "change",
+    ["lasers.red.of=dimm", "sensor.gains=3", "sensor.noise=5", "+lasers.blue={strength: 3}"],
 )
 def test_a_mistake_is_told_as_in_a_fresh_process(mistakes, read, forget, change):
     wanted = mistakes(RECIPE, change)
@@ -94,7 +109,9 @@ def test_the_graph_is_bound_once(read, forget, monkeypatch):
 
 def test_nodes_that_were_edited_are_bound_again(read, toy, forget):
     read(RECIPE)
-    spec = importlib.util.spec_from_file_location(toy.__name__, Path(__file__).parents[1] / "toy_nodes.py")
+    spec = importlib.util.spec_from_file_location(
+        toy.__name__, Path(__file__).parents[1] / "toy_nodes.py"
+    )
     edited = importlib.util.module_from_spec(spec)
     sys.modules[toy.__name__] = edited
     spec.loader.exec_module(edited)
@@ -103,7 +120,9 @@ def test_nodes_that_were_edited_are_bound_again(read, toy, forget):
 
 def test_a_recipe_file_that_was_edited_is_read_again(read, forget):
     read(RECIPE)
-    assert read(RECIPE.replace("pitch: 3 um", "pitch: 4 um")).steps["pupil"].params["pitch"] == pytest.approx(4e-6)
+    assert read(RECIPE.replace("pitch: 3 um", "pitch: 4 um")).steps["pupil"].params[
+        "pitch"
+    ] == pytest.approx(4e-6)
 
 
 def test_promises_are_compared_with_the_recipe_as_it_is_now(read, forget):

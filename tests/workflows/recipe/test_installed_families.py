@@ -34,8 +34,14 @@ def install(write, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path / "site-packages"))
 
     def install(name, family, code):
-        write(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n", f"site-packages/{name}-1.0.dist-info/METADATA")
-        write(f"[neusee.nodes]\n{family} = {name}\n", f"site-packages/{name}-1.0.dist-info/entry_points.txt")
+        write(
+            f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n",
+            f"site-packages/{name}-1.0.dist-info/METADATA",
+        )
+        write(
+            f"[neusee.nodes]\n{family} = {name}\n",
+            f"site-packages/{name}-1.0.dist-info/entry_points.txt",
+        )
         write(code, f"site-packages/{name}.py")
         importlib.invalidate_caches()
         node_families._installed.cache_clear()
@@ -72,12 +78,17 @@ def test_two_packages_with_one_family_are_named(install, write, tmp_path):
     install("kit_two", "gauge", GOOD)
     write(USES.format("gauge.double"))
     [problem] = problems("mine.yaml", (), tmp_path)
-    assert problem.endswith("kit_one and kit_two both install a family of nodes gauge: uninstall one")
+    assert problem.endswith(
+        "kit_one and kit_two both install a family of nodes gauge: uninstall one"
+    )
 
 
 def test_check_takes_the_module_of_a_family_that_is_called_as_its_package(install, write):
     install("labpack", "labpack", GOOD)
-    write("[neusee.nodes]\nlabpack = labpack.nodes\n", "site-packages/labpack-1.0.dist-info/entry_points.txt")
+    write(
+        "[neusee.nodes]\nlabpack = labpack.nodes\n",
+        "site-packages/labpack-1.0.dist-info/entry_points.txt",
+    )
     (write("", "site-packages/labpack.py")).unlink()
     network = "from torch import nn\n\n\nclass Small(nn.Module):\n"
     network += '    """A network."""\n\n    def forward(self, x):\n        return x\n'

@@ -8,7 +8,8 @@ import pytest
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.recipe import loading
-from neusee.workflows.recipe.blocks import evaluate_block, train_block, train_lift_block
+from neusee.workflows.recipe.blocks import evaluate_block, train_block
+from neusee.workflows.recipe.blocks import train_block as train_lift_block
 from neusee.workflows.recipe.loading import groups, load, recipes
 from neusee.workflows.recipe.text.yaml_values import parse
 from neusee.workflows.store.result_store import Store
@@ -51,9 +52,19 @@ def swap(old, new):
 
 def test_a_checked_recipe_has_everything_in_si(read):
     recipe = read(CAMERA)
-    assert (recipe.name, recipe.title, recipe.seed, recipe.tolerance) == ("mine", "A camera of toys.", 7, 1e-3)
+    assert (recipe.name, recipe.title, recipe.seed, recipe.tolerance) == (
+        "mine",
+        "A camera of toys.",
+        7,
+        1e-3,
+    )
     assert recipe.outputs == ("raw",)
-    assert recipe.steps["raw"].params == {"gain": 0.37, "sigma": 10.5, "bits": 12, "rounding": "nearest"}
+    assert recipe.steps["raw"].params == {
+        "gain": 0.37,
+        "sigma": 10.5,
+        "bits": 12,
+        "rounding": "nearest",
+    }
     assert recipe.steps["pupil"].params == {"pitch": pytest.approx(3.74e-6), "diameter": 1e-3}
     assert recipe.steps["psf[red]"].params["shape"] == (8, 8)
     assert recipe.steps["raw"].node.path == "toy.digitize"
@@ -77,12 +88,20 @@ def test_a_step_whose_parameters_are_all_removed_is_written_with_its_defaults(re
 
 
 def test_final_values_have_their_sources(read):
-    config = read(CAMERA, "sensor.gain=3", "optics.window.0=16", "steps.raw.with.bits=8", "~sensor.bits").config
+    config = read(
+        CAMERA, "sensor.gain=3", "optics.window.0=16", "steps.raw.with.bits=8", "~sensor.bits"
+    ).config
     assert (config["sensor.gain"].value, config["sensor.gain"].source) == (3, "argument 1")
-    assert (config["optics.window"].value, config["optics.window"].source) == ([16, 8], "mine.yaml:5:11, argument 2")
+    assert (config["optics.window"].value, config["optics.window"].source) == (
+        [16, 8],
+        "mine.yaml:5:11, argument 2",
+    )
     assert config["steps.raw.with.bits"].source == "argument 3"
     assert config["lasers.red.wavelength"].source == "mine.yaml:8:21"
-    assert (config["steps.pupil.with.diameter"].value, config["steps.pupil.with.diameter"].source) == (
+    assert (
+        config["steps.pupil.with.diameter"].value,
+        config["steps.pupil.with.diameter"].source,
+    ) == (
         1e-3,
         "default of toy.pupil",
     )
@@ -95,7 +114,11 @@ def test_the_config_is_a_recipe_that_says_the_same(read, tmp_path, toy):
     assert {n: (s.params, s.wires) for n, s in again.steps.items()} == {
         n: (s.params, s.wires) for n, s in first.steps.items()
     }
-    assert (again.outputs, again.seed, again.tolerance) == (first.outputs, first.seed, first.tolerance)
+    assert (again.outputs, again.seed, again.tolerance) == (
+        first.outputs,
+        first.seed,
+        first.tolerance,
+    )
     assert "gain: 3" in first.config.to_yaml()
     assert "# argument 1" in first.config.to_yaml()
 
@@ -131,14 +154,19 @@ def test_references_keep_their_type_nest_and_paste(read):
 
 
 def test_a_reference_may_name_a_parameter_of_another_step(read):
-    text = CAMERA.replace('bits: "${sensor.bits}"', 'bits: "${steps.height.with.samples}"').replace(", bits: 12", "")
+    text = CAMERA.replace('bits: "${sensor.bits}"', 'bits: "${steps.height.with.samples}"').replace(
+        ", bits: 12", ""
+    )
     steps = read(text.replace("toy.height}", "toy.height, with: {samples: 5}}")).steps
     assert steps["raw"].params["bits"] == 5
 
 
-def test_a_file_is_found_beside_the_yaml_that_names_it_and_an_argument_from_the_working_folder(write, toy, tmp_path):
+def test_a_file_is_found_beside_the_yaml_that_names_it_and_an_argument_from_the_working_folder(
+    write, toy, tmp_path
+):
     write(
-        "scene: {file: pictures/a.png}\nsteps: {scene: {node: toy.photograph, with: {file: '${scene.file}'}}}\n",
+        "scene: {file: pictures/a.png}\nsteps: {scene: {node: toy.photograph, with: {file:"
+        " '${scene.file}'}}}\n",
         "scene/a.yaml",
     )
     write("x", "scene/pictures/a.png")
@@ -154,7 +182,8 @@ def test_a_file_is_found_beside_the_yaml_that_names_it_and_an_argument_from_the_
 def test_notes_come_once(read):
     text = CAMERA.replace("{pitch:", "{diameter: 11 mm, pitch:")
     text = text.replace(
-        "  psf:", "  other: {node: toy.pupil, from: height, with: {pitch: 3 um, diameter: 11 mm}}\n  psf:"
+        "  psf:",
+        "  other: {node: toy.pupil, from: height, with: {pitch: 3 um, diameter: 11 mm}}\n  psf:",
     )
     assert read(text).notes == ("aperture 11.0 mm > pupil grid 8.08 mm: clipped",)
 
@@ -174,16 +203,23 @@ def _heights(folder, side):
     np.save(folder / "mask.npy", np.zeros((side, side), np.float32))
 
 
-def test_a_preflight_sees_an_input_that_parameters_alone_decide(read, mistakes, tmp_path, monkeypatch):
+def test_a_preflight_sees_an_input_that_parameters_alone_decide(
+    read, mistakes, tmp_path, monkeypatch
+):
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
     _heights(tmp_path, 4)
     size, note = read(ON_A_GRID).notes
-    assert size.startswith("mask.npy states no pitch: its samples count as those of the pupil, 10 um apart")
+    assert size.startswith(
+        "mask.npy states no pitch: its samples count as those of the pupil, 10 um apart"
+    )
     assert note == "feature 12 um is less than 1.5 samples of 10 um: not resolved"
     assert read(ON_A_GRID, "steps.written.with.feature=15 um").notes == (size,)
     assert not (tmp_path / "cache").exists()  # nothing is stored
     _heights(tmp_path, 8)
-    message = "mask.npy is (8, 8), not the pupil grid (4, 4): state its pitch to resample it, or set samples to 8"
+    message = (
+        "mask.npy is (8, 8), not the pupil grid (4, 4): state its pitch to resample it, or set"
+        " samples to 8"
+    )
     assert mistakes(ON_A_GRID) == [f"mine.yaml:5:56 | steps.mask.with.file = mask.npy | {message}"]
     assert read(ON_A_GRID, "steps.stop.with.samples=8", "steps.stop.with.diameter=80 um")
 
@@ -219,15 +255,22 @@ def test_only_the_families_that_are_named_are_imported(read, monkeypatch):
 
 
 def test_a_value_that_only_an_absent_item_needs_is_not_unknown(read):
-    assert read(CAMERA.replace("outputs: [raw]", "outputs: [raw]").replace('"spot[green]"', "raw"), "lasers={}")
+    assert read(
+        CAMERA.replace("outputs: [raw]", "outputs: [raw]").replace('"spot[green]"', "raw"),
+        "lasers={}",
+    )
 
 
 def _table():
     """The changes of mistakes.txt, each with the messages that it must get."""
-    for block in Path(__file__).with_name("mistakes.txt").read_text(encoding="utf-8").split("\n\n")[1:]:
+    for block in (
+        Path(__file__).with_name("mistakes.txt").read_text(encoding="utf-8").split("\n\n")[1:]
+    ):
         change, *diagnostics = block.strip().split("\n")
         old, new = change.split(" => ")
-        yield pytest.param(old, new, [f"mine.yaml:{problem.strip()}" for problem in diagnostics], id=change)
+        yield pytest.param(
+            old, new, [f"mine.yaml:{problem.strip()}" for problem in diagnostics], id=change
+        )
 
 
 @pytest.mark.parametrize(("old", "new", "diagnostics"), [*_table()])
@@ -254,12 +297,18 @@ def test_two_dimensions_make_item_ambiguous(mistakes):
 
 
 def test_references_that_run_in_a_circle_are_told_with_their_way(mistakes):
-    text = swap("3.74 um", '"${optics.a}"').replace("  window", '  a: "${optics.b}"\n  b: "${optics.a}"\n  window')
-    assert mistakes(text) == ["mine.yaml:6:6 | optics.b | the value refers to itself: optics.a -> optics.b -> optics.a"]
+    text = swap("3.74 um", '"${optics.a}"').replace(
+        "  window", '  a: "${optics.b}"\n  b: "${optics.a}"\n  window'
+    )
+    assert mistakes(text) == [
+        "mine.yaml:6:6 | optics.b | the value refers to itself: optics.a -> optics.b -> optics.a"
+    ]
 
 
 def test_all_mistakes_come_at_once_in_the_order_of_the_file(mistakes):
-    text = swap("gain: 0.37", "gian: 0.37").replace("3.74 um", "3.74").replace("toy.spot", "toy.spt")
+    text = (
+        swap("gain: 0.37", "gian: 0.37").replace("3.74 um", "3.74").replace("toy.spot", "toy.spt")
+    )
     text = text.replace("outputs: [raw]", "outputs: [rav]")
     got = mistakes(text, "sensor.bitts=3")
     assert [line.split(" | ")[0] for line in got] == [
@@ -270,7 +319,8 @@ def test_all_mistakes_come_at_once_in_the_order_of_the_file(mistakes):
 
 def test_one_wrong_value_that_many_steps_use_is_one_mistake(mistakes):
     text = CAMERA.replace(
-        "  psf:", '  other: {node: toy.pupil, from: height, with: {pitch: "${optics.pitch}"}}\n  psf:'
+        "  psf:",
+        '  other: {node: toy.pupil, from: height, with: {pitch: "${optics.pitch}"}}\n  psf:',
     )
     assert len(mistakes(text.replace("3.74 um", "3.74"))) == 1
 
@@ -280,8 +330,9 @@ def test_the_lines_are_aligned(read):
 
     with pytest.raises(RecipeError) as caught:
         read(swap("gain: 0.37", "gian: 0.37"), "sensor.bitts=3")
-    assert str(caught.value) == (
-        "argument 1       sensor.bitts=3   unknown; did you mean sensor.bits?\n"
+    assert (
+        str(caught.value)
+        == "argument 1       sensor.bitts=3   unknown; did you mean sensor.bits?\n"
         "mine.yaml:2:10   sensor.gian      unknown; did you mean gain? (needed at mine.yaml:21:13)"
     )
 
@@ -307,8 +358,15 @@ def test_an_override_of_a_value_is_parsed_as_yaml():
 def test_the_settings_of_trainings_are_imported_for_recipes_that_have_one():
     """Their import takes 2 % of the processor time of a run that computes nothing."""
     tops = [
-        part.module for part in ast.parse(Path(loading.__file__).read_text()).body if isinstance(part, ast.ImportFrom)
+        part.module
+        for part in ast.parse(Path(loading.__file__).read_text()).body
+        if isinstance(part, ast.ImportFrom)
     ]
-    assert "neusee.workflows.recipe.wiring" in tops
+    assert "neusee.workflows.recipe.steps" in tops
     assert not [name for name in tops if ".blocks" in name]
-    assert loading.BLOCKS == (train_block.KEY, train_lift_block.KEY, evaluate_block.KEY, loading.TRACED)
+    assert loading.BLOCKS == (
+        train_block.KEY,
+        train_lift_block.LIFT_KEY,
+        evaluate_block.KEY,
+        loading.TRACED,
+    )

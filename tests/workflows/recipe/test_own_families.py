@@ -50,7 +50,8 @@ steps:
 outputs: [bloomed, total]
 """
 IDENTITY = (
-    "from torch import Tensor\nfrom neusee.nodes import node\n\n\n@node()\ndef f(x: Tensor) -> Tensor:\n    return x\n"
+    "from torch import Tensor\nfrom neusee.nodes import node\n\n\n@node()\ndef f(x: Tensor) ->"
+    " Tensor:\n    return x\n"
 )
 USES = """\
 outputs: [b]
@@ -91,7 +92,9 @@ def test_a_file_beside_the_recipe_is_a_family(mine, tmp_path):
     assert float(result["total"]) == pytest.approx(float(scene.sum()), rel=1e-6)
 
 
-def test_paths_are_relative_to_the_recipe_and_the_final_recipe_runs_elsewhere(mine, tmp_path, monkeypatch):
+def test_paths_are_relative_to_the_recipe_and_the_final_recipe_runs_elsewhere(
+    mine, tmp_path, monkeypatch
+):
     mine()
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
@@ -103,11 +106,16 @@ def test_paths_are_relative_to_the_recipe_and_the_final_recipe_runs_elsewhere(mi
 def in_new_process(tmp_path, *words):
     env = {**os.environ, "NEUSEE_CACHE": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
     command = [sys.executable, "-m", "neusee", *words]
-    return subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
+    return subprocess.run(
+        command, cwd=tmp_path, env=env, capture_output=True, text=True, check=False
+    )
 
 
 def state_of(process):
-    return ["run" if step["state"] == "run" else "cached" for step in json.loads(process.stdout)["steps"]]
+    return [
+        "run" if step["state"] == "run" else "cached"
+        for step in json.loads(process.stdout)["steps"]
+    ]
 
 
 @pytest.mark.slow
@@ -116,7 +124,11 @@ def test_an_edited_helper_runs_the_step_again_and_why_names_it(mine, tmp_path):
     states = [state_of(in_new_process(tmp_path, "run", "mine.yaml", "--json")) for _ in range(2)]
     assert states == [["run"] * 3, ["cached"] * 3]
     mine(share=0.4)
-    assert state_of(in_new_process(tmp_path, "run", "mine.yaml", "--json")) == ["cached", "run", "run"]
+    assert state_of(in_new_process(tmp_path, "run", "mine.yaml", "--json")) == [
+        "cached",
+        "run",
+        "run",
+    ]
     why = in_new_process(tmp_path, "why", "bloomed", "mine.yaml").stdout
     assert "code of share() in bloom_a_helper.py changed" in why
 
@@ -124,13 +136,17 @@ def test_an_edited_helper_runs_the_step_again_and_why_names_it(mine, tmp_path):
 def test_a_folder_is_a_family_and_an_entry_may_name_it(write, tmp_path):
     write('"""Lab."""\nfrom ._inner import tilt\n', "lab_b/__init__.py")
     code = "from torch import Tensor\nfrom neusee.nodes import node\n\n\n@node()\n"
-    code += 'def tilt(x: Tensor, *, by: float = 1.0) -> Tensor:\n    """Tilt."""\n    return x + by\n'
+    code += (
+        'def tilt(x: Tensor, *, by: float = 1.0) -> Tensor:\n    """Tilt."""\n    return x + by\n'
+    )
     write(code, "lab_b/_inner.py")
     write("nodes: [./lab_b]\n" + USES.format("lab_b.tilt"))
     assert load("mine.yaml", (), tmp_path).steps["b"].node.path == "lab_b.tilt"
     write("nodes: [optics_of_ours: ./lab_b]\n" + USES.format("optics_of_ours.tilt"), "other.yaml")
     [problem] = problems("other.yaml", (), tmp_path)
-    assert problem.endswith("lab_b is the family lab_b in this process: use that name, or a new process")
+    assert problem.endswith(
+        "lab_b is the family lab_b in this process: use that name, or a new process"
+    )
     node_families._family_of.clear()
     assert load("other.yaml", (), tmp_path).steps["b"].node.path == "optics_of_ours.tilt"
 
@@ -141,11 +157,15 @@ BAD = {
     "[./none]": f"./none {FAILS}there is no file",
     "[none_such.mod]": "no module none_such.mod is installed",
     "[lab_c]": "no module lab_c is installed; write ./lab_c for the folder",
-    "[optics: ok_c.py]": "a family of nodes optics is there already, of neusee or an installed package: name yours",
+    "[optics: ok_c.py]": (
+        "a family of nodes optics is there already, of neusee or an installed package: name yours"
+    ),
     "[ok_c.py, sub/ok_c.py]": f"sub/ok_c.py {FAILS}the name ok_c is that of",
     "ok_c.py": "must be a list of files and modules, not a string",
     "[3]": "must be a file, a folder or a module, such as bloom.py, or `family: module`",
-    "[{a: b.py, c: d.py}]": "must be a file, a folder or a module, such as bloom.py, or `family: module`",
+    "[{a: b.py, c: d.py}]": (
+        "must be a file, a folder or a module, such as bloom.py, or `family: module`"
+    ),
     "[string.py]": f"string.py {FAILS}the name string is that of",
     "[bad_c.py]": f"bad_c.py {FAILS}bad_c.py:2: ZeroDivisionError: division by zero",
     "[syntax_c.py]": f"syntax_c.py {FAILS}syntax_c.py:1: SyntaxError: ",
@@ -153,7 +173,9 @@ BAD = {
     "[math]": "math defines no node",
     "[a-b.py]": f"a-b.py {FAILS}a-b is not the name of a module: use letters, digits and _",
     "[exits_c.py]": f"exits_c.py {FAILS}exits_c.py:2: SystemExit: 0",
-    "[lacks_c.py]": f"lacks_c.py {FAILS}lacks_c.py:1: ModuleNotFoundError: No module named 'none_such_at_all'",
+    "[lacks_c.py]": (
+        f"lacks_c.py {FAILS}lacks_c.py:1: ModuleNotFoundError: No module named 'none_such_at_all'"
+    ),
 }
 
 
@@ -178,13 +200,27 @@ def test_a_mistake_is_located_once_and_hides_what_follows_from_it(write, tmp_pat
 @pytest.mark.parametrize(
     ("annotation", "problem"),
     [
-        ("by=1.0", "tilt_d.py:5: tilt does not say what by is: write a type such as `by: float`, or a unit"),
-        ("by: 'None_such' = 1", "tilt_d.py:5: the annotations of tilt cannot be read: NameError: name 'None_such'"),
+        (
+            "by=1.0",
+            (
+                "tilt_d.py:5: tilt does not say what by is: write a type such as `by: float`, or a"
+                " unit"
+            ),
+        ),
+        (
+            "by: 'None_such' = 1",
+            "tilt_d.py:5: the annotations of tilt cannot be read: NameError: name 'None_such'",
+        ),
     ],
 )
-def test_a_parameter_without_a_type_is_located_at_its_function(write, tmp_path, annotation, problem):
+def test_a_parameter_without_a_type_is_located_at_its_function(
+    write, tmp_path, annotation, problem
+):
     code = "from torch import Tensor\nfrom neusee.nodes import node\n\n\n@node()\n"
-    write(f'{code}def tilt(x: Tensor, *, {annotation}) -> Tensor:\n    """Tilt."""\n    return x\n', "tilt_d.py")
+    write(
+        f'{code}def tilt(x: Tensor, *, {annotation}) -> Tensor:\n    """Tilt."""\n    return x\n',
+        "tilt_d.py",
+    )
     write("nodes: [tilt_d.py]\n" + USES.format("tilt_d.tilt"))
     [found] = problems("mine.yaml", (), tmp_path)
     assert found.startswith(f"mine.yaml:5:13 | steps.b.node | {problem}")
@@ -199,7 +235,10 @@ def test_a_helper_of_another_folder_is_not_taken_for_the_one_beside(write, tmp_p
         write(f"nodes: [{family}.py]\n" + USES.format(f"{family}.f"), f"{folder}/mine.yaml")
     load(tmp_path / "a" / "mine.yaml")
     [problem] = problems(tmp_path / "b" / "mine.yaml")
-    assert f"the name helper_d is that of {tmp_path / 'a' / 'helper_d.py'}: rename {tmp_path / 'b'}" in problem
+    assert (
+        f"the name helper_d is that of {tmp_path / 'a' / 'helper_d.py'}: rename {tmp_path / 'b'}"
+        in problem
+    )
 
 
 @pytest.mark.slow
@@ -210,7 +249,10 @@ def test_no_code_refuses_before_anything_is_run(mine, tmp_path, monkeypatch):
     for words in (["validate", str(recipe), "--no-code"], ["--no-code", "run", str(recipe)]):
         found = in_new_process(tmp_path, *words)
         assert found.returncode == 2
-        assert "nodes.0 = bloom_e.py   names code, which NEUSEE_NO_CODE or --no-code refuses to run" in found.stderr
+        assert (
+            "nodes.0 = bloom_e.py   names code, which NEUSEE_NO_CODE or --no-code refuses to run"
+            in found.stderr
+        )
         assert found.stderr.count("\n") == 2
     assert "bloom_e" not in sys.modules
 
@@ -223,7 +265,10 @@ def test_nodes_and_schema_list_those_of_a_recipe(mine, tmp_path, monkeypatch):
     out = CliRunner().invoke(app, ["nodes", "bloom_f.bloom", "--recipe", "mine.yaml"]).output
     assert "full_well  charge from 0 to 1e+12 e-, such as 390 e-" in out
     schema = json_schema.schema(families_of("mine.yaml"))
-    good = {"nodes": ["bloom_f.py"], "steps": {"a": {"node": "bloom_f.bloom", "with": {"full_well": "3 e-"}}}}
+    good = {
+        "nodes": ["bloom_f.py"],
+        "steps": {"a": {"node": "bloom_f.bloom", "with": {"full_well": "3 e-"}}},
+    }
     jsonschema.validate(good, schema)
     good["steps"]["a"]["with"]["full_wel"] = 3
     with pytest.raises(jsonschema.ValidationError):
@@ -233,7 +278,10 @@ def test_nodes_and_schema_list_those_of_a_recipe(mine, tmp_path, monkeypatch):
 def test_a_group_brings_its_node_and_the_recipe_its_own(mine, write, tmp_path):
     mine("bloom_g")
     mine("bloom_h")
-    write("nodes: [../bloom_g.py]\nsteps: {first: {node: bloom_g.bloom, from: scene}}\n", "spill/g.yaml")
+    write(
+        "nodes: [../bloom_g.py]\nsteps: {first: {node: bloom_g.bloom, from: scene}}\n",
+        "spill/g.yaml",
+    )
     text = RECIPE.format(family="bloom_h").replace("nodes:", "defaults: [spill: g]\nnodes:")
     write(text)
     recipe = load("mine.yaml", (), tmp_path)

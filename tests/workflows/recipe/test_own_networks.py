@@ -1,4 +1,6 @@
-"""Networks of a user: computed and keyed with their code, and their mistakes located before the run."""
+"""Networks of a user: computed and keyed with their code, and their mistakes located before the
+run.
+"""
 
 import os
 import pickle
@@ -10,10 +12,10 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from neusee.nodes import restore
-from neusee.nodes.network_classes import Architecture
+from neusee.nodes.own_modules import Architecture
 from neusee.workflows import RecipeError, Store, load, run
 from neusee.workflows.graph.run_error import RunError
-from neusee.workflows.recipe.own_families import VARIABLE
+from neusee.workflows.recipe.node_families import NO_CODE_VARIABLE
 
 NETWORK = '''\
 """Networks."""
@@ -165,7 +167,8 @@ def test_the_picture_goes_through_the_class_with_its_weights(mine, tmp_path):
         assert torch.equal(torch.random.get_rng_state(), before)
     net = sys.modules["net_a"].Small(4)
     net.load_state_dict(load_file(tmp_path / "small.safetensors"))
-    padded = torch.nn.functional.pad(found["scene"][None], (0, 2, 0, 3), "reflect")  # to multiples of 4
+    # to multiples of 4
+    padded = torch.nn.functional.pad(found["scene"][None], (0, 2, 0, 3), "reflect")
     with torch.no_grad():
         wanted = net.eval()(padded)[0, :, :21, :30]
     assert torch.equal(found["restored"], wanted)
@@ -195,7 +198,9 @@ def test_an_edit_of_the_class_or_of_its_helper_runs_it_again_and_why_names_it(mi
 
     def say(*words):
         command = [sys.executable, "-m", "neusee", *words]
-        ran = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
+        ran = subprocess.run(
+            command, cwd=tmp_path, env=env, capture_output=True, text=True, check=False
+        )
         assert ran.returncode in (0, 3), ran.stdout + ran.stderr
         return ran.stdout
 
@@ -209,22 +214,36 @@ def test_an_edit_of_the_class_or_of_its_helper_runs_it_again_and_why_names_it(mi
     assert "restored: class Small in net_k.py changed" in say("why", "restored", "mine.yaml")
     edited("net_k.py", "return x * self.kernel -", "return x * self.kernel +")
     edited("net_k_helper.py", "return 0.5", "return 0.25")
-    assert "restored: code of share() in net_k_helper.py changed" in say("why", "restored", "mine.yaml")
+    assert "restored: code of share() in net_k_helper.py changed" in say(
+        "why", "restored", "mine.yaml"
+    )
 
 
 #: what is overridden, and the start of the mistake that it makes
 MISTAKES = [
     ("network.architecture=net_m.Smal", "net_m has no network class Smal; did you mean Small?"),
-    ("network.architecture=net_m.small", "net_m.small is no class of torch.nn.Module; did you mean Small?"),
+    (
+        "network.architecture=net_m.small",
+        "net_m.small is no class of torch.nn.Module; did you mean Small?",
+    ),
     (
         "network.architecture=other.Small",
-        "no family of your own is called other; there are: net_m; list the file of the class, such as `nodes",
+        (
+            "no family of your own is called other; there are: net_m; list the file of the class,"
+            " such as `nodes"
+        ),
     ),
-    ("network.architecture=net_m", "must be the name of a network class in a family of your own, such as mynet.Small"),
+    (
+        "network.architecture=net_m",
+        "must be the name of a network class in a family of your own, such as mynet.Small",
+    ),
     ("network.architecture=3", "must be the name of a network class in a family of your own"),
     ("network.architecture=null", "name the class of the network, such as mynet.SmallUNet"),
     ("network.parameters={with: 3}", "net_m.Small takes no argument with; did you mean width?"),
-    ("network.parameters={width: -1}", "net_m.Small(width=-1): Trying to create tensor with negative dimension -1"),
+    (
+        "network.parameters={width: -1}",
+        "net_m.Small(width=-1): Trying to create tensor with negative dimension -1",
+    ),
     ("network.parameters=4", "must be a mapping"),
     ("network.multiple=0", "must be greater than or equal to 1"),
     ("network.weights=null", "a network needs trained weights: train them by `neusee train`"),
@@ -235,25 +254,46 @@ MISTAKES = [
         "network.weights=small.pth",
         "small.pth is a pickle, which can run code when it is read: save the weights as .safe",
     ),
-    ("network.weights=nan.safetensors", "nan.safetensors: first.bias holds 1 values that are not finite"),
+    (
+        "network.weights=nan.safetensors",
+        "nan.safetensors: first.bias holds 1 values that are not finite",
+    ),
     (
         "network.weights=other.safetensors",
         "other.safetensors was trained with class: Other, and this network has class: ",
     ),
     (
         "network.weights=mean.safetensors",
-        'mean.safetensors was trained with parameters: {"mean": false, "width": 4}, and this network has parameters: '
-        '{"mean": true, "width": 4}; write parameters: {"mean": false, "width": 4}',
+        (
+            'mean.safetensors was trained with parameters: {"mean": false, "width": 4}, and this'
+            ' network has parameters: {"mean": true, "width": 4}; write parameters: {"mean": false,'
+            ' "width": 4}'
+        ),
     ),
     ("Two", "net_m.Two returns a tuple, not one picture 1 x 3 x 33 x 35"),
-    ("Noisy", "net_m.Noisy gives other numbers for the same picture in eval(): draw random numbers only while self.tr"),
+    (
+        "Noisy",
+        (
+            "net_m.Noisy gives other numbers for the same picture in eval(): draw random numbers"
+            " only while self.tr"
+        ),
+    ),
     ("Counting", "net_m.Counting gives other numbers for the same picture in eval(): "),
     ("Writing", "net_m.Writing changes its input: work on a copy, such as picture.clone()"),
     ("Secret", "net_m.Secret changes its input: work on a copy, such as picture.clone()"),
-    ("Endless", "net_m.Endless returns 3465 values that are not finite (NaN or infinity) for 1 x 3 x 33 x 35"),
+    (
+        "Endless",
+        (
+            "net_m.Endless returns 3465 values that are not finite (NaN or infinity) for 1 x 3 x 33"
+            " x 35"
+        ),
+    ),
     (
         "Halving",
-        "net_m.Halving returns 1 x 3 x 17 x 18 for a picture 1 x 3 x 33 x 35: return the same shape; if it needs sides",
+        (
+            "net_m.Halving returns 1 x 3 x 17 x 18 for a picture 1 x 3 x 33 x 35: return the same"
+            " shape; if it needs sides"
+        ),
     ),
     ("Eight", "net_m.Eight fails for a picture 1 x 3 x 33 x 35: net_m.py:71: unflatten: "),
     ("Double", "net_m.Double returns torch.float64 for torch.float32: keep the type"),
@@ -262,7 +302,9 @@ MISTAKES = [
 ]
 
 
-@pytest.mark.parametrize(("given", "message"), MISTAKES, ids=lambda text: text[:30].replace(" ", "_"))
+@pytest.mark.parametrize(
+    ("given", "message"), MISTAKES, ids=lambda text: text[:30].replace(" ", "_")
+)
 def test_a_mistake_is_located_before_anything_runs(given, message, mine, tmp_path):
     recipe = mine("net_m")
     state = {"first.weight": torch.ones(4, 3, 3, 3), "first.bias": torch.full((4,), torch.inf)}
@@ -291,7 +333,9 @@ def test_a_file_that_cannot_be_imported_is_one_mistake_at_its_entry(mine, tmp_pa
     (tmp_path / "net_c.py").write_text("import nothing_of_this_name\n")
     recipe.write_text(recipe.read_text().replace("net_b", "net_c"))
     (found,) = problems(recipe, (), tmp_path)
-    assert found.startswith("mine.yaml:2:9 | nodes.0 = net_c.py | net_c.py cannot be imported: net_c.py:1: ModuleNotF")
+    assert found.startswith(
+        "mine.yaml:2:9 | nodes.0 = net_c.py | net_c.py cannot be imported: net_c.py:1: ModuleNotF"
+    )
     (tmp_path / "net_d.py").write_text("from torch import nn\n")
     recipe.write_text(recipe.read_text().replace("net_c", "net_d"))
     (found,) = problems(recipe, (), tmp_path)
@@ -317,15 +361,19 @@ def test_no_code_refuses_the_class_and_a_file_of_torch_export(mine, tmp_path, mo
     recipe = mine("net_n")
     (tmp_path / "whole.pt2").write_bytes(b"")
     (tmp_path / "bare.yaml").write_text(
-        "# Bare.\nsteps:\n  scene: {node: scene.targets, with: {kind: points, shape: [8, 8]}}\n"
-        "  restored: {node: restore.network, from: scene, with: {weights: whole.pt2}}\noutputs: [restored]\n"
+        "# Bare.\nsteps:\n  scene: {node: scene.targets, with: {kind: points, shape: [8, 8]}}\n "
+        " restored: {node: restore.network, from: scene, with: {weights: whole.pt2}}\noutputs:"
+        " [restored]\n"
     )
-    monkeypatch.setenv(VARIABLE, "1")
-    assert any("names code, which NEUSEE_NO_CODE" in text for text in problems(recipe, (), tmp_path))
+    monkeypatch.setenv(NO_CODE_VARIABLE, "1")
+    assert any(
+        "names code, which NEUSEE_NO_CODE" in text for text in problems(recipe, (), tmp_path)
+    )
     (found,) = problems(tmp_path / "bare.yaml", (), tmp_path)
-    assert found == (
-        "bare.yaml:4:66 | steps.restored.with.weights = whole.pt2 | a file of torch.export holds code, which "
-        "NEUSEE_NO_CODE or --no-code refuses to run"
+    assert (
+        found
+        == "bare.yaml:4:66 | steps.restored.with.weights = whole.pt2 | a file of torch.export holds"
+        " code, which NEUSEE_NO_CODE or --no-code refuses to run"
     )
 
 

@@ -1,7 +1,8 @@
 """A run with `reading=as_printed`, against the formulas of the paper, written here apart in NumPy.
 
-The reflectance of the scene, the height map and the tabulated curves (daylight and the CIE observer) are those of the
-run; everything that the paper prints as a formula is computed here from the printed numbers.
+The reflectance of the scene, the height map and the tabulated curves (daylight and the CIE
+observer) are those of the run; everything that the paper prints as a formula is computed here from
+the printed numbers.
 """
 
 from dataclasses import replace
@@ -22,7 +23,8 @@ SMALL = [
     f"optics.window=[{N_PSF}, {N_PSF}]", f"scene.shape=[{N_SCENE}, {N_SCENE}]",
     f"sensor.shape=[{N_SENSOR}, {N_SENSOR}]", f"lasers.green.angle=[{ANGLE[0] * 1e3} mrad, {ANGLE[1] * 1e3} mrad]",
     "doe=half_ring", "doe.waves=[3]",
-    "outputs=[cube, illuminant, responses, laser_responses, fabricated, photons, charge, dark, read, well, digital, "
+    "outputs=[cube, illuminant, responses, laser_responses, fabricated, photons, charge, dark, "
+    "read, well, digital, "
     "raw, signal]",
 ]  # fmt: skip
 
@@ -47,14 +49,18 @@ def fused_silica(wavelength):
 
 
 def psf(height, wavelengths, size, angle=(0.0, 0.0)):
-    """|U|^2 of the printed integral over an 11 mm disc on the grid, as the share of the disc's light in each pixel."""
+    """|U|^2 of the printed integral over an 11 mm disc on the grid, as the share of the disc's
+    light in each pixel.
+    """
     u = (np.arange(N_PUPIL) - (N_PUPIL - 1) / 2) * PITCH_U
     aperture = (np.hypot(u[:, None], u) <= DIAMETER / 2).astype(float)
     x = (np.arange(size) - size // 2) * PITCH_X
     found = []
     for wavelength in wavelengths:
         field = aperture * np.exp(2j * np.pi / wavelength * fused_silica(wavelength) * height)
-        rows, columns = (np.exp(-2j * np.pi * np.outer(x - FOCAL * a, u) / (wavelength * FOCAL)) for a in angle)
+        rows, columns = (
+            np.exp(-2j * np.pi * np.outer(x - FOCAL * a, u) / (wavelength * FOCAL)) for a in angle
+        )
         amplitude = rows @ field @ columns.T * PITCH_U * PITCH_X / (wavelength * FOCAL)
         found.append(np.abs(amplitude) ** 2 / aperture.sum())
     return np.array(found)
@@ -78,7 +84,9 @@ def photons(irradiance, wavelengths, responses):
 
 
 def printed_photons(run, height):
-    """Photons of scene and laser: daylight twice, every band scaled to alpha_b, the line at points of a 10 nm grid."""
+    """Photons of scene and laser: daylight twice, every band scaled to alpha_b, the line at
+    points of a 10 nm grid.
+    """
     bands = np.linspace(400e-9, 700e-9, 31)
     radiance = data(run, "cube") * (data(run, "illuminant") ** 2)[:, None, None]
     plain = blurred(radiance, psf(np.zeros_like(height), bands, N_PSF)).max((1, 2))
@@ -123,7 +131,9 @@ def test_the_digital_numbers_are_those_of_the_printed_formulas(run, arm):
     assert added.max() <= 0.51
     assert abs(added.mean() + 0.5) < 5 * np.sqrt(1 / 6 / added.size)
     assert data(run, f"digital[{arm}]").max() <= np.floor(GAIN * WELL + 0.5)  # 9435 of 65 535
-    np.testing.assert_allclose(data(run, f"signal[{arm}]"), data(run, f"raw[{arm}]") / GAIN, rtol=1e-6)
+    np.testing.assert_allclose(
+        data(run, f"signal[{arm}]"), data(run, f"raw[{arm}]") / GAIN, rtol=1e-6
+    )
 
 
 def test_without_a_share_of_the_mean_no_light_is_left(tmp_path):

@@ -15,11 +15,15 @@ def rng(seed):
 
 def test_the_mean_of_the_dark_current_is_drawn_for_each_exposure():
     dark = torch.zeros(64, 64)
-    counts = [sensor.dark_current(dark, mean=40.0, mean_of="exposure", rng=rng(s)) for s in range(200)]
+    counts = [
+        sensor.dark_current(dark, mean=40.0, mean_of="exposure", rng=rng(s)) for s in range(200)
+    ]
     means = np.array([float(x.mean()) for x in counts])
     assert means.mean() == pytest.approx(40, abs=5 * 20 / np.sqrt(200))
     assert means.std() == pytest.approx(20, rel=0.25)
-    within = np.mean([float(x.var()) / max(float(x.mean()), 1.0) for x in counts if float(x.mean()) > 5])
+    within = np.mean(
+        [float(x.var()) / max(float(x.mean()), 1.0) for x in counts if float(x.mean()) > 5]
+    )
     assert within == pytest.approx(1, rel=0.02)  # Poisson within an exposure
     usual = [float(sensor.dark_current(dark, mean=40.0, rng=rng(s)).mean()) for s in range(20)]
     assert np.std(usual) < 0.5
@@ -31,7 +35,9 @@ def test_the_dark_current_is_left_out_only_below_a_bound_that_holds_for_every_dr
     stats = TensorStats.of(torch.full((8, 8), 1e4))
     bound = sensor.dark_current.hooks.skip_bound
     for seed in range(50):
-        added = sensor.dark_current(torch.zeros(400, 400), mean=2.0, mean_of="exposure", rng=rng(seed))
+        added = sensor.dark_current(
+            torch.zeros(400, 400), mean=2.0, mean_of="exposure", rng=rng(seed)
+        )
         rms = float(added.double().square().mean().sqrt())
         assert rms / 1e4 < 1.01 * bound(stats, mean=2.0, full_well=None, mean_of="exposure")
 
@@ -41,10 +47,15 @@ def test_the_reconstruction_loss_is_a_mean_or_the_printed_sum(reduction):
     a, b = (np.random.default_rng(s).random((3, 9, 8)) for s in (0, 1))
     pixels = np.sqrt((a - b) ** 2 + 1e-6)
     frequencies = np.abs(np.fft.fft2(a) - np.fft.fft2(b))
-    wanted = (pixels.mean(), frequencies.mean() / np.sqrt(72)) if reduction == "mean" else (
-        pixels.sum(), frequencies.sum())  # fmt: skip
+    wanted = (
+        (pixels.mean(), frequencies.mean() / np.sqrt(72))
+        if reduction == "mean"
+        else (pixels.sum(), frequencies.sum())
+    )
     given = torch.from_numpy(a), torch.from_numpy(b)
-    assert float(losses.charbonnier(*given, reduction=reduction)) == pytest.approx(wanted[0], rel=1e-12)
+    assert float(losses.charbonnier(*given, reduction=reduction)) == pytest.approx(
+        wanted[0], rel=1e-12
+    )
     assert float(losses.fft_l1(*given, reduction=reduction)) == pytest.approx(wanted[1], rel=1e-12)
 
 
@@ -60,7 +71,9 @@ def test_the_printed_ratio_of_a_background_is_one_of_peaks():
 
 
 def test_the_gradient_of_the_contrast_near_its_floor_is_that_of_float64():
-    """A blur whose contrast falls to the floor, where round-off of single precision turned the gradient."""
+    """A blur whose contrast falls to the floor, where round-off of single precision turned the
+    gradient.
+    """
     line = torch.exp(-0.5 * ((torch.arange(64) - 32) / 3.0) ** 2)
     kernel = line[:, None] * line
     found = []
@@ -79,22 +92,37 @@ def test_camera_grain_is_equal_in_every_precision():
 
 
 SMALL = [
-    "optics.samples=64", "optics.pitch=126.2 um", "optics.bands=3", "optics.window=[32, 32]", "scene.shape=[32, 32]",
-    "sensor.shape=[32, 32]", "doe=half_ring", "doe.waves=[2]", "lasers.green.angle=[0 mrad, 0 mrad]",
+    "optics.samples=64",
+    "optics.pitch=126.2 um",
+    "optics.bands=3",
+    "optics.window=[32, 32]",
+    "scene.shape=[32, 32]",
+    "sensor.shape=[32, 32]",
+    "doe=half_ring",
+    "doe.waves=[2]",
+    "lasers.green.angle=[0 mrad, 0 mrad]",
     "outputs=[photons]",
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("reading", "ratio"), [("coherent", 2.0), ("as_printed", 1.0)])
 def test_a_longer_exposure_collects_more_light_unless_as_printed(tmp_path, reading, ratio):
-    words = [*SMALL, *(["reading.saturating_exposure=${sensor.exposure}"] if reading == "as_printed" else [])]
+    words = [
+        *SMALL,
+        *(["reading.saturating_exposure=${sensor.exposure}"] if reading == "as_printed" else []),
+    ]
     usual, longer = (
-        load("first_light", [*words, f"sensor.exposure={seconds} s"]).run(Store(tmp_path)) for seconds in (0.1, 0.2)
+        load("first_light", [*words, f"sensor.exposure={seconds} s"]).run(Store(tmp_path))
+        for seconds in (0.1, 0.2)
     )
     for arm in ("plain", "mask"):
-        assert float(longer[f"photons[{arm}]"].sum() / usual[f"photons[{arm}]"].sum()) == pytest.approx(ratio, rel=1e-4)
+        assert float(
+            longer[f"photons[{arm}]"].sum() / usual[f"photons[{arm}]"].sum()
+        ) == pytest.approx(ratio, rel=1e-4)
 
 
 def test_a_laboratory_counts_every_photon_in_every_reading():
     recipe = load("calibrate", ["reading=as_printed"])
-    assert {s.params["mean_shift"] for s in recipe.steps.values() if "mean_shift" in s.params} == {0.0}
+    assert {s.params["mean_shift"] for s in recipe.steps.values() if "mean_shift" in s.params} == {
+        0.0
+    }

@@ -1,4 +1,6 @@
-"""Each packaged recipe whose laser has a strength says which strength it means, so that its numbers stay."""
+"""Each packaged recipe whose laser has a strength says which strength it means, so that its
+numbers stay.
+"""
 
 import re
 from pathlib import Path
@@ -30,12 +32,19 @@ def test_the_recipes_with_a_strength_are_found():
 
 @pytest.mark.parametrize("name", LASERS)
 def test_a_packaged_recipe_says_which_strength_it_means(name):
-    assert re.search(r"^reading: \{strength: irradiance\}", LASERS[name].read_text(encoding="utf-8"), re.MULTILINE)
+    assert re.search(
+        r"^reading: \{strength: irradiance\}",
+        LASERS[name].read_text(encoding="utf-8"),
+        re.MULTILINE,
+    )
 
 
 @pytest.mark.parametrize(
-    ("words", "meaning"), [((), "irradiance"), (("reading.strength=first_channel",), "first_channel")]
+    ("words", "meaning"),
+    [((), "irradiance"), (("reading.strength=first_channel",), "first_channel")],
 )
 def test_the_meaning_reaches_every_spot(words, meaning):
     recipe = load("first_light", words)
-    assert {recipe.steps[f"spot[{arm},green]"].params["meaning"] for arm in ("plain", "mask")} == {meaning}
+    assert {recipe.steps[f"spot[{arm},green]"].params["meaning"] for arm in ("plain", "mask")} == {
+        meaning
+    }

@@ -1,4 +1,6 @@
-"""What is printed while steps run: items share a line, states are told apart, sleepers are one line."""
+"""What is printed while steps run: items share a line, states are told apart, sleepers are one
+line.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +12,9 @@ import torch
 
 from neusee.nodes import Check, TensorStats, node
 from neusee.workflows.graph.diagnostics import Location
-from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.graph.step_record import Event, StepRecord
+from neusee.workflows.graph.recipe_graph import Event, Recipe, Step, StepRecord
 from neusee.workflows.report import console as console_room
-from neusee.workflows.report.next_commands import commands_to_try
+from neusee.workflows.report.terminal_text import commands_to_try
 
 
 @node()
@@ -27,7 +28,9 @@ NAMES = ["spot[mask,green]", "spot[mask,red]", "raw"]
 
 
 def recipe() -> Recipe:
-    steps = {name: Step(name, charge, {}, {"x": None}, Location("a.yaml", 1, 1), {}) for name in NAMES}
+    steps = {
+        name: Step(name, charge, {}, {"x": None}, Location("a.yaml", 1, 1), {}) for name in NAMES
+    }
     return Recipe("r", "", 1, 0.0, ("raw",), steps)
 
 
@@ -58,10 +61,13 @@ def test_a_copy_that_was_not_needed_is_not_said_to_have_run(capsys):
     assert "spot ×2 cpu 1 not needed, 1 run 0.250" in out
 
 
-@pytest.mark.parametrize(("there", "suggested"), [("doe.vortex", "axicon"), ("doe.half_rings", "vortex")])
+@pytest.mark.parametrize(
+    ("there", "suggested"), [("doe.vortex", "axicon"), ("doe.half_rings", "vortex")]
+)
 def test_the_mask_to_try_next_is_not_the_mask_of_the_run(there, suggested):
     made = SimpleNamespace(
-        config=SimpleNamespace(settings={}), steps={"height": SimpleNamespace(node=SimpleNamespace(path=there))}
+        config=SimpleNamespace(settings={}),
+        steps={"height": SimpleNamespace(node=SimpleNamespace(path=there))},
     )
     first = commands_to_try(made, ["first_light", "doe=x"], lambda words: True)[0]
     assert first.split("#")[0].split() == ["neusee", "run", "first_light", f"doe={suggested}"]
@@ -98,7 +104,12 @@ def test_nothing_is_printed_where_silence_was_asked_for(capsys):
 
 
 def test_left_out_steps_are_named_once_with_the_largest_bound():
-    rows = [{"step": f"dark[{i}]", "bound": b, "estimated": False} for i, b in (("a", 1e-5), ("b", 3e-5))]
+    rows = [
+        {"step": f"dark[{i}]", "bound": b, "estimated": False}
+        for i, b in (("a", 1e-5), ("b", 3e-5))
+    ]
     rows.append({"step": "psf[a]", "bound": 2e-4, "estimated": True})
-    line = console_room.left_out_line({"left_out": rows, "spent": {"left_out": rows}, "tolerance": 1e-3})
+    line = console_room.left_out_line(
+        {"left_out": rows, "spent": {"left_out": rows}, "tolerance": 1e-3}
+    )
     assert line == "left out dark (at most 3.0e-05), psf (estimated 2.0e-04); tolerance 0.001"

@@ -1,4 +1,6 @@
-"""Data files of a run: other programs read back every number, and a file never looks whole before it is."""
+"""Data files of a run: other programs read back every number, and a file never looks whole
+before it is.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ def test_a_png_of_16_bits_comes_back(planes, tmp_path, monkeypatch):
     if planes == 3:
         from kornia_rs.io import read_image_png_u16
 
-        found = torch.from_numpy(np.asarray(read_image_png_u16(str(path), "rgb")).astype(np.int64)).permute(2, 0, 1)
+        found = torch.from_numpy(
+            np.asarray(read_image_png_u16(str(path), "rgb")).astype(np.int64)
+        ).permute(2, 0, 1)
     else:
         from PIL import Image
 
@@ -48,7 +52,9 @@ def test_a_png_of_16_bits_comes_back(planes, tmp_path, monkeypatch):
     assert torch.equal(found.double(), image.double())
 
 
-@pytest.mark.parametrize("image", [torch.full((3, 2, 2), torch.nan), torch.full((3, 2, 2), 65536.0), noise(2, 4, 4)])
+@pytest.mark.parametrize(
+    "image", [torch.full((3, 2, 2), torch.nan), torch.full((3, 2, 2), 65536.0), noise(2, 4, 4)]
+)
 def test_a_png_refuses_what_it_cannot_hold(image, tmp_path):
     with pytest.raises(ValueError, match="16-bit PNG"):
         data_exports.png16(tmp_path / "x.png", image=image)
@@ -60,7 +66,9 @@ def test_pictures_come_back_from_openexr(tmp_path):
     data_exports.exr(tmp_path / "x.exr", image=image)
     data_exports.exr(tmp_path / "grey.exr", image=image[:1])
     found = channels(tmp_path / "x.exr")
-    assert [torch.equal(torch.from_numpy(found[c]), image[i]) for i, c in enumerate("RGB")] == [True] * 3
+    assert [torch.equal(torch.from_numpy(found[c]), image[i]) for i, c in enumerate("RGB")] == [
+        True
+    ] * 3
     assert torch.equal(torch.from_numpy(channels(tmp_path / "grey.exr")["Y"]), image[0])
 
 
@@ -80,7 +88,9 @@ def test_outputs_are_read_by_safetensors(tmp_path):
     from safetensors.torch import load_file
 
     psf = Psf(noise(3, 4, 5), torch.ones(3, dtype=torch.float64))
-    data_exports.safetensors(path := tmp_path / "x", path=noise(2, 3).bool(), psf=psf, raw=noise(4, 6).t())
+    data_exports.safetensors(
+        path := tmp_path / "x", path=noise(2, 3).bool(), psf=psf, raw=noise(4, 6).t()
+    )
     found = load_file(path)
     of_psf = {f"psf.{field}" for field in ("intensity", "clear_peak", "cut_off", "averaged")}
     assert found.keys() == {"path", "raw", *of_psf}

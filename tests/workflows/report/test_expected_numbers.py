@@ -1,4 +1,6 @@
-"""Expected numbers hold for the recipe as written; what an override reaches is no longer promised."""
+"""Expected numbers hold for the recipe as written; what an override reaches is no longer
+promised.
+"""
 
 import pytest
 

@@ -1,4 +1,6 @@
-"""Files that are made beside the run are those that the report makes, and every failure is left to the report."""
+"""Files that are made beside the run are those that the report makes, and every failure is left
+to the report.
+"""
 
 from __future__ import annotations
 
@@ -17,16 +19,14 @@ import pytest
 import torch
 
 from neusee.nodes import node
-from neusee.workflows.engine.memory_watch import MemoryLimit
+from neusee.workflows.engine.memory_limits import MemoryLimit
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
-from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.graph.step_record import StepRecord
-from neusee.workflows.report import drawing_process, files_beside
-from neusee.workflows.report.drawing_process import DrawingProcess, NotDrawn
-from neusee.workflows.report.files_beside import FilesBeside
-from neusee.workflows.report.graph_ahead import GraphAhead
-from neusee.workflows.report.requirements import Bound
+from neusee.workflows.graph.recipe_graph import Recipe, Step, StepRecord
+from neusee.workflows.report import files_beside
+from neusee.workflows.report import files_beside as drawing_process
+from neusee.workflows.report.contents import Bound
+from neusee.workflows.report.files_beside import DrawingProcess, FilesBeside, GraphAhead, NotDrawn
 from neusee.workflows.report.run_pictures import DerivedFile, Drawing, files_of, graphs, states_of
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
@@ -160,10 +160,12 @@ def test_what_is_large_or_no_data_is_not_sent(tmp_path, forks, monkeypatch):
 
 def test_the_process_that_draws_ends_with_a_run_that_is_killed(tmp_path, forks):
     code = (
-        "from neusee.workflows.report.drawing_process import DrawingProcess\n"
+        "from neusee.workflows.report.files_beside import DrawingProcess\n"
         "import time\nprint(DrawingProcess()._process.pid, flush=True)\ntime.sleep(60)"
     )
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True
+    ) as parent:
         child = int(parent.stdout.readline())
         parent.kill()
     for _ in range(6000):
@@ -183,7 +185,7 @@ def _has_ended(pid: int) -> bool:
 
 def test_a_drawing_is_sent_by_its_name(tmp_path, forks):
     drawer = DrawingProcess()
-    drawing = Drawing("report.figures.recipe_graph:graph")
+    drawing = Drawing("report.figures.graph_and_timeline:graph")
     drawer.make(tmp_path / "g.png", drawing, {"sources": {"a": []}, "states": {"a": "run"}})
     drawer.close()
     assert (tmp_path / "g.png").read_bytes().startswith(b"\x89PNG")
@@ -192,11 +194,16 @@ def test_a_drawing_is_sent_by_its_name(tmp_path, forks):
 def test_two_threads_take_turns_with_the_process_that_draws(tmp_path, forks):
     drawer = DrawingProcess()
     with ThreadPoolExecutor(4) as threads:
-        made = [threads.submit(drawer.make, tmp_path / str(n), sums, {"x": torch.full((9,), n)}) for n in range(40)]
+        made = [
+            threads.submit(drawer.make, tmp_path / str(n), sums, {"x": torch.full((9,), n)})
+            for n in range(40)
+        ]
         for each in made:
             each.result(60)
     drawer.close()
-    assert [(tmp_path / str(n)).read_text().split()[1] for n in range(40)] == [str(9 * n) for n in range(40)]
+    assert [(tmp_path / str(n)).read_text().split()[1] for n in range(40)] == [
+        str(9 * n) for n in range(40)
+    ]
 
 
 def test_a_thread_that_waits_is_the_next(tmp_path, forks):
@@ -241,7 +248,9 @@ def short(path: Path, /, **values: torch.Tensor) -> None:
 
 
 def slow(path: Path, /, **values: torch.Tensor) -> None:
-    """Draw a picture, in the other process not before one was drawn in this process, if a `GATE` is named."""
+    """Draw a picture, in the other process not before one was drawn in this process, if a `GATE`
+    is named.
+    """
     _pass_the_gate()
     sums(path, **values)
 
@@ -282,15 +291,21 @@ class Sums:
         sums(path, **values)
 
 
-def test_the_last_pictures_are_drawn_here_while_the_other_process_is_busy(tmp_path, forks, monkeypatch):
+def test_the_last_pictures_are_drawn_here_while_the_other_process_is_busy(
+    tmp_path, forks, monkeypatch
+):
     monkeypatch.setattr(files_beside, "Drawing", type(slow))
     makers = {}
     for imported in (True, False):
-        monkeypatch.setattr(sys.modules[__name__], "GATE", [str(tmp_path / "gate")] if imported else [])
+        monkeypatch.setattr(
+            sys.modules[__name__], "GATE", [str(tmp_path / "gate")] if imported else []
+        )
         monkeypatch.setattr(files_beside, "_draws_at_once", lambda imported=imported: imported)
         (paths, missing), early = result_of(tmp_path / str(imported), files(slow))
         assert (texts(paths), missing, len(early)) == ({"one": "2016", "both": "6048"}, {}, 2)
-        makers[imported] = {name: path.read_text().split()[0] == str(os.getpid()) for name, path in paths.items()}
+        makers[imported] = {
+            name: path.read_text().split()[0] == str(os.getpid()) for name, path in paths.items()
+        }
     assert makers == {True: {"one": False, "both": True}, False: {"one": False, "both": False}}
 
 
@@ -316,13 +331,19 @@ def exceeds(path: Path, /, **values: torch.Tensor) -> None:
 
 
 @pytest.mark.parametrize("error", [MemoryLimit, ValueError])
-def test_too_little_memory_ends_the_report_and_other_errors_are_met_again(tmp_path, forks, monkeypatch, gate, error):
+def test_too_little_memory_ends_the_report_and_other_errors_are_met_again(
+    tmp_path, forks, monkeypatch, gate, error
+):
     monkeypatch.setattr(files_beside, "Drawing", type(slow))
     monkeypatch.setattr(files_beside, "_draws_at_once", lambda: True)
     shelf = DerivedFiles(Store(tmp_path / "cache"))
-    with FilesBeside(lambda _: files(exceeds if error is MemoryLimit else breaks), shelf, 1e12) as beside:
+    with FilesBeside(
+        lambda _: files(exceeds if error is MemoryLimit else breaks), shelf, 1e12
+    ) as beside:
         run(recipe(), shelf.store, show=beside)
-        beside.add("late", "0" * 32, exceeds if error is MemoryLimit else breaks, {"x": torch.ones(3)})
+        beside.add(
+            "late", "0" * 32, exceeds if error is MemoryLimit else breaks, {"x": torch.ones(3)}
+        )
         with pytest.raises(MemoryLimit) if error is MemoryLimit else nullcontext():
             beside.finish()
 

@@ -8,15 +8,19 @@ from itertools import pairwise
 import pytest
 
 from neusee.workflows.placement.heft_schedule import Cluster, Device, Task, heft
-from neusee.workflows.report.figures import gantt
-from neusee.workflows.report.figures.gantt import timeline
+from neusee.workflows.report.figures import graph_and_timeline as gantt
+from neusee.workflows.report.figures.graph_and_timeline import timeline
 from neusee.workflows.report.figures.style import styled
 
 
 def planned(count):
     """``count`` tasks in chains of four on two lanes."""
     tasks = [
-        Task(f"step{i}", (f"step{i - 1}",) if i % 4 else (), {"cpu": 0.1 * (i % 9 + 1), "cuda:0": 0.1})
+        Task(
+            f"step{i}",
+            (f"step{i - 1}",) if i % 4 else (),
+            {"cpu": 0.1 * (i % 9 + 1), "cuda:0": 0.1},
+        )
         for i in range(count)
     ]
     return heft(tasks, Cluster((Device("cpu"), Device("cuda:0", "cuda"))))
@@ -45,7 +49,8 @@ def bars(ax, filled):
     """(row, from ms, ms) of the bars of the steps, as drawn."""
     found = [p for p in ax.patches if bool(p.get_facecolor()[3]) == filled]
     return sorted(
-        (round(p.get_y() + p.get_height() / 2, 6), round(p.get_x(), 6), round(p.get_width(), 6)) for p in found
+        (round(p.get_y() + p.get_height() / 2, 6), round(p.get_x(), 6), round(p.get_width(), 6))
+        for p in found
     )
 
 
@@ -55,7 +60,9 @@ def test_each_step_has_the_bar_of_the_plan_and_that_of_the_run(drawn):
     row = {name: y for y, name in enumerate(names(steps))}
     slots = [(s.task, s.device, s.start, s.end - s.start) for s in schedule.slots]
     for filled, spans in ((False, slots), (True, ran(schedule))):
-        assert bars(steps, filled) == sorted((row[n], round(b * 1e3), round(t * 1e3)) for n, _, b, t in spans)
+        assert bars(steps, filled) == sorted(
+            (row[n], round(b * 1e3), round(t * 1e3)) for n, _, b, t in spans
+        )
     starts = {s.task: s.start for s in schedule.slots}
     assert [starts[name] for name in row] == sorted(starts.values())
 
@@ -115,13 +122,17 @@ def test_a_plan_of_some_steps_is_not_taken_for_the_whole(drawn):
 @pytest.mark.parametrize("name", ["i" * 60, "W" * 60, "s"])
 def test_names_and_times_stand_beside_the_bars(drawn, name):
     schedule = planned(9)
-    rows = [(name if n == 4 else step, lane, began, took) for n, (step, lane, began, took) in enumerate(ran(schedule))]
+    rows = [
+        (name if n == 4 else step, lane, began, took)
+        for n, (step, lane, began, took) in enumerate(ran(schedule))
+    ]
     with styled():
         figure, lanes, steps = drawn(schedule, rows)
         figure.canvas.draw()
     inside = steps.get_window_extent()
     assert all(
-        label.get_window_extent().x1 < inside.x0 for label in (*steps.get_yticklabels(), *lanes.get_yticklabels())
+        label.get_window_extent().x1 < inside.x0
+        for label in (*steps.get_yticklabels(), *lanes.get_yticklabels())
     )
     assert all(text.get_window_extent().x0 > inside.x1 for text in steps.texts)
     left = min(label.get_window_extent().x0 for label in steps.get_yticklabels())

@@ -1,4 +1,6 @@
-"""A table on a terminal: whatever its height, the terminal has printed it once when it is finished."""
+"""A table on a terminal: whatever its height, the terminal has printed it once when it is
+finished.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +64,8 @@ def test_each_row_is_printed_once_however_often_the_table_is_drawn(terminal, cou
         for i in range(count):
             shown.names.append(f"step-{i:02}")
             shown._live.refresh()
-            assert shown.names[-1] in "".join(screened(terminal.getvalue())[-HEIGHT:])  # the newest row is in sight
+            # the newest row is in sight
+            assert shown.names[-1] in "".join(screened(terminal.getvalue())[-HEIGHT:])
     lines = screened(terminal.getvalue())
     assert [line.split()[0] for line in lines if line.startswith("step-")] == shown.names
     assert sum(line.startswith("step ") for line in lines) == 1

@@ -1,9 +1,11 @@
-"""The figure of one's own tables: a panel for each table in use, with the numbers and units of its file."""
+"""The figure of one's own tables: a panel for each table in use, with the numbers and units of
+its file.
+"""
 
 import numpy as np
 import pytest
 
-from neusee.workflows.report.figures import own_tables
+from neusee.workflows.report.figures import optics as own_tables
 
 draw = own_tables.tables.__wrapped__
 
@@ -40,7 +42,11 @@ def test_every_table_has_its_panel_and_its_numbers(table_arguments):
 
 def test_what_is_no_table_of_the_user_has_no_panel():
     coefficients = {"B": (1.1,), "C": (0.01,), "range": (4e-7, 7e-7)}
-    shown = panels(draw(camera="CIE 1931", light="D65", glass=coefficients, lasers={"green": None}, height=None))
+    shown = panels(
+        draw(
+            camera="CIE 1931", light="D65", glass=coefficients, lasers={"green": None}, height=None
+        )
+    )
     assert list(shown) == ["Sellmeier coefficients"]
     (curve,) = shown["Sellmeier coefficients"].lines
     assert curve.get_ydata()[0] == pytest.approx((1 + 1.1 * 0.16 / (0.16 - 0.01)) ** 0.5, rel=1e-12)
@@ -49,7 +55,9 @@ def test_what_is_no_table_of_the_user_has_no_panel():
 
 
 def test_a_colour_camera_has_three_curves_relative_to_the_largest(tmp_path):
-    (tmp_path / "rgb.csv").write_text("wavelength (nm),red (1),green (1),blue (1)\n400,0,0,3\n550,1,4,1\n700,3,0,0\n")
+    (tmp_path / "rgb.csv").write_text(
+        "wavelength (nm),red (1),green (1),blue (1)\n400,0,0,3\n550,1,4,1\n700,3,0,0\n"
+    )
     (panel,) = panels(draw(camera=tmp_path / "rgb.csv")).values()
     assert [line.get_label() for line in panel.lines] == ["red", "green", "blue"]
     assert max(line.get_ydata().max() for line in panel.lines) == 1

@@ -18,17 +18,15 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.report import contents, run_pictures
-from neusee.workflows.report.figures import (
-    camera_overview,
-    frame_and_interval,
-    numerics,
-    optics,
-    own_tables,
-    photon_transfer,
-    recipe_graph,
-    scene_spectra,
-    shading_field,
-)
+from neusee.workflows.report.figures import camera_pictures as camera_overview
+from neusee.workflows.report.figures import camera_pictures as frame_and_interval
+from neusee.workflows.report.figures import camera_pictures as scene_spectra
+from neusee.workflows.report.figures import camera_pictures as shading_field
+from neusee.workflows.report.figures import graph_and_timeline as recipe_graph
+from neusee.workflows.report.figures import optics
+from neusee.workflows.report.figures import optics as own_tables
+from neusee.workflows.report.figures import verification as numerics
+from neusee.workflows.report.figures import verification as photon_transfer
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.result_store import Store
 
@@ -38,7 +36,9 @@ PITCH, FOCAL, PIXEL, DIAMETER = 8.078e-3 / 64, 0.11, 2.9e-6, 8.078e-3
 
 def bands() -> Bands:
     centres = torch.linspace(400e-9, 700e-9, B, dtype=torch.float64)
-    return Bands(centres, torch.full((B,), 75e-9, dtype=torch.float64), torch.ones(B, dtype=torch.float64))
+    return Bands(
+        centres, torch.full((B,), 75e-9, dtype=torch.float64), torch.ones(B, dtype=torch.float64)
+    )
 
 
 def pupil(waves: float) -> Pupil:
@@ -48,7 +48,15 @@ def pupil(waves: float) -> Pupil:
     height = waves * 550e-9 / 0.46 * radius / (DIAMETER / 2) * clear
     index = torch.full((B,), 0.46, dtype=torch.float64)
     nothing = torch.zeros_like(height)
-    return Pupil(clear, clear, height, nothing, index, bands().centres, torch.tensor(PITCH, dtype=torch.float64))
+    return Pupil(
+        clear,
+        clear,
+        height,
+        nothing,
+        index,
+        bands().centres,
+        torch.tensor(PITCH, dtype=torch.float64),
+    )
 
 
 def psf_of(p: Pupil, *, shape: tuple[int, int] = (N, N), precision: str = "double") -> Psf:
@@ -74,7 +82,9 @@ def scene() -> torch.Tensor:
 def shading() -> Shading:
     log = torch.linspace(-0.3, 0.3, 12).double()[:, None] * torch.linspace(0.5, 1, 9).double()
     smooth, one = torch.ones(N, N), torch.tensor(0.8).double()
-    return Shading(smooth, smooth, log, 0.1 + log.abs(), one, 1 - one, one > 0, torch.tensor(20), one)
+    return Shading(
+        smooth, smooth, log, 0.1 + log.abs(), one, 1 - one, one > 0, torch.tensor(20), one
+    )
 
 
 def spot() -> torch.Tensor:
@@ -106,12 +116,18 @@ def light() -> SimpleNamespace:
 def linear_image(radiance: torch.Tensor, psf: Psf) -> torch.Tensor:
     """Linear convolution, the axis at N // 2."""
     shape = [r + p for r, p in zip(radiance.shape[-2:], psf.intensity.shape[-2:], strict=True)]
-    full = torch.fft.irfft2(torch.fft.rfft2(radiance, shape) * torch.fft.rfft2(psf.intensity, shape), shape)
+    full = torch.fft.irfft2(
+        torch.fft.rfft2(radiance, shape) * torch.fft.rfft2(psf.intensity, shape), shape
+    )
     top, left = (n // 2 for n in psf.intensity.shape[-2:])
     return full[..., top : top + radiance.shape[-2], left : left + radiance.shape[-1]]
 
 
-VARIANTS = [("as used", "", 3e-7, 0.02), ("precision", "double", 2e-15, 0.05), ("allowed error", "1e-4", 4e-5, 0.01)]
+VARIANTS = [
+    ("as used", "", 3e-7, 0.02),
+    ("precision", "double", 2e-15, 0.05),
+    ("allowed error", "1e-4", 4e-5, 0.01),
+]
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +137,13 @@ def drawings(light: SimpleNamespace, table_arguments: dict) -> dict[str, tuple]:
     return {
         "overview": (
             camera_overview.overview,
-            dict(truth=scene(), plain=scene() + 0.3, mask=scene(), restored=scene(), spots={"green": spot()}),
+            dict(
+                truth=scene(),
+                plain=scene() + 0.3,
+                mask=scene(),
+                restored=scene(),
+                spots={"green": spot()},
+            ),
         ),
         "frame": (
             frame_and_interval.restored_frame,
@@ -134,7 +156,10 @@ def drawings(light: SimpleNamespace, table_arguments: dict) -> dict[str, tuple]:
             ),
         ),
         "height": (optics.height, dict(pupil=pupil(4.0))),
-        "psf": (optics.psf, dict(plain=light.plain, mask=light.mask, bands=bands(), pixel_pitch=PIXEL)),
+        "psf": (
+            optics.psf,
+            dict(plain=light.plain, mask=light.mask, bands=bands(), pixel_pitch=PIXEL),
+        ),
         "shading": (shading_field.transmission, dict(shading=shading())),
         "suppression": (
             optics.suppression,
@@ -158,8 +183,18 @@ def drawings(light: SimpleNamespace, table_arguments: dict) -> dict[str, tuple]:
         "graph": (
             recipe_graph.graph,
             dict(
-                sources={"bands": [], "psf[plain]": ["bands"], "psf[mask]": ["bands"], "image": ["psf[mask]"]},
-                states={"bands": "cached", "psf[plain]": "cached", "psf[mask]": "run", "image": "left out"},
+                sources={
+                    "bands": [],
+                    "psf[plain]": ["bands"],
+                    "psf[mask]": ["bands"],
+                    "image": ["psf[mask]"],
+                },
+                states={
+                    "bands": "cached",
+                    "psf[plain]": "cached",
+                    "psf[mask]": "run",
+                    "image": "left out",
+                },
             ),
         ),
     }
@@ -208,8 +243,17 @@ def test_texts_are_large_enough_and_none_lies_on_another(figure_of, name):
 
     figure = figure_of(name)
     inside = [t for ax in figure.axes for t in _ticks_shown(ax)]
-    ticks = {id(t) for ax in figure.axes for axis in (ax.xaxis, ax.yaxis) for t in axis.get_ticklabels(which="both")}
-    texts = [t for t in figure.findobj(Text) if t.get_text().strip() and t.get_visible() and id(t) not in ticks]
+    ticks = {
+        id(t)
+        for ax in figure.axes
+        for axis in (ax.xaxis, ax.yaxis)
+        for t in axis.get_ticklabels(which="both")
+    }
+    texts = [
+        t
+        for t in figure.findobj(Text)
+        if t.get_text().strip() and t.get_visible() and id(t) not in ticks
+    ]
     texts += inside
     assert texts
     assert min(t.get_fontsize() for t in texts if "mathdefault" not in t.get_text()) >= 9
@@ -217,7 +261,12 @@ def test_texts_are_large_enough_and_none_lies_on_another(figure_of, name):
     if name in ("error_time",):
         return  # where its labels fall is up to the clock
     for (a, one), (b, other) in itertools.combinations(boxes, 2):
-        apart = one.x1 <= other.x0 + 1 or other.x1 <= one.x0 + 1 or one.y1 <= other.y0 + 1 or other.y1 <= one.y0 + 1
+        apart = (
+            one.x1 <= other.x0 + 1
+            or other.x1 <= one.x0 + 1
+            or one.y1 <= other.y0 + 1
+            or other.y1 <= one.y0 + 1
+        )
         assert apart, f"{a!r} lies on {b!r}"
 
 
@@ -251,7 +300,9 @@ def test_axes_say_their_unit(figure_of):
 @pytest.mark.parametrize("name", NAMES)
 def test_no_axes_are_empty(figure_of, name):
     for ax in figure_of(name).axes:
-        curves = [line for line in ax.lines if len(line.get_xdata()) > 2 or line.get_linestyle() == "None"]
+        curves = [
+            line for line in ax.lines if len(line.get_xdata()) > 2 or line.get_linestyle() == "None"
+        ]
         assert curves or ax.images or ax.patches or ax.collections or ax.texts, ax.get_title()
 
 
@@ -264,7 +315,9 @@ def test_a_lamp_darkens_neither_the_scene_nor_the_points_of_the_spectra():
     assert float(ax.images[0].get_array()[:, 20:].max()) > 0.9
 
 
-@pytest.mark.parametrize(("at", "rings"), [((12, 30), 2), ((0, 30), 0), ((12, N - 1), 0), ((N - 1, N - 1), 0)])
+@pytest.mark.parametrize(
+    ("at", "rings"), [((12, 30), 2), ((0, 30), 0), ((12, N - 1), 0), ((N - 1, N - 1), 0)]
+)
 def test_a_ring_marks_a_laser_only_inside_the_picture(at, rings):
     light = torch.zeros(3, N, N)
     light[:, *at] = 1.0
@@ -299,7 +352,9 @@ def test_laser_added_as_shifted_psf_is_sound_where_a_joint_convolution_is_not(li
 
 
 def test_graph_places_no_two_boxes_on_one_another_and_readers_below():
-    sources = {f"s{i}": [f"s{j}" for j in range(max(0, i - 3), i)] + ["root"] for i in range(45)} | {"root": []}
+    sources = {
+        f"s{i}": [f"s{j}" for j in range(max(0, i - 3), i)] + ["root"] for i in range(45)
+    } | {"root": []}
     wires, _, _ = recipe_graph.grouped(sources, {})
     places = recipe_graph.layout(wires)
     by_row = sorted((y, x) for x, y in places.values())
@@ -309,7 +364,9 @@ def test_graph_places_no_two_boxes_on_one_another_and_readers_below():
 
 def test_graph_groups_items_and_a_family_that_ran_at_all_ran():
     sources = {"a[x]": [], "a[y]": [], "b": ["a[x]", "a[y]"]}
-    wires, looks, counts = recipe_graph.grouped(sources, {"a[x]": "cached", "a[y]": "run", "b": "not needed"})
+    wires, looks, counts = recipe_graph.grouped(
+        sources, {"a[x]": "cached", "a[y]": "run", "b": "not needed"}
+    )
     assert wires == {"a": [], "b": ["a"]}
     assert looks == {"a": "run", "b": "cached"}
     assert counts == {"a": 2, "b": 1}
@@ -375,4 +432,6 @@ def test_every_figure_names_a_function_and_its_arguments():
         arguments = inspect.signature(draw).parameters
         assert set(arguments) == set(figure.needs), figure.name
         optional = {n for n, need in figure.needs.items() if need.startswith("?")}
-        assert optional == {n for n, p in arguments.items() if p.default is not p.empty}, figure.name
+        assert optional == {n for n, p in arguments.items() if p.default is not p.empty}, (
+            figure.name
+        )

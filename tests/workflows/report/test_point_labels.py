@@ -1,4 +1,6 @@
-"""Labels of the points of a diagram: none lies on another, on a marker, on a note or on the legend."""
+"""Labels of the points of a diagram: none lies on another, on a marker, on a note or on the
+legend.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +9,13 @@ import itertools
 import numpy as np
 import pytest
 
-from neusee.workflows.report.figures.point_labels import PointLabel, place_labels, plain_ticks
-from neusee.workflows.report.figures.style import BLACK, canvas
+from neusee.workflows.report.figures.style import (
+    BLACK,
+    PointLabel,
+    canvas,
+    place_labels,
+    plain_ticks,
+)
 
 
 def labelled(points, note=""):
@@ -18,7 +25,9 @@ def labelled(points, note=""):
     ax.legend(loc="upper right")
     if note:
         ax.text(*points[0], note)
-    place_labels(figure, {ax: [PointLabel(x, y, f"label {i}", BLACK) for i, (x, y) in enumerate(points)]})
+    place_labels(
+        figure, {ax: [PointLabel(x, y, f"label {i}", BLACK) for i, (x, y) in enumerate(points)]}
+    )
     return figure, ax
 
 
@@ -26,7 +35,9 @@ def labelled(points, note=""):
 def test_labels_of_points_side_by_side_are_apart(apart):
     figure, ax = labelled([(apart**i, 1e-3) for i in range(4)], note="a note")
     renderer = figure.canvas.get_renderer()
-    boxes = [text.get_window_extent(renderer) for text in ax.texts] + [ax.get_legend().get_window_extent(renderer)]
+    boxes = [text.get_window_extent(renderer) for text in ax.texts] + [
+        ax.get_legend().get_window_extent(renderer)
+    ]
     assert len(boxes) >= 4
     assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
 
@@ -49,7 +60,11 @@ def test_plain_numbers_are_apart(low, high):
     plain_ticks(ax.xaxis)
     figure.draw_without_rendering()
     end = ax.get_xlim()
-    labels = [t.label1 for t in ax.xaxis.get_major_ticks() if end[0] <= t.get_loc() <= end[1] and t.label1.get_text()]
+    labels = [
+        t.label1
+        for t in ax.xaxis.get_major_ticks()
+        if end[0] <= t.get_loc() <= end[1] and t.label1.get_text()
+    ]
     boxes = [label.get_window_extent(figure.canvas.get_renderer()) for label in labels]
     assert len(boxes) >= 1
     assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))

@@ -1,4 +1,6 @@
-"""The crate of a folder of results: what it says is there, and it is there only when the folder is whole."""
+"""The crate of a folder of results: what it says is there, and it is there only when the folder
+is whole.
+"""
 
 import json
 import os
@@ -7,9 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.report import crate_sources, run_crate
-from neusee.workflows.report.crate_sources import CREATOR, LICENCE
-from neusee.workflows.report.run_crate import CRATE, remove_crate, restore_crate, write_crate
+from neusee.workflows.report import run_crate
+from neusee.workflows.report import run_crate as crate_sources
+from neusee.workflows.report.run_crate import (
+    CRATE,
+    CREATOR,
+    LICENCE,
+    remove_crate,
+    restore_crate,
+    write_crate,
+)
 from neusee.workflows.report.run_folder import new_run
 from tests.workflows.crate_rules import faults
 
@@ -72,13 +81,20 @@ def test_a_command_that_took_seconds_began_before_it_ended(folder):
 
 def test_what_did_not_complete_says_so(folder):
     assert crated(folder)["#a%20run"]["actionStatus"] == "http://schema.org/CompletedActionStatus"
-    assert crated(folder, state="interrupted")["#a%20run"]["actionStatus"] == "http://schema.org/FailedActionStatus"
+    assert (
+        crated(folder, state="interrupted")["#a%20run"]["actionStatus"]
+        == "http://schema.org/FailedActionStatus"
+    )
 
 
 def test_a_photograph_that_ships_has_its_licence(folder):
-    from neusee.workflows.keys.input_file_digest import file_digest
+    from neusee.workflows.keys.cache_key import file_digest
 
-    row = {"parameter": "scene.file", "file": "china.jpg", "digest": file_digest(SAMPLES / "china.jpg")}
+    row = {
+        "parameter": "scene.file",
+        "file": "china.jpg",
+        "digest": file_digest(SAMPLES / "china.jpg"),
+    }
     name = f"#input-{row['digest']}"
     found = crated(folder, inputs=[row, row | {"parameter": "again.file"}])
     assert found[name]["license"] == {"@id": "https://creativecommons.org/licenses/by/2.0/"}
@@ -91,7 +107,11 @@ def test_a_photograph_that_ships_has_its_licence(folder):
 
 
 def test_every_sample_that_ships_has_a_licence():
-    shipped = {path.name for path in SAMPLES.iterdir() if path.suffix in (".jpg", ".exr", ".png", ".safetensors")}
+    shipped = {
+        path.name
+        for path in SAMPLES.iterdir()
+        if path.suffix in (".jpg", ".exr", ".png", ".safetensors")
+    }
     assert shipped <= crate_sources._samples().keys()
 
 
@@ -117,7 +137,11 @@ def test_the_creator_is_named(given, name, place, folder, monkeypatch):
 
 @pytest.mark.parametrize(
     ("given", "place"),
-    [("", "#licence"), ("all rights reserved", "#licence"), ("https://a.org/by/4.0/", "https://a.org/by/4.0/")],
+    [
+        ("", "#licence"),
+        ("all rights reserved", "#licence"),
+        ("https://a.org/by/4.0/", "https://a.org/by/4.0/"),
+    ],
 )
 def test_the_licence_is_named(given, place, folder, monkeypatch):
     monkeypatch.setenv(LICENCE, given)
@@ -148,7 +172,9 @@ def test_a_damaged_crate_is_removed(text, folder):
 def test_no_crate_appears_before_the_folder_is_whole(tmp_path, monkeypatch):
     seen = []
     rename = Path.rename
-    monkeypatch.setattr(Path, "rename", lambda part, to: seen.append(sorted(os.listdir(part))) or rename(part, to))
+    monkeypatch.setattr(
+        Path, "rename", lambda part, to: seen.append(sorted(os.listdir(part))) or rename(part, to)
+    )
     with new_run(tmp_path, "r", "k" * 8) as run:
         run.write("a.txt", "a")
         assert not (run.path / CRATE).exists()
@@ -160,15 +186,30 @@ FAULTS = [
     (lambda g: g["./"].pop("license"), "the root has no license"),
     (lambda g: g["./"].update(datePublished="today"), "datePublished is no date"),
     (lambda g: g["recipe.yaml"].update(colour="red"), "recipe.yaml: colour is not in the context"),
-    (lambda g: g["recipe.yaml"].update({"@type": "Recipes"}), "recipe.yaml: Recipes is not in the context"),
+    (
+        lambda g: g["recipe.yaml"].update({"@type": "Recipes"}),
+        "recipe.yaml: Recipes is not in the context",
+    ),
     (lambda g: g["recipe.yaml"].update(contentSize="1"), "recipe.yaml has another size than 1"),
-    (lambda g: g["recipe.yaml"].update(contentSize=9), "recipe.yaml contentSize: 9 is neither a text nor a reference"),
-    (lambda g: g["#a%20run"].update(agent={"@id": "#nobody"}), "#a%20run agent: nothing is #nobody"),
+    (
+        lambda g: g["recipe.yaml"].update(contentSize=9),
+        "recipe.yaml contentSize: 9 is neither a text nor a reference",
+    ),
+    (
+        lambda g: g["#a%20run"].update(agent={"@id": "#nobody"}),
+        "#a%20run agent: nothing is #nobody",
+    ),
     (lambda g: g["#a%20run"].update(object=[]), "the recipe is not what the command read"),
-    (lambda g: g["#a%20run"].update(startTime="2027-01-31T11:59:00.000+00:00"), "the command ended before it began"),
+    (
+        lambda g: g["#a%20run"].update(startTime="2027-01-31T11:59:00.000+00:00"),
+        "the command ended before it began",
+    ),
     (lambda g: g["./"].pop("mentions"), "the root does not mention the action"),
     (lambda g: g["./"]["hasPart"].pop(), "recipe.yaml is no part of the root"),
-    (lambda g: g.update({"#x": {"@id": "#x", "@type": "Person", "name": "x"}}), "nothing leads to #x"),
+    (
+        lambda g: g.update({"#x": {"@id": "#x", "@type": "Person", "name": "x"}}),
+        "nothing leads to #x",
+    ),
 ]
 
 
@@ -185,4 +226,6 @@ def test_a_planted_fault_is_found(harm, said, folder):
 def test_a_file_that_is_gone_or_new_is_found(folder):
     crated(folder)
     (folder / "recipe.yaml").rename(folder / "other.yaml")
-    assert {"recipe.yaml is not in the folder", "other.yaml is not in the crate"} <= set(faults(folder))
+    assert {"recipe.yaml is not in the folder", "other.yaml is not in the crate"} <= set(
+        faults(folder)
+    )

@@ -13,7 +13,10 @@ from neusee.workflows.report.run_folder import new_run
 def test_an_abandoned_folder_is_swept_and_a_young_one_is_not(tmp_path):
     ended = subprocess.Popen([sys.executable, "-S", "-c", ""])
     ended.wait()
-    old, young = tmp_path / f".2026-01-01_a_0.{ended.pid}.part", tmp_path / f".2026-01-01_b_0.{ended.pid}.part"
+    old, young = (
+        tmp_path / f".2026-01-01_a_0.{ended.pid}.part",
+        tmp_path / f".2026-01-01_b_0.{ended.pid}.part",
+    )
     for part in (old, young):
         (part / "figures").mkdir(parents=True)
         (part / "figures" / "x.png").write_bytes(b"x")
@@ -34,7 +37,10 @@ def test_a_folder_that_a_process_writes_stays_whatever_the_clock_says(tmp_path):
             os.utime(path, (0, 0))  # as if written before the clock was set
         with new_run(tmp_path, "other", "k" * 8) as other:
             other.write("b.txt", "b")
-    assert sorted(path.name[11:] for path in tmp_path.glob("2*")) == ["other_kkkkkkkk", "r_kkkkkkkk"]
+    assert sorted(path.name[11:] for path in tmp_path.glob("2*")) == [
+        "other_kkkkkkkk",
+        "r_kkkkkkkk",
+    ]
 
 
 def failing(root):

@@ -15,7 +15,9 @@ from neusee.nodes import Check, node
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step
 from neusee.workflows.placement.tasks_and_devices import Schedule, Slot
-from neusee.workflows.report import result_numbers, run_folder, run_html, run_page, run_pictures, run_timing
+from neusee.workflows.report import result_numbers, run_folder, run_page, run_pictures
+from neusee.workflows.report import run_folder as run_html
+from neusee.workflows.report import run_page as run_timing
 from neusee.workflows.report.run_folder import find_run, new_run
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
@@ -95,12 +97,16 @@ def recipe(value: float = 3.0, promised: float = 6.0) -> Recipe:
         "truth": Step("truth", doubled, {}, {"x": "number"}, mark, {}),
     }
     expect = (Expectation("twice & more", "truth", (0,), promised, 0.01, mark),)
-    return Recipe("small", "A <b>small</b> recipe.", 5, 1e-3, ("truth",), steps, expect, notes=("a < b",))
+    return Recipe(
+        "small", "A <b>small</b> recipe.", 5, 1e-3, ("truth",), steps, expect, notes=("a < b",)
+    )
 
 
 @pytest.fixture
 def done(tmp_path):
-    return simulate(recipe(), Store(tmp_path / "cache"), tmp_path / "runs", ["neusee", "run", "small", "a=1 m"])
+    return simulate(
+        recipe(), Store(tmp_path / "cache"), tmp_path / "runs", ["neusee", "run", "small", "a=1 m"]
+    )
 
 
 class Reader(HTMLParser):
@@ -187,7 +193,16 @@ def test_sentences_have_room_beside_wide_columns_and_show_no_backticks(done):
 def test_a_section_without_a_figure_is_left_out_and_its_reason_is_a_note(done):
     text = done.page.read_text()
     headings = re.findall(r'<h2 id="([a-z-]+)">', text)
-    assert headings == ["results", "notes", "left-out", "graph", "time", "steps", "provenance", "again"]
+    assert headings == [
+        "results",
+        "notes",
+        "left-out",
+        "graph",
+        "time",
+        "steps",
+        "provenance",
+        "again",
+    ]
     assert re.findall(r'<a href="#([a-z-]+)">', text) == headings
     (line,) = re.findall(r"<li>Not drawn: (.*)</li>", text)
     assert "Point-spread functions (the recipe has no step" in line
@@ -195,10 +210,17 @@ def test_a_section_without_a_figure_is_left_out_and_its_reason_is_a_note(done):
 
 
 def test_a_reason_and_a_check_share_a_column_that_wraps(done):
-    step = {**done.document["steps"][0], "state": "left out", "why": "changes at most 0", "checks": [{"text": "a < b",
-            "ok": True}]}  # fmt: skip
+    step = {
+        **done.document["steps"][0],
+        "state": "left out",
+        "why": "changes at most 0",
+        "checks": [{"text": "a < b", "ok": True}],
+    }
     text = run_html.page({**done.document, "steps": [step]}, {})
-    assert '<td class="check"><span class="soft">changes at most 0</span>; <span>a &lt; b</span></td>' in text
+    assert (
+        '<td class="check"><span class="soft">changes at most 0</span>; <span>a &lt; b</span></td>'
+        in text
+    )
     assert "nowrap" not in re.search(r"td\.check \{(.*?)\}", text)[1]
 
 
@@ -210,7 +232,12 @@ def test_a_short_time_is_not_shown_as_none(done):
 
 
 def test_a_truth_value_is_written_as_a_recipe_writes_it():
-    assert [run_page._written(value) for value in (True, False, "once", 0.1)] == ["true", "false", "once", "0.1"]
+    assert [run_page._written(value) for value in (True, False, "once", 0.1)] == [
+        "true",
+        "false",
+        "once",
+        "0.1",
+    ]
 
 
 def _luminance(colour: str) -> float:
@@ -233,7 +260,9 @@ def test_text_stands_out_from_its_ground(done):
     ]
     for colours in (dict(re.findall(r"--([\w-]+): (#\w{6})", block)) for block in blocks):
         for ink, ground in pairs:
-            light, dark = sorted((_luminance(colours[ink]), _luminance(colours[ground])), reverse=True)
+            light, dark = sorted(
+                (_luminance(colours[ink]), _luminance(colours[ground])), reverse=True
+            )
             assert (light + 0.05) / (dark + 0.05) >= (7 if ink != "link" else 4.5), (ink, ground)
 
 
@@ -260,14 +289,20 @@ def test_outputs_read_back_as_they_are(done):
     assert torch.equal(tensors["truth"], torch.tensor([6.0, 12.0], dtype=torch.float64))
 
 
-@pytest.mark.parametrize(("promised", "met"), [(6.0, True), (6.05, True), (6.1, False), (-6.0, False)])
+@pytest.mark.parametrize(
+    ("promised", "met"), [(6.0, True), (6.05, True), (6.1, False), (-6.0, False)]
+)
 def test_expected_numbers_are_met_or_missed(promised, met):
-    rows = result_numbers.expected(recipe(promised=promised), lambda step: torch.tensor([6.0, 12.0]))
+    rows = result_numbers.expected(
+        recipe(promised=promised), lambda step: torch.tensor([6.0, 12.0])
+    )
     assert [r["ok"] for r in rows] == [met]
 
 
 def test_a_number_that_is_none_is_missed():
-    rows = result_numbers.expected(recipe(promised=6.0), lambda step: torch.tensor([float("nan"), 12.0]))
+    rows = result_numbers.expected(
+        recipe(promised=6.0), lambda step: torch.tensor([float("nan"), 12.0])
+    )
     assert not rows[0]["ok"]
 
 
@@ -314,12 +349,18 @@ def test_the_unit_of_a_result_is_read_from_the_docstring(line, unit):
     assert run_page.unit_of(f"Say.\n\n    {line}\n") == unit
 
 
-# --- time -------------------------------------------------------------------------------------------------------------
+# --- time -----------------------------------------------------------------------------------------
 
 
 def row(step, state="run", seconds=0.0, began=0.0, predicted=None, key=None, **more):
     made = {"made_in": seconds, "bytes": 1000, "kept": True}
-    return {"step": step, "state": state, "seconds": seconds, "began": began, "predicted": predicted} | {
+    return {
+        "step": step,
+        "state": state,
+        "seconds": seconds,
+        "began": began,
+        "predicted": predicted,
+    } | {
         "key": key or step,
         **made,
         **more,
@@ -389,14 +430,19 @@ def test_a_page_of_before_there_was_an_account_of_time_is_still_written(done):
     path.write_text(json.dumps(doc))
     page = run_html.rebuild(done.folder)
     assert "Time" in page.read_text()
-    (entry,) = [e for e in json.loads((done.folder / "ro-crate-metadata.json").read_text())["@graph"]
-                if e["@id"] == "report.html"]  # fmt: skip
+    (entry,) = [
+        e
+        for e in json.loads((done.folder / "ro-crate-metadata.json").read_text())["@graph"]
+        if e["@id"] == "report.html"
+    ]
     assert entry["contentSize"] == str(page.stat().st_size)
 
 
 def test_the_page_shows_what_each_step_was_expected_to_take(done):
     text = done.page.read_text()
-    assert text.count(" expected</span>") == sum(s["predicted"] is not None for s in done.document["steps"])
+    assert text.count(" expected</span>") == sum(
+        s["predicted"] is not None for s in done.document["steps"]
+    )
     doc = dict(done.document)
     doc["steps"] = [{**s, "predicted": 1.25} for s in doc["steps"]]
     assert run_html.page(doc, {}).count("1.250 expected</span>") == 2
@@ -404,7 +450,10 @@ def test_the_page_shows_what_each_step_was_expected_to_take(done):
 
 def test_every_row_of_the_page_has_a_cell_for_each_column(done):
     for body in re.findall(r"<table.*?</table>", done.page.read_text(), re.DOTALL):
-        counts = [len(re.findall(r"<t[hd][ >]", row)) for row in re.findall(r"<tr>.*?</tr>", body, re.DOTALL)]
+        counts = [
+            len(re.findall(r"<t[hd][ >]", row))
+            for row in re.findall(r"<tr>.*?</tr>", body, re.DOTALL)
+        ]
         assert len(set(counts)) <= 1, body[:200]
 
 
@@ -412,22 +461,35 @@ def test_the_run_is_drawn_over_time_unless_nothing_ran(done, tmp_path):
     assert "data:image/png" in done.page.read_text().split('id="time"')[1].split('id="steps"')[0]
     again = simulate(recipe(), Store(tmp_path / "cache"), tmp_path / "runs", ["neusee", "run"])
     assert not (again.folder / "figures" / "timeline.png").exists()
-    assert "data:image/png" not in again.page.read_text().split('id="time"')[1].split('id="steps"')[0]
+    assert (
+        "data:image/png" not in again.page.read_text().split('id="time"')[1].split('id="steps"')[0]
+    )
     assert "timeline" not in {f["name"] for f in again.document["figures"]}
 
 
 def test_only_what_was_known_is_drawn_as_the_plan(tmp_path):
     result = recipe().run(Store(tmp_path / "cache"))
     told = {
-        "number": replace(result.done["number"], predicted=1.0, began=5.0, seconds=2.0, lane="cpu:1"),
-        "truth": replace(result.done["truth"], predicted=None, began=7.0, seconds=1.0, lane="cpu:1"),
+        "number": replace(
+            result.done["number"], predicted=1.0, began=5.0, seconds=2.0, lane="cpu:1"
+        ),
+        "truth": replace(
+            result.done["truth"], predicted=None, began=7.0, seconds=1.0, lane="cpu:1"
+        ),
     }
-    plan = Schedule((Slot("number", "cpu:1", 0.0, 1.0), Slot("truth", "cpu:1", 1.0, 99.0)), 99.0, {"cpu:1": 0.0}, 0.0)
+    plan = Schedule(
+        (Slot("number", "cpu:1", 0.0, 1.0), Slot("truth", "cpu:1", 1.0, 99.0)),
+        99.0,
+        {"cpu:1": 0.0},
+        0.0,
+    )
     seen = run_pictures.timeline(replace(result, done=told, schedule=plan))
     assert seen["rows"] == [("number", "cpu:1", 0.0, 2.0), ("truth", "cpu:1", 2.0, 1.0)]
     assert [slot.task for slot in seen["schedule"].slots] == ["number"]
     told = {name: replace(done, predicted=1.5) for name, done in told.items()}
-    seen = run_pictures.timeline(replace(result, done=told, schedule=replace(plan, slots=plan.slots[:1])))
+    seen = run_pictures.timeline(
+        replace(result, done=told, schedule=replace(plan, slots=plan.slots[:1]))
+    )
     assert [(s.task, s.device, s.start, s.end, s.after) for s in seen["schedule"].slots] == [
         ("number", "cpu:1", 0.0, 1.5, ""),
         ("truth", "cpu:1", 1.5, 3.0, "number"),
@@ -439,9 +501,16 @@ def test_only_what_was_known_is_drawn_as_the_plan(tmp_path):
 def test_a_guess_leaves_no_gap_in_the_plan_that_is_drawn(tmp_path):
     result = recipe().run(Store(tmp_path / "cache"))
     told = {
-        "number": replace(result.done["number"], predicted=None, began=5.0, seconds=2.0, lane="cpu"),
+        "number": replace(
+            result.done["number"], predicted=None, began=5.0, seconds=2.0, lane="cpu"
+        ),
         "truth": replace(result.done["truth"], predicted=1.0, began=7.0, seconds=1.0, lane="cpu"),
     }
-    plan = Schedule((Slot("number", "cpu", 0.0, 99.0), Slot("truth", "cpu", 99.0, 100.0)), 100.0, {"cpu": 0.0}, 0.0)
+    plan = Schedule(
+        (Slot("number", "cpu", 0.0, 99.0), Slot("truth", "cpu", 99.0, 100.0)),
+        100.0,
+        {"cpu": 0.0},
+        0.0,
+    )
     seen = run_pictures.timeline(replace(result, done=told, schedule=plan))
     assert [(s.task, s.start, s.end) for s in seen["schedule"].slots] == [("truth", 0.0, 1.0)]

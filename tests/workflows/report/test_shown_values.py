@@ -1,4 +1,6 @@
-"""Memory of the report: a value is there from its first picture to its last, and a limit stops the report."""
+"""Memory of the report: a value is there from its first picture to its last, and a limit stops
+the report.
+"""
 
 import gc
 import threading
@@ -13,9 +15,9 @@ from neusee.workflows.engine.local_executor import program_memory
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
-from neusee.workflows.report import shown_values
+from neusee.workflows.report import run_pictures as shown_values
 from neusee.workflows.report.run_folder import NotWritten
-from neusee.workflows.report.shown_values import in_turn
+from neusee.workflows.report.run_pictures import in_turn
 from neusee.workflows.simulation import simulate_recipe
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
@@ -37,7 +39,12 @@ def recipe(outputs=("out",)):
     at = Location("t.yaml", 1, 1)
     values = {"out": 1.0, "a": 2.0, "b": 3.0}
     return Recipe(
-        "t", "", 1, 0.0, outputs, {name: Step(name, level, {"value": v}, {}, at, {}) for name, v in values.items()}
+        "t",
+        "",
+        1,
+        0.0,
+        outputs,
+        {name: Step(name, level, {"value": v}, {}, at, {}) for name, v in values.items()},
     )
 
 
@@ -55,7 +62,8 @@ def made(tmp_path):
 
 def test_every_group_gets_its_values_and_no_value_outlives_its_last_group(made):
     groups, seen, there = [["a"], ["a", "out"], ["b"], ["out"]], [], {}
-    gc.freeze()  # each collection looks at what is made from here on, not at all that other tests left
+    # each collection looks at what is made from here on, not at all that other tests left
+    gc.freeze()
     for group, values in zip(groups, in_turn(groups, made), strict=True):
         gc.collect()
         seen.append({name: float(value[0]) for name, value in values.items()})
@@ -103,8 +111,12 @@ def test_a_stored_value_that_was_lost_is_computed_again(made, asked, monkeypatch
     assert (values, asked) == ([2.0], [["a"]])
 
 
-def test_a_report_that_takes_more_than_the_limit_is_stopped_and_leaves_no_folder(tmp_path, monkeypatch):
-    """Measured before: a report took 1821 MB where the limit was 1694 MB, and the run ended with exit code 0."""
+def test_a_report_that_takes_more_than_the_limit_is_stopped_and_leaves_no_folder(
+    tmp_path, monkeypatch
+):
+    """Measured before: a report took 1821 MB where the limit was 1694 MB, and the run ended with
+    exit code 0.
+    """
 
     def hoard(*_):
         held = []
@@ -116,7 +128,11 @@ def test_a_report_that_takes_more_than_the_limit_is_stopped_and_leaves_no_folder
     run(recipe(), Store(tmp_path / "cache"))
     monkeypatch.setattr(simulate_recipe, "pictures", hoard)
     limit = program_memory() + 300 * MB
-    with pytest.raises(NotWritten, match=r"the report was stopped, .*: the process holds .* the limit is "):
-        simulate(recipe(), Store(tmp_path / "cache"), tmp_path / "runs", ["neusee", "run"], memory=limit)
+    with pytest.raises(
+        NotWritten, match=r"the report was stopped, .*: the process holds .* the limit is "
+    ):
+        simulate(
+            recipe(), Store(tmp_path / "cache"), tmp_path / "runs", ["neusee", "run"], memory=limit
+        )
     assert list((tmp_path / "runs").glob("*")) == []
     assert run(recipe(), Store(tmp_path / "cache")).done["out"].state == "cached"

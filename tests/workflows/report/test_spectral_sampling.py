@@ -1,17 +1,28 @@
-"""The report of a run states the error by the number of bands beside the tolerance, and warns where it is larger."""
+"""The report of a run states the error by the number of bands beside the tolerance, and warns
+where it is larger.
+"""
 
 import pytest
 
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
-from neusee.workflows.report import contents, run_html, run_page
+from neusee.workflows.report import contents, run_page
+from neusee.workflows.report import run_folder as run_html
 from neusee.workflows.report.console import closing
-from neusee.workflows.report.spectral_sampling import spectral_error
+from neusee.workflows.report.tolerance_spent import spectral_error
 from neusee.workflows.store.result_store import Store
 
-SMALL = ["optics.samples=128", "optics.pitch=60 um", "optics.window=[64, 64]", "sensor.shape=[48, 48]",
-         "scene.shape=[64, 64]", "restore=null", "steps.restored_quality=null", "outputs=[lsr, outside, raw]",
-         "optics.bands=5"]  # fmt: skip
+SMALL = [
+    "optics.samples=128",
+    "optics.pitch=60 um",
+    "optics.window=[64, 64]",
+    "sensor.shape=[48, 48]",
+    "scene.shape=[64, 64]",
+    "restore=null",
+    "steps.restored_quality=null",
+    "outputs=[lsr, outside, raw]",
+    "optics.bands=5",
+]
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +42,10 @@ def test_an_error_larger_than_the_tolerance_is_a_warning(store):
     assert all(error > 1e-3 for error in errors.values())
     assert doc["spectral"]["larger"]
     line = next(line for line in closing(doc, "report.html", []) if line.startswith("bands"))
-    assert f"LOOK: error by the number of bands: {errors['of the PSF of a white point']:.1e} of the PSF" in line
+    assert (
+        f"LOOK: error by the number of bands: {errors['of the PSF of a white point']:.1e} of"
+        " the PSF" in line
+    )
     assert "larger than the tolerance 0.001, which is relative to the bands of the recipe" in line
     assert "This error is larger than the tolerance of 0.001" in run_html.page(doc, {})
     rows = {(step, index): number for step, _, index, number in doc["metrics"]}

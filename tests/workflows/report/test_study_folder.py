@@ -1,4 +1,6 @@
-"""The folder of a study: document, page, pictures and tables are there together, or the folder is not."""
+"""The folder of a study: document, page, pictures and tables are there together, or the folder
+is not.
+"""
 
 import csv
 import json
@@ -14,7 +16,8 @@ from neusee.workflows.report.study_page import Section
 def recipe(write, tmp_path):
     return load(
         write(
-            "steps: {bands: {node: spectra.bands, with: {start: 400 nm, stop: 700 nm, count: 3}}}\noutputs: [bands]\n"
+            "steps: {bands: {node: spectra.bands, with: {start: 400 nm, stop: 700 nm, count:"
+            " 3}}}\noutputs: [bands]\n"
         ),
         folder=tmp_path,
     )
@@ -29,7 +32,11 @@ def test_a_folder_has_the_document_the_page_and_all_files(recipe, tmp_path):
         [Section("A part", "Its text.")],
         pictures={"drawn": b"PNG", "not drawn": None},
         tables={"table.csv": (("a", "b"), [(1, 2.5)])},
-        files={"text.txt": "x", "bytes.bin": b"y", "by_path.txt": lambda path: path.write_text("z")},
+        files={
+            "text.txt": "x",
+            "bytes.bin": b"y",
+            "by_path.txt": lambda path: path.write_text("z"),
+        },
         shown=("command", "tolerance"),
         banner="Not fit for use.",
     )
@@ -37,8 +44,20 @@ def test_a_folder_has_the_document_the_page_and_all_files(recipe, tmp_path):
     assert folder.name.endswith(f"_{recipe.name}_leave_out_01234567")
     names = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
     written = {"text.txt", "bytes.bin", "by_path.txt", "table.csv", "figures/drawn.png"}
-    assert names == {"report.html", "provenance.json", "recipe.yaml", "ro-crate-metadata.json"} | written
-    assert list(csv.reader((folder / "table.csv").read_text().splitlines())) == [["a", "b"], ["1", "2.5"]]
+    assert (
+        names
+        == {
+            "report.html",
+            "provenance.json",
+            "recipe.yaml",
+            "ro-crate-metadata.json",
+        }
+        | written
+    )
+    assert list(csv.reader((folder / "table.csv").read_text().splitlines())) == [
+        ["a", "b"],
+        ["1", "2.5"],
+    ]
     found = json.loads((folder / "provenance.json").read_text())
     assert found == document
     assert list(found)[:5] == ["study", "recipe", "command", "date", "seconds"]
@@ -58,7 +77,12 @@ def test_a_study_that_cannot_be_written_leaves_no_folder(recipe, tmp_path):
         raise OSError("disk full")
 
     with pytest.raises(OSError, match="disk full"):
-        study.write(tmp_path / "runs", "0" * 8, study.document({}), StudyReport("", "", [], files={"a": fail}))
+        study.write(
+            tmp_path / "runs",
+            "0" * 8,
+            study.document({}),
+            StudyReport("", "", [], files={"a": fail}),
+        )
     assert not list((tmp_path / "runs").iterdir())
 
 

@@ -24,7 +24,9 @@ class Cells(HTMLParser):
         self._class = found.get("class") or "" if tag == "td" else None
         if tag == "img":
             self.pictures.append(found["src"])
-        self.fetched += [found[a] for a in ("src", "href") if not found.get(a, "#").startswith(("#", "data:"))]
+        self.fetched += [
+            found[a] for a in ("src", "href") if not found.get(a, "#").startswith(("#", "data:"))
+        ]
 
     def handle_data(self, data):
         if self._class is not None:
@@ -33,7 +35,13 @@ class Cells(HTMLParser):
 
 
 def made(**how):
-    section = Section("Cases", "One.\n\nTwo <b>.", ("case", "error"), [["dark", 1.23456e-4], ["<one>", None]], **how)
+    section = Section(
+        "Cases",
+        "One.\n\nTwo <b>.",
+        ("case", "error"),
+        [["dark", 1.23456e-4], ["<one>", None]],
+        **how,
+    )
     return page("Study of x", "It holds.", [section], {"neusee": "0.1", "seeds": [1, 2]})
 
 
@@ -44,7 +52,10 @@ def test_cells_hold_numbers_to_three_digits_and_marks_as_classes():
 
 
 def test_a_mark_where_there_is_no_cell_is_refused():
-    with pytest.raises(ValueError, match=r"Cases: the pass, warn or fail mark at row 2, column 0 is outside the table"):
+    with pytest.raises(
+        ValueError,
+        match=r"Cases: the pass, warn or fail mark at row 2, column 0 is outside the table",
+    ):
         made(marks={(2, 0): "fail"})
 
 
@@ -74,7 +85,8 @@ def contrast(ink, paper):
 
 def test_every_ink_is_read_on_its_ground_in_light_and_in_dark():
     schemes = [
-        dict(re.findall(r"--([\w-]+): (#\w{6})", block)) for block in re.findall(r":root \{(.*?)\}", made(), re.S)
+        dict(re.findall(r"--([\w-]+): (#\w{6})", block))
+        for block in re.findall(r":root \{(.*?)\}", made(), re.S)
     ]
     assert len(schemes) == 2
     for colours in schemes:
@@ -83,13 +95,17 @@ def test_every_ink_is_read_on_its_ground_in_light_and_in_dark():
         assert min(contrast(colours[a], colours[b]) for a, b in pairs) >= 4.5  # WCAG 2.1, level AA
 
 
-@pytest.mark.parametrize(("value", "text"), [(3, "3"), (True, "yes"), (2.0, "2"), (1e-9, "1e-09"), ("a", "a")])
+@pytest.mark.parametrize(
+    ("value", "text"), [(3, "3"), (True, "yes"), (2.0, "2"), (1e-9, "1e-09"), ("a", "a")]
+)
 def test_what_a_cell_says(value, text):
     assert said(value) == text
 
 
 def test_words_between_backticks_are_code_and_a_sign_stays_beside_its_word():
-    text = page("t", "of `a` and `<b>`", [Section("s", "", ("c",), [("yes",)], marks={(0, 0): "pass"})], {})
+    text = page(
+        "t", "of `a` and `<b>`", [Section("s", "", ("c",), [("yes",)], marks={(0, 0): "pass"})], {}
+    )
     assert "<p>of <code>a</code> and <code>&lt;b&gt;</code></p>" in text
     assert 'td.pass::before { content: "✓\\a0"; }' in text
 
@@ -106,11 +122,15 @@ def test_a_dash_stands_below_the_numbers_of_its_column():
 
 def test_a_figure_has_a_text_that_says_what_it_shows():
     section = Section("Curves", "The middle 90 % of the draws. Less.\n\nMore.", picture=b"PNG")
-    assert '<img alt="Figure: Curves. The middle 90 % of the draws."' in page("a", "b", [section], {})
+    assert '<img alt="Figure: Curves. The middle 90 % of the draws."' in page(
+        "a", "b", [section], {}
+    )
 
 
 def test_provenance_is_text_without_braces_and_without_empty_rows():
-    text = page("a", "b", [], {"versions": {"python": "3.12", "torch": 2.5}, "command": "", "seeds": [1, 2]})
+    text = page(
+        "a", "b", [], {"versions": {"python": "3.12", "torch": 2.5}, "command": "", "seeds": [1, 2]}
+    )
     assert re.findall(r"<th>(\w+)</th><td class=\"key\">(.*?)</td>", text) == [
         ("versions", "python 3.12, torch 2.5"),
         ("seeds", "1, 2"),
@@ -132,12 +152,16 @@ def test_a_number_does_not_break_at_its_hyphen():
 def test_a_long_name_may_go_on_in_a_new_line_and_a_number_may_not():
     rows = [["developed_quality[mask]", "raw[plain]", "a < b_c", "-1.2345678901234567e-05"]]
     text = page("a", "b", [Section("h", "", tuple("wxyz"), rows)], {})
-    assert "<td>developed_<wbr>quality<wbr>[mask]</td><td>raw[plain]</td><td>a &lt; b_c</td>" in text
+    assert (
+        "<td>developed_<wbr>quality<wbr>[mask]</td><td>raw[plain]</td><td>a &lt; b_c</td>" in text
+    )
     assert text.count("<wbr>") == 2
 
 
 def test_a_mapping_inside_a_mapping_has_brackets():
-    text = page("a", "b", [], {"settings": {"weights": {"lsr": 2, "bsr": 1}, "at": "", "slopes": [4, 48]}})
+    text = page(
+        "a", "b", [], {"settings": {"weights": {"lsr": 2, "bsr": 1}, "at": "", "slopes": [4, 48]}}
+    )
     assert "weights (lsr 2, bsr 1), at –, slopes (4, 48)" in text
 
 

@@ -1,4 +1,6 @@
-"""The page says what was left out, what that may change at most, and, where it was run in full, what it did change."""
+"""The page says what was left out, what that may change at most, and, where it was run in full,
+what it did change.
+"""
 
 import json
 from dataclasses import replace
@@ -9,11 +11,11 @@ from typer.testing import CliRunner
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
 from neusee.workflows.engine.runner import run
-from neusee.workflows.report import run_html
+from neusee.workflows.report import run_folder as run_html
 from neusee.workflows.report.tolerance_spent import said_of_errors, spent
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.leave_out.omission_rows import OmissionComparison
+from neusee.workflows.studies.leave_out.left_out_steps import OmissionComparison
 from neusee.workflows.tolerance import cheaper_steps
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 from neusee.workflows.tolerance.error_norm import error_of
@@ -59,7 +61,10 @@ def test_sums_over_bands_stand_in_for_images_that_nobody_asks_for(recipe):
 
 
 def test_the_well_is_summed_only_where_it_is_asked_for(recipe):
-    for outputs, rows in ((["raw[mask]"], "responses.rows"), (["raw[mask]", "peak[mask]"], "responses.wells")):
+    for outputs, rows in (
+        (["raw[mask]"], "responses.rows"),
+        (["raw[mask]", "peak[mask]"], "responses.wells"),
+    ):
         found = with_substitutions(recipe, outputs)
         assert found.steps["image[mask].channels"].wires["rows"] == rows
         assert found.steps[rows].params["well"] == (rows == "responses.wells")
@@ -73,7 +78,9 @@ def test_an_image_that_is_asked_for_is_whole(recipe, warm):
 
 
 @pytest.mark.parametrize(
-    "change", [{"exact": True}, {"tolerance": 0.0}, {"tolerance": 1e-5}], ids=["keep all", "no tolerance", "fine"]
+    "change",
+    [{"exact": True}, {"tolerance": 0.0}, {"tolerance": 1e-5}],
+    ids=["keep all", "no tolerance", "fine"],
 )
 def test_nothing_stands_in_where_nothing_may(recipe, change):
     whole = replace(recipe, **change)
@@ -106,7 +113,9 @@ def test_a_large_tolerance_spoils_no_figure_of_merit(recipe, warm):
     assert (spent(result)["held"], spent(full)["held"]) == (1e-3, recipe.tolerance)
     assert result.proof.worst <= 1e-3
     for arm in ("plain", "mask"):
-        assert error_of(result[f"developed_quality[{arm}]"], full[f"developed_quality[{arm}]"]) <= 0.1
+        assert (
+            error_of(result[f"developed_quality[{arm}]"], full[f"developed_quality[{arm}]"]) <= 0.1
+        )
     assert run(wide, warm, ["raw[plain]"]).recipe.limit("raw[plain]") == 0.1
 
 
@@ -116,7 +125,9 @@ def test_what_a_cheaper_step_says_and_took_is_said_again_from_the_cache(recipe, 
     assert {record.state for record in again.done.values()} <= {"cached", "not needed", "left out"}
     assert all(each["what"] and each["seconds"] for each in first if each["instead"])
     for name in ("what", "seconds", "bound", "instead", "why"):
-        assert [each[name] for each in spent(again)["economies"]] == [each[name] for each in first], name
+        assert [each[name] for each in spent(again)["economies"]] == [
+            each[name] for each in first
+        ], name
 
 
 def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
@@ -130,9 +141,12 @@ def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
     assert measured["raw[mask]"] == error_of(result["raw[mask]"], full["raw[mask]"])
     economy = after["economies"][0]
     alike = [
-        step.seconds for name, step in full.done.items() if name.startswith(economy["step"].partition("[")[0] + "[")
+        step.seconds
+        for name, step in full.done.items()
+        if name.startswith(economy["step"].partition("[")[0] + "[")
     ]
-    assert min(alike) - 1e-9 <= economy["full_seconds"] <= max(alike) + 1e-9  # arms of one size are one measurement
+    # arms of one size are one measurement
+    assert min(alike) - 1e-9 <= economy["full_seconds"] <= max(alike) + 1e-9
     assert spent(full)["economies"] == []
     assert spent(full)["exact"]
     assert f"measured beside --exact: {max(measured.values()):.1e}" in said_of_errors(after)
@@ -143,7 +157,9 @@ def test_measured_errors_stand_where_the_full_run_is_stored(recipe, store):
 @pytest.mark.slow
 def test_the_command_line_shows_what_stands_in(tmp_path, monkeypatch):
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
-    done = CliRunner().invoke(app, ["run", "first_light", *SMALL, "--out", str(tmp_path / "runs")])
+    done = CliRunner().invoke(
+        app, ["run", "first_light", *SMALL, "outputs=[raw]", "--out", str(tmp_path / "runs")]
+    )
     assert done.exit_code == 0, done.output
     assert "cube.mixture" in done.output
     assert "cheaper  image[mask] (at most" in done.output
@@ -153,7 +169,15 @@ def test_the_command_line_shows_what_stands_in(tmp_path, monkeypatch):
 def test_the_command_line_shows_a_run_that_could_not_prove_its_tolerance(tmp_path, monkeypatch):
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(cheaper_steps, "_LEAST", 0.0)  # so fine a tolerance would not even be tried
-    words = ["run", "first_light", *SMALL, "tolerance=1e-7", "--out", str(tmp_path / "runs")]
+    words = [
+        "run",
+        "first_light",
+        *SMALL,
+        "tolerance=1e-7",
+        "outputs=[raw]",
+        "--out",
+        str(tmp_path / "runs"),
+    ]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
     assert "cheaper" not in done.output
@@ -172,7 +196,9 @@ def test_the_page_says_it(recipe, warm, tmp_path):
     assert max(doc["spent"]["bounds"].values()) <= recipe.tolerance
     whole = simulate(replace(recipe, exact=True), warm, tmp_path / "runs", ["neusee"])
     assert "every step was computed in full" in whole.page.read_text()
-    assert "measured beside --exact" in run_html.page({**doc, "spent": spent(run(recipe, warm))}, {})
+    assert "measured beside --exact" in run_html.page(
+        {**doc, "spent": spent(run(recipe, warm))}, {}
+    )
 
 
 def account_of(*rows):
@@ -181,11 +207,14 @@ def account_of(*rows):
 
 
 def test_a_measurement_of_some_outputs_is_not_that_of_all():
-    """The photons of a recipe were off by 5.3e-6, its pictures by 2e-3, and the terminal said "measured 5.3e-06"."""
+    """The photons of a recipe were off by 5.3e-6, its pictures by 2e-3, and the terminal said
+    "measured 5.3e-06".
+    """
     account = account_of(("photons", 7.4e-6, "proved", 5.3e-6), ("raw", 4.6e-3, "estimated", None))
-    assert said_of_errors(account) == (
-        "error    7.4e-06 in photons at most, proved; 4.6e-03 in raw, an estimate that 95% of errors do not exceed; "
-        "measured beside --exact: 5.3e-06 in photons; not measured: raw"
+    assert (
+        said_of_errors(account)
+        == "error    7.4e-06 in photons at most, proved; 4.6e-03 in raw, an estimate that 95% of"
+        " errors do not exceed; measured beside --exact: 5.3e-06 in photons; not measured: raw"
     )
 
 
@@ -199,4 +228,8 @@ def test_study_and_run_state_the_same_error(recipe, warm):
     rows = {row["output"]: row for row in spent(run(recipe, warm))["outputs"]}
     for output in OmissionComparison(recipe, warm).output_errors():
         row = rows[output.output]
-        assert (output.bound, output.kind, output.rms) == (row["error"], row["kind"], row["measured"])
+        assert (output.bound, output.kind, output.rms) == (
+            row["error"],
+            row["kind"],
+            row["measured"],
+        )

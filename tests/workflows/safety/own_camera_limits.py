@@ -1,12 +1,14 @@
-"""Distances of damage, saturation and eye of a Gaussian beam and a plain lens, without a line of the project.
+"""Distances of damage, saturation and eye of a Gaussian beam and a plain lens, without a line of
+the project.
 
-With |U|^2 of `own_camera_spots` at v = pi D r / (lambda f), the sensor has for each watt of the laser
+With |U|^2 of `own_camera_spots` at v = pi D r / (lambda f), the sensor has for each watt of the
+laser
 
     E(v) = tau T 2 / (pi w^2) (pi D^2 / (4 lambda f))^2 |U(v)|^2
 
-Damage is expected where the peak reaches the published threshold, or where the hottest point is as warm as under the
-published Gaussian spot at its threshold. A pixel is full where the mean over its area fills it.
-All quantities are in SI units; every setting may be an array of draws.
+Damage is expected where the peak reaches the published threshold, or where the hottest point is as
+warm as under the published Gaussian spot at its threshold. A pixel is full where the mean over its
+area fills it. All quantities are in SI units; every setting may be an array of draws.
 """
 
 import math
@@ -82,11 +84,15 @@ def reach_of_heat(diameter: Floats | float, seconds: Floats | float) -> Floats:
 
 
 def fluence(seconds: Floats | float, diameter: Floats, place: int) -> Floats:
-    """Return the green threshold in J/m2: an end or the middle of the published bracket, for a heated spot."""
+    """Return the green threshold in J/m2: an end or the middle of the published bracket, for a
+    heated spot.
+    """
     time = np.asarray(seconds, float)
 
     def steady(when: Floats) -> Floats:
-        wide = reach_of_heat(GREEN_SPOT, when) / reach_of_heat(np.maximum(diameter, GREEN_SPOT), when)
+        wide = reach_of_heat(GREEN_SPOT, when) / reach_of_heat(
+            np.maximum(diameter, GREEN_SPOT), when
+        )
         return STEADY * when * wide
 
     join = steady(np.full_like(time, 1e-5))
@@ -107,7 +113,9 @@ def colour_factor(wavelength: float, place: int) -> float:
 
 
 def damage_ratios(given: Settings, metres: Floats, spots: Spots, place: int) -> dict[str, Floats]:
-    """Return exposure over threshold of each part of the light, with the bracket at one of its places."""
+    """Return exposure over threshold of each part of the light, with the bracket at one of its
+    places.
+    """
     fill, waves = taper_and_defocus(given, metres)
     bound, unit = envelope(fill, waves), axis_unit(given, metres)
     peak = spots.peak * bound
@@ -124,7 +132,11 @@ def damage_ratios(given: Settings, metres: Floats, spots: Spots, place: int) -> 
     dose = given["energy"] * unit * peak * share
     once = dose / (fluence(seconds, heated, place) * colour)
     mean = dose * rate / steady
-    return {"pulse": once, "mean": mean, "accumulation": once * (1 - np.minimum(1, seconds * rate)) + mean}
+    return {
+        "pulse": once,
+        "mean": mean,
+        "accumulation": once * (1 - np.minimum(1, seconds * rate)) + mean,
+    }
 
 
 def saturation_ratio(given: Settings, metres: Floats, spots: Spots) -> Floats:
@@ -141,10 +153,18 @@ def saturation_ratio(given: Settings, metres: Floats, spots: Spots) -> Floats:
 
 
 def eye_exposure(wavelength: float, seconds: float) -> float:
-    """Return the largest exposure in J/m2 by IEC 60825-1 of a small source, without its blue-light rule."""
+    """Return the largest exposure in J/m2 by IEC 60825-1 of a small source, without its
+    blue-light rule.
+    """
     nm = wavelength * 1e9
     if nm >= 1400:
-        return 1e4 if 1500 <= nm < 1800 else 5600 * max(seconds, 1e-3) ** 0.25 if seconds > 1e-3 else 1e3
+        return (
+            1e4
+            if 1500 <= nm < 1800
+            else 5600 * max(seconds, 1e-3) ** 0.25
+            if seconds > 1e-3
+            else 1e3
+        )
     infrared = 10 ** (0.002 * (nm - 700)) if nm > 700 else 1.0
     water = 10 ** (0.018 * (nm - 1150)) if nm > 1150 else 1.0
     if nm >= 1050:
@@ -153,16 +173,26 @@ def eye_exposure(wavelength: float, seconds: float) -> float:
 
 
 def eye_distance(given: Settings) -> Floats | float:
-    """Return the distance from which on an eye is safe in clear air, of continuous light or of a single pulse."""
+    """Return the distance from which on an eye is safe in clear air, of continuous light or of a
+    single pulse.
+    """
     wavelength = float(np.mean(given["wavelength"]))
     visible = wavelength < 700e-9
     seconds = (0.25 if visible else 10.0) if "power" in given else float(np.mean(given["duration"]))
     limit = eye_exposure(wavelength, seconds)
     joule = given["power"] * seconds if "power" in given else given["energy"]
-    aperture = 7e-3 if wavelength < 1400e-9 else 1e-3 if seconds <= 0.35 else 1.5e-3 * min(seconds, 10.0) ** 0.375
+    aperture = (
+        7e-3
+        if wavelength < 1400e-9
+        else 1e-3
+        if seconds <= 0.35
+        else 1.5e-3 * min(seconds, 10.0) ** 0.375
+    )
     share = math.pi * aperture**2 / 4 * limit / np.asarray(joule, float)
     square = np.where(share < 1, -(aperture**2) / 2 / np.log1p(-np.minimum(share, 1 - 1e-15)), 0.0)
-    return 2 / given["divergence"] * np.sqrt(np.maximum(square - np.asarray(waist_of(given)) ** 2, 0))
+    return (
+        2 / given["divergence"] * np.sqrt(np.maximum(square - np.asarray(waist_of(given)) ** 2, 0))
+    )
 
 
 def zones(metres: Floats, ratio: Floats) -> list[tuple[Floats, Floats]]:
@@ -170,7 +200,10 @@ def zones(metres: Floats, ratio: Floats) -> list[tuple[Floats, Floats]]:
     height, at, found = np.log(np.maximum(ratio, 1e-300)), np.log(metres), []
     for row in height:
         inside = np.concatenate([[False], row >= 0, [False]])
-        first, last = np.flatnonzero(inside[1:] & ~inside[:-1]), np.flatnonzero(inside[:-1] & ~inside[1:]) - 1
+        first, last = (
+            np.flatnonzero(inside[1:] & ~inside[:-1]),
+            np.flatnonzero(inside[:-1] & ~inside[1:]) - 1,
+        )
         near = [_between(at, row, k - 1, k) if k else at[0] for k in first]
         far = [_between(at, row, k, k + 1) if k < len(at) - 1 else at[-1] for k in last]
         found.append((np.exp(near), np.exp(far)))

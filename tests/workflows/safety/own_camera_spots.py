@@ -1,7 +1,9 @@
-"""Spots of a tapered and defocused beam behind a round lens, by quadrature, without a line of the project.
+"""Spots of a tapered and defocused beam behind a round lens, by quadrature, without a line of the
+project.
 
-The field in the lens is exp(-x s + 2 pi i W s) over s, the square of the radius over that of the rim, with the taper
-x = (D / 2 w)^2 and W waves of defocus. At v = pi D r / (lambda f) the light is |U|^2, with
+The field in the lens is exp(-x s + 2 pi i W s) over s, the square of the radius over that of the
+rim, with the taper x = (D / 2 w)^2 and W waves of defocus. At v = pi D r / (lambda f) the light is
+|U|^2, with
 
     U(v) = integral over s from 0 to 1 of exp(-x s + 2 pi i W s) J0(v sqrt(s))
 """
@@ -16,7 +18,8 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.special import ellipk, erf, j0
 
 Floats = NDArray[np.float64]
-MOST_WAVES, MOST_TAPER = 36.0, 30.0  # of the quadrature; beyond, the wave from the rim and a Gaussian spot
+# of the quadrature; beyond, the wave from the rim and a Gaussian spot
+MOST_WAVES, MOST_TAPER = 36.0, 30.0
 TABLE_WAVES = 15.5  # of a table, unless it begins at stronger defocus
 STEP = 0.12  # of v
 
@@ -33,11 +36,15 @@ class Spots:
 def envelope(fill: Floats, waves: Floats) -> Floats:
     """Return an upper bound of the light on the axis that goes smoothly over the defocus."""
     square = np.maximum(fill**2 + (2 * math.pi * waves) ** 2, 1e-30)
-    return (np.expm1(-fill) ** 2 + 4 * np.exp(-fill) * np.minimum(1, (math.pi * waves) ** 2)) / square
+    return (
+        np.expm1(-fill) ** 2 + 4 * np.exp(-fill) * np.minimum(1, (math.pi * waves) ** 2)
+    ) / square
 
 
 def light(fill: Floats, waves: Floats, reach: Floats) -> Floats:
-    """Return |U|^2 (spot, reach): by quadrature, or for strong defocus or taper by the wave from the rim."""
+    """Return |U|^2 (spot, reach): by quadrature, or for strong defocus or taper by the wave from
+    the rim.
+    """
     kappa = fill - 2j * math.pi * waves
     if waves.max() > MOST_WAVES or fill.max() > MOST_TAPER:
         inside = (reach < 4 * math.pi * waves[:, None]) | (fill[:, None] > MOST_TAPER)
@@ -59,7 +66,9 @@ def grouped(fill: Floats, waves: Floats) -> list[NDArray[np.intp]]:
 
 
 def spots_of(fill: Floats, waves: Floats, half: float, damage: bool) -> Spots:
-    """Return the spots for pairs of taper and defocus; ``half`` a pixel is in units of v. The other kind is 0."""
+    """Return the spots for pairs of taper and defocus; ``half`` a pixel is in units of v. The
+    other kind is 0.
+    """
     fill = np.maximum(fill, 1e-3)
     peak, heat, pixel = np.zeros_like(fill), np.zeros_like(fill), np.zeros_like(fill)
     for group in grouped(fill, waves):
@@ -70,7 +79,11 @@ def spots_of(fill: Floats, waves: Floats, half: float, damage: bool) -> Spots:
         found = light(x, w, np.concatenate([[0.0], reach]))
         if damage:
             peak[group] = found.max(1)
-            heat[group] = geometric_heat(x, w) if far else hottest(found[:, 1:], reach, 4 * math.pi * w.max() + 3)
+            heat[group] = (
+                geometric_heat(x, w)
+                if far
+                else hottest(found[:, 1:], reach, 4 * math.pi * w.max() + 3)
+            )
         else:
             pixel[group] = brightest_pixel(found, np.concatenate([[0.0], reach]), half)
     bound = envelope(fill, waves)
@@ -78,7 +91,9 @@ def spots_of(fill: Floats, waves: Floats, half: float, damage: bool) -> Spots:
 
 
 def geometric_heat(fill: Floats, waves: Floats) -> Floats:
-    """Return the heat in the middle of a spot of straight rays: a Gaussian that the rim of the lens cuts."""
+    """Return the heat in the middle of a spot of straight rays: a Gaussian that the rim of the
+    lens cuts.
+    """
     square = fill**2 + (2 * math.pi * waves) ** 2
     rim = np.where(fill > MOST_TAPER, np.inf, 4 * math.pi * waves)
     rate = np.sqrt(fill / (2 * square))
@@ -86,8 +101,12 @@ def geometric_heat(fill: Floats, waves: Floats) -> Floats:
 
 
 def hottest(found: Floats, reach: Floats, edge: float) -> Floats:
-    """Return the integral of E / (2 pi distance) where it is largest; the wings fall as the third power."""
-    radii = np.concatenate([[0.0], np.unique(np.round(np.linspace(0, edge, 24)[1:] / STEP) * STEP)])[:, None]
+    """Return the integral of E / (2 pi distance) where it is largest; the wings fall as the
+    third power.
+    """
+    radii = np.concatenate(
+        [[0.0], np.unique(np.round(np.linspace(0, edge, 24)[1:] / STEP) * STEP)]
+    )[:, None]
     parameter = np.minimum(4 * radii * reach / (radii + reach) ** 2, 1 - 1e-12)
     kernel = 2 / math.pi * ellipk(parameter) * reach / (radii + reach) * STEP
     return np.asarray((found @ kernel.T).max(1) + found[:, -30:].mean(1) * reach[-1] / 2)
@@ -117,10 +136,14 @@ def gaussian_pixel(fill: Floats, waves: Floats, half: float) -> Floats:
     return np.asarray((math.sqrt(math.pi) / 2 * erf(side) / side) ** 2)
 
 
-def table_of(fill: Floats, waves: Floats, half: float, damage: bool) -> Callable[[Floats, Floats], Spots]:
-    """Return a function like `spots_of` that interpolates between the extremes of arrays of any shape.
+def table_of(
+    fill: Floats, waves: Floats, half: float, damage: bool
+) -> Callable[[Floats, Floats], Spots]:
+    """Return a function like `spots_of` that interpolates between the extremes of arrays of any
+    shape.
 
-    Beyond the quadrature the bright moments of a spot count, which are less than 1/16 of the distance apart.
+    Beyond the quadrature the bright moments of a spot count, which are less than 1/16 of the
+    distance apart.
     """
     ends = np.log(np.clip([fill.min() * 0.999, fill.max() * 1.001], 1e-3, MOST_TAPER) * [0.999, 1])
     most = min(max(TABLE_WAVES, waves.min() + 6), MOST_WAVES - 0.5)

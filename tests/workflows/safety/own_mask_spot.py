@@ -1,13 +1,14 @@
-"""The spot of a laser behind a mask over the distance, without a line of the project: a fine pupil and its transforms.
+"""The spot of a laser behind a mask over the distance, without a line of the project: a fine pupil
+and its transforms.
 
-A Gaussian beam of the radius w (1/e2) and the wavefront radius R meets a lens that is focused at infinity, behind a
-mask of the height h and the index n. For each watt of the laser the sensor has
+A Gaussian beam of the radius w (1/e2) and the wavefront radius R meets a lens that is focused at
+infinity, behind a mask of the height h and the index n. For each watt of the laser the sensor has
 
     E(x) = tau / (lambda f)^2 |sum U exp(-2 pi i x u / (lambda f))|^2 du^4
     U(u) = sqrt(2 / (pi w^2)) exp(-u^2 / w^2 + i pi u^2 / (lambda R) + 2 pi i (n - 1) h(u) / lambda)
 
-Samples at the rim count with their share inside the circle. The mean over a pixel is the sum of the autocorrelation
-of U, times the sinc of the pixel, over its frequencies.
+Samples at the rim count with their share inside the circle. The mean over a pixel is the sum of the
+autocorrelation of U, times the sinc of the pixel, over its frequencies.
 """
 
 import math
@@ -49,7 +50,9 @@ def fused_silica(wavelength: float) -> float:
     """Return n - 1 of fused silica (Malitson 1965)."""
     square = (wavelength * 1e6) ** 2
     terms = ((0.6961663, 0.0684043), (0.4079426, 0.1162414), (0.8974794, 9.896161))
-    return math.sqrt(1 + sum(strength * square / (square - line**2) for strength, line in terms)) - 1
+    return (
+        math.sqrt(1 + sum(strength * square / (square - line**2) for strength, line in terms)) - 1
+    )
 
 
 def axicon(waves: float) -> Mask:
@@ -59,13 +62,19 @@ def axicon(waves: float) -> Mask:
 
 
 def vortex(charge: float) -> Mask:
-    """Return a vortex of a charge at 550 nm. Its slope is that of a ring at a tenth of the radius."""
+    """Return a vortex of a charge at 550 nm. Its slope is that of a ring at a tenth of the
+    radius.
+    """
     wave = 550e-9 / fused_silica(550e-9)
-    return Mask(lambda v, u: charge * wave * np.arctan2(v, u) / (2 * math.pi), charge / (2 * math.pi * 0.1))
+    return Mask(
+        lambda v, u: charge * wave * np.arctan2(v, u) / (2 * math.pi), charge / (2 * math.pi * 0.1)
+    )
 
 
 def five_half_rings(waves: tuple[float, ...] = (12, 18, 24, 30, 36)) -> Mask:
-    """Return half-rings of equal area, each a rising cone on one side and a falling one on the other, in turns."""
+    """Return half-rings of equal area, each a rising cone on one side and a falling one on the
+    other, in turns.
+    """
     wave = 550e-9 / fused_silica(550e-9)
 
     def height(v: Floats, u: Floats) -> Floats:
@@ -78,7 +87,9 @@ def five_half_rings(waves: tuple[float, ...] = (12, 18, 24, 30, 36)) -> Mask:
 
 
 def smooth_random(seed: int, waves: float, terms: int = 12) -> Mask:
-    """Return cosines of up to 2 periods a radius on a plate; their steepest slope stays below `waves` a radius."""
+    """Return cosines of up to 2 periods a radius on a plate; their steepest slope stays below
+    `waves` a radius.
+    """
     draw = np.random.default_rng(seed)
     waviness = draw.uniform(-2, 2, (terms, 2))
     phase = draw.uniform(0, 2 * math.pi, terms)
@@ -87,7 +98,11 @@ def smooth_random(seed: int, waves: float, terms: int = 12) -> Mask:
     scale = waves * 550e-9 / fused_silica(550e-9) / steepest
 
     def height(v: Floats, u: Floats) -> Floats:
-        turns = 2 * math.pi * (np.multiply.outer(waviness[:, 0], v) + np.multiply.outer(waviness[:, 1], u))
+        turns = (
+            2
+            * math.pi
+            * (np.multiply.outer(waviness[:, 0], v) + np.multiply.outer(waviness[:, 1], u))
+        )
         waves_of_terms = np.cos(turns + phase[:, None, None])
         return scale * (size.sum() + np.tensordot(size, waves_of_terms, 1))
 
@@ -97,7 +112,9 @@ def smooth_random(seed: int, waves: float, terms: int = 12) -> Mask:
 def beam_at(setting: Setting, metres: float) -> tuple[float, float]:
     """Return the radius and the curvature of the wavefront at a distance."""
     rayleigh = 2 * setting.waist / setting.divergence
-    return math.hypot(setting.waist, setting.divergence * metres / 2), metres / (metres**2 + rayleigh**2)
+    return math.hypot(setting.waist, setting.divergence * metres / 2), metres / (
+        metres**2 + rayleigh**2
+    )
 
 
 def blur(setting: Setting, metres: float) -> float:
@@ -108,7 +125,9 @@ def blur(setting: Setting, metres: float) -> float:
 
 
 def samples_for(setting: Setting, metres: float, reach: float = 0.0) -> int:
-    """Return samples across the lens that carry the spot and `reach` (wavelength times f-number) with room."""
+    """Return samples across the lens that carry the spot and `reach` (wavelength times f-number)
+    with room.
+    """
     return max(384, int(fft.next_fast_len(int(2.6 * max(blur(setting, metres), reach) + 128))))
 
 
@@ -139,7 +158,9 @@ def zoomed(field: NDArray[np.complex128], rows: Floats, columns: Floats) -> Floa
 
 
 def peak(setting: Setting, metres: float, samples: int | None = None) -> float:
-    """Return the highest irradiance at a point of the sensor's plane for each watt of the laser (1/m2)."""
+    """Return the highest irradiance at a point of the sensor's plane for each watt of the laser
+    (1/m2).
+    """
     samples = samples or samples_for(setting, metres)
     field = pupil(setting, metres, samples)
     light = np.abs(fft.fft2(field, (2 * samples, 2 * samples))) ** 2
@@ -161,13 +182,22 @@ def clear_peak(setting: Setting, metres: float) -> float:
     width, _ = beam_at(setting, metres)
     fill = (setting.diameter / (2 * width)) ** 2
     mean = -math.expm1(-fill) / fill * math.pi * setting.diameter**2 / 4
-    return setting.transmittance * 2 / (math.pi * width**2) * (mean / (setting.wavelength * setting.focal_length)) ** 2
+    return (
+        setting.transmittance
+        * 2
+        / (math.pi * width**2)
+        * (mean / (setting.wavelength * setting.focal_length)) ** 2
+    )
 
 
 def pixels(setting: Setting, metres: float, samples: int | None = None) -> Floats:
-    """Return the irradiance of each pixel for each watt, without scatter; the axis is in the middle of a pixel."""
+    """Return the irradiance of each pixel for each watt, without scatter; the axis is in the
+    middle of a pixel.
+    """
     unit = setting.wavelength * setting.focal_length / setting.diameter
-    samples = samples or samples_for(setting, metres, 0.5 * math.hypot(*setting.shape) * setting.pixel / unit)
+    samples = samples or samples_for(
+        setting, metres, 0.5 * math.hypot(*setting.shape) * setting.pixel / unit
+    )
     size = 2 * samples
     spectrum = fft.fft2(pupil(setting, metres, samples), (size, size))
     lags = np.rint(fft.fftfreq(size, 1 / size))
@@ -175,7 +205,8 @@ def pixels(setting: Setting, metres: float, samples: int | None = None) -> Float
     smear = np.sinc(scale * lags)
     pairs = fft.ifft2(np.abs(spectrum) ** 2, overwrite_x=True) * smear[:, None] * smear
     left, right = (
-        np.exp(-2j * math.pi * scale * np.outer(np.arange(count) - count // 2, lags)) for count in setting.shape
+        np.exp(-2j * math.pi * scale * np.outer(np.arange(count) - count // 2, lags))
+        for count in setting.shape
     )
     return (left @ pairs @ right.T).real * point_gain(setting, samples)
 
@@ -196,12 +227,16 @@ def faintest_of(light: Floats, share: float) -> float:
     return float(np.sort(light, axis=None)[-rank])
 
 
-def levels(setting: Setting, metres: float, share: float, samples: int | None = None) -> tuple[float, float]:
+def levels(
+    setting: Setting, metres: float, share: float, samples: int | None = None
+) -> tuple[float, float]:
     """Return the light of that pixel for each watt, without scatter and with half a per cent."""
     core = pixels(setting, metres, samples)
     return faintest_of(core, share), faintest_of(0.995 * core + scattered(setting, metres), share)
 
 
-def saturation(wavelength: float, pixel: float, efficiency: float, well: float, exposure: float) -> float:
+def saturation(
+    wavelength: float, pixel: float, efficiency: float, well: float, exposure: float
+) -> float:
     """Return the irradiance that fills a pixel (W/m2)."""
     return well * PLANCK_LIGHT / wavelength / (efficiency * pixel**2 * exposure)

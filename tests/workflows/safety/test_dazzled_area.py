@@ -1,4 +1,6 @@
-"""Dazzle behind a mask in an estimate: against a Hankel integral and roots of SciPy, and what is said without it."""
+"""Dazzle behind a mask in an estimate: against a Hankel integral and roots of SciPy, and what is
+said without it.
+"""
 
 import math
 import re
@@ -14,10 +16,19 @@ from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.safety.run_safety import document
 from neusee.workflows.safety.safety_estimate import estimate
 
+pytestmark = pytest.mark.usefixtures("without_remedies")
 #: a window of 243 pixels of the pointer's camera, and a pupil fine enough for 0.2 % of the picture
-SMALL = ["safety.dazzle.share=0.002", "wide.window=[729, 729]", "optics.samples=512", "optics.window=[96, 96]",
-         "doe=axicon", "doe.waves=5", "safety.protection.filter=null",
-         "+safety.lens.focus=laser", "+safety.lens.scatter=null"]  # fmt: skip
+SMALL = [
+    "safety.dazzle.share=0.002",
+    "wide.window=[729, 729]",
+    "optics.samples=512",
+    "optics.window=[96, 96]",
+    "doe=axicon",
+    "doe.waves=5",
+    "safety.protection.filter=null",
+    "+safety.lens.focus=laser",
+    "+safety.lens.scatter=null",
+]
 PIXELS = 0.002 * 1536 * 2048
 WAVELENGTH, FOCAL, DIAMETER, PITCH = 532e-9, 50e-3, 12e-3, 3.45e-6
 
@@ -28,12 +39,16 @@ def store(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def said(store):
+def said(store, without_remedies):
     return document(estimate(load("safety_pointer", [*SMALL, "safety.draws=1000"]), store))
 
 
 def dazzle(said, protection):
-    return next(each for each in said["limits"] if each["protection"] == protection and each["effect"] == "dazzle")
+    return next(
+        each
+        for each in said["limits"]
+        if each["protection"] == protection and each["effect"] == "dazzle"
+    )
 
 
 def silica(wavelength):
@@ -44,16 +59,21 @@ def silica(wavelength):
 
 
 def axicon_at_the_lens():
-    """Irradiance at the lens that fills the pixels: the Hankel integral of the axicon over 5 x 5 points of each."""
+    """Irradiance at the lens that fills the pixels: the Hankel integral of the axicon over 5 x 5
+    points of each.
+    """
     waves = 5 * 550e-9 / WAVELENGTH * (silica(WAVELENGTH) - 1) / (silica(550e-9) - 1)
     spread, half, points = WAVELENGTH * FOCAL / DIAMETER / PITCH, 60, 5
     at, weights = np.polynomial.legendre.leggauss(500)
     radius = (at + 1) / 2
     table = np.linspace(0, 1.5 * half, 6000)
-    field = np.concatenate([
-        j0(np.outer(np.pi / spread * part, radius)) @ (radius * weights * np.exp(2j * np.pi * waves * radius))
-        for part in np.array_split(table, 20)
-    ])  # fmt: skip
+    field = np.concatenate(
+        [
+            j0(np.outer(np.pi / spread * part, radius))
+            @ (radius * weights * np.exp(2j * np.pi * waves * radius))
+            for part in np.array_split(table, 20)
+        ]
+    )
     inside = (np.arange(points) - (points - 1) / 2) / points
     side = (np.arange(-half, half + 1)[:, None] + inside).ravel()
     light = np.interp(np.hypot(side[:, None], side), table, np.abs(field) ** 2)
@@ -82,18 +102,28 @@ def test_the_zone_of_dazzle_behind_a_mask_ends_at_its_root_with_the_interval_of_
     limit = axicon_at_the_lens() * (math.pi * DIAMETER**2 / 4 / (WAVELENGTH * FOCAL)) ** 2
     (zone,) = dazzle(said, "mask")["zones"]
     end = brentq(lambda x: math.log(sensor(math.exp(x)) / limit), math.log(20), math.log(1e6))
-    assert zone["far"]["value"] == pytest.approx(math.exp(end), rel=0.012)  # half of the 2 % of the limit
+    # half of the 2 % of the limit
+    assert zone["far"]["value"] == pytest.approx(math.exp(end), rel=0.012)
     spread = math.hypot(math.log(1.1) / 2, math.log(1.2))  # of sqrt(power) / divergence
     for name, sign in (("low", -1), ("high", 1)):
-        assert zone["far"][name] == pytest.approx(zone["far"]["value"] * math.exp(sign * 1.645 * spread), rel=0.06)
+        assert zone["far"][name] == pytest.approx(
+            zone["far"]["value"] * math.exp(sign * 1.645 * spread), rel=0.06
+        )
     assert dazzle(said, "plain lens")["zones"][0]["far"]["value"] < zone["far"]["value"]
 
 
 @pytest.mark.parametrize("window", [183, 99])
 def test_an_area_beyond_the_window_has_a_safe_limit_and_is_said_with_the_way_out(window, store):
-    """The ring of the axicon lies at 33 pixels: the larger window holds it, the smaller one the core alone."""
-    found = estimate(load("safety_pointer", [*SMALL, "safety.draws=100", f"wide.window=[{window}, {window}]"]), store)
-    (limit,) = (each for each in found.findings if each.option == "mask" and each.limit.effect == "dazzle")
+    """The ring of the axicon lies at 33 pixels: the larger window holds it, the smaller one the
+    core alone.
+    """
+    found = estimate(
+        load("safety_pointer", [*SMALL, "safety.draws=100", f"wide.window=[{window}, {window}]"]),
+        store,
+    )
+    (limit,) = (
+        each for each in found.findings if each.option == "mask" and each.limit.effect == "dazzle"
+    )
     assert limit.at_lens.value < axicon_at_the_lens()
     (line,) = (line for line in found.unsaid if "behind the mask" in line)
     assert "Choose a larger window" in line
@@ -107,11 +137,17 @@ def test_an_area_beyond_the_window_has_a_safe_limit_and_is_said_with_the_way_out
             "safety.protection.pixels.mask",
             "name a step of laser.bright_pix",
         ),
-        (["steps.laser_pixels.with.pixel_pitch=1.15 um"], "pixels.mask", "give it safety.sensor.pixel_pitch"),
+        (
+            ["steps.laser_pixels.with.pixel_pitch=1.15 um"],
+            "pixels.mask",
+            "give it safety.sensor.pixel_pitch",
+        ),
         (["safety.protection.pixels.mask=laser_pixel"], "pixels.mask", "laser_pixels"),
     ],
 )
-def test_a_step_that_does_not_rank_the_pixels_of_the_sensor_is_refused_before_the_run(store, changes, place, fix):
+def test_a_step_that_does_not_rank_the_pixels_of_the_sensor_is_refused_before_the_run(
+    store, changes, place, fix
+):
     with pytest.raises(RecipeError) as caught:
         estimate(load("safety_pointer", [*SMALL, *changes]), store)
     (one,) = caught.value.diagnostics

@@ -7,7 +7,7 @@ import pytest
 
 from neusee.nodes.laser import beam
 from neusee.workflows.recipe.blocks.safety_block import Lens
-from neusee.workflows.safety.distance_ladder import (
+from neusee.workflows.safety.exposures import (
     FAR_WAVES,
     UNFOCUSED_WAVES,
     as_wide,
@@ -23,7 +23,9 @@ WIDE = beam(905e-9, power=1.0, waist=30e-3, divergence=5e-4)
 
 
 def lens(focus="infinity", defocus="0 waves"):
-    return Lens.model_validate({"focal_length": "50 mm", "diameter": "12 mm", "focus": focus, "defocus": defocus})
+    return Lens.model_validate(
+        {"focal_length": "50 mm", "diameter": "12 mm", "focus": focus, "defocus": defocus}
+    )
 
 
 def width(laser, distance):
@@ -38,7 +40,9 @@ def bend(laser, distance):
 
 @pytest.mark.parametrize(("laser", "decides"), [(POINTER, "curvature"), (WIDE, "curvature"),
                                                 (beam(532e-9, power=1.0, divergence=5e-5), "fill")])  # fmt: skip
-def test_a_distant_laser_fills_the_lens_to_two_per_cent_with_three_hundredths_of_a_wave(laser, decides):
+def test_a_distant_laser_fills_the_lens_to_two_per_cent_with_three_hundredths_of_a_wave(
+    laser, decides
+):
     far = far_distance(laser, 12e-3)
     fill, waves = (12e-3 / (2 * width(laser, far))) ** 2, 12e-3**2 / (8 * laser.wavelength * far)
     assert max(fill / 0.02, waves / 0.03) == pytest.approx(1, rel=1e-6)
@@ -54,7 +58,9 @@ def test_a_distance_and_the_fill_of_the_lens_are_inverse_to_each_other():
 
 def test_a_beam_has_its_width_at_the_distance_that_is_returned():
     at = np.array([0.01, 3.0, 4e4])
-    np.testing.assert_allclose(as_wide(POINTER, np.array([width(POINTER, r) for r in at])), at, rtol=1e-6)
+    np.testing.assert_allclose(
+        as_wide(POINTER, np.array([width(POINTER, r) for r in at])), at, rtol=1e-6
+    )
     assert as_wide(POINTER, np.array([0.1 * POINTER.waist])) == pytest.approx(1e-3)
 
 
@@ -66,11 +72,17 @@ def test_values_between_rungs_never_overshoot_and_one_rung_holds_everywhere():
     assert between[..., 0].min() >= 0
     assert between[..., 0].max() <= 1
     np.testing.assert_allclose(between[0, 200], [0.5, -1], atol=1e-12)
-    np.testing.assert_array_equal(interpolated(rungs[:1], values[3:4], np.zeros((2, 3))), np.full((2, 3, 2), [1.0, -2]))
+    np.testing.assert_array_equal(
+        interpolated(rungs[:1], values[3:4], np.zeros((2, 3))), np.full((2, 3, 2), [1.0, -2])
+    )
 
 
 def test_the_focus_of_a_lens_is_its_distance_or_none():
-    assert [focus_of(lens(focus)) for focus in ("infinity", "laser", "7 m")] == [math.inf, math.inf, 7.0]
+    assert [focus_of(lens(focus)) for focus in ("infinity", "laser", "7 m")] == [
+        math.inf,
+        math.inf,
+        7.0,
+    ]
 
 
 @pytest.mark.parametrize("focus", ["infinity", "10 m", "laser"])
@@ -91,9 +103,15 @@ def test_no_step_of_the_ladder_is_wider_than_it_may_be_and_both_ends_are_on_it(f
     assert len(rungs) < 150
 
 
-@pytest.mark.parametrize(("focus", "waves"), [("3 m", "0 waves"), ("infinity", "0.35 waves"), ("3540 m", "1 waves")])
-def test_the_ladder_of_a_lens_out_of_focus_ends_where_its_defocus_is_that_of_a_distant_laser(focus, waves):
-    """There a change of 0.03 waves changes the light on the axis by 7 %, which held for all distances beyond."""
+@pytest.mark.parametrize(
+    ("focus", "waves"), [("3 m", "0 waves"), ("infinity", "0.35 waves"), ("3540 m", "1 waves")]
+)
+def test_the_ladder_of_a_lens_out_of_focus_ends_where_its_defocus_is_that_of_a_distant_laser(
+    focus, waves
+):
+    """There a change of 0.03 waves changes the light on the axis by 7 %, which held for all
+    distances beyond.
+    """
     last = ladder(POINTER, lens(focus, waves), 12e-3, (0.3, 1e6), 0.3, 0.5)[-1]
     assert bend(POINTER, last) < 0.0021
 
@@ -106,7 +124,10 @@ def test_the_ladder_ends_where_it_is_asked_before_the_laser_is_distant():
 def test_a_lens_on_the_laser_has_no_defocus_that_would_need_more_rungs():
     near, far = 0.3, far_distance(POINTER, 12e-3)
     plain, bent = (
-        ladder(POINTER, lens("laser", waves), 12e-3, (near, far), 0.3, 0.5) for waves in ("0 waves", "-9 waves")
+        ladder(POINTER, lens("laser", waves), 12e-3, (near, far), 0.3, 0.5)
+        for waves in ("0 waves", "-9 waves")
     )
     np.testing.assert_array_equal(plain, bent)
-    assert len(ladder(POINTER, lens("infinity", "-9 waves"), 12e-3, (near, far), 0.3, 0.5)) > len(plain)
+    assert len(ladder(POINTER, lens("infinity", "-9 waves"), 12e-3, (near, far), 0.3, 0.5)) > len(
+        plain
+    )

@@ -1,10 +1,12 @@
-"""Zones of distance: none, one or several, their ends, and what draws say of them, against closed forms."""
+"""Zones of distance: none, one or several, their ends, and what draws say of them, against
+closed forms.
+"""
 
 import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from neusee.workflows.safety.distance_zones import Spread, crossings, sampled, zones_of
+from neusee.workflows.safety.exposures import Spread, crossings, sampled, zones_of
 
 AT = sampled(1.0, 1e4, (100.0,))
 
@@ -31,7 +33,9 @@ def test_a_zone_that_begins_away_from_the_laser_has_two_roots():
 
 def test_several_zones_and_none_stand_in_one_table_of_draws():
     waves = np.sin(np.log(AT) * 2)
-    near, far = crossings(AT, np.exp(np.stack([waves, np.full_like(waves, -1), np.full_like(waves, 1)])))
+    near, far = crossings(
+        AT, np.exp(np.stack([waves, np.full_like(waves, -1), np.full_like(waves, 1)]))
+    )
     roots = np.exp(np.arange(6) * np.pi / 2)
     assert near[0] == pytest.approx(roots[::2], rel=1e-3)
     assert far[0] == pytest.approx(roots[1::2], rel=1e-3)
@@ -47,7 +51,8 @@ def test_an_exposure_of_zero_ends_a_zone():
 
 
 def test_the_ends_and_the_probability_of_none_follow_the_law():
-    draws = np.exp(np.random.default_rng(1).standard_normal(4000) * 0.5)  # factor on the squared distance
+    # factor on the squared distance
+    draws = np.exp(np.random.default_rng(1).standard_normal(4000) * 0.5)
     ratio = 10.0**2 / AT**2
     found = zones_of(AT, ratio, ratio * draws[:, None] ** 2, 20.0)
     (zone,) = found.zones
@@ -71,7 +76,10 @@ def test_a_limit_that_is_met_in_some_draws_only_has_no_zone_but_a_reach():
 
 
 def test_the_ends_between_two_zones_are_those_of_draws_with_as_many_zones():
-    one, two = np.where(AT < 10, 2.0, 0.1), np.where((AT < 10) | ((AT > 100) & (AT < 1000)), 2.0, 0.1)
+    one, two = (
+        np.where(AT < 10, 2.0, 0.1),
+        np.where((AT < 10) | ((AT > 100) & (AT < 1000)), 2.0, 0.1),
+    )
     found = zones_of(AT, two, np.stack([one, one, one, two]), 500.0)
     assert len(found.zones) == 2
     assert found.alike == 0.25
@@ -82,14 +90,21 @@ def test_the_ends_between_two_zones_are_those_of_draws_with_as_many_zones():
 
 
 def test_zones_that_no_draw_shares_have_ends_without_an_interval():
-    one, two = np.where(AT < 10, 2.0, 0.1), np.where((AT < 10) | ((AT > 100) & (AT < 1000)), 2.0, 0.1)
+    one, two = (
+        np.where(AT < 10, 2.0, 0.1),
+        np.where((AT < 10) | ((AT > 100) & (AT < 1000)), 2.0, 0.1),
+    )
     found = zones_of(AT, two, np.stack([one, one]), 500.0)
     assert found.zones[1].near == Spread.of(found.zones[1].near.value, np.zeros(0))
 
 
 def test_the_farthest_distance_has_the_interval_of_every_draw_with_a_zone():
-    """A third of the draws reaches farther in one zone; the two nominal zones hid this as 300 m without an interval."""
-    two = np.where((AT < 100) | ((AT > 200) & (AT < 300)), 1.1, 0.9) / np.where(AT < 900, 1.0, 100.0)
+    """A third of the draws reaches farther in one zone; the two nominal zones hid this as 300 m
+    without an interval.
+    """
+    two = np.where((AT < 100) | ((AT > 200) & (AT < 300)), 1.1, 0.9) / np.where(
+        AT < 900, 1.0, 100.0
+    )
     found = zones_of(AT, two, np.stack([two] * 60 + [two * 2] * 30 + [two * 0.1] * 10), 50.0)
     assert len(found.zones) == 2
     assert found.zones[1].far.value == pytest.approx(300, rel=0.02)
@@ -106,7 +121,9 @@ def test_an_exposure_that_just_reaches_the_limit_exceeds_it_there():
 
 @pytest.mark.parametrize("recipe", [0.2, 30.0, 5e5])
 def test_zones_lie_between_the_asked_distances_wherever_the_laser_of_the_recipe_is(recipe):
-    """The exposure is above the limit up to 300 m; at the distance of the recipe it is judged apart."""
+    """The exposure is above the limit up to 300 m; at the distance of the recipe it is judged
+    apart.
+    """
     at = sampled(2.0, 5e3, (recipe,))
     ratio = (300.0 / at) ** 2
     found = zones_of(at, ratio, np.stack([ratio, ratio * 1.1, ratio / 1.1]), recipe, (2.0, 5e3))

@@ -6,6 +6,7 @@ from tests.benchmarks import judged_lasers
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("without_remedies")
 def test_no_laser_of_the_table_contradicts_the_formulas_by_hand(capsys):
     assert judged_lasers.main() == 0
     assert capsys.readouterr().out.endswith("36 lasers, 0 contradictions\n")

@@ -1,4 +1,6 @@
-"""The lens of an estimate is that of the recipe, however its diameter is written; another one is refused."""
+"""The lens of an estimate is that of the recipe, however its diameter is written; another one is
+refused.
+"""
 
 import math
 
@@ -7,6 +9,9 @@ import pytest
 from neusee.workflows import RecipeError, Store, load
 from neusee.workflows.safety.safety_estimate import estimate, prepare
 
+#: the peak behind the plain lens alone: no mask, and no light beside the peak
+ALONE = ["safety.protection={}", "safety.dazzle=null"]
+pytestmark = pytest.mark.usefixtures("without_remedies")
 FOCAL, WAVELENGTH, POWER, DIVERGENCE, DISTANCE = 0.11, 532e-9, 5e-3, 1e-3, 1e4
 CAMERA = [
     "laser=pointer", f"lasers.pointer.distance={DISTANCE} m", "+safety=camera", "safety.draws=100", "doe=flat",
@@ -21,47 +26,82 @@ def store(tmp_path_factory):
 
 
 def peak(diameter):
-    """Return the peak in W/m2 of a beam that overfills a clear lens: E (pi D^2 / 4)^2 / (lambda f)^2."""
+    """Return the peak in W/m2 of a beam that overfills a clear lens: E (pi D^2 / 4)^2 / (lambda
+    f)^2.
+    """
     width = math.hypot(WAVELENGTH / (math.pi * DIVERGENCE / 2), DIVERGENCE / 2 * DISTANCE)
-    return 2 * POWER / (math.pi * width**2) * (math.pi * diameter**2 / 4 / (WAVELENGTH * FOCAL)) ** 2
+    return (
+        2 * POWER / (math.pi * width**2) * (math.pi * diameter**2 / 4 / (WAVELENGTH * FOCAL)) ** 2
+    )
 
 
 def judged(recipe, store):
-    """Return the exposure and the limit on the sensor of the first law of damage behind the plain lens."""
+    """Return the exposure and the limit on the sensor of the first law of damage behind the
+    plain lens.
+    """
     found = estimate(recipe, store)
-    first = next(f for f in found.findings if f.option == "plain lens" and f.limit.effect == "damage")
+    first = next(
+        f for f in found.findings if f.option == "plain lens" and f.limit.effect == "damage"
+    )
     return first.exposure.value, first.at_sensor.value
 
 
 def override(folder, diameter):
-    return load("first_light", [*CAMERA, f"optics.diameter={diameter}"], folder)
+    return load("first_light", [*CAMERA, *ALONE, f"optics.diameter={diameter}"], folder)
 
 
 def own_recipe(folder, diameter):
-    names = "scene: china, illuminant: daylight, lift: lmmse, optics: small, sensor: small, flare: clean"
-    options = [f"{{{each}}}" for each in (*names.split(", "), "restore: wiener", "reading: coherent", "laser: pointer",
-                                          "doe: flat")]  # fmt: skip
+    names = (
+        "scene: china, illuminant: daylight, lift: lmmse, optics: small, sensor: small, flare:"
+        " clean"
+    )
+    options = [
+        f"{{{each}}}"
+        for each in (
+            *names.split(", "),
+            "restore: wiener",
+            "reading: coherent",
+            "laser: pointer",
+            "doe: flat",
+        )
+    ]
     defaults = "\n".join(f"  - {each}" for each in ("camera: neusee", *options))
-    (folder / "mine.yaml").write_text(f"defaults:\n{defaults}\noutputs: [peak]\noptics: {{diameter: {diameter}}}\n")
-    return load(str(folder / "mine.yaml"), CAMERA[1:], folder)
+    (folder / "mine.yaml").write_text(
+        f"defaults:\n{defaults}\noutputs: [peak]\noptics: {{diameter: {diameter}}}\n"
+    )
+    return load(str(folder / "mine.yaml"), [*CAMERA[1:], *ALONE], folder)
 
 
 def own_group(folder, diameter):
     (folder / "optics").mkdir()
-    lens = f"optics:\n  focal_length: 0.11 m\n  diameter: {diameter}\n  samples: 640\n  pitch: 3.74 um\n"
-    rest = "  shortest: 400 nm\n  longest: 700 nm\n  bands: 3\n  window: [64, 64]\n  defocus: 0 waves\n"
+    lens = (
+        f"optics:\n  focal_length: 0.11 m\n  diameter: {diameter}\n  samples: 640\n  pitch: 3.74"
+        " um\n"
+    )
+    rest = (
+        "  shortest: 400 nm\n  longest: 700 nm\n  bands: 3\n  window: [64, 64]\n  defocus: 0"
+        " waves\n"
+    )
     rest += "  aberrations: {}\n  pixel: point\n  border: reflect\n"
     mask = "mask: {material: fused silica, wrap_at: null, levels: null, max_height: null}\n"
     (folder / "optics" / "mine.yaml").write_text(f"# My lens.\n{lens}{rest}{mask}")
-    return load("first_light", ["optics=mine", *(word for word in CAMERA if "optics" not in word)], folder)
+    return load(
+        "first_light",
+        ["optics=mine", *(word for word in CAMERA if "optics" not in word), *ALONE],
+        folder,
+    )
 
 
 def from_python(folder, diameter):
-    return load("first_light", CAMERA, folder, optics={"diameter": diameter})
+    return load("first_light", [*CAMERA, *ALONE], folder, optics={"diameter": diameter})
 
 
 def drawn(folder, diameter):
-    return load("first_light", [*CAMERA, f'optics.diameter="lognormal({diameter}, 1.05)"'.replace('"', "")], folder)
+    return load(
+        "first_light",
+        [*CAMERA, *ALONE, f'optics.diameter="lognormal({diameter}, 1.05)"'.replace('"', "")],
+        folder,
+    )
 
 
 WRITTEN = [override, own_recipe, own_group, from_python, drawn]
@@ -78,7 +118,9 @@ def test_the_peak_is_that_of_the_diameter_as_written(tmp_path, store, written, d
 def test_the_ratio_to_the_threshold_grows_with_the_fourth_power_of_the_diameter(tmp_path, store):
     ratios = []
     for millimetres in (5, 8.0784, 11, 25):
-        exposure, limit = judged(load("first_light", [*CAMERA, f"optics.diameter={millimetres} mm"]), store)
+        exposure, limit = judged(
+            load("first_light", [*CAMERA, *ALONE, f"optics.diameter={millimetres} mm"]), store
+        )
         ratios.append(exposure / limit / millimetres**4)
     assert ratios == pytest.approx([ratios[0]] * 4, rel=1e-3)
 
@@ -98,7 +140,9 @@ def test_the_ratio_to_the_threshold_grows_with_the_fourth_power_of_the_diameter(
     ],
 )  # fmt: skip
 def test_another_lens_than_that_of_the_steps_is_refused(tmp_path, recipe, changes, path, message):
-    """Each was estimated without a word: for the smaller of both lenses, or with the mask of another lens."""
+    """Each was estimated without a word: for the smaller of both lenses, or with the mask of
+    another lens.
+    """
     words = CAMERA if recipe == "first_light" else ["safety.draws=100", "optics.samples=256"]
     with pytest.raises(RecipeError, match=message) as error:
         prepare(load(recipe, [*words, *changes], tmp_path), None)

@@ -1,4 +1,6 @@
-"""Levels of light of ranked pixels with the veil of a lens, against sums over every pixel and SciPy's programs."""
+"""Levels of light of ranked pixels with the veil of a lens, against sums over every pixel and
+SciPy's programs.
+"""
 
 import math
 from types import SimpleNamespace
@@ -10,8 +12,8 @@ from scipy.optimize import brentq
 
 from neusee.nodes.laser import BrightPixels
 from neusee.workflows.recipe.blocks.safety_block import Laser, Safety, SafetySettings
-from neusee.workflows.safety.light_levels import Grid, Levels, Veil, levels_of, veil_of
-from neusee.workflows.safety.uncertain_values import SettingDraws
+from neusee.workflows.safety.exposures import SettingDraws
+from neusee.workflows.safety.laser_spots import Grid, Levels, Veil, levels_of, veil_of
 
 SHAPE = (61, 81)
 Y, X = (np.arange(n) - n // 2 for n in SHAPE)
@@ -29,12 +31,19 @@ def veil(share=0.02):
 
 def groups(light, rim=(math.inf, 0.0, 1.0), smooth=None):
     """Every pixel of a frame as a group of its own, or of several that are alike."""
-    columns = [AWAY.ravel(), np.ones(AWAY.size), light.ravel(), (light if smooth is None else smooth).ravel()]
+    columns = [
+        AWAY.ravel(),
+        np.ones(AWAY.size),
+        light.ravel(),
+        (light if smooth is None else smooth).ravel(),
+    ]
     return BrightPixels(*map(torch.from_numpy, columns), torch.tensor(rim, dtype=torch.float64))
 
 
 def spot(kind):
-    """Pixels of a spot in the middle, or of a mask that sends its light to a ring and leaves the middle dark."""
+    """Pixels of a spot in the middle, or of a mask that sends its light to a ring and leaves the
+    middle dark.
+    """
     core = np.exp(-((AWAY / 4) ** 2)) if kind == "middle" else np.exp(-(((AWAY - 20) / 2) ** 2))
     return core / core.sum()
 
@@ -55,15 +64,21 @@ def test_the_veil_lies_beside_the_spot_behind_a_mask_as_well(kind, share):
 
 def test_without_a_veil_there_is_one_row_of_the_core_and_the_veiled_feature_has_the_smooth_one():
     core, smooth = spot("middle"), np.full(SHAPE, 1 / AWAY.size)
-    bare, _ = levels_of(groups(core, smooth=smooth), SHAPE, RANKS, None, np.array([0.1, 0.2]), False)
+    bare, _ = levels_of(
+        groups(core, smooth=smooth), SHAPE, RANKS, None, np.array([0.1, 0.2]), False
+    )
     assert bare.shape == (1, len(RANKS))
-    np.testing.assert_allclose(np.exp(bare[0]), np.sort(core.ravel())[::-1][RANKS.astype(int) - 1] + 1e-300, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.exp(bare[0]), np.sort(core.ravel())[::-1][RANKS.astype(int) - 1] + 1e-300, rtol=1e-9
+    )
     even, _ = levels_of(groups(core, smooth=smooth), SHAPE, RANKS, None, np.zeros(1), True)
     np.testing.assert_allclose(np.exp(even[0]), 1 / AWAY.size, rtol=1e-9)
 
 
 def in_window(half=10, light=1e-5):
-    """A window of 21 pixels of a frame of 61 x 81: a spot within it, a rim, and a tenth of the light nowhere."""
+    """A window of 21 pixels of a frame of 61 x 81: a spot within it, a rim, and a tenth of the
+    light nowhere.
+    """
     inside = np.maximum(np.abs(Y)[:, None], np.abs(X)) <= half
     core = np.where(inside, 1 / (1 + (AWAY / 2) ** 3), 0.0)
     core *= 0.8 / core.sum()
@@ -75,7 +90,9 @@ def in_window(half=10, light=1e-5):
 @pytest.mark.parametrize("rim", [1e-5, 3e-4])
 @pytest.mark.parametrize("share", [0.0, 0.02])
 def test_hidden_light_is_dealt_out_so_that_as_many_pixels_as_can_be_reach_a_level(share, rim):
-    """The tenth that neither window nor radial law has lies outside: levels by a root of SciPy over all pixels."""
+    """The tenth that neither window nor radial law has lies outside: levels by a root of SciPy
+    over all pixels.
+    """
     found, inside, core = in_window(light=rim)
     outside = AWAY[~inside]
     light = (1 - share) * rim * (10 / outside) ** 3 + share / 0.02 * law(outside)
@@ -84,13 +101,19 @@ def test_hidden_light_is_dealt_out_so_that_as_many_pixels_as_can_be_reach_a_leve
 
     def lit(level):
         lacks = np.sort(np.maximum(level - light, 0.0)).cumsum()
-        return np.searchsorted(lacks, hidden, side="right") + np.searchsorted(-own, -level, side="right")
+        return np.searchsorted(lacks, hidden, side="right") + np.searchsorted(
+            -own, -level, side="right"
+        )
 
     ranks = np.array([200.0, 500.0, 1500.0, 4000.0])
     lights = veil() if share else None
     levels, beyond = levels_of(found, SHAPE, ranks, lights, np.array([share]), False)
     expected = [
-        math.exp(brentq(lambda x, rank=rank: lit(math.exp(x)) - rank + 0.5, math.log(1e-9), math.log(0.1)))
+        math.exp(
+            brentq(
+                lambda x, rank=rank: lit(math.exp(x)) - rank + 0.5, math.log(1e-9), math.log(0.1)
+            )
+        )
         for rank in ranks
     ]
     np.testing.assert_allclose(np.exp(levels[0]), expected, rtol=0.05)
@@ -118,13 +141,17 @@ def test_a_grid_holds_its_values_and_interpolates_them_in_straight_lines():
     at = np.array([[-1.0, 0.0, 0.6, 2.0, 5.0]])
     weights = np.stack(grid.weights(at))
     np.testing.assert_allclose(weights.sum(0), 1, rtol=1e-12)
-    np.testing.assert_allclose((weights * grid.points[:, None, None]).sum(0), np.clip(at, 0, 2), atol=1e-12)
+    np.testing.assert_allclose(
+        (weights * grid.points[:, None, None]).sum(0), np.clip(at, 0, 2), atol=1e-12
+    )
     assert one.weights(at)[0].tolist() == [[1.0]]
 
 
 @pytest.mark.parametrize(("low", "high"), [(-0.75, 0.38), (0.2, 0.9), (-3.0, -0.1), (0.0, 1.0)])
 def test_a_grid_through_zero_holds_its_values_and_gives_zero_without_interpolation(low, high):
-    """The nominal values and all draws far from the laser have the offset 0: a chord there was 6 % too low."""
+    """The nominal values and all draws far from the laser have the offset 0: a chord there was 6
+    % too low.
+    """
     points = Grid.through_zero(np.array([low, high]), 1.5).points
     assert 0.0 in points.tolist()
     assert points[0] <= low + 1e-12
@@ -147,7 +174,9 @@ def test_levels_are_those_of_their_rungs_and_nearer_than_the_first_the_bound():
     np.testing.assert_allclose(found[0], [[7, 8], [7, 8], *expected, expected[2]], rtol=1e-9)
     assert table.at(place, [np.array([[0.25]])], slice(1, 2)).shape == (1, 6, 1)
     free = Levels(rungs, (grid,), values, np.zeros_like(values))
-    np.testing.assert_allclose(free.at(place, [np.array([[0.25]])], slice(None))[0, 0], expected[0], rtol=1e-9)
+    np.testing.assert_allclose(
+        free.at(place, [np.array([[0.25]])], slice(None))[0, 0], expected[0], rtol=1e-9
+    )
 
 
 def case(scatter, stated=False):
@@ -173,14 +202,19 @@ def test_a_share_that_is_stated_is_not_drawn_unless_it_is_a_law():
     stated = veil_of(case({"share": 0.02}, stated=True), SettingDraws(4, {}, {}, 3))
     assert (stated.share.tolist(), stated.assumed) == ([0.02], False)
     drawn = veil_of(
-        case({"share": 0.02}, stated=True), SettingDraws(2, {"lens.scatter.share": np.array([0.01, 0.04])}, {}, 3)
+        case({"share": 0.02}, stated=True),
+        SettingDraws(2, {"lens.scatter.share": np.array([0.01, 0.04])}, {}, 3),
     )
     assert (drawn.share.tolist(), drawn.assumed) == ([0.02, 0.01, 0.04], False)
 
 
 def test_the_veil_of_stated_surfaces_is_theirs():
-    """pi b0 l^2 ln(1 + 1 / l^2) for the slope -2, in the middle of a pixel far away b0 (1 + (x / f l)^2)^-1."""
-    found = veil_of(case({"surfaces": {"front": {"b0": 2.0, "l": 0.01, "s": -2.0}}}), SettingDraws(4, {}, {}, 3))
+    """pi b0 l^2 ln(1 + 1 / l^2) for the slope -2, in the middle of a pixel far away b0 (1 + (x /
+    f l)^2)^-1.
+    """
+    found = veil_of(
+        case({"surfaces": {"front": {"b0": 2.0, "l": 0.01, "s": -2.0}}}), SettingDraws(4, {}, {}, 3)
+    )
     assert not found.assumed
     assert found.share.tolist() == pytest.approx([math.pi * 2e-4 * math.log1p(1e4)], rel=1e-6)
     angle = 3.45e-6 / 50e-3
@@ -189,8 +223,12 @@ def test_the_veil_of_stated_surfaces_is_theirs():
 
 
 def test_a_group_is_as_bright_from_its_first_pixel_to_its_last():
-    """100 pixels of 1e-3 before 400 of 1e-5: the 101st and the 500th have the same light, the 80th has the other."""
-    radius, pixels, light = (torch.tensor(column).double() for column in ([1.0, 9.0], [100.0, 400.0], [1e-3, 1e-5]))
+    """100 pixels of 1e-3 before 400 of 1e-5: the 101st and the 500th have the same light, the
+    80th has the other.
+    """
+    radius, pixels, light = (
+        torch.tensor(column).double() for column in ([1.0, 9.0], [100.0, 400.0], [1e-3, 1e-5])
+    )
     pair = BrightPixels(radius, pixels, light, light, torch.tensor([math.inf, 0.0, 1.0]))
     ranks = np.array([80.0, 100.0, 101.0, 250.0, 500.0])
     found, _ = levels_of(pair, (20, 25), ranks, None, np.zeros(1), False)

@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 
 from neusee.workflows import Store, load
+from neusee.workflows.safety.laser_spots import peaks_of
 from neusee.workflows.safety.run_safety import document
 from neusee.workflows.safety.safety_estimate import estimate
-from neusee.workflows.safety.spots_along import peaks_of
 from tests.workflows.safety import own_mask_spot as own
 
 EFFICIENCY, WELL, EXPOSURE = 0.05, 30000, 1e-6
 END = 1.03  # ends of intervals agree within this factor
 CAREFUL = 0.08  #: on the careful side, since what an interpolation may miss counts upward
 LIMIT = 0.03  # limits at the distance of the recipe agree within this share
+
+pytestmark = pytest.mark.usefixtures("without_remedies")
 
 RECIPE = """
 defaults: [camera: lens_only, optics: lens_only, doe: {doe}, safety: masked_dazzle]
@@ -65,7 +67,9 @@ class Case:
 
     @property
     def saturation(self) -> float:
-        return own.saturation(self.setting.wavelength, self.setting.pixel, EFFICIENCY, WELL, EXPOSURE)
+        return own.saturation(
+            self.setting.wavelength, self.setting.pixel, EFFICIENCY, WELL, EXPOSURE
+        )
 
     @property
     def power(self) -> float:
@@ -128,7 +132,8 @@ def holds(ends: list[tuple[float, float]], metres: float) -> bool:
 def own_levels(case: Case, metres: float, name: str) -> tuple[float, float]:
     """Return the light for each watt at a rank 8 pixels, or a hundredth, later and earlier.
 
-    Pixels stand on a lattice, about a spot in the middle of one: eight of them have the same distance.
+    Pixels stand on a lattice, about a spot in the middle of one: eight of them have the same
+    distance.
     """
     light = own.pixels(case.setting, metres)
     if name == "with scatter":
@@ -137,7 +142,9 @@ def own_levels(case: Case, metres: float, name: str) -> tuple[float, float]:
     return own.faintest_of(light, case.share + room), own.faintest_of(light, case.share - room)
 
 
-def own_margins(case: Case, power: float, threshold: float, name: str, metres: float) -> tuple[float, float]:
+def own_margins(
+    case: Case, power: float, threshold: float, name: str, metres: float
+) -> tuple[float, float]:
     """Return the least and the greatest exposure over the limit that the separate code allows."""
     if name == "damage":
         return (power * own.peak(case.setting, metres) / threshold,) * 2
@@ -146,21 +153,33 @@ def own_margins(case: Case, power: float, threshold: float, name: str, metres: f
 
 
 def compare(case: Case, power: float, threshold: float, name: str, row: dict) -> None:
-    """Compare the limit, the ends of all intervals, and the distances outside of them, of one row."""
+    """Compare the limit, the ends of all intervals, and the distances outside of them, of one
+    row.
+    """
 
     def margins(metres: float) -> tuple[float, float]:
         return own_margins(case, power, threshold, name, metres)
 
     lower, higher = margins(case.metres)
-    assert lower * (1 - LIMIT) < row["ratio"] < higher * (1 + CAREFUL), (name, row["ratio"], lower, higher)
+    assert lower * (1 - LIMIT) < row["ratio"] < higher * (1 + CAREFUL), (
+        name,
+        row["ratio"],
+        lower,
+        higher,
+    )
     ends = [(zone["near"]["value"], zone["far"]["value"]) for zone in row["zones"]]
     assert ends, name
     for near, far in ends:
         begins = near == pytest.approx(case.near)
-        assert begins or (margins(near / END)[0] < 1 < margins(near * (1 + CAREFUL))[1]), (name, near)
+        assert begins or (margins(near / END)[0] < 1 < margins(near * (1 + CAREFUL))[1]), (
+            name,
+            near,
+        )
         assert margins(far / (1 + CAREFUL))[1] > 1 > margins(far * END)[0], (name, far)
     for metres in np.geomspace(case.near, 300, 7):
-        assert holds(ends, metres) or margins(metres)[0] < 1, f"{name}: not exceeded at {metres:g} m"
+        assert holds(ends, metres) or margins(metres)[0] < 1, (
+            f"{name}: not exceeded at {metres:g} m"
+        )
 
 
 def check(case: Case, folder: Path) -> None:
@@ -209,11 +228,17 @@ def tilted(waves: float) -> own.Mask:
 
 @pytest.mark.parametrize(("waves", "is_computed"), [(12.0, True), (40.0, False)])
 def test_a_peak_outside_the_window_of_its_spot_counts(waves, is_computed, tmp_path):
-    """In a window of 16 wavelengths times f-number to each side a spot at 24 is found, one at 80 is bounded."""
+    """In a window of 16 wavelengths times f-number to each side a spot at 24 is found, one at 80
+    is bounded.
+    """
     setting = replace(SMALL.setting, mask=tilted(waves))
     numbers = f"{{file: mask.npy, unit: 1 m, pitch: {setting.diameter / SMALL.samples:.12g} m}}"
-    path = write(replace(SMALL, setting=setting, doe="pixelwise", numbers=numbers), 1.0, 1.0, tmp_path)
-    recipe = load(path, ["optics.window=[128, 128]", "safety.distances=[0.5 m, 100 m]", "safety.dazzle=null"])
+    path = write(
+        replace(SMALL, setting=setting, doe="pixelwise", numbers=numbers), 1.0, 1.0, tmp_path
+    )
+    recipe = load(
+        path, ["optics.window=[128, 128]", "safety.distances=[0.5 m, 100 m]", "safety.dazzle=null"]
+    )
     assert recipe.safety is not None
     peaks = peaks_of(recipe, recipe.safety, Store(tmp_path / "store"))
     assert peaks is not None
@@ -272,20 +297,36 @@ def drawn_case(kind: str, seed: int) -> Case:
     )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "seed"), [("axicon", 1), ("five_half_rings", 2), ("smooth_random", 3)])
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        pytest.param("axicon", 1, marks=pytest.mark.long),  # a smaller one is above
+        pytest.param("five_half_rings", 2, marks=pytest.mark.slow),
+        pytest.param("smooth_random", 3, marks=pytest.mark.slow),
+    ],
+)
 def test_drawn_cameras_behind_masks(kind, seed, tmp_path):
     check(drawn_case(kind, seed), tmp_path)
 
 
 @pytest.mark.slow
 def test_bounds_count_where_the_samples_do_not_carry_the_curvature(tmp_path):
-    """At 0.3 m a beam of 20 mrad has 50 waves of curvature over a lens of 8 mm, which 192 samples do not carry."""
+    """At 0.3 m a beam of 20 mrad has 50 waves of curvature over a lens of 8 mm, which 192
+    samples do not carry.
+    """
     small = SMALL.setting
-    lens = replace(small, divergence=0.02, waist=2 * 532e-9 / (math.pi * 0.02), focal_length=4.12 * 8e-3, diameter=8e-3)
+    lens = replace(
+        small,
+        divergence=0.02,
+        waist=2 * 532e-9 / (math.pi * 0.02),
+        focal_length=4.12 * 8e-3,
+        diameter=8e-3,
+    )
     case = replace(SMALL, setting=lens, metres=0.3)
     power, threshold = case.power, case.threshold
-    rows, not_said = behind_mask(write(case, power, threshold, tmp_path), [], Store(tmp_path / "store"))
+    rows, not_said = behind_mask(
+        write(case, power, threshold, tmp_path), [], Store(tmp_path / "store")
+    )
     assert any("Nearer than" in sentence for sentence in not_said), not_said
     assert rows["damage"]["ratio"] > own_margins(case, power, threshold, "damage", 0.3)[0]
     assert rows["dazzle"]["ratio"] > own_margins(case, power, threshold, "with scatter", 0.3)[0]

@@ -6,11 +6,17 @@ import pytest
 
 from neusee.workflows import Store, load
 from neusee.workflows.safety import run_safety
-from neusee.workflows.safety.distance_zones import Spread
-from neusee.workflows.safety.safety_words import metres, scaled, share, with_ends
+from neusee.workflows.safety.exposures import Spread
+from neusee.workflows.safety.safety_text import metres, scaled, share, with_ends
 
-QUICK = ["safety.draws=100", "optics.samples=256", "optics.window=[96, 96]", "safety.protection.filter=null",
-         "wide.window=[303, 303]", "safety.dazzle.share=0.001"]  # fmt: skip
+QUICK = [
+    "safety.draws=100",
+    "optics.samples=256",
+    "optics.window=[96, 96]",
+    "safety.protection.filter=null",
+    "wide.window=[303, 303]",
+    "safety.dazzle.share=0.001",
+]
 
 
 @pytest.fixture(scope="module")
@@ -20,11 +26,23 @@ def store(tmp_path_factory):
 
 @pytest.mark.slow
 def test_an_estimate_is_computed_once_and_has_its_pictures_and_table(store, tmp_path, monkeypatch):
-    first, found = run_safety.assess(load("safety_laboratory", QUICK), store, tmp_path / "runs", ["neusee", "safety"])
-    monkeypatch.setattr(run_safety, "complete", lambda *_: pytest.fail("the estimate was in the store"))
-    second, again = run_safety.assess(load("safety_laboratory", QUICK), store, tmp_path / "runs", ["neusee", "safety"])
+    first, found = run_safety.assess(
+        load("safety_laboratory", QUICK), store, tmp_path / "runs", ["neusee", "safety"]
+    )
+    monkeypatch.setattr(
+        run_safety, "complete", lambda *_: pytest.fail("the estimate was in the store")
+    )
+    second, again = run_safety.assess(
+        load("safety_laboratory", QUICK), store, tmp_path / "runs", ["neusee", "safety"]
+    )
     assert (again.document, again.paragraphs) == (found.document, found.paragraphs)
-    for name in ("limits.csv", "recipe.yaml", "figures/pattern.png", "figures/distances.png", "figures/irradiance.png"):
+    for name in (
+        "limits.csv",
+        "recipe.yaml",
+        "figures/pattern.png",
+        "figures/distances.png",
+        "figures/irradiance.png",
+    ):
         assert (first / name).read_bytes() == (second / name).read_bytes(), name
     text = (second / "report.html").read_text(encoding="utf-8")
     assert "<h2" in text
@@ -41,7 +59,10 @@ def test_the_key_changes_with_the_table_of_thresholds_and_with_the_distance(stor
     spans = "wavelength from (nm),wavelength to (nm),duration from (ns),duration to (ns)"
     keys = set()
     for joules, metres_ in ((1, 2), (2, 2), (2, 3), (2, 3)):
-        table.write_text(f"device,damage,{spans},threshold (J/cm2),source\nCMOS,point,500,600,1,100,{joules},bench\n")
+        table.write_text(
+            f"device,damage,{spans},threshold"
+            f" (J/cm2),source\nCMOS,point,500,600,1,100,{joules},bench\n"
+        )
         changes = [*few, f"safety.damage.file={table}", f"lasers.reflection.distance={metres_} m"]
         recipe = load("safety_laboratory", changes)
         keys.add(run_safety.key_of(recipe, run_safety.prepare(recipe, store), store))

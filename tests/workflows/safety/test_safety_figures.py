@@ -1,10 +1,12 @@
-"""The picture of the spot on the sensor over a limit of damage: never one colour, and white at the limit."""
+"""The picture of the spot on the sensor over a limit of damage: never one colour, and white at
+the limit.
+"""
 
 import numpy as np
 import pytest
 
 from neusee.workflows.safety.damage_pattern import DamagePattern
-from neusee.workflows.safety.safety_figures import spots
+from neusee.workflows.safety.safety_page import spots
 
 
 @pytest.mark.parametrize("peak", [5e-8, 0.0096, 0.3, 1.0, 2.6, 40.0, 2.3e5])

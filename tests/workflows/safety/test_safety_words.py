@@ -2,15 +2,18 @@
 
 import pytest
 
-from neusee.workflows.safety.distance_zones import Spread, Zones
-from neusee.workflows.safety.safety_words import zones_text
+from neusee.workflows.safety.exposures import Spread, Zones
+from neusee.workflows.safety.safety_text import zones_text
 
 
 @pytest.mark.parametrize(
     ("reach", "text"),
     [
         (None, "nowhere"),
-        (Spread(1.02, 1.0, 1.06), "nowhere at the nominal values; in some draws out to 1.02 m (1 m to 1.06 m)"),
+        (
+            Spread(1.02, 1.0, 1.06),
+            "nowhere at the nominal values; in some draws out to 1.02 m (1 m to 1.06 m)",
+        ),
         (Spread(2e3, 2e3, 2e3), "nowhere at the nominal values; in some draws out to 2 km"),
     ],
 )

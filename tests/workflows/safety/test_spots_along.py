@@ -8,9 +8,9 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 
 from neusee.workflows import load
-from neusee.workflows.safety import spots_along
-from neusee.workflows.safety.distance_ladder import miss_between
-from neusee.workflows.safety.spots_along import at_distance
+from neusee.workflows.safety import laser_spots as spots_along
+from neusee.workflows.safety.exposures import miss_between
+from neusee.workflows.safety.laser_spots import at_distance
 
 STEP = "laser_pixels[mask,pointer]"
 DIAMETER, WAVELENGTH = 12e-3, 532e-9
@@ -20,22 +20,31 @@ RAYLEIGH = (2 * WAVELENGTH / (math.pi * 1e-3)) / 0.5e-3
 @functools.cache
 def pointer(focus="infinity", samples=512):
     return load(
-        "safety_pointer", [f"+safety.lens.focus={focus}", f"optics.samples={samples}", "optics.defocus=0.3 waves"]
+        "safety_pointer",
+        [f"+safety.lens.focus={focus}", f"optics.samples={samples}", "optics.defocus=0.3 waves"],
     )
 
 
 def defocus_of(recipe):
-    (pupil,) = (step for step in spots_along._upstream(recipe, STEP) if step.node.path == "optics.pupil")
+    (pupil,) = (
+        step for step in spots_along._upstream(recipe, STEP) if step.node.path == "optics.pupil"
+    )
     return pupil.params["defocus"]
 
 
 @pytest.mark.parametrize("metres", [5.0, 700.0])
 @pytest.mark.parametrize("focus", ["infinity", "20 m", "laser"])
 def test_a_spot_at_another_distance_has_its_wavefront_and_the_defocus_of_the_focus(focus, metres):
-    """A lens on the laser takes away the bend of the wavefront, one on 20 m that of a point there, at 550 nm."""
+    """A lens on the laser takes away the bend of the wavefront, one on 20 m that of a point
+    there, at 550 nm.
+    """
     recipe = pointer(focus)
     varied = at_distance(recipe, recipe.safety, STEP, metres)
-    moved = [step.params["distance"] for step in varied.steps.values() if step.node.path == "laser.wavefront"]
+    moved = [
+        step.params["distance"]
+        for step in varied.steps.values()
+        if step.node.path == "laser.wavefront"
+    ]
     assert metres in moved
     bend = {"infinity": 0.0, "20 m": 1 / 20, "laser": 1 / (metres + RAYLEIGH**2 / metres)}[focus]
     assert defocus_of(varied) == pytest.approx(0.3 - bend * DIAMETER**2 / 8 / 550e-9, rel=1e-9)
@@ -44,7 +53,9 @@ def test_a_spot_at_another_distance_has_its_wavefront_and_the_defocus_of_the_foc
 
 @pytest.mark.parametrize("samples", [512, 3072])
 def test_the_nearest_spot_is_one_whose_bend_the_samples_of_the_pupil_carry(samples):
-    """Between two samples of the rim, or of the edge of the beam, the phase turns by a quarter at most."""
+    """Between two samples of the rim, or of the edge of the beam, the phase turns by a quarter
+    at most.
+    """
     recipe = pointer(samples=samples)
     first = spots_along._first(recipe.safety, recipe, STEP)
 
@@ -81,17 +92,23 @@ def test_spots_are_added_where_interpolation_misses_them_and_the_miss_is_said():
     assert {math.sqrt(30.0), math.sqrt(30.0 * 900.0)} <= set(asked)
     assert 5 < len(found.distances) <= 13
     assert len(found.misses) == len(found.distances) - 1
-    straight = spots_along._refined([1.0, 30.0, 900.0], lambda distance: np.array([3 * math.log(distance)]), 13)
+    straight = spots_along._refined(
+        [1.0, 30.0, 900.0], lambda distance: np.array([3 * math.log(distance)]), 13
+    )
     assert len(straight.distances) == 5
     assert max(straight.misses) < 1e-9
     assert 0 < max(found.misses) < 0.06
 
 
 def test_the_gap_that_misses_most_has_the_next_spot_and_no_miss_is_too_small():
-    """A maximum at 700 m and a smooth rest: the spots gather there, and most of what they miss is counted."""
+    """A maximum at 700 m and a smooth rest: the spots gather there, and most of what they miss
+    is counted.
+    """
 
     def bent(distance):
-        return np.array([-math.log(distance) + 2 * math.exp(-((math.log(distance / 700) / 0.6) ** 2))])
+        return np.array(
+            [-math.log(distance) + 2 * math.exp(-((math.log(distance / 700) / 0.6) ** 2))]
+        )
 
     found = spots_along._refined([1.0, 10.0, 100.0, 1000.0, 10000.0], bent, 25)
     assert len([at for at in found.distances if 200 < at < 2500]) >= 8

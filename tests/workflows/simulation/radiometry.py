@@ -1,4 +1,5 @@
-"""Radiometry by SciPy alone: electrons of a laser in watts and of a white wall in lux, from text-book integrals.
+"""Radiometry by SciPy alone: electrons of a laser in watts and of a white wall in lux, from
+text-book integrals.
 
 Nothing of neusee is imported, so that a test compares two computations that share no line.
 """
@@ -14,7 +15,9 @@ PIXEL = 2.9e-6
 
 
 def beam_at_lens(wavelength, laser):
-    """1/e2 radius and curvature radius of the beam at the lens, by the complex beam parameter of the embedded beam."""
+    """1/e2 radius and curvature radius of the beam at the lens, by the complex beam parameter of
+    the embedded beam.
+    """
     stretch = math.sqrt(2) if laser.get("convention") == "1/e" else 1.0
     quality, least = laser.get("m_squared", 1.0), wavelength / math.pi
     waist, divergence = laser.get("waist"), laser.get("divergence")
@@ -31,7 +34,11 @@ def mean_power(laser, exposure):
     if "pulse_duration" not in laser:
         return laser["power"]
     energy = laser.get("pulse_energy", laser.get("power", 0.0) / laser.get("repetition_rate", 1.0))
-    delay, duration, rate = laser.get("pulse_delay", 0.0), laser["pulse_duration"], laser.get("repetition_rate")
+    delay, duration, rate = (
+        laser.get("pulse_delay", 0.0),
+        laser["pulse_duration"],
+        laser.get("repetition_rate"),
+    )
     numbers = [0] if rate is None else range(-2, int(exposure * rate) + 3)
     caught = 0.0
     for number in numbers:
@@ -46,24 +53,38 @@ def haze(wavelength, laser):
         return laser.get("air_transmittance", 1.0)
     km = laser["visibility"] / 1e3
     q = 1.3 if km > 6 else 0.585 * km ** (1 / 3) if laser["haze"] == "kruse" else 0.16 * km + 0.34
-    return 10 ** (-3.912 / math.log(10) / laser["visibility"] * (wavelength / 550e-9) ** -q * laser["distance"])
+    return 10 ** (
+        -3.912
+        / math.log(10)
+        / laser["visibility"]
+        * (wavelength / 550e-9) ** -q
+        * laser["distance"]
+    )
 
 
 def irradiance(wavelength, laser, radii, exposure, points=600):
-    """Irradiance on the sensor in W/m2 at distances from the middle of the spot: the Hankel integral of the pupil."""
+    """Irradiance on the sensor in W/m2 at distances from the middle of the spot: the Hankel
+    integral of the pupil.
+    """
     w, curvature = beam_at_lens(wavelength, laser)
     axis = 2 * mean_power(laser, exposure) * haze(laser["wavelength"], laser) / (math.pi * w**2)
     node, weight = special.roots_legendre(points)
     a = LENS["diameter"] / 2
     rho, weight = a * (node + 1) / 2, weight * a / 2
     k = 2 * math.pi / wavelength
-    field = np.sqrt(axis) * np.exp(-((rho / w) ** 2) + 1j * k * rho**2 / (2 * curvature)) * rho * weight
+    field = (
+        np.sqrt(axis) * np.exp(-((rho / w) ** 2) + 1j * k * rho**2 / (2 * curvature)) * rho * weight
+    )
     bessel = special.j0(k * np.outer(radii, rho) / LENS["focal"])
-    return LENS["transmittance"] * np.abs(2 * math.pi * bessel @ field / (wavelength * LENS["focal"])) ** 2
+    return (
+        LENS["transmittance"]
+        * np.abs(2 * math.pi * bessel @ field / (wavelength * LENS["focal"])) ** 2
+    )
 
 
 def sampled_irradiance(wavelength, laser, y, x, exposure, samples=540):
-    """Irradiance on the sensor in W/m2 at the places (y, x) by a sum over the samples of the pupil inside its rim.
+    """Irradiance on the sensor in W/m2 at the places (y, x) by a sum over the samples of the pupil
+    inside its rim.
 
     The rim is a staircase, whose samples stand for the area of the disc.
     """
@@ -73,14 +94,23 @@ def sampled_irradiance(wavelength, laser, y, x, exposure, samples=540):
     square = at[:, None] ** 2 + at**2
     inside = square <= LENS["diameter"] ** 2 / 4
     field = inside * np.exp(-square / w**2 + 1j * math.pi / wavelength * square / curvature)
-    rows, columns = (np.exp(-2j * math.pi / (wavelength * LENS["focal"]) * np.outer(to, at)) for to in (y, x))
+    rows, columns = (
+        np.exp(-2j * math.pi / (wavelength * LENS["focal"]) * np.outer(to, at)) for to in (y, x)
+    )
     step = math.pi * LENS["diameter"] ** 2 / 4 / inside.sum() * (LENS["diameter"] / samples) ** 2
-    return LENS["transmittance"] * axis * step * np.abs(rows @ field @ columns.T / (wavelength * LENS["focal"])) ** 2
+    return (
+        LENS["transmittance"]
+        * axis
+        * step
+        * np.abs(rows @ field @ columns.T / (wavelength * LENS["focal"])) ** 2
+    )
 
 
 def electrons(laser, radii, exposure, efficiency):
     """Electrons of a pixel at its centre, at distances from the middle of the spot."""
-    return line_electrons(laser, exposure, efficiency, lambda nm: irradiance(nm, laser, radii, exposure))
+    return line_electrons(
+        laser, exposure, efficiency, lambda nm: irradiance(nm, laser, radii, exposure)
+    )
 
 
 def line_electrons(laser, exposure, efficiency, light, nodes=9):
@@ -95,10 +125,21 @@ def line_electrons(laser, exposure, efficiency, light, nodes=9):
 
 
 def white_electrons(lux, spectrum, luminous, efficiency, band, exposure):
-    """Electrons of a pixel on the image of a white wall: lux to candela, to watts through 683 lm/W, to the sensor."""
+    """Electrons of a pixel on the image of a white wall: lux to candela, to watts through 683
+    lm/W, to the sensor.
+    """
     nm = np.arange(360, 831) * 1e-9
     watts = lux / math.pi / (683 * integrate.trapezoid(spectrum(nm) * luminous(nm), nm))
     fine = np.linspace(*band, 6001)
     solid = math.pi * LENS["diameter"] ** 2 / 4 / LENS["focal"] ** 2
-    photons = watts * spectrum(fine) * fine / (PLANCK * LIGHT) * solid * LENS["transmittance"] * exposure * PIXEL**2
+    photons = (
+        watts
+        * spectrum(fine)
+        * fine
+        / (PLANCK * LIGHT)
+        * solid
+        * LENS["transmittance"]
+        * exposure
+        * PIXEL**2
+    )
     return integrate.trapezoid(photons * efficiency(fine), fine)

@@ -1,4 +1,6 @@
-"""The option `damage: published` in a recipe in watts: one verdict for every setting of the camera, and dead pixels."""
+"""The option `damage: published` in a recipe in watts: one verdict for every setting of the
+camera, and dead pixels.
+"""
 
 import pytest
 import torch
@@ -53,7 +55,9 @@ def compute(tmp_path_factory):
     (folder / "own.csv").write_text(OWN)
     (folder / "mono.csv").write_text("wavelength (nm),QE (%)\n350,20\n525,69\n1100,0.2\n")
     store = Store(folder / "store")
-    return lambda name, outputs, *changes: load(f"{name}.yaml", list(changes), folder).run(store, outputs=outputs)
+    return lambda name, outputs, *changes: load(f"{name}.yaml", list(changes), folder).run(
+        store, outputs=outputs
+    )
 
 
 def test_the_verdict_is_the_same_for_every_exposure_gain_well_and_noise(compute):
@@ -79,9 +83,13 @@ def test_the_verdict_is_the_same_for_every_exposure_gain_well_and_noise(compute)
 
 @pytest.mark.slow
 def test_the_frame_has_the_dead_pixels_of_both_lasers(compute):
-    found = compute("green", ["raw[plain]", "dead[plain]", "damage[plain,dot]", "damage[plain,flash]"])
+    found = compute(
+        "green", ["raw[plain]", "dead[plain]", "damage[plain,dot]", "damage[plain,flash]"]
+    )
     raw, dead = found["raw[plain]"], found["dead[plain]"]
-    pattern = (found["damage[plain,dot]"].pattern | found["damage[plain,flash]"].pattern)[4:44, 2:46]
+    pattern = (found["damage[plain,dot]"].pattern | found["damage[plain,flash]"].pattern)[
+        4:44, 2:46
+    ]
     black = (pattern & 4 > 0).any(0) | (pattern & 4 > 0).any(1)[:, None]  # crosses
     assert 0 < int((pattern & 1).sum()) < 400
     assert 0 < int(black.sum()) < black.numel()

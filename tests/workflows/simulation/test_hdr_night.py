@@ -1,12 +1,20 @@
-"""The street at night: what the recipe restores is nearer to the scene than the picture before restoration."""
+"""The street at night: what the recipe restores is nearer to the scene than the picture before
+restoration.
+"""
 
 import pytest
 
 from neusee.workflows import Store, load
 
-SMALL = ["optics.samples=128", "optics.pitch=63.11 um", "optics.window=[128, 128]", "optics.bands=7",
-         "scene.shape=[128, 128]", "sensor.shape=[112, 112]",
-         "outputs=[developed_quality, restored_quality]"]  # fmt: skip
+SMALL = [
+    "optics.samples=128",
+    "optics.pitch=63.11 um",
+    "optics.window=[128, 128]",
+    "optics.bands=7",
+    "scene.shape=[128, 128]",
+    "sensor.shape=[112, 112]",
+    "outputs=[developed_quality, restored_quality]",
+]
 
 
 def gains(words, folder):

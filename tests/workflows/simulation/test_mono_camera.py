@@ -1,4 +1,6 @@
-"""A camera of one channel from a table of its quantum efficiency: the whole chain, and light at 1064 nm."""
+"""A camera of one channel from a table of its quantum efficiency: the whole chain, and light at
+1064 nm.
+"""
 
 from functools import partial
 
@@ -8,14 +10,25 @@ import torch
 from PIL import Image
 from safetensors.torch import save_file
 
-from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
+from neusee.nodes.restore._networks._unet_and_nafnet import NAFNet
 from neusee.nodes.scene import grey
 from neusee.nodes.scene._spectral_exr import exr_parts
 from neusee.workflows import Store, load
 
 #: quantum efficiency in percent by wavelength in nm, as a data sheet draws it
-QE = [(350, 20), (400, 45), (450, 60), (525, 69), (600, 62), (700, 45), (850, 19), (950, 7), (1050, 1.2), (1100, 0.2)]
+QE = [
+    (350, 20),
+    (400, 45),
+    (450, 60),
+    (525, 69),
+    (600, 62),
+    (700, 45),
+    (850, 19),
+    (950, 7),
+    (1050, 1.2),
+    (1100, 0.2),
+]
 SENSOR = """\
 # A mono camera like an IMX, with its quantum efficiency to 1100 nm.
 defaults: [small]
@@ -30,9 +43,17 @@ lasers:
   infrared: {wavelength: 1064 nm, fwhm: 1 nm, strength: 1e3, angle: [0.2 mrad, -0.1 mrad]}
 """
 SMALL = [
-    "laser=infrared", "camera=mono", "scene.shape=[64, 64]", "sensor.shape=[48, 48]", "optics.samples=64",
-    "optics.pitch=126.2 um", "optics.window=[64, 64]", "optics.bands=5", "doe.waves=[2]", "expect={}",
-]  # fmt: skip
+    "laser=infrared",
+    "camera=mono",
+    "scene.shape=[64, 64]",
+    "sensor.shape=[48, 48]",
+    "optics.samples=64",
+    "optics.pitch=126.2 um",
+    "optics.window=[64, 64]",
+    "optics.bands=5",
+    "doe.waves=[2]",
+    "expect={}",
+]
 PLANCK, LIGHT = 6.62607015e-34, 299792458.0
 
 
@@ -43,17 +64,23 @@ def mono(tmp_path):
         (tmp_path / path).parent.mkdir()
         (tmp_path / path).write_text(text)
     rows = "".join(f"{nm},{percent}\n" for nm, percent in QE)
-    (tmp_path / "sensor" / "mono.csv").write_text("# read off a curve\nwavelength (nm),QE (%)\n" + rows)
+    (tmp_path / "sensor" / "mono.csv").write_text(
+        "# read off a curve\nwavelength (nm),QE (%)\n" + rows
+    )
 
     def compute(outputs, *words):
-        recipe = load("first_light", [*SMALL, "sensor=mine", *words, f"outputs=[{outputs}]"], tmp_path)
+        recipe = load(
+            "first_light", [*SMALL, "sensor=mine", *words, f"outputs=[{outputs}]"], tmp_path
+        )
         return recipe, recipe.run(Store(tmp_path / "store"))
 
     return compute
 
 
 def test_1064_nm_gives_the_photons_of_the_direct_sum(mono):
-    """Irradiance times QE over its largest, wavelength, exposure and area of a pixel, over the energy of a photon."""
+    """Irradiance times QE over its largest, wavelength, exposure and area of a pixel, over the
+    energy of a photon.
+    """
     _, result = mono('"spot[plain,infrared]", "laser_photons[plain,infrared]", "line[infrared]"')
     line, spot = result["line[infrared]"], result["spot[plain,infrared]"].double().numpy()
     wanted = np.zeros(spot.shape[1:])
@@ -62,7 +89,9 @@ def test_1064_nm_gives_the_photons_of_the_direct_sum(mono):
         wanted += image * share * 0.1 * 2.9e-6**2 * centre / (PLANCK * LIGHT)
     found = result["laser_photons[plain,infrared]"]
     assert found.shape == (1, 64, 64)
-    np.testing.assert_allclose(found[0].double().numpy(), wanted, rtol=2e-6, atol=1e-6 * wanted.max())
+    np.testing.assert_allclose(
+        found[0].double().numpy(), wanted, rtol=2e-6, atol=1e-6 * wanted.max()
+    )
     assert wanted.max() > 25500 / 0.69  # the laser alone fills a pixel
 
 
@@ -76,21 +105,29 @@ def test_the_same_laser_is_missing_from_the_picture_of_an_eye(mono):
 @pytest.mark.slow
 @pytest.mark.parametrize("restore", ["wiener", "richardson_lucy"])
 def test_the_whole_chain_runs_with_one_channel_and_its_pictures_are_grey(mono, restore):
-    _, result = mono("raw, developed, restored, truth, scene, restored_quality, saturated", f"restore={restore}")
+    _, result = mono(
+        "raw, developed, restored, truth, scene, restored_quality, saturated", f"restore={restore}"
+    )
     assert result["raw[mask]"].shape == (1, 48, 48)
     for name in ("developed[plain]", "restored", "truth"):
         picture = result[name]
         assert picture.shape == (3, 48, 48)
         assert torch.equal(picture[0], picture[1])
         assert torch.equal(picture[0], picture[2])
-    luminance = (result["scene"].double() * torch.tensor([0.2126, 0.7152, 0.0722]).double()[:, None, None]).sum(0)
-    torch.testing.assert_close(result["truth"][0].double(), luminance[8:56, 8:56], rtol=1e-6, atol=1e-7)
+    luminance = (
+        result["scene"].double() * torch.tensor([0.2126, 0.7152, 0.0722]).double()[:, None, None]
+    ).sum(0)
+    torch.testing.assert_close(
+        result["truth"][0].double(), luminance[8:56, 8:56], rtol=1e-6, atol=1e-7
+    )
     assert float(result["restored_quality"].psnr) > 10
 
 
 @pytest.mark.slow
 def test_a_grey_scene_is_developed_to_its_luminance(mono):
-    """Behind the plain lens and without a laser, a flat grey field keeps its level: the matrix balances white."""
+    """Behind the plain lens and without a laser, a flat grey field keeps its level: the matrix
+    balances white.
+    """
     words = ["laser=none", "scene=siemens", "sensor.read_noise=0 e-", "restore=wiener_blind"]
     _, result = mono("developed, truth", *words)
     inner = (slice(None), slice(16, 32), slice(16, 32))
@@ -100,14 +137,18 @@ def test_a_grey_scene_is_developed_to_its_luminance(mono):
 
 def test_grey_is_the_luminance_in_each_channel():
     picture = torch.rand(2, 3, 4, 5, generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(grey(picture).double(), grey.hooks.reference(picture), rtol=1e-6, atol=1e-7)
+    torch.testing.assert_close(
+        grey(picture).double(), grey.hooks.reference(picture), rtol=1e-6, atol=1e-7
+    )
     assert torch.equal(grey(torch.ones(3, 2, 2)), torch.ones(3, 2, 2))
     with pytest.raises(ValueError, match=r"\(1, 4, 5\) is not a colour picture"):
         grey(picture[0, :1])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("change", ["restore=nafnet", "flare=dirty_windshield", "reading=as_printed"])
+@pytest.mark.parametrize(
+    "change", ["restore=nafnet", "flare=dirty_windshield", "reading=as_printed"]
+)
 def test_every_other_branch_of_the_graph_runs_with_one_channel(tmp_path, mono, change):
     net = start_network(partial(NAFNet, width=16), torch.Generator().manual_seed(0))
     save_file(net.state_dict(), tmp_path / "net.safetensors")
@@ -125,18 +166,32 @@ def test_the_page_of_a_run_shows_the_mono_camera(tmp_path, mono, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "cache"))
     outputs = (
-        "outputs=[raw, restored, lsr, bsr, outside, developed_quality, restored_quality, peak, saturated, transfer]"
+        "outputs=[raw, restored, lsr, bsr, outside, developed_quality, restored_quality, peak,"
+        " saturated, transfer]"
     )
     with pytest.raises(SystemExit) as end:
         app.main(["run", "first_light", *SMALL, "sensor=mine", outputs])
     assert not end.value.code
     latest = tmp_path / "runs" / "latest"
     drawn = {path.stem for path in (latest / "figures").iterdir()}
-    assert drawn >= {"overview", "spectra", "tables", "suppression", "psf", "height", "sensor", "graph"}
+    assert drawn >= {
+        "overview",
+        "spectra",
+        "tables",
+        "suppression",
+        "psf",
+        "height",
+        "sensor",
+        "graph",
+    }
     page = (latest / "report.html").read_text()
     assert 'id="tables">Your own tables' in page
     assert "LSR at 700 nm, the band nearest to the laser at 1064 nm" in page
-    assert {path.name for path in (latest / "data").iterdir()} >= {"raw_mask.png", "raw_mask.exr", "restored.exr"}
+    assert {path.name for path in (latest / "data").iterdir()} >= {
+        "raw_mask.png",
+        "raw_mask.exr",
+        "restored.exr",
+    }
     raw = np.asarray(Image.open(latest / "data" / "raw_mask.png"))
     assert raw.shape == (48, 48)
     assert raw.max() > 1000

@@ -1,4 +1,6 @@
-"""What a run computes: the outputs of the recipe and what these need, and nothing for the report alone."""
+"""What a run computes: the outputs of the recipe and what these need, and nothing for the report
+alone.
+"""
 
 import json
 
@@ -31,7 +33,9 @@ def report(write, tmp_path):
 
     def report(*changes):
         recipe = load(write(RECIPE), changes, tmp_path)
-        return simulate(recipe, Store(tmp_path / "cache"), tmp_path / "runs", ["neusee", "run"]).document
+        return simulate(
+            recipe, Store(tmp_path / "cache"), tmp_path / "runs", ["neusee", "run"]
+        ).document
 
     return report
 

@@ -1,4 +1,6 @@
-"""What recipes tell a Wiener filter: ghosts are glare wherever there are some, and lasers known roughly have laws."""
+"""What recipes tell a Wiener filter: ghosts are glare wherever there are some, and lasers known
+roughly have laws.
+"""
 
 import pytest
 
@@ -21,7 +23,9 @@ def test_a_clean_window_has_no_ghosts(restorer):
 
 
 def test_the_laws_of_a_laser_reach_its_patterns():
-    recipe = load("six_lasers", ["restore=wiener_uncertain", "restore.pixels=0.25", "restore.wavelength=3 nm"])
+    recipe = load(
+        "six_lasers", ["restore=wiener_uncertain", "restore.pixels=0.25", "restore.wavelength=3 nm"]
+    )
     patterns = recipe.steps["deconvolved"].wires["nearby"]
     assert len(patterns) == len(recipe.steps["deconvolved"].wires["glare"]) == 6
     laws = {"pixels": 0.25, "wavelength": 3e-9, "defocus": 0.1}
@@ -39,9 +43,15 @@ def test_a_search_is_told_nothing_of_the_laser_but_the_frame():
         told.add(name)
         if name != "raw[mask]":  # the frame
             wires = recipe.steps[name].wires.values()
-            before += [each for wire in wires for each in ([wire] if isinstance(wire, str) else wire or ())]
+            before += [
+                each for wire in wires for each in ([wire] if isinstance(wire, str) else wire or ())
+            ]
     assert {"search", "found_glare[first]", "found_nearby[third]", "raw[mask]"} <= told
-    assert not [name for name in told if "green" in name or name.startswith(("line", "laser", "direction", "light"))]
+    assert not [
+        name
+        for name in told
+        if "green" in name or name.startswith(("line", "laser", "direction", "light"))
+    ]
     assert recipe.steps["deconvolved"].wires["glare"] == tuple(
         f"found_glare[{n}]" for n in ("first", "second", "third")
     )

@@ -2,13 +2,12 @@
 
 import os
 import shutil
-import subprocess
 import tempfile
 from pathlib import Path
 
 import pytest
 
-from tests.workflows.store.other_users import FIRST, GROUP, STRANGER, command_of
+from tests.workflows.store.other_users import FIRST, GROUP, STRANGER, forks_of_users, who
 
 
 @pytest.fixture
@@ -20,17 +19,29 @@ def place():
     shutil.rmtree(folder)
 
 
-@pytest.fixture
-def cache(place):
+@pytest.fixture(scope="module")
+def users():
+    """A server of commands of several users."""
     if not hasattr(os, "geteuid") or os.geteuid() != 0:
         pytest.skip("only root can start processes of other users")
-    if not (shutil.which("unshare") and shutil.which("setpriv")):
-        pytest.skip("there is no unshare and setpriv of util-linux")
-    tried = subprocess.run(
-        command_of(place, STRANGER, "", 0o022, "import neusee"), capture_output=True, text=True, cwd="/"
-    )
-    if tried.returncode:
-        pytest.skip(f"other users cannot read this Python, and mounts are not allowed: {tried.stderr[-200:]}")
+    if not shutil.which("unshare"):
+        pytest.skip("there is no unshare of util-linux")
+    folder = tempfile.mkdtemp(prefix="neusee-users-")
+    os.chmod(folder, 0o755)
+    forks = forks_of_users(folder)
+    code = "import neusee, os\nos.listdir(next(iter(neusee.__path__)))"
+    try:
+        tried = forks(cwd="/", env=os.environ, code=code, user=who(STRANGER, ()))
+        assert tried.returncode == 0, tried.stderr[-200:]
+    except (AssertionError, OSError, ValueError) as error:
+        pytest.skip(f"other users cannot read this Python, and mounts are not allowed: {error}")
+    yield forks
+    forks.close()
+    shutil.rmtree(folder)
+
+
+@pytest.fixture
+def cache(place, users):
     folder = place / "cache"
     folder.mkdir()
     os.chown(folder, FIRST, GROUP)

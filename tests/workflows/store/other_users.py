@@ -7,10 +7,14 @@ import sys
 import tempfile
 from pathlib import Path
 
+from tests.workflows.forked_commands import Commands
+
 GROUP = 60_001
 FIRST, SECOND, STRANGER = 60_011, 60_012, 60_013  #: numbers of users; no account is needed
 #: what a user must read, and what the home folder of root may hide
-NEEDED = tuple(dict.fromkeys(map(os.path.realpath, (sys.base_prefix, sys.prefix, Path(__file__).parents[3]))))
+NEEDED = tuple(
+    dict.fromkeys(map(os.path.realpath, (sys.base_prefix, sys.prefix, Path(__file__).parents[3])))
+)
 
 
 def hidden_above(path):
@@ -20,7 +24,9 @@ def hidden_above(path):
 
 
 def opened(place):
-    """Lines of a shell that, in a mount namespace of their own, let every user enter what Python needs."""
+    """Lines of a shell that, in a mount namespace of their own, let every user enter what Python
+    needs.
+    """
     lines, known = ["set -e", "mount --make-rprivate /"], {}
     for path in NEEDED:
         top = hidden_above(path)
@@ -38,8 +44,28 @@ def opened(place):
     return lines
 
 
-def command_of(place, user, groups, umask, *words):
-    """The command that runs Python as a user; in a test, ``words`` are its arguments."""
-    who = ["setpriv", f"--reuid={user}", f"--regid={user}", f"--groups={groups}" if groups else "--clear-groups"]
-    script = "; ".join([*opened(tempfile.mkdtemp(dir=place)), f"umask {umask:04o}", 'exec "$@"'])
-    return ["unshare", "--mount", "sh", "-c", script, "sh", *who, sys.executable, "-c", *words]
+#: what the processes of other users import, before they are those of others
+IMPORTS = (
+    "neusee.workflows",
+    "neusee.workflows.engine.runner",
+    "neusee.workflows.store.remote_store",
+    "tests.workflows.store.whole_cache",
+    *(f"neusee.nodes.{family}" for family in ("doe", "flare", "laser", "optics", "scene")),
+    *(f"neusee.nodes.{family}" for family in ("sensor", "spectra", "restore", "metrics")),
+)
+
+
+def forks_of_users(place):
+    """A server of commands whose processes may become users, in a mount namespace of its own."""
+    script = "; ".join([*opened(tempfile.mkdtemp(dir=place)), 'exec "$@"'])
+    above = [str(Path(__file__).parents[3]), os.environ.get("PYTHONPATH", "")]
+    return Commands(
+        imports=IMPORTS,
+        prefix=["unshare", "--mount", "sh", "-c", script, "sh"],
+        variables={"PYTHONDONTWRITEBYTECODE": "1", "PYTHONPATH": os.pathsep.join(above)},
+    )
+
+
+def who(user, groups=(GROUP,), umask=0o022):
+    """What a process needs to become a user."""
+    return {"number": user, "groups": list(groups), "umask": umask}

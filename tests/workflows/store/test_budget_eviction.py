@@ -11,11 +11,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neusee.workflows.store import budget_eviction, shared_folder
+from neusee.workflows.store import eviction as budget_eviction
+from neusee.workflows.store import shared_folder
 from neusee.workflows.store.band_files import Stacked
-from neusee.workflows.store.budget_eviction import Candidate, chosen
-from neusee.workflows.store.byte_sizes import parse_size
+from neusee.workflows.store.cache_settings import parse_size
 from neusee.workflows.store.derived_files import DerivedFiles
+from neusee.workflows.store.eviction import Candidate, chosen
 from neusee.workflows.store.result_store import Store
 
 N = 5000  #: numbers in a value: 20 kB
@@ -27,7 +28,11 @@ def key_of(i):
 
 
 def put(store, i, seconds=1.0, n=N):
-    return store.put(key_of(i), torch.full((n,), float(i)), {"step": f"s{i}", "seconds": seconds, "facts": {"max": i}})
+    return store.put(
+        key_of(i),
+        torch.full((n,), float(i)),
+        {"step": f"s{i}", "seconds": seconds, "facts": {"max": i}},
+    )
 
 
 def used(root, i, ago):
@@ -69,7 +74,8 @@ def test_sizes_are_read_as_people_write_them(text, size, monkeypatch, tmp_path):
 def test_what_is_no_size_is_refused_with_the_fix(text, monkeypatch, tmp_path):
     monkeypatch.setenv("NEUSEE_CACHE_BUDGET", text)
     with pytest.raises(
-        ValueError, match=r"NEUSEE_CACHE_BUDGET: .* is not a size: write a number of bytes, such as 20 GB"
+        ValueError,
+        match=r"NEUSEE_CACHE_BUDGET: .* is not a size: write a number of bytes, such as 20 GB",
     ):
         Store(tmp_path)
 
@@ -110,7 +116,9 @@ def test_the_fewest_seconds_a_byte_go_first_and_count_half_a_week_later():
     assert [c.key for c in chosen([dear, cheap], 1)] == ["cheap"]
     assert [c.key for c in chosen([dear, large], 1)] == ["large"]
     assert [c.key for c in chosen([Candidate("dear", 100, 3.0, -2 * week), cheap], 1)] == ["dear"]
-    assert [c.key for c in chosen([Candidate("dear", 100, 3.0, -1.5 * week), cheap], 1)] == ["cheap"]
+    assert [c.key for c in chosen([Candidate("dear", 100, 3.0, -1.5 * week), cheap], 1)] == [
+        "cheap"
+    ]
 
 
 def test_a_value_stays_where_those_that_go_make_just_enough_room_without_it():
@@ -315,7 +323,10 @@ for i in range(40):
 @pytest.mark.slow
 def test_users_who_make_room_at_once_do_no_harm(tmp_path):
     command = [sys.executable, "-c", EVICTOR, str(tmp_path), str(8 * SIZE)]
-    users = [subprocess.Popen([*command, str(5 * i)], stderr=subprocess.PIPE, text=True) for i in range(2)]
+    users = [
+        subprocess.Popen([*command, str(5 * i)], stderr=subprocess.PIPE, text=True)
+        for i in range(2)
+    ]
     for user in users:
         assert user.communicate()[1] == ""
         assert user.returncode == 0
@@ -332,7 +343,10 @@ def test_users_who_make_room_at_once_do_no_harm(tmp_path):
 
 
 def banded(names):
-    return Stacked(torch.stack([torch.full((2000,), float(n)) for n in names]), tuple(f"{n:032x}" for n in names))
+    return Stacked(
+        torch.stack([torch.full((2000,), float(n)) for n in names]),
+        tuple(f"{n:032x}" for n in names),
+    )
 
 
 def bands(root):
@@ -397,7 +411,9 @@ def test_damaged_entries_go_after_a_week(tmp_path, monkeypatch):
 
 def test_pictures_go_with_their_entry_and_count(tmp_path, monkeypatch):
     store = Store(tmp_path)
-    path = DerivedFiles(store).keep(key_of(1), ".png", "picture", lambda path: path.write_bytes(b"x" * 50_000))
+    path = DerivedFiles(store).keep(
+        key_of(1), ".png", "picture", lambda path: path.write_bytes(b"x" * 50_000)
+    )
     stray = path.with_name(f"{key_of(257)}.png")
     stray.write_bytes(b"y")
     half = path.with_name(f".{key_of(257)}.77.png")
@@ -428,7 +444,7 @@ def test_nothing_is_swept_where_there_is_nothing(tmp_path):
     assert not (tmp_path / "none").exists()
 
 
-# --- borders ----------------------------------------------------------------------------------------------------------
+# --- borders --------------------------------------------------------------------------------------
 
 
 class Folder:
@@ -443,7 +459,9 @@ class Folder:
         return self.stored
 
 
-@pytest.mark.parametrize(("stored", "excess"), [(999, 0.0), (1000, 0.0), (1001, 101.0), (5000, 4100.0)])
+@pytest.mark.parametrize(
+    ("stored", "excess"), [(999, 0.0), (1000, 0.0), (1001, 101.0), (5000, 4100.0)]
+)
 def test_beyond_the_budget_a_tenth_of_it_is_freed_too(monkeypatch, stored, excess):
     """Nine tenths of the budget remain, so that the next write evicts nothing."""
     folder = Folder(monkeypatch, stored)
@@ -480,15 +498,21 @@ def test_the_weight_halves_in_a_week_since_the_newest_use():
 
 
 def test_of_equal_weight_the_longest_unused_goes_first_and_then_the_key_decides():
-    nothing = [Candidate("b", 10, 0.0, 5.0), Candidate("a", 10, -3.0, 5.0), Candidate("c", 10, 0.0, 1.0)]
+    nothing = [
+        Candidate("b", 10, 0.0, 5.0),
+        Candidate("a", 10, -3.0, 5.0),
+        Candidate("c", 10, 0.0, 1.0),
+    ]
     assert [c.key for c in chosen(nothing, 25)] == ["c", "a", "b"]
     assert chosen(nothing, 0) == []
     assert chosen([Candidate("empty", 0, 0.0, 0.0)], 10) == []
 
 
 def test_of_values_that_together_free_too_much_the_dearest_stays():
-    first, second, third = (Candidate(name, size, 1.0 + i * size, 0.0) for i, (name, size) in
-                            enumerate((("first", 10), ("second", 10), ("third", 20))))  # fmt: skip
+    first, second, third = (
+        Candidate(name, size, 1.0 + i * size, 0.0)
+        for i, (name, size) in enumerate((("first", 10), ("second", 10), ("third", 20)))
+    )
     assert [c.key for c in chosen([first, second, third], 30)] == ["first", "third"]
 
 
@@ -511,7 +535,9 @@ def test_all_bytes_but_receipts_are_divided_among_the_values(tmp_path):
     assert sizes[key_of(1)] == pytest.approx(2.5 / 4 * sum(sizes.values()), rel=0.05)
 
 
-def test_a_value_that_this_program_does_not_read_saves_no_time_and_frees_its_record_too(tmp_path, monkeypatch):
+def test_a_value_that_this_program_does_not_read_saves_no_time_and_frees_its_record_too(
+    tmp_path, monkeypatch
+):
     put(Store(tmp_path), 1, seconds=100.0)
     monkeypatch.setenv("NEUSEE_CACHE_SECRET", "one")  # the record has no signature
     store = Store(tmp_path)

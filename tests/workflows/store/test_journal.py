@@ -51,8 +51,24 @@ def test_a_line_for_each_result_and_each_receipt(tmp_path):
     store.put(key_of(0), torch.zeros(2), about(0))
     store.put_receipt(key_of(1), {**about(1), "bytes": 4000, "peak": 77})
     expected = [
-        {"key": key_of(0), "step": "s", "recipe": "r", "seconds": 0.0, "bytes": 8, "device": "cpu", "peak": None},
-        {"key": key_of(1), "step": "s", "recipe": "r", "seconds": 1.0, "bytes": 4000, "device": "cpu", "peak": 77},
+        {
+            "key": key_of(0),
+            "step": "s",
+            "recipe": "r",
+            "seconds": 0.0,
+            "bytes": 8,
+            "device": "cpu",
+            "peak": None,
+        },
+        {
+            "key": key_of(1),
+            "step": "s",
+            "recipe": "r",
+            "seconds": 1.0,
+            "bytes": 4000,
+            "device": "cpu",
+            "peak": 77,
+        },
     ]
     for i, row in enumerate(expected):
         row |= {"date": about(i)["date"], "node": "a.b", "kept": i == 0, "size": None}
@@ -95,7 +111,9 @@ def test_a_lost_journal_is_made_anew_from_the_results(tmp_path):
     assert keys(Store(tmp_path)) == [*map(key_of, range(5)), key_of(9)]
 
 
-@pytest.mark.parametrize("damage", [b"", b"\0" * 700, b"{}\n" * 30, b'{"journal":"x"', b"\xff" * 50])
+@pytest.mark.parametrize(
+    "damage", [b"", b"\0" * 700, b"{}\n" * 30, b'{"journal":"x"', b"\xff" * 50]
+)
 def test_a_journal_that_is_none_is_made_anew(tmp_path, damage):
     rows = filled(tmp_path).journal.rows()
     path_of(tmp_path).write_bytes(damage)
@@ -111,7 +129,9 @@ def test_torn_lines_are_skipped(tmp_path):
         file.write(b'\n{"key":"' + b"f" * 32)
     store.put_receipt(key_of(8), about(8))
     with path_of(tmp_path).open("ab") as file:
-        file.write(b'\nnull\n[]\n7\n{"key":3}\n{"key":"a","step":[],"node":"n","seconds":1,"bytes":1,"kept":true}')
+        file.write(
+            b'\nnull\n[]\n7\n{"key":3}\n{"key":"a","step":[],"node":"n","seconds":1,"bytes":1,"kept":true}'
+        )
     assert keys(Store(tmp_path)) == keys(store) == [*map(key_of, range(5)), key_of(8)]
 
 
@@ -173,7 +193,9 @@ def test_where_it_cannot_be_written_it_is_still_read(tmp_path, monkeypatch, numb
     monkeypatch.setattr(os, "replace", fail)
     store = Store(tmp_path)
     assert store.journal.rows() == rows
-    monkeypatch.setattr(journal.metadata, "each", lambda disk: pytest.fail("all results were read twice"))
+    monkeypatch.setattr(
+        journal.metadata, "each", lambda disk: pytest.fail("all results were read twice")
+    )
     assert store.journal.of_step("s") == rows
 
 
@@ -189,12 +211,16 @@ for i in range(200):
 
 def test_lines_of_many_writers_do_not_mix(tmp_path):
     filled(tmp_path, 1)
-    writers = [subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path), name]) for name in "abc"]
+    writers = [
+        subprocess.Popen([sys.executable, "-c", WRITER, str(tmp_path), name]) for name in "abc"
+    ]
     assert [writer.wait() for writer in writers] == [0, 0, 0]
     found = keys(Store(tmp_path))
     assert found[0] == key_of(0)
     for name in "abc":
-        assert [key for key in found[1:] if key.endswith(name * 30)] == [f"{i:02x}" + name * 30 for i in range(200)]
+        assert [key for key in found[1:] if key.endswith(name * 30)] == [
+            f"{i:02x}" + name * 30 for i in range(200)
+        ]
     assert all(json.loads(line) for line in path_of(tmp_path).read_bytes().splitlines())
 
 
@@ -206,7 +232,9 @@ def test_threads_may_write_and_read_at_once(tmp_path):
 
 
 def test_the_newest_lines_of_a_long_journal_are_read_alone(tmp_path, monkeypatch):
-    """What others add is seen, all lines are still there for who asks, and changes of the file lose none."""
+    """What others add is seen, all lines are still there for who asks, and changes of the file
+    lose none.
+    """
     monkeypatch.setattr(journal, "_LATEST", 5000)
     writer = Store(tmp_path)
     for i in range(60):

@@ -1,4 +1,6 @@
-"""Leases: one live owner at a time, taken over as soon as it is dead and never because a clock jumped."""
+"""Leases: one live owner at a time, taken over as soon as it is dead and never because a clock
+jumped.
+"""
 
 import errno
 import os
@@ -13,15 +15,17 @@ import pytest
 import torch
 
 from neusee.workflows.store import lease as lease_module
-from neusee.workflows.store import process_owner, shared_folder
+from neusee.workflows.store import shared_folder
+from neusee.workflows.store import shared_folder as process_owner
 from neusee.workflows.store.lease import Lease
-from neusee.workflows.store.process_owner import Owner, me, owner_of
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.shared_folder import Owner, me, owner_of
 
 KEY = "ab" + "0" * 30
 FAR = "0123456789ab-77-1234"  #: a process of another machine
 
-FORKS = pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")  # the child uses no other thread
+# the child uses no other thread
+FORKS = pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
 
 HOLDER = """
 import sys, time
@@ -38,7 +42,9 @@ time.sleep(600)
 
 @pytest.fixture
 def holder(tmp_path):
-    """Start processes that hold the lease of `KEY` and have a file half written; they are ended afterwards."""
+    """Start processes that hold the lease of `KEY` and have a file half written; they are ended
+    afterwards.
+    """
     started = []
 
     def start(key=KEY):
@@ -64,7 +70,11 @@ def held_by(root, text, key=KEY):
 
 
 def temporaries(root):
-    return sorted(f.name for f in (root / "tmp").iterdir() if f.name != ".lock" and not f.name.startswith("badge."))
+    return sorted(
+        f.name
+        for f in (root / "tmp").iterdir()
+        if f.name != ".lock" and not f.name.startswith("badge.")
+    )
 
 
 def test_one_holder_at_a_time(tmp_path):
@@ -130,7 +140,10 @@ def test_a_live_holder_elsewhere_is_waited_for_and_a_killed_one_taken_over(tmp_p
 def test_a_stopped_holder_is_taken_over_and_may_go_on(tmp_path, holder):
     process, store = holder(), Store(tmp_path)
     process.send_signal(signal.SIGSTOP)
-    while Owner(process_owner.host(), process.pid, process_owner._process(process.pid)[1]).state == "alive":
+    while (
+        Owner(process_owner.host(), process.pid, process_owner._process(process.pid)[1]).state
+        == "alive"
+    ):
         time.sleep(0.001)
     with store.claim(KEY):
         process.send_signal(signal.SIGCONT)
@@ -264,7 +277,9 @@ def test_heartbeats_are_seen_while_a_lease_is_held_and_end_after_it(tmp_path, mo
         assert path.stat().st_size >= size + 3
         assert sum(t.name == "neusee-leases" for t in threading.enumerate()) == 1
     until = time.monotonic() + 120
-    while any(t.name == "neusee-leases" for t in threading.enumerate()) and time.monotonic() < until:
+    while (
+        any(t.name == "neusee-leases" for t in threading.enumerate()) and time.monotonic() < until
+    ):
         time.sleep(0.005)
     assert not any(t.name == "neusee-leases" for t in threading.enumerate())
     assert not list((tmp_path / "tmp").glob("badge.*"))
@@ -295,7 +310,12 @@ def test_a_forked_child_holds_nothing(tmp_path):
         child = os.fork()
         if child == 0:
             lease.release()
-            os._exit(int(store.claim(KEY) is not None or (tmp_path / "tmp" / f"{KEY}.lease").exists() is False))
+            os._exit(
+                int(
+                    store.claim(KEY) is not None
+                    or (tmp_path / "tmp" / f"{KEY}.lease").exists() is False
+                )
+            )
         assert os.waitpid(child, 0)[1] == 0
         assert Store(tmp_path).claim(KEY) is None
 
@@ -327,7 +347,9 @@ def test_a_folder_that_takes_no_files_gives_leases_that_do_nothing(tmp_path):
         assert isinstance(two, Lease)
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EPERM, errno.EOPNOTSUPP, errno.EMLINK])
+@pytest.mark.parametrize(
+    "number", [errno.ENOSPC, errno.EROFS, errno.EPERM, errno.EOPNOTSUPP, errno.EMLINK]
+)
 def test_a_disk_that_fails_gives_leases_that_do_nothing(tmp_path, monkeypatch, number):
     def fail(*args):
         raise OSError(number, os.strerror(number))
@@ -362,5 +384,13 @@ def test_an_owner_reads_back():
     assert owner_of(str(me())) == me()
     assert me().state == "alive"
     assert owner_of(FAR).state == "foreign"
-    for text in ("", "a-b-c", "0123456789ab", "0123456789ab-x-1", "0123456789ab--", KEY, "0123456789ab-" + "9" * 50):
+    for text in (
+        "",
+        "a-b-c",
+        "0123456789ab",
+        "0123456789ab-x-1",
+        "0123456789ab--",
+        KEY,
+        "0123456789ab-" + "9" * 50,
+    ):
         assert owner_of(text) is None

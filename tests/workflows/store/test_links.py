@@ -7,7 +7,9 @@ import warnings
 import pytest
 import torch
 
-from neusee.workflows.store import budget_eviction, garbage_files, shared_folder
+from neusee.workflows.store import eviction as budget_eviction
+from neusee.workflows.store import eviction as garbage_files
+from neusee.workflows.store import shared_folder
 from neusee.workflows.store.result_store import Store
 
 KEY = "ab" + "0" * 30
@@ -66,7 +68,12 @@ def test_a_file_that_is_a_link_loses_the_link_alone(tmp_path, outside, target):
     root = tmp_path / "cache"
     Store(root).put("ef" + "0" * 30, BIG, {})
     to = {"file": outside / "precious", "folder": outside, "loop": root / "tmp" / "x.1"}[target]
-    places = [root / "tmp" / "x.1", root / "tmp" / ".lock", root / "journal.jsonl", root / "brief.jsonl"]
+    places = [
+        root / "tmp" / "x.1",
+        root / "tmp" / ".lock",
+        root / "journal.jsonl",
+        root / "brief.jsonl",
+    ]
     for path in places:
         path.unlink(missing_ok=True)
         path.symlink_to(to)
@@ -83,7 +90,9 @@ def test_a_file_that_is_a_link_loses_the_link_alone(tmp_path, outside, target):
 
 
 def test_a_folder_that_becomes_a_link_in_the_middle_is_not_followed(tmp_path, outside, monkeypatch):
-    """The other process renames the folder and puts a link there, after the list was made and before the removal."""
+    """The other process renames the folder and puts a link there, after the list was made and
+    before the removal.
+    """
     root = tmp_path / "cache"
     (root / "ab").mkdir(parents=True)
     (root / "ab" / f"{KEY}.safetensors").write_bytes(b"orphan")
@@ -107,7 +116,12 @@ def test_what_is_removed_is_below_the_root(tmp_path):
     disk = shared_folder.Disk(tmp_path / "cache")
     (tmp_path / "cache").mkdir()
     (tmp_path / "precious").write_bytes(b"x")
-    for path in (f"{disk.folder}/../precious", f"{tmp_path}/precious", f"{disk.folder}/./x", f"{disk.folder}/"):
+    for path in (
+        f"{disk.folder}/../precious",
+        f"{tmp_path}/precious",
+        f"{disk.folder}/./x",
+        f"{disk.folder}/",
+    ):
         with pytest.raises(OSError, match=r"not below|Is a directory|No such file|Not a directory"):
             disk.unlink(path)
     assert (tmp_path / "precious").exists()

@@ -1,12 +1,13 @@
-"""Values that are computed once: kept under a key, whatever their type, and computed again where a file is damaged."""
+"""Values that are computed once: kept under a key, whatever their type, and computed again where
+a file is damaged.
+"""
 
 import time
 from dataclasses import dataclass, field
 
 import pytest
 
-from neusee.workflows.store.memo import compute_once
-from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.result_store import Store, compute_once
 
 ABOUT = {"step": "a study"}
 
@@ -23,7 +24,8 @@ FOUND = Measured(0.1 + 0.2, ("a", "b"), {"raw": [1e-300, float("inf")]})
 
 @pytest.mark.parametrize("small", [False, True])
 @pytest.mark.parametrize(
-    ("kind", "value"), [(Measured, FOUND), (dict, {"psnr": 0.1 + 0.2}), (dict, {}), (list, [1.5, 2.5])]
+    ("kind", "value"),
+    [(Measured, FOUND), (dict, {"psnr": 0.1 + 0.2}), (dict, {}), (list, [1.5, 2.5])],
 )
 def test_a_value_is_computed_once_and_comes_back_as_it_was(tmp_path, kind, value, small):
     calls = []
@@ -57,7 +59,9 @@ def test_a_damaged_value_is_computed_again(tmp_path):
     (file,) = tmp_path.glob(f"*/{'0' * 32}.json")
     file.write_bytes(file.read_bytes().replace(b"first", b"worst"))
     with pytest.warns(UserWarning, match="damaged"):
-        assert compute_once(Store(tmp_path), "0" * 32, dict, lambda: {"second": 2}, ABOUT) == {"second": 2}
+        assert compute_once(Store(tmp_path), "0" * 32, dict, lambda: {"second": 2}, ABOUT) == {
+            "second": 2
+        }
 
 
 def test_what_fails_is_not_kept(tmp_path):

@@ -16,9 +16,9 @@ import pytest
 import torch
 from fsspec.implementations.memory import MemoryFileSystem
 
-from neusee.workflows.keys.seal import seal_record as seal
-from neusee.workflows.keys.seal import unseal_record as unseal
-from neusee.workflows.store import remote_files
+from neusee.workflows.keys.sealed_files import seal_record as seal
+from neusee.workflows.keys.sealed_files import unseal_record as unseal
+from neusee.workflows.store import remote_store as remote_files
 from neusee.workflows.store.band_files import Stacked
 from neusee.workflows.store.remote_store import RemoteStore, local_layer, open_store
 from neusee.workflows.store.result_store import Store
@@ -30,7 +30,14 @@ SPEC.loader.exec_module(forks)
 KEY = "ab" + "0" * 30
 BIG = torch.arange(5000, dtype=torch.float32)
 SMALL = torch.arange(5, dtype=torch.float64)
-ABOUT = {"step": "s", "seconds": 2.0, "date": "2026-01-01", "origin": {"node": "a.b"}, "facts": None, "checks": []}
+ABOUT = {
+    "step": "s",
+    "seconds": 2.0,
+    "date": "2026-01-01",
+    "origin": {"node": "a.b"},
+    "facts": None,
+    "checks": [],
+}
 
 
 class Clock:
@@ -46,13 +53,16 @@ class Clock:
 
 
 class Weather(MemoryFileSystem):
-    """A file system in memory that counts what is asked of it, and may be slow, down or read-only."""
+    """A file system in memory that counts what is asked of it, and may be slow, down or
+    read-only.
+    """
 
     protocol = "weather"
     asked: ClassVar[list[str]] = []
     threads: ClassVar[set[int]] = set()
     latency, down, read_only = 0.0, False, False
-    company: ClassVar[threading.Barrier | None] = None  #: who asks waits for as many others that ask
+    #: who asks waits for as many others that ask
+    company: ClassVar[threading.Barrier | None] = None
     clock: ClassVar[Clock | None] = None
 
     def _ask(self, what, writes=False):
@@ -214,7 +224,9 @@ def test_the_first_of_two_writers_stays(store):
 def test_writers_at_once_leave_one_whole_value(store, url):
     """Each machine has computed another value; what the others then read is one of them."""
     stores = [store(str(i)) for i in range(8)]
-    threads = [threading.Thread(target=s.put, args=(KEY, BIG + i, ABOUT)) for i, s in enumerate(stores)]
+    threads = [
+        threading.Thread(target=s.put, args=(KEY, BIG + i, ABOUT)) for i, s in enumerate(stores)
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -249,7 +261,9 @@ def test_bands_travel_one_by_one_and_once(bad):
     assert torch.equal(Store(two.root).get(other)[0], BANDS)
 
 
-@pytest.mark.parametrize("damage", [lambda raw: raw[:-3], lambda raw: b"", lambda raw: b"\xff" + raw[1:]])
+@pytest.mark.parametrize(
+    "damage", [lambda raw: raw[:-3], lambda raw: b"", lambda raw: b"\xff" + raw[1:]]
+)
 def test_a_damaged_band_there_is_seen_and_mended(store, url, damage):
     store("one").put(KEY, stacked(0, 1, 2), ABOUT)
     fs, _ = fsspec.core.url_to_fs(url)
@@ -286,14 +300,18 @@ def test_a_name_that_leads_elsewhere_is_refused(store, url, tmp_path):
 
 
 def layout(name):
-    return {"stacked": {"names": [name], "xxh3": ["0" * 32], "dtype": "float32", "shape": [1, 64, 64]}}
+    return {
+        "stacked": {"names": [name], "xxh3": ["0" * 32], "dtype": "float32", "shape": [1, 64, 64]}
+    }
 
 
 # faults
 
 
 @pytest.mark.parametrize("suffix", [".json", ".safetensors"])
-@pytest.mark.parametrize("damage", [lambda raw: raw[:-3], lambda raw: b"", lambda raw: raw[:40] + b"\xff" + raw[41:]])
+@pytest.mark.parametrize(
+    "damage", [lambda raw: raw[:-3], lambda raw: b"", lambda raw: raw[:40] + b"\xff" + raw[41:]]
+)
 def test_damage_there_is_seen_and_mended(store, url, suffix, damage):
     store("one").put(KEY, BIG, ABOUT)
     fs, _ = fsspec.core.url_to_fs(url)
@@ -427,7 +445,8 @@ def test_a_killed_upload_leaves_nothing_for_long(tmp_path):
 def test_a_thousand_misses_are_not_a_thousand_questions(bad, monkeypatch):
     store = bad()
     for i in range(1000):
-        if i == 3:  # from here on all folders are listed, and the first five questions wait for each other
+        # from here on all folders are listed, and the first five questions wait for each other
+        if i == 3:
             monkeypatch.setattr(Weather, "company", threading.Barrier(5))
         assert not store.has(f"{i * 37 % 256:02x}" + f"{i:030x}")
     assert len(Weather.asked) <= 256
@@ -453,7 +472,9 @@ def test_a_transfer_is_priced_by_those_before_it(bad):
             reader.get(key)
         local = Store.write_seconds(writer, x.nbytes), Store.read_seconds(reader, x.nbytes)
         here = writer.write_seconds(x.nbytes), reader.read_seconds(x.nbytes)
-        prices[latency] = [with_transfer - without for with_transfer, without in zip(here, local, strict=True)]
+        prices[latency] = [
+            with_transfer - without for with_transfer, without in zip(here, local, strict=True)
+        ]
         assert min(prices[latency]) > 0
     assert all(slow > fast + 0.1 for slow, fast in zip(prices[0.1], prices[0.0], strict=True))
 
@@ -484,7 +505,9 @@ def test_each_url_has_a_local_layer_of_its_own(monkeypatch):
 
 
 def test_a_wrong_scheme_is_named_with_the_right_one():
-    with pytest.raises(ValueError, match=r"no file system has the scheme fiel:// of fiel:///x; did you mean file\?"):
+    with pytest.raises(
+        ValueError, match=r"no file system has the scheme fiel:// of fiel:///x; did you mean file\?"
+    ):
         open_store("fiel:///x")
 
 
@@ -496,11 +519,16 @@ def test_a_missing_package_is_named(monkeypatch):
 
 def test_a_missing_package_for_a_scheme_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "s3fs", None)
-    with pytest.raises(ModuleNotFoundError, match=r"s3://bucket/name needs one more package: .*s3fs"):
+    with pytest.raises(
+        ModuleNotFoundError, match=r"s3://bucket/name needs one more package: .*s3fs"
+    ):
         open_store("s3://bucket/name")
 
 
 def test_nothing_is_imported_for_a_path(tmp_path):
-    code = f"import sys; from neusee.workflows.store.remote_store import open_store; open_store({str(tmp_path)!r})\n"
+    code = (
+        "import sys; from neusee.workflows.store.remote_store import open_store;"
+        f" open_store({str(tmp_path)!r})\n"
+    )
     code += "assert not {'fsspec', 'torch'} & set(sys.modules), sys.modules.keys()"
     assert os.spawnl(os.P_WAIT, sys.executable, sys.executable, "-c", code) == 0

@@ -1,12 +1,13 @@
-"""A cache of a group: real users of one group store and load, and a user without rights harms nothing."""
+"""A cache of a group: real users of one group store and load, and a user without rights harms
+nothing.
+"""
 
 import json
 import os
-import subprocess
 
 import pytest
 
-from tests.workflows.store.other_users import FIRST, GROUP, SECOND, STRANGER, command_of
+from tests.workflows.store.other_users import FIRST, GROUP, SECOND, STRANGER, who
 
 RUN = """
 import json, sys, warnings
@@ -30,19 +31,24 @@ print(json.dumps({"states": states, "kept": [r.kept for r in result.done.values(
 """
 
 
-def as_user(user, cache, *words, groups=str(GROUP), umask=0o022):
+@pytest.fixture
+def as_user(users):
     """What a user's process says of a run with a cache; its own group is not that of the cache."""
-    home = cache.parent / f"home-{user}"
-    if not home.exists():
-        home.mkdir()
-        os.chown(home, user, user)
-    environment = {**os.environ, "HOME": str(home), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
-    environment["CXX"] = "/bin/false"  # a new user has no compiled code
-    environment.pop("NEUSEE_CACHE", None)
-    command = command_of(cache.parent, user, groups, umask, RUN, str(cache), *words)
-    done = subprocess.run(command, env=environment, cwd=home, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+
+    def as_user(user, cache, *words, groups=(GROUP,), umask=0o022):
+        home = cache.parent / f"home-{user}"
+        if not home.exists():
+            home.mkdir()
+            os.chown(home, user, user)
+        environment = {**os.environ, "HOME": str(home), "OMP_NUM_THREADS": "1"}
+        environment["CXX"] = "/bin/false"  # a new user has no compiled code
+        environment.pop("NEUSEE_CACHE", None)
+        rights = who(user, groups, umask)
+        done = users(str(cache), *words, cwd=home, env=environment, code=RUN, user=rights)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    return as_user
 
 
 def owners(cache):
@@ -55,7 +61,7 @@ def owners(cache):
     [(0o2775, 0o022), (0o775, 0o022), (0o2770, 0o077)],
     ids=["a group folder", "without the bit that hands the group on", "for the group alone"],
 )
-def test_two_users_of_a_group_store_and_load(cache, mode, umask):
+def test_two_users_of_a_group_store_and_load(as_user, cache, mode, umask):
     cache.chmod(mode)
     first = as_user(FIRST, cache, umask=umask)
     second = as_user(SECOND, cache, "sensor.read_noise=20 e-", umask=umask)
@@ -71,24 +77,32 @@ def test_two_users_of_a_group_store_and_load(cache, mode, umask):
 
 
 @pytest.mark.slow
-def test_a_user_without_rights_reads_and_harms_nothing(cache):
+def test_a_user_without_rights_reads_and_harms_nothing(as_user, cache):
     cache.chmod(0o2775)
     as_user(FIRST, cache)
-    before = {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in cache.rglob("*") if path.is_file()}
-    stranger = as_user(STRANGER, cache, groups="")
+    before = {
+        path: (path.stat().st_mtime_ns, path.stat().st_size)
+        for path in cache.rglob("*")
+        if path.is_file()
+    }
+    stranger = as_user(STRANGER, cache, groups=())
     assert set(stranger["states"].values()) <= {"cached", "not needed", "left out"}
-    changed = as_user(STRANGER, cache, "sensor.read_noise=20 e-", groups="")
+    changed = as_user(STRANGER, cache, "sensor.read_noise=20 e-", groups=())
     assert "run" in changed["states"].values()
     assert {
-        path: (path.stat().st_mtime_ns, path.stat().st_size) for path in cache.rglob("*") if path.is_file()
+        path: (path.stat().st_mtime_ns, path.stat().st_size)
+        for path in cache.rglob("*")
+        if path.is_file()
     } == before
     hidden = cache.parent / "hidden"
     hidden.mkdir(mode=0o700)
-    assert "run" in as_user(STRANGER, hidden, groups="")["states"].values(), "a cache that cannot be read stops no run"
+    assert "run" in as_user(STRANGER, hidden, groups=())["states"].values(), (
+        "a cache that cannot be read stops no run"
+    )
 
 
 @pytest.mark.slow
-def test_the_folder_of_the_cache_may_be_read_only_to_its_own_user(cache):
+def test_the_folder_of_the_cache_may_be_read_only_to_its_own_user(as_user, cache):
     cache.chmod(0o2775)
     as_user(FIRST, cache)
     cache.chmod(0o555)

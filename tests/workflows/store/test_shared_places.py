@@ -1,22 +1,22 @@
-"""Caches with obstacles in the place of files: no user waits for one, reads something wrong or changes what is not its.
+"""Caches with obstacles in the place of files: no user waits for one, reads something wrong or
+changes what is not its.
 
-Real users read a read-only cache beside their own one, a folder of their group, and a folder at a URL.
+Real users read a read-only cache beside their own one, a folder of their group, and a folder at a
+URL.
 """
 
 import json
 import os
 import shutil
 import socket
-import subprocess
 from pathlib import Path
 
 import pytest
 
 from neusee.workflows.store.remote_store import RemoteStore
-from tests.workflows.store.other_users import FIRST, GROUP, SECOND, STRANGER, command_of
+from tests.workflows.store.other_users import FIRST, GROUP, SECOND, STRANGER, who
 from tests.workflows.store.whole_cache import ABOUT, fill, key_of, values_of
 
-ROOT = Path(__file__).parents[3]
 PATIENCE = 300  #: s until a process that waits counts as blocked
 
 TRY = """
@@ -62,24 +62,30 @@ for number, folder in enumerate(folders):
 """
 
 
-def tried(user, how, folders, groups=str(GROUP)):
-    """What a user's process says of caches, by folder: before and after it stored the values itself."""
-    place = folders[0].parents[1]
-    home = place / f"home-{user}"
-    home.mkdir(exist_ok=True)
-    os.chown(home, user, user)
-    environment = {**os.environ, "HOME": str(home), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
-    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    words = [TRY, how, str(home), str(PATIENCE), *map(str, folders)]
-    command = command_of(place, user, groups, 0o022, *words)
-    done = subprocess.run(command, env=environment, cwd=home, capture_output=True, text=True, check=False)
-    lines = done.stdout.splitlines()
-    assert done.returncode == 0, f"{lines[-1:]}: {done.stderr[-2000:]}"
-    return {Path(line.partition(" ")[0]): json.loads(line.partition(" ")[2]) for line in lines}
+@pytest.fixture
+def tried(users):
+    """What a user's process says of caches, by folder: before and after it stored the values
+    itself.
+    """
+
+    def tried(user, how, folders, groups=(GROUP,)):
+        home = folders[0].parents[1] / f"home-{user}"
+        home.mkdir(exist_ok=True)
+        os.chown(home, user, user)
+        environment = {**os.environ, "HOME": str(home), "OMP_NUM_THREADS": "1"}
+        words = [how, str(home), str(PATIENCE), *map(str, folders)]
+        done = users(*words, cwd=home, env=environment, code=TRY, user=who(user, groups))
+        lines = done.stdout.splitlines()
+        assert done.returncode == 0, f"{lines[-1:]}: {done.stderr[-2000:]}"
+        return {Path(line.partition(" ")[0]): json.loads(line.partition(" ")[2]) for line in lines}
+
+    return tried
 
 
 def socket_at(path):
-    """Leave a socket in the place of a file; the name is short, because that of a socket must be."""
+    """Leave a socket in the place of a file; the name is short, because that of a socket must
+    be.
+    """
     before = Path.cwd()
     os.chdir(path.parent)
     try:
@@ -113,16 +119,29 @@ def owned(root, user=FIRST):
 
 
 def places(root, more=()):
-    """Every path of the layout of a cache, the folders among them, and some that only other processes make."""
-    found = [path.relative_to(root) for path in root.rglob("*") if not path.name.startswith("badge")]
+    """Every path of the layout of a cache, the folders among them, and some that only other
+    processes make.
+    """
+    found = [
+        path.relative_to(root) for path in root.rglob("*") if not path.name.startswith("badge")
+    ]
     return sorted({*found, *map(Path, more)})
 
 
-MORE = ("tmp/.lock", f"tmp/{key_of('payload', 1)}.lease", "pins", "bad", f"pins/{key_of('payload', 1)}", "posterior")
+MORE = (
+    "tmp/.lock",
+    f"tmp/{key_of('payload', 1)}.lease",
+    "pins",
+    "bad",
+    f"pins/{key_of('payload', 1)}",
+    "posterior",
+)
 
 
 def obstructed(right, folder, name, make):
-    """A copy of a cache with something else in the place of one file or folder; None if it cannot be made."""
+    """A copy of a cache with something else in the place of one file or folder; None if it
+    cannot be made.
+    """
     shutil.copytree(right, folder)
     path = folder / name
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -140,7 +159,9 @@ def obstructed(right, folder, name, make):
 
 @pytest.fixture
 def cases(cache):
-    """Returns the folders of caches, each with one obstacle, after the cache was written by ``write``."""
+    """Returns the folders of caches, each with one obstacle, after the cache was written by
+    ``write``.
+    """
 
     def cases(write, kind, more=()):
         right = cache.parent / "right"
@@ -148,7 +169,8 @@ def cases(cache):
         owned(right)
         names = places(right, more)
         folders = [
-            obstructed(right, cache.parent / "cases" / str(n), name, OBSTACLES[kind]) for n, name in enumerate(names)
+            obstructed(right, cache.parent / "cases" / str(n), name, OBSTACLES[kind])
+            for n, name in enumerate(names)
         ]
         if None in folders:
             pytest.skip("a device cannot be made here")
@@ -160,12 +182,22 @@ def cases(cache):
 def seen(folder):
     """What lies below a folder: kind, size and time of change of each path."""
     found = {path: path.lstat() for path in [folder, *folder.rglob("*")]}
-    return {path: (about.st_mode, about.st_size, about.st_mtime_ns, about.st_ino) for path, about in found.items()}
+    return {
+        path: (about.st_mode, about.st_size, about.st_mtime_ns, about.st_ino)
+        for path, about in found.items()
+    }
 
 
 def wrong(said, right):
-    """The names for which a cache gave something else than the value that was stored, or nothing."""
-    return [(str(folder), n) for folder, pairs in said.items() for n, pair in pairs.items() if pair[0] not in right[n]]
+    """The names for which a cache gave something else than the value that was stored, or
+    nothing.
+    """
+    return [
+        (str(folder), n)
+        for folder, pairs in said.items()
+        for n, pair in pairs.items()
+        if pair[0] not in right[n]
+    ]
 
 
 def of_number_one(root):
@@ -174,9 +206,12 @@ def of_number_one(root):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", OBSTACLES)
-def test_a_member_of_the_group_waits_for_no_obstacle_and_reads_nothing_wrong(cases, kind):
+def test_a_member_of_the_group_waits_for_no_obstacle_and_reads_nothing_wrong(cases, tried, kind):
     right, folders = cases(of_number_one, kind, MORE)
-    known = {n: ("None", "'null'", *pair) for n, pair in tried(SECOND, "folder", [right, *folders[:0]])[right].items()}
+    known = {
+        n: ("None", "'null'", *pair)
+        for n, pair in tried(SECOND, "folder", [right, *folders[:0]])[right].items()
+    }
     said = tried(SECOND, "folder", folders)
     assert len(said) == len(folders) > 25
     assert wrong(said, known) == []
@@ -184,11 +219,14 @@ def test_a_member_of_the_group_waits_for_no_obstacle_and_reads_nothing_wrong(cas
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", OBSTACLES)
-def test_a_user_who_may_only_read_waits_for_no_obstacle_and_changes_nothing(cases, kind):
+def test_a_user_who_may_only_read_waits_for_no_obstacle_and_changes_nothing(cases, tried, kind):
     right, folders = cases(of_number_one, kind, MORE)
-    known = {n: ("None", "'null'", *pair) for n, pair in tried(STRANGER, "folder", [right], "")[right].items()}
+    known = {
+        n: ("None", "'null'", *pair)
+        for n, pair in tried(STRANGER, "folder", [right], ())[right].items()
+    }
     before = [seen(folder) for folder in folders]
-    said = tried(STRANGER, "folder", folders, "")
+    said = tried(STRANGER, "folder", folders, ())
     assert wrong(said, known) == []
     assert [seen(folder) for folder in folders] == before
 
@@ -204,17 +242,25 @@ def there(root):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", OBSTACLES)
 @pytest.mark.parametrize("user", [SECOND, STRANGER], ids=["of the group", "who may only read"])
-def test_a_folder_at_a_url_is_read_beside_an_own_one(cases, kind, user):
-    """What is loaded there and what is computed is stored in the own folder, whatever lies in the other one."""
+def test_a_folder_at_a_url_is_read_beside_an_own_one(cases, tried, kind, user):
+    """What is loaded there and what is computed is stored in the own folder, whatever lies in
+    the other one.
+    """
     pytest.importorskip("fsspec")
-    groups = str(GROUP) if user == SECOND else ""
+    groups = (GROUP,) if user == SECOND else ()
     right, folders = cases(there, kind)
     before = [seen(folder) for folder in [right, *folders]]
     said = tried(user, "url", [right, *folders], groups)
     known = {n: ("None", *pair) for n, pair in said[right].items()}
-    assert "None" not in {pair[0] for pair in said[right].values()}, "what is stored there is loaded"
+    assert "None" not in {pair[0] for pair in said[right].values()}, (
+        "what is stored there is loaded"
+    )
     assert wrong(said, known) == []
-    assert all(pair[1] == said[right][n][1] != "None" for pairs in said.values() for n, pair in pairs.items())
+    assert all(
+        pair[1] == said[right][n][1] != "None"
+        for pairs in said.values()
+        for n, pair in pairs.items()
+    )
     if user == STRANGER:
         assert [seen(folder) for folder in [right, *folders]] == before
     else:

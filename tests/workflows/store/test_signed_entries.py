@@ -8,7 +8,7 @@ import warnings
 import pytest
 import torch
 
-from neusee.workflows.keys.seal import OtherFormat, Unsigned, seal_record, unseal_record
+from neusee.workflows.keys.sealed_files import OtherFormat, Unsigned, seal_record, unseal_record
 from neusee.workflows.store.band_files import Stacked
 from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.remote_store import RemoteStore
@@ -35,7 +35,9 @@ def plain(value):
 
 
 def read(store):
-    """The value, or None where it is not read; each warning must be the one of a missing signature, or of damage."""
+    """The value, or None where it is not read; each warning must be the one of a missing
+    signature, or of damage.
+    """
     with warnings.catch_warnings(record=True):
         warnings.simplefilter("always")
         try:
@@ -46,7 +48,9 @@ def read(store):
 
 @pytest.fixture(params=["folder", "url"])
 def place(request, tmp_path):
-    """Opens the shared place of several users anew: a folder, or a URL with a local folder for each call."""
+    """Opens the shared place of several users anew: a folder, or a URL with a local folder for
+    each call.
+    """
     opened = []
 
     def store():
@@ -110,7 +114,11 @@ def test_a_signature_is_that_of_format_kind_key_and_content(secret):
     text = b"neusee cache 2\nresult\n" + KEY.encode() + b"\n" + hashlib.sha256(body).digest()
     assert about["sign"] == hmac.new(b"one", text, "sha256").hexdigest()
     assert unseal_record("result", raw) == {"key": KEY, "x": 1}
-    for forged in (raw.replace(about["sign"].encode(), b"0" * 64), raw[:-76] + b'"}', raw[:-1] + b" "):
+    for forged in (
+        raw.replace(about["sign"].encode(), b"0" * 64),
+        raw[:-76] + b'"}',
+        raw[:-1] + b" ",
+    ):
         with pytest.raises(ValueError, match=r"signature|checksum"):
             unseal_record("result", forged)
     secret("two")

@@ -1,4 +1,6 @@
-"""Small results in one file: what is lost of it is computed again, and nothing wrong is ever served."""
+"""Small results in one file: what is lost of it is computed again, and nothing wrong is ever
+served.
+"""
 
 import os
 import subprocess
@@ -9,11 +11,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.workflows.store import small_results
+from neusee.workflows.store import payload as small_results
 from neusee.workflows.store.metadata import INLINE
+from neusee.workflows.store.payload import SmallResults
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.store.shared_folder import Disk
-from neusee.workflows.store.small_results import SmallResults
 
 
 def key(i):
@@ -23,7 +25,9 @@ def key(i):
 def jotted(root, count, start=0):
     store = Store(root)
     for i in range(start, start + count):
-        assert store.put_small(key(i), torch.full((3,), float(i)), {"step": f"s{i}", "seconds": 1e-4})
+        assert store.put_small(
+            key(i), torch.full((3,), float(i)), {"step": f"s{i}", "seconds": 1e-4}
+        )
     return store
 
 
@@ -90,7 +94,9 @@ def test_where_no_line_can_be_written_there_is_one_warning(tmp_path, monkeypatch
 
     monkeypatch.setattr(os, "write", full)
     with pytest.warns(UserWarning, match="cannot be written") as seen:
-        assert [store.put_small(key(i), torch.zeros(2), {"step": "s"}) for i in range(3)] == [False] * 3
+        assert [store.put_small(key(i), torch.zeros(2), {"step": "s"}) for i in range(3)] == [
+            False
+        ] * 3
     assert len(seen) == 1
 
 

@@ -80,7 +80,9 @@ ALL = Counter({"begin": 1, "add1": 1, "add2": 1, "add3": 1, "total": 1})
 
 
 class Ward:
-    """A store under observation, and a row of steps that all are outputs: four large ones and a small one."""
+    """A store under observation, and a row of steps that all are outputs: four large ones and a
+    small one.
+    """
 
     def __init__(self, folder: Path, server: Any, store: Path | None = None) -> None:
         self.folder, self.server, self.store = folder / "nodes", server, store or folder / "cache"
@@ -88,7 +90,9 @@ class Ward:
         self.folder.mkdir()
         (self.folder / "fault.py").write_text(NODES)
 
-    def job(self, level: float = 0.0, count: int = COUNT, first: str = "", pause: float = 0.003) -> dict[str, Any]:
+    def job(
+        self, level: float = 0.0, count: int = COUNT, first: str = "", pause: float = 0.003
+    ) -> dict[str, Any]:
         steps = [["begin", "begin", {"level": level, "count": count}, {}]]
         for k, (name, source) in enumerate(zip(STEPS[1:4], STEPS, strict=False)):
             steps.append([name, "add", {"k": k + 1.0}, {"x": source}])
@@ -96,9 +100,15 @@ class Ward:
         return {**self._common(first, pause), "steps": steps, "outputs": STEPS}
 
     def whose(self, pause: float = 0.003, gate: Path | str = "") -> dict[str, Any]:
-        """A job whose value tells which process has computed it, which takes as long as there is a file ``gate``."""
+        """A job whose value tells which process has computed it, which takes as long as there is
+        a file ``gate``.
+        """
         first = f"os.environ['FAULT_GATE'] = {str(gate)!r}"
-        return {**self._common(first, pause), "steps": [["whose", "whose", {}, {}]], "outputs": ["whose"]}
+        return {
+            **self._common(first, pause),
+            "steps": [["whose", "whose", {}, {}]],
+            "outputs": ["whose"],
+        }
 
     def _common(self, first: str, pause: float) -> dict[str, Any]:
         environment = {"FAULT_LOG": str(self.log), "FAULT_PAUSE": str(pause)}
@@ -143,7 +153,11 @@ class Ward:
             if path.is_file():
                 os.utime(path, (time.time() - 86400,) * 2)
         self.run(level=-1.0)
-        return [path.name for path in (self.store / "tmp").iterdir() if path.stat().st_mtime < time.time() - 3600]
+        return [
+            path.name
+            for path in (self.store / "tmp").iterdir()
+            if path.stat().st_mtime < time.time() - 3600
+        ]
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +175,10 @@ def ward(tmp_path, server):
 def mounted(folder: Path, options: str) -> None:
     command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", folder]
     if os.geteuid() != 0 or subprocess.run(command, capture_output=True).returncode:
-        pytest.skip("only root may mount a small disk; the tests with a limit on the size of files stand in for it")
+        pytest.skip(
+            "only root may mount a small disk; the tests with a limit on the size of files stand in"
+            " for it"
+        )
 
 
 @pytest.fixture
@@ -200,11 +217,12 @@ def killed(ward: Ward, count: int) -> None:
 
 @pytest.mark.slow
 def test_a_killed_run_does_no_harm(ward):
-    killed(ward, 5)
+    killed(ward, 8)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_fifty_killed_runs_do_no_harm(ward):
+    """`test_a_killed_run_does_no_harm` kills eight."""
     killed(ward, 50)
 
 
@@ -212,7 +230,7 @@ def test_fifty_killed_runs_do_no_harm(ward):
 def test_killed_crowds_do_no_harm(ward):
     """Four runs of the same steps at once, of which one after the other is killed."""
     draw = random.Random(4)
-    for i in range(12):
+    for i in range(6):
         crowd = [ward.server.start(**ward.job(level=float(i))) for _ in range(4)]
         for child in crowd[:3]:
             time.sleep(draw.uniform(0.0, 0.05))
@@ -251,10 +269,15 @@ def test_damage_is_seen_and_mended(ward, suffix, damage):
 
 @pytest.mark.slow
 @settings(
-    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+    max_examples=12,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(
-    which=st.integers(0, 4), suffix=st.sampled_from(["json", "safetensors"]), at=st.floats(0, 1), bit=st.integers(0, 7)
+    which=st.integers(0, 4),
+    suffix=st.sampled_from(["json", "safetensors"]),
+    at=st.floats(0, 1),
+    bit=st.integers(0, 7),
 )
 def test_no_flipped_bit_is_served(ward, which, suffix, at, bit):
     ward.run()
@@ -284,7 +307,7 @@ def test_damage_beside_the_results_costs_nothing(ward):
 # full and read-only disks
 
 
-@pytest.mark.parametrize("free", [0, 1, 3, 10, 50, 85, 130, 200])  # kB; a value has 80 kB
+@pytest.mark.parametrize("free", [0, 3, 50, 85, 200])  # kB; a value has 80 kB
 def test_a_full_disk_costs_one_warning(disk, free):
     ballast = disk.store / "ballast"
     ballast.write_bytes(bytes((1024 - free) * 1024))
@@ -317,7 +340,9 @@ def test_files_that_may_not_grow_cost_one_warning(ward, limit):
     last = "resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)"
     ward.log.write_text("x" * 10)
     ward.forget()
-    found = ward.server.run(**ward.job(first=f"{first}\nos.environ['FAULT_LOG'] = '/dev/null'"), last=last)
+    found = ward.server.run(
+        **ward.job(first=f"{first}\nos.environ['FAULT_LOG'] = '/dev/null'"), last=last
+    )
     ward.right(found)
     assert len(found["warnings"]) == 1
     assert "cannot be written" in found["warnings"][0]
@@ -386,7 +411,9 @@ def test_a_failed_step_lets_the_next_one_try(ward):
 
 
 def waiting(ward: Ward, gate: Path) -> Any:
-    """A process in the midst of computing, which it does until somebody removes the file ``gate``."""
+    """A process in the midst of computing, which it does until somebody removes the file
+    ``gate``.
+    """
     gate.touch()
     child = ward.server.start(**ward.whose(gate=gate))
     end = time.monotonic() + 300
@@ -423,11 +450,16 @@ def test_a_stopped_owner_is_followed_and_does_no_harm_when_it_wakes(ward):
 
 @pytest.mark.slow
 def test_two_who_evict_and_two_who_compute_do_no_harm(ward):
-    """Each evictor leaves room for two values of nine, over and over, while others write and read them."""
+    """Each evictor leaves room for two values of nine, over and over, while others write and
+    read them.
+    """
     evict = "for _ in range(60):\n    type(store)(store.root).gc(budget=200_000)"
     crowd = [(ward.server.start(**ward.job(level=9.0, first=evict)), 9.0) for _ in range(2)]
     for i in range(12):
-        crowd += [(ward.server.start(**ward.job(level=level)), level) for level in (float(i % 3), float(i % 2))]
+        crowd += [
+            (ward.server.start(**ward.job(level=level)), level)
+            for level in (float(i % 3), float(i % 2))
+        ]
         for child, level in crowd[-2:]:
             ward.right(child.result(), level)
     for child, level in crowd:
@@ -452,7 +484,10 @@ def test_another_user_may_evict_what_it_may_write(server):
         ward.log.chmod(0o666)
         evict = "for _ in range(20):\n    type(store)(store.root).gc(budget=100_000)"
         for i in range(4):
-            crowd = [ward.server.start(**ward.job(level=float(i), first=f"{who}\n{evict}")) for who in ("", NOBODY)]
+            crowd = [
+                ward.server.start(**ward.job(level=float(i), first=f"{who}\n{evict}"))
+                for who in ("", NOBODY)
+            ]
             for child in crowd:
                 found = child.result()
                 ward.right(found, float(i))
@@ -467,7 +502,9 @@ CLOCKS = {
     "ten years ahead": f"later = lambda: {3650 * DAY}",
     "ten years behind": f"later = lambda: {-3650 * DAY}",
     "at the beginning of time": "later = lambda: -real()",
-    "back and forth": f"from itertools import cycle; turn = cycle([0, {DAY}, {-DAY}]); later = lambda: next(turn)",
+    "back and forth": (
+        f"from itertools import cycle; turn = cycle([0, {DAY}, {-DAY}]); later = lambda: next(turn)"
+    ),
 }
 
 
@@ -487,7 +524,9 @@ def test_a_wrong_clock_does_no_harm(ward, name):
 
 @pytest.mark.parametrize("name", CLOCKS)
 def test_processes_whose_clocks_differ_get_on_with_each_other(ward, name):
-    """Who is ten years ahead holds nobody for dead, and sweeps away nothing that is being written."""
+    """Who is ten years ahead holds nobody for dead, and sweeps away nothing that is being
+    written.
+    """
     firsts = ("", clock(name), "", clock(name))
     crowd = [ward.server.start(**ward.job(first=first, pause=0.05)) for first in firsts]
     for child in crowd:

@@ -10,14 +10,20 @@ import torch
 
 from neusee.workflows.answers.stored_answer import Answer, read_answer, write_answer
 from neusee.workflows.answers.witnesses import Witnesses
-from neusee.workflows.keys.code_memo import read_memo, read_parts, write_memo, write_parts
+from neusee.workflows.keys.module_digest import read_memo, read_parts, write_memo, write_parts
 from neusee.workflows.store.band_files import Stacked
-from neusee.workflows.store.bandwidth import Speeds
 from neusee.workflows.store.derived_files import DerivedFiles
-from neusee.workflows.store.result_store import Store
+from neusee.workflows.store.result_store import Speeds, Store
 
 KINDS = ("payload", "inline", "bands", "small", "receipt", "picture")
-ABOUT = {"step": "s", "recipe": "r", "seconds": 2.0, "bytes": 32000, "date": "2026-01-01", "device": "cpu"}
+ABOUT = {
+    "step": "s",
+    "recipe": "r",
+    "seconds": 2.0,
+    "bytes": 32000,
+    "date": "2026-01-01",
+    "device": "cpu",
+}
 
 
 def key_of(kind, number):
@@ -46,10 +52,15 @@ def fill(root, numbers=(1, 2), version=0):
         store.put_receipt(key_of("receipt", number), about)
         picture = f"picture {number}.{version}".encode()
         DerivedFiles(store).keep(
-            key_of("picture", number), ".png", "a", lambda path, text=picture: path.write_bytes(text)
+            key_of("picture", number),
+            ".png",
+            "a",
+            lambda path, text=picture: path.write_bytes(text),
         )
         write_parts(root, f"{number:032x}", {"m": {"f()": f"{number}.{version}"}})
-        answer = Answer("s", Witnesses({}, [], {}, {}), f"{number}.{version}", False, "", "", "", {})
+        answer = Answer(
+            "s", Witnesses({}, [], {}, {}), f"{number}.{version}", False, "", "", "", {}
+        )
         with suppress(OSError):  # as its caller does
             write_answer(store.disk, f"{number:032x}", answer)
     write_memo(root / "code.json", {})
@@ -86,7 +97,9 @@ def believed(root, numbers=(1, 2)):
                 found = DerivedFiles(store).find(key_of("picture", number), suffix)
                 said[f"picture {number} {suffix}"] = content(found)
             said[f"definitions {number}"] = json.dumps(read_parts(root, f"{number:032x}") or None)
-            said[f"answer {number}"] = getattr(read_answer(store.disk, f"{number:032x}"), "text", None)
+            said[f"answer {number}"] = getattr(
+                read_answer(store.disk, f"{number:032x}"), "text", None
+            )
         said["sources"] = None if read_memo(root / "code.json") == {} else "another memo"
         said["speeds"] = json.dumps(Speeds(store.disk)._stored() or None)
         rows = frozenset(json.dumps(row) for row in store.journal.rows())

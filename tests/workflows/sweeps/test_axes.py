@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.sweeps.axes import Axis, points, read_axes, read_words
-from neusee.workflows.sweeps.value_ranges import MOST, split, values_of
+from neusee.workflows.sweeps.axes import MOST, Axis, points, read_axes, read_words, split, values_of
 
 PLAIN = st.text("abcxyz019.-_ ", min_size=1, max_size=8).map(str.strip).filter(bool)
 QUOTED = st.text("ab,[]{}() '", max_size=8).map(lambda t: f'"{t}"')
@@ -63,12 +62,27 @@ def test_values_as_they_are_written(text, values):
         ("range(0, 1, 1e-300)", "range: the range has too many values"),
         ("range(1e999)", "range: 1e999 is not a number"),
         ("range(a, b)", "range: a is not a number"),
-        ("linspace(1 nm, 2 um, 3)", "linspace: write all numbers in the same unit instead of nm, um"),
-        ("linspace(1, 2 um, 3)", "linspace: write all numbers in the same unit instead of none, um"),
-        ("linspace(1, 2)", "linspace: write the first value, the last value and the number of values"),
-        ("linspace(1, 2, 2.5)", "linspace: the number of values must be a whole number of at least 1, not 2.5"),
+        (
+            "linspace(1 nm, 2 um, 3)",
+            "linspace: write all numbers in the same unit instead of nm, um",
+        ),
+        (
+            "linspace(1, 2 um, 3)",
+            "linspace: write all numbers in the same unit instead of none, um",
+        ),
+        (
+            "linspace(1, 2)",
+            "linspace: write the first value, the last value and the number of values",
+        ),
+        (
+            "linspace(1, 2, 2.5)",
+            "linspace: the number of values must be a whole number of at least 1, not 2.5",
+        ),
         ("linspace(1, 2, 0)", "linspace: the range is empty"),
-        ("logspace(0, 1, 3)", "logspace: the first and the last value of a logarithmic range must be positive"),
+        (
+            "logspace(0, 1, 3)",
+            "logspace: the first and the last value of a logarithmic range must be positive",
+        ),
         ("linspce(1, 2, 3)", "there is no range function linspce; did you mean linspace?"),
     ],
 )
@@ -86,7 +100,9 @@ def test_only_commas_outside_quotes_and_brackets_split(parts):
 @given(NUMBERS, NUMBERS, st.integers(2, 50))
 def test_linspace_is_exact_to_the_last_bit(start, stop, count):
     values = [float(v) for v in values_of(f"linspace({start}, {stop}, {count})")]
-    exact = [Fraction(start) + (Fraction(stop) - Fraction(start)) * i / (count - 1) for i in range(count)]
+    exact = [
+        Fraction(start) + (Fraction(stop) - Fraction(start)) * i / (count - 1) for i in range(count)
+    ]
     assert values == [float(x) for x in exact]
 
 
@@ -105,10 +121,12 @@ def test_logspace_has_its_ends_and_equal_ratios(start, stop, count):
     values = [float(v) for v in values_of(f"logspace({start!r}, {stop!r}, {count})")]
     ratio = math.log(stop / start) / (count - 1)
     assert (values[0], values[-1]) == (start, stop)
-    assert [math.log(v / start) for v in values] == pytest.approx([i * ratio for i in range(count)], abs=1e-12)
+    assert [math.log(v / start) for v in values] == pytest.approx(
+        [i * ratio for i in range(count)], abs=1e-12
+    )
 
 
-# --- arguments and points -------------------------------------------------------------------------------------------
+# --- arguments and points -------------------------------------------------------------------------
 
 
 def refused(call):
@@ -121,7 +139,14 @@ def test_what_is_one_value_is_the_same_at_every_point(tmp_path):
     found = read_words(["a=1,2", "b=7", "~c", "+d=8", "e=[1, 2]", "f='x, y'"], tmp_path)
     assert [isinstance(x, Axis) for x in found] == [True, False, False, False, False, False]
     assert [p.shown for p in points(found)] == ["a=1", "a=2"]
-    assert [o.text for o in points(found)[1].overrides] == ["a=2", "b=7", "~c", "+d=8", "e=[1, 2]", "f='x, y'"]
+    assert [o.text for o in points(found)[1].overrides] == [
+        "a=2",
+        "b=7",
+        "~c",
+        "+d=8",
+        "e=[1, 2]",
+        "f='x, y'",
+    ]
 
 
 def test_the_last_axis_is_the_fastest_and_points_count_from_one(tmp_path):
@@ -138,22 +163,35 @@ def test_paired_axes_run_together(tmp_path):
 
 def test_paired_axes_of_unequal_length_name_both(tmp_path):
     arguments = read_words(["a=1,2", "b=range(3)"], tmp_path, first=2)
-    told = "argument 3 | b | has 3 values, and a (argument 2) has 2: give paired axes the same number of values"
+    told = (
+        "argument 3 | b | has 3 values, and a (argument 2) has 2: give paired axes the same number"
+        " of values"
+    )
     assert refused(lambda: points(arguments, paired=True)) == [told]
 
 
 def test_every_wrong_argument_is_named_at_once(tmp_path):
-    told = refused(lambda: read_words(["a=1,,2", "b=2", "c", "+d=1,2", "e=range(0)", "f=1,[:"], tmp_path, first=2))
+    told = refused(
+        lambda: read_words(
+            ["a=1,,2", "b=2", "c", "+d=1,2", "e=range(0)", "f=1,[:"], tmp_path, first=2
+        )
+    )
     assert [line.partition(" | ")[0] for line in told] == [f"argument {n}" for n in (2, 4, 5, 6, 7)]
 
 
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["a=1"], "sweep |  | the sweep has no axis: write a=1,2 or a='linspace(450 nm, 650 nm, 5)'"),
+        (
+            ["a=1"],
+            "sweep |  | the sweep has no axis: write a=1,2 or a='linspace(450 nm, 650 nm, 5)'",
+        ),
         (["a=1,2", "a=3,4"], "argument 2 | a | axis a is also in argument 1: remove one"),
         (["a=1,2,1"], "argument 1 | a | the value 1 appears twice on the axis: remove one"),
-        (["a=range(1000)", "b=range(1000)"], "sweep |  | a sweep of 1000000 points is too long: at most 100000 points"),
+        (
+            ["a=range(1000)", "b=range(1000)"],
+            "sweep |  | a sweep of 1000000 points is too long: at most 100000 points",
+        ),
     ],
 )
 def test_axes_that_make_no_sweep(tmp_path, words, told):
@@ -161,8 +199,15 @@ def test_axes_that_make_no_sweep(tmp_path, words, told):
 
 
 def test_axes_as_python_values(tmp_path):
-    found = read_axes({"a": [1, 2.5], "b": ("5 e-", "no, yes"), "c": "range(2)", "d": [[1, 2]]}, tmp_path)
-    assert [[c.value for c in axis.coordinates] for axis in found] == [[1, 2.5], ["5 e-", "no, yes"], [0, 1], [[1, 2]]]
+    found = read_axes(
+        {"a": [1, 2.5], "b": ("5 e-", "no, yes"), "c": "range(2)", "d": [[1, 2]]}, tmp_path
+    )
+    assert [[c.value for c in axis.coordinates] for axis in found] == [
+        [1, 2.5],
+        ["5 e-", "no, yes"],
+        [0, 1],
+        [[1, 2]],
+    ]
     assert [c.shown for c in found[3].coordinates] == ["[1, 2]"]
 
 

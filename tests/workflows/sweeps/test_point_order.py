@@ -1,4 +1,6 @@
-"""The order of the points: what is costly and shared is made once, even where only one point's results are held."""
+"""The order of the points: what is costly and shared is made once, even where only one point's
+results are held.
+"""
 
 import itertools
 import random
@@ -25,7 +27,8 @@ def jobs_of(sizes, reach=REACH):
     for place in itertools.product(*map(range, sizes)):
         value = dict(zip(names, place, strict=True))
         keys = {
-            step: f"{step}:" + ",".join(f"{n}{value[n]}" for n in names if n in axes) for step, axes in reach.items()
+            step: f"{step}:" + ",".join(f"{n}{value[n]}" for n in names if n in axes)
+            for step, axes in reach.items()
         }
         found.append(PointJob(place, keys, CHAIN, ("noise",)))
     return found
@@ -48,7 +51,8 @@ def test_no_order_of_a_small_sweep_needs_less(sizes, seed):
     jobs = jobs_of(sizes)
     order = best_order(jobs, costs)
     assert sorted(order) == list(range(len(jobs)))
-    orders = itertools.permutations(range(1, len(jobs)))  # any point may be first: only differences count
+    # any point may be first: only differences count
+    orders = itertools.permutations(range(1, len(jobs)))
     best = min(work(jobs, (0, *rest), costs) for rest in orders)
     assert work(jobs, order, costs) <= best * (1 + 1e-12)
 
@@ -58,7 +62,10 @@ def test_the_axis_that_reaches_the_costly_step_varies_slowest():
     slow_a = best_order(jobs, {**dict.fromkeys(REACH, 0.01), "pupil": 100.0})
     slow_b = best_order(jobs, {**dict.fromkeys(REACH, 0.01), "scene": 100.0})
     changes = [
-        [sum(jobs[i].place[n] != jobs[j].place[n] for i, j in itertools.pairwise(order)) for n in (0, 1)]
+        [
+            sum(jobs[i].place[n] != jobs[j].place[n] for i, j in itertools.pairwise(order))
+            for n in (0, 1)
+        ]
         for order in (slow_a, slow_b)
     ]
     assert changes == [[2, 9], [8, 3]]
@@ -77,19 +84,34 @@ def test_without_costs_the_axis_that_reaches_more_steps_varies_slowest():
 
 def test_paired_points_with_the_same_costly_result_stand_together():
     keys = [("x", 1), ("y", 2), ("x", 3), ("y", 4)]
-    jobs = [PointJob((i, i), {"pupil": p, "noise": f"n{n}"}, {}, ("noise",)) for i, (p, n) in enumerate(keys)]
+    jobs = [
+        PointJob((i, i), {"pupil": p, "noise": f"n{n}"}, {}, ("noise",))
+        for i, (p, n) in enumerate(keys)
+    ]
     assert best_order(jobs, {"pupil": 5.0, "noise": 9.0}, paired=True) == [0, 2, 1, 3]
 
 
 def test_a_step_without_a_cost_counts_as_the_usual_one():
-    assert filled({"a": 1.0, "b": 5.0, "c": 6.0}, "abcd") == {"a": 1.0, "b": 5.0, "c": 6.0, "d": 5.0}
+    assert filled({"a": 1.0, "b": 5.0, "c": 6.0}, "abcd") == {
+        "a": 1.0,
+        "b": 5.0,
+        "c": 6.0,
+        "d": 5.0,
+    }
     assert filled({}, "ab") == {"a": 1.0, "b": 1.0}
 
 
 def test_sharing_counts_different_results_and_the_work_that_they_save():
     costs = {"fixed": 100.0, "pupil": 10.0, "psf": 1.0, "scene": 0.0, "sensor": 0.0, "noise": 0.0}
     found = sharing(jobs_of((3, 2, 2)), costs)
-    assert found.distinct == {"pupil": 3, "psf": 6, "scene": 2, "sensor": 12, "noise": 2, "fixed": 1}
+    assert found.distinct == {
+        "pupil": 3,
+        "psf": 6,
+        "scene": 2,
+        "sensor": 12,
+        "noise": 2,
+        "fixed": 1,
+    }
     assert (found.points, found.steps, found.made) == (12, 72, 26)
     assert (found.alone, found.together) == (12 * 111.0, 100.0 + 30.0 + 6.0)
     assert found.saved == pytest.approx(1 - 136 / 1332)
@@ -107,6 +129,9 @@ def test_a_chain_of_ten_thousand_steps_is_walked():
     names = [f"s{i}" for i in range(10_000)]
     sources = {name: (before,) for before, name in itertools.pairwise(names)} | {"s0": ()}
     jobs = [
-        PointJob((i,), {n: n if n != names[-1] else f"last{i}" for n in names}, sources, (names[-1],)) for i in (0, 1)
+        PointJob(
+            (i,), {n: n if n != names[-1] else f"last{i}" for n in names}, sources, (names[-1],)
+        )
+        for i in (0, 1)
     ]
     assert work_left(jobs, {}, lambda key: False) == [10_000.0, 1.0]

@@ -1,4 +1,6 @@
-"""A sweep checks everything first, shares what it can, goes on where it stopped and keeps what failed."""
+"""A sweep checks everything first, shares what it can, goes on where it stopped and keeps what
+failed.
+"""
 
 import csv
 import gc
@@ -19,7 +21,8 @@ from neusee.workflows.engine import local_executor
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.sweeps import sweep_files, sweep_points
+from neusee.workflows.sweeps import sweep_points
+from neusee.workflows.sweeps import sweep_table as sweep_files
 from neusee.workflows.sweeps.sweep_run import sweep
 from tests.workflows.crate_rules import faults
 
@@ -34,7 +37,10 @@ steps:
   quality: {node: swept.quality, from: noted}
 outputs: [noted, quality]
 """
-AXES = {"sensor.read_noise": ["1 e-", "2 e-", "3 e-"], "light.colour": "linspace(500 nm, 600 nm, 2)"}
+AXES = {
+    "sensor.read_noise": ["1 e-", "2 e-", "3 e-"],
+    "light.colour": "linspace(500 nm, 600 nm, 2)",
+}
 WORDS = ["sensor.read_noise=1 e-,2 e-,3 e-", "light.colour=linspace(500 nm, 600 nm, 2)"]
 
 
@@ -42,7 +48,9 @@ WORDS = ["sensor.read_noise=1 e-,2 e-,3 e-", "light.colour=linspace(500 nm, 600 
 def nodes(monkeypatch):
     """The family ``swept``, as if it were one of the package."""
     name = "neusee.nodes.swept"
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[1] / "sweep_nodes.py")
+    spec = importlib.util.spec_from_file_location(
+        name, Path(__file__).parents[1] / "sweep_nodes.py"
+    )
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, name, module)
     spec.loader.exec_module(module)
@@ -81,7 +89,7 @@ def refused(call):
     return [f"{p.mark} | {p.path} | {p.message}" for p in caught.value.diagnostics]
 
 
-# --- what it gives --------------------------------------------------------------------------------------------------
+# --- what it gives --------------------------------------------------------------------------------
 
 
 def test_every_number_of_every_point_is_a_row(recipe, store):
@@ -91,7 +99,9 @@ def test_every_number_of_every_point_is_a_row(recipe, store):
     assert [row["sensor.read_noise (e-)"] for row in means] == [1, 1, 2, 2, 3, 3]
     assert [row["light.colour (nm)"] for row in means] == [500, 600, 500, 600, 500, 600]
     assert [row["value"] for row in means] == pytest.approx([1001, 1201, 1002, 1202, 1003, 1203])
-    assert [row["index"] for row in found.rows if row["point"] == 1 and row["field"] == "profile"] == [0, 1, 2, 3]
+    assert [
+        row["index"] for row in found.rows if row["point"] == 1 and row["field"] == "profile"
+    ] == [0, 1, 2, 3]
     assert {row["status"] for row in found.rows} == {"ok"}
 
 
@@ -107,7 +117,9 @@ def test_what_points_share_is_made_once(recipe, store, nodes):
 
 
 def test_paired_axes(recipe, store):
-    found = sweep(recipe, {"light.level": [1, 2], "light.colour": ["500 nm", "1 um"]}, zip=True, store=store)
+    found = sweep(
+        recipe, {"light.level": [1, 2], "light.colour": ["500 nm", "1 um"]}, zip=True, store=store
+    )
     means = [row for row in found.rows if row["field"] == "mean"]
     assert [row["light.level"] for row in means] == [1, 2]
     assert [row["light.colour (m)"] for row in means] == pytest.approx([500e-9, 1e-6])
@@ -115,7 +127,11 @@ def test_paired_axes(recipe, store):
 
 
 def test_groups_are_axes_and_fixed_changes_hold_at_every_point(nodes, write, store):
-    path = str(write("defaults: [light: red]\n" + RECIPE.replace("light: {level: 2.0, colour: 500 nm}\n", "")))
+    path = str(
+        write(
+            "defaults: [light: red]\n" + RECIPE.replace("light: {level: 2.0, colour: 500 nm}\n", "")
+        )
+    )
     write("light: {level: 1.0, colour: 600 nm}", "light/red.yaml")
     write("light: {level: 1.0, colour: 500 nm}", "light/green.yaml")
     found = sweep(path, {"light": ["red", "green"]}, ["sensor.read_noise=0 e-"], store=store)
@@ -156,32 +172,45 @@ def test_a_table_to_read(recipe, store):
     assert "<td>1002</td>" in page
 
 
-# --- what is refused ------------------------------------------------------------------------------------------------
+# --- what is refused ------------------------------------------------------------------------------
 
 
 def test_every_mistake_of_every_point_before_anything_runs(recipe, store, nodes):
     told = refused(
-        lambda: run_sweep(recipe, ["sensor.read_noise=1 e-,2,3 nm", "light.colour=500 nm,5 nm", "x.y=1"], store=store)
+        lambda: run_sweep(
+            recipe,
+            ["sensor.read_noise=1 e-,2,3 nm", "light.colour=500 nm,5 nm", "x.y=1"],
+            store=store,
+        )
     )
-    assert [line.partition(" | ")[0] for line in told] == ["argument 2", "argument 2", "argument 3", "argument 4"]
+    assert [line.partition(" | ")[0] for line in told] == [
+        "argument 2",
+        "argument 2",
+        "argument 3",
+        "argument 4",
+    ]
     assert "sensor.read_noise = 2" in told[0]
     assert nodes.CALLS == []
 
 
 def test_preflight_looks_at_every_point(recipe, store, nodes):
     told = refused(lambda: sweep(recipe, {"sensor.read_noise": ["1 e-", "2000 ke-"]}, store=store))
-    assert told == ["argument sensor.read_noise | sensor.read_noise = 2000 ke- | is beyond every sensor"]
+    assert told == [
+        "argument sensor.read_noise | sensor.read_noise = 2000 ke- | is beyond every sensor"
+    ]
     assert nodes.CALLS == []
 
 
-def test_netcdf_without_its_packages_is_refused_before_anything_runs(recipe, store, nodes, monkeypatch):
+def test_netcdf_without_its_packages_is_refused_before_anything_runs(
+    recipe, store, nodes, monkeypatch
+):
     monkeypatch.setattr(sweep_files, "_PACKAGES", ("xarray", "no_such_package"))
     told = refused(lambda: run_sweep(recipe, WORDS, netcdf=True, store=store))
     assert told == ['--netcdf |  | needs no_such_package: pip install "neusee[xarray]"']
     assert nodes.CALLS == []
 
 
-# --- what fails, and what goes on -----------------------------------------------------------------------------------
+# --- what fails, and what goes on -----------------------------------------------------------------
 
 
 def test_a_failing_point_stops_the_sweep_with_its_error(recipe, store):
@@ -200,14 +229,18 @@ def test_a_failing_point_is_kept_and_the_others_go_on(recipe, store):
     assert "ValueError: 2 e- are too many" in row["message"]
 
 
-@pytest.mark.parametrize(("on_error", "points", "state"), [("continue", 3, "complete"), ("stop", 2, "stopped")])
+@pytest.mark.parametrize(
+    ("on_error", "points", "state"), [("continue", 3, "complete"), ("stop", 2, "stopped")]
+)
 def test_the_command_says_which_point_failed_and_fails(command, on_error, points, state):
     words = ["sensor.read_noise=1 e-,2 e-,3 e-", "sensor.most=1.5"]
     code, folder, out = command(*words, on_error=on_error)
     rows = read_table(folder)
     assert code == 1
     assert len({row["point"] for row in rows}) == points
-    assert {row["point"] for row in rows if row["status"] == "failed"} == {str(n) for n in range(2, points + 1)}
+    assert {row["point"] for row in rows if row["status"] == "failed"} == {
+        str(n) for n in range(2, points + 1)
+    }
     assert "failed: point 2, sensor.read_noise=2 e-: " in out
     assert f"state: {state}\n" in (folder / "sweep.yaml").read_text()
     assert ("partial" in folder.resolve().name) == (state == "stopped")
@@ -221,7 +254,10 @@ def test_an_interrupted_sweep_leaves_a_valid_table_and_goes_on(command, nodes, r
     assert 0 < len(done) < 6
     assert "_partial_" in folder.resolve().name
     assert "state: interrupted\n" in (folder / "sweep.yaml").read_text()
-    again = f"neusee sweep {recipe} 'sensor.read_noise=1 e-,2 e-,3 e-' 'light.colour=linspace(500 nm, 600 nm, 2)'"
+    again = (
+        f"neusee sweep {recipe} 'sensor.read_noise=1 e-,2 e-,3 e-' 'light.colour=linspace(500 nm,"
+        " 600 nm, 2)'"
+    )
     assert f"to go on: {again}" in out
     nodes.CALLS.clear()
     code, folder, out = command()
@@ -232,11 +268,14 @@ def test_an_interrupted_sweep_leaves_a_valid_table_and_goes_on(command, nodes, r
     assert nodes.CALLS.count("quality") == 6 - len(done)
 
 
-# --- workers --------------------------------------------------------------------------------------------------------
+# --- workers --------------------------------------------------------------------------------------
 
 
 def of_numbers(found):
-    return [{name: value for name, value in row.items() if name not in ("seconds", "cached")} for row in found.rows]
+    return [
+        {name: value for name, value in row.items() if name not in ("seconds", "cached")}
+        for row in found.rows
+    ]
 
 
 def test_workers_give_the_same_rows_and_leave_nothing_in_the_store(recipe, tmp_path, nodes):
@@ -248,7 +287,9 @@ def test_workers_give_the_same_rows_and_leave_nothing_in_the_store(recipe, tmp_p
     assert of_numbers(found) == of_numbers(alone)
     assert [o.state for o in found.outcomes] == ["run"] * 6
     kept = {key: about.get("kept", True) for key, about in Store(tmp_path / "alone").entries()}
-    assert {key: about.get("kept", True) for key, about in Store(tmp_path / "shared").entries()} == kept
+    assert {
+        key: about.get("kept", True) for key, about in Store(tmp_path / "shared").entries()
+    } == kept
     assert {path.name for path in (tmp_path / "shared/tmp").iterdir()} <= {".lock"}
     again = sweep(recipe, AXES, store=Store(tmp_path / "shared"), workers=2)
     assert [o.state for o in again.outcomes] == ["cached"] * 6
@@ -277,9 +318,13 @@ def test_points_of_a_killed_worker_are_run(recipe, store, nodes, monkeypatch):
     assert of_numbers(sweep(recipe, AXES, store=store, workers=2)) == wanted
 
 
-def test_workers_divide_the_memory_and_a_point_that_has_too_little_runs_here(recipe, store, nodes, monkeypatch):
+def test_workers_divide_the_memory_and_a_point_that_has_too_little_runs_here(
+    recipe, store, nodes, monkeypatch
+):
     asked = []
-    monkeypatch.setattr(sweep_points, "memory_limit", lambda memory, workers: asked.append(workers) or 1.0)
+    monkeypatch.setattr(
+        sweep_points, "memory_limit", lambda memory, workers: asked.append(workers) or 1.0
+    )
     wanted = of_numbers(sweep(recipe, AXES, store=Store(store.root.parent / "alone")))
     assert asked == []
     nodes.CALLS.clear()
@@ -288,7 +333,9 @@ def test_workers_divide_the_memory_and_a_point_that_has_too_little_runs_here(rec
     free = local_executor.free_memory()
     monkeypatch.setattr(local_executor, "free_memory", lambda: free)
     monkeypatch.setattr(local_executor, "process_memory", lambda: 0)
-    assert local_executor.memory_limit(None, 2) == pytest.approx(local_executor.memory_limit(None) / 2)
+    assert local_executor.memory_limit(None, 2) == pytest.approx(
+        local_executor.memory_limit(None) / 2
+    )
 
 
 def test_a_command_with_workers_that_is_interrupted_keeps_what_is_done(command, nodes):
@@ -315,7 +362,7 @@ def test_a_cache_that_cannot_be_written_is_said_once_by_all_workers(recipe, tmp_
     assert "warning  the cache" in capsys.readouterr().out
 
 
-# --- files ----------------------------------------------------------------------------------------------------------
+# --- files ----------------------------------------------------------------------------------------
 
 
 def test_the_table_is_read_back_as_it_was(command, recipe, store):
@@ -326,7 +373,15 @@ def test_the_table_is_read_back_as_it_was(command, recipe, store):
     assert len(rows) == len(expected) == 6 * (16 + 1 + 4)
     for row, told in zip(rows, expected, strict=True):
         assert list(row) == list(told)
-        exact = ("point", "sensor.read_noise (e-)", "light.colour (nm)", "step", "field", "index", "value")
+        exact = (
+            "point",
+            "sensor.read_noise (e-)",
+            "light.colour (nm)",
+            "step",
+            "field",
+            "index",
+            "value",
+        )
         assert [row[name] for name in exact] == [str(told[name]) for name in exact]
     assert f"table    {folder.resolve() / 'sweep.csv'}" in out
 
@@ -339,8 +394,16 @@ def test_the_account_can_be_read_as_yaml_and_says_how_to_run_it_again(command):
     assert found["axes"] == {"sensor.read_noise": ["1 e-", "2 e-"], "light.level": [1, 2]}
     assert found["overrides"] == ["light.colour=600 nm"]
     assert found["order"] == [1, 2, 4, 3] or found["order"] == [1, 3, 4, 2]
-    assert (found["state"], found["points"], found["done"], found["failed"]) == ("complete", 4, 4, [])
-    assert " 'sensor.read_noise=1 e-,2 e-' light.level=1,2 'light.colour=600 nm' --out " in found["again"]
+    assert (found["state"], found["points"], found["done"], found["failed"]) == (
+        "complete",
+        4,
+        4,
+        [],
+    )
+    assert (
+        " 'sensor.read_noise=1 e-,2 e-' light.level=1,2 'light.colour=600 nm' --out "
+        in found["again"]
+    )
     assert found["versions"]["torch"] == torch.__version__
     assert list(faults(folder)) == []
 
@@ -360,12 +423,16 @@ def test_quiet_says_on_stderr_what_failed(recipe, store, tmp_path, capsys):
     words = ["sensor.read_noise=1 e-,2 e-", "sensor.most=1.5"]
     assert run_sweep(recipe, words, out=tmp_path / "runs", store=store, quiet=True) == 1
     found = capsys.readouterr()
-    assert found.out.splitlines() == [str((tmp_path / "runs/sweeps/latest").resolve() / "sweep.csv")]
+    assert found.out.splitlines() == [
+        str((tmp_path / "runs/sweeps/latest").resolve() / "sweep.csv")
+    ]
     assert found.err.startswith("failed: point 2, sensor.read_noise=2 e-: ")
     assert "mine.yaml:7:" in found.err
 
 
-def test_plain_lines_and_a_live_table_show_the_same_points(recipe, store, tmp_path, monkeypatch, capsys):
+def test_plain_lines_and_a_live_table_show_the_same_points(
+    recipe, store, tmp_path, monkeypatch, capsys
+):
     def shown(tty):
         monkeypatch.setattr(sys.stdout, "isatty", lambda: tty, raising=False)
         monkeypatch.setenv("COLUMNS", "200")
@@ -379,14 +446,16 @@ def test_plain_lines_and_a_live_table_show_the_same_points(recipe, store, tmp_pa
         assert "quality.mean 1002" in out
 
 
-# --- xarray ---------------------------------------------------------------------------------------------------------
+# --- xarray ---------------------------------------------------------------------------------------
 
 
 def test_a_product_is_a_data_set_with_the_axes_as_dimensions(recipe, store):
     pytest.importorskip("xarray")
     pytest.importorskip("h5netcdf")
     pytest.importorskip("h5py")
-    found = sweep(recipe, {**AXES, "sensor.most": [2.5]}, store=store, on_error="continue").to_xarray()
+    found = sweep(
+        recipe, {**AXES, "sensor.most": [2.5]}, store=store, on_error="continue"
+    ).to_xarray()
     assert dict(found.sizes) == {
         "sensor.read_noise": 3,
         "light.colour": 2,
@@ -397,7 +466,9 @@ def test_a_product_is_a_data_set_with_the_axes_as_dimensions(recipe, store):
     assert found["light.colour"].values.tolist() == pytest.approx([500e-9, 600e-9])
     assert found["light.colour"].attrs["units"] == "m"
     assert "units" not in found["sensor.most"].attrs
-    mean = found["quality.mean"].sel({"sensor.read_noise": 2.0, "light.colour": 600e-9}, method="nearest")
+    mean = found["quality.mean"].sel(
+        {"sensor.read_noise": 2.0, "light.colour": 600e-9}, method="nearest"
+    )
     assert mean.values.tolist() == pytest.approx([1202])
     assert found["ran"].values[:, 0, 0].tolist() == [True, True, False]
     assert bool(found["quality.mean"].isnull()[2].all())
@@ -408,7 +479,10 @@ def test_paired_axes_are_coordinates_of_the_points(recipe, store):
     pytest.importorskip("h5netcdf")
     pytest.importorskip("h5py")
     found = sweep(
-        recipe, {"light.level": [1, 2], "sensor.read_noise": ["1 e-", "2 e-"]}, zip=True, store=store
+        recipe,
+        {"light.level": [1, 2], "sensor.read_noise": ["1 e-", "2 e-"]},
+        zip=True,
+        store=store,
     ).to_xarray()
     assert found["quality.mean"].dims == ("point",)
     assert found["sensor.read_noise"].dims == ("point",)
@@ -440,7 +514,7 @@ def test_netcdf_is_read_back_as_it_was(command, recipe, store):
         assert found.drop_vars("seconds").identical(wanted.drop_vars("seconds"))
 
 
-# --- many points ----------------------------------------------------------------------------------------------------
+# --- many points ----------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -448,7 +522,13 @@ def test_fifty_sweeps_leave_nothing_behind(recipe, tmp_path):
     def once(level):
         store = Store(tmp_path / "cache")  # one of its own: a store remembers what it has seen
         axes = {"sensor.read_noise": ["1 e-", "2 e-"]}
-        sweep(recipe, axes, [f"light.level={level}", "sensor.most=1.5"], store=store, on_error="continue")
+        sweep(
+            recipe,
+            axes,
+            [f"light.level={level}", "sensor.most=1.5"],
+            store=store,
+            on_error="continue",
+        )
 
     def held():
         gc.collect()
@@ -485,6 +565,10 @@ def test_points_keep_what_differs_from_the_first(recipe, store):
         assert list(kept.steps) == list(alone.steps)
         for name, step in alone.steps.items():
             assert (kept.steps[name].params, kept.steps[name].wires) == (step.params, step.wires)
-        assert (kept.seed, kept.outputs, kept.tolerance) == (alone.seed, alone.outputs, alone.tolerance)
+        assert (kept.seed, kept.outputs, kept.tolerance) == (
+            alone.seed,
+            alone.outputs,
+            alone.tolerance,
+        )
     assert all(len(checked.kept.steps) < len(found.recipe.steps) / 2 for checked in found.checked)
     assert len({id(checked.job.sources) for checked in found.checked}) == 1

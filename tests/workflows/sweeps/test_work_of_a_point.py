@@ -1,4 +1,6 @@
-"""What holds for all points of a sweep is done once; a further point does what differs, counted and not timed."""
+"""What holds for all points of a sweep is done once; a further point does what differs, counted
+and not timed.
+"""
 
 import sys
 from collections import Counter
@@ -6,19 +8,26 @@ from pathlib import Path
 
 import pytest
 
-from neusee.workflows.engine import cost_laws, step_job
+from neusee.workflows.engine import cost_model as cost_laws
+from neusee.workflows.engine import step_job
 from neusee.workflows.graph import recipe_graph
-from neusee.workflows.keys import known_keys
-from neusee.workflows.recipe.text import composition, option_groups
+from neusee.workflows.keys import code_digest as known_keys
+from neusee.workflows.recipe.text import composition
+from neusee.workflows.recipe.text import composition as option_groups
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import points as points_of
 from neusee.workflows.sweeps.axes import read_axes, read_words
 from neusee.workflows.sweeps.sweep_points import outcomes, plan_sweep
 
 SMALL = [
-    "optics.samples=64", "optics.pitch=126.22 um", "optics.bands=3", "optics.window=[32, 32]", "scene.shape=[28, 28]",
-    "sensor.shape=[24, 24]", "outputs=[saturated]",
-]  # fmt: skip
+    "optics.samples=64",
+    "optics.pitch=126.22 um",
+    "optics.bands=3",
+    "optics.window=[32, 32]",
+    "scene.shape=[28, 28]",
+    "sensor.shape=[24, 24]",
+    "outputs=[saturated]",
+]
 CHAIN = """# Three steps
 sensor: {noise: 5 e-}
 steps:
@@ -53,7 +62,9 @@ def mean(image: Tensor) -> Tensor:
 
 
 class Ticks:
-    """A clock by which every step takes 0.3 s, so that every result is kept, however busy the machine is."""
+    """A clock by which every step takes 0.3 s, so that every result is kept, however busy the
+    machine is.
+    """
 
     now = 1.9e9
 
@@ -67,7 +78,9 @@ class Ticks:
 
 @pytest.fixture(autouse=True)
 def every_result_is_kept(monkeypatch):
-    """What is kept, and so what a later point computes again, is chosen by the time that a step took."""
+    """What is kept, and so what a later point computes again, is chosen by the time that a step
+    took.
+    """
     monkeypatch.setattr(step_job, "time", Ticks())
 
 
@@ -120,7 +133,8 @@ def test_a_further_point_repeats_nothing_that_cannot_differ(tmp_path, counted):
     assert further["key_of"] <= 11  # ten steps depend on the noise, and one reads a file
     further = {name: (many[1][name] - few[1][name]) / 4 for name in many[1]}
     assert further["key_of"] <= 9  # the two full wells are left out
-    assert further["form_of"] <= 3  # the two steps that have the noise, and the one that reads a file
+    # the two steps that have the noise, and the one that reads a file
+    assert further["form_of"] <= 3
 
 
 def test_the_calls_of_a_point_do_not_grow_with_the_points_before_it(tmp_path):
@@ -137,5 +151,6 @@ def test_the_calls_of_a_point_do_not_grow_with_the_points_before_it(tmp_path):
             calls[0] = 0
     finally:
         sys.setprofile(None)
-    # the fewest calls of a point: a thread that waits for another calls once more, and never once less
+    # the fewest calls of a point: a thread that waits for another calls once more, and never once
+    # less
     assert min(found[80:]) == pytest.approx(min(found[10:30]), rel=0.1)

@@ -23,7 +23,9 @@ def test_a_known_difference():
 
 def test_60_db_is_a_thousandth():
     reference = torch.linspace(0, 1, 10001, dtype=torch.float64)
-    noise = torch.randn(10001, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 1e-3
+    noise = (
+        torch.randn(10001, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 1e-3
+    )
     psnr = -10 * math.log10(float(noise.square().mean()))
     assert -20 * math.log10(error_of(reference + noise, reference)) == pytest.approx(psnr)
 
@@ -56,7 +58,9 @@ def test_large_tensors_are_compared_in_parts_and_in_double_precision():
     assert error_of(value.double(), reference) == pytest.approx(1 / math.sqrt(len(reference)))
 
 
-@pytest.mark.parametrize("value", [torch.ones(3), (torch.ones(2),), None], ids=["shape", "kind", "nothing"])
+@pytest.mark.parametrize(
+    "value", [torch.ones(3), (torch.ones(2),), None], ids=["shape", "kind", "nothing"]
+)
 def test_what_cannot_be_compared_is_refused(value):
     with pytest.raises(ValueError, match="cannot compare"):
         error_of(value, torch.ones(2))

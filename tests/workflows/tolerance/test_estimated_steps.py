@@ -1,4 +1,6 @@
-"""Cheaper steps whose error is estimated: used where they may be, forbidden by a word, and within the tolerance."""
+"""Cheaper steps whose error is estimated: used where they may be, forbidden by a word, and
+within the tolerance.
+"""
 
 from dataclasses import replace
 
@@ -7,7 +9,7 @@ import pytest
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.recipe.changed_recipe import changed
+from neusee.workflows.recipe.loading import changed
 from neusee.workflows.report.tolerance_spent import said_of_economies, said_of_errors, spent
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
@@ -44,14 +46,21 @@ def test_a_psf_that_only_an_image_reads_is_computed_for_few_bands(recipe):
     assert few_of(recipe, "image[mask]") == {"psf[plain]"}
     found = with_substitutions(recipe, recipe.outputs)
     assert found.steps["psf[mask]"] == recipe.steps["psf[mask]"]
-    assert found.steps["psf[mask].choice"].params["within"] > found.steps["image[mask].channels"].params["within"]
+    assert (
+        found.steps["psf[mask].choice"].params["within"]
+        > found.steps["image[mask].channels"].params["within"]
+    )
     optimised = with_substitutions(recipe, recipe.outputs, pinned=["height"])
     assert "psf[mask].few" not in optimised.steps
     assert "psf[plain].few" in optimised.steps
 
 
 def test_a_word_in_the_recipe_and_an_exact_run_forbid_estimates(recipe):
-    for other in (changed(recipe, ["estimates=false"]), replace(recipe, exact=True), replace(recipe, tolerance=0.0)):
+    for other in (
+        changed(recipe, ["estimates=false"]),
+        replace(recipe, exact=True),
+        replace(recipe, tolerance=0.0),
+    ):
         assert few_of(other) == set()
     proved = changed(recipe, ["estimates=false"])
     assert not proved.estimates
@@ -64,12 +73,16 @@ def test_a_word_in_the_recipe_and_an_exact_run_forbid_estimates(recipe):
 
 
 @pytest.mark.parametrize("tolerance", [1e-3, pytest.param(1e-4, marks=pytest.mark.slow)])
-def test_the_error_is_within_the_tolerance_and_the_account_says_what_is_estimated(recipe, tolerance, tmp_path):
+def test_the_error_is_within_the_tolerance_and_the_account_says_what_is_estimated(
+    recipe, tolerance, tmp_path
+):
     store, loose = Store(tmp_path), replace(recipe, tolerance=tolerance)
     full = run(replace(loose, exact=True), store)
     result = run(loose, store)
     for name, value in full.values.items():
-        assert error_of(result[name], value) <= max(result.proof.held[name], 1e-6) <= tolerance, name
+        assert error_of(result[name], value) <= max(result.proof.held[name], 1e-6) <= tolerance, (
+            name
+        )
     account = spent(result)
     plain = next(each for each in account["economies"] if each["step"] == "psf[plain]")
     assert plain["estimated"]
@@ -79,13 +92,18 @@ def test_the_error_is_within_the_tolerance_and_the_account_says_what_is_estimate
     assert f"psf[plain] (estimated {plain['bound']:.1e})" in said_of_economies(account)
     worst = max((row for row in account["outputs"]), key=lambda row: row["error"])
     assert {row["kind"] for row in account["outputs"]} == {"estimated"}
-    assert f"{worst['error']:.1e} in {worst['output']}, an estimate that 95% of errors" in said_of_errors(account)
+    assert (
+        f"{worst['error']:.1e} in {worst['output']}, an estimate that 95% of errors"
+        in said_of_errors(account)
+    )
 
 
 def test_a_looser_tolerance_takes_no_more_bands(recipe, tmp_path):
     counts = []
     for tolerance in (1e-4, 1e-3, 1e-2, 3e-2):
         found = with_substitutions(replace(recipe, tolerance=tolerance), recipe.outputs)
-        counts.append(len(run(found, Store(tmp_path), ["psf[plain].choice"])["psf[plain].choice"].used))
+        counts.append(
+            len(run(found, Store(tmp_path), ["psf[plain].choice"])["psf[plain].choice"].used)
+        )
     assert counts == sorted(counts, reverse=True)
     assert counts[-1] < counts[0] < 31

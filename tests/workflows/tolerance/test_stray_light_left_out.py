@@ -1,4 +1,6 @@
-"""Stray light in a recipe: every PSF has it, and a tolerance omits it only where the scene does not need it."""
+"""Stray light in a recipe: every PSF has it, and a tolerance omits it only where the scene does
+not need it.
+"""
 
 import pytest
 
@@ -6,8 +8,15 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
 
-SMALL = ["optics.samples=64", "optics.pitch=126.2 um", "optics.bands=3", "optics.window=[48, 48]",
-         "scene.shape=[48, 48]", "sensor.shape=[40, 40]", "scene=edge"]  # fmt: skip
+SMALL = [
+    "optics.samples=64",
+    "optics.pitch=126.2 um",
+    "optics.bands=3",
+    "optics.window=[48, 48]",
+    "scene.shape=[48, 48]",
+    "sensor.shape=[40, 40]",
+    "scene=edge",
+]
 LENS = "stray_light.surfaces.lens"
 
 
@@ -29,8 +38,10 @@ def test_the_group_puts_the_psf_of_the_camera_behind_stray_light():
     for name in ("psf[plain]", "psf[mask]", "laser_psf[plain,green]"):
         lens = with_veil[f"lens_{name}"]
         assert (lens.node, dict(lens.wires), lens.params) == (
-            without[name].node, dict(without[name].wires), without[name].params,
-        )  # fmt: skip
+            without[name].node,
+            dict(without[name].wires),
+            without[name].params,
+        )
         assert with_veil[name].node.path == "flare.stray_light"
         assert with_veil[name].wires["psf"] == f"lens_{name}"
     for reader in ("image[mask]", "spot[mask,green]", "lsr[plain]", "deconvolved"):
@@ -66,7 +77,10 @@ def test_a_lens_without_scatter_is_no_step_at_all(states):
         (f"{LENS}.l=0", "must be greater than 0"),
         (f"{LENS}.s=1", "must be less than or equal to 0"),
         (f"{LENS}.radius=3", "needs a unit"),
-        (f"{LENS}.b0=1e4", "surface lens scatters 113 of the light at 550 nm, and the limit is below 1"),
+        (
+            f"{LENS}.b0=1e4",
+            "surface lens scatters 113 of the light at 550 nm, and the limit is below 1",
+        ),
         (f"{LENS}.radius=2 um", "this surface lies on the sensor; choose a larger radius"),
         ("stray_light.scaling=rough", "'none' or 'roughness'"),
     ],

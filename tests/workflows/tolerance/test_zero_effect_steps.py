@@ -1,4 +1,6 @@
-"""What is nothing by its parameters is not computed, and the result is what it was, to the last bit."""
+"""What is nothing by its parameters is not computed, and the result is what it was, to the last
+bit.
+"""
 
 from dataclasses import replace
 
@@ -23,9 +25,22 @@ SMALL = [
     "steps.restored_quality=null",
     "outputs=[raw, peak, lsr]",
 ]
-CLEAN = [f"dirt.{name}=0" for name in ("dust", "scratches", "smudges")] + ["dirt.grease=0 waves", "dirt.dents=0 waves"]
-LASER = {"laser_psf", "laser_pupil", "laser_photons", "spot", "direction", "line", "laser_index", "laser_responses",
-         "light", "wavefront"}  # fmt: skip
+CLEAN = [f"dirt.{name}=0" for name in ("dust", "scratches", "smudges")] + [
+    "dirt.grease=0 waves",
+    "dirt.dents=0 waves",
+]
+LASER = {
+    "laser_psf",
+    "laser_pupil",
+    "laser_photons",
+    "spot",
+    "direction",
+    "line",
+    "laser_index",
+    "laser_responses",
+    "light",
+    "wavefront",
+}
 
 
 def recipe(*changes, flare="dirty_windshield"):
@@ -33,7 +48,10 @@ def recipe(*changes, flare="dirty_windshield"):
 
 
 def asked(found):
-    return {name.partition("[")[0] for name in needed(with_substitutions(found, found.outputs), found.outputs)}
+    return {
+        name.partition("[")[0]
+        for name in needed(with_substitutions(found, found.outputs), found.outputs)
+    }
 
 
 CASES = [
@@ -45,7 +63,9 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "gone"), CASES, ids=["all", "no light", "no ghosts", "no energy", "clean"])
+@pytest.mark.parametrize(
+    ("changes", "gone"), CASES, ids=["all", "no light", "no ghosts", "no energy", "clean"]
+)
 def test_only_what_is_nothing_goes(changes, gone):
     everything = asked(recipe())
     assert everything >= LASER | {"ghosts", "ghost_photons", "dirt"}
@@ -56,7 +76,9 @@ def test_a_little_is_not_nothing():
     assert asked(recipe("lasers.green.strength=1e-30")) == asked(recipe())
 
 
-@pytest.mark.parametrize("changes", [("lasers.green.strength=0",), CLEAN, ("ghosts.count=0",)], ids=str)
+@pytest.mark.parametrize(
+    "changes", [("lasers.green.strength=0",), CLEAN, ("ghosts.count=0",)], ids=str
+)
 def test_the_result_is_the_same(changes, tmp_path):
     found = recipe("tolerance=0", *changes)
     spared = run(found, Store(tmp_path / "a"))

@@ -1,6 +1,7 @@
 """Photographs of noise that are the same in every process, whichever tests ran before.
 
-Pillow draws its noise from the C library's generator, so that the picture depends on all that was drawn before.
+Pillow draws its noise from the C library's generator, so that the picture depends on all that was
+drawn before.
 """
 
 import numpy as np

@@ -1,7 +1,9 @@
-"""A training with any changed input begins anew and says what changed; with equal inputs it goes on, renamed or not.
+"""A training with any changed input begins anew and says what changed; with equal inputs it goes
+on, renamed or not.
 
-Each kind of input changes the content of a file under its old name, with its old size and time where that can be, or
-one value, one line of code, one law. The folder of results is compared, which the digest of all inputs names.
+Each kind of input changes the content of a file under its old name, with its old size and time
+where that can be, or one value, one line of code, one law. The folder of results is compared, which
+the digest of all inputs names.
 """
 
 import os
@@ -21,14 +23,18 @@ from safetensors.torch import load_file, save_file
 from neusee.nodes.losses import _restoration_losses
 from neusee.nodes.restore import NAFNet, start_network
 from neusee.workflows import Store, load
-from neusee.workflows.training.loop.changed_inputs import prepare_folder
-from neusee.workflows.training.run_training import BegunTraining, train
-from neusee.workflows.training.unchanged_files import UnchangedFiles
+from neusee.workflows.training.loop.recorded_inputs import prepare_folder
+from neusee.workflows.training.run_training import BegunTraining, UnchangedFiles, train
 
 TINY = [
-    "optics.samples=48", "optics.pitch=168.27 um", "optics.bands=3", "optics.window=[32, 32]", "scene.shape=[32, 32]",
-    "sensor.shape=[24, 24]", "train.held_out=0.4",
-]  # fmt: skip
+    "optics.samples=48",
+    "optics.pitch=168.27 um",
+    "optics.bands=3",
+    "optics.window=[32, 32]",
+    "scene.shape=[32, 32]",
+    "sensor.shape=[24, 24]",
+    "train.held_out=0.4",
+]
 NODE = '''\
 """A plate of glass."""
 
@@ -50,7 +56,9 @@ def plate(stop: Stop, *, thickness: PositiveLength = 1e-6) -> Tensor:
     row = next(csv.reader((Path(__file__).parent / "glass.csv").open()))
     return torch.full(stop.amplitude.shape, thickness_of(thickness) * float(row[0]), dtype=torch.float64)
 '''
-HELPER = '"""Glass."""\n\n\ndef thickness_of(metres):\n    """Return it."""\n    return 1.0 * metres\n'
+HELPER = (
+    '"""Glass."""\n\n\ndef thickness_of(metres):\n    """Return it."""\n    return 1.0 * metres\n'
+)
 NETWORK = '''\
 """A network."""
 
@@ -118,7 +126,9 @@ class Laboratory:
         return self.folder / name.format(**self.names)
 
     def begin(self, words):
-        """Begin the training, as `train` does before its first iteration; return its folder and what was said."""
+        """Begin the training, as `train` does before its first iteration; return its folder and
+        what was said.
+        """
         for module in self.names.values():
             sys.modules.pop(module, None)
         recipe = load(self.path(self.recipe), [*TINY, *words], self.folder)
@@ -177,7 +187,7 @@ def lab(tmp_path, store):
     sys.path[:] = [place for place in sys.path if not place.startswith(str(tmp_path))]
 
 
-# --- what changes -----------------------------------------------------------------------------------------------------
+# --- what changes ---------------------------------------------------------------------------------
 
 
 def another_map(lab):
@@ -199,7 +209,11 @@ def one_byte_within(lab):
     path = lab.path("photographs/large.jpg")
     content = bytearray(path.read_bytes())
     assert len(content) > 3 * 65536
-    middle = next(i for i in range(len(content) // 2, len(content)) if 0 < content[i] < 0x7F and content[i - 1] != 0xFF)
+    middle = next(
+        i
+        for i in range(len(content) // 2, len(content))
+        if 0 < content[i] < 0x7F and content[i - 1] != 0xFF
+    )
     content[middle] ^= 1
     path.write_bytes(content)
 
@@ -297,7 +311,10 @@ def test_a_changed_input_begins_anew_and_is_named(lab, kind, monkeypatch):
     more = change(lab) or ()
     again, lines = lab.begin([*words, *(more if isinstance(more, tuple) else ())])
     assert again != first
-    assert f"begins anew, because its inputs are not those of {first.name}, which stays as it is:" in lines
+    assert (
+        f"begins anew, because its inputs are not those of {first.name}, which stays as it is:"
+        in lines
+    )
     assert re.search(said, lines), lines
     assert len(lines.splitlines()) <= 4, "nothing else changed"
 
@@ -308,7 +325,11 @@ def test_equal_files_are_the_same_training_wherever_they_are_and_whatever_they_a
     assert lab.begin(words) == (first, "")
     for i in range(4):
         lab.path(f"photographs/{i}.png").rename(lab.path(f"photographs/{9 - i}_renamed.png"))
-    for old, new in (("m.npy", "n.npy"), ("first.safetensors", "1.safetensors"), ("lamp.csv", "l.csv")):
+    for old, new in (
+        ("m.npy", "n.npy"),
+        ("first.safetensors", "1.safetensors"),
+        ("lamp.csv", "l.csv"),
+    ):
         lab.path(old).rename(lab.path(new))
     lab.path("mine.yaml").rename(lab.path("yours.yaml"))
     lab.path("doe/mine.yaml").rename(lab.path("doe/plate.yaml"))
@@ -317,11 +338,18 @@ def test_equal_files_are_the_same_training_wherever_they_are_and_whatever_they_a
     sys.path[:] = [place for place in sys.path if place != str(lab.folder)]
     lab.folder.rename(moved)
     lab.folder, lab.recipe = moved, "yours.yaml"
-    words = ["doe=pixelwise", "doe.file=n.npy", "train.start=1.safetensors", "illuminant.kind=l.csv"]
+    words = [
+        "doe=pixelwise",
+        "doe.file=n.npy",
+        "train.start=1.safetensors",
+        "illuminant.kind=l.csv",
+    ]
     assert lab.begin(words) == (first, "")
 
 
-@pytest.mark.parametrize("word", ["outputs=[truth]", "train.show=7", "train.keep=9", "train.tensorboard=false"])
+@pytest.mark.parametrize(
+    "word", ["outputs=[truth]", "train.show=7", "train.keep=9", "train.tensorboard=false"]
+)
 def test_what_changes_no_weight_is_no_input(lab, word):
     first, _ = lab.begin([])
     assert lab.begin([word]) == (first, "")
@@ -338,12 +366,17 @@ def test_a_checkpoint_without_inputs_is_not_continued(lab):
 
 def test_code_that_reads_what_no_key_sees_is_refused_before_a_training(lab):
     lab.replace("{nets}.py", "from torch import nn\n", "import os\n\nfrom torch import nn\n")
-    lab.replace("{nets}.py", "return x + self", "return x * float(os.environ.get('SCALE', '1')) + self")
-    with pytest.raises(ValueError, match=r"train\.network\.architecture .*nets_\w+\.py:\d+: os\.environ.*a cache key"):
+    lab.replace(
+        "{nets}.py", "return x + self", "return x * float(os.environ.get('SCALE', '1')) + self"
+    )
+    with pytest.raises(
+        ValueError,
+        match=r"train\.network\.architecture .*nets_\w+\.py:\d+: os\.environ.*a cache key",
+    ):
         lab.begin([])
 
 
-# --- while it runs ----------------------------------------------------------------------------------------------------
+# --- while it runs --------------------------------------------------------------------------------
 
 
 def test_a_photograph_that_is_changed_or_gone_while_a_training_runs_stops_it(tmp_path):
@@ -355,7 +388,10 @@ def test_a_photograph_that_is_changed_or_gone_while_a_training_runs_stops_it(tmp
     os.utime(paths[0], ns=(1, 1))
     files.require()
     paths[1].write_bytes(b"Picture b.png")
-    with pytest.raises(ValueError, match=r"the photograph .*b\.png has another content now, after this training began"):
+    with pytest.raises(
+        ValueError,
+        match=r"the photograph .*b\.png has another content now, after this training began",
+    ):
         files.require()
     paths[1].unlink()
     with pytest.raises(ValueError, match=r"b\.png cannot be read any more \(No such file"):
@@ -363,19 +399,30 @@ def test_a_photograph_that_is_changed_or_gone_while_a_training_runs_stops_it(tmp
 
 
 WHOLE = [
-    "train.learn=null", "train.network={kind: unet, width: 4}", "train.critics.width=4", "train.keep=1", "doe=flat",
-    "train.stages.2.iterations=3", "train.stages.2.batch=1", "train.stages.2.adversarial=0", "train.average=0",
+    "train.learn=null",
+    "train.network={kind: unet, width: 4}",
+    "train.critics.width=4",
+    "train.keep=1",
+    "doe=flat",
+    "train.stages.2.iterations=3",
+    "train.stages.2.batch=1",
+    "train.stages.2.adversarial=0",
+    "train.average=0",
     "train.validate_every=9",
-]  # fmt: skip
+]
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 def test_an_interrupted_training_with_renamed_photographs_goes_on_to_the_same_weights(lab):
-    """And the network of other photographs under the old names is another one, which begins at the beginning."""
+    """And the network of other photographs under the old names is another one, which begins at
+    the beginning.
+    """
 
     def trained(runs, watch=None):
-        recipe = load("train_small", [*TINY, *WHOLE, f"train.photographs={lab.path('photographs')}"])
+        recipe = load(
+            "train_small", [*TINY, *WHOLE, f"train.photographs={lab.path('photographs')}"]
+        )
         lines = []
         folder = train(recipe, lab.store, lab.folder / runs, [], lines.append, (2,), watch=watch)
         return folder, "\n".join(lines)
@@ -392,22 +439,37 @@ def test_an_interrupted_training_with_renamed_photographs_goes_on_to_the_same_we
     again, lines = trained("parts")
     assert "continues in stage 2 after 1 iterations" in lines
     assert again.name == whole.name
-    assert (again / "network.safetensors").read_bytes() == (whole / "network.safetensors").read_bytes()
+    assert (again / "network.safetensors").read_bytes() == (
+        whole / "network.safetensors"
+    ).read_bytes()
     for path in lab.path("photographs").glob("*.png"):
         inverted(f"photographs/{path.name}")(lab)
     other, lines = trained("parts")
     assert other != again
     assert "other content" in lines
     assert "continues" not in lines
-    assert (other / "network.safetensors").read_bytes() != (whole / "network.safetensors").read_bytes()
+    assert (other / "network.safetensors").read_bytes() != (
+        whole / "network.safetensors"
+    ).read_bytes()
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 def test_another_mask_in_the_folder_of_a_training_is_not_that_of_its_second_stage(lab):
-    stages = ["train.stages.1={iterations: 1, batch: 1, adversarial: 0}", "train.stages.2.iterations=1"]
-    words = [*TINY, *WHOLE, "doe=unet", "doe.grid=24", "train.learn=height", *stages, "train.held_out=null",
-             f"train.photographs={lab.path('photographs')}"]  # fmt: skip
+    stages = [
+        "train.stages.1={iterations: 1, batch: 1, adversarial: 0}",
+        "train.stages.2.iterations=1",
+    ]
+    words = [
+        *TINY,
+        *WHOLE,
+        "doe=unet",
+        "doe.grid=24",
+        "train.learn=height",
+        *stages,
+        "train.held_out=null",
+        f"train.photographs={lab.path('photographs')}",
+    ]
     recipe = load("train_small", words)
 
     def trained(*numbers):
@@ -416,7 +478,10 @@ def test_another_mask_in_the_folder_of_a_training_is_not_that_of_its_second_stag
     file = trained(1) / "mask.safetensors"
     before = file.read_bytes()
     save_file({"height": load_file(file)["height"] * 1.1}, file)
-    with pytest.raises(ValueError, match=r"mask\.safetensors has another content than the mask behind which stage 2"):
+    with pytest.raises(
+        ValueError,
+        match=r"mask\.safetensors has another content than the mask behind which stage 2",
+    ):
         trained(2)
     file.write_bytes(before)
     assert (trained(2) / "training.json").is_file()

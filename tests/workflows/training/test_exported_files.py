@@ -1,4 +1,6 @@
-"""A training that exports its network: the graph has the best weights, and what cannot be exported ends it early."""
+"""A training that exports its network: the graph has the best weights, and what cannot be
+exported ends it early.
+"""
 
 import importlib.util
 
@@ -27,7 +29,9 @@ def test_what_cannot_be_exported_is_refused_before_the_training(tmp_path, monkey
     with pytest.raises(RecipeError, match="export: the scan of fft_mamba"):
         load("train_small", [*TINY, "train.network.kind=fft_mamba", "train.export=[onnx]"])
     found = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "onnxscript" else found(name))
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "onnxscript" else found(name)
+    )
     with pytest.raises(ValueError, match=r"train\.export: .*onnxscript must be installed"):
         trained(["train.export=[onnx]"], tmp_path)
     assert not list(tmp_path.rglob("losses.csv"))

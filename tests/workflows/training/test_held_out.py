@@ -1,4 +1,6 @@
-"""Held-out photographs: the same split whatever the names, a validation that agrees with NumPy, and the best state."""
+"""Held-out photographs: the same split whatever the names, a validation that agrees with NumPy,
+and the best state.
+"""
 
 import csv
 import json
@@ -11,11 +13,12 @@ from PIL import Image
 from safetensors.torch import load_file
 from scipy import stats
 
-from neusee.nodes.scene import Photographs, _photograph_folder
+from neusee.nodes.scene import Photographs
+from neusee.nodes.scene import _photograph as _photograph_folder
 from neusee.workflows import RecipeError, Store, load
+from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.held_out import COLUMNS, Validation, interval, split
-from neusee.workflows.training.parallel.process_mesh import ALONE
-from neusee.workflows.training.parallel.shared_graph import Shared
+from neusee.workflows.training.process_mesh import ALONE
 from neusee.workflows.training.run_training import train
 from neusee.workflows.training.training_pictures import TrainingStream
 
@@ -62,7 +65,7 @@ def rows_of(folder):
         return list(csv.DictReader(file))
 
 
-# --- the split --------------------------------------------------------------------------------------------------------
+# --- the split ------------------------------------------------------------------------------------
 
 
 def test_the_split_follows_the_content_and_not_the_names(tmp_path, folder):
@@ -111,25 +114,37 @@ def test_patience_without_held_out_photographs_is_a_mistake(folder):
 
 def test_the_photograph_of_the_recipe_alone_holds_nothing_out():
     recipe = load("train_small", TINY)
-    assert split(recipe, recipe.training, Photographs((recipe.steps["scene"].params["file"],))).held_out == ()
+    assert (
+        split(
+            recipe, recipe.training, Photographs((recipe.steps["scene"].params["file"],))
+        ).held_out
+        == ()
+    )
 
 
 @pytest.mark.slow
 def test_no_crop_of_a_held_out_photograph_is_trained_on(tmp_path, folder):
-    """Photographs of one colour each, so that the colour of any crop says from which photograph it is."""
+    """Photographs of one colour each, so that the colour of any crop says from which photograph
+    it is.
+    """
     for i in range(5):
         Image.new("RGB", (40, 36), (40 * i + 20, 0, 0)).save(tmp_path / f"{i}.png")
     recipe = tiny(tmp_path)
     parts = split(recipe, recipe.training, Photographs.under(tmp_path))
-    red = {path: float(Photographs((path,)).crop((8, 8), 1, 1)[0, 0, 0]) for path in sorted(tmp_path.glob("*.png"))}
-    stream = TrainingStream(recipe, recipe.training, parts.trained, Store(tmp_path), "cpu", recipe, ALONE, parts.judged)
+    red = {
+        path: float(Photographs((path,)).crop((8, 8), 1, 1)[0, 0, 0])
+        for path in sorted(tmp_path.glob("*.png"))
+    }
+    stream = TrainingStream(
+        recipe, recipe.training, parts.trained, Store(tmp_path), "cpu", recipe, ALONE, parts.judged
+    )
     for stage, allowed in ((1, parts.trained.paths), (2, parts.trained.paths), (3, parts.judged)):
         count = 24 if stage != 3 else len(parts.judged)
         seen = {float(stream._drawn(stage, n)[0]["scene"][0, 0, 0]) for n in range(count)}
         assert seen == {red[path] for path in allowed}
 
 
-# --- the validation ---------------------------------------------------------------------------------------------------
+# --- the validation -------------------------------------------------------------------------------
 
 
 def test_the_interval_is_that_of_student():
@@ -141,13 +156,17 @@ def test_the_interval_is_that_of_student():
 def test_a_validation_agrees_with_numpy_and_repeats(tmp_path, folder):
     recipe = tiny(folder)
     parts = split(recipe, recipe.training, Photographs.under(folder))
-    stream = TrainingStream(recipe, recipe.training, parts.trained, Store(tmp_path), "cpu", recipe, ALONE, parts.judged)
+    stream = TrainingStream(
+        recipe, recipe.training, parts.trained, Store(tmp_path), "cpu", recipe, ALONE, parts.judged
+    )
     net = torch.nn.Identity()
     net.train()
     judge = Validation(parts, ALONE, "cpu")
     found = judge(net, stream, Shared.of({}), False)
     assert net.training
-    assert judge(net, stream, Shared.of({}), True) == judge(net, stream, Shared.of({}), True) == found
+    assert (
+        judge(net, stream, Shared.of({}), True) == judge(net, stream, Shared.of({}), True) == found
+    )
     each = []
     for number in range(2):
         sample = stream({}, 3, number)
@@ -170,7 +189,11 @@ def test_the_best_state_is_kept_and_a_stopped_training_finds_the_same(tmp_path, 
     rows = rows_of(whole)
     assert [bool(row["held_out_PSNR"]) for row in rows] == [False, True] * 3
     about = json.loads((whole / "training.json").read_text())
-    scores = {int(row["iteration"]) + 1: float(row["held_out_PSNR"]) for row in rows if row["held_out_PSNR"]}
+    scores = {
+        int(row["iteration"]) + 1: float(row["held_out_PSNR"])
+        for row in rows
+        if row["held_out_PSNR"]
+    }
     assert about["best"]["iterations"] == max(scores, key=scores.get)
     assert len(about["held_out"]) == 2
 

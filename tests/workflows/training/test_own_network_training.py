@@ -1,4 +1,6 @@
-"""A network class of the user in training: dropout and batch norm resume to the bit, and its file is used as it is."""
+"""A network class of the user in training: dropout and batch norm resume to the bit, and its
+file is used as it is.
+"""
 
 import json
 import os
@@ -12,17 +14,31 @@ from safetensors.torch import load_file, save_file
 from neusee.workflows import RecipeError, Store, load, run
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints, PointRequest
 from neusee.workflows.evaluation.evaluation_scenes import scenes
-from neusee.workflows.evaluation.pipelines import CASES, EvaluationRefused, compose_pipelines, read_pipelines
+from neusee.workflows.evaluation.pipelines import (
+    CASES,
+    EvaluationRefused,
+    compose_pipelines,
+    read_pipelines,
+)
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.training.parallel.process_mesh import ALONE, Mesh
+from neusee.workflows.training.process_mesh import ALONE, Mesh
 from neusee.workflows.training.run_training import train
 from neusee.workflows.training.training_inputs import code_of_class, network_settings
 
 TINY = [
-    "optics.samples=64", "optics.pitch=126.2 um", "optics.bands=3", "optics.window=[48, 48]", "scene.shape=[48, 48]",
+    "optics.samples=64",
+    "optics.pitch=126.2 um",
+    "optics.bands=3",
+    "optics.window=[48, 48]",
+    "scene.shape=[48, 48]",
     "sensor.shape=[33, 36]",
-]  # fmt: skip
-SHORT = ["train.stages.2.iterations=3", "train.stages.2.batch=1", "train.critics.width=4", "train.keep=1"]
+]
+SHORT = [
+    "train.stages.2.iterations=3",
+    "train.stages.2.batch=1",
+    "train.critics.width=4",
+    "train.keep=1",
+]
 NETWORK = '''\
 """A network."""
 
@@ -84,7 +100,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture
 def mine(tmp_path, monkeypatch):
-    """Write a network, a recipe that trains it and an option that restores with it, under a name of the test."""
+    """Write a network, a recipe that trains it and an option that restores with it, under a name
+    of the test.
+    """
     name = f"own_{abs(hash(tmp_path)) % 10**9:09d}"
     (tmp_path / "restore").mkdir()
     (tmp_path / f"{name}.py").write_text(NETWORK)
@@ -96,7 +114,9 @@ def mine(tmp_path, monkeypatch):
 
 def trained(tmp_path, out="runs", *words, watch=None):
     recipe = load("mine.yaml", [*TINY, *SHORT, *words], tmp_path)
-    return train(recipe, Store(tmp_path / "cache"), tmp_path / out, [], lambda line: None, (2,), watch=watch)
+    return train(
+        recipe, Store(tmp_path / "cache"), tmp_path / out, [], lambda line: None, (2,), watch=watch
+    )
 
 
 class Stopped(Exception):
@@ -115,7 +135,9 @@ def test_a_stopped_training_goes_on_to_the_same_weights_and_a_run_uses_them(mine
         trained(tmp_path, "stopped", watch=stop)
     again = trained(tmp_path, "stopped")
     assert again.name == whole.name
-    assert (again / "network.safetensors").read_bytes() == (whole / "network.safetensors").read_bytes()
+    assert (again / "network.safetensors").read_bytes() == (
+        whole / "network.safetensors"
+    ).read_bytes()
 
     weights = whole / "network.safetensors"
     state = load_file(weights)
@@ -150,10 +172,14 @@ def other_weights(tmp_path, state):
     return tmp_path / "other.safetensors"
 
 
-def test_a_training_is_another_one_after_an_edit_of_the_class_and_in_the_same_folder_without(mine, tmp_path):
+def test_a_training_is_another_one_after_an_edit_of_the_class_and_in_the_same_folder_without(
+    mine, tmp_path
+):
     def identity():
         network = load("mine.yaml", [*TINY, *SHORT], tmp_path).training.network
-        return network_settings(network), code_of_class(network.architecture, Code(tmp_path / "code.json"))
+        return network_settings(network), code_of_class(
+            network.architecture, Code(tmp_path / "code.json")
+        )
 
     first, code = identity()
     assert first == {"class": f"{mine}.Small", "parameters": {"width": 4}, "multiple": None}
@@ -167,9 +193,21 @@ def test_a_training_is_another_one_after_an_edit_of_the_class_and_in_the_same_fo
 
 NET = "train.network"
 MISTAKES = [
-    ([f"{NET}.architecture={{0}}.Smal"], f"argument 11 | {NET}.architecture", "{0} has no network class Smal"),
-    ([f"{NET}.parameters={{{{depth: 3}}}}"], f"argument 11 | {NET}.parameters", "{0}.Small takes no argument depth"),
-    ([f"{NET}.width=8"], f"argument 11 | {NET}.width", "width is of the networks of neusee: write parameters: {{width"),
+    (
+        [f"{NET}.architecture={{0}}.Smal"],
+        f"argument 11 | {NET}.architecture",
+        "{0} has no network class Smal",
+    ),
+    (
+        [f"{NET}.parameters={{{{depth: 3}}}}"],
+        f"argument 11 | {NET}.parameters",
+        "{0}.Small takes no argument depth",
+    ),
+    (
+        [f"{NET}.width=8"],
+        f"argument 11 | {NET}.width",
+        "width is of the networks of neusee: write parameters: {{width",
+    ),
     ([f"{NET}.parameters=4"], f"argument 11 | {NET}.parameters", "must be a mapping"),
     (
         [f"{NET}.architecture={{0}}.Fixed", f"{NET}.parameters=null"],
@@ -179,7 +217,10 @@ MISTAKES = [
     (
         [f"{NET}.architecture={{0}}.Single", f"{NET}.parameters=null", "train.precision=float64"],
         f"argument 11 | {NET}.architecture",
-        "{0}.Single fails for a picture 1 x 3 x 33 x 35: {0}.py:32: Input type (float) and bias type (double) should",
+        (
+            "{0}.Single fails for a picture 1 x 3 x 33 x 35: {0}.py:32: Input type (float) and bias"
+            " type (double) should"
+        ),
     ),
     ([f"+{NET}.multiple=0"], f"argument 11 | {NET}.multiple", "must be greater than or equal to 1"),
     (
@@ -201,11 +242,16 @@ def test_a_mistake_is_located_before_the_training(words, place, message, mine, t
 
 def test_an_option_of_the_user_that_takes_no_file_is_refused(mine, tmp_path):
     option = tmp_path / "restore" / "bare.yaml"
-    option.write_text("# Bare.\nsteps: {restored: {node: restore.colour, from: {channels: signal, matrix: matrix}}}\n")
+    option.write_text(
+        "# Bare.\nsteps: {restored: {node: restore.colour, from: {channels: signal, matrix:"
+        " matrix}}}\n"
+    )
     weights = tmp_path / "any.safetensors"
     weights.write_bytes(b"")
     with pytest.raises(EvaluationRefused, match="bare takes no file: remove @ and the file name"):
-        compose_pipelines("mine.yaml", TINY, read_pipelines(f"flat+bare@{weights}", tmp_path), tmp_path)
+        compose_pipelines(
+            "mine.yaml", TINY, read_pipelines(f"flat+bare@{weights}", tmp_path), tmp_path
+        )
 
 
 def test_an_option_in_a_shared_folder_is_found(mine, tmp_path, monkeypatch):
@@ -214,13 +260,17 @@ def test_an_option_in_a_shared_folder_is_found(mine, tmp_path, monkeypatch):
     save_file(network.state_dict() | {"a": torch.zeros(1)}, tmp_path / "wrong.safetensors")
     (tmp_path / "away").mkdir()
     asked = read_pipelines(f"flat+mine@{tmp_path / 'wrong.safetensors'}", tmp_path / "away")
-    with pytest.raises(EvaluationRefused, match=r"wrong.safetensors: a is \(1,\), own_.*Small has None"):
+    with pytest.raises(
+        EvaluationRefused, match=r"wrong.safetensors: a is \(1,\), own_.*Small has None"
+    ):
         compose_pipelines("first_light", TINY, asked, tmp_path / "away")
 
 
 def test_all_processes_have_the_running_means_of_the_first(monkeypatch):
     net, sent = torch.nn.Sequential(torch.nn.Conv2d(3, 3, 1), torch.nn.BatchNorm2d(3)), []
-    monkeypatch.setattr(torch.distributed, "broadcast", lambda buffer, source: sent.append((buffer, source)))
+    monkeypatch.setattr(
+        torch.distributed, "broadcast", lambda buffer, source: sent.append((buffer, source))
+    )
     ALONE.share_buffers(net)
     assert not sent
     Mesh(data=2, rank=1).share_buffers(net)

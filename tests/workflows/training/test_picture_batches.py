@@ -1,4 +1,6 @@
-"""Pictures that go through the network together: the losses and gradients of pictures that go one by one."""
+"""Pictures that go through the network together: the losses and gradients of pictures that go
+one by one.
+"""
 
 import pytest
 import torch
@@ -6,8 +8,7 @@ import torch
 from neusee.nodes import losses
 from neusee.nodes.restore import Informed, NAFNet, start_network
 from neusee.nodes.values import FilterFacts
-from neusee.workflows.training.picture_batches import joined, together
-from neusee.workflows.training.training_iteration import Learner, Scales, _apart
+from neusee.workflows.training.training_iteration import Learner, Scales, _apart, joined, together
 from neusee.workflows.training.training_pictures import Sample
 
 MAPS = 32
@@ -21,7 +22,11 @@ def sample(seed, size=(12, 16), informed=True):
 
     picture, truth = drawn(1, 3, *size), drawn(1, 3, *size)
     facts = FilterFacts(
-        drawn(3, *size) - 0.5, drawn(3, *size) + 0.1, drawn(MAPS, *size), 1 + drawn(3, 1, 1), drawn(3, 1, 1)
+        drawn(3, *size) - 0.5,
+        drawn(3, *size) + 0.1,
+        drawn(MAPS, *size),
+        1 + drawn(3, 1, 1),
+        drawn(3, 1, 1),
     )
     given = (facts, torch.eye(3, dtype=torch.float64) + 0.1 * drawn(3, 3)) if informed else ()
     return Sample(picture, truth, torch.zeros(0), {"noise": seed}, given)
@@ -45,8 +50,12 @@ def test_gradients_are_those_of_pictures_one_by_one(informed):
     numbered = list(enumerate(pictures))
     groups = list(together(numbered, True))
     assert sorted(n for numbers, _ in groups for n in numbers) == [0, 1, 2, 3, 4]
-    assert [numbers for numbers, _ in groups] == [[0, 1, 3, 4], [2]], "pictures of one size go together"
-    for one, many in zip(gradients(net, together(numbered, False), 5), gradients(net, groups, 5), strict=True):
+    assert [numbers for numbers, _ in groups] == [[0, 1, 3, 4], [2]], (
+        "pictures of one size go together"
+    )
+    for one, many in zip(
+        gradients(net, together(numbered, False), 5), gradients(net, groups, 5), strict=True
+    ):
         torch.testing.assert_close(many, one, rtol=1e-10, atol=1e-12)
 
 

@@ -1,4 +1,6 @@
-"""Pictures of a training of the unrolled filter: the filter's own, with the problem that it solved."""
+"""Pictures of a training of the unrolled filter: the filter's own, with the problem that it
+solved.
+"""
 
 import pytest
 import torch
@@ -34,7 +36,9 @@ def stream(words, photograph, store):
     return TrainingStream(recipe, recipe.training, Photographs((photograph,)), store, "cpu", recipe)
 
 
-def test_the_picture_is_that_of_any_network_behind_the_filter_and_the_problem_has_it_as_its_answer(photograph, store):
+def test_the_picture_is_that_of_any_network_behind_the_filter_and_the_problem_has_it_as_its_answer(
+    photograph, store
+):
     posed, other = stream(POSED, photograph, store), stream(OTHER, photograph, store)
     one, same = posed({}, 2, 0), other({}, 2, 0)
     assert one.drawn == same.drawn
@@ -53,12 +57,20 @@ def test_what_the_informed_network_sees_is_turned_with_the_picture(photograph, s
     one = stream([*INFORMED, "train.augment.pooled=turned_mask"], photograph, store)
     sample = one({}, 2, 0)
     known, matrix = sample.given
-    assert torch.allclose(restore.colour(known.answer * known.scale + known.mean, matrix), sample.picture[0], atol=1e-4)
-    number = next(n for n in range(2, 99, 2) if not torch.equal(one.turned(sample, 2, n).truth, sample.truth))
+    assert torch.allclose(
+        restore.colour(known.answer * known.scale + known.mean, matrix),
+        sample.picture[0],
+        atol=1e-4,
+    )
+    number = next(
+        n for n in range(2, 99, 2) if not torch.equal(one.turned(sample, 2, n).truth, sample.truth)
+    )
     other = one.turned(sample, 2, number)
     seen, own = other.given
     assert torch.equal(own, matrix)
-    assert torch.allclose(restore.colour(seen.answer * seen.scale + seen.mean, own), other.picture[0], atol=1e-4)
+    assert torch.allclose(
+        restore.colour(seen.answer * seen.scale + seen.mean, own), other.picture[0], atol=1e-4
+    )
     assert torch.equal(seen.maps[:3], seen.answer)
     assert torch.allclose(seen.deviation.sum((1, 2)), known.deviation.sum((1, 2)), rtol=1e-5)
 
@@ -74,7 +86,9 @@ def test_the_store_gives_back_the_bits_of_picture_and_problem(photograph, store)
 @pytest.mark.slow
 def test_under_a_mismatch_the_problem_is_that_of_the_recipe(photograph, store):
     plain = stream(POSED, photograph, store)({}, 2, 0)
-    moved = stream([*POSED, "+train.mismatch.optics.defocus=0.3 waves"], photograph, store)({}, 2, 0)
+    moved = stream([*POSED, "+train.mismatch.optics.defocus=0.3 waves"], photograph, store)(
+        {}, 2, 0
+    )
     assert torch.equal(moved.given[0].psf, plain.given[0].psf)
     assert not torch.equal(moved.given[0].picture, plain.given[0].picture)
 
@@ -85,7 +99,10 @@ def test_under_a_mismatch_the_problem_is_that_of_the_recipe(photograph, store):
         ("train.patch=[8, 8]", "restores a whole picture behind a fixed mask: write patch: null"),
         ("train.export=[pt2]", "is in no graph of torch.export"),
         ("train.augment.pooled=turned_mask", "write augment.pooled: none"),
-        ("train.network={kind: unet, steps: 3}", "only the network unrolled has such options, not unet"),
+        (
+            "train.network={kind: unet, steps: 3}",
+            "only the network unrolled has such options, not unet",
+        ),
     ],
 )
 def test_settings_that_the_network_cannot_have_are_refused(word, message):
@@ -94,7 +111,9 @@ def test_settings_that_the_network_cannot_have_are_refused(word, message):
 
 
 def test_a_training_on_another_picture_than_that_of_the_filter_is_refused(photograph, store):
-    with pytest.raises(ValueError, match=r"train.picture.*the network unrolled starts from the Wiener filter"):
+    with pytest.raises(
+        ValueError, match=r"train.picture.*the network unrolled starts from the Wiener filter"
+    ):
         stream([*POSED, "train.picture=developed[mask]"], photograph, store)
 
 
@@ -103,7 +122,15 @@ def test_a_recipe_takes_the_trained_network(tmp_path):
     weights = trained([*POSED, "train.rates.weights=1e-2"], tmp_path) / "network.safetensors"
     camera = [word for word in TINY if not word.startswith("train.")]
     words = [*camera, "doe=half_ring", "laser=none", "outputs=[restored]"]
-    taken = ["restore=unrolled", f"restore.weights={weights}", "restore.width=2", "restore.unrolled=1"]
-    told, found = (run(load("first_light", [*words, *more]), Store(tmp_path))["restored"] for more in ([], taken))
+    taken = [
+        "restore=unrolled",
+        f"restore.weights={weights}",
+        "restore.width=2",
+        "restore.unrolled=1",
+    ]
+    told, found = (
+        run(load("first_light", [*words, *more]), Store(tmp_path))["restored"]
+        for more in ([], taken)
+    )
     assert torch.isfinite(found).all()
     assert not torch.equal(found, told)

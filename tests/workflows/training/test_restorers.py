@@ -1,4 +1,6 @@
-"""The paper's camera with a network in place of Wiener: by one word of a recipe, and a file of weights."""
+"""The paper's camera with a network in place of Wiener: by one word of a recipe, and a file of
+weights.
+"""
 
 from functools import partial
 
@@ -8,9 +10,8 @@ from safetensors.torch import save_file
 from torch.testing import assert_close
 
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba
-from neusee.nodes.restore._networks._nafnet import NAFNet
 from neusee.nodes.restore._networks._restorer import start_network
-from neusee.nodes.restore._networks._unet import UNet
+from neusee.nodes.restore._networks._unet_and_nafnet import NAFNet, UNet
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import RecipeError
@@ -36,7 +37,9 @@ every_network = pytest.mark.parametrize("name", MAKE)
 
 
 def small(name, *changes):
-    return load("first_light", [*SMALL, f"restore={name}", "restore.width=2", *FEW.get(name, []), *changes])
+    return load(
+        "first_light", [*SMALL, f"restore={name}", "restore.width=2", *FEW.get(name, []), *changes]
+    )
 
 
 @every_network
@@ -44,7 +47,8 @@ def test_a_recipe_names_its_network_and_the_picture_goes_through_it(name, tmp_pa
     store = Store(tmp_path / "store")
     for seed in (0, 1):
         net = start_network(MAKE[name], torch.Generator().manual_seed(seed))
-        save_file(net.state_dict(), tmp_path / "trained.safetensors")  # other weights in a file of the same name
+        # other weights in a file of the same name
+        save_file(net.state_dict(), tmp_path / "trained.safetensors")
         found = run(small(name, f"restore.weights={tmp_path / 'trained.safetensors'}"), store)
         with torch.no_grad():
             wanted = net(found["developed[mask]"][None])[0]
@@ -62,10 +66,17 @@ def test_without_weights_a_recipe_is_refused_where_they_are_to_be_given(name):
     (problem,) = caught.value.diagnostics
     assert str(problem.mark) == f"restore/{name}.yaml:{'3:12' if name == 'fft_mamba' else '2:20'}"
     assert problem.path == "restore.weights = None"
-    assert problem.message.endswith("give the .safetensors file of its weights, or choose restore: wiener")
+    assert problem.message.endswith(
+        "give the .safetensors file of its weights, or choose restore: wiener"
+    )
 
 
 def test_weights_of_another_width_are_refused_before_the_run(tmp_path):
-    save_file(start_network(partial(UNet, 3), torch.Generator()).state_dict(), tmp_path / "wide.safetensors")
-    with pytest.raises(RecipeError, match=r"wide.safetensors: down.0.0.bias is \(3,\), this network \(width 2\)"):
+    save_file(
+        start_network(partial(UNet, 3), torch.Generator()).state_dict(),
+        tmp_path / "wide.safetensors",
+    )
+    with pytest.raises(
+        RecipeError, match=r"wide.safetensors: down.0.0.bias is \(3,\), this network \(width 2\)"
+    ):
         small("unet", f"restore.weights={tmp_path / 'wide.safetensors'}")

@@ -1,4 +1,6 @@
-"""Learning: two stages from a clean start, the same pictures whoever asks, and a killed training that goes on."""
+"""Learning: two stages from a clean start, the same pictures whoever asks, and a killed training
+that goes on.
+"""
 
 import csv
 import importlib.util
@@ -23,8 +25,8 @@ from neusee.nodes.scene import Photographs
 from neusee.workflows import RecipeError, Store, as_function, load
 from neusee.workflows.cli import app
 from neusee.workflows.recipe.blocks.train_block import MaskSettings, Rates
+from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.mask_design import design_page
-from neusee.workflows.training.parallel.shared_graph import Shared
 from neusee.workflows.training.run_training import frozen, train
 from neusee.workflows.training.training_pictures import TrainingStream
 from tests.workflows.crate_rules import faults
@@ -59,8 +61,15 @@ def tiny(photographs):
 
 
 def trained(recipe, folder, stages=(1, 2), watch=None):
-    return train(recipe, Store(folder / "store"), folder / "runs", ["neusee", "train"], lambda line: None, stages,
-                 watch=watch)  # fmt: skip
+    return train(
+        recipe,
+        Store(folder / "store"),
+        folder / "runs",
+        ["neusee", "train"],
+        lambda line: None,
+        stages,
+        watch=watch,
+    )
 
 
 def pupil(recipe):
@@ -86,18 +95,32 @@ def test_both_stages_at_64_pixels_and_31_bands(tmp_path, photographs):
     assert trained(recipe, tmp_path, [2]) == folder
     assert (folder / "mask.safetensors").read_bytes() == before
     rows = losses(folder)
-    assert [(row["stage"], row["iteration"]) for row in rows] == [(s, i) for s in "12" for i in "012"]
+    assert [(row["stage"], row["iteration"]) for row in rows] == [
+        (s, i) for s in "12" for i in "012"
+    ]
     assert all(np.isfinite(float(x)) for row in rows for x in row.values() if x)
     lsr = [float(row["LSR"]) for row in rows if row["LSR"]]
     assert lsr[-1] < lsr[0]
     height = load_file(folder / "mask.safetensors")["height"]
     assert height.shape == (128, 128)
-    files = [f"doe.file={folder / 'mask.safetensors'}", f"restore.weights={folder / 'network.safetensors'}"]
-    own = ["doe=pixelwise", "restore=fft_mamba", "restore.width=16", *files, "outputs=[restored, lsr]"]
+    files = [
+        f"doe.file={folder / 'mask.safetensors'}",
+        f"restore.weights={folder / 'network.safetensors'}",
+    ]
+    own = [
+        "doe=pixelwise",
+        "restore=fft_mamba",
+        "restore.width=16",
+        *files,
+        "outputs=[restored, lsr]",
+    ]
     made = load("train_small", own).run(Store(tmp_path / "store"))
     assert made["restored"].shape == (3, 64, 64)
     assert (folder / "curves.png").stat().st_size > 10_000
-    assert sorted(path.name for path in (folder / "pictures").iterdir()) == ["stage1_000003.png", "stage2_000003.png"]
+    assert sorted(path.name for path in (folder / "pictures").iterdir()) == [
+        "stage1_000003.png",
+        "stage2_000003.png",
+    ]
 
 
 @pytest.mark.slow
@@ -116,7 +139,9 @@ recipe = load("train_small", {[*TINY, f"train.photographs={photographs}"]!r})
 train(recipe, Store(here / "store"), here / "runs", [], print, watch=watch)
 """
     env = {**os.environ, "PYTHONPATH": str(ROOT / ".src"), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False
+    )
     assert done.returncode == -signal.SIGKILL, done.stderr
     assert list((tmp_path / "killed" / "runs").rglob("ro-crate-metadata.json")) == []
     again = trained(tiny, tmp_path / "killed")
@@ -135,7 +160,9 @@ def test_a_picture_is_the_same_in_whatever_order(tmp_path, tiny):
     shared = Shared.of(samples.shared({"height": height})).values
     first = [samples(shared, 1, number) for number in (0, 1, 2)]
     again = [samples(shared, 1, number) for number in (2, 0, 1)]
-    assert all(torch.equal(first[n].picture, x.picture) for n, x in zip((2, 0, 1), again, strict=True))
+    assert all(
+        torch.equal(first[n].picture, x.picture) for n, x in zip((2, 0, 1), again, strict=True)
+    )
     assert not torch.equal(first[0].picture, first[1].picture)
     assert not torch.equal(first[0].truth, samples(shared, 2, 0).truth)
     assert all(400e-9 <= x.drawn["lasers.drawn.wavelength"] <= 700e-9 for x in first)
@@ -144,7 +171,9 @@ def test_a_picture_is_the_same_in_whatever_order(tmp_path, tiny):
 def test_the_gradient_through_the_cut_is_the_whole_one(tmp_path):
     recipe = load("train_small", [*TINY, "laser=green", "sensor.read_noise=10 e-", "tolerance=0"])
     how = recipe.training
-    samples = TrainingStream(recipe, how, Photographs((recipe.steps["scene"].params["file"],)), Store(tmp_path), "cpu")
+    samples = TrainingStream(
+        recipe, how, Photographs((recipe.steps["scene"].params["file"],)), Store(tmp_path), "cpu"
+    )
     relief = relief_of(recipe)
     shared = Shared.of(samples.shared({"height": relief(pupil(recipe))}))
     for number in (0, 1):
@@ -155,12 +184,24 @@ def test_the_gradient_through_the_cut_is_the_whole_one(tmp_path):
     relief.zero_grad()
     loss = torch.zeros(())
     names = [*samples._readers, "scene", "height"]
-    noise = [name for name, step in recipe.steps.items() if step.node.random and name.endswith(("[mask]", "[green]"))]
-    f = as_function(recipe, *names, outputs=[how.picture, how.truth], store=Store(tmp_path), redraw=noise)
+    noise = [
+        name
+        for name, step in recipe.steps.items()
+        if step.node.random and name.endswith(("[mask]", "[green]"))
+    ]
+    f = as_function(
+        recipe, *names, outputs=[how.picture, how.truth], store=Store(tmp_path), redraw=noise
+    )
     for number in (0, 1):
         seen = samples(shared.values, 1, number)
-        theta = {**samples._readers, "height": relief(pupil(recipe)), "scene": _scene(samples, number)}
-        theta |= samples._inputs.theta({k: v for k, v in seen.drawn.items() if k in samples._inputs.names})
+        theta = {
+            **samples._readers,
+            "height": relief(pupil(recipe)),
+            "scene": _scene(samples, number),
+        }
+        theta |= samples._inputs.theta(
+            {k: v for k, v in seen.drawn.items() if k in samples._inputs.names}
+        )
         if seen.drawn.get("laser") == "none":
             theta |= dict.fromkeys(samples._lasers, 0.0)
         found = f(theta, seed=seen.drawn["noise"])
@@ -176,7 +217,9 @@ def _scene(samples, number):
 
 def samples_of(recipe, folder, still=False):
     sources = Photographs.under(recipe.training.photographs)
-    return TrainingStream(recipe, recipe.training, sources, Store(folder), "cpu", recipe if still else None)
+    return TrainingStream(
+        recipe, recipe.training, sources, Store(folder), "cpu", recipe if still else None
+    )
 
 
 def test_patches_are_the_same_places_of_a_picture_and_its_truth(tmp_path, photographs):
@@ -187,19 +230,26 @@ def test_patches_are_the_same_places_of_a_picture_and_its_truth(tmp_path, photog
     assert cut.picture.shape == cut.truth.shape == (2, 3, 12, 9)
     places = [(y, x) for y in range(21) for x in range(24)]
     for part, true in zip(cut.picture, cut.truth, strict=True):
-        same = [(y, x) for y, x in places if torch.equal(whole.picture[0, :, y : y + 12, x : x + 9], part)]
+        same = [
+            (y, x)
+            for y, x in places
+            if torch.equal(whole.picture[0, :, y : y + 12, x : x + 9], part)
+        ]
         assert len(same) == 1
         ((y, x),) = same
         assert torch.equal(whole.truth[0, :, y : y + 12, x : x + 9], true)
     too_large = replace(recipe, training=how.model_copy(update={"patch": (40, 9)}))
     with pytest.raises(
-        ValueError, match=r"train\.patch: \[40, 9\] is larger than the picture \[32, 32\]: set a smaller patch"
+        ValueError,
+        match=r"train\.patch: \[40, 9\] is larger than the picture \[32, 32\]: set a smaller patch",
     ):
         samples_of(too_large, tmp_path, still=True)({}, 2, 0)
 
 
 def test_a_pool_comes_again_where_the_element_is_still(tmp_path, photographs):
-    recipe = load("train_small", [*STILL, "doe=flat", "train.pool=2", f"train.photographs={photographs}"])
+    recipe = load(
+        "train_small", [*STILL, "doe=flat", "train.pool=2", f"train.photographs={photographs}"]
+    )
     samples = samples_of(recipe, tmp_path, still=True)
     first, second, third = (samples({}, 2, number) for number in range(3))
     assert third is first
@@ -210,9 +260,18 @@ def test_a_pool_comes_again_where_the_element_is_still(tmp_path, photographs):
 
 @pytest.mark.slow
 def test_a_network_is_learnt_behind_the_recipes_own_restorer(tmp_path, photographs):
-    """It sees what the Wiener filter made, and in stage 1 the element is learnt through the filter."""
-    words = [*STILL, "doe=half_ring", "doe.waves=[2]", "laser=none", "restore=wiener", "train.stages.1.iterations=1",
-             f"train.photographs={photographs}"]  # fmt: skip
+    """It sees what the Wiener filter made, and in stage 1 the element is learnt through the
+    filter.
+    """
+    words = [
+        *STILL,
+        "doe=half_ring",
+        "doe.waves=[2]",
+        "laser=none",
+        "restore=wiener",
+        "train.stages.1.iterations=1",
+        f"train.photographs={photographs}",
+    ]
     coded, filtered = (
         samples_of(load("train_small", [*words, *more]), tmp_path, still=True)({}, 2, 0)
         for more in ([], ["train.picture=restored"])
@@ -220,7 +279,12 @@ def test_a_network_is_learnt_behind_the_recipes_own_restorer(tmp_path, photograp
     assert torch.equal(coded.truth, filtered.truth)
     far = [float((sample.picture - sample.truth).abs().mean()) for sample in (coded, filtered)]
     assert far[1] < 0.7 * far[0]
-    alone = ["train.stages.1.batch=1", "train.stages.1.lsr=0", "train.stages.1.bsr=0", "train.stages.1.adversarial=0"]
+    alone = [
+        "train.stages.1.batch=1",
+        "train.stages.1.lsr=0",
+        "train.stages.1.bsr=0",
+        "train.stages.1.adversarial=0",
+    ]
     recipe = load("train_small", [*words, *alone, "train.picture=restored"])
     folder = trained(recipe, tmp_path, [1])
     start = recipe.run(Store(tmp_path / "store"), outputs=["height"])["height"]
@@ -241,14 +305,18 @@ def test_a_network_is_learnt_behind_an_element_that_stays(tmp_path, photographs)
 
 def test_it_runs_as_printed_too(tmp_path, photographs):
     strength = 'lasers.drawn.strength="uniform(0, 2e6)"'
-    recipe = load("train_small", ["train=as_printed", *TINY, strength, f"train.photographs={photographs}"])
+    recipe = load(
+        "train_small", ["train=as_printed", *TINY, strength, f"train.photographs={photographs}"]
+    )
     rows = losses(trained(recipe, tmp_path))
     assert len(rows) == 7
     assert all(np.isfinite(float(x)) for row in rows for x in row.values() if x)
     assert [bool(row["reconstruction"]) for row in rows] == [False] * 4 + [True] * 3
 
 
-BOARD = pytest.mark.skipif(not importlib.util.find_spec("tensorboard"), reason='pip install -e ".[tensorboard]"')
+BOARD = pytest.mark.skipif(
+    not importlib.util.find_spec("tensorboard"), reason='pip install -e ".[tensorboard]"'
+)
 
 
 @pytest.mark.slow
@@ -266,22 +334,34 @@ def test_tensorboard_shows_each_iteration_once_and_the_pictures(tmp_path, photog
     with pytest.raises(KeyboardInterrupt):
         trained(load("train_small", changes), tmp_path, watch=stopped)
     folder = trained(load("train_small", changes), tmp_path)
-    assert folder.name == trained(load("train_small", [*changes, "train.tensorboard=false"]), tmp_path).name
+    assert (
+        folder.name
+        == trained(load("train_small", [*changes, "train.tensorboard=false"]), tmp_path).name
+    )
     events = EventAccumulator(str(folder / "tensorboard")).Reload()
     assert {"LSR", "BSR", "L1", "critics", "rate"} <= set(events.Tags()["scalars"])
     shown = events.Scalars("L1")
     assert [event.step for event in shown] == list(range(7))
-    assert [event.value for event in shown] == pytest.approx([float(row["L1"]) for row in losses(folder)], rel=1e-5)
+    assert [event.value for event in shown] == pytest.approx(
+        [float(row["L1"]) for row in losses(folder)], rel=1e-5
+    )
     assert [event.step for event in events.Scalars("LSR")] == list(range(4))
     assert [event.step for event in events.Images("stage 1")] == [1, 3]
     assert [event.step for event in events.Images("stage 2")] == [5, 6]
 
 
-def test_tensorboard_that_is_not_installed_is_said_before_anything_is_learnt(tmp_path, photographs, monkeypatch):
+def test_tensorboard_that_is_not_installed_is_said_before_anything_is_learnt(
+    tmp_path, photographs, monkeypatch
+):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    recipe = load("train_small", [*TINY, "train.tensorboard=true", f"train.photographs={photographs}"])
+    recipe = load(
+        "train_small", [*TINY, "train.tensorboard=true", f"train.photographs={photographs}"]
+    )
     with pytest.raises(
-        ValueError, match=r'train.tensorboard: TensorBoard is not installed.*pip install -e "\.\[tensorboard\]"'
+        ValueError,
+        match=(
+            r'train.tensorboard: TensorBoard is not installed.*pip install -e "\.\[tensorboard\]"'
+        ),
     ):
         trained(recipe, tmp_path)
 
@@ -292,7 +372,10 @@ def test_what_is_not_a_number_stops_and_is_kept(tmp_path, tiny, monkeypatch):
     monkeypatch.setattr(losses, "charbonnier", lambda a, b: (a - b).mean() * float("nan"))
     with pytest.raises(
         ArithmeticError,
-        match="stage 1, iteration 0, pictures 0 to 1: these numbers are NaN or infinite: reconstruction",
+        match=(
+            "stage 1, iteration 0, pictures 0 to 1: these numbers are NaN or infinite:"
+            " reconstruction"
+        ),
     ):
         trained(tiny, tmp_path)
     (folder,) = (tmp_path / "runs").iterdir()
@@ -312,11 +395,19 @@ def test_a_training_that_goes_on_has_no_crate_until_it_ends(tmp_path, tiny):
     folder = trained(tiny, tmp_path, [1])
     assert list(faults(folder)) == []
     seen = []
-    trained(tiny, tmp_path, [2], lambda *state: seen.append((folder / "ro-crate-metadata.json").exists()))
+    trained(
+        tiny,
+        tmp_path,
+        [2],
+        lambda *state: seen.append((folder / "ro-crate-metadata.json").exists()),
+    )
     assert (set(seen), list(faults(folder))) == ({False}, [])
 
 
-def test_a_state_that_is_none_is_not_gone_on_from(tmp_path, tiny):
+def test_a_state_that_is_none_is_not_gone_on_from(tmp_path, photographs):
+    tiny = load(
+        "train_small", [*TINY, "train.stages.1.iterations=1", f"train.photographs={photographs}"]
+    )
     folder = trained(tiny, tmp_path, [1])
     (folder / "state.pt").write_bytes(b"half")
     with pytest.raises(ValueError, match=r"state\.pt cannot be read"):
@@ -355,27 +446,45 @@ def test_a_mistake_is_located(change, said):
 
 
 def test_options_of_one_network_are_refused_of_another():
-    with pytest.raises(RecipeError, match="directions, pyramid: only the network fft_mamba has such options, not unet"):
-        load("train_small", ["train.network.kind=unet", "train.network.pyramid=true", "train.network.directions=4"])
+    with pytest.raises(
+        RecipeError,
+        match="directions, pyramid: only the network fft_mamba has such options, not unet",
+    ):
+        load(
+            "train_small",
+            ["train.network.kind=unet", "train.network.pyramid=true", "train.network.directions=4"],
+        )
 
 
 def test_a_network_with_options_is_learnt_and_restores_only_with_them(tmp_path, photographs):
     options = ["directions=4", "pyramid=true", "frequency=amp_phase"]
     own = [*TINY, "train.network.kind=fft_mamba", *(f"train.network.{x}" for x in options)]
-    recipe = load("train_small", [*own, "train.stages.1.batch=1", "train.stages.1.iterations=1",
-                                  f"train.photographs={photographs}"])  # fmt: skip
+    recipe = load(
+        "train_small",
+        [
+            *own,
+            "train.stages.1.batch=1",
+            "train.stages.1.iterations=1",
+            f"train.photographs={photographs}",
+        ],
+    )
     folder = trained(recipe, tmp_path, [1])
-    run = ["restore=fft_mamba", "restore.width=4", f"restore.weights={folder / 'network.safetensors'}"]
+    run = [
+        "restore=fft_mamba",
+        "restore.width=4",
+        f"restore.weights={folder / 'network.safetensors'}",
+    ]
     with pytest.raises(RecipeError, match="trained with directions: 4"):
         load("first_light", run)
     load("first_light", [*run, *(f"restore.{x}" for x in options)])
 
 
-@pytest.mark.parametrize(("doe", "said"), [("flat", "which has no trainable parameters"), ("unet", ""), ("axicon", "")])
+@pytest.mark.parametrize(
+    ("doe", "said"), [("flat", "which has no trainable parameters"), ("axicon", "")]
+)
 def test_only_what_learns_can_be_learnt(tmp_path, photographs, doe, said):
-    changes = [c for c in TINY if not c.startswith("doe.") or doe == "unet"]
-    recipe = load("train_small", [f"doe={doe}", *changes,
-                                  f"train.photographs={photographs}"])  # fmt: skip
+    short = ["train.stages.1.iterations=1", "train.stages.2.iterations=1"]
+    recipe = load("train_small", [f"doe={doe}", *STILL, *short, f"train.photographs={photographs}"])
     if said:
         with pytest.raises(ValueError, match=said):
             trained(recipe, tmp_path)
@@ -395,9 +504,14 @@ def test_rates_fall_as_the_paper_prints_them():
     assert 2e-4 * printed.share(10_000) == pytest.approx(6.6e-9, rel=0.01)
 
 
-# --- the element without images ---------------------------------------------------------------------------------------
+# --- the element without images -------------------------------------------------------------------
 
-MASK = ["train.mask.iterations=4", "+train.mask.grid=32", "+train.mask.bands=3", "train.mask.max_height=3 um"]
+MASK = [
+    "train.mask.iterations=4",
+    "+train.mask.grid=32",
+    "+train.mask.bands=3",
+    "train.mask.max_height=3 um",
+]
 
 
 @pytest.fixture
@@ -405,7 +519,8 @@ def command(tmp_path, monkeypatch, capfd):
     """Call the command line in a folder of its own; the exit code, stdout and stderr."""
     monkeypatch.setenv("NEUSEE_CACHE", str(tmp_path / "store"))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(design_page, "pictures", lambda *_: {})  # they take longer than what is tested
+    # they take longer than what is tested
+    monkeypatch.setattr(design_page, "pictures", lambda *_: {})
 
     def call(*words):
         with pytest.raises(SystemExit) as end:
@@ -416,8 +531,15 @@ def command(tmp_path, monkeypatch, capfd):
 
 
 def test_a_mask_is_designed_and_stage_2_learns_behind_it(command, tmp_path, photographs):
-    words = ["train_small", *TINY, *MASK, f"train.photographs={photographs}", "train.mask.feature=300 um",
-             "mask.levels=16", "mask.max_height=3 um"]  # fmt: skip
+    words = [
+        "train_small",
+        *TINY,
+        *MASK,
+        f"train.photographs={photographs}",
+        "train.mask.feature=300 um",
+        "mask.levels=16",
+        "mask.max_height=3 um",
+    ]
     code, out, err = command(*words, "--stage", "mask")
     assert (code, err) == (0, "")
     assert "levels 16, greatest height 3 um, least feature 300 um" in out
@@ -426,7 +548,12 @@ def test_a_mask_is_designed_and_stage_2_learns_behind_it(command, tmp_path, phot
     assert height.shape == (64, 64)
     assert "least feature" in (folder / "report.html").read_text()
     made = json.loads((folder / "mask.json").read_text())
-    assert made["fabrication"] == {"levels": 16, "max_height": 3e-6, "wrap_at": None, "feature": 3e-4}
+    assert made["fabrication"] == {
+        "levels": 16,
+        "max_height": 3e-6,
+        "wrap_at": None,
+        "feature": 3e-4,
+    }
     assert not (folder / "mask.state").exists()
     before = (folder / "mask.safetensors").stat().st_mtime_ns
     assert list(faults(folder)) == []
@@ -447,14 +574,24 @@ def test_a_mask_is_designed_and_stage_2_learns_behind_it(command, tmp_path, phot
 def _element_of(words, folder):
     """The relief that stage 2 sees."""
     recipe = load(words[0], words[1:])
-    return frozen(recipe, recipe.training, folder).run(Store(folder / "own"), outputs=["height"])["height"]
+    return frozen(recipe, recipe.training, folder).run(Store(folder / "own"), outputs=["height"])[
+        "height"
+    ]
 
 
 def test_a_mask_is_designed_where_nothing_else_could_learn(command, tmp_path, photographs):
     changes = [c for c in TINY if not c.startswith("doe.")]
-    words = ["train_small", "doe=flat", *changes, "train.mask.kind=five_half_rings",
-             "train.mask.iterations=1", "+train.mask.population=5", "+train.mask.polish=5", "+train.mask.bands=2",
-             f"train.photographs={photographs}"]  # fmt: skip
+    words = [
+        "train_small",
+        "doe=flat",
+        *changes,
+        "train.mask.kind=five_half_rings",
+        "train.mask.iterations=1",
+        "+train.mask.population=5",
+        "+train.mask.polish=5",
+        "+train.mask.bands=2",
+        f"train.photographs={photographs}",
+    ]
     assert "which has no trainable parameters" in command(*words)[2]
     code, out, err = command(*words, "--stage", "mask")
     assert (code, err) == (0, "")
@@ -464,7 +601,10 @@ def test_a_mask_is_designed_where_nothing_else_could_learn(command, tmp_path, ph
     assert (Path(out.strip()) / "network.safetensors").is_file()
 
 
-def test_a_mask_is_not_designed_over_one_that_learns(tmp_path, tiny, photographs):
+def test_a_mask_is_not_designed_over_one_that_learns(tmp_path, photographs):
+    tiny = load(
+        "train_small", [*TINY, "train.stages.1.iterations=1", f"train.photographs={photographs}"]
+    )
     folder = trained(tiny, tmp_path, [1])
     before = (folder / "mask.safetensors").read_bytes()
     with pytest.raises(ValueError, match="training stage 1 has begun"):

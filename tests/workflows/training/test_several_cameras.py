@@ -12,12 +12,16 @@ from neusee import recipes
 from neusee.nodes.scene import Photographs
 from neusee.workflows import RecipeError, Store, load
 from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.held_out import Split, _by_photograph
-from neusee.workflows.training.parallel.process_mesh import Mesh, MeshError
-from neusee.workflows.training.parallel.shared_graph import Shared
-from neusee.workflows.training.several_cameras import SeveralCameras, require_alone
+from neusee.workflows.training.process_mesh import Mesh, MeshError
 from neusee.workflows.training.training_inputs import inputs_of
-from neusee.workflows.training.training_pictures import HELD_OUT, TrainingStream
+from neusee.workflows.training.training_pictures import (
+    HELD_OUT,
+    SeveralCameras,
+    TrainingStream,
+    require_alone,
+)
 from tests.workflows.training.noise_photographs import noise_photograph
 from tests.workflows.training.test_posed_pictures import POSED
 from tests.workflows.training.test_warm_start import trained
@@ -35,8 +39,12 @@ def files(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_picture_n_is_of_camera_n_and_a_held_out_photograph_is_seen_by_every_camera(files, tmp_path):
-    """The references are recipes with the words of a camera as arguments, and a stream that knows one camera."""
+def test_picture_n_is_of_camera_n_and_a_held_out_photograph_is_seen_by_every_camera(
+    files, tmp_path
+):
+    """The references are recipes with the words of a camera as arguments, and a stream that
+    knows one camera.
+    """
     store, photographs = Store(tmp_path), Photographs((files / "one.png",))
     masked = ["doe=pixelwise", f"doe.file={files / 'mask.npy'}"]
     others = [["doe=flat", "sensor.background=loguniform(0.02, 0.5)"], masked]
@@ -46,7 +54,9 @@ def test_picture_n_is_of_camera_n_and_a_held_out_photograph_is_seen_by_every_cam
     def alone(words, stage, number):
         other = load("train_small", [*WORDS, *words])
         held_out = photographs.paths * 3
-        stream = TrainingStream(other, other.training, photographs, store, "cpu", other, held_out=held_out)
+        stream = TrainingStream(
+            other, other.training, photographs, store, "cpu", other, held_out=held_out
+        )
         return stream({}, stage, number)
 
     found = dict(mixed.batch(Shared.of({}), 2, 1, 3))  # the last is the first of the pool again
@@ -63,7 +73,16 @@ def test_picture_n_is_of_camera_n_and_a_held_out_photograph_is_seen_by_every_cam
 
 
 def test_a_photograph_counts_once_whatever_the_number_of_its_pictures():
-    found = {"0 a": 1.0, "1 a": 3.0, "2 a": 5.0, "3 a": 9.0, "0 b": 2.0, "1 b": 2.0, "2 b": 4.0, "3 b": 4.0}
+    found = {
+        "0 a": 1.0,
+        "1 a": 3.0,
+        "2 a": 5.0,
+        "3 a": 9.0,
+        "0 b": 2.0,
+        "1 b": 2.0,
+        "2 b": 4.0,
+        "3 b": 4.0,
+    }
     assert _by_photograph(found, 2) == {"0 a": 2.0, "1 a": 7.0, "0 b": 2.0, "1 b": 4.0}
     assert _by_photograph(found, 1) == found
 
@@ -77,7 +96,10 @@ def test_a_photograph_counts_once_whatever_the_number_of_its_pictures():
             ["train.cameras=[[doe=flat, train.pool=3]]"],
             r"train\.cameras\.0.*train\.pool=3 is no setting of a camera",
         ),
-        (["train.cameras=[[doe=flat]]", "train.learn=height"], "where no mask is trained: write learn: null"),
+        (
+            ["train.cameras=[[doe=flat]]", "train.learn=height"],
+            "where no mask is trained: write learn: null",
+        ),
     ],
 )
 def test_cameras_that_cannot_be_are_refused(words, message):
@@ -98,7 +120,9 @@ def test_a_file_of_a_camera_is_sought_beside_the_recipe_and_counts_by_its_conten
 
     def key():
         split = Split(Photographs((files / "one.png",)))
-        return inputs_of(recipe, recipe.training, split, None, Code(Store(tmp_path / "store").code_memo)).key
+        return inputs_of(
+            recipe, recipe.training, split, None, Code(Store(tmp_path / "store").code_memo)
+        ).key
 
     before = key()
     np.save(tmp_path / "masks" / "mine.npy", np.zeros((48, 48)))

@@ -1,4 +1,6 @@
-"""What ships trained: it is small, it fits its recipes, and it restores better than the told filter."""
+"""What ships trained: it is small, it fits its recipes, and it restores better than the told
+filter.
+"""
 
 from pathlib import Path
 
@@ -37,14 +39,23 @@ def test_the_demonstration_shows_the_network_beside_the_filter():
 
 
 @pytest.mark.slow
-def test_the_network_is_better_than_the_told_filter_and_no_worse_than_the_best_on_scenes_that_no_training_saw(tmp_path):
-    """Drawn leaves, which no photograph shows; a lens and a laser not as the filter is told, and three masks."""
+def test_the_network_is_better_than_the_told_filter_and_no_worse_than_the_best_on_scenes_that_no_training_saw(
+    tmp_path,
+):
+    """Drawn leaves, which no photograph shows; a lens and a laser not as the filter is told, and
+    three masks.
+    """
     scenes = [own_camera.picture("leaves", 224, np.random.default_rng(seed)) for seed in range(2)]
     for number, scene in enumerate(scenes):
-        Image.fromarray((255 * scene ** (1 / 2.2)).round().astype(np.uint8)).save(tmp_path / f"{number}.png")
+        Image.fromarray((255 * scene ** (1 / 2.2)).round().astype(np.uint8)).save(
+            tmp_path / f"{number}.png"
+        )
     photographs = Photographs.under(tmp_path)
     file = tmp_path / "judged.yaml"
-    file.write_text((SAMPLES.parent / "train_informed.yaml").read_text().replace("samples/", f"{SAMPLES}/") + STEPS)
+    file.write_text(
+        (SAMPLES.parent / "train_informed.yaml").read_text().replace("samples/", f"{SAMPLES}/")
+        + STEPS
+    )
     over_told, over_best = [], []
     for mask in ("plain", "half_ring", "designed"):
         recipe = load(file, words(mask))
@@ -63,9 +74,12 @@ def test_the_network_is_better_than_the_told_filter_and_no_worse_than_the_best_o
 
 @pytest.mark.slow
 def test_the_demonstration_is_better_than_its_filter_behind_a_mask_that_suppresses(tmp_path):
-    """Its photograph was one of the training; the filter is told the laser exactly, the network roughly."""
+    """Its photograph was one of the training; the filter is told the laser exactly, the network
+    roughly.
+    """
     found = load("demonstration").run(
-        Store(tmp_path), outputs=["restored_quality", "wiener_quality", "developed_quality[mask]", "lsr[mask]"]
+        Store(tmp_path),
+        outputs=["restored_quality", "wiener_quality", "developed_quality[mask]", "lsr[mask]"],
     )
     restored, wiener = found["restored_quality"], found["wiener_quality"]
     assert float(restored.l1) < float(wiener.l1) < float(found["developed_quality[mask]"].l1)

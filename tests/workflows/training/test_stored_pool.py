@@ -1,4 +1,6 @@
-"""Pools in the store: the same bits as simulated ones, another picture for any other camera, and a kill loses one."""
+"""Pools in the store: the same bits as simulated ones, another picture for any other camera, and
+a kill loses one.
+"""
 
 import os
 
@@ -27,7 +29,9 @@ def photograph(tmp_path_factory):
 
 def stream(words, photograph, folder):
     recipe = load("train_small", [*TINY, *POOL, *words])
-    return TrainingStream(recipe, recipe.training, Photographs((photograph,)), Store(folder), "cpu", recipe)
+    return TrainingStream(
+        recipe, recipe.training, Photographs((photograph,)), Store(folder), "cpu", recipe
+    )
 
 
 def pictures(words, photograph, folder):
@@ -39,15 +43,26 @@ def test_a_second_training_reads_the_bits_that_the_first_one_simulated(tmp_path,
     simulated, none = pictures(["train.keep_pool=false"], photograph, tmp_path)
     assert none.pool_counts == {}
     first, writer = pictures([], photograph, tmp_path)
-    again, reader = pictures(["train.rates.weights=3e-3", "train.network.width=6"], photograph, tmp_path)
+    again, reader = pictures(
+        ["train.rates.weights=3e-3", "train.network.width=6"], photograph, tmp_path
+    )
     assert writer.pool_counts == {"from_store": 0, "simulated": 3}
     assert reader.pool_counts == {"from_store": 3, "simulated": 0}
     for a, b, c in zip(simulated, first, again, strict=True):
         assert a.drawn == b.drawn == c.drawn
-        assert all(torch.equal(x, b.tensors[n]) and torch.equal(x, c.tensors[n]) for n, x in a.tensors.items())
+        assert all(
+            torch.equal(x, b.tensors[n]) and torch.equal(x, c.tensors[n])
+            for n, x in a.tensors.items()
+        )
 
 
-OTHERS = ["train.patch=[12, 12]", "train.laser_free=1", "train.augment.exposure=1", "seed=8", "tolerance=1e-4"]
+OTHERS = [
+    "train.patch=[12, 12]",
+    "train.laser_free=1",
+    "train.augment.exposure=1",
+    "seed=8",
+    "tolerance=1e-4",
+]
 
 
 @pytest.mark.parametrize(
@@ -75,13 +90,19 @@ def test_another_photograph_is_another_picture(tmp_path, photograph):
     assert other.pool_counts == {"from_store": 0, "simulated": 1}
 
 
-def test_another_mask_under_the_same_name_is_another_pool_and_a_renamed_one_is_the_same(tmp_path, photograph):
+def test_another_mask_under_the_same_name_is_another_pool_and_a_renamed_one_is_the_same(
+    tmp_path, photograph
+):
     """The keys of the first picture, which cover everything that the picture depends on."""
 
     def key(name):
-        samples = stream(["doe=pixelwise", f"doe.file={tmp_path / name}"], photograph, tmp_path / "store")
+        samples = stream(
+            ["doe=pixelwise", f"doe.file={tmp_path / name}"], photograph, tmp_path / "store"
+        )
         theta, noise, _ = samples._drawn(2, 0)
-        return samples._stored._key(theta["scene"], {reader: theta[reader] for reader in samples._readers}, noise)
+        return samples._stored._key(
+            theta["scene"], {reader: theta[reader] for reader in samples._readers}, noise
+        )
 
     np.save(tmp_path / "m.npy", np.random.default_rng(1).uniform(0, 1e-6, (48, 48)))
     first = key("m.npy")

@@ -1,11 +1,13 @@
-"""The resize and the crop of training pictures beside those of kornia, and what a picture does not compute."""
+"""The resize and the crop of training pictures beside those of kornia, and what a picture does
+not compute.
+"""
 
 import pytest
 import torch
 from kornia.geometry.transform import crop_by_indices
 from kornia.geometry.transform import resize as kornia_resize
 
-from neusee.nodes.bicubic_resize import resize
+from neusee.nodes.resampling import resize
 from neusee.nodes.scene import Photographs
 from neusee.workflows import Store, load
 from neusee.workflows.training.training_pictures import TrainingStream

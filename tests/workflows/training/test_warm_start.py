@@ -1,4 +1,6 @@
-"""A training that begins with the weights of another: the same weights at first, and no resumption."""
+"""A training that begins with the weights of another: the same weights at first, and no
+resumption.
+"""
 
 import json
 import re
@@ -23,8 +25,15 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def trained(words, folder, lines=None, watch=None):
     said = (lines if lines is not None else []).append
-    return train(load("train_small", [*TINY, *words]), Store(folder / "store"), folder / "runs", [], said, (2,),
-                 watch=watch)  # fmt: skip
+    return train(
+        load("train_small", [*TINY, *words]),
+        Store(folder / "store"),
+        folder / "runs",
+        [],
+        said,
+        (2,),
+        watch=watch,
+    )
 
 
 @pytest.fixture
@@ -42,9 +51,13 @@ def test_the_network_begins_with_the_given_weights_and_stays_there_at_no_rate(tm
     assert f"begins with the weights of {weights}" in lines
     expected, made = load_file(weights), load_file(found / "network.safetensors")
     assert expected.keys() == made.keys()
-    assert all(float((made[name] - x).abs().max()) < 1e-25 for name, x in expected.items()), "zeros move by the rate"
+    assert all(float((made[name] - x).abs().max()) < 1e-25 for name, x in expected.items()), (
+        "zeros move by the rate"
+    )
     assert json.loads((found / "training.json").read_text())["start"]["file"] == str(weights)
-    assert trained([f"train.start={weights.parent}", *slow], tmp_path) == found, "a folder means its weights"
+    assert trained([f"train.start={weights.parent}", *slow], tmp_path) == found, (
+        "a folder means its weights"
+    )
     assert trained(slow, tmp_path) != found
 
 
@@ -61,7 +74,9 @@ def test_a_stopped_training_goes_on_and_does_not_begin_again(tmp_path, weights):
     assert not any("begins with" in line for line in lines)
     assert any("continues in stage 2 after 1 iterations" in line for line in lines)
     whole = trained(words, tmp_path / "whole")
-    assert (again / "network.safetensors").read_bytes() == (whole / "network.safetensors").read_bytes()
+    assert (again / "network.safetensors").read_bytes() == (
+        whole / "network.safetensors"
+    ).read_bytes()
     weights.write_bytes(b"")
     save_file({"other": torch.zeros(1)}, weights)
     with pytest.raises(ValueError, match=r"train\.start   network\.safetensors: "):
@@ -69,11 +84,15 @@ def test_a_stopped_training_goes_on_and_does_not_begin_again(tmp_path, weights):
 
 
 def test_weights_that_do_not_fit_are_refused_with_the_layer(tmp_path, weights):
-    with pytest.raises(ValueError, match=r"train\.start   network\.safetensors: \w.* is \(.*\), the net"):
+    with pytest.raises(
+        ValueError, match=r"train\.start   network\.safetensors: \w.* is \(.*\), the net"
+    ):
         trained([f"train.start={weights}", "train.network.width=6"], tmp_path)
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(ValueError, match=re.escape(f"{empty}/network.safetensors is no file of weights")):
+    with pytest.raises(
+        ValueError, match=re.escape(f"{empty}/network.safetensors is no file of weights")
+    ):
         trained([f"train.start={empty}"], tmp_path)
     with pytest.raises(RecipeError, match="there is neither a file nor a folder"):
         load("train_small", [*TINY, "train.start=nowhere.safetensors"])

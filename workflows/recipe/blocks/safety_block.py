@@ -1,4 +1,4 @@
-"""Settings of the estimate of damage, dazzle and eye exposure, which form the block ``safety`` of a recipe."""
+"""Settings of the estimate of damage, dazzle and eye exposure: the block safety."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
@@ -14,34 +14,119 @@ from neusee.nodes import ParameterError
 from neusee.nodes.flare import Surfaces
 from neusee.nodes.laser import Beam, DamageLaw, TrainRule, beam, read_damage_laws
 from neusee.nodes.optics import refuse_impossible_f_number
+from neusee.nodes.sensor import Bits, electrons_to_clip, refuse_without_steps
 from neusee.nodes.units import (
     BeamRadius,
     Count,
     Diameter,
     Distance,
+    Efficiency,
     Electrons,
     Energy,
     Exposure,
     FocalLength,
     Frequency,
+    Gain,
     Luminance,
+    PixelPitch,
     PositiveAngle,
     Power,
+    Shape,
     Time,
     Visibility,
     Wavelength,
     Waves,
 )
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
-from neusee.workflows.recipe.blocks.sensor_facts import LaserChannels, Passing, SensorFacts
 from neusee.workflows.recipe.blocks.settings_block import SettingsBlock, located
-from neusee.workflows.recipe.text.named_files import refuse_outside
+from neusee.workflows.recipe.text.composition import refuse_outside
 from neusee.workflows.recipe.text.references import References, Scope, broken
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted, kind
 
+if TYPE_CHECKING:
+    from neusee.workflows.graph.recipe_graph import Step
+
+
+# --- sensor facts ---------------------------------------------------------------------------------
+
+# The sensor of an estimate of safety: its pixels, and what fills them.
+
+
+Passing = Annotated[float, Field(gt=0, le=1)]
+
+
+class SensorFacts(SettingsBlock):
+    """What damage and dazzle need to know of the sensor; no quantum efficiency means that none
+    is known.
+    """
+
+    pixel_pitch: PixelPitch
+    shape: Shape
+    quantum_efficiency: Efficiency | None = (
+        None  #: at the wavelength of the laser; with ``responses``, that of the sensor
+    )
+    #: step of the response of each channel to the laser, such as ``laser_responses``
+    responses: str | None = None
+    full_well: Annotated[Electrons, Field(ge=1)] | None = None
+    gain: Gain | None = None  #: with ``bits``: the converter may end below the full well
+    bits: Bits | None = None
+    offset: Electrons = 0.0  #: part of a well that is filled without light
+    exposure: Exposure | None = None
+
+    @property
+    def fills(self) -> float:
+        """Return the electrons of light that fill a pixel, to its full well or to the end of the
+        converter.
+        """
+        well = self.full_well or math.inf
+        if self.gain is None or self.bits is None or self.full_well is None:
+            return well - self.offset
+        return electrons_to_clip(well, self.gain, self.bits, self.offset)
+
+    @model_validator(mode="after")
+    def _leaves_room_for_light(self) -> SensorFacts:
+        if not self.fills > 0:
+            full = f"an offset of {self.offset:g} e- leaves no room for light"
+            raise ValueError(
+                f"{full} in a full well of {self.full_well:g} e-, or in the range of the converter"
+            )
+        if self.full_well is not None and self.gain is not None and self.bits is not None:
+            refuse_without_steps(self.full_well, gain=self.gain, bits=self.bits)
+        return self
+
+
+@dataclass(frozen=True)
+class LaserChannels:
+    """The responses of the colour channels to a laser, as steps that can be asked at another
+    wavelength too.
+    """
+
+    line: Step  #: of the bands of the laser
+    responses: Step
+    #: response of the channel that responds most, relative to the quantum efficiency of the sensor
+    largest: float
+    key: str  #: of the responses, for the key of an estimate
+
+
+# --- safety block ---------------------------------------------------------------------------------
+
+# Settings of the estimate of damage, dazzle and eye exposure, which form the block ``safety`` of a
+# recipe.
+
+
 KEY, LASERS = "safety", "lasers"  #: keys of the two blocks in a recipe
-SATURATION = ("quantum_efficiency", "full_well", "exposure")  #: facts of a sensor without which nothing saturates
-BEAM = ("wavelength", "power", "pulse_energy", "pulse_duration", "repetition_rate", "waist", "divergence", "m_squared")
+#: facts of a sensor without which nothing saturates
+SATURATION = ("quantum_efficiency", "full_well", "exposure")
+BEAM = (
+    "wavelength",
+    "power",
+    "pulse_energy",
+    "pulse_duration",
+    "repetition_rate",
+    "waist",
+    "divergence",
+    "m_squared",
+)
 
 Above = Annotated[float, Field(gt=0, le=1e9)]
 Exponent = Annotated[float, Field(ge=0, le=1)]
@@ -49,7 +134,9 @@ Model = TypeVar("Model", bound=SettingsBlock)
 
 
 class Laser(SettingsBlock):
-    """Light of a laser in physical units, its distance from the camera, and the air between both."""
+    """Light of a laser in physical units, its distance from the camera, and the air between
+    both.
+    """
 
     wavelength: Wavelength
     power: Power | None = None  #: of a pulse train: the mean
@@ -66,10 +153,12 @@ class Laser(SettingsBlock):
     haze: Literal["kruse", "kim"] = "kim"
 
     def beam(self, values: Mapping[str, float] | None = None) -> Beam:
-        """Return the beam with ``values`` in place of its own; raise `ParameterError` for values that disagree."""
-        given = {name: getattr(self, name) for name in BEAM}
-        given |= {name: value for name, value in (values or {}).items() if name in BEAM}
-        return beam(**given, convention=self.convention)
+        """Return the beam with ``values`` in place of its own; raise `ParameterError` for values
+        that disagree.
+        """
+        parameters = {name: getattr(self, name) for name in BEAM}
+        parameters |= {name: value for name, value in (values or {}).items() if name in BEAM}
+        return beam(**parameters, convention=self.convention)
 
     @model_validator(mode="after")
     def _has_one_air(self) -> Laser:
@@ -79,16 +168,21 @@ class Laser(SettingsBlock):
 
 
 class Scatter(SettingsBlock):
-    """Light that the lens scatters, by the law of Harvey and Shack: a veil around the spot, behind a mask too."""
+    """Light that the lens scatters, by the law of Harvey and Shack: a veil around the spot,
+    behind a mask too.
+    """
 
-    share: Annotated[float, Field(gt=0, lt=1)] = 0.005  #: of the light; without a value in the recipe it is assumed
+    #: of the light; without a value in the recipe it is assumed
+    share: Annotated[float, Field(gt=0, lt=1)] = 0.005
     l: Annotated[float, Field(gt=0, le=10)] = 0.01  #: width of the scatter, as a sine  # noqa: E741
     s: Annotated[float, Field(ge=-10, le=0)] = -1.5  #: slope far outside of the width
     surfaces: Surfaces | None = None  #: of `flare.stray_light`, in place of these numbers
 
 
 class Lens(SettingsBlock):
-    """Lens of the camera: its focal length, its clear diameter, its transmittance, its focus and its scatter."""
+    """Lens of the camera: its focal length, its clear diameter, its transmittance, its focus and
+    its scatter.
+    """
 
     focal_length: FocalLength
     diameter: Diameter
@@ -105,9 +199,11 @@ class Lens(SettingsBlock):
 
 
 class Spots(SettingsBlock):
-    """Steps for the plain lens and the mask, at the wavelength of the laser: PSFs, or pixels ranked by their light.
+    """Steps for the plain lens and the mask, at the wavelength of the laser: PSFs, or pixels ranked
+    by their light.
 
-    ``laser_psf`` means ``laser_psf[plain,pointer]`` and ``laser_psf[mask,pointer]`` for the laser ``pointer``.
+    ``laser_psf`` means ``laser_psf[plain,pointer]`` and ``laser_psf[mask,pointer]`` for the laser
+    ``pointer``.
     """
 
     plain: str | None = None
@@ -115,9 +211,12 @@ class Spots(SettingsBlock):
 
 
 class Protection(SettingsBlock):
-    """Protections beside the plain lens: the mask of the recipe, a grey filter and a smaller stop."""
+    """Protections beside the plain lens: the mask of the recipe, a grey filter and a smaller
+    stop.
+    """
 
-    mask: str | None = None  #: step of the laser suppression ratio (LSR) at the wavelength of the laser, as in `Spots`
+    #: step of the laser suppression ratio (LSR) at the wavelength of the laser, as in `Spots`
+    mask: str | None = None
     filter: Passing | None = None  #: transmittance
     stop: Diameter | None = None  #: diameter
     notch_index: Annotated[float, Field(ge=1, le=4)] = (
@@ -132,7 +231,8 @@ class Damage(SettingsBlock):
 
     device: str = "CMOS"  #: class of the sensor, as the table of thresholds names it
     dwell: Time = 1.0  #: s, for which the light stays on one place of the sensor
-    small_spot_exponent: Exponent = 0.0  #: of published spot / spot, the bonus of a narrower spot; 0: none
+    #: of published spot / spot, the bonus of a narrower spot; 0: none
+    small_spot_exponent: Exponent = 0.0
     file: Path | None = None  #: table of thresholds of the user, which count where they hold
 
 
@@ -149,19 +249,27 @@ class Dazzle(SettingsBlock):
 
     @property
     def least(self) -> float:
-        """Return the least signal-to-noise ratio, or the least contrast, at which the feature is seen."""
+        """Return the least signal-to-noise ratio, or the least contrast, at which the feature is
+        seen.
+        """
         return self.threshold or {"snr": 5.0, "contrast": 0.05}[self.rule]
 
 
 class EyeDazzle(SettingsBlock):
-    """What a viewer has to see beside the laser: the light of the surroundings, the target, and who looks."""
+    """What a viewer has to see beside the laser: the light of the surroundings, the target, and
+    who looks.
+    """
 
-    angles: Annotated[tuple[PositiveAngle, ...], Field(min_length=1)] = tuple(map(math.radians, (1.0, 5.0, 10.0, 20.0)))
-    backgrounds: Annotated[tuple[Luminance, ...], Field(min_length=1)] = (0.1, 10.0, 1000.0)  #: night, dusk and day
+    angles: Annotated[tuple[PositiveAngle, ...], Field(min_length=1)] = tuple(
+        map(math.radians, (1.0, 5.0, 10.0, 20.0))
+    )
+    #: night, dusk and day
+    backgrounds: Annotated[tuple[Luminance, ...], Field(min_length=1)] = (0.1, 10.0, 1000.0)
     contrast: Above = 0.2  #: Weber contrast of the target
     size: PositiveAngle = math.radians(10 / 60)  #: across the target, from 1 to 60 arc minutes
     age: Annotated[float, Field(ge=23, le=75)] = 40.0  #: years
-    pigmentation: Annotated[float, Field(ge=0, le=1.2)] = 0.5  #: of the iris: 0 black, 0.5 brown, 1.0 to 1.2 light
+    #: of the iris: 0 black, 0.5 brown, 1.0 to 1.2 light
+    pigmentation: Annotated[float, Field(ge=0, le=1.2)] = 0.5
     margin: Above = 2.6  #: contrast that the viewer needs, over the threshold of the laboratory
 
     @field_validator("angles")
@@ -169,7 +277,9 @@ class EyeDazzle(SettingsBlock):
     def _has_an_equation(cls, angles: tuple[float, ...]) -> tuple[float, ...]:
         for angle in angles:
             if not math.radians(0.1) <= angle <= math.radians(100):
-                raise ValueError(f"{math.degrees(angle):.3g} deg: the glare equation holds from 0.1 to 100 deg")
+                raise ValueError(
+                    f"{math.degrees(angle):.3g} deg: the glare equation holds from 0.1 to 100 deg"
+                )
         return angles
 
     @field_validator("backgrounds")
@@ -183,25 +293,32 @@ class EyeDazzle(SettingsBlock):
     @classmethod
     def _has_a_threshold(cls, size: float) -> float:
         if not 1 <= math.degrees(size) * 60 <= 60.000001:
-            raise ValueError(f"{math.degrees(size) * 60:.3g} arc minutes: the threshold is known from 1 to 60")
+            raise ValueError(
+                f"{math.degrees(size) * 60:.3g} arc minutes: the threshold is known from 1 to 60"
+            )
         return size
 
 
 class Eye(SettingsBlock):
-    """How long an eye looks into the laser, by which rule trains of pulses are judged, and what the eye has to see."""
+    """How long an eye looks into the laser, by which rule trains of pulses are judged, and what
+    the eye has to see.
+    """
 
     #: None: 0.25 s for visible light, until the eye turns away, and 10 s for other light
     exposure: Exposure | None = None
-    rule: TrainRule = "IEC 60825-1:2014"  #: for trains of pulses; `N^(-1/4)` is the stricter rule of 2007
+    #: for trains of pulses; `N^(-1/4)` is the stricter rule of 2007
+    rule: TrainRule = "IEC 60825-1:2014"
     dazzle: EyeDazzle = EyeDazzle()
 
 
 class Unevenness(SettingsBlock):
     """How much brighter than an even Gaussian beam a laser may be, in places or for moments."""
 
-    hot_spots: Annotated[float, Field(ge=1, le=1000)] = 1.0  #: factor on the irradiance; 1: not counted
+    #: factor on the irradiance; 1: not counted
+    hot_spots: Annotated[float, Field(ge=1, le=1000)] = 1.0
     cn2: Above | None = None  #: m^(-2/3), of the turbulent air; None: not counted
-    worst: Annotated[float, Field(gt=0, lt=1)] = 0.99  #: share of the time in which turbulence is exceeded by none
+    #: share of the time in which turbulence is exceeded by none
+    worst: Annotated[float, Field(gt=0, lt=1)] = 0.99
 
 
 class SafetySettings(SettingsBlock):
@@ -227,7 +344,9 @@ class SafetySettings(SettingsBlock):
     @classmethod
     def _rises(cls, distances: tuple[float, float]) -> tuple[float, float]:
         if not distances[0] < distances[1]:
-            raise ValueError(f"from {distances[0]:g} m to {distances[1]:g} m: write the shorter distance first")
+            raise ValueError(
+                f"from {distances[0]:g} m to {distances[1]:g} m: write the shorter distance first"
+            )
         return distances
 
     @model_validator(mode="after")
@@ -235,7 +354,10 @@ class SafetySettings(SettingsBlock):
         lacking = [name for name in SATURATION if getattr(self.sensor, name) is None]
         if self.dazzle is not None and lacking:
             names = ", ".join(lacking)
-            raise ValueError(f"dazzle needs {names} of the sensor: give sensor.{lacking[0]}, or write dazzle: null")
+            raise ValueError(
+                f"dazzle needs {names} of the sensor: give sensor.{lacking[0]}, or write dazzle:"
+                " null"
+            )
         return self
 
 
@@ -246,15 +368,18 @@ class Safety:
     laser: Laser
     settings: SafetySettings
     name: str  #: of the laser
-    values: Mapping[str, Value]  #: value in the recipe by setting, such as ``laser.power`` or ``lens.diameter``
-    laws: tuple[DamageLaw, ...]  #: thresholds of damage in the file of the user; empty without a file
+    #: value in the recipe by setting, such as ``laser.power`` or ``lens.diameter``
+    values: Mapping[str, Value]
+    #: thresholds of damage in the file of the user; empty without a file
+    laws: tuple[DamageLaw, ...]
     channels: LaserChannels | None = None  #: known where the settings name a step of responses
 
 
 def read_safety(
     root: Value, references: References, diagnostics: list[Diagnostic], files: dict[Where, str]
 ) -> Safety | None:
-    """Return the settings in the block ``safety`` of a recipe, or None for null or a mistake; report each mistake.
+    """Return the settings in the block ``safety`` of a recipe, or None for null or a mistake;
+    report each mistake.
 
     The full path of a file is added to ``files``, by the path of the value in the recipe.
     """
@@ -264,7 +389,9 @@ def read_safety(
     if broken(block) or block.data is None:
         return None
     if not isinstance(block.data, dict):
-        diagnostics.append(Diagnostic(block.mark, KEY, f"must be a mapping of settings, not {kind(block)}"))
+        diagnostics.append(
+            Diagnostic(block.mark, KEY, f"must be a mapping of settings, not {kind(block)}")
+        )
         return None
     before = len(diagnostics)
     block = _located_in(block, root.mark.file)
@@ -279,20 +406,22 @@ def read_safety(
     return Safety(laser, settings, str(item.path[-1]), values, laws)
 
 
-def _laws(block: Value, diagnostics: list[Diagnostic], files: dict[Where, str]) -> tuple[DamageLaw, ...]:
+def _laws(
+    block: Value, diagnostics: list[Diagnostic], files: dict[Where, str]
+) -> tuple[DamageLaw, ...]:
     """Return the thresholds of damage in the file of the user; report a mistake in the file."""
-    given = block.below(("damage", "file"))
-    if given is None or not isinstance(given.data, str):
+    file = block.below(("damage", "file"))
+    if file is None or not isinstance(file.data, str):
         return ()
-    path = (Path(given.mark.folder) / Path(given.data).expanduser()).resolve()
-    files[given.path] = str(path)
+    path = (Path(file.mark.folder) / Path(file.data).expanduser()).resolve()
+    files[file.path] = str(path)
     try:
-        refuse_outside(path, given.mark)
+        refuse_outside(path, file.mark)
         if not path.is_file():
             raise ValueError(f"no such file: {path}")
         return read_damage_laws(path)
     except (ValueError, OSError) as error:
-        diagnostics.append(Diagnostic(given.mark, given.name, str(error)))
+        diagnostics.append(Diagnostic(file.mark, file.name, str(error)))
         return ()
 
 
@@ -300,12 +429,14 @@ def _validated(model: type[Model], block: Value, diagnostics: list[Diagnostic]) 
     try:
         return model.model_validate(block.plain)
     except ValidationError as error:
-        diagnostics += (located(block, model, each) for each in error.errors())
+        diagnostics += (located(block, model, details) for details in error.errors())
         return None
 
 
 def _located_in(value: Value, file: str) -> Value:
-    """Return a mapping with the place where a file writes into it, in place of that in an option that came before."""
+    """Return a mapping with the place where a file writes into it, in place of that in an option
+    that came before.
+    """
     if not isinstance(value.data, dict):
         return value
     items = {key: _located_in(item, file) for key, item in value.data.items()}
@@ -315,19 +446,30 @@ def _located_in(value: Value, file: str) -> Value:
     return replace(value, data=items, key=own, mark=own)
 
 
-def _laser_of(root: Value, block: Value, references: References, diagnostics: list[Diagnostic]) -> Value | None:
-    """Return the laser that the settings name, or the only laser, with references resolved; None for a mistake."""
-    lasers = {str(name): value for name, value in (root.items[LASERS].items if LASERS in root.items else {}).items()}
-    given = block.child("laser")
-    if given is not None and given.data is not None:
-        if str(given.data) not in lasers:
-            message = f"{given.data} is no laser of the recipe; {nearest(str(given.data), lasers)}"
-            diagnostics.append(Diagnostic(given.mark, given.name, message))
+def _laser_of(
+    root: Value, block: Value, references: References, diagnostics: list[Diagnostic]
+) -> Value | None:
+    """Return the laser that the settings name, or the only laser, with references resolved; None
+    for a mistake.
+    """
+    lasers = {
+        str(name): value
+        for name, value in (root.items[LASERS].items if LASERS in root.items else {}).items()
+    }
+    setting = block.child("laser")
+    if setting is not None and setting.data is not None:
+        if str(setting.data) not in lasers:
+            message = (
+                f"{setting.data} is no laser of the recipe; {nearest(str(setting.data), lasers)}"
+            )
+            diagnostics.append(Diagnostic(setting.mark, setting.name, message))
             return None
-        name = str(given.data)
+        name = str(setting.data)
     elif len(lasers) != 1:
         several = f"the recipe has the lasers {', '.join(lasers)}: write safety.laser=NAME"
-        diagnostics.append(Diagnostic(block.key, KEY, several if lasers else "the recipe has no laser"))
+        diagnostics.append(
+            Diagnostic(block.key, KEY, several if lasers else "the recipe has no laser")
+        )
         return None
     else:
         name = next(iter(lasers))
@@ -335,24 +477,39 @@ def _laser_of(root: Value, block: Value, references: References, diagnostics: li
 
 
 def _laser(item: Value, diagnostics: list[Diagnostic]) -> Laser | None:
-    """Return the light of a laser, without the values that steps of the recipe read; report each mistake."""
+    """Return the light of a laser, without the values that steps of the recipe read; report each
+    mistake.
+    """
     if not isinstance(item.data, dict):
-        diagnostics.append(Diagnostic(item.mark, item.name, f"must be a mapping of values, not {kind(item)}"))
+        diagnostics.append(
+            Diagnostic(item.mark, item.name, f"must be a mapping of values, not {kind(item)}")
+        )
         return None
-    own = Value({k: v for k, v in item.data.items() if k in Laser.model_fields}, item.key, item.key, item.path)
+    own = Value(
+        {k: v for k, v in item.data.items() if k in Laser.model_fields},
+        item.key,
+        item.key,
+        item.path,
+    )
     laser = _validated(Laser, own, diagnostics)
     try:
         if laser is not None:
             laser.beam()
     except ParameterError as error:
         value = item.child(error.parameter)
-        diagnostics.append(Diagnostic(value.mark if value else item.key, f"{item.name}.{error.parameter}", str(error)))
+        diagnostics.append(
+            Diagnostic(
+                value.mark if value else item.key, f"{item.name}.{error.parameter}", str(error)
+            )
+        )
         return None
     return laser
 
 
 def _leaves(value: Value, path: Where) -> Iterator[tuple[Where, Value]]:
-    """Yield each single value below a mapping with the path of its setting, which is not where a reference leads."""
+    """Yield each single value below a mapping with the path of its setting, which is not where a
+    reference leads.
+    """
     for key, child in value.items.items():
         if isinstance(child.data, dict):
             yield from _leaves(child, (*path, key))

@@ -1,4 +1,6 @@
-"""Blocks of settings in a recipe: their base class, the types of their values, and a reader that reports mistakes."""
+"""Blocks of settings in a recipe: their base class, the types of their values, and a reader that
+reports mistakes.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,7 @@ from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import BaseModel, Field, ValidationError
 
-from neusee.nodes.parameter_model import ParameterModel
+from neusee.nodes.parameters import ParameterModel
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.recipe.text.composition import Composed
 from neusee.workflows.recipe.text.field_errors import message_of
@@ -30,29 +32,41 @@ Settings = TypeVar("Settings", bound=BaseModel)
 
 
 def read_block(
-    composed: Composed, key: str, model: type[Settings], plain: Any, context: dict[str, Any] | None = None
+    composed: Composed,
+    key: str,
+    model: type[Settings],
+    plain: Any,
+    context: dict[str, Any] | None = None,
 ) -> tuple[Composed, Settings | None]:
     """Return a recipe without its block ``key``, and the validated settings from that block.
 
-    ``plain`` is the plain data of the block, and ``context`` has what the models of the settings need to know of the
-    recipe. Mistakes in the block add diagnostics, and the settings are None.
+    ``plain`` is the plain data of the block, and ``context`` has what the models of the settings
+    need to know of the recipe. Mistakes in the block add diagnostics, and the settings are None.
     """
-    block, rest = composed.root.items[key], composed.without(key)
+    block, without_block = composed.root.items[key], composed.without(key)
     try:
-        return rest, model.model_validate(plain, context=context)
+        return without_block, model.model_validate(plain, context=context)
     except ValidationError as error:
-        return rest.with_problems(located(block, model, each) for each in error.errors()), None
+        return without_block.with_problems(
+            located(block, model, details) for details in error.errors()
+        ), None
 
 
 def located(block: Value, model: type[BaseModel], error: Any) -> Diagnostic:
-    """Return the diagnostic for a pydantic error, with the location of the innermost value that the error names."""
+    """Return the diagnostic for a pydantic error, with the location of the innermost value that
+    the error names.
+    """
     value = block
     for key in error["loc"]:
         value = value.child(key) or value
     text = message_of(error, value)
     if error["type"] == "extra_forbidden":
         names = _fields(model, error["loc"])
-        return Diagnostic(value.key, value.name, instead(value.name) or f"unknown; {nearest(error['loc'][-1], names)}")
+        return Diagnostic(
+            value.key,
+            value.name,
+            instead(value.name) or f"unknown; {nearest(error['loc'][-1], names)}",
+        )
     if now := instead(f"{value.name}={error['input']}"):
         text = f"{error['input']} {now}"
     elif error["type"] == "missing":
@@ -65,5 +79,12 @@ def _fields(model: type[BaseModel], path: Sequence[int | str]) -> list[str]:
     for key in path:
         if key in model.model_fields:
             annotation: Any = model.model_fields[str(key)].annotation
-            model = next((each for each in get_args(annotation) if hasattr(each, "model_fields")), annotation)
+            model = next(
+                (
+                    model_class
+                    for model_class in get_args(annotation)
+                    if hasattr(model_class, "model_fields")
+                ),
+                annotation,
+            )
     return list(model.model_fields)

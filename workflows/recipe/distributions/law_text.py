@@ -1,34 +1,46 @@
-"""Text of a probability distribution in place of a value of a recipe, such as ``normal(10.5 e-, 0.5 e-)``.
-
-A distribution of samples names a file, whose path is relative to the folder of the recipe.
-"""
+"""Text of a probability distribution in a recipe, such as normal(10.5 e-, 0.5 e-)."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from neusee.nodes.units import read_written
-from neusee.workflows.graph.diagnostics import Location, nearest
-from neusee.workflows.recipe.distributions.sample_table import read_columns, require_samples, si_unit, with_units
-from neusee.workflows.recipe.distributions.scalar import Law
+from neusee.nodes.units import read_any, read_written
+from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
+from neusee.workflows.recipe.distributions.joint_distribution import (
+    read_columns,
+    require_samples,
+    si_unit,
+    with_units,
+)
 from neusee.workflows.recipe.distributions.shapes import (
     Beta,
     Discrete,
+    Law,
     LogNormal,
     LogUniform,
+    Moved,
     Normal,
     Shape,
     Triangular,
     Uniform,
 )
-from neusee.workflows.recipe.text.named_files import refuse_outside
+from neusee.workflows.recipe.text.composition import refuse_outside
+from neusee.workflows.recipe.text.yaml_values import Value
+
+# --- law text -------------------------------------------------------------------------------------
+
+# Text of a probability distribution in place of a value of a recipe, such as ``normal(10.5 e-, 0.5
+# e-)``.
+#
+# A distribution of samples names a file, whose path is relative to the folder of the recipe.
+
 
 #: each kind of distribution with its form and the meaning of its arguments
 KINDS = {
@@ -37,7 +49,10 @@ KINDS = {
     "uniform": ("uniform(1 um, 2 um)", "least and largest value"),
     "loguniform": ("loguniform(1, 1e6)", "least and largest value, uniform in the logarithm"),
     "triangular": ("triangular(9 e-, 10 e-, 12 e-)", "least, most probable and largest value"),
-    "beta": ("beta(2, 5, 0 e-, 20 e-)", "two shape parameters, then least and largest value, which may be left out"),
+    "beta": (
+        "beta(2, 5, 0 e-, 20 e-)",
+        "two shape parameters, then least and largest value, which may be left out",
+    ),
     "truncated": (
         "truncated(normal(2 e-, 1 e-), 0 e-, inf)",
         "a distribution, its lower bound or -inf, and its upper bound or inf",
@@ -70,19 +85,25 @@ class _Numbers:
 
 
 def is_law(text: Any) -> bool:
-    """Return True if a recipe value is a text that begins with the name of a distribution, such as ``normal(``."""
+    """Return True if a recipe value is a text that begins with the name of a distribution, such
+    as ``normal(``.
+    """
     return isinstance(text, str) and _BEGIN.match(text) is not None
 
 
 def read_law(text: str, folder: Path = Path(), mark: Location | None = None) -> Law:
-    """Return the probability distribution in a text; raise ValueError with the correct form for an invalid text.
+    """Return the probability distribution in a text; raise ValueError with the correct form for an
+    invalid text.
 
-    Args: folder: folder of the recipe, to which the path of a file of samples is relative. mark: place of the text.
+    Args: folder: folder of the recipe, to which the path of a file of samples is relative. mark:
+            place of the text.
     """
     text = text.strip()
     match = _CALL.fullmatch(text)
     if match is None or not _is_closed(match[2]):
-        raise ValueError("the text is not a complete distribution: write kind(…, …), in quotes inside [ ] or { }")
+        raise ValueError(
+            "the text is not a complete distribution: write kind(…, …), in quotes inside [ ] or { }"
+        )
     kind, arguments = match[1], _arguments(match[2])
     if not all(arguments):
         raise ValueError(_form(kind))
@@ -99,7 +120,9 @@ def _form(kind: str) -> str:
 
 
 def _is_closed(text: str) -> bool:
-    """Return True if no parenthesis closes before it opens, as in ``normal(1, 2) + normal(3, 4)``."""
+    """Return True if no parenthesis closes before it opens, as in ``normal(1, 2) + normal(3,
+    4)``.
+    """
     depth = 0
     for sign in text:
         depth += (sign == "(") - (sign == ")")
@@ -109,7 +132,9 @@ def _is_closed(text: str) -> bool:
 
 
 def _arguments(text: str) -> list[str]:
-    """Return the arguments between the outer commas of a text; a comma in quotes or parentheses separates nothing."""
+    """Return the arguments between the outer commas of a text; a comma in quotes or parentheses
+    separates nothing.
+    """
     parts, depth, quote = [""], 0, ""
     for sign in text:
         if quote or sign in "\"'":
@@ -119,7 +144,7 @@ def _arguments(text: str) -> list[str]:
             parts.append("")
         else:
             parts[-1] += sign
-    return [part.strip() for part in parts]
+    return [argument.strip() for argument in parts]
 
 
 def _numbers(arguments: Sequence[str]) -> _Numbers:
@@ -132,10 +157,10 @@ def _numbers(arguments: Sequence[str]) -> _Numbers:
     return _Numbers(tuple(number for number, _, _ in read), unit, reciprocal)
 
 
-def _plain(argument: str, what: str) -> float:
+def _plain(argument: str, meaning: str) -> float:
     number, unit, _ = read_written(argument)
     if unit:
-        raise ValueError(f"{what} is a number without a unit, such as 1.1, not {argument}")
+        raise ValueError(f"{meaning} is a number without a unit, such as 1.1, not {argument}")
     return number
 
 
@@ -178,7 +203,9 @@ def _triangular(kind: str, text: str, arguments: Sequence[str]) -> Law:
     numbers = _numbers(arguments)
     low, mode, high = numbers.values
     if not (low <= mode <= high and low < high):
-        raise ValueError("the least, the most probable and the largest value must stand in this order")
+        raise ValueError(
+            "the least, the most probable and the largest value must stand in this order"
+        )
     return _law(kind, text, Triangular(low, mode, high), numbers)
 
 
@@ -199,7 +226,12 @@ def _beta(kind: str, text: str, arguments: Sequence[str]) -> Law:
 
 def _discrete(kind: str, text: str, arguments: Sequence[str]) -> Law:
     matches = [_WEIGHTED.fullmatch(argument) for argument in arguments]
-    numbers = _numbers([match[1] if match else argument for match, argument in zip(matches, arguments, strict=True)])
+    numbers = _numbers(
+        [
+            match[1] if match else argument
+            for match, argument in zip(matches, arguments, strict=True)
+        ]
+    )
     if len(set(numbers.values)) < len(arguments) or len(arguments) < 2:
         raise ValueError("a discrete distribution needs two or more values, all different")
     weights = _weights([match[2] for match in matches if match], len(arguments))
@@ -226,7 +258,10 @@ def _truncated(text: str, arguments: Sequence[str], folder: Path, mark: Location
         raise ValueError(_form("truncated"))
     law = read_law(arguments[0], folder, mark)
     if law.kind == "truncated":
-        raise ValueError("a truncated distribution cannot be truncated again: write one distribution with both bounds")
+        raise ValueError(
+            "a truncated distribution cannot be truncated again: write one distribution with both"
+            " bounds"
+        )
     low, high = (_bound(argument, law) for argument in arguments[1:])
     if math.isinf(low) and math.isinf(high):
         raise ValueError("a truncated distribution needs a bound: " + KINDS["truncated"][0])
@@ -282,14 +317,19 @@ def _column(path: Path, names: Sequence[str], name: str | None) -> str:
     if name is None and len(names) == 1:
         return names[0]
     if name is None:
-        raise ValueError(f"{path.name} has the columns {', '.join(names)}: write empirical({path.name}, column NAME)")
+        raise ValueError(
+            f"{path.name} has the columns {', '.join(names)}: write empirical({path.name}, column"
+            " NAME)"
+        )
     if name not in names:
         raise ValueError(f"{path.name} has no column {name}; {nearest(name, names)}")
     return name
 
 
 def _unit(unit: str) -> tuple[float, str]:
-    """Return the factor of a unit and its SI unit; raise ValueError for a unit that no value of a recipe has."""
+    """Return the factor of a unit and its SI unit; raise ValueError for a unit that no value of
+    a recipe has.
+    """
     read_written(f"1 {unit}")
     return si_unit(unit)
 
@@ -303,3 +343,113 @@ _READERS: dict[str, Callable[[str, str, Sequence[str]], Law]] = {
     "beta": _beta,
     "discrete": _discrete,
 }
+
+
+# --- mismatch laws --------------------------------------------------------------------------------
+
+# Laws of how a camera differs from what a recipe says of it: a training draws them, and the
+# restorer is not told.
+#
+# A ``lognormal`` or ``loguniform`` law multiplies the value of the recipe; any other law, or a
+# single value, is added to it.
+
+
+#: standard deviation of a true value that is certain, relative to the value of the recipe
+_NARROW = 1e-3
+_NARROWEST = 1e-9  #: standard deviation in SI if the value of the recipe is 0
+ANGLE = "angle"  #: key of the direction of a laser, of which y and x differ independently
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The law of the difference of one value from that of the recipe."""
+
+    law: Law
+    own: float  #: value of the recipe, in SI
+    mark: Location
+
+    def of(self, value: float, drawn: float) -> float:
+        """Return the true value of the camera from the value of the recipe and a draw."""
+        return value * drawn if self.law.multiplies else value + drawn
+
+    @property
+    def truth(self) -> Law:
+        """Return the distribution of the true value, which is nowhere a single value."""
+        shape: Shape = self.law.shape
+        if isinstance(shape, Normal) and not shape.sd:
+            shape = Normal(shape.mean, abs(self.own) * _NARROW or _NARROWEST)
+        if self.law.multiplies:
+            return replace(self.law, shape=Moved(shape, factor=self.own))
+        return replace(self.law, shape=Moved(shape, offset=self.own))
+
+
+def read_mismatch(
+    block: Value, root: Value, diagnostics: list[Diagnostic]
+) -> dict[str, Difference]:
+    """Return the differences that ``train.mismatch`` states, by the path of the value in the
+    recipe ``root``.
+    """
+    differences = {}
+    for path, leaf in _laws(block):
+        try:
+            differences[path] = _difference(path, leaf, root)
+        except ValueError as error:
+            diagnostics.append(Diagnostic(leaf.mark, f"{block.name}.{path}", str(error)))
+    return differences
+
+
+def _laws(block: Value, above: str = "") -> Iterator[tuple[str, Value]]:
+    for key, value in block.items.items():
+        if isinstance(value.data, dict):
+            yield from _laws(value, f"{above}{key}.")
+        else:
+            yield f"{above}{key}", value
+
+
+def _difference(path: str, leaf: Value, root: Value) -> Difference:
+    own = root.below(path.split("."))
+    if own is None:
+        raise ValueError(
+            f"the recipe has no value {path};"
+            f" {nearest(path, [recipe_value.name for recipe_value in root.leaves()])}"
+        )
+    value, unit = _own(path, own)
+    law = (
+        read_law(leaf.data, Path(leaf.mark.folder), leaf.mark)
+        if is_law(leaf.data)
+        else _single(leaf)
+    )
+    if law.reciprocal:
+        raise ValueError(
+            "a gain in e-/DN has no difference that is added: write lognormal(1, …), not"
+            f" {law.text}"
+        )
+    if law.multiplies:
+        if law.unit:
+            raise ValueError(f"{law.kind} multiplies {path}: write it without the unit {law.unit}")
+        if not value:
+            raise ValueError(
+                f"{path} is 0, which {law.text} would multiply: write normal(…, …) or uniform(…, …)"
+            )
+    elif law.unit != unit:
+        raise ValueError(
+            f"{law.text} is added to {path}, whose unit is {unit or 'none'}, not"
+            f" {law.unit or 'none'}"
+        )
+    return Difference(replace(law, unit=unit), value, leaf.mark)
+
+
+def _own(path: str, own: Value) -> tuple[float, str]:
+    """Return the value of the recipe and its unit; a direction counts as 0 rad, because it may
+    be drawn.
+    """
+    if path.rpartition(".")[2] == ANGLE:
+        return 0.0, "rad"
+    if own.data is None:
+        raise ValueError(f"{path} is null, from which nothing can differ: give it a value first")
+    return read_any(own.plain)
+
+
+def _single(leaf: Value) -> Law:
+    value, unit = read_any(leaf.plain)
+    return Law("normal", str(leaf.data), Normal(value, 0.0), unit)

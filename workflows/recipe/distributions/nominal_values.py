@@ -1,6 +1,8 @@
-"""Nominal values of uncertain inputs, which a run uses in place of probability distributions and of a posterior.
+"""Nominal values of uncertain inputs, which a run uses in place of probability distributions and of
+a posterior.
 
-A run uses the median of a distribution and the value that ``posterior`` chooses; the study of uncertainty draws values.
+A run uses the median of a distribution and the value that ``posterior`` chooses; the study of
+uncertainty draws values.
 """
 
 from __future__ import annotations
@@ -13,10 +15,16 @@ from typing import Any
 
 from neusee.nodes.units import KNOWN_UNITS, read_any
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, nearest
-from neusee.workflows.recipe.distributions.joint import BARE_GAIN, GAIN_UNIT, Joint, Posterior, read_posterior, summary
-from neusee.workflows.recipe.distributions.law_text import is_law, read_law
-from neusee.workflows.recipe.distributions.mismatch_laws import Difference
-from neusee.workflows.recipe.distributions.scalar import Law, written
+from neusee.workflows.recipe.distributions.joint_distribution import (
+    BARE_GAIN,
+    GAIN_UNIT,
+    Joint,
+    Posterior,
+    read_posterior,
+    summary,
+)
+from neusee.workflows.recipe.distributions.law_text import Difference, is_law, read_law
+from neusee.workflows.recipe.distributions.shapes import Law, written
 from neusee.workflows.recipe.text.composition import Composed
 from neusee.workflows.recipe.text.references import BROKEN
 from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES
@@ -26,8 +34,10 @@ KEY = "posterior"  #: key of the block in a recipe
 _BLOCK = "sensor"  #: block of the values that a calibration names without their block
 _KEYS = ("file", "use", "values")
 _SUMMARY = ("mean", "sd", "correlation", "covariance")
-_MANY_SCALES = ("m", "s", "rad", "W", "J", "Hz")  #: units whose numbers a table could mean in another scale
-_FAR = 0.005  #: probability of each tail of a posterior in which a recipe's own value counts as far off
+#: units whose numbers a table could mean in another scale
+_MANY_SCALES = ("m", "s", "rad", "W", "J", "Hz")
+#: probability of each tail of a posterior in which a recipe's own value counts as far off
+_FAR = 0.005
 
 
 @dataclass(frozen=True)
@@ -48,7 +58,9 @@ class Standing:
 
     @property
     def far(self) -> bool:
-        """Return True if the recipe's own value lies in one of the two tails of the posterior with 0.5 % each."""
+        """Return True if the recipe's own value lies in one of the two tails of the posterior
+        with 0.5 % each.
+        """
         return not _FAR <= self.below <= 1 - _FAR
 
 
@@ -62,8 +74,10 @@ class Uncertain:
     standings: tuple[Standing, ...] = ()
     notes: tuple[str, ...] = ()
     source: str = ""  #: of the posterior
-    units: Mapping[str, str] = field(default_factory=dict)  #: SI unit by path of the values in the joint distribution
-    mismatch: Mapping[str, Difference] = field(default_factory=dict)  #: by path, of the true values of a training
+    #: SI unit by path of the values in the joint distribution
+    units: Mapping[str, str] = field(default_factory=dict)
+    #: by path, of the true values of a training
+    mismatch: Mapping[str, Difference] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -71,11 +85,14 @@ class Uncertain:
         return (*self.laws, *(self.joint.names if self.joint else ()))
 
     def said(self, name: str) -> str:
-        """Return the distribution of an uncertain value as text, or the source of the posterior with this value."""
+        """Return the distribution of an uncertain value as text, or the source of the posterior
+        with this value.
+        """
         return self.laws[name].text if name in self.laws else f"posterior {self.source}"
 
     def at(self, values: Mapping[str, float]) -> Any:
-        """Return the recipe with the given numbers in SI units in place of its uncertain values, after a check.
+        """Return the recipe with the given numbers in SI units in place of its uncertain values,
+        after a check.
 
         Raises `RecipeError` for an invalid value.
         """
@@ -89,7 +106,9 @@ class Uncertain:
 
 
 def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
-    """Return a recipe with a number in place of every distribution, and its uncertain values, or None for none."""
+    """Return a recipe with a number in place of every distribution, and its uncertain values, or
+    None for none.
+    """
     laws, root = dict[str, Law](), composed.root
     diagnostics = list(composed.diagnostics)
     for path, leaf in _laws(root):
@@ -100,20 +119,32 @@ def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:
             root = put(root, path, BROKEN)
             continue
         root = put(root, path, written(law.median, law.unit))
-    given = root.items.get(KEY)
-    if given is None and not laws and len(diagnostics) == len(composed.diagnostics):
+    block = root.items.get(KEY)
+    if block is None and not laws and len(diagnostics) == len(composed.diagnostics):
         return composed, None
-    notes = [f"{path} is {law.text}: this run uses {_rounded(law.median, law.unit)}" for path, law in laws.items()]
+    notes = [
+        f"{path} is {law.text}: this run uses {_rounded(law.median, law.unit)}"
+        for path, law in laws.items()
+    ]
     reader = _Reader(root.without(KEY), laws, diagnostics)
-    if given is not None:
-        reader.read(given)
+    if block is not None:
+        reader.read(block)
     settled = replace(composed, root=reader.root, diagnostics=tuple(diagnostics))
-    rest = (tuple(reader.standings), (*notes, *reader.notes), reader.source, reader.units)
-    return settled, Uncertain(replace(settled, diagnostics=()), laws, reader.joint, *rest)
+    return settled, Uncertain(
+        replace(settled, diagnostics=()),
+        laws,
+        reader.joint,
+        standings=tuple(reader.standings),
+        notes=(*notes, *reader.notes),
+        source=reader.source,
+        units=reader.units,
+    )
 
 
 def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
-    """Yield the path and the value of every distribution in a recipe; a value with YAML aliases has several paths."""
+    """Yield the path and the value of every distribution in a recipe; a value with YAML aliases
+    has several paths.
+    """
     for key, block in reversed(root.items.items()):
         if key != KEY:
             yield from (((key, *path), value) for path, value in _laws_in(block))
@@ -121,15 +152,17 @@ def _laws(root: Value) -> Iterator[tuple[Where, Value]]:
 
 @functools.lru_cache(maxsize=64)
 def _laws_in(block: Value) -> tuple[tuple[Where, Value], ...]:
-    """Return the distributions in a block, which the points of a sweep share where they have the same block."""
-    found: list[tuple[Where, Value]] = []
+    """Return the distributions in a block, which the points of a sweep share where they have the
+    same block.
+    """
+    laws: list[tuple[Where, Value]] = []
     stack: list[tuple[Where, Value]] = [((), block)]
     while stack:
         path, value = stack.pop()
         if is_law(value.data):
-            found.append((path, value))
+            laws.append((path, value))
         stack += [((*path, key), child) for key, child in value.items.items()]
-    return tuple(found)
+    return tuple(laws)
 
 
 def put(root: Value, path: Where, data: Any, mark: Location | None = None) -> Value:
@@ -141,7 +174,9 @@ def put(root: Value, path: Where, data: Any, mark: Location | None = None) -> Va
 
 
 class _Reader:
-    """Reader of the recipe key ``posterior``, which replaces values of the recipe by values from the posterior."""
+    """Reader of the recipe key ``posterior``, which replaces values of the recipe by values from
+    the posterior.
+    """
 
     def __init__(self, root: Value, laws: Mapping[str, Law], diagnostics: list[Diagnostic]) -> None:
         self.root, self.laws, self.diagnostics = root, laws, diagnostics
@@ -151,76 +186,101 @@ class _Reader:
         self.units: dict[str, str] = {}
         self.source = ""
 
-    def read(self, given: Value) -> None:
-        """Read the posterior that a recipe names, and put its values into the recipe; report each mistake."""
-        if given.data is None:
+    def read(self, block: Value) -> None:
+        """Read the posterior that a recipe names, and put its values into the recipe; report
+        each mistake.
+        """
+        if block.data is None:
             return
-        items = given.items if isinstance(given.data, dict) else {"file": given}
+        items = block.items if isinstance(block.data, dict) else {"file": block}
         if strange := [v for key, v in items.items() if key not in (*_KEYS, *_SUMMARY)]:
-            return self._fail(strange[0].key, strange[0].name, f"unknown; {nearest(strange[0].name, _KEYS)}")
+            return self._fail(
+                strange[0].key, strange[0].name, f"unknown; {nearest(strange[0].name, _KEYS)}"
+            )
         try:
-            posterior = self._posterior(given, items)
+            posterior = self._posterior(block, items)
         except ValueError as error:
-            place = items.get("covariance") or items.get("correlation") or given
+            place = items.get("covariance") or items.get("correlation") or block
             return self._fail(place.mark, place.name, str(error))
         try:
             use = self._use(items.get("use"), posterior)
             pairs = self._pairs(items.get("values"), posterior)
         except ValueError as error:
-            return self._fail(given.mark, KEY, str(error))
-        self._apply(posterior, pairs, use, given.mark)
+            return self._fail(block.mark, KEY, str(error))
+        self._apply(posterior, pairs, use, block.mark)
 
-    def _posterior(self, given: Value, items: Mapping[Any, Value]) -> Posterior:
+    def _posterior(self, block: Value, items: Mapping[Any, Value]) -> Posterior:
         if any(key in items for key in _SUMMARY):
-            self.source = f"summary at {given.mark}"
+            self.source = f"summary at {block.mark}"
             return summary({key: _flat(v) for key, v in items.items() if key in _SUMMARY})
         file = items.get("file")
         if file is None or not isinstance(file.data, str):
-            raise ValueError("the posterior has no file: write posterior: PATH, or posterior: {file: PATH, use: mean}")
+            raise ValueError(
+                "the posterior has no file: write posterior: PATH, or posterior: {file: PATH, use:"
+                " mean}"
+            )
         self.source = file.data
         return read_posterior(Path(file.mark.folder) / Path(file.data).expanduser(), file.mark)
 
-    def _use(self, given: Value | None, posterior: Posterior) -> str | int:
-        use = "mean" if given is None else given.data
+    def _use(self, setting: Value | None, posterior: Posterior) -> str | int:
+        use = "mean" if setting is None else setting.data
         draws = posterior.joint.draws
         if use in ("mean", "nominal"):
             return str(use)
-        if isinstance(use, int) and not isinstance(use, bool) and draws is not None and 0 <= use < len(draws):
+        if (
+            isinstance(use, int)
+            and not isinstance(use, bool)
+            and draws is not None
+            and 0 <= use < len(draws)
+        ):
             return use
         number = f", or the number of a draw, 0 to {len(draws) - 1}" if draws is not None else ""
         raise ValueError(f"use = {use}: write mean, nominal (the recipe's own value){number}")
 
-    def _pairs(self, given: Value | None, posterior: Posterior) -> dict[str, str]:
-        """Return the name in the posterior for each value that the recipe takes from it, by the value's recipe path."""
+    def _pairs(self, setting: Value | None, posterior: Posterior) -> dict[str, str]:
+        """Return the name in the posterior for each value that the recipe takes from it, by the
+        value's recipe path.
+        """
         names = posterior.joint.names
-        if given is not None and not isinstance(given.data, dict):
-            raise ValueError("values must be a mapping: write values: {path in the recipe: name in the posterior}")
-        if given is not None:
-            pairs = {path: str(name) for path, name in _flat(given).items()}
-            if wrong := [name for name in pairs.values() if name not in names]:
-                now = POSTERIOR_NAMES.get(wrong[0])
-                hint = f"called {now} now" if now in names else f"not in the posterior; {nearest(wrong[0], names)}"
-                raise ValueError(f"values: {wrong[0]} is {hint}")
-        else:
-            all_pairs = {name if "." in name else f"{_BLOCK}.{name}": name for name in names}
-            pairs = {path: name for path, name in all_pairs.items() if self._value(path) is not None}
-            if lost := [name for path, name in all_pairs.items() if path not in pairs]:
-                self.notes.append(f"this recipe does not have these values of the posterior: {', '.join(lost)}")
+        pairs = self._own_pairs(names) if setting is None else _stated_pairs(setting, names)
         if wrong := [path for path in pairs if self._value(path) is None]:
             raise ValueError(f"values: the recipe has no value at the path {wrong[0]}")
         if not pairs:
-            raise ValueError(f"no value of the recipe is in the posterior, which contains {', '.join(names)}")
+            raise ValueError(
+                f"no value of the recipe is in the posterior, which contains {', '.join(names)}"
+            )
         own = [name for name in posterior.untold if self._value(f"{_BLOCK}.{name}") is not None]
-        if own and given is None:
-            self.notes.append(f"the posterior does not tell {', '.join(own)}: the recipe's own value counts as certain")
+        if own and setting is None:
+            self.notes.append(
+                f"the posterior does not tell {', '.join(own)}: the recipe's own value counts as"
+                " certain"
+            )
         self._conventions(posterior, pairs)
         return pairs
 
+    def _own_pairs(self, names: Sequence[str]) -> dict[str, str]:
+        """Return the name in the posterior for each value of the recipe that has the same name; say
+        which names have no value.
+        """
+        all_pairs = {name if "." in name else f"{_BLOCK}.{name}": name for name in names}
+        pairs = {path: name for path, name in all_pairs.items() if self._value(path) is not None}
+        if lost := [name for path, name in all_pairs.items() if path not in pairs]:
+            self.notes.append(
+                f"this recipe does not have these values of the posterior: {', '.join(lost)}"
+            )
+        return pairs
+
     def _conventions(self, posterior: Posterior, pairs: Mapping[str, str]) -> None:
-        """Raise ValueError if a posterior has a gain without a unit, or a dark current for another exposure time."""
+        """Raise ValueError if a posterior has a gain without a unit, or a dark current for
+        another exposure time.
+        """
         for path, name in pairs.items():
             value = self._value(path)
-            is_gain = value and isinstance(value.data, str) and value.data.strip().endswith(("e-/DN", GAIN_UNIT))
+            is_gain = (
+                value
+                and isinstance(value.data, str)
+                and value.data.strip().endswith(("e-/DN", GAIN_UNIT))
+            )
             if is_gain and posterior.units.get(name) != GAIN_UNIT:
                 raise ValueError(f"the {name} of the posterior has no unit: {BARE_GAIN}")
         exposure = self._value(f"{_BLOCK}.exposure")
@@ -228,19 +288,28 @@ class _Reader:
         if "dark_current" in pairs.values() and exposure is not None and " in " in words:
             other, own = read_any(words.partition(" in ")[2])[0], read_any(exposure.data)[0]
             if abs(other - own) > 1e-9 * own:
-                raise ValueError(f"the dark current is for {other:g} s in the posterior and {own:g} s in the recipe")
+                raise ValueError(
+                    f"the dark current is for {other:g} s in the posterior and {own:g} s in the"
+                    " recipe"
+                )
 
     def _value(self, path: str) -> Value | None:
         return self.root.below(path.split("."))
 
-    def _apply(self, posterior: Posterior, pairs: Mapping[str, str], use: str | int, mark: Location) -> None:
-        kept = {}
+    def _apply(
+        self, posterior: Posterior, pairs: Mapping[str, str], use: str | int, mark: Location
+    ) -> None:
+        taken = {}
         for path, name in pairs.items():
             value = self._value(path)
             assert value is not None
             if path in self.laws or value.mark.line == 0:
                 if path in self.laws and value.mark.line:
-                    self._fail(value.mark, path, "the value has a distribution here and in the posterior: remove one")
+                    self._fail(
+                        value.mark,
+                        path,
+                        "the value has a distribution here and in the posterior: remove one",
+                    )
                 self.notes.append(f"{path} comes from the argument, not from the posterior")
                 continue
             try:
@@ -251,51 +320,100 @@ class _Reader:
             if fault := _unit_fault(name, posterior.units.get(name, ""), unit):
                 self._fail(mark, KEY, fault)
                 continue
-            kept[path] = name
+            taken[path] = name
             self.units[path] = unit
             self._stand(posterior, path, name, own, use, mark)
-        if kept:
-            joint = posterior.joint.only(tuple(kept.values()))
-            self.joint = replace(joint, names=tuple(kept))
+        if taken:
+            joint = posterior.joint.only(tuple(taken.values()))
+            self.joint = replace(joint, names=tuple(taken))
 
-    def _stand(self, posterior: Posterior, path: str, name: str, own: float, use: str | int, mark: Location) -> None:
-        """Compare a value in the recipe with the posterior, and replace it by the value that a run uses."""
+    def _stand(
+        self, posterior: Posterior, path: str, name: str, own: float, use: str | int, mark: Location
+    ) -> None:
+        """Compare a value in the recipe with the posterior, and replace it by the value that a
+        run uses.
+        """
         joint, unit, kind = posterior.joint, self.units[path], posterior.kinds.get(name, "estimate")
         i = joint.names.index(name)
-        used, why = own, "recipe"
+        nominal, why = own, "recipe"
         if isinstance(use, int):
             assert joint.draws is not None
-            used, why = float(joint.draws[use, i]), f"draw {use}"
+            nominal, why = float(joint.draws[use, i]), f"draw {use}"
         elif kind == "estimate" and use == "mean":
-            used, why = float(joint.mean[i]), "mean"
-        if used != own:
-            self.root = put(self.root, tuple(path.split(".")), written(used, unit), mark)
-        numbers = (float(joint.mean[i]), float(joint.sd[i]), *joint.interval(name))
-        words = (unit, joint.below(name, own), _rounded(used, unit), why)
-        standing = Standing(path, _rounded(own, unit), kind, *numbers, *words)
+            nominal, why = float(joint.mean[i]), "mean"
+        if nominal != own:
+            self.root = put(self.root, tuple(path.split(".")), written(nominal, unit), mark)
+        low, high = joint.interval(name)
+        standing = Standing(
+            path,
+            own=_rounded(own, unit),
+            kind=kind,
+            mean=float(joint.mean[i]),
+            sd=float(joint.sd[i]),
+            low=low,
+            high=high,
+            unit=unit,
+            below=joint.below(name, own),
+            used=_rounded(nominal, unit),
+            why=why,
+        )
         self.standings.append(standing)
         if standing.far:
             law = f"{standing.mean:.6g} ± {standing.sd:.2g} {unit}".rstrip()
-            self.notes.append(f"{path} = {standing.own} is far from its posterior, {law} ({self.source})")
+            self.notes.append(
+                f"{path} = {standing.own} is far from its posterior, {law} ({self.source})"
+            )
 
     def _fail(self, mark: Location, path: str, message: str) -> None:
         self.diagnostics.append(Diagnostic(mark, path, message))
 
 
 def _unit_fault(name: str, unit: str, own: str) -> str:
-    """Return what is wrong with the unit of a value of the posterior, beside the unit of the recipe's ``own`` value."""
+    """Return what is wrong with the unit of a value of the posterior, beside the unit of the
+    recipe's ``own`` value.
+    """
     if not unit and own in _MANY_SCALES:
-        return f"the {name} of the posterior has no unit: write it after the mean, or in the heading, {name} [{own}]"
+        return (
+            f"the {name} of the posterior has no unit: write it after the mean, or in the heading,"
+            f" {name} [{own}]"
+        )
     if unit in KNOWN_UNITS and unit != own:
-        return f"the {name} of the posterior is in {unit}, and the value of the recipe in {own or 'no unit'}"
+        return (
+            f"the {name} of the posterior is in {unit}, and the value of the recipe in"
+            f" {own or 'no unit'}"
+        )
     return ""
 
 
+def _stated_pairs(setting: Value, names: Sequence[str]) -> dict[str, str]:
+    """Return the name in the posterior for each value by its path, as a recipe states them."""
+    if not isinstance(setting.data, dict):
+        raise ValueError(
+            "values must be a mapping: write values: {path in the recipe: name in the posterior}"
+        )
+    pairs = {path: str(name) for path, name in _flat(setting).items()}
+    if wrong := [name for name in pairs.values() if name not in names]:
+        now = POSTERIOR_NAMES.get(wrong[0])
+        hint = (
+            f"called {now} now"
+            if now in names
+            else f"not in the posterior; {nearest(wrong[0], names)}"
+        )
+        raise ValueError(f"values: {wrong[0]} is {hint}")
+    return pairs
+
+
 def _flat(value: Value) -> Any:
-    """Return the values of a nested YAML mapping by dotted path; return any other YAML value as plain data."""
+    """Return the values of a nested YAML mapping by dotted path; return any other YAML value as
+    plain data.
+    """
     if not isinstance(value.data, dict):
         return value.plain
-    return {dotted(leaf.path[len(value.path) :]): leaf.plain for leaf in value.leaves() if leaf is not value}
+    return {
+        dotted(leaf.path[len(value.path) :]): leaf.plain
+        for leaf in value.leaves()
+        if leaf is not value
+    }
 
 
 def _rounded(value: float, unit: str) -> str:

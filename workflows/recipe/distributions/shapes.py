@@ -1,18 +1,26 @@
-"""Probability distributions of a number: quantiles at standard normal numbers, and measures for integrals.
-
-Every quantile is a function of a standard normal number ``z``, whose cumulative probability is that of the value.
-Two tails are then equally accurate, and a draw needs one normal number, whatever the distribution is.
-"""
+"""Probability distributions of a number: quantiles, measures, and draws of a value."""
 
 from __future__ import annotations
 
 import hashlib
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+# --- shapes ---------------------------------------------------------------------------------------
+
+# Probability distributions of a number: quantiles at standard normal numbers, and measures for
+# integrals.
+#
+# Every quantile is a function of a standard normal number ``z``, whose cumulative probability is
+# that of the value. Two tails are then equally accurate, and a draw needs one normal number,
+# whatever the distribution is.
+
 
 FloatArray = NDArray[np.float64]
 
@@ -27,18 +35,24 @@ class Shape(ABC):
 
     @abstractmethod
     def at(self, z: FloatArray) -> FloatArray:
-        """Return the values of the distribution at the cumulative probabilities of standard normal numbers ``z``."""
+        """Return the values of the distribution at the cumulative probabilities of standard
+        normal numbers ``z``.
+        """
 
     @abstractmethod
     def score(self, x: float) -> float:
         """Return the standard normal number at which the distribution has the value ``x``."""
 
     def coordinate(self, z: FloatArray) -> FloatArray:
-        """Return the coordinate in which outputs are expected to be smooth; here the value itself."""
+        """Return the coordinate in which outputs are expected to be smooth; here the value
+        itself.
+        """
         return self.at(z)
 
     def measure(self) -> tuple[FloatArray, FloatArray]:
-        """Return points of `coordinate` and their probabilities, for means of functions of the coordinate."""
+        """Return points of `coordinate` and their probabilities, for means of functions of the
+        coordinate.
+        """
         z, weights = _normal_measure()
         return self.coordinate(z), weights
 
@@ -50,12 +64,15 @@ class Shape(ABC):
         return mean, math.sqrt(float(weights @ (x - mean) ** 2))
 
     def truncated(self, low: float, high: float) -> Shape:
-        """Return the distribution under the condition that the value is between ``low`` and ``high``.
+        """Return the distribution under the condition that the value is between ``low`` and
+        ``high``.
 
         Raises ValueError if less than 1e-9 of the distribution lies there.
         """
         if not low < high:
-            raise ValueError(f"the lower bound {low:g} must be smaller than the upper bound {high:g}")
+            raise ValueError(
+                f"the lower bound {low:g} must be smaller than the upper bound {high:g}"
+            )
         cut = Truncated(self, low, high)
         if not cut.share > _SMALLEST_SHARE:
             raise ValueError("less than 1e-9 of the distribution lies between the two bounds")
@@ -129,7 +146,9 @@ class LogUniform(Shape):
         return np.asarray(self.low * np.exp(np.log(self.high / self.low) * ndtr(z)), np.float64)
 
     def score(self, x: float) -> float:
-        return _score(math.log(x / self.low) / math.log(self.high / self.low)) if x > 0 else -math.inf
+        return (
+            _score(math.log(x / self.low) / math.log(self.high / self.low)) if x > 0 else -math.inf
+        )
 
     def coordinate(self, z: FloatArray) -> FloatArray:
         from scipy.special import ndtr
@@ -152,7 +171,9 @@ class Triangular(Shape):
         below, above = ndtr(z), ndtr(-z)
         rising = self.low + np.sqrt(below * width * (self.mode - self.low))
         falling = self.high - np.sqrt(above * width * (self.high - self.mode))
-        return np.asarray(np.where(below * width < self.mode - self.low, rising, falling), np.float64)
+        return np.asarray(
+            np.where(below * width < self.mode - self.low, rising, falling), np.float64
+        )
 
     def score(self, x: float) -> float:
         x, width = min(max(x, self.low), self.high), self.high - self.low
@@ -185,7 +206,9 @@ class Beta(Shape):
 
         share = min(max((x - self.low) / (self.high - self.low), 0.0), 1.0)
         below = float(betainc(self.a, self.b, share))
-        return _score(below) if below < 0.5 else -_score(float(betainc(self.b, self.a, 1.0 - share)))
+        return (
+            _score(below) if below < 0.5 else -_score(float(betainc(self.b, self.a, 1.0 - share)))
+        )
 
 
 @dataclass(frozen=True)
@@ -223,7 +246,9 @@ class Discrete(Shape):
 
     def truncated(self, low: float, high: float) -> Shape:
         if not low < high:
-            raise ValueError(f"the lower bound {low:g} must be smaller than the upper bound {high:g}")
+            raise ValueError(
+                f"the lower bound {low:g} must be smaller than the upper bound {high:g}"
+            )
         inside = (self.values >= low) & (self.values <= high)
         if inside.sum() < 2:
             raise ValueError("fewer than two values of the distribution lie between the two bounds")
@@ -291,7 +316,8 @@ def share_between(low: float, high: float) -> float:
 
 
 def scores_between(z: FloatArray, low: float, high: float) -> FloatArray:
-    """Map standard normal numbers to those of the normal distribution truncated to ``low`` … ``high``.
+    """Map standard normal numbers to those of the normal distribution truncated to ``low`` …
+    ``high``.
 
     The map keeps the order, and both tails keep their accuracy.
     """
@@ -312,7 +338,100 @@ def _score(probability: float) -> float:
 
 
 def _normal_measure() -> tuple[FloatArray, FloatArray]:
-    """Return standard normal numbers and their probabilities; the rule is exact to rounding for smooth functions."""
+    """Return standard normal numbers and their probabilities; the rule is exact to rounding for
+    smooth functions.
+    """
     z = np.linspace(-_REACH, _REACH, _NODES)
     weights = np.exp(-(z**2) / 2)
     return z, weights / weights.sum()
+
+
+# --- scalar ---------------------------------------------------------------------------------------
+
+# Probability distribution of one recipe value, such as ``normal(10.5 e-, 0.5 e-)`` in place of
+# ``10.5 e-``.
+
+
+#: normal scores whose values are tried
+_PROBES = (0.3, -0.3, 1.0, -1.0, 2.0, -2.0, 3.0, -3.0, 6.0, -6.0)
+
+
+@dataclass(frozen=True)
+class Law:
+    """Probability distribution of a recipe value or, for a gain in e-/DN, of its reciprocal."""
+
+    kind: str
+    text: str  #: as written in the recipe
+    shape: Shape  #: of the number as written, in SI
+    unit: str  #: SI unit of a draw; empty for a number without a unit
+    reciprocal: bool = False  #: whether a draw is the reciprocal of a number from the distribution
+    file: Path | None = None  #: file of the samples of an empirical distribution
+    written_path: str = ""  #: of this file, as in the text
+
+    def at(self, z: FloatArray) -> FloatArray:
+        """Return the values of the distribution at the cumulative probabilities of standard
+        normal numbers ``z``.
+        """
+        x = self.shape.at(np.asarray(z, np.float64))
+        with np.errstate(divide="ignore"):
+            return np.asarray(1.0 / x if self.reciprocal else x, np.float64)
+
+    @property
+    def median(self) -> float:
+        """Return the median of the distribution; a run uses the median unless it samples the
+        distribution.
+        """
+        return float(self.at(np.zeros(())))
+
+    def other_than(self, value: float) -> float:
+        """Return a value of the distribution that differs from ``value``, unless all others are
+        rarer than 1e-9.
+        """
+        values = self.at(np.array(_PROBES))
+        return float(next((x for x in values if x != value), value))
+
+    @property
+    def multiplies(self) -> bool:
+        """Return True if a difference with this distribution is a factor, as that of a lognormal
+        distribution.
+        """
+        shape = self.shape.shape if isinstance(self.shape, Truncated) else self.shape
+        return isinstance(shape, LogNormal | LogUniform)
+
+    @property
+    def full_text(self) -> str:
+        """Return the text with the absolute path of the file of samples, which is valid in any
+        folder.
+        """
+        if self.file is None:
+            return self.text
+        return self.text.replace(self.written_path, f'"{self.file.resolve()}"', 1)
+
+    @property
+    def identity(self) -> str:
+        """Return a text that differs for any two distributions, also for samples of a file whose
+        content differs.
+        """
+        samples = self.shape.identity if isinstance(self.shape, Discrete) else ""
+        return f"{self.text} {samples}".strip()
+
+    def truncated(self, low: float, high: float) -> Law:
+        """Return the distribution of numbers as written between two bounds in SI; raise
+        ValueError if none is left.
+        """
+        return replace(self, shape=self.shape.truncated(low, high))
+
+
+def draw_laws(
+    laws: Mapping[str, Law], count: int, seed: Sequence[int], first: int = 0
+) -> dict[str, list[float]]:
+    """Return ``count`` independent draws of each law in SI, from the number ``first`` on, by the
+    name of the law.
+    """
+    z = np.random.default_rng(list(seed)).standard_normal((first + count, len(laws)))[first:]
+    return {name: law.at(z[:, i]).tolist() for i, (name, law) in enumerate(laws.items())}
+
+
+def written(value: float, unit: str) -> str | float:
+    """Return a value in SI as it is written in a recipe: a number, or a text with the unit."""
+    return f"{value!r} {unit}" if unit else value

@@ -1,4 +1,6 @@
-"""Sentences for values that a model of parameters or settings refuses: what to write, in the words of a recipe."""
+"""Sentences for values that a model of parameters or settings refuses: what to write, in the
+words of a recipe.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ _LONG = 1e9  #: limit from which a number is told by its power of ten
 
 
 def message_of(error: ErrorDetails, value: Value) -> str:
-    """Return the sentence for an error of a model, so that the user knows what to write in place of ``value``."""
+    """Return the sentence for an error of a model, so that the user knows what to write in place
+    of ``value``.
+    """
     if error["type"] == "missing" and isinstance(error["loc"][-1], str):
         return f"lacks {error['loc'][-1]}"
     if error["type"] == "extra_forbidden":
@@ -37,19 +41,29 @@ def message_of(error: ErrorDetails, value: Value) -> str:
 
 
 def _in_plain_words(text: str) -> str:
-    """Return the text of an error without the words of a programmer, such as input, tuple and dictionary."""
+    """Return the text of an error without the words of a programmer, such as input, tuple and
+    dictionary.
+    """
     text = re.sub(
-        r"^Input should be (a valid |valid )?", lambda m: "must be a " if m[1] == "a valid " else "must be ", text
+        r"^Input should be (a valid |valid )?",
+        lambda m: "must be a " if m[1] == "a valid " else "must be ",
+        text,
     )
     text = re.sub(r"^must be a (?=[aeiou])", "must be an ", text)
-    text = text.replace("must be a tuple", "must be a list, such as [1, 2]").replace("a dictionary", "a mapping")
-    text = text.replace("must be an integer, got a number with a fractional part", "must be a whole number")
+    text = text.replace("must be a tuple", "must be a list, such as [1, 2]").replace(
+        "a dictionary", "a mapping"
+    )
+    text = text.replace(
+        "must be an integer, got a number with a fractional part", "must be a whole number"
+    )
     text = re.sub(r"must be an integer, unable to parse .*", "must be a whole number", text)
     return re.sub(r"must be a number, unable to parse .*", "must be a number", text)
 
 
 def _limit_in_unit(error: ErrorDetails, value: Value) -> str:
-    """Return the sentence for a limit of a quantity in a unit that a reader would use, or "" for any other error."""
+    """Return the sentence for a limit of a quantity in a unit that a reader would use, or "" for
+    any other error.
+    """
     name = next((name for name in _LIMITS if name in error.get("ctx", {})), None)
     if name is None:
         return ""

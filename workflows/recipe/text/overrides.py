@@ -1,24 +1,47 @@
-"""Overrides of a recipe by arguments: ``a.b=1`` changes a value, ``+a.b=1`` adds a value, ``~a.b`` removes a value."""
+"""Overrides of a recipe, by arguments such as a.b=1 and by values of Python."""
 
 from __future__ import annotations
 
 import difflib
+import os
 import re
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
+from neusee.workflows.graph.final_values import flow
 from neusee.workflows.recipe.text.renamed_keys import instead
-from neusee.workflows.recipe.text.yaml_values import Value, parse
+from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted, parse
+
+# --- overrides ------------------------------------------------------------------------------------
+
+# Overrides of a recipe by arguments: ``a.b=1`` changes a value, ``+a.b=1`` adds a value, ``~a.b``
+# removes a value.
+
 
 #: recipe keys that are not blocks of parameters
-_WHOLE = {"steps", "seed", "tolerance", "estimates", "outputs", "exports", "expect", "posterior", "nodes"}
+_WHOLE = {
+    "steps",
+    "seed",
+    "tolerance",
+    "estimates",
+    "outputs",
+    "exports",
+    "expect",
+    "posterior",
+    "nodes",
+}
 RESERVED = frozenset(_WHOLE | {"safety", "traceability"})
-_OPEN = ("expect", "posterior", "safety", "traceability")  #: keys below which an override may set a missing path
+#: keys below which an override may set a missing path
+_OPEN = ("expect", "posterior", "safety", "traceability")
 
 Trail = list[tuple[Value, str | int]]  #: values along a path, each with the key of the next value
 
-_SYNTAX = re.compile(r"(?P<sign>[+~]?)(?P<path>[^\s=+~.]+(?:\.[^\s=.]+)*)(?:=(?P<value>.*))?", re.DOTALL)
+_SYNTAX = re.compile(
+    r"(?P<sign>[+~]?)(?P<path>[^\s=+~.]+(?:\.[^\s=.]+)*)(?:=(?P<value>.*))?", re.DOTALL
+)
 _HELP = "is not an override: write path=value, +path=value, ~path or group=option"
 
 
@@ -34,27 +57,47 @@ class Override:
 
 
 def read_override(text: str, mark: Location) -> Override:
-    """Return the override in an argument such as ``a.b=1``; read its value as YAML: ``20 e-`` is a string."""
+    """Return the override in an argument such as ``a.b=1``; read its value as YAML: ``20 e-`` is
+    a string.
+    """
     match = _SYNTAX.fullmatch(text)
     if match is None:
         raise RecipeError([Diagnostic(mark, text, _HELP)])
     sign, path, value = match["sign"], tuple(match["path"].split(".")), match["value"]
     if sign == "~":
         if value is not None:
-            raise RecipeError([Diagnostic(mark, text, f"~ removes a value and cannot set one: write ~{match['path']}")])
+            raise RecipeError(
+                [
+                    Diagnostic(
+                        mark, text, f"~ removes a value and cannot set one: write ~{match['path']}"
+                    )
+                ]
+            )
         return Override(text, sign, path, None, mark)
     if value is None:
-        raise RecipeError([Diagnostic(mark, text, f"the argument has no value: write {text}=VALUE")])
+        raise RecipeError(
+            [Diagnostic(mark, text, f"the argument has no value: write {text}=VALUE")]
+        )
     if not value.strip():
-        raise RecipeError([Diagnostic(mark, text, f"the value is empty: write {text}VALUE, or {text}null for none")])
+        raise RecipeError(
+            [
+                Diagnostic(
+                    mark, text, f"the value is empty: write {text}VALUE, or {text}null for none"
+                )
+            ]
+        )
     try:
         return Override(text, sign, path, parse(value, mark, path), mark)
     except RecipeError as error:
         raise RecipeError([Diagnostic(mark, text, p.message) for p in error.diagnostics]) from None
 
 
-def apply(root: Value, override: Override, diagnostics: list[Diagnostic], groups: Iterable[str] = ()) -> Value:
-    """Return a recipe after an override; for a mistake, add a diagnostic and return the recipe unchanged."""
+def apply(
+    root: Value, override: Override, diagnostics: list[Diagnostic], groups: Iterable[str] = ()
+) -> Value:
+    """Return a recipe after an override; for a mistake, add a diagnostic and return the recipe
+    unchanged.
+    """
     trail, missing = _follow(root, override.path)
     fault = _fault(root, override, trail, missing, groups)
     if fault:
@@ -64,20 +107,26 @@ def apply(root: Value, override: Override, diagnostics: list[Diagnostic], groups
 
 
 def _follow(root: Value, path: tuple[str, ...]) -> tuple[Trail, tuple[str, ...]]:
-    """Return the recipe values along a path with their keys, and the part of the path that does not exist."""
+    """Return the recipe values along a path with their keys, and the part of the path that does
+    not exist.
+    """
     trail: Trail = []
     here = root
-    for n, part in enumerate(path):
+    for n, name in enumerate(path):
         items = here.items
-        key: str | int = int(part) if part not in items and part.isdecimal() and int(part) in items else part
+        key: str | int = (
+            int(name) if name not in items and name.isdecimal() and int(name) in items else name
+        )
         if key not in items:
-            return [*trail, (here, part)], path[n:]
+            return [*trail, (here, name)], path[n:]
         trail.append((here, key))
         here = items[key]
     return trail, ()
 
 
-def _fault(root: Value, o: Override, trail: Trail, missing: tuple[str, ...], groups: Iterable[str]) -> str | None:
+def _fault(
+    root: Value, o: Override, trail: Trail, missing: tuple[str, ...], groups: Iterable[str]
+) -> str | None:
     """Return the message for an invalid override of a recipe, or None for a valid override."""
     here = trail[-1][0]
     if not missing:
@@ -87,12 +136,18 @@ def _fault(root: Value, o: Override, trail: Trail, missing: tuple[str, ...], gro
             return None
         return f"{here.name} has {len(here.data)} values: 0 to {len(here.data) - 1}"
     if o.sign == "+" or (o.sign == "" and _implied(root, o.path)):
-        return None if isinstance(here.data, dict | None) else f"{here.name} is a single value, not a mapping"
+        return (
+            None
+            if isinstance(here.data, dict | None)
+            else f"{here.name} is a single value, not a mapping"
+        )
     return instead(".".join(o.path)) or f"unknown; {_suggest(root, o.path, groups)}"
 
 
 def _implied(root: Value, path: tuple[str, ...]) -> bool:
-    """Return True if an override may set a missing path without a ``+``, as for a global key or a key of a step."""
+    """Return True if an override may set a missing path without a ``+``, as for a global key or
+    a key of a step.
+    """
     if path[0] != "steps":
         return path[0] in RESERVED and (len(path) == 1 or path[0] in _OPEN)
     steps = root.items.get("steps")
@@ -100,11 +155,13 @@ def _implied(root: Value, path: tuple[str, ...]) -> bool:
 
 
 def _suggest(root: Value, path: tuple[str, ...], groups: Iterable[str]) -> str:
-    """Return a hint with the most similar path in the recipe, because an unknown path is often a typing error."""
+    """Return a hint with the most similar path in the recipe, because an unknown path is often a
+    typing error.
+    """
     here, similar = root, list[str]()
-    for part in path:
+    for name in path:
         names = {*map(str, here.items), *((*RESERVED, *groups) if here is root else ())}
-        close = difflib.get_close_matches(part, names, 1)
+        close = difflib.get_close_matches(name, names, 1)
         if not close:
             break
         similar += close
@@ -112,39 +169,176 @@ def _suggest(root: Value, path: tuple[str, ...], groups: Iterable[str]) -> str:
     if len(similar) == len(path):
         return f"did you mean {'.'.join(similar)}?"
     leaves = [leaf for leaf in root.leaves() if leaf.path[0] not in RESERVED]
-    same = {leaf.name for leaf in leaves if difflib.get_close_matches(path[-1], [str(leaf.path[-1])], 1, 0.75)}
+    same = {
+        leaf.name
+        for leaf in leaves
+        if difflib.get_close_matches(path[-1], [str(leaf.path[-1])], 1, 0.75)
+    }
     if same:
         return f"did you mean {' or '.join(sorted(same)[:3])}?"
     return f"{here.name or 'the recipe'} has {', '.join(map(str, here.items)) or 'no such value'}"
 
 
 def _rebuild(trail: Trail, missing: tuple[str, ...], o: Override) -> Value:
-    """Return the recipe after an override; each value along the path is rebuilt, from the innermost value outwards."""
+    """Return the recipe after an override; each value along the path is rebuilt, from the
+    innermost value outwards.
+    """
     value = _parsed_again(trail, missing, o)
     for n in range(len(missing) - 1, 0, -1):
         assert value is not None
-        value = Value({_key(missing[n]): value}, o.mark, o.mark, o.path[: len(o.path) - len(missing) + n])
+        value = Value(
+            {_key(missing[n]): value}, o.mark, o.mark, o.path[: len(o.path) - len(missing) + n]
+        )
     for here, key in reversed(trail):
         key = _key(key) if missing and here is trail[-1][0] else key
-        value = Value({key: value}, o.mark, here.key, here.path) if here.data is None else here.replaced(key, value)
+        value = (
+            Value({key: value}, o.mark, here.key, here.path)
+            if here.data is None
+            else here.replaced(key, value)
+        )
     assert value is not None
     return value
 
 
 def _parsed_again(trail: Trail, missing: tuple[str, ...], o: Override) -> Value | None:
-    """Return the value of an override; parse the value again if the path of the override has integer keys."""
+    """Return the value of an override; parse the value again if the path of the override has
+    integer keys.
+    """
     keys = tuple(key for _, key in trail)
     path = (*keys[:-1], *map(_key, missing)) if missing else keys
-    return o.value if o.value is None or path == o.path else parse(o.text.partition("=")[2], o.mark, path)
+    return (
+        o.value
+        if o.value is None or path == o.path
+        else parse(o.text.partition("=")[2], o.mark, path)
+    )
 
 
-def _key(part: str | int) -> str | int:
-    return int(part) if isinstance(part, str) and part.isdecimal() else part
+def _key(name: str | int) -> str | int:
+    return int(name) if isinstance(name, str) and name.isdecimal() else name
 
 
 def arguments_in(value: Value) -> Iterator[Location]:
-    """Yield the location of each argument that changed a value within a list or a mapping of a recipe."""
+    """Yield the location of each argument that changed a value within a list or a mapping of a
+    recipe.
+    """
     for child in value.items.values():
         if not child.mark.line:
             yield child.mark
         yield from arguments_in(child)
+
+
+# --- python overrides -----------------------------------------------------------------------------
+
+# Overrides of a recipe by Python values: ``sensor={"read_noise": "20 e-"}`` means
+# ``sensor.read_noise=20 e-``.
+#
+# A mapping changes only the values that it names, but an empty mapping or a step with ``node``
+# replaces the whole value. A string is not read as YAML.
+
+
+_ALLOWED = "give a number, a string, True or False, None, a list or a mapping"
+_LONGEST = 40  #: largest number of characters of a value in a message
+
+
+def overrides_of(values: Mapping[str, Any], folder: Path) -> list[Override]:
+    """Return the overrides that keyword arguments contain; raise one `RecipeError` for all
+    invalid values.
+    """
+    overrides: list[Override] = []
+    diagnostics: list[Diagnostic] = []
+    for key, value in values.items():
+        mark = Location(f"argument {key}", folder=str(folder))
+        try:
+            overrides += _read(key, value, mark)
+        except RecipeError as error:
+            diagnostics += error.diagnostics
+    if diagnostics:
+        raise RecipeError(diagnostics)
+    return overrides
+
+
+def _read(key: str, argument: Any, mark: Location) -> Iterator[Override]:
+    """Yield the overrides that one keyword argument contains: one override for each value in a
+    mapping.
+    """
+    named = _named(key, argument, mark)
+    if named.sign:
+        yield named if named.sign == "~" else _override(named, named.path, argument)
+        return
+    stack = [(named.path, argument)]
+    while stack:
+        path, value = stack.pop()
+        if isinstance(value, Mapping) and value and not _whole_step(path, value):
+            stack += [
+                ((*path, str(_python_key(name, mark, path))), below)
+                for name, below in reversed(list(value.items()))
+            ]
+        else:
+            yield _override(named, path, value)
+
+
+def _named(key: str, argument: Any, mark: Location) -> Override:
+    """Return the override that the name of a keyword argument says, without its value."""
+    if key.startswith("~") and argument is not None:
+        raise RecipeError(
+            [
+                Diagnostic(
+                    mark, key, f"~ removes a value and cannot set one: write {{{key!r}: None}}"
+                )
+            ]
+        )
+    try:
+        return read_override(key if key.startswith("~") else f"{key}=null", mark)
+    except RecipeError as error:
+        raise RecipeError([Diagnostic(mark, key, p.message) for p in error.diagnostics]) from None
+
+
+def _whole_step(path: tuple[str, ...], value: Mapping[Any, Any]) -> bool:
+    return len(path) == 2 and path[0] == "steps" and "node" in value
+
+
+def _override(named: Override, path: tuple[str, ...], argument: Any) -> Override:
+    name = ".".join(path)
+    mark = named.mark if path == named.path else replace(named.mark, file=f"argument {name}")
+    value = _value(argument, mark, path)
+    shown = flow(value.plain)
+    shown = shown if len(shown) <= _LONGEST else shown[: _LONGEST - 1] + "…"
+    return Override(f"{named.sign}{name}={shown}", named.sign, path, value, mark)
+
+
+def _value(argument: Any, mark: Location, path: Where) -> Value:
+    """Return a recipe `Value` with the data of a Python value and the location of the argument
+    that contains it.
+    """
+    if isinstance(argument, Mapping):
+        data = {
+            _python_key(key, mark, path): _value(item, mark, (*path, str(key)))
+            for key, item in argument.items()
+        }
+        return Value(data, mark, mark, path)
+    if isinstance(argument, list | tuple | range):
+        return Value(
+            [_value(item, mark, (*path, i)) for i, item in enumerate(argument)], mark, mark, path
+        )
+    if isinstance(argument, os.PathLike):
+        return Value(os.fspath(argument), mark, mark, path)
+    if argument is None or isinstance(argument, bool | int | float | str):
+        return Value(argument, mark, mark, path)
+    # a number or an array of numpy or torch
+    listed = argument.tolist() if hasattr(argument, "tolist") else argument
+    if not isinstance(listed, bool | int | float | str | list):
+        message = f"a recipe cannot contain a value of type {type(argument).__name__}: {_ALLOWED}"
+        raise RecipeError([Diagnostic(mark, dotted(path), message)])
+    return _value(listed, mark, path)
+
+
+def _python_key(key: Any, mark: Location, path: Where) -> str | int:
+    if isinstance(key, str | int) and not isinstance(key, bool) and key != "":
+        return key
+    raise RecipeError(
+        [
+            Diagnostic(
+                mark, dotted(path), f"a mapping's key must be a name or an integer, not {key!r}"
+            )
+        ]
+    )

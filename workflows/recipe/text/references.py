@@ -1,4 +1,6 @@
-"""References such as ``${sensor.gain}``, by which a value of a recipe copies another value of the recipe."""
+"""References such as ``${sensor.gain}``, by which a value of a recipe copies another value of
+the recipe.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from neusee.workflows.graph.diagnostics import UNREAD, Diagnostic
-from neusee.workflows.recipe.text.option_groups import packaged
+from neusee.workflows.recipe.text.composition import packaged
 from neusee.workflows.recipe.text.overrides import RESERVED
 from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
@@ -19,17 +21,23 @@ _REFERENCE = re.compile(r"\$\{([^${}]*)\}")
 _DEEPEST = 50  #: longest chain of references
 _MOST_VALUES = 100_000  #: values to which references may expand one value
 _MOST_CHARACTERS = 100_000  #: characters to which references may expand one text
+#: what to do about a block that lacks values, in a recipe and in an option of the user
+_ADVICE_IN_RECIPE = "give them, or name an option that has them in `defaults`"
+_ADVICE_IN_OPTION = "extend an option that has them, such as `defaults: [small]`"
 
 
 @dataclass(frozen=True, slots=True)
 class Scope:
-    """The items, such as a laser, of one copy of a step; ``${item.x}`` and ``${each.lasers.x}`` refer to them."""
+    """The items, such as a laser, of one copy of a step; ``${item.x}`` and ``${each.lasers.x}``
+    refer to them.
+    """
 
     items: Mapping[str, Value]  #: by the name of the list of items
     step: str
 
     def find(self, parts: list[str]) -> tuple[Value | None, list[str], str]:
-        """Return the item to which a reference such as ``${item.x}`` refers, and the path below the item.
+        """Return the item to which a reference such as ``${item.x}`` refers, and the path below the
+        item.
 
         If no item fits, return None, an empty path and a message.
         """
@@ -40,37 +48,51 @@ class Scope:
             return self.items[parts[1]], parts[2:], ""
         if not dims:
             return None, [], f"${{{'.'.join(parts)}}} needs `each` in steps.{self.step}"
-        rest = "".join(f".{part}" for part in parts[1 if parts[0] == "item" else 2 :])
-        return None, [], f"write {' or '.join(f'${{each.{dim}{rest}}}' for dim in dims)}"
+        below = "".join(f".{name}" for name in parts[1 if parts[0] == "item" else 2 :])
+        return None, [], f"write {' or '.join(f'${{each.{dim}{below}}}' for dim in dims)}"
 
 
 class References:
     """Resolver of the references in a recipe, with a record of the values that the steps use."""
 
-    def __init__(self, root: Value, diagnostics: list[Diagnostic], replaced: Mapping[Where, str] | None = None) -> None:
+    def __init__(
+        self,
+        root: Value,
+        diagnostics: list[Diagnostic],
+        replaced: Mapping[Where, str] | None = None,
+    ) -> None:
         self.root, self.diagnostics = root, diagnostics
-        self.replaced = replaced or {}  #: the argument that replaced an option, by the path of a value of the option
+        #: the argument that replaced an option, by the path of a value of the option
+        self.replaced = replaced or {}
         self.notes: list[str] = []  #: on values of the user's recipe that the arguments make unused
         self.used: set[Where] = set()
         self.known: dict[Where, Value] = {}  #: resolved values
-        self.trace: list[tuple[Where, Value | None]] = []  #: each path that was looked up, with the value there
+        #: each path that was looked up, with the value there
+        self.trace: list[tuple[Where, Value | None]] = []
         self._traces: dict[Where, list[tuple[Where, Value | None]]] = {}  #: by resolved value
         self.open: list[Where] = []  #: values that are being resolved
         self.lacking: list[tuple[Where, Diagnostic]] = []  #: targets that do not exist
         self.spare: set[Where] = set()  #: unused values of packaged options
-        self.offered: set[Where] = set()  #: values to which an optional reference refers and that nobody gave
+        #: values to which an optional reference refers and that nobody gave
+        self.offered: set[Where] = set()
         self.followed = 0  #: references followed since the last value of a step was begun
-        self.weights: dict[int, tuple[int, Any]] = {}  #: number of values in each list or mapping, by identity
+        #: number of values in each list or mapping, by identity
+        self.weights: dict[int, tuple[int, Any]] = {}
 
     def resolve(self, value: Value, scope: Scope) -> Value:
-        """Return a recipe value with its references resolved; report a failed reference and return `BROKEN` for it.
+        """Return a recipe value with its references resolved; report a failed reference and return
+        `BROKEN` for it.
 
-        An optional reference, ``${scene.illuminance?}``, leaves its key out of the mapping if the value does not exist.
+        An optional reference, ``${scene.illuminance?}``, leaves its key out of the mapping if the
+        value does not exist.
         """
         if isinstance(value.data, dict):
-            children = [(key, child, self.resolve(child, scope)) for key, child in value.data.items()]
-            kept = [each for each in children if each[2].data is not ABSENT]
-            return replace(value, data={key: replace(resolved, key=child.key) for key, child, resolved in kept})
+            data = {}
+            for key, child in value.data.items():
+                resolved = self.resolve(child, scope)
+                if resolved.data is not ABSENT:
+                    data[key] = replace(resolved, key=child.key)
+            return replace(value, data=data)
         if isinstance(value.data, list):
             items = (self.resolve(child, scope) for child in value.data)
             return replace(value, data=[item for item in items if item.data is not ABSENT])
@@ -79,7 +101,9 @@ class References:
         return self._text(value, scope)
 
     def _text(self, value: Value, scope: Scope) -> Value:
-        """Return a string of a recipe with its references resolved, beginning with the innermost reference."""
+        """Return a string of a recipe with its references resolved, beginning with the innermost
+        reference.
+        """
         text = value.data
         while match := _REFERENCE.search(text):
             target = self._target(match[1], value, scope)
@@ -88,16 +112,24 @@ class References:
             if match[0] == text:
                 return target
             if target.data is ABSENT:
-                return self._fail(value, f"the optional reference ${{{match[1]}}} must be the whole value")
+                return self._fail(
+                    value, f"the optional reference ${{{match[1]}}} must be the whole value"
+                )
             if target.data is BROKEN:
                 return target
             if isinstance(target.data, dict | list):
-                return self._fail(value, f"${{{match[1]}}} is a list or a mapping: it cannot be part of a string")
+                return self._fail(
+                    value, f"${{{match[1]}}} is a list or a mapping: it cannot be part of a string"
+                )
             text = text[: match.start()] + _pasted(target.data) + text[match.end() :]
             if len(text) > _MOST_CHARACTERS:
-                return self._fail(value, f"references expand this text to more than {_MOST_CHARACTERS} characters")
+                return self._fail(
+                    value, f"references expand this text to more than {_MOST_CHARACTERS} characters"
+                )
         if "${" in text:
-            return self._fail(value, "the reference is incomplete: write a reference as ${block.name}")
+            return self._fail(
+                value, "the reference is incomplete: write a reference as ${block.name}"
+            )
         return replace(value, data=text)
 
     def _target(self, text: str, origin: Value, scope: Scope) -> Value | None:
@@ -121,7 +153,9 @@ class References:
         return self._followed(target, scope, origin)
 
     def _followed(self, target: Value, scope: Scope, origin: Value) -> Value | None:
-        """Return the target value of a reference, with its own references resolved; report a cycle of references."""
+        """Return the target value of a reference, with its own references resolved; report a
+        cycle of references.
+        """
         if target.path in self.known:
             self.trace += self._traces[target.path]
             return self.known[target.path]
@@ -138,28 +172,38 @@ class References:
             return None
         self.open.append(target.path)
         first = len(self.trace)
-        value = self.resolve(target, scope if target.path[0] == "steps" else Scope({}, dotted(target.path)))
+        value = self.resolve(
+            target, scope if target.path[0] == "steps" else Scope({}, dotted(target.path))
+        )
         self.open.pop()
         if self._weight(value) > _MOST_VALUES:
-            value = self._fail(target, f"references expand this value to more than {_MOST_VALUES} values")
+            value = self._fail(
+                target, f"references expand this value to more than {_MOST_VALUES} values"
+            )
         elif any(child.data is BROKEN for child in value.items.values()):
             value = replace(value, data=BROKEN)
         if target.path[0] != "steps":
-            self.trace[first:] = dict(self.trace[first:]).items()  # each once: nested lists would grow it
+            # each once: nested lists would grow it
+            self.trace[first:] = dict(self.trace[first:]).items()
             self.known[target.path], self._traces[target.path] = value, self.trace[first:]
         return value
 
     def _weight(self, value: Value) -> int:
-        """Return the number of values in a resolved value, in which references may repeat the same list many times."""
+        """Return the number of values in a resolved value, in which references may repeat the
+        same list many times.
+        """
         if not isinstance(value.data, dict | list):
             return 1
         if id(value.data) not in self.weights:
             weight = 1 + sum(map(self._weight, value.items.values()))
-            self.weights[id(value.data)] = weight, value.data  # kept alive, so that its identity stays its own
+            # kept alive, so that its identity stays its own
+            self.weights[id(value.data)] = weight, value.data
         return self.weights[id(value.data)][0]
 
     def _missing(self, start: Value, parts: list[str], origin: Value, scope: Scope) -> None:
-        """Report a reference to a missing value: at the item if other items have the value, else at the reference."""
+        """Report a reference to a missing value: at the item if other items have the value, else
+        at the reference.
+        """
         path = (*start.path, *parts)
         name = dotted(path)
         siblings = self.root.items[str(start.path[0])].items.values() if start.path else ()
@@ -167,7 +211,9 @@ class References:
             message = f"has no {'.'.join(parts)}; steps.{scope.step} needs this value"
             self.lacking.append((path, Diagnostic(start.key, start.name, message)))
             return
-        near = _nearest(path, {leaf.path for leaf in self.root.leaves() if leaf.path[0] not in RESERVED})
+        near = _nearest(
+            path, {leaf.path for leaf in self.root.leaves() if leaf.path[0] not in RESERVED}
+        )
         hint = f" is unknown; did you mean {dotted(near)}?" if near else " is unknown"
         if now := instead(name):
             hint = f": {now}" if new_name(name) is None else f" {now}"
@@ -180,80 +226,110 @@ class References:
         return replace(origin, data=BROKEN)
 
     def touch(self, value: Value, dims: Sequence[str]) -> None:
-        """Mark the values to which a step without copies refers as used, so that they are not reported as unused."""
+        """Mark the values to which a step without copies refers as used, so that they are not
+        reported as unused.
+        """
         for text in _texts(value):
             for match in _REFERENCE.finditer(text.data):
                 parts = match[1].strip().removesuffix("?").split(".")
                 if parts[0] not in ("item", "each"):
                     self._target(match[1], text, Scope({}, ""))
                     continue
-                rest = parts[1 if parts[0] == "item" else 2 :]
+                below = parts[1 if parts[0] == "item" else 2 :]
                 blocks = ((dim, self.root.items[dim].items) for dim in dims or self.root.items)
-                self.used |= {(dim, name, *rest) for dim, block in blocks for name in block}
+                self.used |= {(dim, name, *below) for dim, block in blocks for name in block}
 
     def finish(self) -> None:
-        """Report values of the recipe that no step uses, and references to values that do not exist.
+        """Report values of the recipe that no step uses, and references to values that do not
+        exist.
 
-        An unused value with a name similar to a missing target is one mistake. A packaged option may set more values
-        than a recipe uses: a camera needs the pixel pitch, a bench does not.
+        An unused value with a name similar to a missing target is one mistake. A packaged option
+        may set more values than a recipe uses: a camera needs the pixel pitch, a bench does not.
         """
         targets = dict(self.lacking)
         misspelt = set()
         for leaf in self._unused():
             meant = self._meant(leaf) or ()
-            if _is_packaged(leaf) and meant not in targets:
+            if meant not in targets and self._may_be_unused(leaf):
                 self.spare.add(leaf.path)
-                continue
-            if leaf.path in self.replaced and meant not in targets and leaf.mark.line and leaf.key.line:
-                self.spare.add(leaf.path)
-                self.notes.append(f"{leaf.name} ({leaf.mark}) is not used with {self.replaced[leaf.path]}")
                 continue
             misspelt.add(meant)
-            if now := instead(leaf.name):
-                self.diagnostics.append(Diagnostic(leaf.key, leaf.name, now))
-                continue
-            shown = dotted(meant[-1:] if meant[:-1] == leaf.path[:-1] else meant)
-            hint = f"; did you mean {shown}?" if shown else ": no step refers to this value"
-            user = f" (needed at {targets[meant].mark})" if meant in targets else ""
-            code = "" if shown else UNREAD
-            self.diagnostics.append(Diagnostic(leaf.key, leaf.name, f"unknown{hint}{user}", code))
+            self.diagnostics.append(_unknown(leaf, meant, targets.get(meant)))
         lacking = [(path, problem) for path, problem in self.lacking if path not in misspelt]
-        whole = dict(self._incomplete({path for path, _ in lacking}))
-        self.diagnostics += whole.values()
-        self.diagnostics += [problem for path, problem in lacking if path[0] not in whole or len(path) != 2]
+        incomplete = dict(self._incomplete({path for path, _ in lacking}))
+        self.diagnostics += incomplete.values()
+        self.diagnostics += [
+            problem for path, problem in lacking if path[0] not in incomplete or len(path) != 2
+        ]
+
+    def _may_be_unused(self, leaf: Value) -> bool:
+        """Return True for a value of a packaged option, and for one of an option that an argument
+        replaces, which is noted.
+        """
+        if _is_packaged(leaf):
+            return True
+        if leaf.path not in self.replaced or not leaf.mark.line or not leaf.key.line:
+            return False
+        self.notes.append(f"{leaf.name} ({leaf.mark}) is not used with {self.replaced[leaf.path]}")
+        return True
 
     def _incomplete(self, lacking: set[Where]) -> Iterator[tuple[str | int, Diagnostic]]:
-        """Yield one diagnostic for each block of the user that lacks values, at the block instead of at each step."""
+        """Yield one diagnostic for each block of the user that lacks values, at the block
+        instead of at each step.
+        """
         for key in dict.fromkeys(path[0] for path in sorted(lacking, key=str)):
             block = self.root.items.get(str(key))
-            paths = sorted(dotted(path[1:]) for path in lacking if path[0] == key and len(path) == 2)
-            if block is None or not block.mark.line or _place(block) == "packaged" or not isinstance(block.data, dict):
+            paths = sorted(
+                dotted(path[1:]) for path in lacking if path[0] == key and len(path) == 2
+            )
+            if block is None or not block.mark.line or not isinstance(block.data, dict):
                 continue
-            if len(paths) < (3 if _place(block) == "recipe" else 1):
+            place = _place(block)
+            if place == "packaged" or len(paths) < (3 if place == "recipe" else 1):
                 continue
             names = ", ".join(paths[:6]) + (f" and {len(paths) - 6} more" if len(paths) > 6 else "")
-            needs = f"lacks {names}, which steps need"
-            how = "extend an option that has them, such as `defaults: [small]`"
-            if _place(block) == "recipe":
-                how = "give them, or name an option that has them in `defaults`"
-            yield key, Diagnostic(block.key, str(key), f"{needs}: {how}")
+            advice = _ADVICE_IN_RECIPE if place == "recipe" else _ADVICE_IN_OPTION
+            yield (
+                key,
+                Diagnostic(block.key, str(key), f"lacks {names}, which steps need: {advice}"),
+            )
 
     def _unused(self) -> list[Value]:
         blocks = (block for key, block in self.root.items.items() if key not in RESERVED)
         leaves = (leaf for block in blocks for leaf in block.leaves() if leaf.data != {})
-        return [v for v in leaves if not any(v.path[:n] in self.used for n in range(1, len(v.path) + 1))]
+        return [
+            v for v in leaves if not any(v.path[:n] in self.used for n in range(1, len(v.path) + 1))
+        ]
 
     def _meant(self, leaf: Value) -> Where | None:
-        """Return the path that a user probably meant by an unused path: its new name, or a similar path in use."""
+        """Return the path that a user probably meant by an unused path: its new name, or a
+        similar path in use.
+        """
         if now := new_name(leaf.name):
             return tuple(now.split("."))
-        known = {*self.used, *self.offered, *(path for path, _ in self.lacking)}
-        known |= {(name,) for name in (*RESERVED, "defaults")} if len(leaf.path) == 1 else set()
-        return _nearest(leaf.path, known)
+        candidates = {*self.used, *self.offered, *(path for path, _ in self.lacking)}
+        candidates |= (
+            {(name,) for name in (*RESERVED, "defaults")} if len(leaf.path) == 1 else set()
+        )
+        return _nearest(leaf.path, candidates)
+
+
+def _unknown(leaf: Value, meant: Where, needed: Diagnostic | None) -> Diagnostic:
+    """Return the diagnostic for a value that no step uses; ``needed`` is the one of a missing value
+    that the user probably ``meant``.
+    """
+    if now := instead(leaf.name):
+        return Diagnostic(leaf.key, leaf.name, now)
+    shown = dotted(meant[-1:] if meant[:-1] == leaf.path[:-1] else meant)
+    hint = f"; did you mean {shown}?" if shown else ": no step refers to this value"
+    user = f" (needed at {needed.mark})" if needed else ""
+    return Diagnostic(leaf.key, leaf.name, f"unknown{hint}{user}", "" if shown else UNREAD)
 
 
 def _place(block: Value) -> Literal["packaged", "option", "recipe"]:
-    """Return where a block of a recipe is from: a packaged file, an option of a group of the user, or his recipe."""
+    """Return where a block of a recipe is from: a packaged file, an option of a group of the
+    user, or his recipe.
+    """
     folder = Path(block.mark.folder)
     if packaged() in (folder, folder.parent):
         return "packaged"
@@ -261,14 +337,18 @@ def _place(block: Value) -> Literal["packaged", "option", "recipe"]:
 
 
 def _is_packaged(leaf: Value) -> bool:
-    """Return True if a value comes from a packaged option of a group, and not from a user's recipe or an argument."""
+    """Return True if a value comes from a packaged option of a group, and not from a user's
+    recipe or an argument.
+    """
     return leaf.key.line > 0 and leaf.mark.line > 0 and Path(leaf.mark.folder).parent == packaged()
 
 
-def _nearest(path: Where, known: set[Where]) -> Where | None:
-    """Return the path in ``known`` with the last name most similar to that of ``path``, if possible in its block."""
-    paths_by_name = {str(other[-1]): other for other in sorted(known, key=str)}
-    beside = {str(other[-1]): other for other in known if other[:-1] == path[:-1]}
+def _nearest(path: Where, candidates: set[Where]) -> Where | None:
+    """Return the path in ``candidates`` with the last name most similar to that of ``path``, if
+    possible in its block.
+    """
+    paths_by_name = {str(other[-1]): other for other in sorted(candidates, key=str)}
+    beside = {str(other[-1]): other for other in candidates if other[:-1] == path[:-1]}
     for paths in (beside, paths_by_name):
         close = difflib.get_close_matches(str(path[-1]), paths, 1, 0.75)
         if close:
@@ -276,12 +356,20 @@ def _nearest(path: Where, known: set[Where]) -> Where | None:
     return None
 
 
-BROKEN = type("Broken", (), {"__repr__": lambda self: "?", "__doc__": "Value of a failed reference."})()
-ABSENT = type("Absent", (), {"__repr__": lambda self: "-", "__doc__": "Value of an optional reference to nothing."})()
+BROKEN = type(
+    "Broken", (), {"__repr__": lambda self: "?", "__doc__": "Value of a failed reference."}
+)()
+ABSENT = type(
+    "Absent",
+    (),
+    {"__repr__": lambda self: "-", "__doc__": "Value of an optional reference to nothing."},
+)()
 
 
 def broken(value: Value) -> bool:
-    """Return True if a value of a recipe, or a value within it, is `BROKEN` because a reference failed."""
+    """Return True if a value of a recipe, or a value within it, is `BROKEN` because a reference
+    failed.
+    """
     return value.data is BROKEN or any(map(broken, value.items.values()))
 
 

@@ -1,4 +1,6 @@
-"""Table of renamed recipe keys, nodes and parameters, with which messages give the new name for an old one."""
+"""Table of renamed recipe keys, nodes and parameters, with which messages give the new name for
+an old one.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +8,17 @@ import tomllib
 from collections.abc import Iterable
 from importlib import resources
 
-_TABLE = tomllib.loads(resources.files(__package__).joinpath("renamed_keys.toml").read_text(encoding="utf-8"))
+_TABLE = tomllib.loads(
+    resources.files(__package__).joinpath("renamed_keys.toml").read_text(encoding="utf-8")
+)
 _CALLED: dict[str, str] = _TABLE["called"]
 _GRID, _ON_A_GRID = _TABLE["pupil_grid"]["parameters"], _TABLE["pupil_grid"]["nodes"]
 _REMOVED: dict[str, str] = {
     **{f"{node}.{name}": _TABLE["pupil_grid"]["instead"] for node in _ON_A_GRID for name in _GRID},
     **_TABLE["removed"],
 }
-POSTERIOR_NAMES: dict[str, str] = _TABLE["posterior"]  #: present name by that of version 0.1, of a parameter
+#: present name by that of version 0.1, of a parameter
+POSTERIOR_NAMES: dict[str, str] = _TABLE["posterior"]
 
 
 def new_name(old: str) -> str | None:
@@ -26,14 +31,18 @@ def new_name(old: str) -> str | None:
 
 
 def instead(old: str) -> str:
-    """Return a message that says what to write instead of an old recipe path, or an empty text for any other path."""
+    """Return a message that says what to write instead of an old recipe path, or an empty text
+    for any other path.
+    """
     if now := new_name(old):
         return f"is called {now} now"
     return _REMOVED.get(old, "")
 
 
 def became_input(node: str, parameters: Iterable[str]) -> bool:
-    """Return True if a node's ``parameters`` contain those of the pupil grid, which is now an input of the node."""
+    """Return True if a node's ``parameters`` contain those of the pupil grid, which is now an
+    input of the node.
+    """
     return node in _ON_A_GRID and not set(_GRID).isdisjoint(parameters)
 
 

@@ -1,4 +1,4 @@
-"""Values of YAML 1.2 with their locations: ``1e3`` is a number, ``on`` is a string, and ``010`` is the number ten."""
+"""Values of YAML 1.2 with their locations, and sentences for a text that is not YAML."""
 
 from __future__ import annotations
 
@@ -12,12 +12,229 @@ from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError, YAMLStreamError
+from ruamel.yaml.error import MarkedYAMLError, YAMLError, YAMLStreamError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
+from ruamel.yaml.tokens import ScalarToken
 
 from neusee.workflows.graph.diagnostics import CONTROL, Diagnostic, Location, RecipeError, visible
-from neusee.workflows.keys.regular_file import NotRegular, opened
-from neusee.workflows.recipe.text.yaml_mistakes import YamlMistake, directive_mistake, explained
+from neusee.workflows.keys.sealed_files import NotRegular, opened
+
+# --- yaml mistakes --------------------------------------------------------------------------------
+
+# Sentences and places for a text that is not YAML, where a reader finds the mistake and not where
+# the parser stops.
+
+
+_VERSION = re.compile(r"%YAML\s+(\S+)\s*(#.*)?")
+
+
+@dataclass(frozen=True)
+class YamlMistake:
+    """Place of a mistake in a text, counted from 0, and a sentence with the fix."""
+
+    line: int
+    column: int
+    message: str
+
+
+def directive_mistake(text: str) -> YamlMistake | None:
+    """Return the mistake of a directive before the document, or None; a recipe is YAML 1.2, and has
+    no tags.
+
+    A parser of YAML 1.1 reads ``on`` as true and ``010`` as eight, so that a version is never
+    ignored.
+    """
+    for number, line in enumerate(text.removeprefix("\ufeff").splitlines()):
+        if not line.startswith("%"):
+            if line.strip() and not line.lstrip().startswith("#"):
+                return None
+            continue
+        version = _VERSION.fullmatch(line.rstrip())
+        if version is None:
+            name = line.split()[0]
+            return YamlMistake(
+                number, 0, f"the directive {name} has no meaning in a recipe: remove this line"
+            )
+        if version[1] != "1.2":
+            fix = (
+                "remove this line, and see that the file means the same in YAML 1.2 (on is a word,"
+                " 010 is ten)"
+            )
+            return YamlMistake(
+                number, version.start(1), f"recipes are YAML 1.2, not {version[1]}: {fix}"
+            )
+    return None
+
+
+def explained(error: Exception, text: str) -> YamlMistake:
+    """Return the mistake for an error that the YAML parser raised for a text."""
+    if not isinstance(error, MarkedYAMLError) or not error.problem:
+        return YamlMistake(*_first_control_character(text), "is not YAML: an invalid character")
+    places = (_open_quote, _missing_space, _text_goes_on, _open_bracket)
+    for mistake in (place(error, text) for place in places):
+        if mistake is not None:
+            return mistake
+    line, column = _problem_place(error, text)
+    lines = text.splitlines() or [""]
+    here = lines[min(line, len(lines) - 1)]
+    return YamlMistake(line, column, _sentence(error.problem, here, column))
+
+
+def _problem_place(error: MarkedYAMLError, text: str) -> tuple[int, int]:
+    mark = error.problem_mark
+    return (mark.line, mark.column) if mark else _first_control_character(text)
+
+
+def _open_quote(error: MarkedYAMLError, text: str) -> YamlMistake | None:
+    """Return the mistake of a quote that is not closed in its line, at the place where it opens."""
+    if (
+        "quoted scalar" in str(error.context)
+        and error.context_mark
+        and "end of stream" in str(error.problem)
+    ):
+        return YamlMistake(
+            error.context_mark.line,
+            error.context_mark.column,
+            "a quote opens here and never closes",
+        )
+    stop = _problem_place(error, text)[0]
+    long = [
+        token
+        for token in _tokens(text)
+        if _is_quoted_over_lines(token) and token.end_mark.line <= stop
+    ]
+    if not long or long[-1].end_mark.line != stop:
+        return None
+    start = long[-1].start_mark
+    message = (
+        f"the quote that opens here closes only in line {long[-1].end_mark.line + 1}: close it in"
+        " its line"
+    )
+    return YamlMistake(start.line, start.column, message)
+
+
+def _is_quoted_over_lines(token: Any) -> bool:
+    quoted = isinstance(token, ScalarToken) and token.style in ("'", '"')
+    return quoted and bool(token.end_mark.line > token.start_mark.line)
+
+
+def _tokens(text: str) -> Iterator[Any]:
+    """Yield the tokens of a text up to the first that is no YAML."""
+    try:
+        yield from YAML(typ="safe", pure=True).scan(text)
+    except (YAMLError, YAMLStreamError):
+        return
+
+
+def _missing_space(error: MarkedYAMLError, text: str) -> YamlMistake | None:
+    """Return the mistake of a key without a space behind its colon, or of a line that is neither
+    key nor value.
+    """
+    if "could not find expected ':'" not in str(error.problem) or not error.context_mark:
+        return None
+    return _unfinished_key(text, error.context_mark.line, error.context_mark.column)
+
+
+def _unfinished_key(text: str, line: int, column: int) -> YamlMistake:
+    """Return the mistake of a key at a place that no colon with a space follows."""
+    written = (text.splitlines() or [""])[line][column:].split(" #")[0].strip()
+    key, colon, value = written.partition(":")
+    fix = f"write `{key}: {value}`" if colon and value else "write `key: value`"
+    reason = "needs a space after the colon" if colon and value else "has no colon"
+    return YamlMistake(line, column, f"{_short(written)} {reason}: {fix}")
+
+
+def _text_goes_on(error: MarkedYAMLError, text: str) -> YamlMistake | None:
+    """Return the mistake of a key that YAML reads as more of the text before it, which began on an
+    earlier line.
+
+    The text before is a key without a space behind its colon, such as ``seed:7``, or a value, and
+    then the indent of the later key is wrong.
+    """
+    if "mapping values are not allowed" not in str(error.problem):
+        return None
+    line, column = _problem_place(error, text)
+    before = "\n".join([*text.splitlines()[:line], text.splitlines()[line][:column]])
+    scalars = [token for token in _tokens(before) if isinstance(token, ScalarToken)]
+    if not scalars or scalars[-1].start_mark.line == line:
+        return None
+    start = scalars[-1].start_mark
+    if not text.splitlines()[start.line][: start.column].strip(" -"):
+        return _unfinished_key(text, start.line, start.column)
+    indent = column - len(text.splitlines()[line][:column].lstrip())
+    message = (
+        f"a wrong indent: as it stands, this line is more of the value in line {start.line + 1}"
+    )
+    return YamlMistake(line, indent, message)
+
+
+def _open_bracket(error: MarkedYAMLError, text: str) -> YamlMistake | None:
+    """Return the mistake of a list or mapping in brackets that goes on past its line, where the
+    bracket opens.
+    """
+    mark = error.context_mark
+    if mark is None or not str(error.context).startswith("while parsing a flow"):
+        return None
+    if _problem_place(error, text)[0] == mark.line:
+        return None
+    bracket = (text.splitlines() or [""])[mark.line][mark.column : mark.column + 1]
+    return YamlMistake(
+        mark.line, mark.column, f"the {bracket} that opens here is not closed, or lacks a comma"
+    )
+
+
+def _sentence(problem: str, here: str, column: int) -> str:
+    """Return what to do about a problem of the parser in the line ``here``."""
+    if "\\t" in problem or "\t" in here[: column + 1]:
+        return "a tab: indent YAML with spaces"
+    if re.search(r"[^\"']\$\{", here) and "expected" in problem:
+        return 'inside { } or [ ], quote a reference: "${…}"'
+    if re.search(r"\[[^\]]*\w\[", here) and "'['" in problem:
+        return 'inside [ ], quote a name with brackets: "psf[mask]"'
+    if "mapping values are not allowed" in problem:
+        return "a second ':' on this line, or a wrong indent: quote the text, or begin a new line"
+    if "but found another document" in problem:
+        return "a second document (---): a recipe must be a single document"
+    if "cannot start any token" in problem:
+        return f"a text cannot begin with {here[column : column + 1]}: quote the text"
+    if "expected '<document start>'" in problem:
+        return "a line --- must follow %YAML: write it, or remove %YAML"
+    if alias := re.search(r"found undefined alias '(.*)'", problem):
+        return f"no value above has the anchor &{alias[1]}: refer to values with ${{…}}"
+    if "expected <block end>" in problem:
+        return _wrong_indent(problem, here)
+    return f"is not YAML: {problem}"
+
+
+def _wrong_indent(problem: str, here: str) -> str:
+    """Return the sentence for a line that belongs to no mapping or list that is open, because of
+    its indent.
+    """
+    indent = len(here) - len(here.lstrip(" "))
+    if problem.endswith(("'<scalar>'", "'<alias>'", "'<tag>'")):
+        return "text after the end of a value: quote the whole value, or begin a new line"
+    return (
+        f"a wrong indent: the {indent} spaces before this line are those of no line above in the"
+        " same block"
+    )
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= 40 else f"{text[:39]}…"
+
+
+def _first_control_character(text: str) -> tuple[int, int]:
+    """Return the line and column of the first control character in a text."""
+    match = re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f\ud800-\udfff\ufffe\uffff]", text)
+    before = text[: match.start()] if match else ""
+    return before.count("\n"), len(before.rpartition("\n")[2])
+
+
+# --- yaml values ----------------------------------------------------------------------------------
+
+# Values of YAML 1.2 with their locations: ``1e3`` is a number, ``on`` is a string, and ``010`` is
+# the number ten.
+
 
 Where = tuple[str | int, ...]  #: path of a value: keys and indices from the top of a recipe
 
@@ -53,36 +270,52 @@ class Value:
 
     @property
     def items(self) -> dict[Any, Value]:
-        """Return the values in a YAML mapping or list by key or index; return an empty dict for a scalar."""
+        """Return the values in a YAML mapping or list by key or index; return an empty dict for
+        a scalar.
+        """
         if isinstance(self.data, dict):
             return self.data
         return dict(enumerate(self.data)) if isinstance(self.data, list) else {}
 
     def child(self, name: str | int) -> Value | None:
-        """Return the value at a key or an index of a mapping or a list; an index may be written as a string."""
+        """Return the value at a key or an index of a mapping or a list; an index may be written
+        as a string.
+        """
         items = self.items
         if name not in items and isinstance(name, str) and name.isdecimal():
             name = int(name)
-        return items[name] if name in items else next((v for key, v in items.items() if str(key) == str(name)), None)
+        return (
+            items[name]
+            if name in items
+            else next((v for key, v in items.items() if str(key) == str(name)), None)
+        )
 
     def below(self, path: Iterable[str | int]) -> Value | None:
-        """Return the value at a path of keys below this YAML value, or None if the path does not exist."""
+        """Return the value at a path of keys below this YAML value, or None if the path does not
+        exist.
+        """
         value: Value | None = self
         for name in path:
             value = value.child(name) if value else None
         return value
 
     def replaced(self, key: str | int, child: Value | None) -> Value:
-        """Return a copy of a mapping or a list with ``child`` at a key, or without the key if ``child`` is None."""
+        """Return a copy of a mapping or a list with ``child`` at a key, or without the key if
+        ``child`` is None.
+        """
         items = {k: v for k, v in self.items.items() if child is not None or k != key}
         if child is not None:
             items[key] = child
         if isinstance(self.data, list):
-            return replace(self, data=[replace(v, path=(*self.path, i)) for i, v in enumerate(items.values())])
+            return replace(
+                self, data=[replace(v, path=(*self.path, i)) for i, v in enumerate(items.values())]
+            )
         return replace(self, data=items)
 
     def without(self, key: str) -> Value:
-        """Return a copy of a mapping without ``key``, or the mapping itself if it does not have the key."""
+        """Return a copy of a mapping without ``key``, or the mapping itself if it does not have
+        the key.
+        """
         return self.replaced(key, None) if key in self.items else self
 
     def leaves(self) -> Iterator[Value]:
@@ -115,7 +348,10 @@ def read(path: Path, shown: str) -> Document:
         with opened(path) as file:
             size = os.fstat(file.fileno()).st_size
             if size > _LARGEST:
-                message = f"the file has {size} bytes, more than the limit of {_LARGEST}: split the recipe into groups"
+                message = (
+                    f"the file has {size} bytes, more than the limit of {_LARGEST}: split the"
+                    " recipe into groups"
+                )
                 raise RecipeError([Diagnostic(Location(shown), "", message)])
             text = file.read(_LARGEST).decode("utf-8-sig")
     except NotRegular as error:
@@ -123,9 +359,13 @@ def read(path: Path, shown: str) -> Document:
     except UnicodeDecodeError as error:
         before = error.object[: error.start].decode("utf-8", "replace")
         mark = Location(shown, before.count("\n") + 1, len(before.rpartition("\n")[2]) + 1)
-        raise RecipeError([Diagnostic(mark, "", f"the byte 0x{error.object[error.start]:02x} is not UTF-8")]) from None
+        raise RecipeError(
+            [Diagnostic(mark, "", f"the byte 0x{error.object[error.start]:02x} is not UTF-8")]
+        ) from None
     except OSError as error:
-        raise RecipeError([Diagnostic(Location(shown), "", f"the file cannot be read: {error.strerror}")]) from None
+        raise RecipeError(
+            [Diagnostic(Location(shown), "", f"the file cannot be read: {error.strerror}")]
+        ) from None
     return _document(text, shown, str(path.parent))
 
 
@@ -133,22 +373,30 @@ def read(path: Path, shown: str) -> Document:
 def _document(text: str, shown: str, folder: str) -> Document:
     root = parse(text, Location(shown, 1, 1, folder))
     if not isinstance(root.data, dict):
-        what = "the file is empty" if root.data is None else f"the file contains {kind(root)}"
-        raise RecipeError([Diagnostic(Location(shown, 1, 1), "", f"{what}: write a mapping, `key: value`")])
+        problem = "the file is empty" if root.data is None else f"the file contains {kind(root)}"
+        raise RecipeError(
+            [Diagnostic(Location(shown, 1, 1), "", f"{problem}: write a mapping, `key: value`")]
+        )
     first = text.lstrip().partition("\n")[0].strip()
     return Document(root, visible(first.lstrip("# ")) if first.startswith("#") else "")
 
 
 def parse(text: str, start: Location, path: Where = ()) -> Value:
-    """Return the values in a YAML text; ``start`` is the location of the text in a file, or an argument."""
+    """Return the values in a YAML text; ``start`` is the location of the text in a file, or an
+    argument.
+    """
     builder = _Builder(start)
     if mistake := directive_mistake(text):
         raise RecipeError([_diagnostic(mistake, start, path)])
     try:
         node = YAML(typ="safe", pure=True).compose(text)
-        value = Value(None, start, start, path) if node is None else builder.value(node, path, start)
+        value = (
+            Value(None, start, start, path) if node is None else builder.value(node, path, start)
+        )
     except RecursionError:
-        raise RecipeError([Diagnostic(start, dotted(path), "the YAML text is nested too deeply")]) from None
+        raise RecipeError(
+            [Diagnostic(start, dotted(path), "the YAML text is nested too deeply")]
+        ) from None
     except (YAMLError, YAMLStreamError) as error:
         raise RecipeError([_diagnostic(explained(error, text), start, path)]) from None
     if builder.diagnostics:
@@ -158,18 +406,30 @@ def parse(text: str, start: Location, path: Where = ()) -> Value:
 
 def _diagnostic(mistake: YamlMistake, start: Location, path: Where) -> Diagnostic:
     """Return the diagnostic for a mistake in a YAML text that begins at ``start``."""
-    mark = Location(start.file, mistake.line + 1, mistake.column + 1, start.folder) if start.line else start
+    mark = (
+        Location(start.file, mistake.line + 1, mistake.column + 1, start.folder)
+        if start.line
+        else start
+    )
     return Diagnostic(mark, dotted(path), mistake.message)
 
 
 def kind(value: Value) -> str:
     """Return the kind of a YAML value in words, such as ``a list``."""
-    names = {dict: "a mapping", list: "a list", str: "a string", bool: "true or false", type(None): "nothing"}
+    names = {
+        dict: "a mapping",
+        list: "a list",
+        str: "a string",
+        bool: "true or false",
+        type(None): "nothing",
+    }
     return names.get(type(value.data), "a number")
 
 
 class _Builder:
-    """Builder of the values in one YAML text; an alias becomes a copy of the value to which it refers."""
+    """Builder of the values in one YAML text; an alias becomes a copy of the value to which it
+    refers.
+    """
 
     def __init__(self, start: Location) -> None:
         self.start = start
@@ -185,15 +445,21 @@ class _Builder:
             return self._refuse(mark, path, f"unknown YAML tag {tag}: remove the tag")
         if isinstance(node, ScalarNode):
             fault = _fault(str(node.value))
-            return self._refuse(mark, path, fault) if fault else Value(_scalar(node), mark, key, path)
+            return (
+                self._refuse(mark, path, fault) if fault else Value(_scalar(node), mark, key, path)
+            )
         if id(node) in self.built:
             self.aliased += self.size[id(node)]
             self._refuse_many(self.aliased, _MOST_ALIASED, mark, path)
             return replace(_moved(self.built[id(node)], path), key=key)
         if id(node) in self.open:
-            return self._refuse(mark, path, "a YAML alias refers to the value that contains the alias")
+            return self._refuse(
+                mark, path, "a YAML alias refers to the value that contains the alias"
+            )
         self.open.add(id(node))
-        data = self._mapping(node, path) if isinstance(node, MappingNode) else self._list(node, path)
+        data = (
+            self._mapping(node, path) if isinstance(node, MappingNode) else self._list(node, path)
+        )
         self.open.discard(id(node))
         value = self.built[id(node)] = Value(data, mark, key, path)
         self._weigh(node, value)
@@ -208,36 +474,62 @@ class _Builder:
                 continue
             key = _key(key_node)
             if key == "<<":
-                self._refuse(mark, path, "merge keys (<<) are not part of YAML 1.2: refer to values with ${…}")
+                self._refuse(
+                    mark,
+                    path,
+                    "merge keys (<<) are not part of YAML 1.2: refer to values with ${…}",
+                )
             elif key is None:
                 self._refuse(mark, path, "the key of a mapping must be a name or a whole number")
             elif isinstance(key, str) and _LACKS_SPACE.fullmatch(key) and _is_empty(value_node):
                 name, _, text = key.partition(":")
-                self._refuse(mark, (*path, name), f"needs a space after the colon: write `{name}: {text}`")
+                self._refuse(
+                    mark, (*path, name), f"needs a space after the colon: write `{name}: {text}`"
+                )
             elif key in data:
                 line = data[key].key.line
-                self._refuse(mark, (*path, key), f"given twice, first in line {line}" if line else "given twice")
+                self._refuse(
+                    mark,
+                    (*path, key),
+                    f"given twice, first in line {line}" if line else "given twice",
+                )
             else:
                 data[key] = self.value(value_node, (*path, key), mark)
         return data
 
     def _list(self, node: Node, path: Where) -> list[Value]:
-        return [self.value(child, (*path, i), self._mark(child)) for i, child in enumerate(node.value)]
+        return [
+            self.value(child, (*path, i), self._mark(child)) for i, child in enumerate(node.value)
+        ]
 
     def _weigh(self, node: Node, value: Value) -> None:
-        """Count the values in a YAML list or mapping; raise `RecipeError` if aliases produce too many values."""
-        children = [v for pair in node.value for v in pair] if isinstance(node, MappingNode) else node.value
+        """Count the values in a YAML list or mapping; raise `RecipeError` if aliases produce too
+        many values.
+        """
+        children = (
+            [v for pair in node.value for v in pair]
+            if isinstance(node, MappingNode)
+            else node.value
+        )
         self.size[id(node)] = 1 + sum(self.size.get(id(child), 1) for child in children)
         self._refuse_many(self.size[id(node)], _MOST, value.mark, value.path)
 
-    def _refuse_many(self, count: int, most: int, mark: Location, path: Where) -> None:
-        if count > most:
-            raise RecipeError([Diagnostic(mark, dotted(path), f"aliases expand this value to more than {most} values")])
+    def _refuse_many(self, count: int, limit: int, mark: Location, path: Where) -> None:
+        if count > limit:
+            raise RecipeError(
+                [
+                    Diagnostic(
+                        mark, dotted(path), f"aliases expand this value to more than {limit} values"
+                    )
+                ]
+            )
 
     def _mark(self, node: Node) -> Location:
         if not self.start.line:
             return self.start
-        return Location(self.start.file, node.start_mark.line + 1, node.start_mark.column + 1, self.start.folder)
+        return Location(
+            self.start.file, node.start_mark.line + 1, node.start_mark.column + 1, self.start.folder
+        )
 
     def _refuse(self, mark: Location, path: Where, message: str) -> Value:
         self.diagnostics.append(Diagnostic(mark, dotted(path), message))
@@ -254,13 +546,18 @@ def _moved(value: Value, path: Where) -> Value:
     return replace(value, data=data, path=path)
 
 
-_KNOWN = {f"!!{name}" for name in ("str", "int", "float", "bool", "null", "map", "seq", "timestamp", "merge", "value")}
+_KNOWN = {
+    f"!!{name}"
+    for name in ("str", "int", "float", "bool", "null", "map", "seq", "timestamp", "merge", "value")
+}
 
 
 def _fault(text: str) -> str:
-    """Return what is wrong with the text of a scalar that would harm a reader or the program, or an empty text."""
-    if found := CONTROL.search(text):
-        return f"has the control character {visible(found[0])}: remove it"
+    """Return what is wrong with the text of a scalar that would harm a reader or the program, or
+    an empty text.
+    """
+    if control := CONTROL.search(text):
+        return f"has the control character {visible(control[0])}: remove it"
     if len(text) > _DIGITS and _INT.fullmatch(text):
         return f"has {len(text)} digits, more than the limit of {_DIGITS}"
     return ""
@@ -276,7 +573,9 @@ def _scalar(node: ScalarNode) -> Any:
 
 
 def number(text: str) -> int | float | str:
-    """Return the number that a text represents in YAML 1.2, or the text itself if it is not a number."""
+    """Return the number that a text represents in YAML 1.2, or the text itself if it is not a
+    number.
+    """
     if _INT.fullmatch(text):
         return int(text, 0 if text[:2] in ("0o", "0x") else 10)
     if _FLOAT.fullmatch(text):
@@ -293,7 +592,9 @@ def _is_empty(node: Node) -> bool:
 
 
 def _key(node: Node) -> str | int | None:
-    """Return the key of a YAML mapping as a name or a whole number, or None for another kind of key."""
+    """Return the key of a YAML mapping as a name or a whole number, or None for another kind of
+    key.
+    """
     if not isinstance(node, ScalarNode):
         return None
     key = _scalar(node)

@@ -1,41 +1,86 @@
-"""Figures of the optics: height and phase of the mask, point-spread functions, laser suppression by wavelength."""
+"""Figures of the optics: mask, point-spread functions, suppression, tables of the user."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from neusee.nodes import metrics
+from neusee.nodes import doe, metrics, spectra
 from neusee.nodes.optics import mask_turns
 from neusee.nodes.values import Bands, Psf, Pupil
-from neusee.workflows.report.figures.point_labels import plain_ticks
-from neusee.workflows.report.figures.style import BLUE, GREEN, VERMILION, canvas, drawn, nanometres, nearest, picture
+from neusee.workflows.report.figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    VERMILION,
+    canvas,
+    drawn,
+    nanometres,
+    nearest,
+    picture,
+    plain_ticks,
+)
+
+# --- optics ---------------------------------------------------------------------------------------
+
+# Figures of the optics: height and phase of the mask, point-spread functions, laser suppression by
+# wavelength.
+
 
 _WAVELENGTHS = (450e-9, 550e-9, 638e-9)  #: m, at which phase and PSF are drawn
 
 
 @drawn
 def height(*, pupil: Pupil) -> Any:
-    """Draw maps of the mask height, and of the wrapped phase at three wavelengths, over the clear aperture."""
+    """Draw maps of the mask height, and of the wrapped phase at three wavelengths, over the
+    clear aperture.
+    """
     figure, axes = canvas(13.0, 3.5, 1, 4)
     step = max(1, pupil.height.shape[-1] // 540)
     clear = pupil.aperture[::step, ::step] > 0
     half = float(pupil.pitch) * pupil.height.shape[-1] / 2 * 1e3
     extent = (-half, half, -half, half)
     metres = pupil.height[::step, ::step].double()
-    _map(figure, axes[0, 0], (metres * 1e6).where(clear, torch.nan), "height", "µm", extent, cmap="cividis")
+    _map(
+        figure,
+        axes[0, 0],
+        (metres * 1e6).where(clear, torch.nan),
+        "height",
+        "µm",
+        extent,
+        cmap="cividis",
+    )
     for ax, wavelength in zip(axes[0, 1:], _WAVELENGTHS, strict=True):
         band, name = nearest(pupil.wavelengths, wavelength)
         turns = torch.remainder(mask_turns(pupil, band, step), 1.0).where(clear, torch.nan)
-        _map(figure, ax, turns, f"phase at {name}", "turns, wrapped", extent, cmap="twilight", vmin=0.0, vmax=1.0)
+        _map(
+            figure,
+            ax,
+            turns,
+            f"phase at {name}",
+            "turns, wrapped",
+            extent,
+            cmap="twilight",
+            vmin=0.0,
+            vmax=1.0,
+        )
     axes[0, 0].set_ylabel("v (mm)")
     return figure
 
 
 def _map(
-    figure: Any, ax: Any, values: Tensor, title: str, unit: str, extent: tuple[float, ...], **options: Any
+    figure: Any,
+    ax: Any,
+    values: Tensor,
+    title: str,
+    unit: str,
+    extent: tuple[float, ...],
+    **options: Any,
 ) -> None:
     shown = ax.imshow(values.cpu().numpy(), origin="lower", extent=extent, **options)
     ax.set(title=title, xlabel="u (mm)")
@@ -47,14 +92,18 @@ def _map(
 
 @drawn
 def psf(*, plain: Psf, mask: Psf, bands: Bands, pixel_pitch: float) -> Any:
-    """Draw the logarithm of the PSF at three wavelengths, and the encircled energy, for plain lens and mask."""
+    """Draw the logarithm of the PSF at three wavelengths, and the encircled energy, for plain
+    lens and mask.
+    """
     figure, axes = canvas(13.0, 6.6, 2, 4)
     figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
     shown: Any = None
-    for row, (arm, each) in enumerate({"plain lens": plain, "with mask": mask}.items()):
+    for row, (arm, arm_psf) in enumerate({"plain lens": plain, "with mask": mask}.items()):
         for column, wavelength in enumerate(_WAVELENGTHS):
-            shown = _spot(axes[row, column], each, *nearest(bands.centres, wavelength), pixel_pitch, arm)
-        _encircled(axes[row, 3], each, bands, pixel_pitch, arm)
+            shown = _spot(
+                axes[row, column], arm_psf, *nearest(bands.centres, wavelength), pixel_pitch, arm
+            )
+        _encircled(axes[row, 3], arm_psf, bands, pixel_pitch, arm)
     bar = figure.colorbar(shown, ax=axes[:, :3].ravel().tolist(), fraction=0.025, pad=0.01)
     bar.set_label("log₁₀ (pixel / peak of the clear lens)", fontsize=10)
     bar.ax.tick_params(labelsize=9)
@@ -64,19 +113,25 @@ def psf(*, plain: Psf, mask: Psf, bands: Bands, pixel_pitch: float) -> Any:
 def _spot(ax: Any, psf: Psf, band: int, name: str, pitch: float, arm: str) -> Any:
     size = min(257, *psf.intensity.shape[-2:])
     log = _window(metrics.over_clear_peak(psf, band), size).double().clamp_min(1e-30).log10()
-    shown = picture(ax, log.cpu().numpy(), f"{arm}, {name}", origin="lower", cmap="viridis", vmin=-8.0, vmax=0.0)
+    shown = picture(
+        ax, log.cpu().numpy(), f"{arm}, {name}", origin="lower", cmap="viridis", vmin=-8.0, vmax=0.0
+    )
     ax.set_xlabel(f"{size * pitch * 1e6:.0f} µm across")
     return shown
 
 
 def _window(image: Tensor, size: int) -> Tensor:
-    """Return the middle ``size`` by ``size`` pixels of an image; the optical axis stays at pixel N // 2."""
+    """Return the middle ``size`` by ``size`` pixels of an image; the optical axis stays at pixel
+    N // 2.
+    """
     top, left = (n // 2 - size // 2 for n in image.shape[-2:])
     return image[top : top + size, left : left + size]
 
 
 def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
-    """Draw the encircled energy of a PSF over the radius at three wavelengths, as a fraction of the pupil's light."""
+    """Draw the encircled energy of a PSF over the radius at three wavelengths, as a fraction of
+    the pupil's light.
+    """
     for wavelength, colour in zip(_WAVELENGTHS, (BLUE, "#00785A", "#B3261E"), strict=True):
         band, name = nearest(bands.centres, wavelength)
         share = metrics.encircled_curve(psf.intensity[band])
@@ -90,7 +145,9 @@ def _encircled(ax: Any, psf: Psf, bands: Bands, pitch: float, arm: str) -> None:
 
 @drawn
 def suppression(*, lsr: Tensor, bands: Bands, psf: Psf, bsr: Tensor | None = None) -> Any:
-    """Draw the laser suppression ratio (LSR) over wavelength with its lower bound, and beside it the BSR if given."""
+    """Draw the laser suppression ratio (LSR) over wavelength with its lower bound, and beside it
+    the BSR if given.
+    """
     figure, axes = canvas(11.0 if bsr is not None else 6.4, 4.2, 1, 2 if bsr is not None else 1)
     nm, left = nanometres(bands.centres), axes[0, 0]
     _unsuppressed(left)
@@ -111,3 +168,146 @@ def suppression(*, lsr: Tensor, bands: Bands, psf: Psf, bsr: Tensor | None = Non
 
 def _unsuppressed(ax: Any) -> None:
     ax.axhline(1.0, color="black", linewidth=0.8, linestyle=":", label="plain lens")
+
+
+# --- own tables -----------------------------------------------------------------------------------
+
+# Figure of the tables of the user: camera, glass, light, lasers and height map, each as its file
+# holds it.
+
+
+_WIDTH = 4.6  #: inches of a panel
+_COLOURS = (VERMILION, GREEN, BLUE)
+_LASERS = (BLUE, VERMILION, GREEN, ORANGE, BLACK)
+_STYLES = ("-", "--", "-.", ":")
+
+Draw = Callable[[Any, Any], None]  #: of the figure and a panel
+
+
+@drawn
+def tables(
+    *,
+    camera: Any = None,
+    glass: Any = None,
+    light: Any = None,
+    lasers: Mapping[str, Any] | None = None,
+    height: Any = None,
+    depth: float | None = None,
+    unit: float | None = None,
+    pitch: float | None = None,
+) -> Any:
+    """Draw each table of the user in a panel of its own; an argument that is no file or
+    coefficients is left out.
+
+    Raises: ValueError if no argument is a table.
+    """
+    files = {name: file for name, file in (lasers or {}).items() if isinstance(file, Path)}
+    panels: list[Draw] = []
+    if isinstance(camera, Path):
+        panels.append(lambda _, ax: _camera(ax, camera))
+    if isinstance(glass, Path | Mapping):
+        panels.append(lambda _, ax: _glass(ax, glass))
+    if isinstance(light, Path):
+        panels.append(lambda _, ax: _light(ax, light))
+    if files:
+        panels.append(lambda _, ax: _lasers(ax, files))
+    if isinstance(height, Path):
+        panels.append(lambda figure, ax: _height(figure, ax, height, depth, unit, pitch))
+    if not panels:
+        raise ValueError("the recipe has no table of its own")
+    return _filled(panels)
+
+
+def _filled(panels: Sequence[Draw]) -> Any:
+    columns = min(3, len(panels))
+    figure, axes = canvas(
+        _WIDTH * columns, 4.2 * -(-len(panels) // columns), -(-len(panels) // columns), columns
+    )
+    for ax in axes.ravel()[len(panels) :]:
+        ax.remove()
+    for draw, ax in zip(panels, axes.ravel(), strict=False):
+        draw(figure, ax)
+    return figure
+
+
+def _camera(ax: Any, file: Path) -> None:
+    curves, absolute = spectra.camera_curves(file)
+    table, mono = curves.table(), len(curves.columns) == 1
+    colours = _COLOURS if not mono else (BLACK,)
+    for column, values, colour in zip(curves.columns, table.values, colours, strict=True):
+        shown = 100 * values if absolute else values / table.values.max()
+        ax.plot(
+            nanometres(table.wavelengths), shown.numpy(), ".-", color=colour, label=column.quantity
+        )
+    ax.set(title=file.name, ylabel="quantum efficiency (%)" if absolute else "relative sensitivity")
+    _spectral(ax)
+
+
+def _glass(ax: Any, glass: Any) -> None:
+    wavelengths, index = doe.index_curve(glass)
+    ax.plot(nanometres(wavelengths), index.numpy(), "-", color=BLUE, label="as used")
+    if isinstance(glass, Path) and (rows := doe.index_rows(glass)):
+        ax.plot(nanometres(rows[0]), rows[1].numpy(), ".", color=BLACK, label="rows of the file")
+    name = glass.name if isinstance(glass, Path) else "Sellmeier coefficients"
+    ax.set(title=name, ylabel="refractive index")
+    _spectral(ax)
+
+
+def _light(ax: Any, file: Path) -> None:
+    table = spectra.light_curve(file).table()
+    power = table.values[0] / table.values.max()
+    ax.plot(nanometres(table.wavelengths), power.numpy(), ".-", color=ORANGE, label="illuminant")
+    ax.set(title=file.name, ylabel="spectral power / largest")
+    _spectral(ax)
+
+
+def _lasers(ax: Any, files: Mapping[str, Path]) -> None:
+    """Draw each laser: separate lines as bars from 0, a spectrum as a curve, both relative to
+    the largest value.
+    """
+    for number, (name, file) in enumerate(files.items()):
+        laser = spectra.laser_table(file)
+        table = laser.power.table()
+        look = {
+            "color": _LASERS[number % len(_LASERS)],
+            "linestyle": _STYLES[number % len(_STYLES)],
+        }
+        nm, power = nanometres(table.wavelengths), (table.values[0] / table.values.max()).numpy()
+        if laser.widths is None:
+            ax.plot(nm, power, label=f"{name}, {file.name}", **look)
+        else:
+            ax.vlines(
+                nm,
+                0,
+                power,
+                label=f"{name}, {file.name}",
+                colors=look["color"],
+                linestyles=look["linestyle"],
+            )
+    ax.set(title="lasers", ylabel="power / largest")
+    _spectral(ax)
+
+
+def _spectral(ax: Any) -> None:
+    ax.set_xlabel("wavelength (nm)")
+    if ax.get_ylabel() != "refractive index":
+        ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]) if ax.dataLim.y0 < 0 else 0.0)
+    ax.margins(x=0.05)
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
+
+
+def _height(
+    figure: Any, ax: Any, file: Path, depth: float | None, unit: float | None, pitch: float | None
+) -> None:
+    heights, own = doe.height_map(file, depth=depth, unit=unit, pitch=pitch)
+    step = max(1, max(heights.shape) // 540)
+    half = [n * (own * 1e3 if own else 1.0) / 2 for n in heights.shape]
+    extent = (-half[1], half[1], -half[0], half[0])
+    microns = (heights[::step, ::step].double() * 1e6).numpy()
+    shown = ax.imshow(microns, origin="lower", extent=extent, cmap="cividis")
+    unit_name = "mm" if own else "samples"
+    ax.set(title=file.name, xlabel=f"u ({unit_name})", ylabel=f"v ({unit_name})")
+    ax.grid(False)
+    bar = figure.colorbar(shown, ax=ax, fraction=0.046, pad=0.03)
+    bar.set_label("height (µm)", fontsize=9)
+    bar.ax.tick_params(labelsize=9)

@@ -1,4 +1,6 @@
-"""The accuracy study: error against run time for tolerances, for settings of a recipe, and for single steps."""
+"""The accuracy study: error against run time for tolerances, for settings of a recipe, and for
+single steps.
+"""
 
 from __future__ import annotations
 
@@ -12,20 +14,31 @@ from typing import Any
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.recipe.changed_recipe import changed
+from neusee.workflows.keys.code_digest import engine
+from neusee.workflows.recipe.loading import changed
 from neusee.workflows.report.study_folder import Progress, StudyReport, StudyRun
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy import accuracy_report
-from neusee.workflows.studies.accuracy.accuracy_report import KEEP_ALL, TOLERANCE, AccuracyResult, power_of_ten
+from neusee.workflows.studies.accuracy import accuracy_page
+from neusee.workflows.studies.accuracy.accuracy_page import (
+    KEEP_ALL,
+    TOLERANCE,
+    AccuracyResult,
+    power_of_ten,
+)
 from neusee.workflows.studies.accuracy.recipe_knobs import Knobs, finest, knobs
 from neusee.workflows.studies.accuracy.single_steps import steps_that_matter, try_step
-from neusee.workflows.studies.accuracy.work_precision_points import TIMES, PointCache, Trial, WorkPrecisionPoint
+from neusee.workflows.studies.accuracy.work_precision_points import (
+    TIMES,
+    PointCache,
+    Trial,
+    WorkPrecisionPoint,
+)
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 _FEWER = (1e-1, 1e-2, 1e-3, 1e-4)
-_PATIENCE, _LITTLE = 4.0, 1.0  #: s that the reference of a step may take; the second value is for ``quick``
+#: s that the reference of a step may take; the second value is for ``quick``
+_PATIENCE, _LITTLE = 4.0, 1.0
 _LEFT = "not measured within the budget: run the study again to continue"
 
 
@@ -41,24 +54,35 @@ def study(
     budget: float | None = None,
     device: str = "cpu",
 ) -> Path:
-    """Measure error against run time, write ``runs/<date>_<recipe>_accuracy_<key>/`` and return that folder.
+    """Measure error against run time, write ``runs/<date>_<recipe>_accuracy_<key>/`` and return
+    that folder.
 
-    Args: seeds: number of seeds of the noise, which give the range of each error. quick: measures fewer settings.
-    budget: seconds after which the study measures no further setting of a parameter; the page names the settings that
-    are left, and the next study measures them. Raises: `ValueError` if ``seeds`` is less than 1.
+    Args: seeds: number of seeds of the noise, which give the range of each error. quick: measures
+            fewer settings.
+    budget: seconds after which the study measures no further setting of a parameter; the page names
+    the settings that are left, and the next study measures them. Raises: `ValueError` if ``seeds``
+    is less than 1.
     """
     if seeds < 1:
-        raise ValueError(f"seeds={seeds}: the accuracy study needs at least one random seed, such as seeds=3")
+        raise ValueError(
+            f"seeds={seeds}: the accuracy study needs at least one random seed, such as seeds=3"
+        )
     study_run = StudyRun("accuracy", recipe, command)
     cache = PointCache(finest(recipe), store, seeds, device)
-    result = _measure(recipe, cache, progress, quick, math.inf if budget is None else time.monotonic() + budget)
-    key = digest("accuracy", cache.key(recipe), [[p.trial.line, p.trial.label] for p in result.points], quick)
+    result = _measure(
+        recipe, cache, progress, quick, math.inf if budget is None else time.monotonic() + budget
+    )
+    key = digest(
+        "accuracy", cache.key(recipe), [[p.trial.line, p.trial.label] for p in result.points], quick
+    )
     document = study_run.document(_document(result, cache, quick))
     return study_run.write(runs, key, document, _report(result, document))
 
 
 def trials(recipe: Recipe, turned: Knobs, quick: bool) -> Iterator[Trial]:
-    """Yield the settings to measure: each tolerance, the full computation, and each value of each varied parameter."""
+    """Yield the settings to measure: each tolerance, the full computation, and each value of
+    each varied parameter.
+    """
     asked = sorted({*(_FEWER if quick else TOLERANCES), recipe.tolerance}, reverse=True)
     for tolerance in asked:
         other = replace(recipe, tolerance=tolerance, exact=False)
@@ -66,26 +90,38 @@ def trials(recipe: Recipe, turned: Knobs, quick: bool) -> Iterator[Trial]:
         yield Trial(TOLERANCE, power_of_ten(tolerance), other, value=tolerance, own=own)
     yield Trial(KEEP_ALL, "", replace(recipe, exact=True), own=recipe.exact)
     for knob in turned.found:
-        paths = (path.strip().removeprefix("steps.").replace(".with.", ".") for path in knob.name.split(","))
+        paths = (
+            path.strip().removeprefix("steps.").replace(".with.", ".")
+            for path in knob.name.split(",")
+        )
         name = f"{knob.what} ({', '.join(paths)})"
         for change in knob.changes:
             try:
-                yield Trial(name, change.label, changed(recipe, change.overrides) if change.overrides else recipe)
+                yield Trial(
+                    name,
+                    change.label,
+                    changed(recipe, change.overrides) if change.overrides else recipe,
+                )
             except RecipeError as error:
                 yield Trial(name, change.label, None, refused=error.diagnostics[0].message)
 
 
-def _measure(recipe: Recipe, cache: PointCache, progress: Progress, quick: bool, until: float) -> AccuracyResult:
+def _measure(
+    recipe: Recipe, cache: PointCache, progress: Progress, quick: bool, until: float
+) -> AccuracyResult:
     turned = knobs(recipe, quick)
     todo = list(trials(recipe, turned, quick))
-    progress(f"{len(todo)} points, {cache.seeds} seed{'s' * (cache.seeds > 1)}; the reference first")
+    progress(
+        f"{len(todo)} points, {cache.seeds} seed{'s' * (cache.seeds > 1)}; the reference first"
+    )
     cache.truth(0)
     points = []
     for number, trial in enumerate(todo, 1):
         left = time.monotonic() > until and _may_wait(trial, cache)
         points.append(cache.point(replace(trial, recipe=None, refused=_LEFT) if left else trial))
-        progress(f"{number}/{len(todo)}  {accuracy_report.summary_line(points[-1])}")
-    for number in range(2, TIMES + 1):  # in turn, so that other work of the machine disturbs all points alike
+        progress(f"{number}/{len(todo)}  {accuracy_page.summary_line(points[-1])}")
+    # in turn, so that other work of the machine disturbs all points alike
+    for number in range(2, TIMES + 1):
         points = [cache.time_again(point, number) for point in points]
         progress(f"timed again: {number} of {TIMES}")
     steps = []
@@ -96,16 +132,22 @@ def _measure(recipe: Recipe, cache: PointCache, progress: Progress, quick: bool,
 
 
 def _may_wait(trial: Trial, cache: PointCache) -> bool:
-    """Return True if a later study may measure the setting: it varies a parameter and has no measurement yet."""
+    """Return True if a later study may measure the setting: it varies a parameter and has no
+    measurement yet.
+    """
     if trial.recipe is None or trial.line in (TOLERANCE, KEEP_ALL):
         return False
     return not cache.store.has(cache.key(trial.recipe))
 
 
-def _slow_steps(recipe: Recipe, points: Sequence[WorkPrecisionPoint]) -> Iterator[tuple[Recipe, str, float]]:
-    """Yield (recipe, step name, share of run time) of each slow step, and of slow steps that replace other steps."""
-    whole = next((p.found.steps for p in points if p.trial.line == KEEP_ALL), {})
-    for name, share in steps_that_matter(recipe, whole):
+def _slow_steps(
+    recipe: Recipe, points: Sequence[WorkPrecisionPoint]
+) -> Iterator[tuple[Recipe, str, float]]:
+    """Yield (recipe, step name, share of run time) of each slow step, and of slow steps that
+    replace other steps.
+    """
+    seconds = next((p.found.steps for p in points if p.trial.line == KEEP_ALL), {})
+    for name, share in steps_that_matter(recipe, seconds):
         yield recipe, name, share
     own = next((p.found.steps for p in points if p.trial.own), {})
     cheaper = with_substitutions(recipe, recipe.outputs)
@@ -121,20 +163,20 @@ def _document(result: AccuracyResult, cache: PointCache, quick: bool) -> dict[st
         "seeds": result.seeds,
         "quick": quick,
         "device": cache.device,
-        "machine": accuracy_report.machine_line(),
-        "failed": accuracy_report.count_missed(result.points),  # number of tolerances
+        "machine": accuracy_page.machine_line(),
+        "failed": accuracy_page.count_missed(result.points),  # number of tolerances
         "engine": engine(),
     }
 
 
 def _report(result: AccuracyResult, document: Mapping[str, Any]) -> StudyReport:
-    pictures = accuracy_report.pictures(result)
+    pictures = accuracy_page.pictures(result)
     return StudyReport(
         f"Accuracy of {result.recipe.name}",
-        accuracy_report.lead(result.recipe, result.points),
-        accuracy_report.sections(result, pictures),
+        accuracy_page.lead(result.recipe, result.points),
+        accuracy_page.sections(result, pictures),
         pictures,
-        tables={"table.csv": (accuracy_report.HEADER, accuracy_report.table(result))},
+        tables={"table.csv": (accuracy_page.HEADER, accuracy_page.table(result))},
         files={"recipe.yaml": result.recipe.config.to_yaml()},
         shown=[name for name in document if name != "config"],
     )

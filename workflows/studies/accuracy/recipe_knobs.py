@@ -1,8 +1,10 @@
-"""Values of a recipe that trade accuracy for run time, such as the number of bands and the precision.
+"""Values of a recipe that trade accuracy for run time, such as the number of bands and the
+precision.
 
-The values are found by the parameters of nodes: ``count`` of a node that returns bands, ``samples`` and ``pitch`` of a
-pupil, the window's ``shape`` of a node that returns a PSF, and every ``precision``. The recipe shows where each value
-is written and which other steps depend on the value.
+The values are found by the parameters of nodes: ``count`` of a node that returns bands, ``samples``
+and ``pitch`` of a pupil, the window's ``shape`` of a node that returns a PSF, and every
+``precision``. The recipe shows where each value is written and which other steps depend on the
+value.
 """
 
 from __future__ import annotations
@@ -14,19 +16,22 @@ from typing import Any, Literal, get_args, get_origin
 
 from neusee.nodes.values import Bands, Psf
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
-from neusee.workflows.recipe.changed_recipe import changed
+from neusee.workflows.recipe.loading import changed
 
 _REFERENCE = re.compile(r"\$\{([\w.-]+)\??\}")
 _ONE_BY_ONE = ("item", "each")  #: first names of paths whose value differs from item to item
 _FACTORS = (0.2, 1 / 3, 0.5, 2.0)  #: factors on the number of intervals between bands
 _FEWER = (1 / 3, 2.0)
-_SCALES = (0.5, 0.75, 0.9, 1.5, 2.0)  #: factors on the number of samples, and on the side of a window
+#: factors on the number of samples, and on the side of a window
+_SCALES = (0.5, 0.75, 0.9, 1.5, 2.0)
 _FEWER_SCALES = (0.75, 1.5)
 
 
 @dataclass(frozen=True)
 class Change:
-    """One value to try for a recipe parameter, as overrides of the recipe (none for the recipe's own value)."""
+    """One value to try for a recipe parameter, as overrides of the recipe (none for the recipe's
+    own value).
+    """
 
     label: str
     overrides: tuple[str, ...]
@@ -34,7 +39,9 @@ class Change:
 
 @dataclass(frozen=True)
 class Knob:
-    """A recipe parameter, or several parameters that change together, with the values to measure."""
+    """A recipe parameter, or several parameters that change together, with the values to
+    measure.
+    """
 
     name: str  #: path in the recipe, such as ``optics.bands``
     what: str
@@ -43,7 +50,9 @@ class Knob:
 
 @dataclass(frozen=True)
 class Knobs:
-    """The parameters of a recipe that can be varied, and the reasons why other parameters cannot be varied."""
+    """The parameters of a recipe that can be varied, and the reasons why other parameters cannot
+    be varied.
+    """
 
     found: tuple[Knob, ...]
     without: tuple[str, ...]
@@ -51,7 +60,9 @@ class Knobs:
 
 @dataclass(frozen=True)
 class _Place:
-    """The path in a recipe at which a parameter value is written, and the steps that read the value."""
+    """The path in a recipe at which a parameter value is written, and the steps that read the
+    value.
+    """
 
     path: str
     value: Any
@@ -59,26 +70,33 @@ class _Place:
 
 
 def knobs(recipe: Recipe, quick: bool = False) -> Knobs:
-    """Return the recipe parameters that trade accuracy for run time; ``quick`` selects fewer values of each."""
-    found: list[Knob] = []
+    """Return the recipe parameters that trade accuracy for run time; ``quick`` selects fewer
+    values of each.
+    """
+    varied: list[Knob] = []
     without: list[str] = []
-    for what, turned in (
+    for kind, turned in (
         ("bands", _bands(recipe, quick)),
         ("pupil samples at the same width", _samples(recipe, quick)),
         ("window of the PSF", _windows(recipe, quick)),
         ("precision", _precisions(recipe)),
     ):
-        mine = [knob if isinstance(knob, str) else replace(knob, what=what) for knob in turned]
-        found += [knob for knob in mine if isinstance(knob, Knob) and len(knob.changes) > 1]
-        without += [f"{what}: {knob}" for knob in mine if isinstance(knob, str)]
+        mine = [knob if isinstance(knob, str) else replace(knob, what=kind) for knob in turned]
+        varied += [knob for knob in mine if isinstance(knob, Knob) and len(knob.changes) > 1]
+        without += [f"{kind}: {knob}" for knob in mine if isinstance(knob, str)]
         if not mine:
-            without.append(f"{what}: this recipe has no such value")
-    return Knobs(tuple(found), tuple(without))
+            without.append(f"{kind}: this recipe has no such value")
+    return Knobs(tuple(varied), tuple(without))
 
 
 def finest(recipe: Recipe) -> Recipe:
-    """Return the recipe with all steps computed in full and in their best precision, at the same sampling."""
-    best = [f"{place.path}={allowed_words(place.steps[0], 'precision')[-1]}" for place in _places(recipe, "precision")]
+    """Return the recipe with all steps computed in full and in their best precision, at the same
+    sampling.
+    """
+    best = [
+        f"{place.path}={allowed_words(place.steps[0], 'precision')[-1]}"
+        for place in _places(recipe, "precision")
+    ]
     return replace(changed(recipe, best) if best else recipe, exact=True)
 
 
@@ -93,7 +111,10 @@ def _samples(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
     samples, pitches = (_places(recipe, name, beside=other) for name, other in _BOTH)
     if len(samples) != 1 or len(pitches) != 1:
         if samples:
-            yield f"{' and '.join(p.path for p in (*samples, *pitches))} are not one pair of samples and pitch"
+            yield (
+                f"{' and '.join(p.path for p in (*samples, *pitches))} are not one pair of samples"
+                " and pitch"
+            )
         return
     own, pitch = int(samples[0].value), pitches[0].value
     if pitch is None:  # the grid is as wide as the aperture
@@ -103,9 +124,11 @@ def _samples(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
     if others := _others(recipe, "pitch", pitches[0]):
         yield f"{', '.join(others)} would keep the old pitch, which is written elsewhere"
         return
-    at, other = samples[0].path, pitches[0].path
-    settings = [(n, str(n), (f"{at}={n}", f"{other}={own * pitch / n!r} m")) for n in _sizes(own, quick)]
-    yield _knob(at, settings, own)
+    path, other = samples[0].path, pitches[0].path
+    settings = [
+        (n, str(n), (f"{path}={n}", f"{other}={own * pitch / n!r} m")) for n in _sizes(own, quick)
+    ]
+    yield _knob(path, settings, own)
 
 
 def _sizes(own: int, quick: bool) -> list[int]:
@@ -123,31 +146,57 @@ def _windows(recipe: Recipe, quick: bool) -> Iterator[Knob | str]:
             continue
         own, scales = tuple(place.value), (1.0, *(_FEWER_SCALES if quick else _SCALES))
         sizes = sorted({tuple(max(1, round(n * f)) for n in own) for f in scales})
-        yield _knob(place.path, [(s, "×".join(map(str, s)), (f"{place.path}={list(s)}",)) for s in sizes], own)
+        yield _knob(
+            place.path,
+            [(s, "×".join(map(str, s)), (f"{place.path}={list(s)}",)) for s in sizes],
+            own,
+        )
 
 
 def _precisions(recipe: Recipe) -> Iterator[Knob | str]:
-    """Yield one parameter for the precisions of all steps, because double precision in one step improves no result."""
+    """Yield one parameter for the precisions of all steps, because double precision in one step
+    improves no result.
+    """
     if places := _places(recipe, "precision"):
         words = allowed_words(places[0].steps[0], "precision")
         path = ", ".join(p.path for p in places)
-        yield _knob(path, [(w, w, tuple(f"{p.path}={w}" for p in places)) for w in words], places[0].value)
+        yield _knob(
+            path, [(w, w, tuple(f"{p.path}={w}" for p in places)) for w in words], places[0].value
+        )
 
 
 def _knob(path: str, settings: Sequence[tuple[Any, str, tuple[str, ...]]], own: Any) -> Knob:
-    """Return the varied parameter at ``path`` with its ``settings`` (value, label, overrides); ``own`` is unchanged."""
-    return Knob(path, "", tuple(Change(label, () if value == own else how) for value, label, how in settings))
+    """Return the varied parameter at ``path`` with its ``settings`` (value, label, overrides);
+    ``own`` is unchanged.
+    """
+    return Knob(
+        path,
+        "",
+        tuple(
+            Change(label, () if value == own else overrides) for value, label, overrides in settings
+        ),
+    )
 
 
 def allowed_words(step: Step, parameter: str) -> tuple[str, ...]:
-    """Return the words that a parameter accepts, the coarsest first, such as the names of precisions."""
+    """Return the words that a parameter accepts, the coarsest first, such as the names of
+    precisions.
+    """
     hint = step.node.hints[parameter]
-    return tuple(map(str, get_args(hint))) if get_origin(hint) is Literal else (str(step.params[parameter]),)
+    return (
+        tuple(map(str, get_args(hint)))
+        if get_origin(hint) is Literal
+        else (str(step.params[parameter]),)
+    )
 
 
-def _places(recipe: Recipe, parameter: str, gives: type | None = None, beside: str = "") -> list[_Place]:
-    """Return the recipe paths that set ``parameter``, for steps that return ``gives`` and also have ``beside``."""
-    found: dict[str, _Place] = {}
+def _places(
+    recipe: Recipe, parameter: str, gives: type | None = None, beside: str = ""
+) -> list[_Place]:
+    """Return the recipe paths that set ``parameter``, for steps that return ``gives`` and also
+    have ``beside``.
+    """
+    places: dict[str, _Place] = {}
     for name in needed(recipe, recipe.outputs):
         step = recipe.steps[name]
         if parameter not in step.params or (beside and beside not in step.params):
@@ -156,17 +205,23 @@ def _places(recipe: Recipe, parameter: str, gives: type | None = None, beside: s
             continue
         path = _written(recipe, step, parameter)
         if path is not None:
-            before = found[path].steps if path in found else ()
-            found[path] = _Place(path, step.params[parameter], (*before, step))
-    return list(found.values())
+            before = places[path].steps if path in places else ()
+            places[path] = _Place(path, step.params[parameter], (*before, step))
+    return list(places.values())
 
 
 def _written(recipe: Recipe, step: Step, parameter: str) -> str | None:
-    """Return the recipe path that sets a step's parameter, or None if repetitions of the step have different values."""
+    """Return the recipe path that sets a step's parameter, or None if repetitions of the step
+    have different values.
+    """
     path = f"steps.{step.name.partition('[')[0]}.with.{parameter}"
     while True:
         setting = recipe.config.settings.get(path)
-        match = _REFERENCE.fullmatch(setting.value) if setting and isinstance(setting.value, str) else None
+        match = (
+            _REFERENCE.fullmatch(setting.value)
+            if setting and isinstance(setting.value, str)
+            else None
+        )
         if match is None:
             return path
         path = match[1]
@@ -175,10 +230,22 @@ def _written(recipe: Recipe, step: Step, parameter: str) -> str | None:
 
 
 def _others(recipe: Recipe, parameter: str, place: _Place) -> list[str]:
-    """Return the names of other steps that read the value at ``place``, or that have an equal pitch at another path."""
-    mine = {step.name for step in place.steps}
+    """Return the names of other steps that read the value at ``place``, or that have an equal
+    pitch at another path.
+    """
     if parameter == "pitch":
-        apart = (s for s in recipe.steps.values() if parameter in s.params and s.params[parameter] == place.value)
-        return [s.name for s in apart if _written(recipe, s, parameter) != place.path]
-    others = (s for s in recipe.steps.values() if s.name not in mine)
-    return [s.name for s in others for p in s.params if _written(recipe, s, p) == place.path and p in s.param_marks]
+        return _equal_elsewhere(recipe, parameter, place)
+    mine = {step.name for step in place.steps}
+    names: list[str] = []
+    for step in recipe.steps.values():
+        if step.name not in mine:
+            read = [p for p in step.params if _written(recipe, step, p) == place.path]
+            names += [step.name for p in read if p in step.param_marks]
+    return names
+
+
+def _equal_elsewhere(recipe: Recipe, parameter: str, place: _Place) -> list[str]:
+    """Return the names of steps whose parameter has the value of ``place`` from another path."""
+    having = [step for step in recipe.steps.values() if parameter in step.params]
+    equal = [step for step in having if step.params[parameter] == place.value]
+    return [step.name for step in equal if _written(recipe, step, parameter) != place.path]

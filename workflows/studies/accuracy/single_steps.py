@@ -1,7 +1,9 @@
-"""Run time and error of variants of single steps, such as another precision, compared with a reference.
+"""Run time and error of variants of single steps, such as another precision, compared with a
+reference.
 
-A variant is the step as used, in another precision, with another allowed error, with a smaller window of the PSF, or
-left out. If the reference takes too long, all variants are measured on the middle of the pictures and on fewer bands.
+A variant is the step as used, in another precision, with another allowed error, with a smaller
+window of the PSF, or left out. If the reference takes too long, all variants are measured on the
+middle of the pictures and on fewer bands.
 """
 
 from __future__ import annotations
@@ -26,11 +28,9 @@ from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import digest, key_of, stream_seed
-from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.report.measured_variants import keep_variants
-from neusee.workflows.store.memo import compute_once
-from neusee.workflows.store.result_store import Store
+from neusee.workflows.keys.code_digest import Code, engine
+from neusee.workflows.report.contents import keep_variants
+from neusee.workflows.store.result_store import Store, compute_once
 from neusee.workflows.store.serialization import each_tensor, tensors_in
 from neusee.workflows.studies.accuracy.recipe_knobs import allowed_words
 from neusee.workflows.tolerance.error_norm import error_of
@@ -39,11 +39,14 @@ Cut = tuple[int, int]  #: the longest side and the largest number of bands; 0 fo
 SHARE = 0.01  #: least share of the run time of a step that is measured
 _ITEM = re.compile(r"\[.*?\]")
 _CUTS: Sequence[Cut] = ((32, 2), (64, 2), (128, 3), (256, 3), (512, 3), (1024, 3), (0, 3), (0, 0))
-_GROWTH = 16.0  #: expected growth of the reference's time from cut to cut, as for a direct convolution
+#: expected growth of the reference's time from cut to cut, as for a direct convolution
+_GROWTH = 16.0
 USED, _PRECISION = "as used", "precision"
 _WINDOWS = (0.75, 0.5, 0.25)  #: shares of the side of a PSF
-_ALLOWANCES = (1e3, 1e2, 1e1, 1e-1, 1e-2, 1e-3)  #: factors on the allowed error ``within`` of a step
-_LONG_ENOUGH, _TIMES = 0.5, 5  #: seconds and calls; a variant is called again until one of the two is reached
+#: factors on the allowed error ``within`` of a step
+_ALLOWANCES = (1e3, 1e2, 1e1, 1e-1, 1e-2, 1e-3)
+#: seconds and calls; a variant is called again until one of the two is reached
+_LONG_ENOUGH, _TIMES = 0.5, 5
 
 
 @dataclass(frozen=True)
@@ -62,13 +65,16 @@ class StepMeasurement:
 
     variants: list[dict[str, Any]] = field(default_factory=list)
     reference: float = 0.0  #: s
-    cut_inputs: str = ""  #: description of the part of the inputs that was used; empty for the whole inputs
+    #: description of the part of the inputs that was used; empty for the whole inputs
+    cut_inputs: str = ""
     refused: str = ""
 
 
 @dataclass(frozen=True)
 class StepTried:
-    """A step with a large share of the run time, and its measurement or the reason why it was not measured."""
+    """A step with a large share of the run time, and its measurement or the reason why it was
+    not measured.
+    """
 
     step: str  #: the slowest item of the step
     node: str
@@ -81,26 +87,39 @@ class StepTried:
 
 
 def steps_that_matter(recipe: Recipe, seconds: Mapping[str, float]) -> list[tuple[str, float]]:
-    """Return (slowest repetition, share of the run time) of each step that takes more than `SHARE` of the run time."""
+    """Return (slowest repetition, share of the run time) of each step that takes more than
+    `SHARE` of the run time.
+    """
     items: dict[str, list[str]] = defaultdict(list)
     for name in seconds:
         if name in recipe.steps:
             items[_ITEM.sub("", name)].append(name)
-    whole = sum(seconds.values()) or 1.0
-    found = [(max(names, key=seconds.__getitem__), sum(seconds[n] for n in names) / whole) for names in items.values()]
-    return sorted((f for f in found if f[1] > SHARE), key=lambda f: -f[1])
+    total = sum(seconds.values()) or 1.0
+    shares = [
+        (max(names, key=seconds.__getitem__), sum(seconds[n] for n in names) / total)
+        for names in items.values()
+    ]
+    return sorted((f for f in shares if f[1] > SHARE), key=lambda f: -f[1])
 
 
 def try_step(recipe: Recipe, name: str, share: float, store: Store, patience: float) -> StepTried:
-    """Measure variants of a step on inputs so small that the reference takes at most about ``patience`` seconds."""
+    """Measure variants of a step on inputs so small that the reference takes at most about
+    ``patience`` seconds.
+    """
     step = recipe.steps[name]
     if step.node.hooks.reference is None:
-        return StepTried(name, step.node.path, share, StepMeasurement(refused="the node has no reference"))
+        return StepTried(
+            name, step.node.path, share, StepMeasurement(refused="the node has no reference")
+        )
     key = _key(recipe, name, patience, store)
     compute = partial(_measure, recipe, step, store, patience)
-    found = compute_once(store, key, StepMeasurement, compute, {"step": f"study accuracy: {name}"})
-    keep_variants(recipe, name, [tuple(variant.values()) for variant in found.variants], store)
-    return StepTried(name, step.node.path, share, found)
+    measurement = compute_once(
+        store, key, StepMeasurement, compute, {"step": f"study accuracy: {name}"}
+    )
+    keep_variants(
+        recipe, name, [tuple(variant.values()) for variant in measurement.variants], store
+    )
+    return StepTried(name, step.node.path, share, measurement)
 
 
 def _key(recipe: Recipe, name: str, patience: float, store: Store) -> str:
@@ -108,7 +127,13 @@ def _key(recipe: Recipe, name: str, patience: float, store: Store) -> str:
     code = Code(store.code_memo)
     for before in needed(recipe, (name,)):
         keys[before], _ = key_of(recipe.steps[before], keys, recipe.seed, code)
-    return digest("accuracy of a step", keys[name], patience, engine("studies.accuracy.single_steps"), machine())
+    return digest(
+        "accuracy of a step",
+        keys[name],
+        patience,
+        engine("studies.accuracy.single_steps"),
+        machine(),
+    )
 
 
 def _measure(recipe: Recipe, step: Step, store: Store, patience: float) -> StepMeasurement:
@@ -120,61 +145,96 @@ def _measure(recipe: Recipe, step: Step, store: Store, patience: float) -> StepM
     with torch.no_grad():
         afforded = _largest(step, inputs, recipe.seed, patience)
         if afforded is None:
-            return StepMeasurement(refused="the reference fails on the inputs and on every part of the inputs")
+            return StepMeasurement(
+                refused="the reference fails on the inputs and on every part of the inputs"
+            )
         size, truth, seconds = afforded
-        part = cut_inputs(step.node, inputs, size)
-        variants = [asdict(variant) for variant in _variants(step, part, truth, recipe.seed)]
-    whole = all(a.shape == b.shape for a, b in zip(tensors_in(inputs), tensors_in(part), strict=True))
-    return StepMeasurement(variants, seconds, "" if whole else _cut_text(step.node, size))
+        small_inputs = cut_inputs(step.node, inputs, size)
+        variants = [
+            asdict(variant) for variant in _variants(step, small_inputs, truth, recipe.seed)
+        ]
+    complete = all(
+        a.shape == b.shape
+        for a, b in zip(tensors_in(inputs), tensors_in(small_inputs), strict=True)
+    )
+    return StepMeasurement(variants, seconds, "" if complete else _cut_text(step.node, size))
 
 
 def _gathered(wire: str | tuple[str, ...] | None, values: Mapping[str, Any]) -> Any:
     return wire and (values[wire] if isinstance(wire, str) else [values[name] for name in wire])
 
 
-def _largest(step: Step, inputs: list[Any], seed: int, patience: float) -> tuple[Cut, Any, float] | None:
-    """Return the largest input size for which the reference takes about ``patience`` s, the result and the time."""
+def _largest(
+    step: Step, inputs: list[Any], seed: int, patience: float
+) -> tuple[Cut, Any, float] | None:
+    """Return the largest input size for which the reference takes about ``patience`` s, the
+    result and the time.
+    """
     best: tuple[Cut, Any, float] | None = None
     for size in _CUTS:
         if best is not None and best[2] * _GROWTH > patience:
             break
-        part = cut_inputs(step.node, inputs, size)
+        small_inputs = cut_inputs(step.node, inputs, size)
         try:
-            best = (size, *_time_once(partial(_call, step, step.node.hooks.reference, part, seed)))
+            best = (
+                size,
+                *_time_once(partial(_call, step, step.node.hooks.reference, small_inputs, seed)),
+            )
         except Exception:  # a small part of a picture may be no valid input; a larger part may be
             continue
     return best
 
 
 def _variants(step: Step, inputs: list[Any], truth: Any, seed: int) -> Iterator[Variant]:
-    """Yield each variant of the step, except variants that fail or whose result has another shape than ``truth``."""
+    """Yield each variant of the step, except variants that fail or whose result has another
+    shape than ``truth``.
+    """
     for (line, label), compute in _calls(step, inputs, seed).items():
-        with suppress(ValueError, RuntimeError):  # another shape, or a dtype that the variant does not take
+        # another shape, or a dtype that the variant does not take
+        with suppress(ValueError, RuntimeError):
             value, seconds = _median_time(compute)
-            yield Variant(line, label, error_of(_compared_value(value), _compared_value(truth)), seconds)
+            yield Variant(
+                line, label, error_of(_compared_value(value), _compared_value(truth)), seconds
+            )
 
 
 def _calls(step: Step, inputs: list[Any], seed: int) -> dict[tuple[str, str], Callable[[], Any]]:
     """Return functions that compute variants of a step, by (changed property, new value)."""
     node = step.node
-    calls: dict[tuple[str, str], Callable[[], Any]] = {(USED, ""): partial(_call, step, node, inputs, seed)}
-    own = step.params.get("precision")
-    for word in allowed_words(step, "precision") if own is not None else ():
-        if word != own:
-            calls[_PRECISION, word] = partial(_call, step, node, inputs, seed, precision=word)
-    if "precision" not in step.params and any(x.dtype == torch.float32 for x in tensors_in(inputs)):
-        double = each_tensor(lambda x: x.double() if x.dtype == torch.float32 else x, inputs)
+    calls: dict[tuple[str, str], Callable[[], Any]] = {
+        (USED, ""): partial(_call, step, node, inputs, seed)
+    }
+    for word in _other_precisions(step):
+        calls[_PRECISION, word] = partial(_call, step, node, inputs, seed, precision=word)
+    if "precision" not in step.params and any(map(_is_single, tensors_in(inputs))):
+        double = each_tensor(lambda x: x.double() if _is_single(x) else x, inputs)
         calls[_PRECISION, "double"] = partial(_call, step, node, double, seed)
     for factor in _ALLOWANCES if "within" in step.params else ():
         within = step.params["within"] * factor
         label = f"{within:.0e}".replace("e-0", "e-")
         calls["allowed error", label] = partial(_call, step, node, inputs, seed, within=within)
-    for share in _WINDOWS if any(isinstance(x, Psf) for x in inputs) else ():
-        smaller = [_inner(x, share) if isinstance(x, Psf) else x for x in inputs]
+    for share, smaller in _smaller_windows(inputs):
         calls["window of the PSF", f"{share:g}"] = partial(_call, step, node, smaller, seed)
     if node.hooks.skip_bound is not None:
         calls["left out", ""] = lambda: inputs[0]
     return calls
+
+
+def _other_precisions(step: Step) -> list[str]:
+    """Return the words for a precision that a step does not have; none without this parameter."""
+    own = step.params.get("precision")
+    return [] if own is None else [w for w in allowed_words(step, "precision") if w != own]
+
+
+def _is_single(x: Tensor) -> bool:
+    return x.dtype == torch.float32
+
+
+def _smaller_windows(inputs: list[Any]) -> Iterator[tuple[float, list[Any]]]:
+    """Yield the inputs with smaller windows of their PSFs, and the share; none without a PSF."""
+    if any(isinstance(x, Psf) for x in inputs):
+        for share in _WINDOWS:
+            yield share, [_inner(x, share) if isinstance(x, Psf) else x for x in inputs]
 
 
 def _inner(psf: Psf, share: float) -> Psf:
@@ -190,14 +250,20 @@ def _centred(x: Tensor, axis: int, count: int) -> Tensor:
 
 
 def _compared_value(value: Any) -> Any:
-    """Return the tensors of a step's result to compare, for example all bands of a low-rank spectral cube."""
+    """Return the tensors of a step's result to compare, for example all bands of a low-rank
+    spectral cube.
+    """
     if isinstance(value, LowRankCube):
         return torch.einsum("bk,kyx->byx", value.basis.to(value.planes), value.planes)
     return value.planes if isinstance(value, Channels) else value
 
 
 def _call(step: Step, function: Any, inputs: list[Any], seed: int, **other: Any) -> Any:
-    rng = {"rng": torch.Generator().manual_seed(stream_seed(seed, step.name))} if step.node.random else {}
+    rng = (
+        {"rng": torch.Generator().manual_seed(stream_seed(seed, step.name))}
+        if step.node.random
+        else {}
+    )
     return function(*inputs, **{**step.params, **other}, **rng)
 
 
@@ -208,7 +274,9 @@ def _time_once(compute: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def _median_time(compute: Callable[[], Any]) -> tuple[Any, float]:
-    """Call a function several times; return the result and the median run time, without a short first call."""
+    """Call a function several times; return the result and the median run time, without a short
+    first call.
+    """
     value, seconds = _time_once(compute)
     times = [] if seconds < _LONG_ENOUGH else [seconds]
     while len(times) < _TIMES and sum(times) < _LONG_ENOUGH:
@@ -217,7 +285,9 @@ def _median_time(compute: Callable[[], Any]) -> tuple[Any, float]:
 
 
 def cut_inputs(node: Node, inputs: list[Any], size: Cut) -> list[Any]:
-    """Crop each picture in ``inputs`` to its middle, and keep fewer spectral bands if the node names the band axis."""
+    """Crop each picture in ``inputs`` to its middle, and keep fewer spectral bands if the node
+    names the band axis.
+    """
     side, bands = size
     parts = []
     for name, value in zip(node.inputs, inputs, strict=True):
@@ -246,7 +316,13 @@ def _fewer_bands(value: Any, axis: int, bands: int) -> Any:
         count = value.shape[axis]
         if count <= bands:
             return value
-        indices = value.new_tensor([round((i + 0.5) * count / bands - 0.5) for i in range(bands)]).long()
+        indices = value.new_tensor(
+            [round((i + 0.5) * count / bands - 0.5) for i in range(bands)]
+        ).long()
         return value.index_select(axis, indices)
     fields = {name: getattr(value, name) for name in band_names(value)}
-    return value._replace(**{n: _fewer_bands(x, axis, bands) for n, x in fields.items()}) if fields else value
+    return (
+        value._replace(**{n: _fewer_bands(x, axis, bands) for n, x in fields.items()})
+        if fields
+        else value
+    )

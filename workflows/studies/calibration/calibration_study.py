@@ -1,4 +1,6 @@
-"""The calibration study: tests of a posterior on simulated sensors, and sensitivity of the posterior to the prior."""
+"""The calibration study: tests of a posterior on simulated sensors, and sensitivity of the
+posterior to the prior.
+"""
 
 from __future__ import annotations
 
@@ -11,28 +13,49 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from neusee.workflows.calibration.identifiability import KINDS, identify
-from neusee.workflows.calibration.log_posterior import SensorPosterior
-from neusee.workflows.calibration.posterior_mode import find_mode, initial_theta
+from neusee.workflows.calibration.log_posterior import SensorPosterior, find_mode, initial_theta
 from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport, StudyRun
 from neusee.workflows.report.study_page import Mark, Section
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.calibration.independent_draws import DRAWS, walk_draws
-from neusee.workflows.studies.calibration.prior_sensitivity import ENOUGH, Sensitivity, sensitivity
-from neusee.workflows.studies.calibration.rank_uniformity import RankTest, rank_tests, ranks
-from neusee.workflows.studies.calibration.simulated_sensors import Sampler, SensorSimulation, SensorSimulator
+from neusee.workflows.studies.calibration.posterior_tests import (
+    DRAWS,
+    ENOUGH,
+    RankTest,
+    Sampler,
+    Sensitivity,
+    SensorSimulation,
+    SensorSimulator,
+    rank_tests,
+    ranks,
+    sensitivity,
+    walk_draws,
+)
 
 PIXELS = 128
 _EVERY = 20  #: simulations for each line of progress
 _WEIGHED = 1000  #: draws for the sensitivity
-_COLUMNS = ("parameter", "simulations", "p", "least p", "coverage", "from", "to", "z mean", "z sd", "holds")
+_COLUMNS = (
+    "parameter",
+    "simulations",
+    "p",
+    "least p",
+    "coverage",
+    "from",
+    "to",
+    "z mean",
+    "z sd",
+    "holds",
+)
 
 
 @dataclass(frozen=True)
 class CalibrationStudyResult:
-    """The result of the calibration study: simulations, a test of each parameter, and the sensitivity to the prior."""
+    """The result of the calibration study: simulations, a test of each parameter, and the
+    sensitivity to the prior.
+    """
 
     simulations: Sequence[SensorSimulation]
     rank_tests: Sequence[RankTest]
@@ -46,18 +69,29 @@ class CalibrationStudyResult:
 
     @property
     def short(self) -> int:
-        """Return the number of simulations whose Markov chain is too short for its autocorrelation time."""
+        """Return the number of simulations whose Markov chain is too short for its
+        autocorrelation time.
+        """
         return sum(not s.refused and not s.independent for s in self.simulations)
 
     @property
     def stranded(self) -> int:
-        """Return the number of simulations in which a walker stays where the posterior is almost 0."""
+        """Return the number of simulations in which a walker stays where the posterior is almost
+        0.
+        """
         return sum(s.stranded > 0 for s in self.simulations)
 
     @property
     def failed(self) -> int:
-        """Return the number of failed criteria, of two for each parameter and three for the set of simulations."""
-        return sum(v.failed for v in self.rank_tests) + bool(self.refused) + bool(self.short) + bool(self.stranded)
+        """Return the number of failed criteria, of two for each parameter and three for the set
+        of simulations.
+        """
+        return (
+            sum(v.failed for v in self.rank_tests)
+            + bool(self.refused)
+            + bool(self.short)
+            + bool(self.stranded)
+        )
 
 
 def study(
@@ -73,30 +107,41 @@ def study(
 ) -> Path:
     """Simulate and calibrate sensors, and return the folder with the results.
 
-    The posterior is sampled by ``sampler``, or by walkers with the move ``move`` if there is no ``sampler``.
+    The posterior is sampled by ``sampler``, or by walkers with the move ``move`` if there is no
+    ``sampler``.
     """
     study_run = StudyRun("calibration", recipe, command)
     with one_thread():
-        simulator = SensorSimulator(recipe, store, pixels, sampler or partial(walk_draws, how=move), move)
+        simulator = SensorSimulator(
+            recipe, store, pixels, sampler or partial(walk_draws, move_name=move), move
+        )
         simulated = list(_simulate_all(simulator, simulations, progress))
         sensitive, reason = _sensitivity(recipe, move)
-    result = CalibrationStudyResult(simulated, rank_tests(simulated), simulator.prior_widths(), sensitive, reason)
+    result = CalibrationStudyResult(
+        simulated, rank_tests(simulated), simulator.prior_widths(), sensitive, reason
+    )
     document = study_run.document(_document(result))
-    return study_run.write(runs, digest(document["verdicts"]), document, _report(recipe, result, pixels))
+    return study_run.write(
+        runs, digest(document["verdicts"]), document, _report(recipe, result, pixels)
+    )
 
 
-def _simulate_all(simulator: SensorSimulator, count: int, progress: Progress) -> Iterator[SensorSimulation]:
+def _simulate_all(
+    simulator: SensorSimulator, count: int, progress: Progress
+) -> Iterator[SensorSimulation]:
     for number in range(count):
-        found = simulator.simulation(number)
-        if found.refused:
-            progress(f"simulation {number}: {found.refused}")
-        yield found
+        simulation = simulator.simulation(number)
+        if simulation.refused:
+            progress(f"simulation {number}: {simulation.refused}")
+        yield simulation
         if (number + 1) % _EVERY == 0 or number + 1 == count:
             progress(f"{number + 1} of {count} simulations")
 
 
 def _sensitivity(recipe: Recipe, move: str) -> tuple[Sensitivity | None, str]:
-    """Return the sensitivity of the recipe's posterior to the prior, or None and the reason why there is none."""
+    """Return the sensitivity of the recipe's posterior to the prior, or None and the reason why
+    there is none.
+    """
     with TemporaryDirectory(prefix="neusee-") as folder:
         problem = SensorPosterior.of(recipe, Store(folder))
     mode = find_mode(problem, initial_theta(problem))
@@ -120,17 +165,28 @@ def _document(result: CalibrationStudyResult) -> dict[str, Any]:
     }
 
 
-# --- the page ---------------------------------------------------------------------------------------------------------
+# --- the page -------------------------------------------------------------------------------------
 
 
 def _report(recipe: Recipe, result: CalibrationStudyResult, pixels: int) -> StudyReport:
     picture = ranks(result.rank_tests)
-    sections = [_ranks(result, picture, pixels), _intervals(result), _weighed(result), *_refusals(result)]
+    sections = [
+        _ranks(result, picture, pixels),
+        _intervals(result),
+        _weighed(result),
+        *_refusals(result),
+    ]
     tables: dict[str, CsvTable] = {
         "table.csv": (_COLUMNS, map(_line, result.rank_tests)),
         "simulations.csv": (("parameter", "truth", "rank", "inside", "z", "told"), _each(result)),
     }
-    return StudyReport(f"{recipe.name}: is the posterior correct?", _lead(result), sections, {"ranks": picture}, tables)
+    return StudyReport(
+        f"{recipe.name}: is the posterior correct?",
+        _lead(result),
+        sections,
+        {"ranks": picture},
+        tables,
+    )
 
 
 def _line(v: RankTest) -> Sequence[Any]:
@@ -149,37 +205,52 @@ def _lead(result: CalibrationStudyResult) -> str:
     taus = max((s.tau for s in result.simulations), default=0.0)
     short = f"{result.short} a chain that is too short, {result.stranded} a stranded walker"
     return (
-        f"{held}. Of {len(result.simulations)} simulations of {seconds:.2g} s each, {len(result.refused)} have no "
-        f"posterior, {short}. The longest autocorrelation time is {taus:.0f} steps."
+        f"{held}. Of {len(result.simulations)} simulations of {seconds:.2g} s each,"
+        f" {len(result.refused)} have no posterior, {short}. The longest autocorrelation time is"
+        f" {taus:.0f} steps."
     )
 
 
 def _ranks(result: CalibrationStudyResult, picture: bytes, pixels: int) -> Section:
-    text = f"""Parameters are drawn from the prior, the recipe's own steps simulate frames of {pixels} x {pixels} pixels
-        with these parameters, and {DRAWS} nearly independent draws are made from the posterior of the frames. If the
-        posterior is correct, the number of draws below the truth, its rank, is uniform. The grey band contains 99 of
-        100 bins of uniform ranks. If ranks are frequent at both ends, the posterior is too narrow; in the middle, too
+    text = f"""Parameters are drawn from the prior, the recipe's own steps simulate frames of
+        {pixels} x {pixels} pixels with these parameters, and {DRAWS} nearly independent draws are
+        made from the posterior of the frames. If the posterior is correct, the number of draws
+        below the truth, its rank, is uniform. The grey band contains 99 of 100 bins of uniform
+        ranks. If ranks are frequent at both ends, the posterior is too narrow; in the middle, too
         wide; at one end, biased.
 
-        The prior is that of the recipe, but no wider than the standard deviations below (of the logarithm; in e- for
-        the offset), so that frames of the recipe's levels constrain every sensor that is drawn. The search for the
-        mode starts near the truth: this study tests the posterior and the draws, not the search. A walker is stranded
-        if its median log posterior lies 20 nats below that of the others."""
+        The prior is that of the recipe, but no wider than the standard deviations below (of the
+        logarithm; in e- for the offset), so that frames of the recipe's levels constrain every
+        sensor that is drawn. The search for the mode starts near the truth: this study tests the
+        posterior and the draws, not the search. A walker is stranded if its median log posterior
+        lies 20 nats below that of the others."""
     rows = [(_plain(name), width) for name, width in result.prior_widths.items()]
     return Section("Ranks of the truth", text, ("parameter", "width of the prior"), rows, picture)
 
 
 def _intervals(result: CalibrationStudyResult) -> Section:
-    text = """p: the probability that uniform ranks in ten bins are at least as uneven as the ranks found; p must exceed
-        0.01 divided by the number of parameters. Coverage: how often the central 90 % of the draws contain the truth; a
-        correct posterior is within the bar in 999 of 1000 studies. z: posterior mean minus truth, in posterior standard
-        deviations. For a normal posterior z has mean 0 and standard deviation 1; for a posterior cut off by a limit,
-        only about. Told: in how many simulations the frames estimate the parameter, or only limit it."""
+    text = """p: the probability that uniform ranks in ten bins are at least as uneven as the ranks
+        found; p must exceed 0.01 divided by the number of parameters. Coverage: how often the
+        central 90 % of the draws contain the truth; a correct posterior is within the bar in 999 of
+        1000 studies. z: posterior mean minus truth, in posterior standard deviations. For a normal
+        posterior z has mean 0 and standard deviation 1; for a posterior cut off by a limit, only
+        about. Told: in how many simulations the frames estimate the parameter, or only limit it."""
     columns = ("parameter", "p", "at least", "coverage", "bar", "z mean", "z sd", "told")
     rows, marks = [], dict[tuple[int, int], Mark]()
     for i, v in enumerate(result.rank_tests):
         bar = f"{v.bar[0]:.3f} to {v.bar[1]:.3f}"
-        rows.append((_plain(v.name), v.p, v.least_p, v.coverage, bar, v.z_mean, v.z_sd, _count_kinds(result, v.name)))
+        rows.append(
+            (
+                _plain(v.name),
+                v.p,
+                v.least_p,
+                v.coverage,
+                bar,
+                v.z_mean,
+                v.z_sd,
+                _count_kinds(result, v.name),
+            )
+        )
         marks[i, 1] = "pass" if v.uniform else "fail"
         marks[i, 3] = "pass" if v.covered else "fail"
     return Section("Coverage", text, columns, rows, marks=marks)
@@ -193,14 +264,23 @@ def _count_kinds(result: CalibrationStudyResult, name: str) -> str:
 def _weighed(result: CalibrationStudyResult) -> Section:
     heading = "Sensitivity to the prior"
     if result.sensitivity is None:
-        return Section(heading, f"The sensitivity to the prior is not known: {result.no_sensitivity}.")
+        return Section(
+            heading, f"The sensitivity to the prior is not known: {result.no_sensitivity}."
+        )
     names, left = list(result.sensitivity.left), result.sensitivity.left
-    text = f"""Draws from the posterior of the recipe's own frames and prior, reweighted as if one prior were twice as
-        wide. Value: the mean, or the 95 % limit of a parameter that the frames only limit. Under each prior: the change
-        of the value, in posterior standard deviations. Last row: the effective sample size as a share of the draws.
-        Below {ENOUGH:g} reweighting is unreliable, and the table has a dash: the prior of this parameter constrains the
-        parameter at least about as much as the frames do."""
-    columns = ("parameter", "from these frames", "value", "sd", *(f"{_plain(name)} x 2" for name in names))
+    text = f"""Draws from the posterior of the recipe's own frames and prior, reweighted as if one
+        prior were twice as wide. Value: the mean, or the 95 % limit of a parameter that the frames
+        only limit. Under each prior: the change of the value, in posterior standard deviations.
+        Last row: the effective sample size as a share of the draws. Below {ENOUGH:g} reweighting is
+        unreliable, and the table has a dash: the prior of this parameter constrains the parameter
+        at least about as much as the frames do."""
+    columns = (
+        "parameter",
+        "from these frames",
+        "value",
+        "sd",
+        *(f"{_plain(name)} x 2" for name in names),
+    )
     rows: list[list[Any]] = []
     for f in result.sensitivity.findings:
         moved = [None if x is None else (x - f.value) / f.sd for x in f.doubled.values()]
@@ -216,7 +296,14 @@ def _refusals(result: CalibrationStudyResult) -> list[Section]:
     if not result.refused:
         return []
     rows = Counter(result.refused).most_common()
-    return [Section("Simulations without a posterior", "They are left out of the ranks.", ("why", "count"), rows)]
+    return [
+        Section(
+            "Simulations without a posterior",
+            "They are left out of the ranks.",
+            ("why", "count"),
+            rows,
+        )
+    ]
 
 
 def _plain(name: str) -> str:

@@ -1,31 +1,208 @@
-"""The leave-out study: the error of a recipe with steps left out, and the run time of simpler scenes."""
+"""The leave-out study: error of left-out steps, and run time of simpler scenes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from neusee.workflows.engine.provenance import machine
+from neusee.workflows.engine.runner import Result
+from neusee.workflows.graph.diagnostics import UNREAD, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import digest
+from neusee.workflows.keys.code_digest import Code, engine
+from neusee.workflows.recipe.loading import changed
 from neusee.workflows.report.figures.style import BLUE, canvas, drawn
 from neusee.workflows.report.study_folder import SHOWN, CsvTable, Progress, StudyReport, StudyRun
 from neusee.workflows.report.study_page import Mark, Section
-from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.leave_out.omission_rows import OmissionComparison, OmissionRow, OutputError
-from neusee.workflows.studies.leave_out.scene_costs import SceneCost, measure_scenes
+from neusee.workflows.store.result_store import Store, compute_once
+from neusee.workflows.studies.cold_run import key_parts, run_cold
+from neusee.workflows.studies.leave_out.left_out_steps import (
+    OmissionComparison,
+    OmissionRow,
+    OutputError,
+)
+
+# --- scene costs ----------------------------------------------------------------------------------
+
+# Run times of simpler scenes: the recipe without a laser, at one wavelength, or behind a clean
+# window.
+
+
+_TIMES = 3  #: cold runs of a scene; the median of their times counts
+_QUICK = 5.0  #: s; a scene that takes longer is run once
+_WINDOW = ("flare.dirt", "flare.ghosts")
+#: works even with one band
+_LIFT = "steps.cube={node: spectra.lift_mallett, from: {rgb: scene, bands: bands}}"
+_GREY = "steps.scene={node: scene.targets, with: {kind: siemens, shape: '${scene.shape}'}}"
+
+
+@dataclass(frozen=True)
+class SceneCost:
+    """The run time of a recipe with one scene, and the steps that the engine left out."""
+
+    scene: str
+    seconds: float  #: median of the engine's cold runs; NaN if the scene could not be run
+    computing: float  #: s in the steps
+    steps: int  #: number of computed steps
+    left_out: tuple[str, ...]  #: steps that the engine left out, or replaced by cheaper steps
+    refused: str = ""
+
+
+def measure_scenes(
+    recipe: Recipe, store: Store, progress: Callable[[str], None]
+) -> Iterator[SceneCost]:
+    """Yield the run time of ``recipe`` with each simpler scene; measure the time if the store
+    does not have it.
+    """
+    code, warm = Code(store.code_memo), list[Result]()
+    for scene, changed_recipe in scenes(recipe).items():
+        if isinstance(changed_recipe, str):
+            yield SceneCost(scene, float("nan"), 0.0, 0, (), changed_recipe)
+            continue
+
+        def compute(scene: str = scene, recipe: Recipe = changed_recipe) -> SceneCost:
+            if not warm:  # the first run of a process imports libraries and reads code
+                warm.append(run_cold(recipe, store))
+            return _cost(scene, recipe, store)
+
+        decided = engine("studies.leave_out.leave_out_study", "engine.runner"), machine()
+        key = digest("content", key_parts(changed_recipe, code), *decided)
+        cost = replace(
+            compute_once(store, key, SceneCost, compute, {"step": "study leave-out"}), scene=scene
+        )
+        progress(f"{scene}: {cost.refused or f'{cost.seconds:.3g} s'}")
+        yield cost
+
+
+def scenes(recipe: Recipe) -> dict[str, Recipe | str]:
+    """Return the recipe with each simpler scene by name, or the reason why the recipe cannot
+    have the scene.
+    """
+    recipes: dict[str, Recipe | str] = {"everything in full": replace(recipe, exact=True)}
+    recipes["as the recipe chooses"] = recipe
+    for scene, overrides in _overrides(recipe).items():
+        try:
+            recipes[scene] = _changed(recipe, overrides)
+        except RecipeError as error:
+            recipes[scene] = "; ".join(problem.message for problem in error.diagnostics)
+    return recipes
+
+
+def _changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
+    """Apply overrides to ``recipe``, and remove the recipe values that no step reads any more."""
+    try:
+        return changed(recipe, overrides)
+    except RecipeError as error:
+        unread = [f"~{problem.path}" for problem in error.diagnostics if problem.code == UNREAD]
+        if len(unread) < len(error.diagnostics):
+            raise
+        return changed(recipe, [*overrides, *unread])
+
+
+def _overrides(recipe: Recipe) -> Mapping[str, Sequence[str]]:
+    no_laser, clean_window = _no_laser(recipe), _clean_window(recipe)
+    lift = [_LIFT] if "cube" in recipe.steps else []
+    one_wavelength = [*_bands(recipe, "549 nm", "551 nm", 1), *lift]
+    changes = {
+        "no laser": no_laser,
+        "clean window": clean_window,
+        "grey scene": _grey_scene(recipe),
+        "narrow band, 540 to 560 nm": _bands(recipe, "540 nm", "560 nm", 3),
+        "one wavelength": one_wavelength,
+        "one wavelength, no laser, clean window": [*no_laser, *clean_window, *one_wavelength],
+    }
+    return {scene: overrides for scene, overrides in changes.items() if overrides}
+
+
+def _no_laser(recipe: Recipe) -> list[str]:
+    has_laser = any(name.startswith("lasers.") for name in recipe.config.settings)
+    return ["lasers={}"] if has_laser else []
+
+
+def _clean_window(recipe: Recipe) -> list[str]:
+    names = {name.partition("[")[0] for name in _window_steps(recipe)}
+    return [f"steps.{name}=null" for name in sorted(names)]
+
+
+def _grey_scene(recipe: Recipe) -> list[str]:
+    has_shape = "scene" in recipe.steps and "scene.shape" in recipe.config.settings
+    return [_GREY] if has_shape else []
+
+
+def _window_steps(recipe: Recipe) -> set[str]:
+    """Return the names of the steps that compute window dirt or ghosts, and of steps that
+    require these results.
+    """
+    window = {name for name, step in recipe.steps.items() if step.node.path in _WINDOW}
+    for name, step in recipe.steps.items():
+        needs = {
+            w for i, w in step.wires.items() if isinstance(w, str) and i not in step.node.optional
+        }
+        if name in window or not needs.isdisjoint(window):
+            window.add(name)
+    return window
+
+
+def _bands(recipe: Recipe, start: str, stop: str, count: int) -> list[str]:
+    names = ("optics.shortest", "optics.longest", "optics.bands")
+    if any(name not in recipe.config.settings for name in names):
+        return []
+    return [f"{name}={value}" for name, value in zip(names, (start, stop, count), strict=True)]
+
+
+def _cost(scene: str, recipe: Recipe, store: Store) -> SceneCost:
+    try:
+        result = _median_run(recipe, store)
+    except RunError as error:
+        return SceneCost(scene, float("nan"), 0.0, 0, (), f"{error.step}: {error.cause}")
+    ran = [done.seconds for done in result.done.values() if done.state == "run"]
+    left_out = [done.step for done in result.done.values() if done.state == "left out"]
+    replaced = [economy.step for economy in result.recipe.substitutions]
+    return SceneCost(scene, result.seconds, sum(ran), len(ran), (*left_out, *replaced))
+
+
+def _median_run(recipe: Recipe, store: Store) -> Result:
+    """Return the run of median time; a quick one is repeated."""
+    results = [run_cold(recipe, store)]
+    while max(r.seconds for r in results) < _QUICK and len(results) < _TIMES:
+        results.append(run_cold(recipe, store))
+    return sorted(results, key=lambda r: r.seconds)[len(results) // 2]
+
+
+# --- leave out study ------------------------------------------------------------------------------
+
+# The leave-out study: the error of a recipe with steps left out, and the run time of simpler
+# scenes.
+
 
 _WAITING = "#9DB8CC"  #: the colour of the seconds that the engine takes outside the steps
-_COLUMNS = ("what", "name", "kind", "chosen", "bound", "rms", "largest", "outputs", "put back", "seconds", "holds")
+_COLUMNS = (
+    "what",
+    "name",
+    "kind",
+    "chosen",
+    "bound",
+    "rms",
+    "largest",
+    "outputs",
+    "put back",
+    "seconds",
+    "holds",
+)
 _HOW = {"handed on": "left out", "not added": "not added", "stands in": "summed"}
 _HELD = {True: "holds", False: "fails"}
 
 
 @dataclass(frozen=True)
 class LeaveOutResult:
-    """The result of the leave-out study: errors of outputs, errors of left-out steps, and run times of scenes."""
+    """The result of the leave-out study: errors of outputs, errors of left-out steps, and run
+    times of scenes.
+    """
 
     output_errors: Sequence[OutputError]
     rows: Sequence[OmissionRow]
@@ -34,13 +211,22 @@ class LeaveOutResult:
     @property
     def failed(self) -> int:
         """Return how many outputs and left-out steps exceed their error bounds."""
-        return sum(not output.holds for output in self.output_errors) + sum(not row.holds for row in self.rows)
+        return sum(not output.holds for output in self.output_errors) + sum(
+            not row.holds for row in self.rows
+        )
 
 
 def study(
-    recipe: Recipe, store: Store, runs: Path, command: Sequence[str], progress: Progress, contents: bool = True
+    recipe: Recipe,
+    store: Store,
+    runs: Path,
+    command: Sequence[str],
+    progress: Progress,
+    contents: bool = True,
 ) -> Path:
-    """Measure the errors of a recipe with steps left out, and with ``contents`` the run times for simpler scenes."""
+    """Measure the errors of a recipe with steps left out, and with ``contents`` the run times
+    for simpler scenes.
+    """
     study_run = StudyRun("leave-out", recipe, command)
     comparison = OmissionComparison(recipe, store)
     output_errors, rows = comparison.output_errors(), []
@@ -53,27 +239,46 @@ def study(
         rows.append(row)
         error = f"{row.rms:.2g}, stated at most {row.bound:.2g}{failure[row.holds]}"
         progress(f"{row.name} {row.kind}: {error} ({len(rows)} of {len(comparison.found)})")
-    result = LeaveOutResult(output_errors, rows, list(measure_scenes(recipe, store, progress)) if contents else [])
-    document = study_run.document({"tolerance": recipe.tolerance, "failed": result.failed, **_document(result)})
+    result = LeaveOutResult(
+        output_errors, rows, list(measure_scenes(recipe, store, progress)) if contents else []
+    )
+    document = study_run.document(
+        {"tolerance": recipe.tolerance, "failed": result.failed, **_document(result)}
+    )
     return study_run.write(runs, digest(document["rows"]), document, _report(recipe, result))
 
 
 def _document(result: LeaveOutResult) -> dict[str, Any]:
-    parts: dict[str, Sequence[Any]] = {"outputs": result.output_errors, "rows": result.rows, "costs": result.costs}
+    parts: dict[str, Sequence[Any]] = {
+        "outputs": result.output_errors,
+        "rows": result.rows,
+        "costs": result.costs,
+    }
     return {name: [asdict(row) for row in rows] for name, rows in parts.items()}
 
 
 def _report(recipe: Recipe, result: LeaveOutResult) -> StudyReport:
-    lines = [*map(_output_line, result.output_errors), *(("omission", *_cells(r), r.holds) for r in result.rows)]
+    lines = [
+        *map(_output_line, result.output_errors),
+        *(("omission", *_cells(r), r.holds) for r in result.rows),
+    ]
     tables: dict[str, CsvTable] = {"table.csv": (_COLUMNS, lines)}
     sections, picture = [_outputs(recipe, result), _omissions(result)], None
     if result.costs:
-        scenes = [(c.scene, c.seconds, c.computing, c.steps, "; ".join(c.left_out), c.refused) for c in result.costs]
-        tables["costs.csv"] = (("scene", "seconds", "computing", "steps", "left out", "refused"), scenes)
+        scenes = [
+            (c.scene, c.seconds, c.computing, c.steps, "; ".join(c.left_out), c.refused)
+            for c in result.costs
+        ]
+        tables["costs.csv"] = (
+            ("scene", "seconds", "computing", "steps", "left out", "refused"),
+            scenes,
+        )
         sections.append(_scenes(result))
         picture = sections[-1].picture
     title, shown = f"{recipe.name}: omissions", (*SHOWN, "tolerance")
-    return StudyReport(title, _lead(recipe, result), sections, {"content": picture}, tables, shown=shown)
+    return StudyReport(
+        title, _lead(recipe, result), sections, {"content": picture}, tables, shown=shown
+    )
 
 
 def _output_line(p: OutputError) -> Sequence[Any]:
@@ -86,46 +291,80 @@ def _cells(r: OmissionRow) -> tuple[Any, ...]:
 
 
 def _lead(recipe: Recipe, result: LeaveOutResult) -> str:
-    chosen = [row for row in result.rows if row.taken]
+    taken = [row for row in result.rows if row.taken]
     worst = max((p.rms for p in result.output_errors), default=0.0)
-    held = "All stated errors hold" if not result.failed else f"{result.failed} stated errors are too small"
+    held = (
+        "All stated errors hold"
+        if not result.failed
+        else f"{result.failed} stated errors are too small"
+    )
     return (
-        f"{held}. Of {len(result.rows)} possible omissions with a known bound, the recipe chooses {len(chosen)} at its "
-        f"tolerance of {recipe.tolerance:.2g}. The largest error of an output is then {worst:.2g}, "
-        "relative to the full computation."
+        f"{held}. Of {len(result.rows)} possible omissions with a known bound, the recipe chooses"
+        f" {len(taken)} at its tolerance of {recipe.tolerance:.2g}. The largest error of an output"
+        f" is then {worst:.2g}, relative to the full computation."
     )
 
 
 def _outputs(recipe: Recipe, result: LeaveOutResult) -> Section:
     tolerance = recipe.tolerance
-    rows = [(p.output, p.bound, p.kind, p.rms, p.largest, tolerance, _HELD[p.holds]) for p in result.output_errors]
-    text = """Each output of the recipe with the chosen omissions, compared with the full computation (`--exact`). The
-        error is the root mean square of the difference over the largest element; the tolerance limits it before noise
-        and rounding. The stated error is that of the page of a run: proved, estimated, or unknown."""
-    columns = ("output", "stated error", "kind", "error", "largest difference", "tolerance", "holds")
-    return Section("The outputs", text, columns, rows, marks=_marks(result.output_errors, len(columns) - 1))
+    rows = [
+        (p.output, p.bound, p.kind, p.rms, p.largest, tolerance, _HELD[p.holds])
+        for p in result.output_errors
+    ]
+    text = """Each output of the recipe with the chosen omissions, compared with the full
+        computation (`--exact`). The error is the root mean square of the difference over the
+        largest element; the tolerance limits it before noise and rounding. The stated error is that
+        of the page of a run: proved, estimated, or unknown."""
+    columns = (
+        "output",
+        "stated error",
+        "kind",
+        "error",
+        "largest difference",
+        "tolerance",
+        "holds",
+    )
+    return Section(
+        "The outputs", text, columns, rows, marks=_marks(result.output_errors, len(columns) - 1)
+    )
 
 
 def _omissions(result: LeaveOutResult) -> Section:
-    text = """Each omission alone, with all other steps computed in full. A step that is left out returns its input.
-        Light that is not added is replaced by zero. For a summed image, only the sums over bands that later steps need
-        are convolved. The stated bound and the error are relative to the largest element: of the step's full result; of
-        the sum, for light that is not added; of the steps that read the image, for a summed image. For noise and for
-        summed images the bound limits the root mean square error, and one draw of the noise may exceed the bound by
-        four standard errors. For all other omissions the bound limits the largest error.
+    text = """Each omission alone, with all other steps computed in full. A step that is left out
+        returns its input. Light that is not added is replaced by zero. For a summed image, only the
+        sums over bands that later steps need are convolved. The stated bound and the error are
+        relative to the largest element: of the step's full result; of the sum, for light that is
+        not added; of the steps that read the image, for a summed image. For noise and for summed
+        images the bound limits the root mean square error, and one draw of the noise may exceed the
+        bound by four standard errors. For all other omissions the bound limits the largest error.
 
-        Outputs: the error of the worst output with this omission alone. Put back: the change of the worst output when
-        the recipe with the chosen omissions computes this step in full. Saved: the run time of the omitted steps, in s.
-        Omissions that the tolerance does not allow are tested too."""
-    columns = ("step", "how", "chosen", "bound", "error", "largest", "outputs", "put back", "saved (s)", "holds")
+        Outputs: the error of the worst output with this omission alone. Put back: the change of the
+        worst output when the recipe with the chosen omissions computes this step in full. Saved:
+        the run time of the omitted steps, in s. Omissions that the tolerance does not allow are
+        tested too."""
+    columns = (
+        "step",
+        "how",
+        "chosen",
+        "bound",
+        "error",
+        "largest",
+        "outputs",
+        "put back",
+        "saved (s)",
+        "holds",
+    )
     cells = [(_cells(row), row) for row in result.rows]
-    rows = [(name, _HOW[kind], *rest, _HELD[row.holds]) for (name, kind, *rest), row in cells]
-    return Section("Each omission", text, columns, rows, marks=_marks(result.rows, len(columns) - 1))
+    rows = [(name, _HOW[kind], *numbers, _HELD[row.holds]) for (name, kind, *numbers), row in cells]
+    return Section(
+        "Each omission", text, columns, rows, marks=_marks(result.rows, len(columns) - 1)
+    )
 
 
 def _scenes(result: LeaveOutResult) -> Section:
-    text = """The run time from an empty store, in one process: the median of up to three runs. The first row is the
-        full computation; in the other rows the engine may leave out steps that the scene does not need."""
+    text = """The run time from an empty store, in one process: the median of up to three runs. The
+        first row is the full computation; in the other rows the engine may leave out steps that the
+        scene does not need."""
     full = result.costs[0].seconds
     rows = []
     for c in result.costs:
@@ -133,7 +372,9 @@ def _scenes(result: LeaveOutResult) -> Section:
         rows.append((c.scene, *seconds, c.steps, c.refused or ", ".join(c.left_out) or "nothing"))
     columns = ("scene", "seconds", "share of full", "steps", "left out or made cheaper")
     timed = [c for c in result.costs if math.isfinite(c.seconds)]
-    return Section("Run time of simpler scenes", text, columns, rows, _bars(timed) if timed else None)
+    return Section(
+        "Run time of simpler scenes", text, columns, rows, _bars(timed) if timed else None
+    )
 
 
 @drawn
@@ -143,7 +384,7 @@ def _bars(costs: Sequence[SceneCost]) -> Any:
     names = [cost.scene for cost in costs]
     inside = [min(cost.computing, cost.seconds) for cost in costs]
     ax.barh(names, inside, color=BLUE, label="in the steps")
-    beside = [cost.seconds - part for cost, part in zip(costs, inside, strict=True)]
+    beside = [cost.seconds - in_steps for cost, in_steps in zip(costs, inside, strict=True)]
     ax.barh(names, beside, left=inside, color=_WAITING, label="in the engine and the store")
     for row, cost in enumerate(costs):
         ax.annotate(f" {cost.seconds:.3g} s", (cost.seconds, row), va="center", fontsize=9)
@@ -151,7 +392,8 @@ def _bars(costs: Sequence[SceneCost]) -> Any:
     ax.grid(False, axis="y")
     ax.set_xlabel("seconds, from an empty store")
     ax.set_xlim(0, 1.15 * max(cost.seconds for cost in costs) or 1.0)
-    figure.legend(loc="outside upper center", ncols=2)  # no bar and no note is there, whatever the times
+    # no bar and no note is there, whatever the times
+    figure.legend(loc="outside upper center", ncols=2)
     return figure
 
 

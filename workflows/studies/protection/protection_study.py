@@ -1,25 +1,405 @@
-"""The protection study: a mask, a grey filter and a smaller stop of equal protection, quiet and under attack."""
+"""The protection study: a mask, a grey filter and a smaller stop of equal protection."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.protection.camera_parts import ProtectionCamera
 from neusee.workflows.protection.equal_rivals import CONTRAST, MEASURES
-from neusee.workflows.protection.front_optics import FrontBench, FrontSettings
-from neusee.workflows.protection.protection_result import DRAWN, LIGHTS, ProtectionResult, measure_protection
+from neusee.workflows.protection.protection_camera import (
+    FrontBench,
+    FrontSettings,
+    ProtectionCamera,
+)
+from neusee.workflows.protection.protection_result import (
+    ATTACKED_AT,
+    DRAWN,
+    LEVELS,
+    LIGHTS,
+    SHOWN_AT,
+    STRENGTHS,
+    ProtectionResult,
+    measure_protection,
+)
 from neusee.workflows.protection.unknown_conditions import Condition, UnknownLaws, draw_conditions
+from neusee.workflows.report.figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    VERMILION,
+    canvas,
+    drawn,
+)
 from neusee.workflows.report.study_folder import SHOWN, Progress, StudyReport, StudyRun
+from neusee.workflows.report.study_page import Section
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.protection.protection_page import draw_pictures, quotable, sections
+
+# --- protection figures ---------------------------------------------------------------------------
+
+# Pictures of the protection study: where the mask wins, NEQ by frequency, bounds, and pictures
+# under attack.
+
+
+_LOOKS: Mapping[str, tuple[str, str]] = {
+    "open lens": (BLACK, ":"),
+    "grey filter": ("#777777", "-"),
+    "stop and filter": (BLUE, "-"),
+    "smaller stop": (GREEN, "--"),
+    "mask": (VERMILION, "-"),
+    "mask and stop": (ORANGE, "-."),
+}
+_LIGHT = "scene light (e- a pixel)"
+_FINE = 121  #: values along each side of the maps
+_MOST = 8.0  #: dB, at which the colours of the maps end
+
+
+@drawn
+def winning_region(result: ProtectionResult) -> Any:
+    """Draw the gain of the mask over the best stop-and-filter by scene light and protection;
+    hatched: the mask wins.
+    """
+    figure, axes = canvas(11.6, 4.1, 1, len(DRAWN), sharey=True)
+    levels = sorted({result.own, *LEVELS})
+    light, level = (np.geomspace(min(ends), max(ends), _FINE) for ends in (LIGHTS, levels))
+    for ax, measure in zip(axes[0], DRAWN, strict=True):
+        gain = _between(
+            levels, [[result.gain[level][n][measure] for n in LIGHTS] for level in levels]
+        )
+        shown = ax.pcolormesh(
+            light,
+            level,
+            gain.clip(-_MOST, _MOST),
+            cmap="RdBu",
+            vmin=-_MOST,
+            vmax=_MOST,
+            shading="gouraud",
+            rasterized=True,
+        )
+        if gain.max() > 0 > gain.min():
+            ax.contour(light, level, gain, levels=[0.0], colors=BLACK, linewidths=1.4)
+        if gain.max() > 0:
+            ax.contourf(
+                light, level, gain, levels=[0.0, gain.max() + 1], colors="none", hatches=["//"]
+            )
+        ax.axhline(result.own, color=BLACK, linewidth=1.0, linestyle="--")
+        ax.set(xscale="log", yscale="log", xlabel=_LIGHT, title=MEASURES[measure])
+        ax.title.set_fontsize(10)
+        ax.grid(False)
+    axes[0, 0].set_ylabel("protection: share of the harm\nof the open lens")
+    figure.colorbar(shown, ax=list(axes[0]), label="gain of the mask (dB)", pad=0.01, extend="both")
+    return figure
+
+
+def _between(levels: Sequence[float], gain: Sequence[Sequence[float]]) -> Any:
+    """Return a gain (level, light) on a finer grid, by linear interpolation in the logarithms of
+    level and light.
+    """
+    x, y = (np.linspace(np.log(min(ends)), np.log(max(ends)), _FINE) for ends in (LIGHTS, levels))
+    rows = np.array([np.interp(x, np.log(LIGHTS), row) for row in gain])
+    return np.array([np.interp(y, np.log(levels), column) for column in rows.T]).T
+
+
+@drawn
+def gain_with_bounds(result: ProtectionResult) -> Any:
+    """Draw the gain of the mask by scene light, with the middle 90 % of the draws, and the bound
+    of its gain in NEQ.
+    """
+    figure, axes = canvas(11.0, 4.2, 1, 2)
+    left, right = axes[0]
+    for measure, colour in zip(DRAWN, (BLUE, ORANGE, VERMILION), strict=True):
+        low, up = np.quantile([result.drawn[n][measure] for n in LIGHTS], [0.05, 0.95], axis=1)
+        left.fill_between(LIGHTS, low, up, color=colour, alpha=0.3, linewidth=0)
+        own = [result.gain[result.own][n][measure] for n in LIGHTS]
+        left.plot(LIGHTS, own, color=colour, label=MEASURES[measure])
+    left.axhline(0.0, color=BLACK, linewidth=0.9)
+    left.set(xscale="log", xlabel=_LIGHT, ylabel="gain of the mask (dB)")
+    left.set_title("over the best stop-and-filter, all wavelengths")
+    left.legend()
+    value, bound = (10 * np.log10([result.bound[n][i] for n in LIGHTS]) for i in (0, 1))
+    right.plot(LIGHTS, value, color=VERMILION, label="this mask")
+    right.plot(LIGHTS, bound, color=BLACK, linestyle="--", label="bound of every mask of this peak")
+    right.fill_between(
+        LIGHTS,
+        bound,
+        max(bound) + 3,
+        color="#777777",
+        alpha=0.2,
+        linewidth=0,
+        label="no mask can be here",
+    )
+    right.axhline(0.0, color=BLACK, linewidth=0.9)
+    right.set(
+        xscale="log", xlabel=_LIGHT, ylabel="gain in mean NEQ (dB)", ylim=(None, max(bound) + 3)
+    )
+    right.set_title("one wavelength, whole lens band, no glare")
+    right.legend(loc="upper right")
+    return figure
+
+
+@drawn
+def neq_by_frequency(result: ProtectionResult) -> Any:
+    """Draw the noise equivalent quanta of each rival by spatial frequency, at one scene light."""
+    figure, axes = canvas(7.4, 4.8)
+    ax = axes[0, 0]
+    for name, label in _labels(result).items():
+        colour, line = _LOOKS[name]
+        ax.plot(result.radius, result.curves[name], color=colour, linestyle=line, label=label)
+    top = max(map(max, result.curves.values()))
+    ax.set(
+        yscale="log",
+        ylim=(top * 1e-8, top * 3),
+        xlabel="spatial frequency (cycles a pixel)",
+        ylabel="NEQ (e-)",
+    )
+    ax.set_title(f"quiet frame, {SHOWN_AT:g} e- a pixel: mean over directions")
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+@drawn
+def under_attack(result: ProtectionResult) -> Any:
+    """Draw information and seen pixels of each rival by strength of the laser: median and middle
+    90 % of the draws.
+    """
+    figure, axes = canvas(11.0, 4.4, 1, 2)
+    for name, label in _labels(result).items():
+        colour, line = _LOOKS[name]
+        _band(axes[0, 0], result.attack[name]["information"], colour, line, label)
+        _band(
+            axes[0, 1],
+            [[100 * x for x in row] for row in result.attack[name]["seen"]],
+            colour,
+            line,
+            label,
+        )
+    for ax, shown in zip(
+        axes[0], ("information (bits a pixel)", "pixels that are not full (%)"), strict=True
+    ):
+        ax.set(
+            xscale="log",
+            xlabel="strength of the laser (wells in the brightest pixel, open lens)",
+            ylabel=shown,
+        )
+        ax.xaxis.label.set_fontsize(9)
+    axes[0, 0].set_yscale("log")
+    top = max(max(map(max, measures["information"])) for measures in result.attack.values())
+    axes[0, 0].set_ylim(top * 1e-5, top * 2)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
+
+
+def _labels(result: ProtectionResult) -> dict[str, str]:
+    """Return the rivals to draw, with their labels; where the best stop needs no filter, two
+    rivals are one curve.
+    """
+    labels = {name: name for name in _LOOKS if name in result.rivals}
+    both, stop = (result.rivals[name].said for name in ("stop and filter", "smaller stop"))
+    if both == stop:
+        del labels["smaller stop"]
+        labels["stop and filter"] = "smaller stop, the best stop and filter"
+    return labels
+
+
+def _band(ax: Any, rows: Sequence[Sequence[float]], colour: str, line: str, name: str) -> None:
+    low, middle, up = np.quantile(np.maximum(rows, 1e-12), [0.05, 0.5, 0.95], axis=0)
+    ax.fill_between(STRENGTHS, low, up, color=colour, alpha=0.15, linewidth=0)
+    ax.plot(STRENGTHS, middle, color=colour, linestyle=line, label=name)
+
+
+# --- protection page ------------------------------------------------------------------------------
+
+# The page of the protection study: a paragraph to quote, the rivals, both questions, and what
+# bounds every mask.
+
+
+def draw_pictures(result: ProtectionResult) -> dict[str, bytes]:
+    """Return the pictures of the page by name, as PNG bytes."""
+    return {
+        "region": winning_region(result),
+        "gain": gain_with_bounds(result),
+        "neq": neq_by_frequency(result),
+        "attack": under_attack(result),
+    }
+
+
+def crossing(gains: Sequence[float]) -> float:
+    """Return the scene light at which a gain falls to 0: below the least light if it never wins,
+    infinite if always.
+    """
+    if gains[0] <= 0:
+        return 0.0
+    for (n, low), (m, high) in pairwise(zip(LIGHTS, gains, strict=True)):
+        if high <= 0:
+            return float(n * (m / n) ** (low / (low - high)))
+    return math.inf
+
+
+def quotable(result: ProtectionResult, camera: str, light: str) -> str:
+    """Return one paragraph that says where the mask wins, by how much, and where it loses, for
+    both questions.
+    """
+    harm = "peak" if light == "pulse" else "heat"
+    parts = [
+        f"{camera}: this mask lowers the {harm} of a laser to {result.own:.2g} at the worst"
+        f" wavelength. Compared with the best smaller stop and grey filter of the same {harm}, in a"
+        " quiet frame:"
+    ]
+    parts += [f"{_said(result, measure)};" for measure in DRAWN]
+    parts[-1] = parts[-1][:-1] + "."
+    names = [name for name in ("mask", "stop and filter", "grey filter") if name in result.lost]
+    halves = ", ".join(f"{_interval(result.lost[name], '.1e')} behind the {name}" for name in names)
+    parts.append(
+        f"Under attack, at {ATTACKED_AT:g} e- a pixel, half of the information of the quiet frame"
+        f" is gone at a strength of {halves}. {_why(result)} Intervals hold 90 % of the draws of"
+        " wavelength, direction, defocus, dirt and scattered light."
+    )
+    return " ".join(parts)
+
+
+def _said(result: ProtectionResult, measure: str) -> str:
+    """Return where the mask wins by one measure: medians over the draws, with intervals."""
+    draws = np.array([result.drawn[n][measure] for n in LIGHTS])
+    own = np.median(draws, axis=1)
+    light = crossing(own.tolist())
+    if light == 0.0:
+        return f"by the {MEASURES[measure]} it loses at every light, by {-own.max():.1f} dB or more"
+    peak = int(own.argmax())
+    by = f"by {own[peak]:.1f} dB ({_ends(draws[peak], '.1f')}) at {LIGHTS[peak]:g} e- a pixel"
+    if math.isinf(light):
+        return f"by the {MEASURES[measure]} it wins at every light, {by}"
+    where = [crossing(row) for row in draws.T.tolist()]
+    return (
+        f"by the {MEASURES[measure]} it wins below {light:.0f} e- a pixel ({_ends(where, '.0f')}),"
+        f" {by}"
+    )
+
+
+def _why(result: ProtectionResult) -> str:
+    brightest = LIGHTS[-1]
+    bound = 10 * math.log10(result.bound[brightest][1])
+    dark = 10 * math.log10(result.bound[LIGHTS[0]][1])
+    return (
+        f"In much light shot noise decides, and no mask of this peak gains more than {bound:.1f} dB"
+        f" in mean NEQ over the lens band at {brightest:g} e- a pixel, against {dark:.1f} dB at"
+        f" {LIGHTS[0]:g} e-; a mask that spreads a laser over the frame lets a strong one fill"
+        " pixels that a filter keeps."
+    )
+
+
+def _interval(values: Sequence[float], form: str) -> str:
+    return f"{format(float(np.median(values)), form)} ({_ends(values, form)})"
+
+
+def _ends(values: Any, form: str) -> str:
+    low, up = np.quantile(values, [0.05, 0.95], method="nearest")
+    return f"{format(float(low), form)} to {format(float(up), form)}"
+
+
+def sections(
+    result: ProtectionResult, pictures: Mapping[str, bytes], notes: Sequence[str]
+) -> list[Section]:
+    """Return the sections of the page."""
+    return [
+        _region(result, pictures["region"]),
+        _quiet(result, pictures["gain"]),
+        Section(
+            "NEQ by frequency",
+            "Noise equivalent quanta, (light |OTF|)^2 over the noise, of each rival in a quiet "
+            "frame. A value counts as many photons as an ideal sensor would need.",
+            picture=pictures["neq"],
+        ),
+        _attack(result, pictures["attack"]),
+        _fields(result),
+        _rivals(result),
+        Section("What is assumed", "\n\n".join(notes)),
+    ]
+
+
+def _region(result: ProtectionResult, picture: bytes) -> Section:
+    text = f"""Gain in dB of the mask, with the best stop and filter of its own, over the best
+        stop-and-filter without a mask, at equal protection. Hatched: the mask wins. The dashed line
+        is the protection of the mask alone, {result.own:.3g}. Above this line the mask protects
+        more than is asked, and still costs its contrast."""
+    return Section("Where the mask wins", text, picture=picture)
+
+
+def _quiet(result: ProtectionResult, picture: bytes) -> Section:
+    text = """Insured: the laser may come, and the frame is quiet. The gain of the mask at its own
+        protection. Error: error variance of the Wiener-filtered picture of a natural scene.
+        Detection: d' of an ideal observer who knows place and shape. Shaded: the middle 90 % of the
+        draws, with a filter that does not know defocus and dirt. On the right, the bound of every
+        mask of this peak (Parseval): it holds for one wavelength, for the unweighted mean NEQ over
+        the whole lens band and without glare, and not for a part of the band."""
+    columns = ("scene light (e-)", *(f"{name} (dB)" for name in MEASURES), "rival by error")
+    rows = [
+        (n, *(round(result.gain[result.own][n][m], 2) for m in MEASURES), result.stops[n].said)
+        for n in LIGHTS
+    ]
+    return Section("Question 1: the everyday picture", text, columns, rows, picture)
+
+
+def _attack(result: ProtectionResult, picture: bytes) -> Section:
+    text = f"""The laser is there, and the scene has {ATTACKED_AT:g} e- a pixel. A strength of 1
+        fills one pixel behind the open lens. A pixel that scene and glare fill holds no
+        information; in every other pixel glare adds shot noise, fixed-pattern noise and what is
+        wrong when glare is subtracted. Lines are medians of the draws, bands the middle 90 %."""
+    columns = ("protection", "strength that halves the information", "5 %", "95 %")
+    rows = [
+        (name, float(np.median(x)), *map(float, np.quantile(x, [0.05, 0.95])))
+        for name, x in result.lost.items()
+    ]
+    return Section("Question 2: under attack", text, columns, rows, picture)
+
+
+def _fields(result: ProtectionResult) -> Section:
+    text = """Share of the pixels in % that are not full, for a laser in the middle of fields of
+        several sizes. A wider field is left out where the samples of the recipe's pupil do not
+        carry it: `optics=neusee` carries 2048."""
+    indices = (4, 8, 11)
+    strengths = [10 ** (0.75 * i) for i in indices]
+    columns = ("protection", "field (pixels)", *(f"strength {s:.0e}" for s in strengths))
+    rows = []
+    for name, sides in result.fields.items():
+        for side, shares in sides.items():
+            rows.append((name, side, *(round(100 * shares[i], 2) for i in indices)))
+    return Section("Fields", text, columns, rows)
+
+
+def _rivals(result: ProtectionResult) -> Section:
+    text = """Each rival of the mask, with the error of the filtered picture (dB below the contrast
+        of the scene, more is better). The notch protects at one wavelength only. Tint: the largest
+        share of light that a channel receives over the smallest."""
+    columns = ("rival", "made of", *(f"error at {n:g} e- (dB)" for n in LIGHTS[::2]), "tint")
+    rows = [
+        (
+            name,
+            rival.said,
+            *(round(result.quiet[name][n]["error"], 2) for n in LIGHTS[::2]),
+            result.tint[name],
+        )
+        for name, rival in result.rivals.items()
+    ]
+    return Section("Rivals of the same protection", text, columns, rows)
+
+
+# --- protection study -----------------------------------------------------------------------------
+
+# The protection study: a mask, a grey filter and a smaller stop of equal protection, quiet and
+# under attack.
+
 
 _COLUMNS = ("protection", "scene light", "measure", "gain", "5 %", "95 %")
-_VARIANCE, _LOW = 0.1, 0.12  #: contrast of a natural scene; highest frequency of the mean log NEQ, cycles per pixel
+#: contrast of a natural scene; highest frequency of the mean log NEQ, cycles per pixel
+_VARIANCE, _LOW = 0.1, 0.12
 _CONTINUOUS = 0.1  #: s, dwell time of continuous light
 _LAWS = UnknownLaws()
 
@@ -37,39 +417,51 @@ def study(
     prnu: float = 0.01,
     residual: float = 0.02,
 ) -> Path:
-    """Compare the mask of a recipe with filters and stops of equal protection, and return the folder with the results.
+    """Compare the mask of a recipe with filters and stops of equal protection, and return the
+    folder with the results.
 
-    Args: draws: of the unknown conditions. bands: wavelengths of the scene; the laser may have each of the recipe.
-    light: `pulse`, whose peak does harm, or `continuous`, whose heat does. size: height of the targets in pixels.
-    prnu: relative spread of the sensitivity of pixels. residual: share of the glare that is subtracted wrongly.
+    Args: draws: of the unknown conditions. bands: wavelengths of the scene; the laser may have each
+            of the recipe.
+    light: `pulse`, whose peak does harm, or `continuous`, whose heat does. size: height of the
+    targets in pixels. prnu: relative spread of the sensitivity of pixels. residual: share of the
+    glare that is subtracted wrongly.
     """
     study_run = StudyRun("protection", recipe, command)
     camera = ProtectionCamera.of(recipe, store, bands)
     side = min(int(n) for n in camera.lens["shape"])
     if 4 * size > side:
-        raise ValueError(f"a text {size:g} pixels high is wider than the PSF window of {side}; give a smaller --size")
+        raise ValueError(
+            f"a text {size:g} pixels high is wider than the PSF window of {side}; give a smaller"
+            " --size"
+        )
     dwell = None if light == "pulse" else _CONTINUOUS
     settings = FrontSettings(_VARIANCE, _LOW, size, (side, 2 * side, 4 * side), dwell)
     bench = FrontBench(camera, store, settings)
     conditions = draw_conditions(draws, recipe.seed, _LAWS)
     result = measure_protection(bench, conditions, camera.pixel(prnu, residual), progress)
     said = quotable(result, recipe.name, light)
-    document = study_run.document({"light": light, "paragraph": said, **_document(result, conditions)})
+    document = study_run.document(
+        {"light": light, "paragraph": said, **_document(result, conditions)}
+    )
     options = {"light": light, "size": size, "prnu": prnu, "residual": residual}
     report = _report(recipe, result, said, _notes(camera, options))
-    return study_run.write(runs, digest(document["gain"], document["lost"], options), document, report)
+    return study_run.write(
+        runs, digest(document["gain"], document["lost"], options), document, report
+    )
 
 
 def _document(result: ProtectionResult, conditions: Sequence[Condition]) -> dict[str, Any]:
     return {
         "protection": result.own,
-        "draws": [one.plain for one in conditions],
+        "draws": [condition.plain for condition in conditions],
         "laws": asdict(_LAWS),
         "rivals": {name: rival.said for name, rival in result.rivals.items()},
         "gain": _texts(result.gain[result.own]),
         "drawn": _texts(result.drawn),
         "quiet": {name: _texts(rows) for name, rows in result.quiet.items()},
-        "bound": {f"{n:g}": {"gain": pair[0], "bound": pair[1]} for n, pair in result.bound.items()},
+        "bound": {
+            f"{n:g}": {"gain": pair[0], "bound": pair[1]} for n, pair in result.bound.items()
+        },
         "largest glare": _texts(result.forbidden),
         "lost": {name: list(rows) for name, rows in result.lost.items()},
         "tint": dict(result.tint),
@@ -81,7 +473,9 @@ def _texts(rows: Any) -> dict[str, Any]:
     return {f"{key:g}": value for key, value in rows.items()}
 
 
-def _report(recipe: Recipe, result: ProtectionResult, said: str, notes: Sequence[str]) -> StudyReport:
+def _report(
+    recipe: Recipe, result: ProtectionResult, said: str, notes: Sequence[str]
+) -> StudyReport:
     pictures = draw_pictures(result)
     return StudyReport(
         f"{recipe.name}: equal protection",
@@ -108,17 +502,28 @@ def _rows(result: ProtectionResult) -> Iterator[Sequence[Any]]:
 
 def _notes(camera: ProtectionCamera, options: dict[str, Any]) -> list[str]:
     noise = camera.noise
-    harm = "peak of the PSF" if options["light"] == "pulse" else f"heat of the hottest pixel after {_CONTINUOUS:g} s"
+    harm = (
+        "peak of the PSF"
+        if options["light"] == "pulse"
+        else f"heat of the hottest pixel after {_CONTINUOUS:g} s"
+    )
     laws = ", ".join(f"{name.replace('_', ' ')} {law}" for name, law in asdict(_LAWS).items())
     wavelengths = len(camera.laser_bands.centres)
     return [
-        f"Equal protection: the {harm} at the worst of {wavelengths} wavelengths. Sensor: read noise "
-        f"{noise['read_noise']:g} e-, well {noise['full_well']:g} e-, PRNU {options['prnu']:.1%}, residual glare "
-        f"{options['residual']:.1%} (the share of the glare that is subtracted wrongly).",
-        f"Scene: grey, natural spectrum 1 / frequency^2 with a contrast variance of {_VARIANCE:g}. Targets: "
-        f"{options['size']:g} pixels high, contrast {CONTRAST:g}. Every rival is restored by the Wiener filter for its "
-        "own PSF and its noise.",
+        (
+            f"Equal protection: the {harm} at the worst of {wavelengths} wavelengths. Sensor: read"
+            f" noise {noise['read_noise']:g} e-, well {noise['full_well']:g} e-, PRNU"
+            f" {options['prnu']:.1%}, residual glare {options['residual']:.1%} (the share of the"
+            " glare that is subtracted wrongly)."
+        ),
+        (
+            "Scene: grey, natural spectrum 1 / frequency^2 with a contrast variance of"
+            f" {_VARIANCE:g}. Targets: {options['size']:g} pixels high, contrast {CONTRAST:g}."
+            " Every rival is restored by the Wiener filter for its own PSF and its noise."
+        ),
         f"Unknown in the draws: {laws}. Directions are shares of the field.",
-        "Left out: ghosts, blooming, edges of the picture, contrast that scattered light of the scene takes, a "
-        "response of the eye, and masks that would be designed for this camera.",
+        (
+            "Left out: ghosts, blooming, edges of the picture, contrast that scattered light of the"
+            " scene takes, a response of the eye, and masks that would be designed for this camera."
+        ),
     ]

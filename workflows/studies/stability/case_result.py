@@ -1,58 +1,299 @@
-"""The test of one step in one extreme case: errors of result and gradient, relative to a float64 computation.
-
-The reference is the node's own reference, or the node's function on the same inputs in float64, with the same random
-numbers. The bound of the result is the node's ``rtol`` times the largest element of the reference. The bound of the
-gradient is 1e-4 of its largest element, or ten times ``rtol`` if that is more.
-
-The gradient of a largest element is ill-conditioned, which is a warning, if a change of the inputs by at most four
-roundings to single precision alone changes it by its error or more: rounding decides which of several elements is the
-largest. Another gradient is excused only where roundings to double precision do so: then nobody knows the reference.
-No other gradient and no result is, because roundings to single precision of a height of 10 mm hide a phase in single
-precision: a step computes its inputs as they are given.
-"""
+"""One step in one extreme case: errors of result and gradient against float64."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
 from neusee.workflows.graph.recipe_graph import Step
+from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.report.study_page import Mark
 from neusee.workflows.store.serialization import each_tensor, tensors_in
 from neusee.workflows.studies.stability.extreme_cases import Case, stated_words
-from neusee.workflows.studies.stability.gradient_error import LEAST, finite, moved_slopes, over, slope_error, terms
-from neusee.workflows.studies.stability.step_runs import (
-    DOUBLE,
-    HALVES,
-    SINGLE,
-    Refused,
-    as_used,
-    in_double,
-    is_picture,
-    pictures_in,
-    run,
-)
 from neusee.workflows.tolerance.error_norm import largest_error
+
+# --- step runs ------------------------------------------------------------------------------------
+
+# The runs of one step of the stability study: as a recipe uses the step, and in float64 as the
+# reference.
+
+
+SINGLE, DOUBLE = 2.0**-24, 2.0**-53  #: largest relative rounding
+HALVES = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}  #: largest relative rounding
+
+
+class Refused(Exception):
+    """Error of a step that rejects its inputs with `ValueError`."""
+
+
+class _CountedInSingle(TorchFunctionMode):
+    """A PyTorch function mode that samples float64 Poisson counts with the mean rounded to
+    single precision.
+    """
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func is torch.poisson and args[0].dtype == torch.float64:
+            return func(args[0].float(), *args[1:], **(kwargs or {})).double()
+        return func(*args, **(kwargs or {}))
+
+
+def is_picture(x: Tensor) -> bool:
+    return (x.is_floating_point() and x.ndim >= 2 and x.dtype != torch.float64) or x.dtype in HALVES
+
+
+def pictures_in(values: Sequence[Any]) -> list[Tensor]:
+    return [x for x in tensors_in(list(values)) if is_picture(x)]
+
+
+def run(step: Step, fn: Any, inputs: Sequence[Any], seed: int, **params: Any) -> Any:
+    rng = (
+        {"rng": torch.Generator().manual_seed(stream_seed(seed, step.name))}
+        if step.node.random
+        else {}
+    )
+    return fn(*inputs, **{**step.params, **params}, **rng)
+
+
+def as_used(step: Step, inputs: Sequence[Any], seed: int) -> Any:
+    """Compute a step with its own parameters and return its result; raise `Refused` for a
+    `ValueError`.
+    """
+    try:
+        return run(step, step.node.fn, inputs, seed)
+    except ValueError as error:
+        raise Refused(str(error)) from error
+
+
+def in_double(step: Step, inputs: Sequence[Any], seed: int) -> Any:
+    wide = each_tensor(lambda x: x.double() if x.is_floating_point() else x, list(inputs))
+    precise = {"precision": "double"} if "precision" in step.params else {}
+    with _CountedInSingle():
+        return run(step, step.node.fn, wide, seed, **precise)
+
+
+def rounded(inputs: Sequence[Any], draw: int, unit: float) -> list[Any]:
+    """Return a step's inputs in float64, each element moved at random by up to four roundings of
+    ``unit``.
+    """
+    rng = torch.Generator().manual_seed(draw)
+
+    def move(x: Tensor) -> Tensor:
+        off = 2 * torch.rand(x.shape, generator=rng, dtype=torch.float64) - 1
+        return x.double() * (1 + 4 * unit * off)
+
+    moved: list[Any] = each_tensor(lambda x: move(x) if is_picture(x) else x, list(inputs))
+    return moved
+
+
+# --- gradient error -------------------------------------------------------------------------------
+
+# The error of the gradient of one step, against the gradient of its float64 reference.
+
+
+#: the least scale of an error, far above denormal numbers
+LEAST = math.sqrt(torch.finfo(torch.float32).tiny)
+
+
+def finite(value: Any) -> bool:
+    return all(bool(x.isfinite().all()) for x in tensors_in(value) if x.is_floating_point())
+
+
+def slope_error(step: Step, inputs: list[Any], seed: int) -> float | None:
+    """Return the error of the gradient of a weighted sum of the result, or None if the result
+    has no gradient.
+    """
+    with torch.enable_grad():
+        usual = _slopes(inputs, lambda values: run(step, step.node.fn, values, seed))
+        if usual is None:
+            return None
+        truth = true_slopes(step, inputs, seed)
+    return _apart(usual, truth, inputs)
+
+
+def moved_slopes(step: Step, inputs: list[Any], seed: int, draws: int, unit: float) -> float:
+    """Return the largest change of the reference gradient by random roundings of the inputs by
+    up to four ``unit``.
+    """
+    with torch.enable_grad():
+        truth = true_slopes(step, inputs, seed)
+        drawn = [true_slopes(step, inputs, seed, moved=(draw, unit)) for draw in range(draws)]
+    return max(
+        (_apart(slopes, truth, inputs) for slopes in drawn if slopes and finite(slopes)),
+        default=0.0,
+    )
+
+
+def _apart(usual: list[Tensor], truth: list[Tensor] | None, inputs: list[Any]) -> float:
+    """Return the largest error of gradients by each picture, or infinity if the reference
+    gradient is not finite.
+    """
+    if truth is None or not finite(truth):
+        return math.inf
+    pictures = pictures_in(inputs)
+    tops = [
+        torch.finfo(torch.float32 if x.dtype == torch.float64 else x.dtype).max for x in pictures
+    ]
+    if any(bool((g.abs() >= top).any()) for g, top in zip(truth, tops, strict=True)):
+        return 0.0  # the gradient exceeds the range of the picture's type
+    return max(over(a, b, _slight(x)) for a, b, x in zip(usual, truth, pictures, strict=True))
+
+
+def _slight(picture: Tensor) -> float:
+    """Return the least divisor of a gradient error: the gradient of a normalised mean, or the
+    least normal number.
+    """
+    top = float(picture.detach().double().abs().max())
+    return max(1.0 / (picture.numel() * max(top, LEAST)), torch.finfo(picture.dtype).tiny)
+
+
+def true_slopes(
+    step: Step,
+    inputs: list[Any],
+    seed: int,
+    number: int | None = None,
+    moved: tuple[int, float] | None = None,
+) -> list[Tensor] | None:
+    """Return the gradients of the reference in float64: of the tensor ``number`` of the result, at
+    inputs that `rounded` moved.
+    """
+    wide = (
+        rounded(inputs, *moved)
+        if moved
+        else each_tensor(lambda x: x.double() if is_picture(x) else x, inputs)
+    )
+    leaves = [
+        id(w) for w, x in zip(tensors_in(wide), tensors_in(inputs), strict=True) if is_picture(x)
+    ]
+    reference = step.node.hooks.reference
+    ways = (
+        [partial(run, step, reference), partial(in_double, step)]
+        if reference
+        else [partial(in_double, step)]
+    )
+
+    def of(way: Any, values: list[Any]) -> Any:
+        value = way(values, seed)
+        return value if number is None else tensors_in(value)[number]
+
+    for way in ways:
+        slopes = _slopes(wide, partial(of, way), leaves)
+        if slopes:
+            return slopes
+    return None
+
+
+def _slopes(inputs: list[Any], fn: Any, ids: list[int] | None = None) -> list[Tensor] | None:
+    """Return the gradients of ``fn(inputs)`` with respect to the pictures, or to the tensors
+    with these ``ids``.
+    """
+    leaves: list[Tensor] = []
+
+    def leaf(x: Tensor) -> Tensor:
+        if is_picture(x) if ids is None else id(x) in ids:
+            leaves.append(x.detach().clone().requires_grad_())
+            return leaves[-1]
+        return x
+
+    total = _weighed(fn(each_tensor(leaf, inputs)))
+    if total is None or not leaves:
+        return None
+    grads = torch.autograd.grad(total, leaves, allow_unused=True)
+    return [torch.zeros_like(x) if g is None else g for x, g in zip(leaves, grads, strict=True)]
+
+
+def _weighed(value: Any) -> Tensor | None:
+    """Return the sum of all differentiable results, each scaled to about 1 and multiplied by
+    fixed random weights.
+    """
+    parts = [
+        (x.double() * _weight(x) / _near(x)).sum() for x in tensors_in(value) if x.requires_grad
+    ]
+    return torch.stack(parts).sum() if parts else None
+
+
+def _weight(x: Tensor) -> Tensor:
+    return torch.rand(x.shape, generator=torch.Generator().manual_seed(5), dtype=torch.float32)
+
+
+def _near(x: Tensor) -> float:
+    """Return a power of ten near the largest element of ``x``, or 1 if ``x`` is tiny or a scalar
+    below 1.
+
+    A loss near 0 is a difference of pictures, whose gradient does not shrink with the loss. In a
+    loss of 1e4, terms of 1e4 cancel where the gradient is 0, and leave their rounding.
+    """
+    top = float(x.detach().double().abs().max())
+    top = top if x.ndim else max(top, 1.0)
+    return 10.0 ** round(math.log10(top) + 0.123) if LEAST < top < math.inf else 1.0
+
+
+def terms(step: Step, inputs: list[Any], truth: Tensor, number: int, seed: int) -> float:
+    """Return the sum of the terms of a scalar result f(x), sum |x df/dx|, beside which their
+    rounding counts.
+
+    Where terms cancel, f is smaller than this sum, which is 0 if it is not finite. ``number`` is
+    the position of ``truth`` among the scalars that the step returns.
+    """
+    with torch.enable_grad():
+        slopes = true_slopes(step, inputs, seed, number) or []
+    moved = sum(
+        float((x.double() * g).abs().sum())
+        for x, g in zip(pictures_in(inputs), slopes, strict=False)
+    )
+    return moved * _near(truth) / float(_weight(truth)) if math.isfinite(moved) else 0.0
+
+
+def over(a: Tensor, b: Tensor, floor: float) -> float:
+    """Return the largest difference of ``a`` and ``b``, divided by the larger of the largest
+    ``|b|`` and ``floor``.
+    """
+    error, top = largest_error(a, b), float(b.detach().double().abs().max()) if b.numel() else 0.0
+    return error if top >= floor else error * (top or 1.0) / floor
+
+
+# --- case result ----------------------------------------------------------------------------------
+
+# The test of one step in one extreme case: errors of result and gradient, relative to a float64
+# computation.
+#
+# The reference is the node's own reference, or the node's function on the same inputs in float64,
+# with the same random numbers. The bound of the result is the node's ``rtol`` times the largest
+# element of the reference. The bound of the gradient is 1e-4 of its largest element, or ten times
+# ``rtol`` if that is more.
+#
+# The gradient of a largest element is ill-conditioned, which is a warning, if a change of the
+# inputs by at most four roundings to single precision alone changes it by its error or more:
+# rounding decides which of several elements is the largest. Another gradient is excused only where
+# roundings to double precision do so: then nobody knows the reference. No other gradient and no
+# result is, because roundings to single precision of a height of 10 mm hide a phase in single
+# precision: a step computes its inputs as they are given.
+
 
 ROUNDING = 2.0**-23  #: the least bound of a result in single precision
 SLOPE = 1e-4  #: the least bound of a gradient in single precision
 _NEAR = 0.5  #: share of a bound above which the mark is ``warn``
 _STEEPER = 10.0  #: ratio of the bound of a gradient to the bound of the result
 _DIM = 1e-3  #: share of the brightest element below which an element is dim
-_LIGHT = ("scene.", "spectra.", "optics.", "sensor.expose", "sensor.add_photons")  #: nodes that must keep dim parts
-_LARGEST = ("metrics.peak_irradiance", "sensor.level")  #: nodes whose gradient is that of a largest element
+#: nodes that must keep dim parts
+_LIGHT = ("scene.", "spectra.", "optics.", "sensor.expose", "sensor.add_photons")
+#: nodes whose gradient is that of a largest element
+_LARGEST = ("metrics.peak_irradiance", "sensor.level")
 _HUGE = 1e30  #: the large number with which infinity is compared
 _ROUNDINGS = 10  #: random roundings of the inputs that are tried
 
 
 @dataclass(frozen=True)
 class Cell:
-    """The test result of one step in one extreme case: pass, warn or fail, and errors of result and gradient."""
+    """The test result of one step in one extreme case: pass, warn or fail, and errors of result
+    and gradient.
+    """
 
     mark: Mark
     note: str
@@ -63,12 +304,18 @@ class Cell:
 
 
 def judge_step(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell | None:
-    """Test a step in an extreme case and return the test result, or None if the case changes no input of the step."""
-    given = _changed_inputs(inputs, case)
-    if given is None:
+    """Test a step in an extreme case and return the test result, or None if the case changes no
+    input of the step.
+    """
+    changed = _changed_inputs(inputs, case)
+    if changed is None:
         return None
     try:
-        return _seen(step, inputs, given, case, seed) if case.expect == "seen" else _compared(step, given, case, seed)
+        return (
+            _seen(step, inputs, changed, case, seed)
+            if case.expect == "seen"
+            else _compared(step, changed, case, seed)
+        )
     except Refused as refused:
         return Cell("pass", f"refused: {refused}")
     except Exception as error:
@@ -76,45 +323,85 @@ def judge_step(step: Step, inputs: Sequence[Any], case: Case, seed: int) -> Cell
 
 
 def _changed_inputs(inputs: Sequence[Any], case: Case) -> list[Any] | None:
-    """Return a step's inputs with the pictures changed for an extreme case, or None if no input is a picture."""
-    given = list(inputs)
+    """Return a step's inputs with the pictures changed for an extreme case, or None if no input
+    is a picture.
+    """
+    changed = list(inputs)
     if case.alike:
-        if len(given) < 2 or not all(isinstance(x, Tensor) and is_picture(x) for x in given[:2]):
+        if len(changed) < 2 or not all(
+            isinstance(x, Tensor) and is_picture(x) for x in changed[:2]
+        ):
             return None
-        given[1] = given[0].clone()
+        changed[1] = changed[0].clone()
     if case.inputs is not None:
-        if not pictures_in(given):
+        if not pictures_in(changed):
             return None
         change = case.inputs
-        given = each_tensor(lambda x: change(x) if is_picture(x) else x, given)
-    return given
+        changed = each_tensor(lambda x: change(x) if is_picture(x) else x, changed)
+    return changed
 
 
-# --- errors of results ------------------------------------------------------------------------------------------------
+# --- errors of results ----------------------------------------------------------------------------
 
 
 def _compared(step: Step, inputs: list[Any], case: Case, seed: int) -> Cell:
     with torch.no_grad():
         value, truth = as_used(step, inputs, seed), _truth(step, inputs, seed)
     if not finite(value):
-        overflows = Cell("pass", "overflows visibly, as the reference does in single precision")
-        return Cell("fail", "not finite") if _fits_single_precision(truth) else overflows
-    bound = max([step.node.rtol, ROUNDING, *(HALVES.get(x.dtype, 0.0) for x in tensors_in(value))])
-    coarse = max((HALVES.get(x.dtype, 0.0) for x in tensors_in(inputs)), default=0.0)  # of a gradient, as of its input
-    slope_bound, moved = max(SLOPE, _STEEPER * bound, 2 * coarse), 0.0
-    dim = case.expect == "dim part" and step.node.path.startswith(_LIGHT)
-    error, slope = _dim_error(value, truth) if dim else _error(value, truth), slope_error(step, inputs, seed)
+        return _overflow(truth)
+    bound = max([step.node.rtol, ROUNDING, *_roundings(value)])
+    error = _dim_error(value, truth) if _is_dim(step, case) else _error(value, truth)
+    # of a gradient, as of its input
+    coarse = max(_roundings(inputs), default=0.0)
+    slope, slope_bound = slope_error(step, inputs, seed), max(SLOPE, _STEEPER * bound, 2 * coarse)
     if error > bound and all(x.ndim == 0 for x in tensors_in(truth)):
-        scalars = enumerate(zip(tensors_in(value), tensors_in(truth), strict=True))
-        error = max(over(a, b, max(LEAST, terms(step, inputs, b, i, seed))) for i, (a, b) in scalars)
-    precision, unit = ("single", SINGLE) if step.node.path in _LARGEST else ("double", DOUBLE)
-    if slope is not None and slope > slope_bound and not coarse:
-        moved = moved_slopes(step, inputs, seed, _ROUNDINGS, unit)
+        error = _error_beside_terms(step, inputs, value, truth, seed)
+    steep = slope is not None and slope > slope_bound and not coarse
+    precision, unit = _input_precision(step)
+    moved = moved_slopes(step, inputs, seed, _ROUNDINGS, unit) if steep else 0.0
     cell = _marked(error, bound, slope, max(slope_bound, moved))
-    if moved > slope_bound and cell.mark != "fail":
-        changes = f"four roundings of the inputs in {precision} precision alone change the gradient by {moved:.1e}"
-        return replace(cell, mark="warn", note=f"ill-conditioned: {changes}")
-    return cell
+    return _ill_conditioned(cell, moved, precision) if moved > slope_bound else cell
+
+
+def _input_precision(step: Step) -> tuple[str, float]:
+    """Return the precision in which the inputs of a step are rounded, and its unit."""
+    return ("single", SINGLE) if step.node.path in _LARGEST else ("double", DOUBLE)
+
+
+def _overflow(truth: Any) -> Cell:
+    """Return the outcome of a result that is not finite."""
+    if _fits_single_precision(truth):
+        return Cell("fail", "not finite")
+    return Cell("pass", "overflows visibly, as the reference does in single precision")
+
+
+def _roundings(value: Any) -> list[float]:
+    """Return the largest relative rounding of each tensor in half precision, and 0 of others."""
+    return [HALVES.get(x.dtype, 0.0) for x in tensors_in(value)]
+
+
+def _is_dim(step: Step, case: Case) -> bool:
+    """Return True if only the dim elements of the result count."""
+    return case.expect == "dim part" and step.node.path.startswith(_LIGHT)
+
+
+def _error_beside_terms(step: Step, inputs: list[Any], value: Any, truth: Any, seed: int) -> float:
+    """Return the largest error of scalars, each relative to the sum of its terms."""
+    errors = []
+    for i, (a, b) in enumerate(zip(tensors_in(value), tensors_in(truth), strict=True)):
+        errors.append(over(a, b, max(LEAST, terms(step, inputs, b, i, seed))))
+    return max(errors)
+
+
+def _ill_conditioned(cell: Cell, moved: float, precision: str) -> Cell:
+    """Return the outcome of a step whose gradient moves with the rounding of its inputs."""
+    if cell.mark == "fail":
+        return cell
+    changes = (
+        f"four roundings of the inputs in {precision} precision alone change the gradient by"
+        f" {moved:.1e}"
+    )
+    return replace(cell, mark="warn", note=f"ill-conditioned: {changes}")
 
 
 def _truth(step: Step, inputs: list[Any], seed: int) -> Any:
@@ -123,22 +410,30 @@ def _truth(step: Step, inputs: list[Any], seed: int) -> Any:
 
 
 def _marked(error: float, bound: float, slope: float | None, steeper: float) -> Cell:
-    """Return the outcome of a test: pass if errors are below half of their bounds, warn up to the bounds, else fail."""
-    used = [error / bound] if slope is None else [error / bound, slope / steeper]
-    within = all(share <= 1.0 for share in used)  # NaN is not within its bound
-    near = within and max(used) > _NEAR
+    """Return the outcome of a test: pass if errors are below half of their bounds, warn up to
+    the bounds, else fail.
+    """
+    shares = [error / bound] if slope is None else [error / bound, slope / steeper]
+    within = all(share <= 1.0 for share in shares)  # NaN is not within its bound
+    near = within and max(shares) > _NEAR
     mark: Mark = "warn" if near else "pass" if within else "fail"
-    return Cell(mark, "near its bound" * near, error, bound, slope, None if slope is None else steeper)
+    return Cell(
+        mark, "near its bound" * near, error, bound, slope, None if slope is None else steeper
+    )
 
 
 def _error(value: Any, truth: Any) -> float:
-    """Return the largest difference of a result from the reference, relative to the reference's largest element."""
+    """Return the largest difference of a result from the reference, relative to the reference's
+    largest element.
+    """
     pairs = list(zip(tensors_in(value), tensors_in(truth), strict=True))
     return max((over(a, b, LEAST) for a, b in pairs), default=0.0)
 
 
 def _dim_error(value: Any, truth: Any) -> float:
-    """Return the largest error of the dim elements of a result, relative to the brightest dim element."""
+    """Return the largest error of the dim elements of a result, relative to the brightest dim
+    element.
+    """
     worst = 0.0
     for a, b in zip(tensors_in(value), tensors_in(truth), strict=True):
         dim = b.abs() < _DIM * b.abs().max() if b.is_floating_point() and b.ndim >= 2 else None
@@ -152,12 +447,17 @@ def _fits_single_precision(truth: Any) -> bool:
     return all(bool((x.abs() < top).all()) for x in tensors_in(truth) if x.is_floating_point())
 
 
-# --- NaN and infinity ------------------------------------------------------------------------------------------------
+# --- NaN and infinity -----------------------------------------------------------------------------
 
 
-def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed: int) -> Cell:
-    """Return a test result that fails if a step's result does not show NaN or infinity of an input picture."""
-    notes = [_one_seen(step, _with_one_changed(i, inputs, given), seed) for i in range(len(pictures_in(inputs)))]
+def _seen(step: Step, inputs: Sequence[Any], changed: list[Any], case: Case, seed: int) -> Cell:
+    """Return a test result that fails if a step's result does not show NaN or infinity of an
+    input picture.
+    """
+    notes = [
+        _one_seen(step, _with_one_changed(i, inputs, changed), seed)
+        for i in range(len(pictures_in(inputs)))
+    ]
     hidden = [note for note in notes if note.startswith("hidden")]
     stated = stated_words(step.node, case.name)
     if hidden and stated is None:
@@ -165,25 +465,27 @@ def _seen(step: Step, inputs: Sequence[Any], given: list[Any], case: Case, seed:
     return Cell("pass", f"as stated: {stated}" if hidden else "; ".join(dict.fromkeys(notes)))
 
 
-def _one_seen(step: Step, given: list[Any], seed: int) -> str:
-    """Return how a step treats NaN or infinity in an input: refused, seen in the result, as a large number, hidden."""
+def _one_seen(step: Step, inputs: list[Any], seed: int) -> str:
+    """Return how a step treats NaN or infinity in an input: refused, seen in the result, as a
+    large number, hidden.
+    """
     with torch.no_grad():
         try:
-            value = as_used(step, given, seed)
+            value = as_used(step, inputs, seed)
         except Refused as refused:
             return f"refused: {refused}"
         if not finite(value):
             return "seen"
-        bad = next(float(x[~x.isfinite()][0]) for x in pictures_in(given) if not finite(x))
+        bad = next(float(x[~x.isfinite()][0]) for x in pictures_in(inputs) if not finite(x))
         if math.isnan(bad):
             return "hidden: a finite result in spite of NaN"
-        large = each_tensor(lambda x: x.nan_to_num(posinf=_HUGE, neginf=-_HUGE), given)
+        large = each_tensor(lambda x: x.nan_to_num(posinf=_HUGE, neginf=-_HUGE), inputs)
         limit = run(step, step.node.fn, large, seed)
         same = finite(limit) and largest_error(value, limit) <= max(step.node.rtol, ROUNDING)
         return "like a large number" if same else "hidden: another result than for a large number"
 
 
-def _with_one_changed(which: int, inputs: Sequence[Any], given: Sequence[Any]) -> list[Any]:
-    swap = {id(pictures_in(inputs)[which]): pictures_in(given)[which]}
+def _with_one_changed(which: int, inputs: Sequence[Any], changed: Sequence[Any]) -> list[Any]:
+    swap = {id(pictures_in(inputs)[which]): pictures_in(changed)[which]}
     only: list[Any] = each_tensor(lambda x: swap.get(id(x), x), list(inputs))
     return only

@@ -1,8 +1,10 @@
-"""The stability study: errors of each step's result and gradient in extreme cases, compared with bounds."""
+"""The stability study: errors of each step in extreme cases, compared with bounds."""
 
 from __future__ import annotations
 
 import itertools
+import math
+import textwrap
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -14,30 +16,158 @@ from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.engine.provenance import versions
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.engine_digest import engine
+from neusee.workflows.keys.code_digest import Code, engine
+from neusee.workflows.report.figures.style import BLACK, canvas, drawn
 from neusee.workflows.report.study_folder import Progress, StudyReport, StudyRun
 from neusee.workflows.report.study_page import Mark, Section
-from neusee.workflows.store.memo import compute_once
-from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.stability.case_recipe import CaseRecipe, unchanged_steps
+from neusee.workflows.store.result_store import Store, compute_once
 from neusee.workflows.studies.stability.case_result import Cell, judge_step
-from neusee.workflows.studies.stability.extreme_cases import CASES, USUAL, Case
-from neusee.workflows.studies.stability.stability_figures import grid_picture
+from neusee.workflows.studies.stability.extreme_cases import (
+    CASES,
+    USUAL,
+    Case,
+    CaseRecipe,
+    unchanged_steps,
+)
 
-_COLUMNS = ("case", "step", "node", "mark", "error", "bound", "gradient error", "gradient bound", "note")
-_HOW = """Each step has the inputs of the recipe, at a small size, with one change: a parameter of the recipe, the
-result of an earlier step, or the pictures among the inputs of the step. A random height map of the same depth takes the
-place of a mask from a file, whose samples do not fit the small pupil. The result is compared with the node's own
-reference, or with the same function on the same inputs in float64. The error is the largest difference over the
-largest element, and the bound is the node's rtol (at least 1.2e-7, the rounding of single precision). A
-single number f in which terms cancel counts with the sum of its terms, sum |x df/dx| over the pictures.
+# --- stability figures ----------------------------------------------------------------------------
 
-The second error is that of the gradient of a weighted sum of the result with respect to every picture, over the
-gradient's largest element; the bound is 1e-4, or ten times the node's rtol if that is more. An error above half of its
-bound is a warning: with the rounding of another machine it may exceed the bound. NaN or infinity must be refused with a
-reason, show in the result, or have the effect of a large number. A step that refuses its inputs passes if its error
-names the cause. An empty cell: the step has the inputs of the usual case, or no inputs."""
+# The picture of the stability study: a grid with the outcome and the error of each node in each
+# extreme case.
+
+
+_COLOURS = {"pass": "#9AD6C1", "warn": "#F6D58A", "fail": "#F2B08A"}
+_WIDE, _TALL = 0.52, 0.23  #: inches of a cell
+_LETTER = 0.085  #: inches, width of a letter
+_ACROSS = 22  #: largest number of nodes side by side; further nodes are drawn in a panel below
+
+Entry = tuple[str, str, str, Cell]  #: group, case, node, cell
+
+
+@drawn
+def grid_picture(entries: Sequence[Entry]) -> Any:
+    """Draw the grid of test outcomes and errors: a row for each extreme case, a column for each
+    node, losses last.
+    """
+    cases = list(dict.fromkeys((group, case) for group, case, _, _ in entries))
+    nodes = sorted({node for _, _, node, _ in entries}, key=lambda n: (n.startswith("losses."), n))
+    panels = max(1, -(-len(nodes) // _ACROSS))
+    across = max(1, -(-len(nodes) // panels))
+    left, above = (
+        _LETTER * max(map(len, names), default=0) for names in ([case for _, case in cases], nodes)
+    )
+    width = max(6.0, left + 1.0 + _WIDE * across)
+    figure, axes = canvas(width, panels * (0.8 + 0.8 * above + _TALL * len(cases)), rows=panels)
+    for ax, first in zip(axes[:, 0], range(0, max(1, len(nodes)), across), strict=True):
+        _panel(
+            ax,
+            [e for e in entries if e[2] in nodes[first : first + across]],
+            cases,
+            nodes[first:],
+            across,
+        )
+    measure = (
+        "largest error over the largest element, of the result or (g) of its gradient, whichever is"
+        " nearer its bound"
+    )
+    text = f"{measure};  ! warn, × fail;  r refused, s seen, – no number to compare"
+    figure.supxlabel(textwrap.fill(text, int(width / _LETTER)), fontsize=9)
+    return figure
+
+
+def _panel(
+    ax: Any, entries: Sequence[Entry], cases: list[tuple[str, str]], nodes: list[str], across: int
+) -> None:
+    for group, case, node, cell in entries:
+        column, row = nodes.index(node), cases.index((group, case))
+        ax.barh(row, 0.96, 0.92, left=column - 0.48, color=_COLOURS[cell.mark])
+        ax.text(column, row, cell_text(cell), ha="center", va="center", color=BLACK, fontsize=9)
+    for row in range(1, len(cases)):
+        if cases[row][0] != cases[row - 1][0]:
+            ax.axhline(row - 0.5, color="#888888", linewidth=0.8)
+    ax.set_xticks(
+        range(min(across, len(nodes))),
+        nodes[:across],
+        rotation=50,
+        ha="left",
+        rotation_mode="anchor",
+    )
+    ax.set_yticks(range(len(cases)), [case for _, case in cases])
+    ax.tick_params(length=0, top=False, bottom=False, labeltop=True, labelbottom=False, left=False)
+    ax.set_xlim(-0.5, across - 0.5)
+    ax.set_ylim(len(cases) - 0.5, -0.5)
+    ax.grid(False)
+    for spine in ax.spines.values():
+        spine.set_visible(False)
+
+
+def cell_text(cell: Cell) -> str:
+    """Return the text of one test in the grid: a sign for warn or fail, and the error that is
+    nearest to its bound.
+    """
+    sign = {"pass": "", "warn": "!", "fail": "×"}[cell.mark]
+    if cell.error is None:
+        short = "r" if cell.note.startswith("refused") else "s" if "seen" in cell.note else "–"
+        return sign + short
+    steep = cell.slope is not None and _share(cell.slope, cell.slope_bound) > _share(
+        cell.error, cell.bound
+    )
+    return (
+        f"{sign}{short_number(cell.slope or 0.0)}g"
+        if steep
+        else f"{sign}{short_number(cell.error)}"
+    )
+
+
+def _share(value: float, bound: float | None) -> float:
+    return value / bound if bound else 0.0
+
+
+def short_number(value: float) -> str:
+    """Return a number as text with one digit and an exponent of at most two digits, such as
+    ``2e-7`` and ``>e99``.
+    """
+    if value == 0:
+        return "0"
+    if not math.isfinite(value):
+        return "inf" if value > 0 else "nan"
+    if not 1e-99 <= abs(value) < 9.5e99:
+        return "<e-99" if abs(value) < 1 else ">e99"
+    mantissa, _, exponent = f"{value:.0e}".partition("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+# --- stability study ------------------------------------------------------------------------------
+
+# The stability study: errors of each step's result and gradient in extreme cases, compared with
+# bounds.
+
+
+_COLUMNS = (
+    "case",
+    "step",
+    "node",
+    "mark",
+    "error",
+    "bound",
+    "gradient error",
+    "gradient bound",
+    "note",
+)
+_HOW = """Each step has the inputs of the recipe, at a small size, with one change: a parameter of
+the recipe, the result of an earlier step, or the pictures among the inputs of the step. A random
+height map of the same depth takes the place of a mask from a file, whose samples do not fit the
+small pupil. The result is compared with the node's own reference, or with the same function on the
+same inputs in float64. The error is the largest difference over the largest element, and the bound
+is the node's rtol (at least 1.2e-7, the rounding of single precision). A single number f in which
+terms cancel counts with the sum of its terms, sum |x df/dx| over the pictures.
+
+The second error is that of the gradient of a weighted sum of the result with respect to every
+picture, over the gradient's largest element; the bound is 1e-4, or ten times the node's rtol if
+that is more. An error above half of its bound is a warning: with the rounding of another machine it
+may exceed the bound. NaN or infinity must be refused with a reason, show in the result, or have the
+effect of a large number. A step that refuses its inputs passes if its error names the cause. An
+empty cell: the step has the inputs of the usual case, or no inputs."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +181,9 @@ class GridCell:
 
     @property
     def severity(self) -> tuple[int, float]:
-        """Return a sort key, largest for the worst result: the outcome, then the largest ratio of error to bound."""
+        """Return a sort key, largest for the worst result: the outcome, then the largest ratio
+        of error to bound.
+        """
         cell = self.cell
         pairs = ((cell.error, cell.bound), (cell.slope, cell.slope_bound))
         shares = [error / bound for error, bound in pairs if error is not None and bound]
@@ -66,24 +198,30 @@ def study(
     progress: Progress,
     cases: Sequence[Case] = CASES,
 ) -> Path:
-    """Test every step of ``recipe`` and its losses in every extreme case, and return the folder with the results."""
+    """Test every step of ``recipe`` and its losses in every extreme case, and return the folder
+    with the results.
+    """
     study_run = StudyRun("stability", recipe, command)
     with one_thread():
         rows = list(_rows(recipe, store, cases, progress))
     document = study_run.document(_document(rows))
-    return study_run.write(runs, digest([repr(_line(row)) for row in rows]), document, _report(recipe, rows, document))
+    return study_run.write(
+        runs, digest([repr(_line(row)) for row in rows]), document, _report(recipe, rows, document)
+    )
 
 
-def _rows(recipe: Recipe, store: Store, cases: Sequence[Case], progress: Progress) -> Iterator[GridCell]:
+def _rows(
+    recipe: Recipe, store: Store, cases: Sequence[Case], progress: Progress
+) -> Iterator[GridCell]:
     code = Code(store.code_memo)
     own = engine("studies.stability.extreme_cases", "studies.stability.case_result")
     usual = CaseRecipe.of(recipe, USUAL, code)
     for number, case in enumerate(cases, 1):
         chain = usual if case is USUAL else CaseRecipe.of(recipe, case, code, usual)
-        found = list(_row(chain, set(unchanged_steps(chain, usual)), store, own))
-        yield from found
-        bad = sum(row.cell.mark == "fail" for row in found)
-        progress(f"[{number}/{len(cases)}] {case.name}: {len(found)} steps, {bad} fail")
+        cells = list(_row(chain, set(unchanged_steps(chain, usual)), store, own))
+        yield from cells
+        bad = sum(row.cell.mark == "fail" for row in cells)
+        progress(f"[{number}/{len(cases)}] {case.name}: {len(cells)} steps, {bad} fail")
     code.save()
 
 
@@ -91,15 +229,27 @@ def _row(chain: CaseRecipe, same: set[str], store: Store, own: str) -> Iterator[
     for name, step in chain.steps.items():
         if name in same:
             continue
-        key = digest("stability", own, chain.case.name, chain.keys[name], [chain.keys[s] for s in step.sources])
-        about = {"step": f"stability of {name}: {chain.case.name}", "recipe": chain.recipe.name, "versions": versions()}
+        key = digest(
+            "stability",
+            own,
+            chain.case.name,
+            chain.keys[name],
+            [chain.keys[s] for s in step.sources],
+        )
+        about = {
+            "step": f"stability of {name}: {chain.case.name}",
+            "recipe": chain.recipe.name,
+            "versions": versions(),
+        }
         cell = compute_once(store, key, dict, partial(_judge, chain, name), about, small=True)
         if cell:
             yield GridCell(chain.case, name, step.node.path, Cell(**cell))
 
 
 def _judge(chain: CaseRecipe, name: str) -> dict[str, Any]:
-    """Return the test result of a step as a dict, empty if an earlier step failed or the case changes no input."""
+    """Return the test result of a step as a dict, empty if an earlier step failed or the case
+    changes no input.
+    """
     try:
         inputs = chain.inputs(name)
         with warnings.catch_warnings():
@@ -110,20 +260,26 @@ def _judge(chain: CaseRecipe, name: str) -> dict[str, Any]:
     return {} if cell is None else asdict(cell)
 
 
-# --- the folder -------------------------------------------------------------------------------------------------------
+# --- the folder -----------------------------------------------------------------------------------
 
 
 def _document(rows: Sequence[GridCell]) -> dict[str, Any]:
     count = {mark: sum(row.cell.mark == mark for row in rows) for mark in ("pass", "warn", "fail")}
-    return {"cells": len(rows), "passed": count["pass"], "warned": count["warn"], "failed": count["fail"]}
+    return {
+        "cells": len(rows),
+        "passed": count["pass"],
+        "warned": count["warn"],
+        "failed": count["fail"],
+    }
 
 
 def _report(recipe: Recipe, rows: Sequence[GridCell], document: Mapping[str, Any]) -> StudyReport:
     worst = _worst_by_case_and_node(rows)
     picture = grid_picture([(row.case.group, row.case.name, row.node, row.cell) for row in worst])
     lead = (
-        f"{document['cells']} cells, {len({r.case.name for r in rows})} cases by {len({r.node for r in rows})} nodes: "
-        f"{document['failed']} fail, {document['warned']} warn, {document['passed']} pass."
+        f"{document['cells']} cells, {len({r.case.name for r in rows})} cases by"
+        f" {len({r.node for r in rows})} nodes: {document['failed']} fail, {document['warned']}"
+        f" warn, {document['passed']} pass."
     )
     return StudyReport(
         f"Stability of {recipe.name}",
@@ -142,15 +298,32 @@ def _worst_by_case_and_node(rows: Sequence[GridCell]) -> list[GridCell]:
 
 
 def _tables(rows: Sequence[GridCell]) -> Iterator[Section]:
-    headings: dict[Mark, str] = {"fail": "What fails", "warn": "What uses more than half of its bound"}
+    headings: dict[Mark, str] = {
+        "fail": "What fails",
+        "warn": "What uses more than half of its bound",
+    }
     for mark, heading in headings.items():
         lines = [_line(row) for row in rows if row.cell.mark == mark]
         marks = {(i, _COLUMNS.index("mark")): mark for i in range(len(lines))}
-        yield Section(heading, "" if lines else "No cell.", _COLUMNS if lines else (), lines, marks=marks)
+        yield Section(
+            heading, "" if lines else "No cell.", _COLUMNS if lines else (), lines, marks=marks
+        )
     cases = {row.case.name: row.case for row in rows}.values()
-    yield Section("The cases", "", ("case", "group", "what"), [(c.name, c.group, c.what) for c in cases])
+    yield Section(
+        "The cases", "", ("case", "group", "what"), [(c.name, c.group, c.what) for c in cases]
+    )
 
 
 def _line(row: GridCell) -> tuple[Any, ...]:
     c = row.cell
-    return row.case.name, row.step, row.node, c.mark, c.error, c.bound, c.slope, c.slope_bound, c.note
+    return (
+        row.case.name,
+        row.step,
+        row.node,
+        c.mark,
+        c.error,
+        c.bound,
+        c.slope,
+        c.slope_bound,
+        c.note,
+    )

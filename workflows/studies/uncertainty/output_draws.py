@@ -1,17 +1,20 @@
-"""The outputs of a recipe for random values of its uncertain inputs; steps without these inputs run only once."""
+"""The outputs of a recipe for random values of its uncertain inputs, and their scatter."""
 
 from __future__ import annotations
 
 import ctypes
+import math
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from neusee.workflows.engine.differentiable_function import as_function
@@ -19,24 +22,190 @@ from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.engine.node_call import place
 from neusee.workflows.engine.provenance import timestamp
 from neusee.workflows.engine.worker_processes import shared_in_order, workers_for
+from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.keys.cache_key import device_kind, digest, key_of
-from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.engine_digest import engine
-from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
+from neusee.workflows.keys.code_digest import Code, engine
+from neusee.workflows.recipe.distributions.shapes import FloatArray as ShapesFloatArray
+from neusee.workflows.recipe.distributions.uncertain_inputs import InputDraws, Inputs
 from neusee.workflows.report.result_numbers import numbers_of
-from neusee.workflows.store.memo import compute_once
-from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.uncertainty.scatter_estimate import FloatArray
+from neusee.workflows.store.result_store import Store, compute_once
+
+# --- scatter estimate -----------------------------------------------------------------------------
+
+# Means and standard deviations of quantities over random draws, and standard errors of the standard
+# deviations.
+
+
+FloatArray = NDArray[np.float64]
+#: share of the largest value; a quantity with a smaller standard deviation is constant
+_CONSTANT = 1e-12
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """The mean, standard deviation and quantiles over all draws, for each element of one
+    quantity.
+    """
+
+    mean: FloatArray
+    sd: FloatArray
+    low: FloatArray  #: 5 %
+    high: FloatArray  #: 95 %
+    #: relative error of the greatest standard deviation; 0 if the quantity is constant
+    error: float
+
+    @property
+    def is_constant(self) -> bool:
+        """Return True if the quantity has the same finite value in all draws."""
+        return bool(np.isfinite(self.mean).all()) and not float(self.sd.max()) > 0
+
+
+def scatter(values: FloatArray, sequences: int = 0) -> Scatter:
+    """Return mean, standard deviation and quantiles of ``values`` (draw, element) over the draws.
+
+    With ``sequences``, draw i belongs to the scrambled Sobol sequence i % sequences; otherwise
+    draws are independent.
+    """
+    # a quantity that is infinite in a draw has no standard deviation
+    with np.errstate(invalid="ignore"):
+        mean, sd = values.mean(0), values.std(0, ddof=1)
+        low, high = np.quantile(values, [0.05, 0.95], axis=0)
+    sd = np.where(sd > _CONSTANT * np.abs(values).max(0), sd, 0.0)
+    worst = values[:, int(sd.argmax())]
+    error = (
+        0.0
+        if not sd.max() > 0
+        else _of_sequences(worst, sequences)
+        if sequences
+        else _jackknife(worst)
+    )
+    return Scatter(mean, sd, low, high, error)
+
+
+def _jackknife(x: FloatArray) -> float:
+    """Estimate the relative standard error of the standard deviation of independent draws ``x``
+    by the jackknife.
+    """
+    n = len(x)
+    apart = (x - x.mean()) ** 2
+    without = np.sqrt((apart.sum() - apart * n / (n - 1)).clip(0.0) / (n - 2))
+    error = math.sqrt((n - 1) / n * float(((without - without.mean()) ** 2).sum()))
+    return error / float(x.std(ddof=1))
+
+
+def _of_sequences(x: FloatArray, count: int) -> float:
+    """Estimate the relative standard error of the standard deviation from the variance in each
+    Sobol sequence.
+    """
+    squares = (x - x.mean()) ** 2
+    means = np.array([squares[i::count].mean() for i in range(count)])
+    return float(means.std(ddof=1) / math.sqrt(count) / means.mean() / 2)
+
+
+def worst_known(scatter: Mapping[str, Scatter]) -> str:
+    """Return the name of the quantity whose standard deviation has the largest relative error."""
+    return max(scatter, key=lambda name: scatter[name].error)
+
+
+# --- allowed draws --------------------------------------------------------------------------------
+
+# The draws of a study whose values the recipe allows together; other draws are left out, and their
+# number is stated.
+#
+# A value alone may be allowed, and two values may exclude each other, such as a full well below the
+# offset.
+
+
+class AllowedDraws:
+    """The allowed draws of the inputs, in order, of which a study takes more and more."""
+
+    def __init__(self, inputs: Inputs, draws: InputDraws, sequences: int) -> None:
+        self._inputs, self._draws = inputs, draws
+        #: draws that are left out together, so that Sobol sequences stay equally long
+        self._block = max(1, sequences)
+        self._allowed: list[int] = []
+        self.tried = 0
+        self.left_out = 0
+        self.reason = ""  #: why the last draw was left out
+
+    @property
+    def available(self) -> int:
+        """Return the largest number of draws that can be tried."""
+        return len(self._draws.z)
+
+    @property
+    def statement(self) -> str:
+        """Return how many draws were left out and why, or an empty text."""
+        return f"{self.left_out} of {self.tried} draws ({self.reason})" if self.left_out else ""
+
+    @property
+    def z(self) -> ShapesFloatArray:
+        """Return the standard normal numbers (draw, input) of the allowed draws so far."""
+        return self._draws.z[self._allowed]
+
+    @property
+    def values(self) -> ShapesFloatArray:
+        """Return the values (draw, input) of the allowed draws so far, in SI."""
+        return self._draws.values[self._allowed]
+
+    def extend(self, count: int) -> None:
+        """Try draws until ``count`` draws have been tried."""
+        while self.tried < min(count, self.available):
+            block = range(self.tried, min(self.tried + self._block, self.available))
+            problems = [self._inputs.problem(self._draws.values[i]) for i in block]
+            wrong = [problem for problem in problems if problem is not None]
+            if wrong:
+                self.left_out += len(block)
+                self.reason = _text(wrong[-1])
+            else:
+                self._allowed += block
+            self.tried = block.stop
+
+
+def refuse_combinations(inputs: Inputs, ends: ShapesFloatArray, draws: AllowedDraws) -> None:
+    """Raise `RecipeError` if values of ``ends`` (run, input), or of a draw, are not allowed
+    together.
+
+    The draws are those that have been tried before anything runs.
+    """
+    problems = [problem for problem in map(inputs.problem, ends) if problem is not None]
+    if problems:
+        raise RecipeError(problems)
+    if draws.left_out:
+        fault = (
+            f"{draws.left_out} of the first {draws.tried} draws have values that are not allowed"
+            " together"
+        )
+        value = inputs.uncertain.composed.root.below(inputs.names[0].split("."))
+        assert value is not None
+        advice = "give narrower or truncated distributions"
+        raise RecipeError(
+            [Diagnostic(value.mark, ", ".join(inputs.names), f"{fault} ({draws.reason}): {advice}")]
+        )
+
+
+def _text(problem: Diagnostic) -> str:
+    return f"{problem.path}: {problem.message}" if problem.path else problem.message
+
+
+# --- output draws ---------------------------------------------------------------------------------
+
+# The outputs of a recipe for random values of its uncertain inputs; steps without these inputs run
+# only once.
+
 
 Numbers = dict[str, list[float]]  #: elements of each quantity, such as ``restored_quality.psnr``
-_ARENAS, _MAPPED, _TRIM = -8, -4, -1  #: M_ARENA_MAX, M_MMAP_MAX and M_TRIM_THRESHOLD of glibc's mallopt
+#: M_ARENA_MAX, M_MMAP_MAX and M_TRIM_THRESHOLD of glibc's mallopt
+_ARENAS, _MAPPED, _TRIM = -8, -4, -1
 _ABOUT = {"step": "study uncertainty"}
 _NARROW = 8  #: a tensor of two axes counts as a picture if both are longer
 
 
 class OutputDraws:
-    """The outputs of a recipe for random values of its uncertain inputs; the store keeps the numbers of each draw."""
+    """The outputs of a recipe for random values of its uncertain inputs; the store keeps the
+    numbers of each draw.
+    """
 
     def __init__(self, inputs: Inputs, store: Store, device: str = "cpu", workers: int = 0) -> None:
         self.inputs, self.store, self.device = inputs, store, device
@@ -53,34 +222,46 @@ class OutputDraws:
 
     @cached_property
     def _function(self) -> Any:
-        """Compute the steps that depend on no uncertain input, and return the recipe as a function of the inputs."""
+        """Compute the steps that depend on no uncertain input, and return the recipe as a
+        function of the inputs.
+        """
         free = tuple(self.inputs.readers)
-        return as_function(self.inputs.recipe, *free, outputs=self.outputs, store=self.store, device=self.device)
+        return as_function(
+            self.inputs.recipe, *free, outputs=self.outputs, store=self.store, device=self.device
+        )
 
     def ready(self) -> float:
-        """Compute the steps that depend on no uncertain input, and return the run time in seconds."""
+        """Compute the steps that depend on no uncertain input, and return the run time in
+        seconds.
+        """
         began = time.perf_counter()
         _ = self._function
         return time.perf_counter() - began
 
     def numbers(self, values: FloatArray) -> list[Numbers]:
-        """Return all numbers in the outputs for each draw of the inputs; compute draws that the store does not have."""
+        """Return all numbers in the outputs for each draw of the inputs; compute draws that the
+        store does not have.
+        """
         keys = [self.key(row) for row in values]
-        found = [kept and kept["numbers"] for kept in map(self._kept, keys)]
-        lacking = [i for i, numbers in enumerate(found) if numbers is None]
+        stored = [record and record["numbers"] for record in map(self._kept, keys)]
+        lacking = [i for i, numbers in enumerate(stored) if numbers is None]
         for i, result in zip(lacking, self._results([values[i] for i in lacking]), strict=True):
-            found[i] = self._keep(keys[i], result)
-        return [numbers for numbers in found if numbers is not None]
+            stored[i] = self._keep(keys[i], result)
+        return [numbers for numbers in stored if numbers is not None]
 
     def pictures(self, values: FloatArray) -> dict[str, tuple[Tensor, Tensor]]:
-        """Return mean and standard deviation of each output picture over the draws, and store each draw's numbers."""
+        """Return mean and standard deviation of each output picture over the draws, and store
+        each draw's numbers.
+        """
         keys = [self.key(row) for row in values]
-        whole = digest("uncertainty pictures", keys)
+        pictures_key = digest("uncertainty pictures", keys)
         if (first := self._kept(keys[0])) is not None and not first["pictures"]:
             return {}
-        found: dict[str, tuple[Tensor, Tensor]]
-        found = compute_once(self.store, whole, dict, lambda: self._sums(keys, values), _ABOUT)
-        return found
+        moments: dict[str, tuple[Tensor, Tensor]]
+        moments = compute_once(
+            self.store, pictures_key, dict, lambda: self._sums(keys, values), _ABOUT
+        )
+        return moments
 
     def _sums(self, keys: Sequence[str], values: FloatArray) -> dict[str, tuple[Tensor, Tensor]]:
         sums = dict[str, _Sum]()
@@ -92,15 +273,21 @@ class OutputDraws:
         return {name: (total.mean, total.sd) for name, total in sums.items()}
 
     def key(self, row: FloatArray) -> str:
-        """Return the store key of one draw: a digest of the output keys of a run with the sampled input values."""
+        """Return the store key of one draw: a digest of the output keys of a run with the
+        sampled input values.
+        """
         recipe = self.inputs.recipe
         keys = self._keys(self.inputs.theta(self._named(row)))
         outputs = [[name, keys[name]] for name in self.outputs]
         within = [recipe.tolerance, recipe.exact, recipe.estimates, device_kind(self.device)]
-        return digest("uncertainty draw", engine("studies.uncertainty.output_draws"), outputs, within)
+        return digest(
+            "uncertainty draw", engine("studies.uncertainty.output_draws"), outputs, within
+        )
 
     def _keys(self, theta: Mapping[str, Any]) -> dict[str, str]:
-        """Return the store keys of steps that depend on the inputs ``theta``; if ``theta`` is empty, of other steps."""
+        """Return the store keys of steps that depend on the inputs ``theta``; if ``theta`` is
+        empty, of other steps.
+        """
         recipe, keys = self.inputs.recipe, dict(self._fixed) if theta else {}
         by_step: dict[str, dict[str, Any]] = {}
         for reader, value in theta.items():
@@ -117,8 +304,8 @@ class OutputDraws:
 
     def _kept(self, key: str) -> dict[str, Any] | None:
         with suppress(KeyError):
-            found: dict[str, Any] = self.store.get(key)
-            return found
+            record: dict[str, Any] = self.store.get(key)
+            return record
         return None
 
     def _keep(self, key: str, result: Mapping[str, Any]) -> Numbers:
@@ -129,7 +316,9 @@ class OutputDraws:
         return numbers
 
     def _results(self, rows: Sequence[FloatArray]) -> Iterator[dict[str, Any]]:
-        """Yield the outputs for each draw of the inputs, in order; worker processes compute in parallel."""
+        """Yield the outputs for each draw of the inputs, in order; worker processes compute in
+        parallel.
+        """
         if not rows:
             return
         self.ready()
@@ -137,7 +326,9 @@ class OutputDraws:
         _keep_memory()
         workers = workers_for(len(rows), self.workers) if self.device == "cpu" else 1
         with one_thread():
-            for result in shared_in_order(lambda number: self._result(rows[number]), len(rows), workers):
+            for result in shared_in_order(
+                lambda number: self._result(rows[number]), len(rows), workers
+            ):
                 self.computed += 1
                 self.seconds += time.perf_counter() - began
                 yield result
@@ -147,11 +338,11 @@ class OutputDraws:
         values = self._named(row)
         try:
             with torch.no_grad():
-                found: dict[str, Any] = self._function(self.inputs.theta(values))
+                result: dict[str, Any] = self._function(self.inputs.theta(values))
         except (RuntimeError, ValueError) as error:
-            at = ", ".join(f"{name} = {value:.6g}" for name, value in values.items())
-            raise ValueError(f"the recipe fails at the input values {at}: {error}") from error
-        return found
+            place = ", ".join(f"{name} = {value:.6g}" for name, value in values.items())
+            raise ValueError(f"the recipe fails at the input values {place}: {error}") from error
+        return result
 
     def _named(self, row: FloatArray) -> dict[str, float]:
         return dict(zip(self.inputs.names, map(float, row), strict=True))
@@ -159,11 +350,11 @@ class OutputDraws:
 
 def quantities(result: Mapping[str, Any]) -> Numbers:
     """Return all numbers in ``result`` by step and field, without pictures."""
-    found: Numbers = {}
+    numbers: Numbers = {}
     for step, value in result.items():
         for _, field, _, number in () if _is_picture(value) else numbers_of(step, value):
-            found.setdefault(f"{step}.{field}" if field else step, []).append(number)
-    return found
+            numbers.setdefault(f"{step}.{field}" if field else step, []).append(number)
+    return numbers
 
 
 def _reached_steps(inputs: Inputs, order: Sequence[str]) -> set[str]:
@@ -175,7 +366,9 @@ def _reached_steps(inputs: Inputs, order: Sequence[str]) -> set[str]:
 
 
 def _is_picture(value: Any) -> bool:
-    return isinstance(value, Tensor) and (value.ndim > 2 or (value.ndim == 2 and min(value.shape) > _NARROW))
+    return isinstance(value, Tensor) and (
+        value.ndim > 2 or (value.ndim == 2 and min(value.shape) > _NARROW)
+    )
 
 
 class _Sum:

@@ -1,23 +1,261 @@
-"""Sobol indices: the share of each independent input in the variance of an output.
-
-First and total indices are those of one polynomial in closed form (Sudret, Reliab. Eng. Syst. Saf. 93 (2008) 964), so
-that a first index is never larger than the total index of the same input. The share of the variance that the polynomial
-does not predict for draws outside its fit may belong to any input: every interval contains this share.
-"""
+"""Sobol indices: the share of each input in a variance, from a polynomial fit."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neusee.workflows.recipe.distributions.shapes import FloatArray, Shape
-from neusee.workflows.studies.uncertainty.polynomial_fit import Candidates, PolynomialFit, fit_polynomial
 
-EXPLAINED = 0.9  #: smallest share of the variance that the polynomial predicts where its indices tell enough
+# --- polynomial fit -------------------------------------------------------------------------------
+
+# A sparse polynomial of independent inputs, fitted to draws of an output, and how well it predicts
+# other draws.
+#
+# Each input has polynomials that are orthonormal under its own distribution, so that the variance
+# of the fitted polynomial is the sum of its squared coefficients. Terms are added one after
+# another, each the one that explains most of what is left (orthogonal matching pursuit), until the
+# error of prediction without the predicted draw no longer falls.
+#
+# Source: Blatman and Sudret, J. Comput. Phys. 230 (2011) 2345, for sparse polynomials and the
+#         corrected error.
+
+
+Powers = tuple[int, ...]  #: degree of each input in a term
+
+_DEGREE = 10  #: largest degree of a term
+_TOGETHER = 3  #: largest number of inputs in a term
+_CANDIDATES = 400  #: largest number of terms from which a fit selects
+_HYPERBOLIC = 0.75  #: exponent of the norm of degrees, below 1 to prefer terms of few inputs
+#: norms of the terms of low degree: squares and products of two inputs; and somewhat more
+_NORMS = (2.6, 5.0)
+_BY_TERM = 3  #: smallest number of draws for each selected term
+_PATIENCE = 12  #: terms after the best number of terms that are tried without a gain
+_EXACT = 1e-13  #: share of the variance that may be left where a polynomial is exact
+_SMALLEST = 1e-7  #: norm of a term beside the selected terms, below which it depends on them
+
+
+@dataclass(frozen=True)
+class OrthonormalPolynomials:
+    """Polynomials of one input that are orthonormal under its distribution, by their three-term
+    recurrence.
+    """
+
+    shape: Shape
+    centres: FloatArray  #: (degree,) coefficients of the recurrence
+    norms: FloatArray  #: (degree + 1,)
+
+    @classmethod
+    def of(cls, shape: Shape, degree: int = _DEGREE) -> OrthonormalPolynomials:
+        """Compute the recurrence for a distribution (Stieltjes); the degree is lower for a few
+        separate values.
+        """
+        x, weights = shape.measure()
+        centres, norms = list[float](), [1.0]
+        before, now = np.zeros_like(x), np.ones_like(x)
+        while len(centres) < min(degree, len(x) - 1):
+            centre = float(weights @ (x * now**2))
+            following = (x - centre) * now - norms[-1] * before if centres else (x - centre) * now
+            norm = float(np.sqrt(weights @ following**2))
+            before, now = now, following / norm
+            centres.append(centre)
+            norms.append(norm)
+        return cls(shape, np.array(centres), np.array(norms))
+
+    @property
+    def degree(self) -> int:
+        """Return the largest degree."""
+        return len(self.centres)
+
+    def at(self, z: FloatArray) -> FloatArray:
+        """Return the polynomials (degree + 1, draw) at standard normal numbers of the input."""
+        x = self.shape.coordinate(z)
+        values = [np.ones_like(x)]
+        before = np.zeros_like(x)
+        for i, centre in enumerate(self.centres):
+            following = (x - centre) * values[-1] - (self.norms[i] * before if i else 0.0)
+            before = values[-1]
+            values.append(following / self.norms[i + 1])
+        return np.stack(values)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """The terms from which a fit selects, at all draws."""
+
+    powers: tuple[Powers, ...]  #: without the constant term
+    columns: FloatArray  #: (draw, term)
+    sizes: tuple[int, ...]  #: numbers of first terms among which terms are selected
+
+    @classmethod
+    def of(cls, shapes: Sequence[Shape], z: FloatArray) -> Candidates:
+        """Return products of the inputs' polynomials at draws ``z`` (draw, input), those of low
+        degree first.
+        """
+        bases = [OrthonormalPolynomials.of(shape) for shape in shapes]
+        values = [basis.at(z[:, i]) for i, basis in enumerate(bases)]
+        powers = _low_degrees([basis.degree for basis in bases])
+        columns = [_product(values, power) for power in powers]
+        norms = np.array([_norm(power) for power in powers])
+        sizes = {int((norms <= largest).sum()) for largest in (*_NORMS, math.inf)}
+        return cls(powers, np.stack(columns, 1), tuple(sorted(sizes)))
+
+
+def _product(values: Sequence[FloatArray], power: Powers) -> FloatArray:
+    product = np.ones(values[0].shape[1])
+    for input_values, degree in zip(values, power, strict=True):
+        if degree:
+            product = product * input_values[degree]
+    return product
+
+
+def _low_degrees(degrees: Sequence[int]) -> tuple[Powers, ...]:
+    """Return the degrees of the candidate terms in rising order of their hyperbolic norm."""
+    candidates: list[tuple[float, Powers]] = []
+    for together in range(1, min(_TOGETHER, len(degrees)) + 1):
+        for inputs in combinations(range(len(degrees)), together):
+            for power in _degrees_of(inputs, degrees):
+                candidates.append((_norm(power), power))
+    return tuple(power for _, power in sorted(candidates)[:_CANDIDATES])
+
+
+def _norm(power: Powers) -> float:
+    """Return the hyperbolic norm of the degrees of a term."""
+    return float(sum(degree**_HYPERBOLIC for degree in power) ** (1 / _HYPERBOLIC))
+
+
+def _degrees_of(inputs: Sequence[int], degrees: Sequence[int]) -> Iterator[Powers]:
+    """Yield the degrees of all terms in which exactly the ``inputs`` occur."""
+    power = [0] * len(degrees)
+
+    def fill(place: int, left: int) -> Iterator[Powers]:
+        if place == len(inputs):
+            yield tuple(power)
+            return
+        others = len(inputs) - place - 1
+        for degree in range(1, min(degrees[inputs[place]], left - others) + 1):
+            power[inputs[place]] = degree
+            yield from fill(place + 1, left - degree)
+
+    yield from fill(0, _DEGREE)
+
+
+@dataclass(frozen=True)
+class PolynomialFit:
+    """A fitted polynomial: its constant, and the coefficients of its terms."""
+
+    constant: float
+    terms: NDArray[np.int64]  #: (term,) numbers of candidates
+    coefficients: FloatArray  #: (term,)
+
+    @cached_property
+    def variances(self) -> FloatArray:
+        """Return the part of each term in the variance of the polynomial."""
+        return np.asarray(self.coefficients**2, np.float64)
+
+    def at(self, columns: FloatArray) -> FloatArray:
+        """Return the polynomial at draws, from the candidate terms (draw, term) at these draws."""
+        return np.asarray(self.constant + columns[:, self.terms] @ self.coefficients, np.float64)
+
+
+def fit_polynomial(
+    candidates: Candidates, y: FloatArray, draws: FloatArray | None = None
+) -> PolynomialFit:
+    """Fit a sparse polynomial to ``y`` (draw,).
+
+    Terms are selected among those of low degree, among more, and among all; the selection with the
+    least error of prediction counts. Args: draws: booleans (draw,) that select the draws of the
+    fit; None for all.
+    """
+    columns, values = (
+        (candidates.columns, y) if draws is None else (candidates.columns[draws], y[draws])
+    )
+    selections = [_select_terms(columns[:, :count], values) for count in candidates.sizes]
+    _, terms = min(selections, key=lambda selection: selection[0])
+    matrix = np.concatenate([np.ones((len(values), 1)), columns[:, terms]], 1)
+    solution = np.linalg.lstsq(matrix, values, rcond=None)[0]
+    return PolynomialFit(
+        float(solution[0]), np.array(terms, np.int64), np.asarray(solution[1:], np.float64)
+    )
+
+
+def _select_terms(columns: FloatArray, y: FloatArray) -> tuple[float, list[int]]:
+    """Return the terms of a sparse polynomial by orthogonal matching pursuit, with their error
+    of prediction.
+    """
+    count, exact = len(y), _EXACT * len(y) * float(y.var())
+    limit = min(columns.shape[1], max(1, count // _BY_TERM) - 1)
+    basis = [np.full(count, count**-0.5)]
+    left, leverage = y - y.mean(), np.full(count, 1.0 / count)
+    lengths = np.sqrt((columns**2).sum(0))
+    selected: list[int] = []
+    best, best_error = 0, _error_of_prediction(left, leverage, 1)
+    while len(selected) < limit and len(selected) - best < _PATIENCE and left @ left > exact:
+        term = _next_term(columns, left, lengths)
+        direction = _apart(columns[:, term], basis)
+        norm = float(np.sqrt(direction @ direction))
+        independent = norm > _SMALLEST * lengths[term]
+        lengths[term] = np.inf
+        if not independent:
+            limit = min(limit, int(np.isfinite(lengths).sum()) + len(selected))
+            continue
+        selected.append(term)
+        basis.append(direction / norm)
+        left = left - (basis[-1] @ left) * basis[-1]
+        leverage = leverage + basis[-1] ** 2
+        error = _error_of_prediction(left, leverage, len(basis))
+        if error < best_error:
+            best, best_error = len(selected), error
+    return best_error, selected[:best]
+
+
+def _next_term(columns: FloatArray, left: FloatArray, lengths: FloatArray) -> int:
+    """Return the term that is most parallel to what is left; a term of infinite length does not
+    count.
+    """
+    return int((np.abs(columns.T @ left) / lengths).argmax())
+
+
+def _apart(column: FloatArray, basis: Sequence[FloatArray]) -> FloatArray:
+    """Return the part of a column that is orthogonal to an orthonormal basis; twice is enough
+    for rounding.
+    """
+    matrix = np.stack(basis)
+    for _ in range(2):
+        column = column - (matrix @ column) @ matrix
+    return column
+
+
+def _error_of_prediction(left: FloatArray, leverage: FloatArray, terms: int) -> float:
+    """Return the mean squared error of draws predicted without them, corrected for the number of
+    terms.
+    """
+    count = len(left)
+    alone = (left / (1.0 - leverage).clip(1e-9)) ** 2
+    return float(alone.mean()) * count / max(1, count - terms)
+
+
+# --- sobol indices --------------------------------------------------------------------------------
+
+# Sobol indices: the share of each independent input in the variance of an output.
+#
+# First and total indices are those of one polynomial in closed form (Sudret, Reliab. Eng. Syst.
+# Saf. 93 (2008) 964), so that a first index is never larger than the total index of the same input.
+# The share of the variance that the polynomial does not predict for draws outside its fit may
+# belong to any input: every interval contains this share.
+
+
+#: smallest share of the variance that the polynomial predicts where its indices tell enough
+EXPLAINED = 0.9
 GROUPS = 8  #: groups of draws, each left out of a fit once
-_T = 2.3646242515927849  #: 97.5 % quantile of Student's distribution with GROUPS - 1 degrees of freedom
+#: 97.5 % quantile of Student's distribution with GROUPS - 1 degrees of freedom
+_T = 2.3646242515927849
 
 
 @dataclass(frozen=True)
@@ -35,7 +273,8 @@ class SobolIndices:
 
     first: Sequence[IndexInterval]  #: share of each input alone
     total: Sequence[IndexInterval]  #: share of each input alone and together with other inputs
-    explained: float  #: share of the variance that the polynomial predicts for draws outside its fit
+    #: share of the variance that the polynomial predicts for draws outside its fit
+    explained: float
 
     @property
     def explains_enough(self) -> bool:
@@ -46,9 +285,11 @@ class SobolIndices:
 def indices(shapes: Sequence[Shape], z: FloatArray, y: FloatArray) -> SobolIndices:
     """Return the Sobol indices of independent inputs in the variance of ``y`` (draw,).
 
-    Args: shapes: distribution of each input. z: standard normal numbers (draw, input) from which the inputs follow.
-    The interval has the scatter between fits without an eighth of the draws (jackknife over `GROUPS` groups; of Sobol
-    sequences each is a group), and above it the share that the polynomial does not explain.
+    Args: shapes: distribution of each input. z: standard normal numbers (draw, input) from which
+            the inputs follow.
+    The interval has the scatter between fits without an eighth of the draws (jackknife over
+    `GROUPS` groups; of Sobol sequences each is a group), and above it the share that the polynomial
+    does not explain.
     """
     scale = float(np.abs(y - y.mean()).max())
     normal = (y - y.mean()) / scale
@@ -58,9 +299,9 @@ def indices(shapes: Sequence[Shape], z: FloatArray, y: FloatArray) -> SobolIndic
     parts: list[FloatArray] = []
     missed = np.empty(len(y))
     for number in range(GROUPS):
-        kept = group != number
-        without = fit_polynomial(candidates, normal, kept)
-        missed[~kept] = normal[~kept] - without.at(candidates.columns[~kept])
+        training = group != number
+        without = fit_polynomial(candidates, normal, training)
+        missed[~training] = normal[~training] - without.at(candidates.columns[~training])
         parts.append(_shares(without, candidates, len(shapes)))
     explained = float(np.clip(1.0 - (missed**2).mean() / normal.var(), 0.0, 1.0))
     scattered = np.stack(parts)
@@ -76,18 +317,25 @@ def _shares(fit: PolynomialFit, candidates: Candidates, inputs: int) -> FloatArr
     variance = fit.variances.sum()
     if not variance > 0:
         return np.zeros((2, inputs))
-    return np.asarray(np.stack([fit.variances @ alone, fit.variances @ powers]) / variance, np.float64)
+    return np.asarray(
+        np.stack([fit.variances @ alone, fit.variances @ powers]) / variance, np.float64
+    )
 
 
 def _with_intervals(shares: FloatArray, half: FloatArray, explained: float) -> SobolIndices:
-    """Return the indices in the whole variance; the interval of a first index lies below that of the total index."""
+    """Return the indices in the whole variance; the interval of a first index lies below that of
+    the total index.
+    """
     values = explained * shares
     low = np.clip(values - explained * half, 0.0, 1.0)
     high = np.clip(values + explained * half + 1.0 - explained, 0.0, 1.0)
     low[1] = np.maximum(low[1], np.minimum(low[0], values[1]))
     high[0] = np.minimum(high[0], np.maximum(high[1], values[0]))
     rows = [
-        [IndexInterval(float(values[k, i]), float(low[k, i]), float(high[k, i])) for i in range(shares.shape[1])]
+        [
+            IndexInterval(float(values[k, i]), float(low[k, i]), float(high[k, i]))
+            for i in range(shares.shape[1])
+        ]
         for k in range(2)
     ]
     return SobolIndices(rows[0], rows[1], explained)

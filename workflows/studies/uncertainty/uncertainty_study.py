@@ -1,4 +1,6 @@
-"""The uncertainty study: the scatter of a recipe's outputs because of uncertain values in the recipe."""
+"""The uncertainty study: the scatter of a recipe's outputs because of uncertain values in the
+recipe.
+"""
 
 from __future__ import annotations
 
@@ -13,23 +15,40 @@ import numpy as np
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.recipe.distributions.allowed_range import NEGLIGIBLE
-from neusee.workflows.recipe.distributions.joint import Z_90
+from neusee.workflows.recipe.distributions.joint_distribution import Z_90
 from neusee.workflows.recipe.distributions.nominal_values import told
-from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, InputDraws, Inputs
+from neusee.workflows.recipe.distributions.uncertain_inputs import (
+    NEGLIGIBLE,
+    SCRAMBLES,
+    InputDraws,
+    Inputs,
+)
 from neusee.workflows.report.study_folder import Content, Progress, StudyReport, StudyRun
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.study_refused import StudyRefused
-from neusee.workflows.studies.uncertainty.allowed_draws import AllowedDraws, refuse_combinations
-from neusee.workflows.studies.uncertainty.output_draws import Numbers, OutputDraws
-from neusee.workflows.studies.uncertainty.scatter_estimate import FloatArray, Scatter, scatter, worst_known
+from neusee.workflows.studies.run_study import StudyRefused
+from neusee.workflows.studies.uncertainty.output_draws import (
+    AllowedDraws,
+    FloatArray,
+    Numbers,
+    OutputDraws,
+    Scatter,
+    refuse_combinations,
+    scatter,
+    worst_known,
+)
 from neusee.workflows.studies.uncertainty.sobol_indices import indices
-from neusee.workflows.studies.uncertainty.uncertainty_page import UncertaintyResult, draw_pictures, lead, sections
+from neusee.workflows.studies.uncertainty.uncertainty_page import (
+    UncertaintyResult,
+    draw_pictures,
+    lead,
+    sections,
+)
 
 LEAST = 64  #: draws before the first decision to stop
 _RARE = 3.09  #: normal score of the quantile at 99.9 %
 _ROUND = 16  #: independent draws in each further round
-PICTURED = 32  #: draws for the mean and standard deviation of pictures; the deviation is known to 13 %
+#: draws for the mean and standard deviation of pictures; the deviation is known to 13 %
+PICTURED = 32
 _KEPT = ("mean", "sd")  #: of each picture
 _COLUMNS = ("quantity", "element", "at the medians", "mean", "sd", "5 %", "95 %")
 
@@ -47,10 +66,12 @@ def study(
     device: str = "cpu",
     until: Sequence[str] = (),
 ) -> Path:
-    """Sample inputs, up to ``most`` times, until all output standard deviations are known to the relative ``error``.
+    """Sample inputs, up to ``most`` times, until all output standard deviations are known to the
+    relative ``error``.
 
-    With ``until``, names of outputs or of single quantities, only their deviations decide. On the CPU, ``workers``
-    processes compute draws; 0 means one for each free processor. Returns the folder with the results.
+    With ``until``, names of outputs or of single quantities, only their deviations decide. On the
+    CPU, ``workers`` processes compute draws; 0 means one for each free processor. Returns the
+    folder with the results.
     """
     study_run = StudyRun("uncertainty", recipe, command)
     inputs = _inputs(recipe)
@@ -76,11 +97,19 @@ class StopRule:
     @property
     def text(self) -> str:
         """Return the standard deviations that decide, in words."""
-        return f"standard deviations of {', '.join(self.until)}" if self.until else "every standard deviation"
+        return (
+            f"standard deviations of {', '.join(self.until)}"
+            if self.until
+            else "every standard deviation"
+        )
 
     def needed(self, count: int, error: float, available: int) -> int:
         """Return about how many draws are needed, from the ``error`` of ``count`` draws."""
-        return count if error <= self.wanted else min(available, int(count * (error / self.wanted) ** 2))
+        return (
+            count
+            if error <= self.wanted
+            else min(available, int(count * (error / self.wanted) ** 2))
+        )
 
     def following(self, count: int) -> int:
         """Return the number of draws of the next round after ``count`` draws."""
@@ -97,47 +126,70 @@ def _inputs(recipe: Recipe) -> Inputs:
         raise StudyRefused(str(error)) from error
 
 
-def _points(inputs: Inputs, seed: int, most: int, points: str) -> InputDraws:
+def _points(inputs: Inputs, seed: int, limit: int, points: str) -> InputDraws:
     if points == "sobol":
-        return inputs.sobol(SCRAMBLES * 2 ** int(np.log2(max(most, LEAST) / SCRAMBLES)), seed)
-    return inputs.independent(most if inputs.most is None else min(most, inputs.most), seed)
+        return inputs.sobol(SCRAMBLES * 2 ** int(np.log2(max(limit, LEAST) / SCRAMBLES)), seed)
+    return inputs.independent(limit if inputs.most is None else min(limit, inputs.most), seed)
 
 
 def _ends(inputs: Inputs) -> FloatArray:
-    """Return the input values of each run: all at their medians, then one input at its 5 % and at its 95 % quantile."""
-    return np.concatenate([inputs.at(np.zeros((1, len(inputs.names)))), _one_at_a_time(inputs, Z_90)])
+    """Return the input values of each run: all at their medians, then one input at its 5 % and
+    at its 95 % quantile.
+    """
+    return np.concatenate(
+        [inputs.at(np.zeros((1, len(inputs.names)))), _one_at_a_time(inputs, Z_90)]
+    )
 
 
 def _one_at_a_time(inputs: Inputs, score: float) -> FloatArray:
-    """Return input values with one input at each of two opposite normal scores, and all others at their medians."""
-    z = [sign * score * direction for direction in np.eye(len(inputs.names)) for sign in (-1, 1)]
+    """Return input values with one input at each of two opposite normal scores, and all others
+    at their medians.
+    """
+    z = []
+    for direction in np.eye(len(inputs.names)):
+        z += [-score * direction, score * direction]
     return inputs.at(np.stack(z))
 
 
-def _chosen(until: Sequence[str], there: Sequence[str]) -> tuple[str, ...]:
-    """Return the names ``there`` that ``until`` means, or all; raise `StudyRefused` for a name of none of them."""
+def _chosen(until: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the ``names`` that ``until`` means, or all; raise `StudyRefused` for a name
+    of none of them.
+    """
     if not until:
-        return tuple(there)
+        return tuple(names)
     decide = dict[str, None]()
     for name in until:
-        meant = _means(name, there)
+        meant = _means(name, names)
         if not meant:
-            raise StudyRefused(f"--until {name}: no output with numbers has this name; there are {', '.join(there)}")
+            raise StudyRefused(
+                f"--until {name}: no output with numbers has this name; there are"
+                f" {', '.join(names)}"
+            )
         decide |= dict.fromkeys(meant)
-    return tuple(name for name in there if name in decide)
+    return tuple(name for name in names if name in decide)
 
 
-def _deciding(until: Sequence[str], there: Sequence[str], constant: Sequence[str]) -> tuple[str, ...]:
-    """Return the numbers that decide when to stop; raise `StudyRefused` for an output that depends on no input."""
-    still = [name for name in until if _means(name, constant) and not _means(name, there)]
+def _deciding(
+    until: Sequence[str], varying: Sequence[str], constant: Sequence[str]
+) -> tuple[str, ...]:
+    """Return the numbers that decide when to stop; raise `StudyRefused` for an output that
+    depends on no input.
+    """
+    still = [name for name in until if _means(name, constant) and not _means(name, varying)]
     if still:
-        raise StudyRefused(f"--until {still[0]}: this output depends on no uncertain input, and does not vary")
-    return _chosen(until, there)
+        raise StudyRefused(
+            f"--until {still[0]}: this output depends on no uncertain input, and does not vary"
+        )
+    return _chosen(until, varying)
 
 
-def _means(name: str, there: Sequence[str]) -> list[str]:
-    """Return the names ``there`` of an output or of a single quantity."""
-    return [quantity for quantity in there if quantity == name or quantity.startswith((f"{name}.", f"{name}["))]
+def _means(name: str, quantities: Sequence[str]) -> list[str]:
+    """Return those of ``quantities`` of an output or of a single quantity."""
+    return [
+        quantity
+        for quantity in quantities
+        if quantity == name or quantity.startswith((f"{name}.", f"{name}["))
+    ]
 
 
 def _measure(
@@ -146,7 +198,9 @@ def _measure(
     _say_inputs(inputs, draws, rule.sequences, progress)
     ends = draws.numbers(_ends(inputs))
     if not ends[0]:
-        raise StudyRefused("the outputs are pictures only: add an output with numbers, such as restored_quality")
+        raise StudyRefused(
+            "the outputs are pictures only: add an output with numbers, such as restored_quality"
+        )
     deciding = _deciding(rule.until, list(ends[0]), draws.is_constant)
     _say_constant(inputs, draws, ends, deciding, progress)
     pictures = draws.pictures(allowed.values[:PICTURED])
@@ -181,32 +235,52 @@ def _measure(
 
 
 def _say_inputs(inputs: Inputs, draws: OutputDraws, sequences: int, progress: Progress) -> None:
-    """Print the inputs, what was cut off their distributions, and the outputs that depend on none of them."""
-    progress(f"{len(inputs.names)} inputs: {', '.join(inputs.names)}; {len(draws.outputs)} outputs depend on them")
+    """Print the inputs, what was cut off their distributions, and the outputs that depend on
+    none of them.
+    """
+    progress(
+        f"{len(inputs.names)} inputs: {', '.join(inputs.names)}; {len(draws.outputs)} outputs"
+        " depend on them"
+    )
     for name, note in inputs.notes.items():
         progress(f"{name} = {inputs.uncertain.said(name)}: {note}")
     if draws.is_constant:
-        progress(f"outputs that depend on no input, and do not vary: {', '.join(draws.is_constant)}")
+        progress(
+            f"outputs that depend on no input, and do not vary: {', '.join(draws.is_constant)}"
+        )
     if inputs.has_table and sequences:
-        progress("a Sobol sequence draws from the columns of the table and their rank correlation, not its rows")
+        progress(
+            "a Sobol sequence draws from the columns of the table and their rank correlation, not"
+            " its rows"
+        )
     progress(f"steps that depend on no input: {draws.ready():.1f} s")
 
 
 def _say_constant(
-    inputs: Inputs, draws: OutputDraws, ends: Sequence[Numbers], deciding: Sequence[str], progress: Progress
+    inputs: Inputs,
+    draws: OutputDraws,
+    ends: Sequence[Numbers],
+    deciding: Sequence[str],
+    progress: Progress,
 ) -> None:
-    """Print which numbers do not vary in the first runs; raise `StudyRefused` if none of those that decide varies."""
+    """Print which numbers do not vary in the first runs; raise `StudyRefused` if none of those
+    that decide varies.
+    """
     constant = _constant(ends)
     if set(deciding) <= set(constant):  # the rare ends of the distributions may tell more
         ends = [*ends, *draws.numbers(_one_at_a_time(inputs, _RARE))]
         constant = _constant(ends)
     if constant:
-        progress(f"{', '.join(constant)}: the same in the first {len(ends)} runs, one input after another at its ends")
+        progress(
+            f"{', '.join(constant)}: the same in the first {len(ends)} runs, one input after"
+            " another at its ends"
+        )
     if set(deciding) <= set(constant):
         raise StudyRefused(
-            f"nothing varies: {', '.join(deciding)} {'is' if len(deciding) == 1 else 'are'} the same in {len(ends)} "
-            "runs, with all inputs at their medians, and with each at its 5 %, 95 %, 0.1 % and 99.9 % quantile. Name "
-            "outputs that the inputs change, or write wider distributions"
+            f"nothing varies: {', '.join(deciding)} {'is' if len(deciding) == 1 else 'are'} the"
+            f" same in {len(ends)} runs, with all inputs at their medians, and with each at its 5"
+            " %, 95 %, 0.1 % and 99.9 % quantile. Name outputs that the inputs change, or write"
+            " wider distributions"
         )
 
 
@@ -221,22 +295,27 @@ def _by_quantity(runs: Sequence[Numbers]) -> dict[str, FloatArray]:
 
 
 def _swings(
-    inputs: Inputs, ends: Sequence[Numbers], values: Mapping[str, FloatArray], scattered: Mapping[str, Scatter]
+    inputs: Inputs,
+    ends: Sequence[Numbers],
+    values: Mapping[str, FloatArray],
+    scattered: Mapping[str, Scatter],
 ) -> dict[str, list[tuple[str, float, float]]]:
-    """Return each output number with one input at its 5 % and 95 % quantile; skip numbers proportional to others."""
-    found: dict[str, list[tuple[str, float, float]]] = {}
+    """Return each output number with one input at its 5 % and 95 % quantile; skip numbers
+    proportional to others.
+    """
+    swings: dict[str, list[tuple[str, float, float]]] = {}
     for name, x in values.items():
-        known = np.isfinite(x).all() and np.isfinite([end[name] for end in ends]).all()
-        varies = known and x.shape[1] == 1 and not scattered[name].is_constant
-        if varies and not any(_proportional(x[:, 0], values[other][:, 0]) for other in found):
-            each = zip(inputs.labels, ends[1::2], ends[2::2], strict=True)
-            found[name] = [(label, low[name][0], high[name][0]) for label, low, high in each]
-    return found
+        finite = np.isfinite(x).all() and np.isfinite([end[name] for end in ends]).all()
+        varies = finite and x.shape[1] == 1 and not scattered[name].is_constant
+        if varies and not any(_proportional(x[:, 0], values[other][:, 0]) for other in swings):
+            pairs = zip(inputs.labels, ends[1::2], ends[2::2], strict=True)
+            swings[name] = [(label, low[name][0], high[name][0]) for label, low, high in pairs]
+    return swings
 
 
 def _proportional(x: FloatArray, y: FloatArray) -> bool:
-    at = int(np.abs(y).argmax())
-    return y[at] != 0 and bool(np.allclose(x * y[at], y * x[at], rtol=1e-9, atol=0.0))
+    index = int(np.abs(y).argmax())
+    return y[index] != 0 and bool(np.allclose(x * y[index], y * x[index], rtol=1e-9, atol=0.0))
 
 
 def _document(result: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
@@ -262,7 +341,9 @@ def _document(result: UncertaintyResult, draws: OutputDraws) -> dict[str, Any]:
 
 def _plain(result: UncertaintyResult, name: str) -> dict[str, Any]:
     s = result.scatter[name]
-    arrays = {what: getattr(s, what).tolist() for what in ("mean", "sd", "low", "high")}
+    arrays = {
+        statistic: getattr(s, statistic).tolist() for statistic in ("mean", "sd", "low", "high")
+    }
     return {"error": s.error, "middle": list(result.middle[name]), **arrays}
 
 
@@ -271,10 +352,11 @@ def _report(result: UncertaintyResult) -> StudyReport:
     draws = zip(result.inputs.names, result.points.values.T, strict=True)
     files: dict[str, Content] = {"draws.npz": _npz({**dict(draws), **result.values})}
     if result.pictures:
-        named = (
-            (f"{name} {what}", x) for name, both in result.pictures.items() for what, x in zip(_KEPT, both, strict=True)
-        )
-        files["pictures.npz"] = _npz({name: x.numpy() for name, x in named})
+        arrays = {}
+        for name, moments in result.pictures.items():
+            for statistic, x in zip(_KEPT, moments, strict=True):
+                arrays[f"{name} {statistic}"] = x.numpy()
+        files["pictures.npz"] = _npz(arrays)
     return StudyReport(
         f"{result.inputs.recipe.name}: uncertainty",
         lead(result),

@@ -1,4 +1,6 @@
-"""A network that estimates spectra from RGB, its training data, and one iteration of its training."""
+"""A network that estimates spectra from RGB, its training data, and one iteration of its
+training.
+"""
 
 from __future__ import annotations
 
@@ -10,35 +12,51 @@ import torch
 from torch import Tensor, nn
 
 from neusee.nodes import losses
-from neusee.nodes.spectra import lift_matrix, lift_pictures, need_mst_plus_plus_bands, render, start_mst_plus_plus
+from neusee.nodes.spectra import (
+    lift_matrix,
+    lift_pictures,
+    need_mst_plus_plus_bands,
+    render,
+    start_mst_plus_plus,
+)
 from neusee.nodes.values import Bands
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import stream_seed
-from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
+from neusee.workflows.recipe.blocks.train_block import LiftTraining
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.loop.resumable_loop import Losses, averaged, require_finite
-from neusee.workflows.training.training_recipe import require_steps
+from neusee.workflows.training.training_pictures import require_steps
 
 
 class Pairs:
-    """Numbered training pairs, each of a picture (3, y, x) and the true spectra of its pixels (31, y, x)."""
+    """Numbered training pairs, each of a picture (3, y, x) and the true spectra of its pixels
+    (31, y, x).
+    """
 
     def __init__(self, recipe: Recipe, settings: LiftTraining, store: Store, device: str) -> None:
         require_steps(recipe, "train_lift", (settings.measured, settings.picture, settings.cube))
         bands = recipe.steps[settings.measured].wires.get("bands")
         if not isinstance(bands, str):
             name = settings.measured
-            raise ValueError(f"train_lift.measured: {name} has no input `bands`: name a spectra.reflectances step")
+            raise ValueError(
+                f"train_lift.measured: {name} has no input `bands`: name a spectra.reflectances"
+                " step"
+            )
         self._names, self._seed = (settings.picture, settings.cube), recipe.seed
         random = {name for name in needed(recipe, self._names) if recipe.steps[name].node.random}
         if not random:
-            raise ValueError(f"train_lift: step {settings.picture} gives no random pictures: use a spectra.leaves step")
-        known = recipe.run(store, [bands, settings.measured], device=device)
-        self.bands: Bands = known[bands]
-        self.measured: Tensor = known[settings.measured]
+            raise ValueError(
+                f"train_lift: step {settings.picture} gives no random pictures: use a"
+                " spectra.leaves step"
+            )
+        results = recipe.run(store, [bands, settings.measured], device=device)
+        self.bands: Bands = results[bands]
+        self.measured: Tensor = results[settings.measured]
         need_mst_plus_plus_bands(self.bands)
-        self._draw = as_function(recipe, outputs=self._names, store=store, device=device, redraw=random)
+        self._draw = as_function(
+            recipe, outputs=self._names, store=store, device=device, redraw=random
+        )
 
     def __call__(self, *number: object) -> tuple[Tensor, Tensor]:
         """Return the training picture with the given number and the true spectra of its pixels.
@@ -50,27 +68,35 @@ class Pairs:
         return picture.float(), cube.float()
 
     def batch(self, numbers: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Return a batch of training pictures and a batch of their true spectra, each as one tensor."""
+        """Return a batch of training pictures and a batch of their true spectra, each as one
+        tensor.
+        """
         pictures, cubes = zip(*map(self, numbers), strict=True)
         return torch.stack(pictures), torch.stack(cubes)
 
 
 class LiftLearner:
-    """The network that estimates spectra from RGB, its optimiser and the moving average of its weights."""
+    """The network that estimates spectra from RGB, its optimiser and the moving average of its
+    weights.
+    """
 
     def __init__(self, settings: LiftTraining, pairs: Pairs, seed: int, device: str) -> None:
         self.settings, self.pairs = settings, pairs
         rng = torch.Generator(device).manual_seed(stream_seed(seed, "train lift network"))
-        self.linear = lift_matrix(pairs.measured.cpu(), pairs.bands.centres.cpu()).to(device, torch.float32)
+        self.linear = lift_matrix(pairs.measured.cpu(), pairs.bands.centres.cpu()).to(
+            device, torch.float32
+        )
         self.net = start_mst_plus_plus(rng, self.linear if settings.start == "linear" else None)
-        self.optimiser = torch.optim.Adam(self.net.parameters(), lr=settings.rate, betas=settings.betas)
+        self.optimiser = torch.optim.Adam(
+            self.net.parameters(), lr=settings.rate, betas=settings.betas
+        )
         self.average = averaged(self.net, settings.ema_decay)
         self.best: nn.Module = self.average.module if self.average else self.net
 
     def parts(self) -> dict[str, Any]:
         """Return by name the objects whose state a checkpoint must contain."""
         parts = {"net": self.net, "optimiser": self.optimiser, "average": self.average}
-        return {name: part for name, part in parts.items() if part}
+        return {name: member for name, member in parts.items() if member}
 
     def iterate(self, iteration: int) -> Losses:
         """Train the network on one batch of pictures, and return the losses.
@@ -87,7 +113,12 @@ class LiftLearner:
         loss.backward()
         largest = math.inf if self.settings.clip is None else self.settings.clip
         slope = float(nn.utils.clip_grad_norm_(self.net.parameters(), largest))
-        errors = {"MRAE": float(loss.detach()), "RMSE": _rmse(estimate.detach(), cube), "slope": slope, "rate": rate}
+        errors = {
+            "MRAE": float(loss.detach()),
+            "RMSE": _rmse(estimate.detach(), cube),
+            "slope": slope,
+            "rate": rate,
+        }
         require_finite(errors)
         self.optimiser.step()
         if self.average:
@@ -96,7 +127,9 @@ class LiftLearner:
 
     @torch.no_grad()
     def validate(self) -> dict[str, Losses]:
-        """Return the mean errors of the network and of a linear estimate, for pictures that are not in the training."""
+        """Return the mean errors of the network and of a linear estimate, for pictures that are
+        not in the training.
+        """
         sums, count = dict[str, Losses](), self.settings.validation_batches
         for number in range(count):
             picture, cube = self.pairs("judge", number)
@@ -106,11 +139,15 @@ class LiftLearner:
                     "RMSE": _rmse(estimate, cube),
                     "colour": _rmse(render(estimate, self.pairs.bands), picture),
                 }
-                sums[name] = {key: sums.get(name, {}).get(key, 0.0) + x / count for key, x in errors.items()}
+                sums[name] = {
+                    key: sums.get(name, {}).get(key, 0.0) + x / count for key, x in errors.items()
+                }
         return sums
 
     def estimates(self, picture: Tensor) -> dict[str, Tensor]:
-        """Estimate the spectra of an RGB picture twice: with the network, and with a linear reconstruction."""
+        """Estimate the spectra of an RGB picture twice: with the network, and with a linear
+        reconstruction.
+        """
         linear = torch.einsum("bc,cyx->byx", self.linear, picture)
         return {
             "mst_plus_plus": lift_pictures(self.best, picture[None])[0].clamp_min(0),

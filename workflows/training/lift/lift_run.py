@@ -1,25 +1,114 @@
-"""The complete training of a network that estimates spectra from RGB, up to the file of its weights."""
+"""The complete training of a network that estimates spectra from RGB, with its figures."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.engine_digest import outline
-from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
+from neusee.workflows.keys.code_digest import Code, outline
+from neusee.workflows.recipe.blocks.train_block import LiftTraining
+from neusee.workflows.report.figures.style import (
+    BLACK,
+    BLUE,
+    ORANGE,
+    PointLabel,
+    canvas,
+    drawn,
+    encoded,
+    picture,
+    place_labels,
+)
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.training.lift import lift_iteration
-from neusee.workflows.training.lift.lift_figures import lift_curves, lifted_spectra
 from neusee.workflows.training.lift.lift_iteration import LiftLearner, Pairs
 from neusee.workflows.training.loop import resumable_loop
-from neusee.workflows.training.loop.changed_inputs import prepare_folder
-from neusee.workflows.training.loop.checkpoint import export
-from neusee.workflows.training.loop.recorded_inputs import CameraInputs, RecordedInputs, folder_of
-from neusee.workflows.training.loop.resumable_loop import DOCUMENT, Losses, Progress, ResumableLoop, Watch
+from neusee.workflows.training.loop.recorded_inputs import (
+    CameraInputs,
+    RecordedInputs,
+    folder_of,
+    prepare_folder,
+)
+from neusee.workflows.training.loop.resumable_loop import (
+    DOCUMENT,
+    Losses,
+    Progress,
+    ResumableLoop,
+    Watch,
+    export,
+)
+from neusee.workflows.training.training_page import running_median
+
+# --- lift figures ---------------------------------------------------------------------------------
+
+# Figures of the training of a network that estimates spectra from RGB: error curves, estimated and
+# true spectra.
+
+
+_SHOWN = ("MRAE", "RMSE", "rate")
+_LOOKS = {"mst_plus_plus": {"color": BLUE}, "linear": {"color": ORANGE, "linestyle": "--"}}
+
+
+@drawn
+def lift_curves(rows: Sequence[Mapping[str, str]]) -> Any:
+    """Draw each training error and its running median over the iterations of the training."""
+    figure, axes = canvas(11.0, 3.0, 1, len(_SHOWN))
+    for ax, name in zip(axes.flat, _SHOWN, strict=True):
+        values = [float(row[name]) for row in rows]
+        ax.plot(values, color=BLUE, alpha=0.25, linewidth=0.7)
+        ax.plot(running_median(values), color=BLUE, linewidth=1.5)
+        ax.set_yscale("log", nonpositive="mask")
+        ax.set_title(name)
+    figure.supxlabel("iteration")
+    return figure
+
+
+@drawn
+def lifted_spectra(
+    shown: Tensor, truth: Tensor, estimates: Mapping[str, Tensor], centres: Tensor
+) -> Any:
+    """Draw a picture, and the true spectra (black) and the estimated spectra of five pixels of
+    the picture.
+    """
+    figure, axes = canvas(13.0, 2.6, 1, 6)
+    y, x = shown.shape[-2:]
+    pixels = [(y * (2 * i + 1) // 10, x * (2 * ((3 * i) % 5) + 1) // 10) for i in range(5)]
+    picture(axes[0, 0], encoded(shown), "picture")
+    axes[0, 0].plot(
+        [c for _, c in pixels],
+        [r for r, _ in pixels],
+        "o",
+        color=BLACK,
+        markerfacecolor="white",
+        markersize=5,
+    )
+    nm = (centres * 1e9).cpu().numpy()
+    for number, (ax, (row, column)) in enumerate(zip(axes[0, 1:], pixels, strict=True), 1):
+        ax.plot(nm, truth[:, row, column].cpu().numpy(), color=BLACK, linewidth=1.5, label="truth")
+        for name, cube in estimates.items():
+            ax.plot(
+                nm, cube[:, row, column].cpu().numpy(), linewidth=1.2, label=name, **_LOOKS[name]
+            )
+        ax.set_title(f"pixel {number}")
+        ax.set_ylim(bottom=0)
+    axes[0, 1].set_ylabel("reflectance")
+    figure.legend(*axes[0, 1].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    figure.supxlabel("wavelength (nm)")
+    place_labels(
+        figure,
+        {axes[0, 0]: [PointLabel(c, r, str(i), BLACK) for i, (r, c) in enumerate(pixels, 1)]},
+    )
+    return figure
+
+
+# --- lift run -------------------------------------------------------------------------------------
+
+# The complete training of a network that estimates spectra from RGB, up to the file of its weights.
+
 
 _COLUMNS = ("iteration", "MRAE", "RMSE", "slope", "rate", "seconds")
 #: files of the program that decide the pairs and the steps of the optimiser
@@ -38,16 +127,20 @@ def train_lift(
     device: str = "cpu",
     watch: Watch | None = None,
 ) -> Path:
-    """Train the network MST++ to estimate spectra from RGB, or continue a stopped training; return the result folder.
+    """Train the network MST++ to estimate spectra from RGB, or continue a stopped training; return
+    the result folder.
 
     ``mst_plus_plus.safetensors`` holds the weights for `spectra.lift_mst_plus_plus`.
 
-    Raises ValueError for a recipe without the block or the steps that the block names; ArithmeticError for a loss that
-    is NaN or infinite, after the weights and picture numbers that led to the loss are written to a file.
+    Raises ValueError for a recipe without the block or the steps that the block names;
+    ArithmeticError for a loss that is NaN or infinite, after the weights and picture numbers that
+    led to the loss are written to a file.
     """
     settings = recipe.lifting
     if settings is None:
-        raise ValueError(f"{recipe.name} has no block `train_lift`: start from the recipe train_lift")
+        raise ValueError(
+            f"{recipe.name} has no block `train_lift`: start from the recipe train_lift"
+        )
     pairs = Pairs(recipe, settings, store, device)
     code = Code(store.code_memo)
     inputs = lift_inputs(recipe, settings, code)
@@ -55,7 +148,9 @@ def train_lift(
     folder = folder_of(runs, recipe.name, inputs)
     prepare_folder(folder, inputs, recipe, store, progress)
     learner = LiftLearner(settings, pairs, recipe.seed, device)
-    _LiftLoop(settings, learner, inputs, folder, progress, device, watch).run_to_end(recipe, command)
+    _LiftLoop(settings, learner, inputs, folder, progress, device, watch).run_to_end(
+        recipe, command
+    )
     return folder
 
 
@@ -63,12 +158,18 @@ def lift_inputs(recipe: Recipe, settings: LiftTraining, code: Code) -> RecordedI
     """Return everything that can change the trained weights."""
     camera = CameraInputs.of(recipe, [settings.measured, settings.picture, settings.cube], code)
     block = settings.model_dump(mode="json", exclude={"keep", "show", "validation_batches"})
-    nodes = {f"neusee.nodes.{name}": code.digest(f"neusee.nodes.{name}") for name in ("losses", "spectra")}
+    nodes = {
+        f"neusee.nodes.{name}": code.digest(f"neusee.nodes.{name}")
+        for name in ("losses", "spectra")
+    }
     program = {name: Path(file).read_bytes() for name, file in _PROGRAM.items()}
     return RecordedInputs(
         kind="lift",
         recipe=recipe.name,
-        settings={**camera.settings, **{f"train_lift.{name}": value for name, value in block.items()}},
+        settings={
+            **camera.settings,
+            **{f"train_lift.{name}": value for name, value in block.items()},
+        },
         steps=camera.steps,
         laws=camera.laws,
         code={**nodes, **{name: outline(source).digest for name, source in program.items()}},
@@ -77,15 +178,25 @@ def lift_inputs(recipe: Recipe, settings: LiftTraining, code: Code) -> RecordedI
 
 class _LiftLoop(ResumableLoop[LiftLearner]):
     def __init__(
-        self, settings: LiftTraining, learner: LiftLearner, inputs: RecordedInputs, folder: Path, progress: Progress,
-        device: str, watch: Watch | None,
-    ) -> None:  # fmt: skip
-        super().__init__(folder, settings, learner, _COLUMNS, progress, device, watch, inputs=inputs.digest)
+        self,
+        settings: LiftTraining,
+        learner: LiftLearner,
+        inputs: RecordedInputs,
+        folder: Path,
+        progress: Progress,
+        device: str,
+        watch: Watch | None,
+    ) -> None:
+        super().__init__(
+            folder, settings, learner, _COLUMNS, progress, device, watch, inputs=inputs.digest
+        )
         self.settings = settings
         self.resume()
 
     def run_to_end(self, recipe: Recipe, command: Sequence[str]) -> None:
-        """Train the network to the last iteration, and write the results; do nothing if the training is finished."""
+        """Train the network to the last iteration, and write the results; do nothing if the
+        training is finished.
+        """
         if self.iteration == self.settings.iterations and (self.folder / DOCUMENT).is_file():
             return
         if self.iteration < self.settings.iterations:
@@ -110,5 +221,6 @@ class _LiftLoop(ResumableLoop[LiftLearner]):
         picture, cube = self.learner.pairs("show", 0)
         centres = self.learner.pairs.bands.centres
         self.write_picture(
-            f"{self.iteration:06d}", lifted_spectra(picture, cube, self.learner.estimates(picture), centres)
+            f"{self.iteration:06d}",
+            lifted_spectra(picture, cube, self.learner.estimates(picture), centres),
         )

@@ -1,14 +1,11 @@
-"""What decides a training: content of files, code and settings, as a folder of results keeps them.
-
-No name of a file, no path and no time counts, so that a training with files that were renamed or moved is the same, and
-one with other content is another. The names are kept beside the digests, for the words that say what changed.
-"""
+"""What decides a training, as its folder keeps it, and what changed since an earlier one."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,13 +13,22 @@ from typing import Any
 
 import numpy as np
 
+from neusee.workflows.explain.change_causes import Comparison, edits
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
-from neusee.workflows.keys.cache_key import code_of, digest, plain
+from neusee.workflows.keys.cache_key import code_of, digest, file_digest, plain, written
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.keys.input_file_digest import file_digest
-from neusee.workflows.keys.regular_file import text_of
-from neusee.workflows.keys.written_params import written
-from neusee.workflows.training.loop.checkpoint import write_whole
+from neusee.workflows.keys.sealed_files import text_of
+from neusee.workflows.store.result_store import Store
+from neusee.workflows.training.loop.resumable_loop import write_whole
+
+# --- recorded inputs ------------------------------------------------------------------------------
+
+# What decides a training: content of files, code and settings, as a folder of results keeps them.
+#
+# No name of a file, no path and no time counts, so that a training with files that were renamed or
+# moved is the same, and one with other content is another. The names are kept beside the digests,
+# for the words that say what changed.
+
 
 FILE = "inputs.json"  #: in the folder of a training
 _FORMAT = 1  #: of this file; a file of another format counts as absent
@@ -50,10 +56,13 @@ class RecordedInputs:
     kind: str  #: training, lift or mask
     recipe: str  #: its name, which decides nothing
     settings: Mapping[str, Any] = field(default_factory=dict)  #: by path
-    steps: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  #: node, code, parameters and inputs by step
-    laws: Mapping[str, Any] = field(default_factory=dict)  #: by path: how it is written, and what decides its draws
+    #: node, code, parameters and inputs by step
+    steps: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    #: by path: how it is written, and what decides its draws
+    laws: Mapping[str, Any] = field(default_factory=dict)
     code: Mapping[str, str] = field(default_factory=dict)  #: digests by what the code is
-    files: Mapping[str, RecordedFile] = field(default_factory=dict)  #: by the setting that names the file
+    #: by the setting that names the file
+    files: Mapping[str, RecordedFile] = field(default_factory=dict)
     photographs: Sequence[RecordedFile] = ()  #: that are trained on
     held_out: Sequence[RecordedFile] = ()
 
@@ -65,7 +74,8 @@ class RecordedInputs:
             self.kind,
             dict(self.settings),
             {name: dict(step) for name, step in self.steps.items()},
-            [[path, law["draws"]] for path, law in self.laws.items()],  # in order, because each takes its own column
+            # in order, because each takes its own column
+            [[path, law["draws"]] for path, law in self.laws.items()],
             dict(self.code),
             {setting: file.content for setting, file in self.files.items()},
             sorted(photograph.content for photograph in self.photographs),
@@ -79,21 +89,27 @@ class RecordedInputs:
 
     def write(self, folder: Path) -> None:
         """Write the inputs into the folder of a training, unless they stand there already."""
-        text = json.dumps({"format": _FORMAT, "digest": self.digest, **asdict(self)}, indent=1, ensure_ascii=False)
+        text = json.dumps(
+            {"format": _FORMAT, "digest": self.digest, **asdict(self)}, indent=1, ensure_ascii=False
+        )
         if self.read(folder) != self:
             write_whole(folder / FILE, text.encode())
 
     @classmethod
     def read(cls, folder: Path) -> RecordedInputs | None:
-        """Return the inputs that the folder of a training keeps, or None for a folder without them."""
+        """Return the inputs that the folder of a training keeps, or None for a folder without
+        them.
+        """
         try:
             written = json.loads(text_of(folder / FILE))
             if written.pop("format") != _FORMAT:
                 return None
             stated = written.pop("digest")
             for name in ("photographs", "held_out"):
-                written[name] = tuple(RecordedFile(**each) for each in written[name])
-            written["files"] = {setting: RecordedFile(**each) for setting, each in written["files"].items()}
+                written[name] = tuple(RecordedFile(**recorded) for recorded in written[name])
+            written["files"] = {
+                setting: RecordedFile(**recorded) for setting, recorded in written["files"].items()
+            }
             record = cls(**written)
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return None
@@ -101,7 +117,9 @@ class RecordedInputs:
 
 
 def folder_of(runs: Path, stem: str, inputs: RecordedInputs) -> Path:
-    """Return the folder of a training: one with equal inputs, whatever its recipe was called, or a new one."""
+    """Return the folder of a training: one with equal inputs, whatever its recipe was called, or
+    a new one.
+    """
     own = runs / f"{stem}_{inputs.key}"
     if own.exists():
         return own
@@ -123,19 +141,28 @@ class CameraInputs:
     laws: Mapping[str, Any]
 
     @classmethod
-    def of(cls, recipe: Recipe, outputs: Iterable[str], code: Code, given: Sequence[str] = ()) -> CameraInputs:
-        """Return what decides the ``outputs`` of a recipe; the caller computes the steps ``given``, which do not count.
+    def of(
+        cls, recipe: Recipe, outputs: Iterable[str], code: Code, computed: Sequence[str] = ()
+    ) -> CameraInputs:
+        """Return what decides the ``outputs`` of a recipe; the steps ``computed`` by the
+        caller do not count.
 
-        Raises ValueError with place and fix for code of the user that reads what cannot be followed.
+        Raises ValueError with place and fix for code of the user that reads what cannot be
+        followed.
         """
-        order = [name for name in needed(recipe, outputs) if name not in given]
+        order = [name for name in needed(recipe, outputs) if name not in computed]
         steps = {name: _origin(recipe.steps[name], recipe.seed, code) for name in order}
         values = {"seed": recipe.seed, "tolerance": recipe.tolerance, "exact": recipe.exact}
         return cls(values, steps, _laws(recipe))
 
     def named(self, prefix: str) -> CameraInputs:
         """Return the same with a prefix before each name, such as that of another camera."""
-        return CameraInputs(*({f"{prefix}{name}": x for name, x in vars(self)[f.name].items()} for f in fields(self)))
+        return CameraInputs(
+            *(
+                {f"{prefix}{name}": x for name, x in vars(self)[f.name].items()}
+                for f in fields(self)
+            )
+        )
 
     def joined(self, other: CameraInputs) -> CameraInputs:
         """Return the inputs of two cameras, whose names differ."""
@@ -143,7 +170,9 @@ class CameraInputs:
 
 
 def _origin(step: Step, seed: int, code: Code) -> dict[str, Any]:
-    """Return what decides a step but for the results that it reads, as `keys.cache_key.key_of` does."""
+    """Return what decides a step but for the results that it reads, as `keys.cache_key.key_of`
+    does.
+    """
     try:
         code_digest = code_of(step, code)
     except LookupError as error:
@@ -164,21 +193,270 @@ def _laws(recipe: Recipe) -> dict[str, Any]:
     uncertain = recipe.uncertain
     if uncertain is None:
         return {}
-    laws = {path: {"text": law.text, "draws": identity(law)} for path, law in uncertain.laws.items()}
+    laws = {
+        path: {"text": law.text, "draws": identity(law)} for path, law in uncertain.laws.items()
+    }
     if uncertain.joint is not None:
-        laws["posterior"] = {"text": f"posterior {uncertain.source}", "draws": identity(uncertain.joint)}
+        laws["posterior"] = {
+            "text": f"posterior {uncertain.source}",
+            "draws": identity(uncertain.joint),
+        }
     for path, difference in uncertain.mismatch.items():
-        laws[f"train.mismatch.{path}"] = {"text": difference.law.text, "draws": identity(difference)}
+        laws[f"train.mismatch.{path}"] = {
+            "text": difference.law.text,
+            "draws": identity(difference),
+        }
     return laws
 
 
 def identity(value: Any) -> Any:
-    """Return JSON values that are equal for equal values: an array is its digest, a file that of its content."""
+    """Return JSON values that are equal for equal values: an array is its digest, a file that of
+    its content.
+    """
     if isinstance(value, np.ndarray):
         content = np.ascontiguousarray(value)
-        return [str(content.dtype), list(content.shape), hashlib.sha256(content.tobytes()).hexdigest()]
+        return [
+            str(content.dtype),
+            list(content.shape),
+            hashlib.sha256(content.tobytes()).hexdigest(),
+        ]
     if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: identity(getattr(value, f.name)) for f in fields(value) if f.name not in _WORDS_ONLY}
+        return {
+            f.name: identity(getattr(value, f.name))
+            for f in fields(value)
+            if f.name not in _WORDS_ONLY
+        }
     if isinstance(value, tuple | list):
-        return [identity(part) for part in value]
+        return [identity(item) for item in value]
     return plain(value)
+
+
+# --- changed inputs -------------------------------------------------------------------------------
+
+# What changed since an earlier training of a recipe, in words: the reason why a training begins
+# anew.
+
+
+_SHOWN = 12  #: changes that are listed
+#: changes above which a training of a recipe with another name is no earlier version of this one
+_FAR = 40
+_CHECKPOINTS = ("state.pt", "mask.state", "mask.json")  #: files of a training that has begun
+CAMERA = "camera "  #: first letters of the names of what a further camera contributes
+
+
+@dataclass(frozen=True)
+class EarlierTraining:
+    """The folder of an earlier training, and the differences of its inputs in words."""
+
+    folder: Path
+    changes: Sequence[str]
+
+    def __str__(self) -> str:
+        listed = [f"  {change}" for change in self.changes[:_SHOWN]]
+        hidden = len(self.changes) - _SHOWN
+        ending = [f"  and {hidden} more"] if hidden > 0 else []
+        head = (
+            f"begins anew, because its inputs are not those of {self.folder.name}, which stays as"
+            " it is:"
+        )
+        return "\n".join([head, *listed, *ending])
+
+
+def prepare_folder(
+    folder: Path,
+    inputs: RecordedInputs,
+    recipe: Recipe,
+    store: Store,
+    progress: Callable[[str], None],
+) -> None:
+    """Make the folder of a training with its inputs; say why a training begins anew although
+    there are earlier ones.
+    """
+    if any((folder / name).is_file() for name in _CHECKPOINTS):
+        record = RecordedInputs.read(folder)
+        if record is not None and record.digest == inputs.digest:
+            inputs.write(folder)  # with the names that the files have now
+        return
+    reason = why_anew(folder, inputs, recipe, store)
+    if reason is not None:
+        progress(str(reason))
+    folder.mkdir(parents=True, exist_ok=True)
+    inputs.write(folder)
+
+
+def why_anew(
+    folder: Path, inputs: RecordedInputs, recipe: Recipe, store: Store
+) -> EarlierTraining | str | None:
+    """Return the earlier training whose inputs differ least, or None if there is no earlier one.
+
+    An earlier training without inputs, as earlier versions wrote it, gives a line of text.
+    """
+    runs, stem = folder.parent, folder.name.rpartition("_")[0]
+    earlier = list(_earlier(runs, stem, inputs, recipe, store))
+    if earlier:
+        return min(earlier, key=lambda training: (len(training.changes), -_began(training.folder)))
+    silent = next((path.parent for path in sorted(runs.glob(f"{stem}_*/state.pt"))), None)
+    if silent is None:
+        return None
+    text = (
+        "an earlier version of neusee wrote it without its inputs, so that nobody can say whether"
+        " they are these"
+    )
+    return f"begins anew, and does not go on with {silent.name}: {text}"
+
+
+def _earlier(
+    runs: Path, stem: str, inputs: RecordedInputs, recipe: Recipe, store: Store
+) -> Iterator[EarlierTraining]:
+    for file in sorted(runs.glob(f"*/{FILE}")):
+        begun = any((file.parent / name).is_file() for name in _CHECKPOINTS)
+        record = RecordedInputs.read(file.parent) if begun else None
+        if record is None or record.kind != inputs.kind or record.digest == inputs.digest:
+            continue
+        changes = changes_since(record, inputs, recipe, store)
+        if file.parent.name.startswith(f"{stem}_") or len(changes) <= _FAR:
+            yield EarlierTraining(file.parent, changes)
+
+
+def _began(folder: Path) -> float:
+    return (folder / FILE).stat().st_mtime
+
+
+def changes_since(
+    old: RecordedInputs, new: RecordedInputs, recipe: Recipe, store: Store
+) -> list[str]:
+    """Return a clause for each input that differs between two trainings."""
+    words = [
+        *_values(old.settings, new.settings),
+        *_changed_laws(old.laws, new.laws),
+        *_files(old.files, new.files),
+        *_photographs(old, new),
+        *_steps(old.steps, new.steps, recipe, store),
+        *_code(old.code, new.code, store),
+    ]
+    return list(dict.fromkeys(words))
+
+
+def _differing(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+    return (name for name in dict.fromkeys([*new, *old]) if old.get(name) != new.get(name))
+
+
+def _values(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+    for name in _differing(old, new):
+        if name not in old or name not in new:
+            yield f"{name} is {'set now' if name in new else 'no longer set'}"
+        else:
+            yield f"{name} {_shown(old[name])} -> {_shown(new[name])}"
+
+
+def _shown(value: Any) -> str:
+    if value is None:
+        return "null"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _changed_laws(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[str]:
+    if old.keys() == new.keys() and list(old) != list(new):
+        yield f"the laws stand in another order: {', '.join(new)}"
+    for path in _differing(_draws(old), _draws(new)):
+        before, after = (laws[path]["text"] if path in laws else "no law" for laws in (old, new))
+        yield (
+            f"{path}: other draws of {after}" if before == after else f"{path} {before} -> {after}"
+        )
+
+
+def _draws(laws: Mapping[str, Any]) -> dict[str, Any]:
+    return {path: law["draws"] for path, law in laws.items()}
+
+
+def _files(old: Mapping[str, RecordedFile], new: Mapping[str, RecordedFile]) -> Iterator[str]:
+    for setting in _differing(_contents(old), _contents(new)):
+        if setting not in old or setting not in new:
+            yield f"{setting} is {'given now' if setting in new else 'no longer given'}"
+        else:
+            yield f"file {new[setting].name}: other content ({setting})"
+
+
+def _contents(files: Mapping[str, RecordedFile]) -> dict[str, str]:
+    return {setting: file.content for setting, file in files.items()}
+
+
+def _photographs(old: RecordedInputs, new: RecordedInputs) -> Iterator[str]:
+    """Yield a clause for each photograph that came, went or changed; a new name of an equal file
+    is no change.
+    """
+    before, after = [*old.photographs, *old.held_out], [*new.photographs, *new.held_out]
+    came = [photograph.name for photograph in _beyond(after, before)]
+    went = [photograph.name for photograph in _beyond(before, after)]
+    yield from _came_and_went(came, went)
+    same_files = not came and not went
+    if same_files and _beyond(new.held_out, old.held_out):
+        yield "other photographs are held out"
+
+
+def _came_and_went(came: Sequence[str], went: Sequence[str]) -> Iterator[str]:
+    """Yield a clause for each name of a photograph; one that came and went has another content."""
+    changed = set(came) & set(went)
+    yield from (f"photograph {name}: other content" for name in sorted(changed))
+    yield from (f"photograph {name} is new" for name in came if name not in changed)
+    yield from (f"photograph {name} is gone" for name in went if name not in changed)
+
+
+def _beyond(files: Sequence[RecordedFile], others: Sequence[RecordedFile]) -> list[RecordedFile]:
+    """Return the files whose content the others do not have, each as often as it is missing
+    there.
+    """
+    unmatched = Counter(file.content for file in others)
+    beyond = []
+    for file in files:
+        unmatched[file.content] -= 1
+        if unmatched[file.content] < 0:
+            beyond.append(file)
+    return beyond
+
+
+def _steps(
+    old: Mapping[str, Mapping[str, Any]],
+    new: Mapping[str, Mapping[str, Any]],
+    recipe: Recipe,
+    store: Store,
+) -> Iterator[str]:
+    for label in _differing(old, new):
+        camera, step = _camera_of(label)
+        before = f"{camera}: " if camera else ""
+        if label not in old or label not in new:
+            yield f"{before}step {step} is {'new' if label in new else 'gone'}"
+            continue
+        comparison = Comparison(store, _recipe_of(camera, recipe))
+        clauses = comparison.own(step, old[label], new[label])
+        if not clauses:
+            clauses = [f"step {step} reads {_read(new[label])}, not {_read(old[label])}"]
+        yield from (f"{before}{clause}" for clause in clauses)
+
+
+def _camera_of(label: str) -> tuple[str, str]:
+    """Return the camera and the step in a name such as ``camera 2: psf[mask]``; the first camera
+    has no name.
+    """
+    camera, colon, step = label.partition(": ")
+    return (camera, step) if colon else ("", label)
+
+
+def _recipe_of(camera: str, recipe: Recipe) -> Recipe:
+    number = camera.removeprefix(CAMERA)
+    if camera.startswith(CAMERA) and number.isdigit() and int(number) - 2 < len(recipe.cameras):
+        return recipe.cameras[int(number) - 2]
+    return recipe
+
+
+def _read(origin: Mapping[str, Any]) -> str:
+    names: list[str] = []
+    for source in origin["inputs"]:
+        names += [source] if isinstance(source, str) else source or []
+    return ", ".join(names) or "nothing"
+
+
+def _code(old: Mapping[str, str], new: Mapping[str, str], store: Store) -> Iterator[str]:
+    for module in _differing(old, new):
+        changes = edits(store.root, old.get(module, ""), new.get(module, ""))
+        yield from changes or [f"the code of {module} changed"]

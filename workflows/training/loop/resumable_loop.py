@@ -1,26 +1,183 @@
-"""The loop of every training; a stopped training continues from its last checkpoint with bit-identical results."""
+"""The loop of every training; a stopped one continues bit by bit from its checkpoint."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
+import os
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
+import torch
 from torch import nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from neusee.nodes.file_headers import archive_needs
+from neusee.nodes.input_files import lines_of
 from neusee.workflows.engine.provenance import timestamp, versions
-from neusee.workflows.recipe.blocks.train_block import Training
-from neusee.workflows.recipe.blocks.train_lift_block import LiftTraining
+from neusee.workflows.recipe.blocks.train_block import LiftTraining, Training
 from neusee.workflows.report.run_crate import remove_crate, write_crate
-from neusee.workflows.training.loop.checkpoint import Rows, StateFile, write_whole
+
+# --- checkpoint -----------------------------------------------------------------------------------
+
+# The files of a training: its checkpoint, its table of losses, and its trained weights.
+
+
+_FORMAT = 1  #: format of a state; a state of another format is refused
+_CELLS = 24.0  #: bytes in memory for each byte of a table of losses
+_NAMES = {"relief": "mask"}  #: names in a state of version 0.1, with the present names
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Replace a file atomically: an interrupted write leaves the old file unchanged."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with partial.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+
+
+@dataclass(frozen=True)
+class StateFile:
+    """The checkpoint file of a training, which is always complete because it is replaced
+    atomically.
+    """
+
+    path: Path
+
+    def write(self, state: Mapping[str, Any]) -> None:
+        """Write a training state to the checkpoint file, in place of the old state."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        memory = io.BytesIO()
+        torch.save({"edition": _FORMAT, **state}, memory)
+        write_whole(self.path, memory.getvalue())
+
+    def read(self, device: str = "cpu", strict: bool = True) -> dict[str, Any]:
+        """Return the training state from the checkpoint file, or an empty dictionary if there is no
+        file.
+
+        Raises ValueError for a file that cannot be read, or that needs more memory than is left; if
+        not ``strict``, an unreadable file counts as absent.
+        """
+        if not self.path.exists():
+            return {}
+        archive_needs(self.path, 1.0)  # a state without room in memory is not absent
+        try:
+            state: dict[str, Any] = torch.load(self.path, map_location=device, weights_only=True)
+            if state.get("edition", _FORMAT) != _FORMAT:
+                raise ValueError(f"the training state has format {state['edition']}, not {_FORMAT}")
+            if "parts" in state:
+                state["parts"] = {
+                    _NAMES.get(name, name): member for name, member in state["parts"].items()
+                }
+        except (
+            RuntimeError,
+            KeyError,
+            EOFError,
+            OSError,
+            ValueError,
+            TypeError,
+            AttributeError,
+        ) as error:
+            if not strict:
+                return {}
+            raise ValueError(
+                f"{self.path} cannot be read ({error}): remove its folder to start again"
+            ) from error
+        return state
+
+
+class Rows:
+    """The table ``losses.csv`` of a training, with one row for each iteration."""
+
+    def __init__(self, path: Path, columns: Sequence[str]) -> None:
+        self._path, self._columns = path, columns
+        self.rows: list[dict[str, str]] = []
+        self._kept = 0
+
+    def cut(self, stage: int, iteration: int, write: bool = True) -> None:
+        """Read the loss table from its file, and discard the rows of the given iteration and of
+        later iterations.
+        """
+        if self._path.exists():
+            lines = csv.DictReader(lines_of(self._path, _CELLS))
+            self.rows = [row for row in lines if _place(row) < (stage, iteration)]
+        self._kept = 0
+        if write:
+            self.keep()
+
+    def add(self, stage: int, iteration: int, losses: Mapping[str, float]) -> None:
+        """Append the losses of an iteration to the loss table in memory; the method `keep`
+        writes the table to disk.
+        """
+        row = {
+            "stage": stage,
+            "iteration": iteration,
+            **{name: f"{x:.6g}" for name, x in losses.items()},
+        }
+        self.rows.append({name: str(row.get(name, "")) for name in self._columns})
+
+    def keep(self) -> None:
+        """Append the new rows of the loss table to its file; the first call writes the whole
+        file.
+        """
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, self._columns)
+        if self._kept == 0:
+            writer.writeheader()
+        writer.writerows(self.rows[self._kept :])
+        if self._kept == 0:
+            write_whole(self._path, text.getvalue().encode())
+        else:
+            with self._path.open("ab") as file:
+                file.write(text.getvalue().encode())
+        self._kept = len(self.rows)
+
+
+def _place(row: Mapping[str, str | None]) -> tuple[int, int]:
+    """Return stage and iteration of a row of the loss table for sorting; an incomplete row comes
+    last.
+    """
+    with suppress(ValueError, TypeError, KeyError):
+        if None not in row.values():
+            return int(row.get("stage") or 0), int(row["iteration"] or 0)
+    return 1 << 62, 0
+
+
+def export(
+    folder: Path,
+    name: str,
+    tensors: Mapping[str, torch.Tensor],
+    about: dict[str, str] | None = None,
+) -> None:
+    """Write tensors and metadata to the file ``<name>.safetensors`` in a folder."""
+    from safetensors.torch import save
+
+    copies = {key: x.detach().cpu().contiguous().clone() for key, x in tensors.items()}
+    write_whole(folder / f"{name}.safetensors", save(copies, about or None))
+
+
+# --- resumable loop -------------------------------------------------------------------------------
+
+# The loop of every training; a stopped training continues from its last checkpoint with
+# bit-identical results.
+
 
 Losses = dict[str, float]
 Progress = Callable[[str], None]  #: takes one line of text about the progress of a training
-Watch = Callable[[int, int, Mapping[str, float]], None]  #: takes the stage, its iterations so far, and the losses
+#: takes the stage, its iterations so far, and the losses
+Watch = Callable[[int, int, Mapping[str, float]], None]
 DOCUMENT = "training.json"  #: the file that a training writes last
 
 
@@ -39,34 +196,55 @@ L = TypeVar("L", bound=Learns)
 
 
 class ResumableLoop(ABC, Generic[L]):
-    """A training loop that writes a checkpoint, a table of losses, pictures and a final document into a folder.
+    """A training loop that writes a checkpoint, a table of losses, pictures and a final document
+    into a folder.
 
-    Among several processes, only the process with ``writes`` writes files. A training without stages is in stage 0.
+    Among several processes, only the process with ``writes`` writes files. A training without
+    stages is in stage 0.
     """
 
     def __init__(
-        self, folder: Path, settings: Training | LiftTraining, learner: L, columns: Sequence[str],
-        progress: Progress, device: str, watch: Watch | None, writes: bool = True, inputs: str = "",
-    ) -> None:  # fmt: skip
+        self,
+        folder: Path,
+        settings: Training | LiftTraining,
+        learner: L,
+        columns: Sequence[str],
+        progress: Progress,
+        device: str,
+        watch: Watch | None,
+        writes: bool = True,
+        inputs: str = "",
+    ) -> None:
         self.folder, self.learner, self.progress, self.device = folder, learner, progress, device
-        self.keep_every, self.show_every, self.watch, self.writes = settings.keep, settings.show, watch, writes
+        self.keep_every, self.show_every, self.watch, self.writes = (
+            settings.keep,
+            settings.show,
+            watch,
+            writes,
+        )
         self.rows, self.state = Rows(folder / "losses.csv", columns), StateFile(folder / "state.pt")
         self.stage, self.iteration, self.batch, self.began = 0, 0, 1, timestamp()
         self.inputs = inputs  #: digest of all that decides the training
 
     @abstractmethod
     def iterate(self) -> Losses:
-        """Compute one training iteration and return the losses; raise `NotFinite` if a loss is NaN or infinite.
+        """Compute one training iteration and return the losses; raise `NotFinite` if a loss is NaN
+        or infinite.
 
-        `NotFinite` is raised for a gradient too, and always before the optimiser changes the weights.
+        `NotFinite` is raised for a gradient too, and always before the optimiser changes the
+        weights.
         """
 
     @abstractmethod
     def show(self) -> None:
-        """Write a picture that shows the output of the networks at the present iteration of the training."""
+        """Write a picture that shows the output of the networks at the present iteration of the
+        training.
+        """
 
     def validate(self, iterations: int) -> Losses:
-        """Return further numbers for the loss table after a number of iterations of the stage; most have none."""
+        """Return further numbers for the loss table after a number of iterations of the stage;
+        most have none.
+        """
         return {}
 
     @property
@@ -75,7 +253,9 @@ class ResumableLoop(ABC, Generic[L]):
         return False
 
     def facts(self) -> dict[str, Any]:
-        """Return what a checkpoint keeps beside stage, iteration, inputs and the learner; most trainings have none."""
+        """Return what a checkpoint keeps beside stage, iteration, inputs and the learner; most
+        trainings have none.
+        """
         return {}
 
     def recall(self, facts: Mapping[str, Any]) -> None:
@@ -85,43 +265,59 @@ class ResumableLoop(ABC, Generic[L]):
         """Prepare networks and optimisers for the present stage of the training."""
 
     def resume(self) -> None:
-        """Continue a training from its checkpoint file, or begin at the first iteration if there is no checkpoint."""
+        """Continue a training from its checkpoint file, or begin at the first iteration if there
+        is no checkpoint.
+        """
         state = self.state.read(self.device)
         if state and state.get("inputs", self.inputs) != self.inputs:
-            text = "was written for other inputs than those of this training, although its folder has their name"
+            text = (
+                "was written for other inputs than those of this training, although its folder has"
+                " their name"
+            )
             raise ValueError(f"{self.state.path} {text}: remove the folder to start again")
         self.stage, self.iteration = state.get("stage", self.stage), state.get("iteration", 0)
         self.begin_stage()
         if state:
             self.recall(state)
-            for name, part in self.learner.parts().items():
-                part.load_state_dict(state["parts"][name])
+            for name, member in self.learner.parts().items():
+                member.load_state_dict(state["parts"][name])
             self.rows.cut(self.stage, self.iteration, self.writes)
             self.progress(
-                f"continues {f'in stage {self.stage} ' if self.stage else ''}after {self.iteration} iterations"
+                f"continues {f'in stage {self.stage} ' if self.stage else ''}after {self.iteration}"
+                " iterations"
             )
 
     def run(self, iterations: int, batch: int) -> None:
-        """Compute the remaining iterations of the present training stage; the caller saves the state at the end."""
+        """Compute the remaining iterations of the present training stage; the caller saves the
+        state at the end.
+        """
         self.batch = batch
         if self.writes and self.iteration < iterations:
             remove_crate(self.folder)
         while self.iteration < iterations and not self.stops_early:
-            began = time.perf_counter()
-            try:
-                losses = self.iterate()
-            except NotFinite as error:
-                raise self._dumped(error) from error
-            losses |= self.validate(self.iteration + 1)
-            losses["seconds"] = time.perf_counter() - began
-            self.rows.add(self.stage, self.iteration, losses)
-            self.iteration += 1
+            losses = self._next_row()
             ended = self.iteration == iterations or self.stops_early
-            if self.writes and (ended or self.iteration % self.show_every == 0):
-                self.show()
+            self._show_at_intervals(ended)
             self.note(losses)
             if not ended and self.iteration % self.keep_every == 0:
                 self.keep()
+
+    def _show_at_intervals(self, ended: bool) -> None:
+        if self.writes and (ended or self.iteration % self.show_every == 0):
+            self.show()
+
+    def _next_row(self) -> Losses:
+        """Compute one iteration, and add its losses and its time to the loss table."""
+        began = time.perf_counter()
+        try:
+            losses = self.iterate()
+        except NotFinite as error:
+            raise self._dumped(error) from error
+        losses |= self.validate(self.iteration + 1)
+        losses["seconds"] = time.perf_counter() - began
+        self.rows.add(self.stage, self.iteration, losses)
+        self.iteration += 1
+        return losses
 
     def note(self, losses: Losses) -> None:
         """Pass the losses of the last training iteration to the callback function ``watch``."""
@@ -131,7 +327,8 @@ class ResumableLoop(ABC, Generic[L]):
     def keep(self) -> None:
         """Write the loss table of a training to disk, and then the checkpoint.
 
-        In this order a killed process can leave surplus rows, which `resume` removes, but no missing rows.
+        In this order a killed process can leave surplus rows, which `resume` removes, but no
+        missing rows.
         """
         if self.writes:
             self.rows.keep()
@@ -143,22 +340,38 @@ class ResumableLoop(ABC, Generic[L]):
         write_whole(self.folder / "pictures" / f"{name}.png", picture)
 
     def close(self, curves: bytes, recipe: str, command: Sequence[str], **facts: Any) -> None:
-        """Write the loss curves, and then the document with the settings and the results of the training."""
+        """Write the loss curves, and then the document with the settings and the results of the
+        training.
+        """
         remove_crate(self.folder)
         write_whole(self.folder / "curves.png", curves)
         seconds = sum(float(row["seconds"]) for row in self.rows.rows)
-        about = {"command": list(command), "recipe": recipe, **facts, "seconds": seconds, "versions": versions()}
+        about = {
+            "command": list(command),
+            "recipe": recipe,
+            **facts,
+            "seconds": seconds,
+            "versions": versions(),
+        }
         text = json.dumps(about, indent=1, ensure_ascii=False) + "\n"
         write_whole(self.folder / DOCUMENT, text.encode())
         write_crate(self.folder, self.folder.name, about | {"began": self.began})
 
     def _packed(self, **about: Any) -> dict[str, Any]:
-        parts = {name: part.state_dict() for name, part in self.learner.parts().items()}
-        return {"stage": self.stage, "iteration": self.iteration, "inputs": self.inputs, **self.facts(), **about,
-                "parts": parts}  # fmt: skip
+        parts = {name: member.state_dict() for name, member in self.learner.parts().items()}
+        return {
+            "stage": self.stage,
+            "iteration": self.iteration,
+            "inputs": self.inputs,
+            **self.facts(),
+            **about,
+            "parts": parts,
+        }
 
     def _dumped(self, error: NotFinite) -> ArithmeticError:
-        """Write the weights and the picture numbers that led to a NaN or infinite loss, and return the error."""
+        """Write the weights and the picture numbers that led to a NaN or infinite loss, and
+        return the error.
+        """
         place = [self.stage, self.iteration] if self.stage else [self.iteration]
         dump = StateFile(self.folder / f"not_finite_{'_'.join(map(str, place))}.pt")
         first, count = self.iteration * self.batch, self.batch
@@ -167,18 +380,25 @@ class ResumableLoop(ABC, Generic[L]):
             self.rows.keep()
         stage = f"stage {self.stage}, " if self.stage else ""
         pictures = f"pictures {first} to {first + count - 1}" if count > 1 else f"picture {first}"
-        text = f"{stage}iteration {self.iteration}, {pictures}: {error}; the weights are in {dump.path}"
+        text = (
+            f"{stage}iteration {self.iteration}, {pictures}: {error}; the weights are in"
+            f" {dump.path}"
+        )
         return ArithmeticError(text)
 
 
 def require_finite(numbers: Mapping[str, float]) -> None:
-    """Raise `NotFinite` if a loss or another named number is NaN or infinite; the message gives its name."""
+    """Raise `NotFinite` if a loss or another named number is NaN or infinite; the message gives
+    its name.
+    """
     wrong = [name for name, x in numbers.items() if not abs(x) < float("inf")]
     if wrong:
         raise NotFinite(f"these numbers are NaN or infinite: {', '.join(wrong)}")
 
 
 def averaged(net: nn.Module, decay: float) -> AveragedModel | None:
-    """Return an exponential moving average of the weights of a network, or None if ``decay`` is 0."""
+    """Return an exponential moving average of the weights of a network, or None if ``decay`` is
+    0.
+    """
     mean = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
     return AveragedModel(net, multi_avg_fn=mean) if decay else None

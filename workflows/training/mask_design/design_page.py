@@ -1,83 +1,254 @@
-"""The report page of a designed mask: height map, figures of merit by wavelength, and losses by iteration."""
+"""The page of a designed mask: height map, figures of merit, and its rival at a peak limit."""
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
 
-from neusee.nodes import metrics
+from neusee.nodes import losses, metrics
 from neusee.workflows.report.figures import optics
-from neusee.workflows.report.figures.style import BLACK, BLUE, GREEN, ORANGE, VERMILION, canvas, drawn
-from neusee.workflows.report.study_page import Section
+from neusee.workflows.report.figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    VERMILION,
+    canvas,
+    drawn,
+)
+from neusee.workflows.report.study_page import Mark, Section
 from neusee.workflows.training.mask_design.design_terms import Fabrication, Terms
-from neusee.workflows.training.mask_design.learnt_mask import LearntMask
-from neusee.workflows.training.mask_design.peak_limit import section
+from neusee.workflows.training.mask_design.mask_optimisers import LearntMask
 
-_COLUMNS = ("nm", "LSR", "even light", "BSR", "median MTF", "at most", "rms MTF", "at most")
+# --- peak limit -----------------------------------------------------------------------------------
+
+# A designed mask behind a peak limit, against its rival: the best round stop with a grey filter at
+# the same limit.
+
+
+_LIGHTS = (10.0, 30.0, 100.0, 300.0, 1000.0)  #: e- in a pixel, beside that of the design
+_DECIBELS = 10 / math.log(10)
+_COLUMNS = (
+    "light (e-)",
+    "error, mask (dB)",
+    "error, stop (dB)",
+    "gain (dB)",
+    "stop",
+    "its filter",
+    "bits, mask",
+    "bits, stop",
+    "more bits",
+)
+
+
+def against_stops(terms: Terms, height: Tensor) -> dict[str, Any]:
+    """Return error and information of a mask behind the peak limit, and those of the best stop, by
+    light of the scene.
+
+    The result is empty if the loss has no such term.
+    """
+    if not terms.settings.weights.protected:
+        return {}
+    with torch.no_grad():
+        psf, exposure = terms.psf(height), terms.exposure()
+        peaks = [
+            float(metrics.lsr(terms.psf(height, None, state)).max())
+            for state, _ in terms.laws.points()
+        ]
+        limit, worst = exposure["limit"], max(peaks)
+        own = {**terms.passed(), "limit": None if limit is None else limit * peaks[0] / worst}
+        lights = sorted({*_LIGHTS, exposure["light"]})
+        rows = [_row(terms, psf, {**exposure, "light": light}, own) for light in lights]
+    stop = 1.0 if terms.shade is None else terms.recipe.steps[terms.shade.step].params["diameter"]
+    return {
+        "limit": limit,
+        "lsr": worst,
+        "stop": stop,
+        "filter": 1.0 if limit is None else min(1.0, limit / worst),
+        "rows": rows,
+    }
+
+
+def _row(terms: Terms, psf: Any, exposure: dict[str, Any], own: dict[str, Any]) -> dict[str, float]:
+    """Return error and information of a mask, whose own limit is lower by what is uncertain, and
+    of the best stop.
+    """
+    sight, row = terms.seen(), {"light": exposure["light"]}
+    for name in ("filtered_error", "information"):
+        row[name] = float(getattr(losses, name)(psf, *sight, **{**exposure, **own}))
+        row[f"{name} of the stop"], width, passed = losses.best_stop(
+            terms.plain(), *sight, **exposure, measure=name
+        )
+        if name == "filtered_error":
+            row |= {"stop": width, "filter of the stop": passed}
+    return row
+
+
+def section(facts: dict[str, Any]) -> Section:
+    """Return the section of the report page that compares a mask with the best stop at the same
+    peak limit.
+    """
+    limit = (
+        "no peak limit"
+        if facts["limit"] is None
+        else f"a peak of at most {facts['limit']:.3g} of the clear lens"
+    )
+    text = f"""Error of the Wiener-filtered picture of a natural scene over its variance, and
+        information per frequency, both for {limit}. The mask has an LSR of {facts["lsr"]:.3g} in
+        its worst band and in the worst state of what is uncertain, a stop of {facts["stop"]:.3g}
+        and a grey filter of {facts["filter"]:.3g}. The rival is the round stop, as a share of the
+        aperture, with the grey filter that has the least error at the same limit. A gain above 0 is
+        in favour of the mask. Unknown glare and clipping are neglected."""
+    listed, marks = [], dict[tuple[int, int], Mark]()
+    for number, row in enumerate(facts["rows"]):
+        mask, stop = (
+            _DECIBELS * row["filtered_error"],
+            _DECIBELS * row["filtered_error of the stop"],
+        )
+        bits, stop_bits = -row["information"], -row["information of the stop"]
+        marks[number, 3] = "pass" if mask < stop else "fail"
+        marks[number, 8] = "pass" if bits > stop_bits else "fail"
+        own = (row["stop"], row["filter of the stop"], bits, stop_bits, bits - stop_bits)
+        listed.append((row["light"], mask, stop, stop - mask, *own))
+    return Section("Behind a peak limit", text, _COLUMNS, listed, marks=marks)
+
+
+def line(facts: dict[str, Any]) -> str:
+    """Return the gain of a mask over the best stop by light of the scene as a line of text."""
+    gains = ", ".join(
+        f"{_DECIBELS * (row['filtered_error of the stop'] - row['filtered_error']):+.2f} dB at"
+        f" {row['light']:g} e-"
+        for row in facts["rows"]
+    )
+    return f"filtered error against the best stop and filter: {gains}"
+
+
+# --- design page ----------------------------------------------------------------------------------
+
+# The report page of a designed mask: height map, figures of merit by wavelength, and losses by
+# iteration.
+
+
+_DESIGN_COLUMNS = (
+    "nm",
+    "LSR",
+    "even light",
+    "BSR",
+    "median MTF",
+    "at most",
+    "rms MTF",
+    "at most",
+)
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, BLACK, "#CC79A7", "#56B4E9", "#777777")
 _STYLES = ("-", "--", ":", "-.")  #: line styles, of which the next begins when all colours are used
-_NAMES = ("lsr", "energy_floor", "bsr", "median_mtf", "median_mtf_bound", "rms_mtf", "rms_mtf_bound")
+_NAMES = (
+    "lsr",
+    "energy_floor",
+    "bsr",
+    "median_mtf",
+    "median_mtf_bound",
+    "rms_mtf",
+    "rms_mtf_bound",
+)
 
 
 def pictures(terms: Terms, height: Tensor, learnt: LearntMask) -> dict[str, bytes]:
-    """Draw the height map, PSF, laser suppression and losses of a designed mask, and return the PNG files by name."""
+    """Draw the height map, PSF, laser suppression and losses of a designed mask, and return the
+    PNG files by name.
+    """
     pupil, psf, plain = terms.pupil(height), terms.psf(height), terms.plain()
     pitch = terms.recipe.steps[terms.settings.psf].params["pixel_pitch"]
     bsr = metrics.bsr(psf)
     drawings = {
         "height": optics.height(pupil=pupil),
         "psf": optics.psf(plain=plain, mask=psf, bands=terms.bands, pixel_pitch=pitch),
-        "suppression": optics.suppression(lsr=metrics.lsr(psf), bands=terms.bands, psf=psf, bsr=bsr),
+        "suppression": optics.suppression(
+            lsr=metrics.lsr(psf), bands=terms.bands, psf=psf, bsr=bsr
+        ),
     }
     return drawings | ({"history": history(learnt.history)} if learnt.history else {})
 
 
 @drawn
 def history(rows: Sequence[Mapping[str, float]]) -> Any:
-    """Draw the loss of a mask design and the loss terms over the iterations, with a curve for each optimisation."""
-    names = [name for name in dict.fromkeys(n for row in rows for n in row) if name not in ("start", "iteration")]
+    """Draw the loss of a mask design and the loss terms over the iterations, with a curve for
+    each optimisation.
+    """
+    columns = dict.fromkeys(itertools.chain.from_iterable(rows))
+    names = [name for name in columns if name not in ("start", "iteration")]
     figure, axes = canvas(3.6 * max(len(names), 2), 3.2, 1, len(names))
     starts = sorted({row["start"] for row in rows})
     looks = dict(zip(starts, itertools.cycle(itertools.product(_STYLES, _COLOURS)), strict=False))
     for ax, name in zip(axes[0], names, strict=True):
         for start in starts:
             own = [row for row in rows if row["start"] == start]
-            style, colour = looks[start]
-            look = {"linestyle": style, "color": colour, "linewidth": 1.2, "label": f"{start:g}"}
-            ax.plot([row["iteration"] for row in own], [row[name] for row in own], **look)
+            _draw_term(ax, own, name, looks[start], f"{start:g}")
         ax.set_title(name)
         ax.set_xlabel("iteration")
         ax.ticklabel_format(axis="y", useOffset=False)
     if len(starts) > 1:
-        figure.legend(*axes[0, 0].get_legend_handles_labels(), title="start", loc="outside right upper")
+        figure.legend(
+            *axes[0, 0].get_legend_handles_labels(), title="start", loc="outside right upper"
+        )
     return figure
 
 
-def sections(figures: Mapping[str, Any], limits: Fabrication, shown: Mapping[str, bytes]) -> list[Section]:
-    """Return the sections of the report page of a designed mask: pictures, figures of merit and fabrication limits."""
+def _draw_term(
+    ax: Any, rows: Sequence[Mapping[str, float]], name: str, look: tuple[str, str], label: str
+) -> None:
+    """Draw a term of the loss of one optimisation over its iterations."""
+    style, colour = look
+    ax.plot(
+        [row["iteration"] for row in rows],
+        [row[name] for row in rows],
+        linestyle=style,
+        color=colour,
+        linewidth=1.2,
+        label=label,
+    )
+
+
+def sections(
+    figures: Mapping[str, Any], limits: Fabrication, shown: Mapping[str, bytes]
+) -> list[Section]:
+    """Return the sections of the report page of a designed mask: pictures, figures of merit and
+    fabrication limits.
+    """
     bands = figures["bands"]
     columns = [[1e9 * value for value in bands["wavelength"]], *(bands[name] for name in _NAMES)]
     bounds = (
-        "`even light` is the LSR of light that is spread evenly over the window of the PSF. "
-        "The sum of the squares of a PSF equals the sum of the squares of its contrast (Parseval), so that a low peak "
-        "leaves little contrast: no PSF with this peak has more contrast than `at most`."
+        "`even light` is the LSR of light that is spread evenly over the window of the PSF. The sum"
+        " of the squares of a PSF equals the sum of the squares of its contrast (Parseval), so that"
+        " a low peak leaves little contrast: no PSF with this peak has more contrast than `at"
+        " most`."
     )
     parts = [
-        Section("Mask", "The height map, and the phase at three wavelengths.", picture=shown.get("height")),
+        Section(
+            "Mask",
+            "The height map, and the phase at three wavelengths.",
+            picture=shown.get("height"),
+        ),
         Section("Fabrication", f"{limits}.", ("limit", "value"), limits.rows()),
-        Section("Light", "The PSF with the mask beside the PSF of the plain lens.", picture=shown.get("psf")),
+        Section(
+            "Light",
+            "The PSF with the mask beside the PSF of the plain lens.",
+            picture=shown.get("psf"),
+        ),
         Section("Suppression", "", picture=shown.get("suppression")),
-        Section("By wavelength", bounds, _COLUMNS, list(zip(*columns, strict=True))),
+        Section("By wavelength", bounds, _DESIGN_COLUMNS, list(zip(*columns, strict=True))),
     ]
     if figures["protected"]:
         parts.insert(1, section(figures["protected"]))
     if "history" in shown:
         text = (
-            "The loss is the weighted sum of its terms. Each term is a mean over the bands of an iteration and has no "
-            "unit. The term `lsr` is a natural logarithm, and so negative, unless the recipe sets `log: false`."
+            "The loss is the weighted sum of its terms. Each term is a mean over the bands of an"
+            " iteration and has no unit. The term `lsr` is a natural logarithm, and so negative,"
+            " unless the recipe sets `log: false`."
         )
         parts.append(Section("Learning", text, picture=shown["history"]))
     return parts

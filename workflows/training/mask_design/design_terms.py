@@ -1,4 +1,4 @@
-"""The loss function of a mask design and its terms, computed from the PSF of the mask."""
+"""The loss function of a mask design: its terms, the camera's laws and the shade."""
 
 from __future__ import annotations
 
@@ -11,28 +11,190 @@ import torch
 from torch import Tensor
 
 from neusee.nodes import losses
-from neusee.nodes.values import Bands, Psf, Pupil, Stop, band_names
+from neusee.nodes.values import Bands, Psf, Pupil, Shade, Stop, band_names
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
-from neusee.workflows.recipe.blocks.mask_design_block import DesignError, MaskTraining, need_steps
+from neusee.workflows.recipe.blocks.train_block import DesignError, MaskTraining, need_steps
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.mask_design.camera_laws import NOMINAL, CameraLaws, State
-from neusee.workflows.training.mask_design.learnt_shade import LearntShade
+
+# --- camera laws ----------------------------------------------------------------------------------
+
+# What a mask design does not know for certain: laws of defocus, wavelength and direction, and how
+# they are drawn.
+
 
 _PRIME = 1_000_003
+_FAR = 3**0.5  #: standard deviations at which the outer points of a law lie
+
+#: defocus, wavelength, direction on y and on x, in standard deviations
+State = tuple[float, float, float, float]
+NOMINAL: State = (0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class CameraLaws:
+    """Normal laws of defocus, wavelength and direction around the values of the recipe, each
+    independent.
+    """
+
+    spreads: State  #: standard deviations in waves, m, rad and rad
+    defocus: Mapping[str, float]  #: the parameter of the pupil and its value in the recipe
+    #: the parameter of the PSF and its value in the recipe
+    angle: Mapping[str, tuple[float, float]]
+    seed: int
+
+    @classmethod
+    def of(cls, recipe: Recipe, settings: MaskTraining) -> CameraLaws:
+        """Read the laws of the settings, and the parameters of the recipe that they move.
+
+        Raises: `DesignError` if the PSF has no defocus or no direction that could be moved.
+        """
+        step, direction = recipe.steps[settings.psf], settings.direction_spread
+        pupil, defocus = step.wires.get("pupil"), dict[str, float]()
+        if settings.defocus_spread:
+            if not isinstance(pupil, str) or "defocus" not in recipe.steps[pupil].params:
+                text = f"the pupil of {settings.psf} has no defocus: remove it, or name another psf"
+                raise DesignError(f"defocus_spread: {text}")
+            defocus = {f"{pupil}.defocus": float(recipe.steps[pupil].params["defocus"])}
+        if direction and "angle" not in step.params:
+            raise DesignError(
+                f"direction_spread: {settings.psf} has no angle: remove it, or name an optics.psf"
+                " step"
+            )
+        angle = {f"{settings.psf}.angle": step.params["angle"]} if direction else {}
+        return cls(
+            (settings.defocus_spread, settings.wavelength_spread, direction, direction),
+            defocus,
+            angle,
+            settings.seed,
+        )
+
+    @property
+    def certain(self) -> bool:
+        """Return True if nothing is uncertain."""
+        return not any(self.spreads)
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Return the parameters of the recipe that the laws move."""
+        return (*self.defocus, *self.angle)
+
+    def values(self, state: State) -> dict[str, Any]:
+        """Return the parameters of the recipe in a state."""
+        defocus, _, *turns = (spread * x for spread, x in zip(self.spreads, state, strict=True))
+        params: dict[str, Any] = {name: nominal + defocus for name, nominal in self.defocus.items()}
+        return params | {
+            name: tuple(a + b for a, b in zip(nominal, turns, strict=True))
+            for name, nominal in self.angle.items()
+        }
+
+    def moved(self, bands: Bands, state: State) -> Bands:
+        """Return the bands with all their wavelengths moved together."""
+        return bands._replace(centres=bands.centres + self.spreads[1] * state[1])
+
+    def drawn(self, number: int) -> State:
+        """Draw the state of the iteration ``number``."""
+        rng = torch.Generator().manual_seed(self.seed * _PRIME - number - 1)
+        defocus, wavelength, y, x = torch.randn(4, generator=rng, dtype=torch.float64).tolist()
+        return defocus, wavelength, y, x
+
+    def points(self) -> list[tuple[State, float]]:
+        """Return 2 d + 1 states with their weights, for d uncertain numbers: exact for polynomials
+        of degree 3.
+
+        For d = 1 these are the points of Gauss-Hermite quadrature.
+        """
+        unknown = [place for place, spread in enumerate(self.spreads) if spread]
+        points = [(NOMINAL, 1 - len(unknown) / 3)]
+        for place in unknown:
+            for far in (-_FAR, _FAR):
+                state = [0.0] * len(self.spreads)
+                state[place] = far
+                points.append(((state[0], state[1], state[2], state[3]), 1 / 6))
+        return points
+
+
+# --- learnt shade ---------------------------------------------------------------------------------
+
+# The shade in front of a mask during its design: what it lets through, and a stop that is learnt
+# with the mask.
+
+
+@dataclass(frozen=True)
+class LearntShade:
+    """The step of a shade, its result as the recipe has it, and that with the stop of the shade
+    fully open.
+    """
+
+    step: str
+    own: Shade
+    wide: Shade
+    learnt: bool
+
+    @classmethod
+    def of(
+        cls, recipe: Recipe, settings: MaskTraining, store: Store | None, device: str
+    ) -> LearntShade | None:
+        """Return the shade in the pupil of the mask, or None for a pupil without one.
+
+        Raises: `DesignError` if a stop is to be learnt and the pupil has no shade of `doe.shade`.
+        """
+        pupil = recipe.steps[settings.psf].wires.get("pupil")
+        name = recipe.steps[pupil].wires.get("shade") if isinstance(pupil, str) else None
+        if not isinstance(name, str) or recipe.steps[name].node.path != "doe.shade":
+            if settings.learn_stop:
+                text = (
+                    f"the pupil of {settings.psf} has no shade whose stop could be learnt: use"
+                    " doe=shaded"
+                )
+                raise DesignError(f"learn_stop: {text}, or remove learn_stop")
+            return None
+        wide = run(stopped(recipe, name, 1.0), store, [name], device=device)[name]
+        own = run(recipe, store, [name], device=device)[name]
+        return cls(name, own, wide, settings.learn_stop)
+
+    def behind(self, stop: Tensor | None) -> Shade:
+        """Return the shade with the amplitude of a stop in place of its own stop, or as it is
+        for None.
+        """
+        return (
+            self.own if stop is None else self.wide._replace(amplitude=self.wide.amplitude * stop)
+        )
+
+    def passed(self, stop: Tensor | None) -> Tensor:
+        """Return the share of the light that the shade lets through, away from its notches."""
+        light = self.behind(stop).amplitude.double().square().sum()
+        return light / torch.count_nonzero(self.wide.amplitude)
+
+
+def stopped(recipe: Recipe, shade: str, diameter: float) -> Recipe:
+    """Return the recipe with another diameter of the stop in a shade."""
+    step = recipe.steps[shade]
+    changed = replace(step, params={**step.params, "diameter": diameter})
+    return replace(recipe, steps={**recipe.steps, shade: changed})
+
+
+# --- design terms ---------------------------------------------------------------------------------
+
+# The loss function of a mask design and its terms, computed from the PSF of the mask.
+
 _FREE = "not limited"
 
 
 @dataclass(frozen=True)
 class Fabrication:
-    """The fabrication limits of a designed mask, such as its greatest height, by name; None stands for no limit."""
+    """The fabrication limits of a designed mask, such as its greatest height, by name; None
+    stands for no limit.
+    """
 
     values: Mapping[str, Any]
 
     @classmethod
     def of(cls, recipe: Recipe, settings: MaskTraining) -> Fabrication:
-        """Return the fabrication limits of a mask from the `doe.fabricate` step of the recipe and from the settings."""
+        """Return the fabrication limits of a mask from the `doe.fabricate` step of the recipe
+        and from the settings.
+        """
         steps = (recipe.steps[name] for name in needed(recipe, [settings.psf]))
         params = next((step.params for step in steps if step.node.path == "doe.fabricate"), {})
         limits = {name: params.get(name) for name in ("levels", "max_height", "wrap_at")}
@@ -40,36 +202,52 @@ class Fabrication:
 
     def rows(self) -> list[tuple[str, str]]:
         """Return the name and the value of each fabrication limit of a mask as text."""
-        words = {"levels": "levels", "max_height": "greatest height", "wrap_at": "wrapped at one wave of",
-                 "feature": "least feature"}  # fmt: skip
-        texts = {name: _FREE if x is None else f"{x * 1e6:.4g} um" for name, x in self.values.items()}
+        words = {
+            "levels": "levels",
+            "max_height": "greatest height",
+            "wrap_at": "wrapped at one wave of",
+            "feature": "least feature",
+        }
+        texts = {
+            name: _FREE if x is None else f"{x * 1e6:.4g} um" for name, x in self.values.items()
+        }
         if (levels := self.values["levels"]) is not None:
             texts["levels"] = str(levels)
         return [(words[name], text) for name, text in texts.items()]
 
     def __str__(self) -> str:
-        return ", ".join(f"{name} {text}" for name, text in self.rows() if text != _FREE) or "no limits"
+        return (
+            ", ".join(f"{name} {text}" for name, text in self.rows() if text != _FREE)
+            or "no limits"
+        )
 
 
 class Terms:
-    """The loss function of a mask design and its terms, for all spectral bands of a recipe or for chosen bands."""
+    """The loss function of a mask design and its terms, for all spectral bands of a recipe or
+    for chosen bands.
+    """
 
-    def __init__(self, recipe: Recipe, settings: MaskTraining, store: Store | None, device: str = "cpu") -> None:
+    def __init__(
+        self, recipe: Recipe, settings: MaskTraining, store: Store | None, device: str = "cpu"
+    ) -> None:
         need_steps(recipe.steps, settings)
         self.settings = settings
         self.fabrication = Fabrication.of(recipe, settings)
-        self.recipe = replace(recipe, exact=True)  # because the error bound of a cheaper step has no gradient
+        # because the error bound of a cheaper step has no gradient
+        self.recipe = replace(recipe, exact=True)
         self._bands = _bands_step(self.recipe, settings.psf)
         self.laws = CameraLaws.of(self.recipe, settings)
         self.shade = LearntShade.of(self.recipe, settings, store, device)
         self._learnt = [self.shade.step] if self.shade and self.shade.learnt else []
         free = [settings.height, self._bands, *self._learnt, *self.laws.free]
-        self._function = as_function(self.recipe, *free, outputs=[settings.psf], store=store, device=device)
-        seen = [settings.illuminant, settings.responses] if settings.weights.coloured else []
+        self._function = as_function(
+            self.recipe, *free, outputs=[settings.psf], store=store, device=device
+        )
+        sight = [settings.illuminant, settings.responses] if settings.weights.coloured else []
         stop = self.mask_step.wires.get("stop")
         stops = [stop] if isinstance(stop, str) else []
-        done = run(self.recipe, store, [self._bands, settings.plain, *seen, *stops], device=device)
-        self._seen: list[Tensor] = [done[name] for name in seen]
+        done = run(self.recipe, store, [self._bands, settings.plain, *sight, *stops], device=device)
+        self._seen: list[Tensor] = [done[name] for name in sight]
         self.bands: Bands = done[self._bands]
         self._plain: Psf = done[settings.plain]
         self._stop: Stop | None = done[stops[0]] if stops else None
@@ -84,22 +262,31 @@ class Terms:
     def stop(self) -> Stop:
         """Return the aperture stop with the pupil grid on which the mask is computed."""
         if self._stop is None:
-            raise DesignError(f"height: the step {self.settings.height} has no input `stop`: name the step of a mask")
+            raise DesignError(
+                f"height: the step {self.settings.height} has no input `stop`: name the step of a"
+                " mask"
+            )
         return self._stop
 
     def psf(
         self,
         height: Tensor,
-        chosen: Sequence[int] | None = None,
+        indices: Sequence[int] | None = None,
         state: State = NOMINAL,
         stop: Tensor | None = None,
     ) -> Psf:
-        """Return the PSF of a mask from its height map, for the spectral bands ``chosen`` or for all bands.
+        """Return the PSF of a mask from its height map, for the spectral bands ``indices`` or for
+        all bands.
 
-        ``state`` moves what is uncertain, in standard deviations. ``stop`` is the amplitude of a learnt stop.
+        ``state`` moves what is uncertain, in standard deviations. ``stop`` is the amplitude of a
+        learnt stop.
         """
-        bands = self.laws.moved(_some(self.bands, chosen), state)
-        values: dict[str, Any] = {self.settings.height: height, self._bands: bands, **self.laws.values(state)}
+        bands = self.laws.moved(_some(self.bands, indices), state)
+        values: dict[str, Any] = {
+            self.settings.height: height,
+            self._bands: bands,
+            **self.laws.values(state),
+        }
         if self.shade is not None and self._learnt:
             values[self.shade.step] = self.shade.behind(stop)
         psf: Psf = self._function(values)[self.settings.psf]
@@ -109,38 +296,53 @@ class Terms:
         """Return the pupil function of a mask from its height map."""
         name = self.recipe.steps[self.settings.psf].wires.get("pupil")
         if not isinstance(name, str):
-            raise DesignError(f"psf: the step {self.settings.psf} has no input `pupil`: name an optics.psf step")
-        function = as_function(self.recipe, self.settings.height, outputs=[name], device=str(self.device))
+            raise DesignError(
+                f"psf: the step {self.settings.psf} has no input `pupil`: name an optics.psf step"
+            )
+        function = as_function(
+            self.recipe, self.settings.height, outputs=[name], device=str(self.device)
+        )
         pupil: Pupil = function({self.settings.height: height})[name]
         return pupil
 
-    def plain(self, chosen: Sequence[int] | None = None) -> Psf:
-        """Return the PSF of the lens without a mask, for the spectral bands ``chosen`` or for all bands."""
-        psf: Psf = _some(self._plain, chosen)
+    def plain(self, indices: Sequence[int] | None = None) -> Psf:
+        """Return the PSF of the lens without a mask, for the spectral bands ``indices`` or for
+        all bands.
+        """
+        psf: Psf = _some(self._plain, indices)
         return psf
 
     def parts(
         self,
         height: Tensor,
-        chosen: Sequence[int] | None = None,
+        indices: Sequence[int] | None = None,
         number: int | None = None,
         stop: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """Return the terms of the mask loss that have a weight above 0, by name, each as a mean over spectral bands.
+        """Return the terms of the mask loss that have a weight above 0, by name, each as a mean
+        over spectral bands.
 
-        What is uncertain is drawn for the iteration ``number``; for None the terms are means over its laws, by a
-        quadrature of 2 d + 1 points for d uncertain numbers. ``stop`` is the amplitude of a learnt stop.
+        What is uncertain is drawn for the iteration ``number``; for None the terms are means over
+        its laws, by a quadrature of 2 d + 1 points for d uncertain numbers. ``stop`` is the
+        amplitude of a learnt stop.
         """
         points = self.laws.points() if number is None else [(self.laws.drawn(number), 1.0)]
         if self.laws.certain:
             points = [(NOMINAL, 1.0)]
-        each = [(self._parts(height, chosen, state, stop), share) for state, share in points]
-        return {name: torch.stack([share * part[name] for part, share in each]).sum() for name in each[0][0]}
+        by_state = [(self._parts(height, indices, state, stop), share) for state, share in points]
+        return {
+            name: torch.stack([share * terms[name] for terms, share in by_state]).sum()
+            for name in by_state[0][0]
+        }
 
     def _parts(
-        self, height: Tensor, chosen: Sequence[int] | None, state: State, stop: Tensor | None
+        self, height: Tensor, indices: Sequence[int] | None, state: State, stop: Tensor | None
     ) -> dict[str, Tensor]:
-        settings, weights, psf = self.settings, self.settings.weights, self.psf(height, chosen, state, stop)
+        settings, weights, psf = (
+            self.settings,
+            self.settings.weights,
+            self.psf(height, indices, state, stop),
+        )
         sums = {}
         if weights.lsr:
             sums["lsr"] = self._suppression(psf)
@@ -151,43 +353,67 @@ class Terms:
         terms = {name: term / len(psf.intensity) for name, term in sums.items()}
         if weights.wiener:  # not a sum over bands, because each channel depends on all bands
             terms["wiener"] = losses.wiener(
-                psf, *self.seen(chosen), noise=settings.noise_share, colour=settings.colour, up_to=settings.up_to
+                psf,
+                *self.seen(indices),
+                noise=settings.noise_share,
+                colour=settings.colour,
+                up_to=settings.up_to,
             )
         for name in ("filtered_error", "information"):
             if getattr(weights, name):
                 shared = {**self.exposure(), **self.passed(stop), "power": settings.power}
-                terms[name] = getattr(losses, name)(psf, *self.seen(chosen), **shared)
+                terms[name] = getattr(losses, name)(psf, *self.seen(indices), **shared)
         return terms
 
     def passed(self, stop: Tensor | None = None) -> dict[str, Any]:
-        """Return the share of the light that a shade in front of the mask lets through, as a parameter of a loss."""
+        """Return the share of the light that a shade in front of the mask lets through, as a
+        parameter of a loss.
+        """
         return {} if self.shade is None else {"transmittance": self.shade.passed(stop)}
 
     def exposure(self) -> dict[str, Any]:
-        """Return the parameters that `losses.filtered_error`, `losses.information` and `losses.best_stop` share."""
+        """Return the parameters that `losses.filtered_error`, `losses.information` and
+        `losses.best_stop` share.
+        """
         s = self.settings
-        return {"light": s.light, "read_noise": s.read_noise, "veil": s.veil, "limit": s.limit,
-                "contrast": s.contrast_variance, "up_to": s.up_to}  # fmt: skip
+        return {
+            "light": s.light,
+            "read_noise": s.read_noise,
+            "veil": s.veil,
+            "limit": s.limit,
+            "contrast": s.contrast_variance,
+            "up_to": s.up_to,
+        }
 
-    def seen(self, chosen: Sequence[int] | None = None) -> tuple[Tensor, Tensor, Bands]:
-        """Return illuminant, responses and bands, for the spectral bands ``chosen`` or for all bands."""
-        light, responses = (x if chosen is None else x[..., list(chosen)] for x in self._seen)
-        return light, responses, _some(self.bands, chosen)
+    def seen(self, indices: Sequence[int] | None = None) -> tuple[Tensor, Tensor, Bands]:
+        """Return illuminant, responses and bands, for the spectral bands ``indices`` or for all
+        bands.
+        """
+        light, responses = (x if indices is None else x[..., list(indices)] for x in self._seen)
+        return light, responses, _some(self.bands, indices)
 
     def _suppression(self, psf: Psf) -> Tensor:
-        """Return the laser suppression loss summed over bands, which is constant below the setting ``enough``."""
+        """Return the laser suppression loss summed over bands, which is constant below the
+        setting ``enough``.
+        """
         settings, count = self.settings, len(psf.intensity)
         loss: Tensor = losses.suppression_loss(psf, power=settings.power, log=settings.log)
         if settings.enough is None:
             return loss
-        return loss.clamp_min(count * (math.log(settings.enough) if settings.log else settings.enough))
+        return loss.clamp_min(
+            count * (math.log(settings.enough) if settings.log else settings.enough)
+        )
 
     def total(self, parts: dict[str, Tensor]) -> Tensor:
         """Return the loss of a mask, which is the weighted sum of its terms."""
-        return torch.stack([getattr(self.settings.weights, name) * term for name, term in parts.items()]).sum()
+        return torch.stack(
+            [getattr(self.settings.weights, name) * term for name, term in parts.items()]
+        ).sum()
 
     def drawn(self, number: int) -> list[int] | None:
-        """Sample the spectral bands of an iteration, one in each equal part of the spectrum; None stands for all."""
+        """Sample the spectral bands of an iteration, one in each equal part of the spectrum;
+        None stands for all.
+        """
         count, all_bands = self.settings.bands, len(self.bands.centres)
         if count is None or count >= all_bands:
             return None
@@ -204,17 +430,26 @@ class Terms:
 
 
 def _bands_step(recipe: Recipe, psf: str) -> str:
-    names = [name for name in needed(recipe, [psf]) if recipe.steps[name].node.path == "spectra.bands"]
+    names = [
+        name for name in needed(recipe, [psf]) if recipe.steps[name].node.path == "spectra.bands"
+    ]
     if len(names) != 1:
-        text = f"{psf} depends on {len(names)} steps of spectra.bands ({', '.join(names)}), not on one step"
+        text = (
+            f"{psf} depends on {len(names)} steps of spectra.bands ({', '.join(names)}), not on one"
+            " step"
+        )
         raise DesignError(f"psf: {text}")
     return names[0]
 
 
-def _some(value: Any, chosen: Sequence[int] | None) -> Any:
-    """Return the part of a PSF or other spectral value at the bands ``chosen``, or the whole value if None."""
-    if chosen is None:
+def _some(value: Any, indices: Sequence[int] | None) -> Any:
+    """Return the part of a PSF or other spectral value at the bands ``indices``, or the whole
+    value if None.
+    """
+    if indices is None:
         return value
-    rows = torch.tensor(list(chosen))
+    rows = torch.tensor(list(indices))
     changed = {name: getattr(value, name) for name in band_names(value)}
-    return value._replace(**{name: x.index_select(0, rows.to(x.device)) for name, x in changed.items()})
+    return value._replace(
+        **{name: x.index_select(0, rows.to(x.device)) for name, x in changed.items()}
+    )

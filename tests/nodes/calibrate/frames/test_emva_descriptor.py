@@ -1,4 +1,6 @@
-"""EMVA 1288 descriptors: levels as they are written, images by content, and every mistake with its line."""
+"""EMVA 1288 descriptors: levels as they are written, images by content, and every mistake with
+its line.
+"""
 
 import os
 from pathlib import Path
@@ -10,10 +12,12 @@ from PIL import Image
 from pydantic import ValidationError
 
 from neusee.nodes.calibrate import descriptor, descriptor_frames, descriptor_series, reduce
-from neusee.nodes.calibrate._frames._emva_descriptor import _parsed
+from neusee.nodes.calibrate._emva_descriptor import _parsed
 from neusee.workflows.keys.cache_key import plain
 
-DATA = Path(os.environ.get("NEUSEE_EMVA1288", Path(__file__).parents[4] / "../shared/data/emva1288"))
+DATA = Path(
+    os.environ.get("NEUSEE_EMVA1288", Path(__file__).parents[4] / "../shared/data/emva1288")
+)
 TEXT = """# EMVA1288 data
 v 3.0
 n 12 6 4
@@ -49,7 +53,9 @@ def given(folder):
 
 
 def pixels(folder, *names):
-    return np.stack([np.asarray(Image.open(folder / "images" / f"{n}.png")) for n in names]).astype(np.float64)
+    return np.stack([np.asarray(Image.open(folder / "images" / f"{n}.png")) for n in names]).astype(
+        np.float64
+    )
 
 
 def test_levels_are_those_of_the_pairs(folder):
@@ -74,19 +80,26 @@ def test_more_images_than_a_pair_are_a_spatial_series_and_no_level(folder):
 
 def test_without_pairs_every_level_counts(folder):
     (folder / "set.txt").write_text(
-        TEXT.replace("b_1.png", "b_1.png\ni images/b_0.png").replace("d_1.png", "d_1.png\ni images/d_2.png")
+        TEXT.replace("b_1.png", "b_1.png\ni images/b_0.png").replace(
+            "d_1.png", "d_1.png\ni images/d_2.png"
+        )
     )
     assert descriptor(file=given(folder)).pixels.tolist() == [72.0, 72.0, 72.0]
 
 
 def test_exposure_0_and_decimal_commas_are_read(folder):
-    (folder / "set.txt").write_text(TEXT.replace("b 40000.0 120.0", "b 000.00 000,35").replace("d 40000.0", "d 0"))
+    (folder / "set.txt").write_text(
+        TEXT.replace("b 40000.0 120.0", "b 000.00 000,35").replace("d 40000.0", "d 0")
+    )
     found = descriptor(file=given(folder))
     assert (found.photons.tolist(), found.exposure.tolist()) == ([0.35, 0.0], [0.0, 0.0])
 
 
 def test_a_path_will_do_where_no_recipe_is_read(folder):
-    assert descriptor(file=folder / "set.txt").mean.tolist() == descriptor(file=given(folder)).mean.tolist()
+    assert (
+        descriptor(file=folder / "set.txt").mean.tolist()
+        == descriptor(file=given(folder)).mean.tolist()
+    )
 
 
 def test_every_image_counts_by_its_content(folder):
@@ -105,7 +118,11 @@ def test_every_image_counts_by_its_content(folder):
         ("b_1", "b_9", r"set\.txt:6: no such image: .*b_9\.png"),
         ("v 3.0", "w 3.0", r"set\.txt:2: cannot read 'w'"),
         ("n 12 6 4", "n 12 6", r"set\.txt:3: cannot read n '12 6': write n BITS WIDTH HEIGHT"),
-        ("b 40000.0 120.0", "b 40000.0", r"set\.txt:4: cannot read b '40000\.0': write b EXPOSURE_NS PHOTONS"),
+        (
+            "b 40000.0 120.0",
+            "b 40000.0",
+            r"set\.txt:4: cannot read b '40000\.0': write b EXPOSURE_NS PHOTONS",
+        ),
         ("b 40000.0 120.0", "b 40000.0 bright", r"set\.txt:4: cannot read b"),
         ("b 40000.0 120.0", "b 40000.0 0", r"set\.txt:4: cannot read b"),
         ("b 40000.0 120.0", "b -1 120", r"set\.txt:4: cannot read b"),
@@ -131,8 +148,16 @@ def test_no_descriptor_at_all(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("n 12 6 4", "n 12 4 6", r"set\.txt:4: image shape \(4, 6\), but descriptor shape \(6, 4\)"),
-        ("n 12 6 4", "n 10 6 4", r"set\.txt:4: a pixel of \d+ DN exceeds the 10 bits given in line n"),
+        (
+            "n 12 6 4",
+            "n 12 4 6",
+            r"set\.txt:4: image shape \(4, 6\), but descriptor shape \(6, 4\)",
+        ),
+        (
+            "n 12 6 4",
+            "n 10 6 4",
+            r"set\.txt:4: a pixel of \d+ DN exceeds the 10 bits given in line n",
+        ),
     ],
 )
 def test_images_are_held_to_what_the_descriptor_says(folder, old, new, message):
@@ -154,7 +179,10 @@ def np_stack(folder):
 
 @pytest.mark.parametrize(
     ("name", "levels", "dark", "images", "longest"),
-    [("001_CCD", 102, 51, [2] * 100 + [50] * 2, 1.402e-2), ("003_Simulation", 53, 2, [2] * 51 + [100] * 2, 1e-3)],
+    [
+        ("001_CCD", 102, 51, [2] * 100 + [50] * 2, 1.402e-2),
+        ("003_Simulation", 53, 2, [2] * 51 + [100] * 2, 1e-3),
+    ],
 )
 def test_descriptors_of_the_working_group_are_understood(name, levels, dark, images, longest):
     file = DATA / f"EMVA1288_ReferenceSet_{name}_12Bit_descriptor.txt"

@@ -1,4 +1,6 @@
-"""Frames out of files: every number as it was written, and a clear refusal of what is no raw frame."""
+"""Frames out of files: every number as it was written, and a clear refusal of what is no raw
+frame.
+"""
 
 import importlib.util
 import struct
@@ -12,8 +14,8 @@ from PIL import Image
 from pydantic import ValidationError
 
 from neusee.nodes import ParameterError
+from neusee.nodes.calibrate import _frame_files as _damaged_frames
 from neusee.nodes.calibrate import frames
-from neusee.nodes.calibrate._frames import _damaged_frames
 
 NUMBERS = np.array([[0, 1, 255, 256], [32767, 32768, 65534, 65535]], np.uint16)
 
@@ -51,10 +53,14 @@ def png_of_four_bits():
     """Two grey pixels of 4 bits: 3 and 9. Pillow scales them to 8."""
 
     def chunk(kind, data):
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
 
     header = struct.pack(">IIBBBBB", 2, 1, 4, 0, 0, 0, 0)
-    parts = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\x00\x39")) + chunk(b"IEND", b"")
+    parts = (
+        chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\x00\x39")) + chunk(b"IEND", b"")
+    )
     return b"\x89PNG\r\n\x1a\n" + parts
 
 
@@ -124,7 +130,9 @@ def test_colour_and_loss_are_refused(tmp_path):
         with pytest.raises(ValueError, match=f"{name}.png is (PNG|JPEG) with pixels of kind"):
             read(tmp_path / f"{name}.png")
     (tmp_path / "four.png").write_bytes(png_of_four_bits())
-    with pytest.raises(ValueError, match=r"four\.png is PNG with pixels of kind L, not raw grey of 8 or 16 bits"):
+    with pytest.raises(
+        ValueError, match=r"four\.png is PNG with pixels of kind L, not raw grey of 8 or 16 bits"
+    ):
         read(tmp_path / "four.png")
     exr(tmp_path / "rgb.exr", NUMBERS, ("R", "G", "B"))
     with pytest.raises(ValueError, match="save one channel alone"):
@@ -144,30 +152,43 @@ def signed_fits(path, numbers):
 def packed_fits(path, numbers):
     from astropy.io import fits as astropy
 
-    astropy.HDUList([astropy.PrimaryHDU(), astropy.CompImageHDU(numbers.astype(np.int16))]).writeto(path)
+    astropy.HDUList([astropy.PrimaryHDU(), astropy.CompImageHDU(numbers.astype(np.int16))]).writeto(
+        path
+    )
     return path
 
 
 SHORT = (signed_fits, packed_fits)  #: 16 bits, which do not hold the largest of the numbers below
-WRONG = [(w, bad) for w in (fits, *SHORT, npy, tiff) for bad in (-1, -32768, 2**24) if bad < 2**15 or w not in SHORT]
+WRONG = [
+    (w, bad)
+    for w in (fits, *SHORT, npy, tiff)
+    for bad in (-1, -32768, 2**24)
+    if bad < 2**15 or w not in SHORT
+]
 
 
 @pytest.mark.parametrize(("write", "bad"), WRONG)
 def test_whole_numbers_that_no_converter_gives_are_found_before_the_run(tmp_path, write, bad):
-    """Types with a sign, and those of 32 bits, may hold such numbers; the numbers of other types are not read."""
+    """Types with a sign, and those of 32 bits, may hold such numbers; the numbers of other types
+    are not read.
+    """
     if "fits" in write.__name__:
         pytest.importorskip("astropy")
     kind = {npy: "npy", tiff: "tif"}.get(write, "fits")
     numbers = np.full((4, 5), 7, np.int32)
     numbers[2, 3] = bad
-    with pytest.raises(ParameterError, match=rf"a\.{kind} holds {bad}(\.0)?, not a digital number: give raw frames"):
+    with pytest.raises(
+        ParameterError, match=rf"a\.{kind} holds {bad}(\.0)?, not a digital number: give raw frames"
+    ):
         frames.hooks.preflight(files=(write(tmp_path / f"a.{kind}", numbers),))
     numbers[2, 3] = 7
     assert frames.hooks.preflight(files=(write(tmp_path / f"b.{kind}", numbers),)) == []
 
 
 @pytest.mark.parametrize("write", [fits, npy, tiff])
-def test_numbers_of_a_type_that_only_counts_are_not_read_before_the_run(tmp_path, write, monkeypatch):
+def test_numbers_of_a_type_that_only_counts_are_not_read_before_the_run(
+    tmp_path, write, monkeypatch
+):
     if write is fits:
         pytest.importorskip("astropy")
     monkeypatch.setattr(_damaged_frames, "read", lambda file: pytest.fail(f"{file} is read"))
@@ -183,14 +204,18 @@ def test_other_shapes_are_refused(tmp_path, shape):
 
 def test_a_kind_that_is_not_read_is_refused_before_the_run(tmp_path):
     (tmp_path / "a.raw").write_bytes(b"1")
-    with pytest.raises(ParameterError, match=r"a\.raw: frames cannot be read from \.raw: give \.png"):
+    with pytest.raises(
+        ParameterError, match=r"a\.raw: frames cannot be read from \.raw: give \.png"
+    ):
         frames.hooks.preflight(files=(tmp_path / "a.raw",))
     assert frames.hooks.preflight(files=(png(tmp_path / "a.png", NUMBERS),)) == []
 
 
 def test_fits_without_astropy_says_what_to_install(tmp_path, monkeypatch):
     known = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "astropy" else known(name, *a))
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *a: None if name == "astropy" else known(name, *a)
+    )
     with pytest.raises(ParameterError, match=r"pip install 'neusee\[fits\]'"):
         frames.hooks.preflight(files=(tmp_path / "a.fits",))
 

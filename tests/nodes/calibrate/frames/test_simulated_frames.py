@@ -7,22 +7,34 @@ import torch
 
 from neusee.nodes.calibrate import expose
 
-SENSOR = {"quantum_efficiency": 0.5, "dark_current": 20.0, "dark_exposure": 0.1, "offset": 300.0, "read_noise": 10.0}
+SENSOR = {
+    "quantum_efficiency": 0.5,
+    "dark_current": 20.0,
+    "dark_exposure": 0.1,
+    "offset": 300.0,
+    "read_noise": 10.0,
+}
 SENSOR |= {"full_well": 1e5, "gain": 2.0}
 
 
 def frames(photons=1000.0, exposure=0.1, seed=1, **how):
     rng = torch.Generator().manual_seed(seed)
-    return expose(photons=photons, exposure=exposure, shape=(200, 100), rng=rng, **{**SENSOR, **how})
+    return expose(
+        photons=photons, exposure=exposure, shape=(200, 100), rng=rng, **{**SENSOR, **how}
+    )
 
 
 @pytest.mark.parametrize("distribution", ["gaussian", "poisson"])
-@pytest.mark.parametrize(("photons", "exposure"), [(0.0, 0.1), (0.0, 10.0), (1000.0, 0.1), (20000.0, 1.0)])
+@pytest.mark.parametrize(
+    ("photons", "exposure"), [(0.0, 0.1), (0.0, 10.0), (1000.0, 0.1), (20000.0, 1.0)]
+)
 def test_mean_and_variance_are_those_of_the_model(distribution, photons, exposure):
     found = frames(photons, exposure, frames=3, distribution=distribution).double()
     electrons = 0.5 * photons + 20.0 * exposure / 0.1
     variance = 4 * (electrons + 100.0) + 1 / 12
-    assert float(found.mean()) == pytest.approx(2 * (electrons + 300.0), abs=4 * math.sqrt(variance / 60_000))
+    assert float(found.mean()) == pytest.approx(
+        2 * (electrons + 300.0), abs=4 * math.sqrt(variance / 60_000)
+    )
     assert float(found.var()) == pytest.approx(variance, rel=4 * math.sqrt(2 / 60_000))
 
 
@@ -51,4 +63,6 @@ def test_the_same_stream_gives_the_same_frames():
 
 
 def test_the_check_says_the_mean():
-    assert expose.hooks.check(torch.full((1, 2, 2), 7.0))[0].text == "mean 7 DN, pixels of 7 to 7 DN"
+    assert (
+        expose.hooks.check(torch.full((1, 2, 2), 7.0))[0].text == "mean 7 DN, pixels of 7 to 7 DN"
+    )

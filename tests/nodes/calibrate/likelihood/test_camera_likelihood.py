@@ -1,4 +1,6 @@
-"""A real camera weighed: against the law written out once more, its extremes, and what was believed beforehand."""
+"""A real camera weighed: against the law written out once more, its extremes, and what was
+believed beforehand.
+"""
 
 import math
 
@@ -12,7 +14,13 @@ from neusee.nodes.units import read_quantity
 from neusee.nodes.values import Levels
 
 SENSOR = {"gain": 0.5, "quantum_efficiency": 0.4, "dark_signal": 50.0, "temporal_dark_noise": 8.0}
-SENSOR |= {"dark_current": 30.0, "dark_exposure": 0.5, "scatter": 0.004, "lamp": 0.012, "drift": 0.05}
+SENSOR |= {
+    "dark_current": 30.0,
+    "dark_exposure": 0.5,
+    "scatter": 0.004,
+    "lamp": 0.012,
+    "drift": 0.05,
+}
 BENT = {"bend": -0.03, "twist": 0.02}
 PHOTONS = [0.0, 0.0, 300.0, 1500.0, 4000.0, 7000.0, 10000.0, 13000.0]
 EXPOSURE = [0.02, 0.4, 0.02, 0.02, 0.1, 0.1, 0.2, 0.2]
@@ -21,10 +29,17 @@ EXPOSURE = [0.02, 0.4, 0.02, 0.02, 0.1, 0.1, 0.2, 0.2]
 def around(seed=3, photons=PHOTONS, exposure=EXPOSURE):
     """Levels that are near the law of `SENSOR`, and no better."""
     rng = torch.Generator().manual_seed(seed)
-    light, time = torch.tensor(photons, dtype=torch.float64), torch.tensor(exposure, dtype=torch.float64)
-    electrons = 0.4 * light * (1 + 0.012 * torch.randn(len(light), generator=rng)) + 60 * (time - time.min())
+    light, time = (
+        torch.tensor(photons, dtype=torch.float64),
+        torch.tensor(exposure, dtype=torch.float64),
+    )
+    electrons = 0.4 * light * (1 + 0.012 * torch.randn(len(light), generator=rng)) + 60 * (
+        time - time.min()
+    )
     mean = 50 + 0.5 * electrons + 0.05 * torch.randn(len(light), generator=rng)
-    variance = (0.25 * (64 + electrons) + 1 / 12) * (1 + 0.006 * torch.randn(len(light), generator=rng))
+    variance = (0.25 * (64 + electrons) + 1 / 12) * (
+        1 + 0.006 * torch.randn(len(light), generator=rng)
+    )
     none, one = torch.zeros(0, dtype=torch.float64), torch.ones_like(light)
     return Levels(light, time, 8e4 * one, mean, variance, 4e4 * one, none.long(), none, none)
 
@@ -41,15 +56,25 @@ def plainly(levels, seen, *, bend, twist):
 
     def response(e):
         """y = K e (1 + bend y/top + twist (y/top)**2), from y = K e on."""
-        return brentq(lambda y: y - 0.5 * e * (1 + bend * y / top + twist * (y / top) ** 2), -200, 4000, xtol=1e-13)
+        return brentq(
+            lambda y: y - 0.5 * e * (1 + bend * y / top + twist * (y / top) ** 2),
+            -200,
+            4000,
+            xtol=1e-13,
+        )
 
     total = 0.0
     for i in seen:
-        y, v, p, t = (float(x[i]) for x in (levels.mean - 50, levels.variance, levels.photons, levels.exposure))
+        y, v, p, t = (
+            float(x[i])
+            for x in (levels.mean - 50, levels.variance, levels.photons, levels.exposure)
+        )
         e = brentq(lambda e, y=y: response(e) - y, -100, 7000, xtol=1e-12)
         slope = (response(e + 0.5) - response(e - 0.5)) / 1.0
         law = slope**2 * (8.0**2 + e) + 1 / 12
-        total += norm.logpdf(math.log(v), math.log(law) - 1 / 4e4, math.hypot(math.sqrt(2 / 4e4), 0.004))
+        total += norm.logpdf(
+            math.log(v), math.log(law) - 1 / 4e4, math.hypot(math.sqrt(2 / 4e4), 0.004)
+        )
         width = math.sqrt((0.012 * 0.4 * p * slope) ** 2 + v / 8e4 + 0.05**2)
         total += norm.logpdf((e - 0.4 * p - 60 * (t - 0.02)) * slope, 0.0, width)
     return total + len(seen) * math.log(2 * math.pi)  # constants are left out
@@ -61,21 +86,31 @@ def test_the_law_is_that_which_is_written_out(bent):
     assert float(camera(levels, **SENSOR, **bent, share=1.0).log) == pytest.approx(
         plainly(levels, range(8), **bent), rel=1e-7
     )
-    assert float(camera(levels, **SENSOR, **bent).log) == pytest.approx(plainly(levels, range(6), **bent), rel=1e-7)
+    assert float(camera(levels, **SENSOR, **bent).log) == pytest.approx(
+        plainly(levels, range(6), **bent), rel=1e-7
+    )
 
 
 def test_levels_on_the_law_leave_no_deviance_and_each_parameter_matters():
     at = camera(exact(), **SENSOR, share=1.0)
     assert float(at.deviance.sum()) < 1e-3
     assert at.degrees_of_freedom.tolist() == [2.0] * 8
-    for name in ("gain", "quantum_efficiency", "dark_signal", "temporal_dark_noise", "dark_current"):
+    for name in (
+        "gain",
+        "quantum_efficiency",
+        "dark_signal",
+        "temporal_dark_noise",
+        "dark_current",
+    ):
         assert float(camera(exact(), **{**SENSOR, name: 1.2 * SENSOR[name]}).deviance.sum()) > 5
     for name in ("bend", "twist"):
         assert float(camera(exact(), **SENSOR, **{name: 0.1}).deviance.sum()) > 5
 
 
 def test_many_cameras_are_weighed_at_once_as_one_by_one():
-    rows = {name: torch.tensor([x, 1.01 * x, 0.98 * x], dtype=torch.float64) for name, x in BENT.items()}
+    rows = {
+        name: torch.tensor([x, 1.01 * x, 0.98 * x], dtype=torch.float64) for name, x in BENT.items()
+    }
     rows["gain"] = torch.tensor([0.5, 0.51, 0.49], dtype=torch.float64)
     given = {**SENSOR, **BENT}
     together = camera(around(), **{**given, **rows})
@@ -97,7 +132,9 @@ def test_the_unit_of_the_gain_is_as_written():
 
 @pytest.mark.parametrize("name", [*CAMERA_NAMES])
 def test_slopes_are_smooth(name):
-    """Central differences of ever smaller steps agree, also at no bend, and with those of automatic gradients."""
+    """Central differences of ever smaller steps agree, also at no bend, and with those of
+    automatic gradients.
+    """
     for base in ({**SENSOR, "bend": 0.0, "twist": 0.0}, {**SENSOR, **BENT}):
         size = abs(base[name]) or 0.1
 
@@ -106,7 +143,11 @@ def test_slopes_are_smooth(name):
 
         found = []
         for step in (1e-3, 3e-4, 1e-4):
-            ends = log(torch.tensor([base[name] + step * size, base[name] - step * size], dtype=torch.float64))
+            ends = log(
+                torch.tensor(
+                    [base[name] + step * size, base[name] - step * size], dtype=torch.float64
+                )
+            )
             found.append(float(ends[0] - ends[1]) / (2 * step * size))
         x = torch.tensor(base[name], dtype=torch.float64, requires_grad=True)
         log(x).backward()
@@ -120,7 +161,10 @@ def test_what_levels_tell_is_the_information_of_the_law():
     for i in range(len(names)):
         for sign in (1, -1):
             moved.append([SENSOR[n] * (1 + sign * step * (i == j)) for j, n in enumerate(names)])
-    given = {n: torch.tensor(x, dtype=torch.float64) for n, x in zip(names, zip(*moved, strict=True), strict=True)}
+    given = {
+        n: torch.tensor(x, dtype=torch.float64)
+        for n, x in zip(names, zip(*moved, strict=True), strict=True)
+    }
     light, time = [0.0] * 8 + [400.0 * i for i in range(1, 33)], [0.02] * 40
     told, slopes = [], []
     for seed in range(200):
@@ -129,7 +173,9 @@ def test_what_levels_tell_is_the_information_of_the_law():
         slopes.append((found.log[::2] - found.log[1::2]) / (2 * step))
     information = torch.stack([j @ j.T for j in told]).mean(0)
     scatter = torch.stack(slopes).T.cov()
-    assert (scatter.diagonal() / information.diagonal()).tolist() == pytest.approx([1.0] * 5, abs=0.35)
+    assert (scatter.diagonal() / information.diagonal()).tolist() == pytest.approx(
+        [1.0] * 5, abs=0.35
+    )
 
 
 def exact_law(seed, photons, exposure):
@@ -143,21 +189,31 @@ def exact_law(seed, photons, exposure):
     electrons = 0.4 * found.photons * (1 + 0.012 * normal()) + 60 * (found.exposure - 0.02)
     variance = 0.25 * (64 + electrons) + 1 / 12
     mean = 50 + 0.5 * electrons + normal() * (0.05**2 + variance / 8e4).sqrt()
-    return found._replace(mean=mean, variance=variance * (normal() * math.hypot(math.sqrt(2 / 4e4), 0.004)).exp())
+    return found._replace(
+        mean=mean, variance=variance * (normal() * math.hypot(math.sqrt(2 / 4e4), 0.004)).exp()
+    )
 
 
 def test_levels_that_pile_up_are_left_out_and_coarse_ones_are_not():
     levels = around()
-    cell = {"cell_level": torch.tensor([3]), "cell_value": torch.tensor([4095.0]), "cell_count": torch.tensor([9.0])}
+    cell = {
+        "cell_level": torch.tensor([3]),
+        "cell_value": torch.tensor([4095.0]),
+        "cell_count": torch.tensor([9.0]),
+    }
     piled = levels._replace(**cell)
     assert camera(piled, **SENSOR).degrees_of_freedom.tolist() == [2, 2, 2, 0, 2, 2, 0, 0]
     coarse = piled._replace(variance=torch.where(torch.arange(8) == 3, 0.5, levels.variance))
     assert camera(coarse, **SENSOR).degrees_of_freedom.tolist() == [2, 2, 2, 2, 2, 2, 0, 0]
-    dark = levels._replace(**{**cell, "cell_level": torch.tensor([0]), "cell_value": torch.tensor([0.0])})
+    dark = levels._replace(
+        **{**cell, "cell_level": torch.tensor([0]), "cell_value": torch.tensor([0.0])}
+    )
     found = camera(dark, **SENSOR)
     assert found.degrees_of_freedom.tolist() == [0, 2, 2, 2, 2, 2, 0, 0]
     said = [check.text for check in camera.hooks.check(found, dark) if not check.ok]
-    assert said == ["the dark frames of 0.02 s pile up at an end: dark signal and dark noise are those of 0.4 s"]
+    assert said == [
+        "the dark frames of 0.02 s pile up at an end: dark signal and dark noise are those of 0.4 s"
+    ]
 
 
 def test_negative_signals_are_weighed_and_what_cannot_be_is_not():
@@ -168,7 +224,8 @@ def test_negative_signals_are_weighed_and_what_cannot_be_is_not():
     assert float(found.deviance[1]) < 40
     assert float(camera(around(), **SENSOR, bend=-1.5).log) == -math.inf  # a response that falls
     assert float(camera(around(), **SENSOR, twist=1.5).log) == -math.inf
-    assert float(camera(around(), **{**SENSOR, "dark_signal": 500.0}).log) == -math.inf  # less than no electrons
+    # less than no electrons
+    assert float(camera(around(), **{**SENSOR, "dark_signal": 500.0}).log) == -math.inf
 
 
 def test_no_scatter_of_any_kind_is_still_a_number():
@@ -193,14 +250,19 @@ def test_measurements_without_hope_are_refused(photons, message):
 def test_a_level_without_scatter_and_light_that_does_nothing_are_refused():
     levels = around()
     with pytest.raises(ValueError, match=r"level 3, of 3\d\d\.?\d* DN, has no variance"):
-        camera(levels._replace(variance=torch.where(torch.arange(8) == 3, 0.0, levels.variance)), **SENSOR)
+        camera(
+            levels._replace(variance=torch.where(torch.arange(8) == 3, 0.0, levels.variance)),
+            **SENSOR,
+        )
     with pytest.raises(ValueError, match="above the dark level, which must be positive"):
         camera(levels._replace(mean=50.0 - levels.photons / 1e3), **SENSOR)
 
 
 def test_the_check_says_what_was_used():
     found = camera(around(), **SENSOR)
-    assert camera.hooks.check(found, around())[0].text.endswith("for 12 means and variances, from 6 of 8 levels")
+    assert camera.hooks.check(found, around())[0].text.endswith(
+        "for 12 means and variances, from 6 of 8 levels"
+    )
     assert camera.hooks.check(found, around())[0].ok
     assert camera.hooks.check(camera(around(), **SENSOR, told=False), around()) == []
 
@@ -242,8 +304,13 @@ def test_one_standard_deviation_is_the_factor_or_the_deviation():
 
 
 def test_priors_that_are_none_are_refused():
-    with pytest.raises(ValueError, match="no parameter is free: give a prior of at least one of gain, quantum"):
+    with pytest.raises(
+        ValueError, match="no parameter is free: give a prior of at least one of gain, quantum"
+    ):
         camera_prior()
     with pytest.raises(ValueError, match=r"temporal_dark_noise: \[0, 2\] is not a prior"):
         camera_prior(temporal_dark_noise=(0.0, 2.0))
-    assert camera_prior.hooks.check(camera_prior(**PRIOR))[0].text == "4 free: gain, dark_signal, lamp, twist"
+    assert (
+        camera_prior.hooks.check(camera_prior(**PRIOR))[0].text
+        == "4 free: gain, dark_signal, lamp, twist"
+    )

@@ -1,4 +1,6 @@
-"""How likely levels are: against every pixel looked at alone, against simulation, and as information."""
+"""How likely levels are: against every pixel looked at alone, against simulation, and as
+information.
+"""
 
 import functools
 import math
@@ -9,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.calibrate import Sufficient, density, expose, levels, reduce, sufficient
-from neusee.nodes.calibrate._likelihood._quantised_gaussian import log_cell
+from neusee.nodes.calibrate._sensor_likelihood import log_cell
 
 PAPER = {
     "gain": 0.37,
@@ -19,7 +21,15 @@ PAPER = {
     "dark_current": 0.002,
     "full_well": 25500.0,
 }
-LIGHT = [(0.0, 0.1), (0.0, 10.0), (200.0, 0.1), (3000.0, 0.1), (30000.0, 0.1), (43000.0, 0.1), (90000.0, 0.1)]
+LIGHT = [
+    (0.0, 0.1),
+    (0.0, 10.0),
+    (200.0, 0.1),
+    (3000.0, 0.1),
+    (30000.0, 0.1),
+    (43000.0, 0.1),
+    (90000.0, 0.1),
+]
 KINDS = ["nearest", "truncation", "dithered_floor"]
 
 
@@ -46,7 +56,9 @@ def frames(light=LIGHT, size=48, seed=0, rounding="nearest", distribution="gauss
 
 
 def measured(stacks, light=LIGHT):
-    return levels([reduce(x, photons=p, exposure=t) for x, (p, t) in zip(stacks, light, strict=True)])
+    return levels(
+        [reduce(x, photons=p, exposure=t) for x, (p, t) in zip(stacks, light, strict=True)]
+    )
 
 
 @functools.cache
@@ -67,7 +79,9 @@ def by_pixel(stacks, rounding, light=LIGHT, **other):
     for x, (photons, exposure) in zip(stacks, light, strict=True):
         electrons, dark = p["quantum_efficiency"] * photons, p["dark_current"] * exposure / 0.1
         mean = torch.tensor(k * (p["offset"] + dark + electrons), dtype=torch.float64)
-        sd = torch.tensor(k * math.sqrt(p["read_noise"] ** 2 + dark + electrons), dtype=torch.float64)
+        sd = torch.tensor(
+            k * math.sqrt(p["read_noise"] ** 2 + dark + electrons), dtype=torch.float64
+        )
         well = torch.tensor(k * p["full_well"], dtype=torch.float64)
         total += float(log_cell(x.double().flatten(), mean, sd, well, rounding, 65535).sum())
     return total
@@ -79,16 +93,26 @@ def test_what_it_says_of_two_sensors_is_what_every_pixel_says(rounding):
     stacks = frames(rounding=rounding)
     data = sufficient(measured(stacks))
     assert 0 < len(data.cell_value) < 40
-    for other in ({"read_noise": 10.8}, {"quantum_efficiency": 0.5602}, {"offset": 391.0}, {"dark_current": 0.02}):
+    for other in (
+        {"read_noise": 10.8},
+        {"quantum_efficiency": 0.5602},
+        {"offset": 391.0},
+        {"dark_current": 0.02},
+    ):
         exact = by_pixel(stacks, rounding, **other) - by_pixel(stacks, rounding)
-        found = float(weigh(data, rounding=rounding, **other).log - weigh(data, rounding=rounding).log)
+        found = float(
+            weigh(data, rounding=rounding, **other).log - weigh(data, rounding=rounding).log
+        )
         assert found == pytest.approx(exact, abs=0.02 + 1e-3 * abs(exact)), other
 
 
 @pytest.mark.parametrize("rounding", KINDS)
 def test_a_well_other_than_that_seen_cannot_be(rounding):
     data = sufficient(measured(frames(rounding=rounding)))
-    at = {w: float(weigh(data, rounding=rounding, full_well=w).log) for w in (25480.0, 25500.0, 25520.0)}
+    at = {
+        w: float(weigh(data, rounding=rounding, full_well=w).log)
+        for w in (25480.0, 25500.0, 25520.0)
+    }
     assert at[25500.0] > -math.inf
     assert at[25480.0] == -math.inf
     assert at[25520.0] < at[25500.0] - 1e6
@@ -139,23 +163,40 @@ def test_what_levels_tell_is_the_curvature_of_the_likelihood():
 
 
 def test_few_electrons_are_counted_out():
-    """A converter of 0.2 DN/e- and a noise of 0.4 e-: numbers of Poisson's electrons, which no Gaussian has."""
+    """A converter of 0.2 DN/e- and a noise of 0.4 e-: numbers of Poisson's electrons, which no
+    Gaussian has.
+    """
     light = [(0.0, 0.1), (2.0, 0.1), (5.0, 0.1)]
-    how = {"gain": 0.7, "read_noise": 0.15, "offset": 20.0, "quantum_efficiency": 0.5, "dark_current": 1e-6}
+    how = {
+        "gain": 0.7,
+        "read_noise": 0.15,
+        "offset": 20.0,
+        "quantum_efficiency": 0.5,
+        "dark_current": 1e-6,
+    }
     stacks = frames(light, size=300, distribution="poisson", **how)
     data = sufficient(measured(stacks, light))
     assert bool((data.pixels == 0)[:2].all())
     found = weigh(data, arrivals="poisson", **how)
-    assert float(found.deviance[:2].sum()) < float(found.degrees_of_freedom[:2].sum()) + 5 * math.sqrt(
-        2 * float(found.degrees_of_freedom[:2].sum())
-    )
+    assert float(found.deviance[:2].sum()) < float(
+        found.degrees_of_freedom[:2].sum()
+    ) + 5 * math.sqrt(2 * float(found.degrees_of_freedom[:2].sum()))
     plain = weigh(data, arrivals="gaussian", **how)
     assert float(plain.deviance[:2].sum()) > 100 * float(found.deviance[:2].sum())
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.floats(-4, 4), st.floats(-2, 4), st.floats(-6, 3), st.floats(0, 6), st.sampled_from(KINDS), st.booleans())
-def test_at_any_size_of_anything_there_is_a_number_or_none(gain, noise, dark, well, rounding, poisson):
+@given(
+    st.floats(-4, 4),
+    st.floats(-2, 4),
+    st.floats(-6, 3),
+    st.floats(0, 6),
+    st.sampled_from(KINDS),
+    st.booleans(),
+)
+def test_at_any_size_of_anything_there_is_a_number_or_none(
+    gain, noise, dark, well, rounding, poisson
+):
     found = weigh(
         SMALL,
         gain=10.0**gain,
@@ -175,7 +216,9 @@ def test_levels_are_taken_apart_and_nothing_is_lost():
     parts, reference = sufficient(whole), sufficient.hooks.reference(whole)
     count = parts.pixels.index_add(0, parts.cell_level, parts.cell_count)
     assert torch.equal(count, whole.pixels)
-    sums = (parts.pixels * parts.mean).index_add(0, parts.cell_level, parts.cell_count * parts.cell_value)
+    sums = (parts.pixels * parts.mean).index_add(
+        0, parts.cell_level, parts.cell_count * parts.cell_value
+    )
     torch.testing.assert_close(sums / count, whole.mean, rtol=1e-12, atol=0)
     assert isinstance(reference, Sufficient)
     for one, other in zip(parts, reference, strict=True):
@@ -184,10 +227,13 @@ def test_levels_are_taken_apart_and_nothing_is_lost():
 
 @pytest.mark.parametrize("reach", [5, 6])
 def test_a_level_whose_numbers_between_the_ends_are_coarse_keeps_all_of_them(reach):
-    """Before, eleven numbers left one between the ends: a variance of 0, and derivatives of infinity."""
+    """Before, eleven numbers left one between the ends: a variance of 0, and derivatives of
+    infinity.
+    """
     normal = torch.randn(2, 48, 48, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
     stack = (144 + 1.05 * normal).round().clamp(144 - reach, 144 + reach)
-    stack[0, 0, 0], stack[0, 1, :40] = 144 - reach, 144 + reach  # a few hot pixels pile up at the end
+    # a few hot pixels pile up at the end
+    stack[0, 0, 0], stack[0, 1, :40] = 144 - reach, 144 + reach
     whole = measured([stack], LIGHT[:1])
     for data in (sufficient(whole), sufficient.hooks.reference(whole)):
         assert data.cell_count.sum() == stack.numel()

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from neusee.nodes.calibrate._likelihood._quantised_gaussian import log_cell
+from neusee.nodes.calibrate._sensor_likelihood import log_cell
 from neusee.nodes.sensor import digitize, full_well
 
 KINDS = ["nearest", "truncation", "dithered_floor"]
@@ -45,7 +45,12 @@ def by_quadrature(k, mean, sd, well, kind, top):
 
     for a, b in pairwise(ends):
         part, _ = quad(
-            lambda x: share(x, k, kind, top) * norm.pdf(x, mean, sd), a, b, epsabs=0, epsrel=1e-11, limit=400
+            lambda x: share(x, k, kind, top) * norm.pdf(x, mean, sd),
+            a,
+            b,
+            epsabs=0,
+            epsrel=1e-11,
+            limit=400,
         )
         total += part
     return total
@@ -53,7 +58,9 @@ def by_quadrature(k, mean, sd, well, kind, top):
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("well", [1e9, 12.3, 11.45, 11.0, 10.7, 10.2])
-@pytest.mark.parametrize(("mean", "sd"), [(10.2, 0.05), (10.6, 0.4), (9.0, 1.0), (13.0, 2.5), (4.0, 3.0)])
+@pytest.mark.parametrize(
+    ("mean", "sd"), [(10.2, 0.05), (10.6, 0.4), (9.0, 1.0), (13.0, 2.5), (4.0, 3.0)]
+)
 def test_agrees_with_an_integral(kind, well, mean, sd):
     for k in range(8, 14):
         exact = by_quadrature(k, mean, sd, well, kind, 4095)
@@ -62,13 +69,17 @@ def test_agrees_with_an_integral(kind, well, mean, sd):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("mean", "sd"), [(0.3, 0.7), (-2.0, 1.0), (7.2, 1.5), (9.0, 4.0), (3.5, 0.2)])
+@pytest.mark.parametrize(
+    ("mean", "sd"), [(0.3, 0.7), (-2.0, 1.0), (7.2, 1.5), (9.0, 4.0), (3.5, 0.2)]
+)
 @pytest.mark.parametrize("well", [1e9, 5.4])
 def test_the_ends_of_the_converter_hold_what_lies_beyond(kind, mean, sd, well):
     """A converter of three bits: 0 to 7."""
     found = log_p(torch.arange(8.0), mean, sd, well, kind, top=7).exp()
     exact = [by_quadrature(k, mean, sd, well, kind, 7) for k in range(1, 7)]
-    torch.testing.assert_close(found[1:7], torch.tensor(exact, dtype=torch.float64), rtol=1e-7, atol=1e-13)
+    torch.testing.assert_close(
+        found[1:7], torch.tensor(exact, dtype=torch.float64), rtol=1e-7, atol=1e-13
+    )
     assert float(found.sum()) == pytest.approx(1.0, abs=1e-12)
 
 
@@ -85,7 +96,9 @@ def test_agrees_with_the_steps_of_the_sensor(kind):
     """Two million draws through the nodes of a recipe: chi squared of the cells."""
     rng = torch.Generator().manual_seed(5)
     k, mean, sd, well = 0.8, 31.0, 2.2, 33.1
-    electrons = full_well(mean + sd * torch.randn(2000, 1000, generator=rng, dtype=torch.float64), capacity=well)
+    electrons = full_well(
+        mean + sd * torch.randn(2000, 1000, generator=rng, dtype=torch.float64), capacity=well
+    )
     counts = torch.bincount(digitize(electrons, gain=k, rounding=kind, rng=rng).flatten().long())
     p = log_p(torch.arange(len(counts)), k * mean, k * sd, k * well, kind).exp()
     seen = p * 2e6 > 20
@@ -100,7 +113,8 @@ def test_far_from_the_mean_nothing_cancels():
     found = log_p(400.0, 0.0, 10.0, 1e9, "nearest")
     exact = norm.logsf(39.95) + math.log1p(-math.exp(norm.logsf(40.05) - norm.logsf(39.95)))
     assert float(found) == pytest.approx(exact, rel=1e-12)
-    tail = log_p(torch.tensor([30.0]), 0.0, 1.0, 1e9, "dithered_floor")  # exp(-435), by the closed form of the tail
+    # exp(-435), by the closed form of the tail
+    tail = log_p(torch.tensor([30.0]), 0.0, 1.0, 1e9, "dithered_floor")
     x = np.linspace(29.5, 31.5, 200001)
     weight = (1 - np.abs(x - 30.5)) * np.exp(-0.5 * (x**2 - 29.5**2))
     exact = math.log(np.trapezoid(weight, x) / math.sqrt(2 * math.pi)) - 0.5 * 29.5**2

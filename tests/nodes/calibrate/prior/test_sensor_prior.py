@@ -45,7 +45,9 @@ def test_there_and_back(free, unit, seed):
 @settings(max_examples=40, deadline=None)
 @given(some, st.sampled_from(UNITS), st.integers(0, 1 << 30))
 def test_the_density_of_a_place_has_the_jacobian_of_its_parameters(free, unit, seed):
-    """Between two places: the difference of log densities, by the derivative of the prior's own coordinates."""
+    """Between two places: the difference of log densities, by the derivative of the prior's own
+    coordinates.
+    """
     c = coordinates(free, unit)
     places = c.place(c.draw(2, torch.Generator().manual_seed(seed)))
 
@@ -64,16 +66,26 @@ def test_the_draws_have_the_prior():
     drawn = c.draw(20000, torch.Generator().manual_seed(3))
     for name, (middle, width) in LAWS.items():
         if name == "offset":
-            assert float(drawn[name].mean()) == pytest.approx(middle, abs=4 * width / math.sqrt(20000))
+            assert float(drawn[name].mean()) == pytest.approx(
+                middle, abs=4 * width / math.sqrt(20000)
+            )
         else:
-            assert float(drawn[name].median()) == pytest.approx(middle, rel=5 * math.log(width) / math.sqrt(20000))
+            assert float(drawn[name].median()) == pytest.approx(
+                middle, rel=5 * math.log(width) / math.sqrt(20000)
+            )
             assert float(drawn[name].log().std()) == pytest.approx(math.log(width), rel=0.03)
 
 
 def test_what_frames_know_does_not_move_along_the_ridge_of_the_gain():
-    """A gain 10 % larger with 10 % less of all that is counted in electrons: only the gain's own coordinate moves."""
+    """A gain 10 % larger with 10 % less of all that is counted in electrons: only the gain's own
+    coordinate moves.
+    """
     c = coordinates(["gain", "offset", "read_noise", "full_well", "quantum_efficiency"])
-    more = {name: x * (1.1 if name == "gain" else 1 / 1.1) for name, x in NOMINAL.items() if name in c.names}
+    more = {
+        name: x * (1.1 if name == "gain" else 1 / 1.1)
+        for name, x in NOMINAL.items()
+        if name in c.names
+    }
     moved = c.place(more) - c.place(NOMINAL)
     assert float(moved[0]) == pytest.approx(math.log(1.1))
     assert bool((moved[1:].abs() < 1e-12).all())

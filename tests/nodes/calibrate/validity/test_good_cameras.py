@@ -1,15 +1,32 @@
-"""Frames of real but good cameras, by a simulator of its own: none is refused, and what is faulty has its own name."""
+"""Frames of real but good cameras, by a simulator of its own: none is refused, and what is
+faulty has its own name.
+"""
 
 import numpy as np
 import pytest
 import torch
 
-from neusee.nodes.calibrate import Stack, hot_pixels, inspect_frames, least_squares, levels, reduce, saturation_signal
+from neusee.nodes.calibrate import (
+    Stack,
+    hot_pixels,
+    inspect_frames,
+    least_squares,
+    levels,
+    reduce,
+    saturation_signal,
+)
 from tests.workflows.calibration.own_real_camera import RealCamera
 
 SLOW = pytest.mark.slow
 #: the camera of which a correction that nobody needs moved the gain by 10 %
-UNEVEN = {"prnu": 0.01, "vignetting": 0.15, "flicker": 0.002, "lamp": 0.003, "brightest": 1.15, "gain": 0.03362}
+UNEVEN = {
+    "prnu": 0.01,
+    "vignetting": 0.15,
+    "flicker": 0.002,
+    "lamp": 0.003,
+    "brightest": 1.15,
+    "gain": 0.03362,
+}
 UNEVEN |= {"read_noise": 30.0, "well": 90_000.0}
 GOOD = {
     "plain": {},
@@ -24,7 +41,14 @@ GOOD = {
 
 def inspected(camera, mask=None, divisor=1):
     stacks = [
-        Stack(shot.name, shot.photons, shot.exposure, "steady", torch.from_numpy(shot.frames // divisor).int(), mask)
+        Stack(
+            shot.name,
+            shot.photons,
+            shot.exposure,
+            "steady",
+            torch.from_numpy(shot.frames // divisor).int(),
+            mask,
+        )
         for shot in camera.shots()
     ]
     return {test.name: test for test in inspect_frames(stacks, False, 0.7)}
@@ -36,7 +60,11 @@ def refused(tests):
 
 def opened(tests):
     """The largest error that follows of what a test found."""
-    return max(max(test.shifts.values(), default=0.0) for test in tests.values() if test.verdict == "widened")
+    return max(
+        max(test.shifts.values(), default=0.0)
+        for test in tests.values()
+        if test.verdict == "widened"
+    )
 
 
 @pytest.mark.parametrize("kind", GOOD)
@@ -50,16 +78,22 @@ def test_good_cameras_pass(kind, seed):
 
 
 def test_levels_that_the_fit_leaves_out_are_not_tested():
-    """Saturated levels, whose neighbours correlate, beside clean ones: only saturation is told of them."""
+    """Saturated levels, whose neighbours correlate, beside clean ones: only saturation is told
+    of them.
+    """
     camera = RealCamera(4, size=(96, 96))
     shots = camera.shots()
     top = max(shots, key=lambda shot: shot.photons)
     smooth = np.cumsum(np.random.default_rng(0).normal(0, 3, top.frames.shape), 2)
     top.frames = (np.median(top.frames) + smooth - smooth.mean()).clip(0, 4095).astype(np.uint16)
-    stacks = [Stack(s.name, s.photons, s.exposure, "steady", torch.from_numpy(s.frames).int()) for s in shots]
+    stacks = [
+        Stack(s.name, s.photons, s.exposure, "steady", torch.from_numpy(s.frames).int())
+        for s in shots
+    ]
     tests = inspect_frames(stacks, False, 0.7)
     assert not [test.name for test in tests if test.verdict in ("refused", "widened")]
-    assert refused({test.name: test for test in inspect_frames(stacks, False, None)})  # if the fit used it
+    # if the fit used it
+    assert refused({test.name: test for test in inspect_frames(stacks, False, None)})
 
 
 def test_a_well_below_the_converter_is_told_as_saturation():
@@ -83,8 +117,13 @@ def test_a_spread_of_read_noise_is_told_with_its_size_and_telegraph_pixels_are_n
     for shot in shots:
         jumps = 15 * jumping * (rng.random(shot.frames.shape) < 0.5)
         shot.frames = (shot.frames + jumps).astype(np.uint16)
-    stacks = [Stack(s.name, s.photons, s.exposure, "steady", torch.from_numpy(s.frames).int()) for s in shots]
-    (found,) = (test for test in inspect_frames(stacks, False, 0.7) if test.name == "no telegraph noise")
+    stacks = [
+        Stack(s.name, s.photons, s.exposure, "steady", torch.from_numpy(s.frames).int())
+        for s in shots
+    ]
+    (found,) = (
+        test for test in inspect_frames(stacks, False, 0.7) if test.name == "no telegraph noise"
+    )
     assert found.verdict == "refused"
     assert "jumps" in found.sentence
 
@@ -149,13 +188,22 @@ def test_what_changes_the_noise_is_refused(fault):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("vignetting", [0.0, 0.3])
 def test_the_signal_of_full_pixels_is_that_of_the_well(seed, vignetting):
-    camera = RealCamera(seed, size=(64, 64), vignetting=vignetting, well_spread=0.02, lit=14, brightest=1.3)
+    camera = RealCamera(
+        seed, size=(64, 64), vignetting=vignetting, well_spread=0.02, lit=14, brightest=1.3
+    )
     parts = [
-        reduce(torch.from_numpy(s.frames).int(), photons=s.photons, exposure=s.exposure, scatter="steady")
+        reduce(
+            torch.from_numpy(s.frames).int(),
+            photons=s.photons,
+            exposure=s.exposure,
+            scatter="steady",
+        )
         for s in camera.shots()
     ]
     found = saturation_signal(levels(parts))
-    assert found.signal == pytest.approx(camera.gain * camera.well, abs=max(3 * found.uncertainty, 0.005 * 3500))
+    assert found.signal == pytest.approx(
+        camera.gain * camera.well, abs=max(3 * found.uncertainty, 0.005 * 3500)
+    )
     assert found.uncertainty < 0.03 * found.signal
     peak = float(least_squares(levels(parts)).saturation)
     assert peak < 0.97 * camera.well, "the level of the greatest variance lies below"
@@ -172,8 +220,14 @@ def test_noisy_pixels_are_not_hot(tmp_path):
 
 
 def test_a_lamp_that_flickers_over_uneven_light_makes_no_row_noise():
-    """The difference of two frames is the light itself, times the flicker: said as drift, and as nothing else."""
-    tests = inspected(RealCamera(11, size=(96, 96), vignetting=0.5, flicker=0.02, gain=0.034, read_noise=30, well=9e4))
+    """The difference of two frames is the light itself, times the flicker: said as drift, and as
+    nothing else.
+    """
+    tests = inspected(
+        RealCamera(
+            11, size=(96, 96), vignetting=0.5, flicker=0.02, gain=0.034, read_noise=30, well=9e4
+        )
+    )
     for name in ("white noise", "no blocks", "no row noise", "no column noise", "no lag"):
         assert tests[name].verdict == "passed", tests[name].sentence
     drift = tests["no drift within a level"]

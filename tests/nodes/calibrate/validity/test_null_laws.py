@@ -8,9 +8,15 @@ import torch
 from scipy.fft import dctn
 from scipy.stats import chi2, kstest, kurtosis, kurtosistest, norm
 
-from neusee.nodes.calibrate._validity._block_test import _cosines, _kept_to, products
-from neusee.nodes.calibrate._validity._frame_pairs import normal_limit, outcome, strongest, studentised
-from neusee.nodes.calibrate._validity._noise_tests import _core, _glynn, _hilferty
+from neusee.nodes.calibrate._frame_pairs import normal_limit, outcome, strongest, studentised
+from neusee.nodes.calibrate._noise_tests import (
+    _core,
+    _cosines,
+    _glynn,
+    _hilferty,
+    _kept_to,
+    products,
+)
 
 
 def test_limits_are_those_of_the_normal_law():
@@ -32,7 +38,9 @@ def test_the_kurtosis_becomes_a_normal_number_as_in_scipy():
     rng = np.random.default_rng(4)
     for n in (100, 4096):
         for x in (rng.standard_normal(n), rng.standard_t(4, n), rng.uniform(-1, 1, n)):
-            assert _glynn(kurtosis(x, fisher=False), n) == pytest.approx(kurtosistest(x).statistic, rel=1e-9)
+            assert _glynn(kurtosis(x, fisher=False), n) == pytest.approx(
+                kurtosistest(x).statistic, rel=1e-9
+            )
 
 
 def test_cosines_of_blocks_are_those_of_scipy():
@@ -64,7 +72,10 @@ def test_the_middle_of_rounded_noise_has_its_standard_deviation(sd):
 
 def test_an_error_above_two_percent_is_refused_and_a_smaller_one_widens():
     strong = strongest([[9.0]])
-    assert [outcome("x", strong, "y", {"gain": g}, "z").verdict for g in (0.01, 0.03)] == ["widened", "refused"]
+    assert [outcome("x", strong, "y", {"gain": g}, "z").verdict for g in (0.01, 0.03)] == [
+        "widened",
+        "refused",
+    ]
     assert outcome("x", strong, "y", {}, "z").verdict == "refused"
     assert outcome("x", strong, "y", {"gain": 0.5}, "z", "w").verdict == "modelled"
     assert outcome("x", strongest([[1.0]]), "y", {"gain": 0.5}, "z").verdict == "passed"

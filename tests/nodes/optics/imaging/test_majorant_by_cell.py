@@ -1,12 +1,13 @@
-"""The bound of an image by cells of pixels is never below the image, whatever the sizes and the border."""
+"""The bound of an image by cells of pixels is never below the image, whatever the sizes and the
+border.
+"""
 
 import pytest
 import torch
 
-from neusee.nodes.optics._imaging._band_image import reach
-from neusee.nodes.optics._imaging._collapsed_plan import Given
-from neusee.nodes.optics._imaging._convolve_plan import majorant_by_cell
-from neusee.nodes.optics._imaging._psf_energy import passed
+from neusee.nodes.optics._band_image import reach
+from neusee.nodes.optics._channel_image import majorant_by_cell
+from neusee.nodes.optics._convolution_plan import ImageFacts, passed
 
 
 def image_of(off, kernel, reflect):
@@ -28,17 +29,24 @@ def given_of(psf, size, reflect):
     rows = torch.tensor([[1.0, 0.2, 0.5], [0.1, 0.7, 0.3]], dtype=torch.float64)
     basis, nothing = torch.ones(3, 1, dtype=torch.float64), torch.zeros(2, 3, dtype=torch.float64)
     gram = torch.ones(1, 1, dtype=torch.float64)
-    return Given(rows, basis, nothing, gram[0], gram, 9 if reflect else 1, passed(psf), size, reflect)
+    return ImageFacts(
+        rows, basis, nothing, gram[0], gram, 9 if reflect else 1, passed(psf), size, reflect
+    )
 
 
 @pytest.mark.parametrize("reflect", [False, True])
-@pytest.mark.parametrize(("size", "window"), [((48, 48), (32, 32)), ((41, 30), (17, 24)), ((24, 37), (9, 36))])
+@pytest.mark.parametrize(
+    ("size", "window"), [((48, 48), (32, 32)), ((41, 30), (17, 24)), ((24, 37), (9, 36))]
+)
 def test_no_pixel_is_above_the_bound_of_its_cell(size, window, reflect):
     torch.manual_seed(sum(size))
     off = torch.rand(size).pow(8)
     psf = torch.rand(3, *window).pow(6)
     given = given_of(psf, size, reflect)
-    kernel = (given.rows.abs().amax(0)[:, None, None] * reach(reach(psf, -2, size[0]), -1, size[1]).double()).sum(0)
+    kernel = (
+        given.rows.abs().amax(0)[:, None, None]
+        * reach(reach(psf, -2, size[0]), -1, size[1]).double()
+    ).sum(0)
     image = image_of(off.double(), kernel, reflect)
     bound = majorant_by_cell(off, psf, given)
     assert bound.shape == (-(-size[0] // 8), -(-size[1] // 8))

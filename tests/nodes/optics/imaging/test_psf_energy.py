@@ -1,4 +1,6 @@
-"""Sums and peaks of PSFs inside and outside of windows: against each window looked at alone, in float64."""
+"""Sums and peaks of PSFs inside and outside of windows: against each window looked at alone, in
+float64.
+"""
 
 import math
 
@@ -7,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.optics._imaging._psf_energy import by_window, centred, passed
+from neusee.nodes.optics._convolution_plan import by_window, centred, passed
 
 
 def outside(stack, window):
@@ -19,7 +21,13 @@ def outside(stack, window):
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(1, 70), st.integers(1, 70), st.integers(1, 4), st.booleans(), st.integers(0, 1 << 30))
+@given(
+    st.integers(1, 70),
+    st.integers(1, 70),
+    st.integers(1, 4),
+    st.booleans(),
+    st.integers(0, 1 << 30),
+)
 def test_each_window_is_as_it_were_measured_alone(y, x, count, negative, seed):
     generator = torch.Generator().manual_seed(seed)
     stack = torch.randn(count, y, x, generator=generator) ** 5
@@ -58,5 +66,9 @@ def test_what_is_not_a_number_is_seen_and_not_summed_away(wrong):
     stack = torch.ones(2, 16, 16)
     stack[1, 3, 4] = wrong
     found = by_window(stack, signed=False)
-    assert torch.isfinite(found.total).tolist() == torch.isfinite(passed(stack).total).tolist() == [True, False]
+    assert (
+        torch.isfinite(found.total).tolist()
+        == torch.isfinite(passed(stack).total).tolist()
+        == [True, False]
+    )
     assert torch.isfinite(found.beyond[-1]).tolist() == [True, False]

@@ -1,4 +1,6 @@
-"""The PSF in C++ against the torch path and the matrices of the definition; the node's own tests run the C++ too."""
+"""The PSF in C++ against the torch path and the matrices of the definition; the node's own tests
+run the C++ too.
+"""
 
 import hashlib
 import math
@@ -12,7 +14,7 @@ from neusee.nodes.optics import psf, pupil, stop
 from neusee.nodes.optics._psf import _Camera, _focus
 from neusee.nodes.optics._psf_definition import by_definition
 from neusee.nodes.optics._transform import _fused
-from neusee.nodes.optics._transform._fused_plan import fused_axis
+from neusee.nodes.optics._transform._fused import fused_axis
 from neusee.nodes.optics._transform._intensity import Sampling, intensity_of
 from neusee.nodes.optics._transform._pupil_field import View
 from neusee.nodes.optics._transform._sample_axis import Axis
@@ -30,11 +32,15 @@ def _compiled():
 
 
 def rough(rows, columns, kind=torch.float32, path=0.0, seed=0):
-    """A pupil whose height is random, with an amplitude that is zero outside a disc, in two bands."""
+    """A pupil whose height is random, with an amplitude that is zero outside a disc, in two
+    bands.
+    """
     draw = torch.Generator().manual_seed(seed)
     v, u = (torch.linspace(-1, 1, n, dtype=torch.float64) for n in (rows, columns))
     disc = (v[:, None].square() + u.square() <= 1).to(kind)
-    height, bend, grey = (torch.rand(rows, columns, generator=draw, dtype=torch.float64).to(kind) for _ in range(3))
+    height, bend, grey = (
+        torch.rand(rows, columns, generator=draw, dtype=torch.float64).to(kind) for _ in range(3)
+    )
     bands = torch.tensor([450e-9, 620e-9], dtype=torch.float64)
     pitch = torch.tensor(8e-3 / max(rows, columns), dtype=torch.float64)
     return Pupil(disc, disc * grey, 2e-5 * height, path * bend, 0.46 + 0 * bands, bands, pitch)
@@ -48,7 +54,12 @@ CASES = [
     ((64, 64), (64, 64), {}, {}),
     ((301, 240), (33, 47), {}, {"path": 3e-6}),
     ((130, 97), (210, 190), {"angle": (1e-4, -2e-4)}, {}),
-    ((48, 48), (35, 40), {"pixel": "zoh", "sensor": "integrated"}, {"path": 1e-6, "kind": torch.float64}),
+    (
+        (48, 48),
+        (35, 40),
+        {"pixel": "zoh", "sensor": "integrated"},
+        {"path": 1e-6, "kind": torch.float64},
+    ),
     ((17, 240), (250, 3), {"pixel": "zoh"}, {}),
     ((1, 5), (1, 1), {}, {}),
 ]
@@ -58,7 +69,9 @@ CASES = [
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_it_is_the_torch_path_but_for_round_off(pupil, shape, params, given, dtype):
     light, view = rough(*pupil, **given), camera(shape, **params)
-    found, expected = (_focus(light, view, dtype, method).intensity for method in ("fused", "kaiser_bessel"))
+    found, expected = (
+        _focus(light, view, dtype, method).intensity for method in ("fused", "kaiser_bessel")
+    )
     truth = by_definition(light, view).intensity
     averaged = 1e-5 * float(expected.max()) if "sensor" in params else 0.0
     peak = float(by_definition(light, camera((33, 33))).intensity.max())
@@ -88,10 +101,15 @@ def test_only_the_gradient_that_is_asked_for_and_none_where_no_light_passes():
     height = light.height.clone().requires_grad_()
     both = light._replace(height=height, amplitude=light.amplitude.clone().requires_grad_())
     (alone,) = torch.autograd.grad(
-        (_focus(light._replace(height=height), camera((9, 9)), torch.float32, "fused").intensity * weight).sum(), height
+        (
+            _focus(light._replace(height=height), camera((9, 9)), torch.float32, "fused").intensity
+            * weight
+        ).sum(),
+        height,
     )
     amplitude, together = torch.autograd.grad(
-        (_focus(both, camera((9, 9)), torch.float32, "fused").intensity * weight).sum(), (both.amplitude, height)
+        (_focus(both, camera((9, 9)), torch.float32, "fused").intensity * weight).sum(),
+        (both.amplitude, height),
     )
     assert torch.equal(alone, together)
     assert not alone[light.amplitude == 0].any()
@@ -100,7 +118,9 @@ def test_only_the_gradient_that_is_asked_for_and_none_where_no_light_passes():
 
 @pytest.mark.parametrize("turns", [1e8, -1e8])
 def test_a_phase_of_many_turns_is_exact(turns):
-    """One sample sends |U|^2 = 1; two samples interfere as their phases do, whole turns apart or not."""
+    """One sample sends |U|^2 = 1; two samples interfere as their phases do, whole turns apart or
+    not.
+    """
     axis = Axis(1, 1, 0.1), Axis(2, 1, 0.1)
     height = torch.tensor([[0.0, turns + 0.3]], dtype=torch.float64)
     sampling = Sampling((View(0, *axis, 1.0, 0.0, (0.0, 0.0), 1.0),), torch.float32, "fused")
@@ -133,7 +153,11 @@ def test_every_factor_of_the_fft_is_used_by_the_cases():
     for samples, shape, *_ in CASES:
         for n, k in zip(samples, shape, strict=True):
             alpha = 8e-3 / max(samples) * 2.9e-6 / (450e-9 * 0.11)
-            used |= set(fused_axis(Axis(n, k, alpha), torch.float32, torch.float32, torch.float32).held[0].tolist())
+            used |= set(
+                fused_axis(Axis(n, k, alpha), torch.float32, torch.float32, torch.float32)
+                .held[0]
+                .tolist()
+            )
     assert used == {2, 3, 4, 5, 8}
 
 
@@ -142,7 +166,9 @@ def test_without_a_compiler_torch_computes_and_it_is_said_once(monkeypatch, tmp_
     monkeypatch.setenv("CXX", str(tmp_path / "no-such-compiler"))
     _cpp_library._say_once.cache_clear()
     light = rough(64, 64)
-    with pytest.warns(UserWarning, match=r"C\+\+ of the PSF is not compiled and torch computes the PSF") as said:
+    with pytest.warns(
+        UserWarning, match=r"C\+\+ of the PSF is not compiled and torch computes the PSF"
+    ) as said:
         found = [_focus(light, camera((64, 64)), torch.float32, "auto").intensity for _ in range(2)]
     assert len(said) == 1
     expected = _focus(light, camera((64, 64)), torch.float64, "direct").intensity

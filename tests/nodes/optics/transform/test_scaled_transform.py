@@ -6,11 +6,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neusee.nodes.optics._transform._banded_matrix import Banded
-from neusee.nodes.optics._transform._chirp_transform import smooth
-from neusee.nodes.optics._transform._sample_axis import Axis, centred, radians, unit_phasor
+from neusee.nodes.optics._transform._fft_transforms import Banded, smooth
+from neusee.nodes.optics._transform._sample_axis import (
+    Axis,
+    borrowed,
+    centred,
+    radians,
+    unit_phasor,
+)
 from neusee.nodes.optics._transform._scaled_transform import cheapest, transform
-from neusee.nodes.optics._transform._workspace import borrowed
 
 METHODS = ["direct", "folded", "bluestein", "kaiser_bessel", "auto"]
 CPU = torch.device("cpu")
@@ -31,13 +35,21 @@ def exact(field, shape, alpha, centre_in, centre_out, sign=-1):
     for n, k, a, c_in, c_out in zip(field.shape, shape, alpha, centre_in, centre_out, strict=True):
         j = torch.arange(n, dtype=torch.float64) - c_in
         kernels.append(
-            torch.exp(2j * math.pi * sign * a * torch.outer(torch.arange(k, dtype=torch.float64) - c_out, j))
+            torch.exp(
+                2j
+                * math.pi
+                * sign
+                * a
+                * torch.outer(torch.arange(k, dtype=torch.float64) - c_out, j)
+            )
         )
     return kernels[0] @ field.to(torch.complex128) @ kernels[1].T
 
 
 def noise(*shape, seed=0):
-    return torch.randn(*shape, dtype=torch.complex128, generator=torch.Generator().manual_seed(seed))
+    return torch.randn(
+        *shape, dtype=torch.complex128, generator=torch.Generator().manual_seed(seed)
+    )
 
 
 sizes = st.tuples(st.integers(1, 60), st.integers(1, 60))
@@ -64,7 +76,10 @@ def test_every_method_is_the_double_sum(method, n, k, a, c_in, c_out, sign):
     ("n", "k"), [((1, 1), (1, 1)), ((7, 1), (1, 13)), ((127, 64), (101, 33)), ((97, 89), (90, 90))]
 )
 def test_primes_ones_and_rectangles(method, n, k):
-    field, where = noise(*n), dict(alpha=(1 / 150, 1 / 97), centre_in=(3.25, -2.0), centre_out=(0.5, 40.0))
+    field, where = (
+        noise(*n),
+        dict(alpha=(1 / 150, 1 / 97), centre_in=(3.25, -2.0), centre_out=(0.5, 40.0)),
+    )
     truth = exact(field, k, **where)
     assert float((transform(field, k, method=method, **where) - truth).abs().max()) < 1e-12 * float(
         truth.abs().max() + 1
@@ -86,12 +101,18 @@ def test_the_adjoint_axis_is_the_conjugate_transpose(method):
     field, other = noise(23, 40), noise(31, 19, seed=1)
     forward = transform(field, (31, 19), (0.011, 0.013), (11, 19.5), (15, 9), method=method)
     back = transform(other, (23, 40), (0.011, 0.013), (15, 9), (11, 19.5), sign=1, method=method)
-    torch.testing.assert_close(torch.vdot(other.flatten(), forward.flatten()),
-                               torch.vdot(back.flatten(), field.flatten()), rtol=1e-12, atol=1e-9)  # fmt: skip
+    torch.testing.assert_close(
+        torch.vdot(other.flatten(), forward.flatten()),
+        torch.vdot(back.flatten(), field.flatten()),
+        rtol=1e-12,
+        atol=1e-9,
+    )
 
 
 def test_phases_stay_exact_far_out():
-    """A float32 chirp of 570 turns is off by 4e-5 rad; reduced in float64 and then cast, by 4e-7."""
+    """A float32 chirp of 570 turns is off by 4e-5 rad; reduced in float64 and then cast, by
+    4e-7.
+    """
     turns = centred(2161, CPU).square() * (3.74e-6 * 2.9e-6 / (400e-9 * 0.11) / 2)
     truth = torch.exp(2j * math.pi * turns)
     assert float((unit_phasor(turns, torch.float32) - truth).abs().max()) < 4e-7
@@ -116,7 +137,12 @@ def test_smooth_numbers():
     assert smooth(75, even=True) % 2 == 0
 
 
-@given(rows=st.integers(1, 90), columns=st.integers(1, 70), step=st.floats(0.05, 3.0), origin=st.floats(-5, 5))
+@given(
+    rows=st.integers(1, 90),
+    columns=st.integers(1, 70),
+    step=st.floats(0.05, 3.0),
+    origin=st.floats(-5, 5),
+)
 @settings(max_examples=60, deadline=None)
 def test_banded_is_the_dense_matrix(rows, columns, step, origin):
     def weigh(i, j):
@@ -126,7 +152,10 @@ def test_banded_is_the_dense_matrix(rows, columns, step, origin):
     dense = weigh(torch.arange(band.n_rows).double()[:, None], torch.arange(columns).double())
     x = torch.randn(columns, 6, dtype=torch.float64)
     padded = torch.nn.functional.pad(x, (0, 0, band.margin, band.margin))
-    left, right = torch.empty(band.n_rows, 6).double(), torch.empty(band.count, 6, band.block).double()
+    left, right = (
+        torch.empty(band.n_rows, 6).double(),
+        torch.empty(band.count, 6, band.block).double(),
+    )
     band.left(padded, left)
     band.right(padded.T.contiguous(), right)
     torch.testing.assert_close(left, dense @ x)
@@ -141,11 +170,16 @@ def test_large_windows_go_by_grids_and_small_ones_by_matrices():
     assert chosen(2160, 2048) == chosen(2048, 2160) == "kaiser_bessel"
     assert chosen(2160, 16) in ("direct", "folded")
     assert chosen(8, 8) in ("direct", "bluestein")
-    assert cheapest(Axis(2160, 2048, 1e-4), Axis(2160, 2048, 1e-4), torch.device("cuda")) == "folded"
+    assert (
+        cheapest(Axis(2160, 2048, 1e-4), Axis(2160, 2048, 1e-4), torch.device("cuda")) == "folded"
+    )
 
 
 def test_threads_never_share_a_workspace():
-    field, where = noise(64, 64), dict(alpha=(0.01, 0.01), centre_in=(31.5, 31.5), centre_out=(20, 20))
+    field, where = (
+        noise(64, 64),
+        dict(alpha=(0.01, 0.01), centre_in=(31.5, 31.5), centre_out=(20, 20)),
+    )
     truth, wrong = exact(field, (48, 48), **where), []
 
     def work():
@@ -163,7 +197,7 @@ def test_threads_never_share_a_workspace():
 
 
 def test_workspaces_are_kept_but_not_collected():
-    from neusee.nodes.optics._transform import _workspace
+    from neusee.nodes.optics._transform import _sample_axis as _workspace
 
     with borrowed(torch.float32, CPU) as first:
         memory = first.take("x", 100).data_ptr()

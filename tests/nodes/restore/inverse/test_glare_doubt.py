@@ -1,4 +1,6 @@
-"""The doubt that a frame tells of: the glare is told rightly, with random errors, or without dirt and defocus."""
+"""The doubt that a frame tells of: the glare is told rightly, with random errors, or without
+dirt and defocus.
+"""
 
 import numpy as np
 import pytest
@@ -32,7 +34,9 @@ def frame(glare, rng):
 
 
 def lens(rng=None):
-    """The light of a point behind a round aperture; with ``rng``, with grains of dirt and 0.1 wave of defocus."""
+    """The light of a point behind a round aperture; with ``rng``, with grains of dirt and 0.1
+    wave of defocus.
+    """
     at = (np.arange(2 * SIDE) - SIDE + 0.5) / 40
     v, u = np.meshgrid(at, at, indexing="ij")
     field = (v**2 + u**2 < 1).astype(complex)
@@ -67,20 +71,28 @@ def test_the_doubt_is_that_of_the_errors_of_the_glare(planted, may_be, seed):
 def test_a_doubt_that_is_found_is_at_least_the_least_one_and_a_stated_one_is_kept():
     for planted, may_be in ((0.0, [0.3]), (1.0, [1.0, 3.0])):
         rng, told = np.random.default_rng([0, int(100 * planted)]), spot()
-        _, seen = frame(told + planted * around(told[None])[0] * rng.standard_normal(told.shape), rng)
+        _, seen = frame(
+            told + planted * around(told[None])[0] * rng.standard_normal(told.shape), rng
+        )
         found = restored(seen, told, None, least=0.3)
         assert any(np.array_equal(found, restored(seen, told, doubt)) for doubt in may_be)
         assert np.array_equal(restored(seen, told, 0.1, least=0.3), restored(seen, told, 0.1))
 
 
 @pytest.mark.parametrize("seed", [3, 4])
-def test_a_lens_that_is_not_as_told_costs_less_than_without_doubt_and_the_right_one_costs_nothing(seed):
+def test_a_lens_that_is_not_as_told_costs_less_than_without_doubt_and_the_right_one_costs_nothing(
+    seed,
+):
     rng = np.random.default_rng(seed)
     true, seen = frame(lens(rng), rng)
-    errors = [np.sqrt(np.mean((restored(seen, lens(), doubt) - true) ** 2)) for doubt in (0.0, None)]
+    errors = [
+        np.sqrt(np.mean((restored(seen, lens(), doubt) - true) ** 2)) for doubt in (0.0, None)
+    ]
     assert errors[1] < 0.5 * errors[0]
     right = lens(np.random.default_rng(seed))
-    free, exact = (np.sqrt(np.mean((restored(seen, right, doubt) - true) ** 2)) for doubt in (None, 0.0))
+    free, exact = (
+        np.sqrt(np.mean((restored(seen, right, doubt) - true) ** 2)) for doubt in (None, 0.0)
+    )
     assert free < 1.05 * exact
 
 

@@ -1,4 +1,6 @@
-"""The most likely picture: against the full matrix, the filter of a picture without edges, and chance itself."""
+"""The most likely picture: against the full matrix, the filter of a picture without edges, and
+chance itself.
+"""
 
 from dataclasses import replace
 
@@ -6,13 +8,13 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from neusee.nodes.restore._inverse import _conjugate_gradients, _fft_grid, _hidden_pixels, _lowest_frequencies
-from neusee.nodes.restore._inverse._conjugate_gradients import descend
-from neusee.nodes.restore._inverse._fft_grid import torus
+from neusee.nodes.restore._inverse import _conjugate_gradients, _hidden_pixels
+from neusee.nodes.restore._inverse import _conjugate_gradients as _lowest_frequencies
+from neusee.nodes.restore._inverse import _masked_blur as _fft_grid
+from neusee.nodes.restore._inverse._conjugate_gradients import Lowest, descend
 from neusee.nodes.restore._inverse._hidden_pixels import halved, most_likely
-from neusee.nodes.restore._inverse._lowest_frequencies import Lowest
-from neusee.nodes.restore._inverse._masked_blur import Blurred, variance
-from neusee.nodes.restore._inverse._picture_scale import fall
+from neusee.nodes.restore._inverse._masked_blur import Blurred, torus, variance
+from neusee.nodes.restore._inverse._wiener_prior import fall
 
 
 def problem(picture, size, channels=1, grey=0.0, seed=0, hidden=0.0):
@@ -32,13 +34,17 @@ def space(seen, spectrum):
 
 
 def by_matrix(seen, glare=()):
-    """The same from its definition: every pixel of the torus an unknown, covariances as matrices."""
+    """The same from its definition: every pixel of the torus an unknown, covariances as
+    matrices.
+    """
     channels, count = len(seen.picture), seen.torus[0] * seen.torus[1]
     units = torch.eye(count, dtype=torch.float64).reshape(count, 1, *seen.torus)
     spectra = torch.fft.rfft2(units)
     blurs = [torch.stack([seen.blur(u)[c].flatten() for u in spectra], 1) for c in range(channels)]
     design = torch.block_diag(*blurs)
-    spread = torch.stack([torch.fft.irfft2(u[0] * seen.power, s=seen.torus).flatten() for u in spectra], 1)
+    spread = torch.stack(
+        [torch.fft.irfft2(u[0] * seen.power, s=seen.torus).flatten() for u in spectra], 1
+    )
     colours = torch.full((channels, channels), seen.grey, dtype=torch.float64).fill_diagonal_(1.0)
     prior = torch.kron(colours, spread)
     known = seen.weight.flatten() > 0
@@ -57,17 +63,25 @@ def test_equals_the_full_matrix(channels, grey, hidden):
     expected = by_matrix(seen)
     torch.testing.assert_close(space(seen, most_likely(seen)), expected, rtol=0, atol=1e-9)
     start = torch.zeros_like(seen.transfer)
-    torch.testing.assert_close(space(seen, descend(seen, start, 300, 0.0)), expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        space(seen, descend(seen, start, 300, 0.0)), expected, rtol=0, atol=1e-5
+    )
 
 
 def test_glare_of_unknown_strength_equals_the_full_matrix():
     seen = problem((6, 5), (10, 9), 2, 0.5, hidden=0.2)
-    patterns = tuple(torch.rand(2, 2, 6, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(5)))
-    marred = replace(seen, picture=seen.picture + 70 * patterns[0] - 30 * patterns[1], glare=patterns)
+    patterns = tuple(
+        torch.rand(2, 2, 6, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    )
+    marred = replace(
+        seen, picture=seen.picture + 70 * patterns[0] - 30 * patterns[1], glare=patterns
+    )
     expected = by_matrix(seen, patterns)
     torch.testing.assert_close(space(seen, most_likely(marred)), expected, rtol=0, atol=1e-4)
     start = torch.zeros_like(seen.transfer)
-    torch.testing.assert_close(space(seen, descend(marred, start, 300, 0.0)), expected, rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        space(seen, descend(marred, start, 300, 0.0)), expected, rtol=0, atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("size", [(24, 24), (96, 80)])
@@ -80,7 +94,9 @@ def test_without_edges_it_is_the_wiener_filter(size):
 
 
 def periodic_filter(seen, weight):
-    """Return the Wiener filter (channel, y, x) of a picture without edges whose channels are alike."""
+    """Return the Wiener filter (channel, y, x) of a picture without edges whose channels are
+    alike.
+    """
     signal = (1 + (len(seen.picture) - 1) * seen.grey) * seen.power
     gain = seen.transfer.conj() * signal / (seen.transfer.abs().square() * signal + 1 / weight)
     return torch.fft.irfft2(gain * torch.fft.rfft2(seen.picture), s=seen.torus)
@@ -89,10 +105,18 @@ def periodic_filter(seen, weight):
 @pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("weight", [1e2, 1e8, 1e12, 1e15, 1e18])
 def test_a_picture_without_noise_is_inverted_to_rounding(weight, channels):
-    """The covariance of the pixels has the squared condition of the blur, and lost 4e-5 at a weight of 1e15."""
+    """The covariance of the pixels has the squared condition of the blur, and lost 4e-5 at a
+    weight of 1e15.
+    """
     model = problem((12, 10), (12, 10))
     alike = model.picture.expand(channels, -1, -1), model.transfer.expand(channels, -1, -1)
-    seen = replace(model, picture=alike[0], transfer=alike[1], weight=torch.full_like(alike[0], weight), grey=0.9)
+    seen = replace(
+        model,
+        picture=alike[0],
+        transfer=alike[1],
+        weight=torch.full_like(alike[0], weight),
+        grey=0.9,
+    )
     expected = periodic_filter(seen, weight)
     answer = space(seen, most_likely(seen))
     assert float((answer - expected).abs().max() / expected.abs().max()) < 1e-8
@@ -127,7 +151,9 @@ def test_even_glare_over_a_picture_without_noise_takes_its_share_of_the_mean(bou
 
 
 def test_on_average_no_other_balance_does_better():
-    """Pictures drawn from the prior, blurred, noisy and cut off: the right noise level has the least mean error."""
+    """Pictures drawn from the prior, blurred, noisy and cut off: the right noise level has the
+    least mean error.
+    """
     size, errors = (40, 40), torch.zeros(3)
     for seed in range(20):
         rng = torch.Generator().manual_seed(seed)
@@ -151,7 +177,10 @@ def test_few_steps_from_a_coarse_start_are_near_the_exact_answer(monkeypatch):
     model = replace(problem((60, 60), size), transfer=torch.fft.rfft2(ring / ring.sum())[None])
     model = replace(model, weight=torch.full((1, 60, 60), 1e4, dtype=torch.float64))
     rng = torch.Generator().manual_seed(1)
-    truth = torch.fft.rfft2(torch.randn(1, *size, dtype=torch.float64, generator=rng)) * model.power.sqrt()
+    truth = (
+        torch.fft.rfft2(torch.randn(1, *size, dtype=torch.float64, generator=rng))
+        * model.power.sqrt()
+    )
     model = replace(model, picture=model.blur(truth) + 0.01 * torch.randn(1, 60, 60, generator=rng))
 
     def error(spectrum):
@@ -167,7 +196,9 @@ def test_few_steps_from_a_coarse_start_are_near_the_exact_answer(monkeypatch):
 
 
 def far(seen, spectrum, answer):
-    """Square distance from the answer in the posterior's own spread: the energy that is left, all pixels together."""
+    """Square distance from the answer in the posterior's own spread: the energy that is left,
+    all pixels together.
+    """
     slope = seen.slope(answer) - seen.slope(spectrum)
     return float((space(seen, slope) * space(seen, spectrum - answer)).sum().abs())
 
@@ -175,23 +206,38 @@ def far(seen, spectrum, answer):
 @pytest.fixture(scope="module", params=[1, 3])
 def answered(request):
     """A problem with glare of unknown strength, and its answer."""
-    seen = problem((90, 70), torus((90, 70), (9, 9)), request.param, 0.9 if request.param > 1 else 0.0, hidden=0.2)
-    pattern = torch.rand(seen.picture.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    seen = problem(
+        (90, 70),
+        torus((90, 70), (9, 9)),
+        request.param,
+        0.9 if request.param > 1 else 0.0,
+        hidden=0.2,
+    )
+    pattern = torch.rand(
+        seen.picture.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(5)
+    )
     seen = replace(seen, weight=40 * seen.weight, glare=(pattern,))
     return seen, most_likely(seen, 400, 1e-14)
 
 
 @pytest.mark.parametrize("single", [False, True])
 def test_it_ends_near_the_answer_as_the_residual_says(answered, single):
-    """The residual tells a tenth to a thirtieth of the square distance; it tells the slowest part too small."""
+    """The residual tells a tenth to a thirtieth of the square distance; it tells the slowest
+    part too small.
+    """
     seen, answer = answered
     count = float((seen.weight > 0).sum())
     steepest = float(space(seen, seen.slope(0 * answer)).abs().max())
     assert float(space(seen, seen.slope(answer)).abs().max()) < 1e-7 * steepest
     rough = Blurred(
-        seen.picture.float(), seen.weight.float(), seen.transfer.to(torch.complex64), seen.power.float(),
-        seen.torus, seen.grey, (seen.glare[0].float(),),
-    )  # fmt: skip
+        seen.picture.float(),
+        seen.weight.float(),
+        seen.transfer.to(torch.complex64),
+        seen.power.float(),
+        seen.torus,
+        seen.grey,
+        (seen.glare[0].float(),),
+    )
     for enough in (1e-1, 1e-3, 1e-5):
         found = most_likely(rough if single else seen, 100, enough).to(answer)
         assert far(seen, found, answer) / count < 40 * enough
@@ -221,13 +267,17 @@ def test_finite_where_some_weights_are_beyond_all_others(ratio):
 
 
 def through_the_matrix(seen):
-    """The exact answer whose gradient autograd takes through every element of the matrix and its decomposition."""
+    """The exact answer whose gradient autograd takes through every element of the matrix and its
+    decomposition.
+    """
     return _hidden_pixels._by_factor(seen, _hidden_pixels._factor(seen))
 
 
 def slopes(leaves, probe, solve):
     picture, weight, transfer, power, pattern = (leaf.clone().requires_grad_() for leaf in leaves)
-    model = Blurred(picture, weight, torch.view_as_complex(transfer), power, probe.shape[-2:], 0.5, (pattern,))
+    model = Blurred(
+        picture, weight, torch.view_as_complex(transfer), power, probe.shape[-2:], 0.5, (pattern,)
+    )
     (space(model, solve(model)) * probe).sum().backward()
     return [leaf.grad for leaf in (picture, weight, transfer, power, pattern)]
 
@@ -236,7 +286,9 @@ def test_gradients_through_the_iteration_are_those_of_the_exact_answer(monkeypat
     size, rng = torus((46, 11), (8, 8)), torch.Generator().manual_seed(4)
     seen = problem((46, 11), size, 2, 0.5)
     weight = seen.weight * (0.5 + torch.rand(seen.weight.shape, generator=rng, dtype=torch.float64))
-    pattern, probe = (torch.randn(2, *n, generator=rng, dtype=torch.float64) for n in ((46, 11), size))
+    pattern, probe = (
+        torch.randn(2, *n, generator=rng, dtype=torch.float64) for n in ((46, 11), size)
+    )
     leaves = [seen.picture, weight, torch.view_as_real(seen.transfer), seen.power, pattern]
     exact = slopes(leaves, probe, through_the_matrix)
     found = slopes(leaves, probe, lambda model: most_likely(model, steps=200, enough=1e-14))
@@ -255,15 +307,23 @@ class Work(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         result = func(*args, **(kwargs or {}))
-        self.decompositions += any(name in str(func) for name in ("cholesky_ex", "linalg_solve", "lu_factor", "eigh"))
+        self.decompositions += any(
+            name in str(func) for name in ("cholesky_ex", "linalg_solve", "lu_factor", "eigh")
+        )
         first = result[0] if isinstance(result, tuple | list) and result else result
-        new = isinstance(first, torch.Tensor) and "view" not in str(func) and first.numel() >= self.side**2
+        new = (
+            isinstance(first, torch.Tensor)
+            and "view" not in str(func)
+            and first.numel() >= self.side**2
+        )
         self.matrices += new
         return result
 
 
 def test_the_gradient_of_a_picture_that_is_solved_exactly_needs_no_matrix_but_the_factor():
-    """Work is counted, not timed: one decomposition forward; one solve by its factor, and no matrix, backward."""
+    """Work is counted, not timed: one decomposition forward; one solve by its factor, and no
+    matrix, backward.
+    """
     picture, size = (20, 16), torus((20, 16), (6, 6))
     seen = problem(picture, size, 2, 0.5, hidden=0.2)
     leaf = seen.picture.clone().requires_grad_()
@@ -286,7 +346,9 @@ def test_gradcheck_of_a_picture_that_is_solved_exactly():
         model = replace(seen, picture=picture, transfer=torch.view_as_complex(through))
         return space(seen, most_likely(model))
 
-    leaves = [leaf.clone().requires_grad_() for leaf in (seen.picture, torch.view_as_real(seen.transfer))]
+    leaves = [
+        leaf.clone().requires_grad_() for leaf in (seen.picture, torch.view_as_real(seen.transfer))
+    ]
     assert torch.autograd.gradcheck(restored, leaves)
 
 
@@ -297,7 +359,9 @@ def test_halving_keeps_the_light_and_the_prior(picture):
     half = halved(replace(seen, picture=torch.ones_like(seen.picture)))
     assert half.torus == (size[0] // 2, size[1] // 2)
     assert half.picture.shape[-2:] == (-(-picture[0] // 2), -(-picture[1] // 2))
-    torch.testing.assert_close(half.picture[half.weight > 0], torch.ones_like(half.picture)[half.weight > 0])
+    torch.testing.assert_close(
+        half.picture[half.weight > 0], torch.ones_like(half.picture)[half.weight > 0]
+    )
     torch.testing.assert_close(half.transfer[..., 0, 0].real, seen.transfer[..., 0, 0].real)
     assert 0.8 < float(variance(half.power, half.torus)) <= 1.0
     assert float(half.weight.sum()) <= float(seen.weight.sum())

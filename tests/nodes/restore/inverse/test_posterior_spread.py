@@ -1,4 +1,6 @@
-"""The deviation of a restored pixel: the exact posterior in NumPy, and pictures that were not tuned on."""
+"""The deviation of a restored pixel: the exact posterior in NumPy, and pictures that were not
+tuned on.
+"""
 
 import numpy as np
 import pytest
@@ -25,9 +27,13 @@ BANDS = Bands(550e-9 * ONE, 1e-8 * ONE, ONE)
 
 
 def exact(electrons, kernel, known, glare, matrix):
-    """The posterior deviation from the definitions: every pixel of the torus an unknown, all covariances dense."""
+    """The posterior deviation from the definitions: every pixel of the torus an unknown, all
+    covariances dense.
+    """
     strengths = fitted(electrons, known, glare, [], 0.0) if len(glare) else []
-    picture = electrons - sum((s * g for s, g in zip(strengths, glare, strict=True)), np.zeros_like(electrons))
+    picture = electrons - sum(
+        (s * g for s, g in zip(strengths, glare, strict=True)), np.zeros_like(electrons)
+    )
     mean = mean_of(picture, known)
     power = spectrum()
     padded = np.pad(kernel, [(0, n - k) for n, k in zip(TORUS, kernel.shape, strict=True)])
@@ -47,13 +53,17 @@ def exact(electrons, kernel, known, glare, matrix):
     if len(glare):
         free = np.array([g.ravel()[rows] for g in glare]).T
         left = left + gain @ free @ np.linalg.solve(free.T @ inverse @ free, (gain @ free).T)
-    whole = left.reshape(CHANNELS, *TORUS, CHANNELS, *TORUS)[:, : SIZE[0], : SIZE[1], :, : SIZE[0], : SIZE[1]]
+    whole = left.reshape(CHANNELS, *TORUS, CHANNELS, *TORUS)[
+        :, : SIZE[0], : SIZE[1], :, : SIZE[0], : SIZE[1]
+    ]
     pixels = np.einsum("iyxjyx->ijyx", whole)
     return np.sqrt(np.einsum("ci,cj,ijyx->cyx", matrix, matrix, pixels))
 
 
 def spread(electrons, kernel, known, glare, matrix, **how):
-    given = [torch.from_numpy(np.ascontiguousarray(x)) for x in (electrons, kernel[None], ~known, matrix)]
+    given = [
+        torch.from_numpy(np.ascontiguousarray(x)) for x in (electrons, kernel[None], ~known, matrix)
+    ]
     channels = torch.ones(CHANNELS, 1, dtype=torch.float64)
     light = [torch.from_numpy(g) for g in glare]
     seed = torch.Generator().manual_seed(5)
@@ -71,7 +81,8 @@ def test_agrees_with_the_exact_posterior(patterns):
     ratio = found / expected
     assert abs(np.log((ratio**2).mean())) < 0.05
     assert np.abs(ratio**2 - 1).max() < 6 * np.sqrt(2 / count)
-    assert np.square(ratio**2 - 1).mean() < 1.5 * 2 / count  # the law of the mean of that many squares
+    # the law of the mean of that many squares
+    assert np.square(ratio**2 - 1).mean() < 1.5 * 2 / count
 
 
 def test_clipped_pixels_are_less_known_behind_a_sharp_lens():
@@ -91,11 +102,13 @@ def test_the_same_seed_gives_the_same_deviation_and_the_check_says_its_ends():
     assert "deviation from" in check.text
 
 
-# --- pictures that the filter was not tuned on, seen by a simulator of its own ---------------------------------------
+# --- pictures that the filter was not tuned on, seen by a simulator of its own --------------------
 
 
 def squares(size, rng):
-    """Overlapping rectangles of random shades, as things that hide one another: edges, flat parts, no law of 1 / f."""
+    """Overlapping rectangles of random shades, as things that hide one another: edges, flat
+    parts, no law of 1 / f.
+    """
     picture = np.full((3, size, size), 0.4)
     for _ in range(60):
         y, x = rng.integers(-10, size, 2)
@@ -113,7 +126,11 @@ def waves(size, rng):
         f = rng.uniform(0.5, 20)
         a, phase = rng.uniform(0, np.pi), rng.uniform(0, 2 * np.pi)
         tint = 1 + 0.2 * rng.standard_normal(3)
-        picture += tint[:, None, None] * f**-1.3 * np.cos(2 * np.pi * f * (y * np.sin(a) + x * np.cos(a)) + phase)
+        picture += (
+            tint[:, None, None]
+            * f**-1.3
+            * np.cos(2 * np.pi * f * (y * np.sin(a) + x * np.cos(a)) + phase)
+        )
     picture = (picture - picture.min()) / np.ptp(picture)
     return 0.1 + 0.8 * picture
 
@@ -125,12 +142,21 @@ def chinese_house(size, rng):
 
     with Image.open(str(files("neusee.recipes") / "samples" / "china.jpg")) as image:
         top, left = rng.integers(0, 150, 2)
-        codes = np.asarray(image.crop((left, top, left + 2 * size, top + 2 * size)).resize((size, size))) / 255.0
-    return np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4).transpose(2, 0, 1)
+        codes = (
+            np.asarray(
+                image.crop((left, top, left + 2 * size, top + 2 * size)).resize((size, size))
+            )
+            / 255.0
+        )
+    return np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4).transpose(
+        2, 0, 1
+    )
 
 
 def simulated(scene, kernel, well, top, rng):
-    """Blur by a sum of shifted pictures, then Poisson arrivals, read noise, whole numbers and a full well."""
+    """Blur by a sum of shifted pictures, then Poisson arrivals, read noise, whole numbers and a
+    full well.
+    """
     side = len(kernel)
     inner = scene.shape[-1] - side + 1
     image = sum(
@@ -154,7 +180,14 @@ def share_inside(kind, kernel, rng):
     kernel = kernel / kernel.sum()
     numbers, clipped, truth = simulated(kind(44, rng), kernel, 3000.0, 2850.0, rng)
     given = [torch.from_numpy(np.ascontiguousarray(x)) for x in (numbers, kernel[None], clipped)]
-    inputs = given[0], Psf(given[1], ONE), ONE, torch.ones(3, 1, dtype=torch.float64), BANDS, given[2]
+    inputs = (
+        given[0],
+        Psf(given[1], ONE),
+        ONE,
+        torch.ones(3, 1, dtype=torch.float64),
+        BANDS,
+        given[2],
+    )
     seed, colours, draws = torch.Generator().manual_seed(1), torch.eye(3, dtype=torch.float64), 8
     restored = wiener(*inputs, read_noise=READ).numpy()
     deviation = wiener_spread(*inputs, colours, read_noise=READ, draws=draws, rng=seed).numpy()
@@ -163,7 +196,9 @@ def share_inside(kind, kernel, rng):
 
 @pytest.mark.slow
 def test_intervals_of_90_percent_hold_the_scene_in_85_to_95_percent_of_pixels():
-    """In eight of nine frames. The ninth, an even sky with one thing at its border, may have fewer."""
+    """In eight of nine frames. The ninth, an even sky with one thing at its border, may have
+    fewer.
+    """
     inside = []
     for kind in (squares, waves, chinese_house):
         rng = np.random.default_rng(11)

@@ -1,12 +1,13 @@
-"""Richardson-Lucy deconvolution: against matrices in NumPy, its likelihood, and a lamp beside a dark scene."""
+"""Richardson-Lucy deconvolution: against matrices in NumPy, its likelihood, and a lamp beside a
+dark scene.
+"""
 
 import numpy as np
 import pytest
 import torch
 
 from neusee.nodes import restore
-from neusee.nodes.restore._inverse._fft_grid import torus
-from neusee.nodes.restore._inverse._psf_on_grid import edge
+from neusee.nodes.restore._inverse._masked_blur import edge, torus
 from neusee.nodes.values import Bands, Psf
 
 ONE = torch.ones(1, dtype=torch.float64)
@@ -38,14 +39,21 @@ def blur_matrix(values, picture, wide):
 
 
 def by_matrix(counts, known, design, iterations, variance, patterns=()):
-    """The multiplicative update of Richardson and Lucy from its definition, with all pixels of the grid unknown."""
+    """The multiplicative update of Richardson and Lucy from its definition, with all pixels of
+    the grid unknown.
+    """
     mean = (counts * known).sum() / known.sum()
-    scene, strengths = np.full(design.shape[1], mean / design.sum(1).max()), np.full(len(patterns), mean)
+    scene, strengths = (
+        np.full(design.shape[1], mean / design.sum(1).max()),
+        np.full(len(patterns), mean),
+    )
     columns = np.array(patterns).reshape(len(patterns), known.size).T
     for _ in range(iterations):
         expected = design @ scene + columns @ strengths + variance
         ratio = known * np.maximum(counts + variance, 0) / expected
-        scene = scene * (design.T @ ratio) / np.maximum(design.T @ known, 1e-3 * design.sum(1).max())
+        scene = (
+            scene * (design.T @ ratio) / np.maximum(design.T @ known, 1e-3 * design.sum(1).max())
+        )
         strengths = strengths * (columns.T @ ratio) / (columns.T @ known)
     return scene
 
@@ -61,9 +69,14 @@ def test_equals_the_update_by_matrices(pattern):
     matrix = blur_matrix(values, size, wide)
     expected = by_matrix(counts.ravel(), known.ravel().astype(float), matrix, 12, 100.0, scaled)
     found = restore.richardson_lucy(
-        torch.from_numpy(counts)[None], psf_of(values), *GREY, torch.from_numpy(~known)[None],
-        **({pattern: [torch.from_numpy(glare)[None]]} if pattern else {}), iterations=12, read_noise=10.0,
-    )  # fmt: skip
+        torch.from_numpy(counts)[None],
+        psf_of(values),
+        *GREY,
+        torch.from_numpy(~known)[None],
+        **({pattern: [torch.from_numpy(glare)[None]]} if pattern else {}),
+        iterations=12,
+        read_noise=10.0,
+    )
     np.testing.assert_allclose(found[0].numpy(), expected.reshape(wide)[:9, :8], rtol=1e-9)
 
 
@@ -87,7 +100,9 @@ def test_each_step_raises_the_likelihood():
 
 
 def night(side=64):
-    """A road of at most 7 % of white, and a lamp 300 times as bright as white, behind a blur with a wide skirt."""
+    """A road of at most 7 % of white, and a lamp 300 times as bright as white, behind a blur
+    with a wide skirt.
+    """
     rng = np.random.default_rng(4)
     scene = np.kron(5 + 60 * rng.random((side // 8, side // 8)), np.ones((8, 8)))
     scene[20:22, 30:32] = 3e5
@@ -112,7 +127,10 @@ def test_a_lamp_beside_a_dark_scene_is_restored_better_than_by_wiener():
     inputs = (seen, psf_of(values), *GREY, seen >= 25500.0)
     found = restore.richardson_lucy(*inputs, read_noise=10.0)
     assert float(found.min()) >= 0
-    before, wiener = error(seen[0].numpy(), scene), error(restore.wiener(*inputs, read_noise=10.0)[0].numpy(), scene)
+    before, wiener = (
+        error(seen[0].numpy(), scene),
+        error(restore.wiener(*inputs, read_noise=10.0)[0].numpy(), scene),
+    )
     now = error(found[0].numpy(), scene)
     assert now < 0.8 * before
     assert now < 0.8 * wiener
@@ -122,21 +140,29 @@ def test_a_lamp_beside_a_dark_scene_is_restored_better_than_by_wiener():
 def test_a_picture_without_light_is_dark(value):
     picture = torch.full((1, 16, 16), value)
     hidden = torch.zeros(1, 16, 16, dtype=torch.bool)
-    found = restore.richardson_lucy(picture, psf_of(kernel()), *GREY, hidden, [torch.ones(1, 16, 16)], read_noise=0.0)
+    found = restore.richardson_lucy(
+        picture, psf_of(kernel()), *GREY, hidden, [torch.ones(1, 16, 16)], read_noise=0.0
+    )
     assert torch.equal(found, torch.zeros_like(picture))
 
 
 def test_a_picture_that_is_clipped_everywhere_is_finite_and_bad_inputs_are_refused():
     picture = torch.full((1, 16, 16), 25500.0)
     inputs = (psf_of(kernel()), *GREY)
-    found = restore.richardson_lucy(picture, *inputs, torch.ones(1, 16, 16, dtype=torch.bool), read_noise=10.0)
+    found = restore.richardson_lucy(
+        picture, *inputs, torch.ones(1, 16, 16, dtype=torch.bool), read_noise=10.0
+    )
     assert bool(found.isfinite().all())
     with pytest.raises(ValueError, match="must have the same channels and pixels"):
-        restore.richardson_lucy(picture, *inputs, torch.zeros(1, 8, 8, dtype=torch.bool), read_noise=10.0)
+        restore.richardson_lucy(
+            picture, *inputs, torch.zeros(1, 8, 8, dtype=torch.bool), read_noise=10.0
+        )
     broken = picture.clone()
     broken[0, 3, 3] = float("nan")
     with pytest.raises(ValueError, match="electrons holds values that are not finite"):
-        restore.richardson_lucy(broken, *inputs, torch.zeros(1, 16, 16, dtype=torch.bool), read_noise=10.0)
+        restore.richardson_lucy(
+            broken, *inputs, torch.zeros(1, 16, 16, dtype=torch.bool), read_noise=10.0
+        )
 
 
 def test_single_precision_keeps_the_stated_error():
@@ -152,7 +178,9 @@ def test_no_scale_of_picture_and_psf_overflows():
     counts = torch.from_numpy(rng.random((1, 24, 24)) * 900).float()
     clipped = torch.zeros(1, 24, 24, dtype=torch.bool)
     found = [
-        restore.richardson_lucy(counts * by, psf_of(values.astype(np.float32) * by), *GREY, clipped, read_noise=0.0)
+        restore.richardson_lucy(
+            counts * by, psf_of(values.astype(np.float32) * by), *GREY, clipped, read_noise=0.0
+        )
         for by in (1.0, 1e18)
     ]
     assert found[1].isfinite().all()

@@ -1,4 +1,6 @@
-"""Light of a laser that a lens scatters: found from speckle that NumPy draws, and removed better than without."""
+"""Light of a laser that a lens scatters: found from speckle that NumPy draws, and removed better
+than without.
+"""
 
 from functools import partial
 
@@ -7,9 +9,8 @@ import pytest
 import torch
 
 from neusee.nodes.restore import wiener, wiener_by_field, wiener_spread
-from neusee.nodes.restore._inverse._glare import visible
-from neusee.nodes.restore._inverse._picture_scale import shared_level
-from neusee.nodes.restore._inverse._scattered_glare import RADII, _likeliest, with_smooth
+from neusee.nodes.restore._inverse._glare import RADII, _likeliest, visible, with_smooth
+from neusee.nodes.restore._inverse._wiener_prior import shared_level
 from neusee.nodes.values import Bands, MeasuredPsf, Psf
 
 SIDE, READ, WELL = 96, 5.0, 25000.0
@@ -22,7 +23,9 @@ WHITE = torch.tensor([[0.9], [1.0], [0.6]], dtype=torch.float64)  #: responses
 def blurred(picture, width):
     """A picture on a torus, convolved with a Gaussian of a standard deviation in pixels."""
     fy, fx = np.fft.fftfreq(SIDE)[:, None], np.fft.fftfreq(SIDE)
-    return np.fft.ifft2(np.fft.fft2(picture) * np.exp(-2 * (np.pi * width) ** 2 * (fy**2 + fx**2))).real
+    return np.fft.ifft2(
+        np.fft.fft2(picture) * np.exp(-2 * (np.pi * width) ** 2 * (fy**2 + fx**2))
+    ).real
 
 
 def speckle(rng):
@@ -34,19 +37,25 @@ def speckle(rng):
 
 def scene(rng):
     fy, fx = np.fft.fftfreq(SIDE)[:, None], np.fft.fftfreq(SIDE)
-    rough = np.fft.fft2(rng.standard_normal((4, SIDE, SIDE))) * (fy**2 + fx**2 + SIDE**-2.0) ** -0.75
+    rough = (
+        np.fft.fft2(rng.standard_normal((4, SIDE, SIDE))) * (fy**2 + fx**2 + SIDE**-2.0) ** -0.75
+    )
     rough = np.fft.ifft2(rough).real
     rough /= rough.std((1, 2), keepdims=True)
     return 5000 * WHITE.numpy()[:, :, None] * np.exp(0.3 * (0.975 * rough[3] + 0.22 * rough[:3]))
 
 
 def frame(strength, shares, seed):
-    """The scene, a frame of it with a laser, and the laser as a clean lens would show it: (channel, y, x) each."""
+    """The scene, a frame of it with a laser, and the laser as a clean lens would show it:
+    (channel, y, x) each.
+    """
     rng = np.random.default_rng(seed)
     y, x = np.indices((SIDE, SIDE))
     away = np.hypot(y - 40, x - 55)
     told = strength * np.cos(2.0 * away) ** 2 / (1 + away) ** 3
-    wide = sum(share * blurred(told, radius / 1.7) for share, radius in zip(shares, RADII, strict=True))
+    wide = sum(
+        share * blurred(told, radius / 1.7) for share, radius in zip(shares, RADII, strict=True)
+    )
     light = COLOUR * np.abs(np.sqrt(told) + np.sqrt(wide) * speckle(rng)) ** 2
     true = scene(rng)
     seen = rng.poisson(true + light) + READ * rng.standard_normal(true.shape)
@@ -91,7 +100,9 @@ def test_a_picture_is_restored_better_when_light_is_scattered_and_as_well_when_n
         for shares in ((0.2, 0.01, 0.02), (0.0, 0.0, 0.0)):
             true, seen, told = frame(strength, shares, seed)
             clipped = seen >= WELL
-            errors.append([rms(restored(seen, told, scatter), true, clipped) for scatter in (True, False)])
+            errors.append(
+                [rms(restored(seen, told, scatter), true, clipped) for scatter in (True, False)]
+            )
     errors = np.log(np.array(errors).reshape(2, 2, 2)).mean(0)
     assert errors[0, 0] < errors[0, 1] - 0.05
     assert errors[1, 0] < errors[1, 1] + 0.05
@@ -104,7 +115,10 @@ def test_the_interval_knows_of_scattered_light(strength):
         true, seen, told = frame(strength, (0.2, 0.01, 0.02), seed)
         known = seen < WELL
         error = restored(seen, told, True) - true
-        more = {"before": [torch.eye(3, dtype=torch.float64)], "rng": torch.Generator().manual_seed(seed)}
+        more = {
+            "before": [torch.eye(3, dtype=torch.float64)],
+            "rng": torch.Generator().manual_seed(seed),
+        }
         spread = restored(seen, told, True, wiener_spread, **more)
         shares.append(np.mean(np.abs(error)[known] < 1.7 * spread[known]))
     assert 0.8 < np.mean(shares) < 0.99
@@ -115,7 +129,9 @@ def test_a_channel_that_glare_covers_takes_the_level_of_others():
     level = white * torch.tensor([100.0, 100.0, 7.0], dtype=torch.float64)[:, None, None]
     trust = torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)[:, None, None]
     torch.testing.assert_close(shared_level(level, trust, white), 100.0 * white)
-    torch.testing.assert_close(shared_level(100.0 * white, torch.zeros_like(trust), white), 100.0 * white)
+    torch.testing.assert_close(
+        shared_level(100.0 * white, torch.zeros_like(trust), white), 100.0 * white
+    )
     own = shared_level(level, torch.ones_like(trust), white)
     assert 7.0 < float(own[2] / white[2]) < 9.0
 
@@ -131,10 +147,15 @@ def test_without_glare_or_known_pixels_nothing_is_scattered():
 
 def test_the_result_has_a_derivative_with_respect_to_the_glare():
     _, seen, told = frame(1e6, (0.2, 0.01, 0.02), 9)
-    seen, told = torch.from_numpy(seen[:, 20:44, 40:64].copy()), torch.from_numpy(told[:, 20:44, 40:64].copy())
+    seen, told = (
+        torch.from_numpy(seen[:, 20:44, 40:64].copy()),
+        torch.from_numpy(told[:, 20:44, 40:64].copy()),
+    )
     told.requires_grad_(True)
     psf = Psf(torch.ones(1, 1, 1, dtype=torch.float64), ONE)
-    found = wiener(seen, psf, ONE, WHITE, BANDS, seen >= WELL, [told], scatter=True, read_noise=READ)
+    found = wiener(
+        seen, psf, ONE, WHITE, BANDS, seen >= WELL, [told], scatter=True, read_noise=READ
+    )
     (slope,) = torch.autograd.grad(found.sum(), told)
     assert bool(slope.isfinite().all())
     assert bool((slope != 0).any())
@@ -144,7 +165,9 @@ def test_a_measured_psf_takes_scattered_light_too():
     true, seen, told = frame(1e7, (0.2, 0.01, 0.02), 3)
     one = torch.ones(1, 1, 3, 1, 1, dtype=torch.float64)
     rest = torch.zeros(1, 4, dtype=torch.float64)
-    measured = MeasuredPsf(one, 0 * one, one[None].float(), rest, rest[0, :3], rest[0, :3], one[:, :, 0, 0, 0], one)
+    measured = MeasuredPsf(
+        one, 0 * one, one[None].float(), rest, rest[0, :3], rest[0, :3], one[:, :, 0, 0, 0], one
+    )
     seen, told = torch.from_numpy(seen), torch.from_numpy(told)
     errors = []
     for how in ({"scatter": True}, {"doubt": None, "least_doubt": 0.3}):

@@ -1,4 +1,6 @@
-"""A border wider than the reach of the PSF: opposite ends of a picture need not agree, against dense NumPy algebra."""
+"""A border wider than the reach of the PSF: opposite ends of a picture need not agree, against
+dense NumPy algebra.
+"""
 
 import numpy as np
 import pytest
@@ -6,7 +8,7 @@ import torch
 
 from neusee.nodes.restore import wiener, wiener_spread
 from neusee.nodes.restore._inverse import _wiener
-from neusee.nodes.restore._inverse._picture_scale import about_mean, expected_variance, fall
+from neusee.nodes.restore._inverse._wiener_prior import about_mean, expected_variance, fall
 from neusee.nodes.values import Bands, Psf
 
 ONE = torch.ones(1, dtype=torch.float64)
@@ -42,22 +44,33 @@ def law(period, wide):
 
 def restored(electrons, kernel, **how):
     psf = Psf(torch.tensor(kernel)[None], ONE)
-    channels, clipped = torch.ones(1, 1, dtype=torch.float64), torch.zeros(1, SIDE, SIDE, dtype=torch.bool)
+    channels, clipped = (
+        torch.ones(1, 1, dtype=torch.float64),
+        torch.zeros(1, SIDE, SIDE, dtype=torch.bool),
+    )
     picture = torch.tensor(electrons)[None]
     return wiener(picture, psf, ONE, channels, BANDS, clipped, read_noise=READ, **how)[0].numpy()
 
 
 def model(scaled):
-    """Prior of a scene that does not repeat, camera and noise as matrices, in the units of a posed filter."""
+    """Prior of a scene that does not repeat, camera and noise as matrices, in the units of a
+    posed filter.
+    """
     covariance, side = law(2 * SIDE, 64 * SIDE), SIDE + 2 * REACH
     at = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1).reshape(-1, 2)
     apart = at[:, None] - at
     camera = np.zeros((SIDE * SIDE, side * side))
     for row, (y, x) in enumerate(np.ndindex(SIDE, SIDE)):
         window = np.zeros((side, side))
-        window[y : y + 2 * REACH + 1, x : x + 2 * REACH + 1] = ring()[::-1, ::-1] / float(scaled.share)
+        window[y : y + 2 * REACH + 1, x : x + 2 * REACH + 1] = ring()[::-1, ::-1] / float(
+            scaled.share
+        )
         camera[row] = window.ravel()
-    return covariance[apart[..., 0], apart[..., 1]], camera, np.diag(1 / scaled.problem.weight[0].numpy().ravel())
+    return (
+        covariance[apart[..., 0], apart[..., 1]],
+        camera,
+        np.diag(1 / scaled.problem.weight[0].numpy().ravel()),
+    )
 
 
 def inner(values):
@@ -66,7 +79,9 @@ def inner(values):
 
 
 def dense(scaled):
-    """The mean of the posterior of a scene that does not repeat, for the mean, scale and weights of a posed filter."""
+    """The mean of the posterior of a scene that does not repeat, for the mean, scale and weights
+    of a posed filter.
+    """
     prior, camera, noise = model(scaled)
     seen = scaled.problem.picture[0].numpy().ravel()
     found = prior @ camera.T @ np.linalg.solve(camera @ prior @ camera.T + noise, seen)
@@ -76,7 +91,9 @@ def dense(scaled):
 def dense_variance(scaled):
     """The mean variance of the pixels of the frame in that posterior."""
     prior, camera, noise = model(scaled)
-    left = prior - prior @ camera.T @ np.linalg.solve(camera @ prior @ camera.T + noise, camera @ prior)
+    left = prior - prior @ camera.T @ np.linalg.solve(
+        camera @ prior @ camera.T + noise, camera @ prior
+    )
     return inner(np.diag(left)).mean() * (float(scaled.scale) / float(scaled.share)) ** 2
 
 
@@ -96,7 +113,9 @@ def posed(electrons, border):
     kernel = torch.tensor(ring())[None]
     known = torch.ones(1, SIDE, SIDE, dtype=torch.float64)
     settings = _wiener.Settings(1.0, READ, border=border)
-    return _wiener.posed(torch.tensor(electrons)[None], known, kernel, _wiener.visible([], [], known), settings)
+    return _wiener.posed(
+        torch.tensor(electrons)[None], known, kernel, _wiener.visible([], [], known), settings
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -119,18 +138,26 @@ def test_a_scene_whose_ends_differ_is_restored_better(seed):
     picture = valid(ramp, ring())
     noisy = picture + rng.standard_normal(picture.shape) * np.sqrt(picture + READ**2)
     inside = slice((wide - SIDE) // 2, (wide + SIDE) // 2)
-    errors = [np.std(restored(noisy, ring(), border=border) - ramp[inside, inside]) for border in (1.0, 2.0)]
+    errors = [
+        np.std(restored(noisy, ring(), border=border) - ramp[inside, inside])
+        for border in (1.0, 2.0)
+    ]
     assert errors[1] < 0.75 * errors[0]
 
 
-@pytest.mark.parametrize(("picture", "torus"), [((5, 4), (12, 15)), ((6, 6), (6, 6)), ((1, 7), (3, 20))])
+@pytest.mark.parametrize(
+    ("picture", "torus"), [((5, 4), (12, 15)), ((6, 6), (6, 6)), ((1, 7), (3, 20))]
+)
 def test_the_variance_about_the_mean_is_that_of_the_covariance(picture, torus):
     rng = np.random.default_rng(1)
     kernel = rng.uniform(0, 1, torus)
     power = fall(torus)
     transfer = torch.fft.rfft2(torch.tensor(kernel))[None]
     found = float(expected_variance(transfer, about_mean(power, picture, torus), torus))
-    whole = np.abs(np.fft.fft2(kernel)) ** 2 * np.fft.fft2(torch.fft.irfft2(power, s=torus).numpy()).real
+    whole = (
+        np.abs(np.fft.fft2(kernel)) ** 2
+        * np.fft.fft2(torch.fft.irfft2(power, s=torus).numpy()).real
+    )
     covariance = np.fft.ifft2(whole).real
     at = np.stack(np.meshgrid(*map(np.arange, picture), indexing="ij"), -1).reshape(-1, 2)
     apart = at[:, None] - at
@@ -150,10 +177,22 @@ def test_the_deviation_of_drawn_scenes_is_that_of_the_wider_border():
     clipped = torch.zeros(1, SIDE, SIDE, dtype=torch.bool)
     found = [
         wiener_spread(
-            torch.tensor(electrons)[None], psf, ONE, one, BANDS, clipped, one, law="filter", draws=64, border=border,
-            read_noise=READ, rng=torch.Generator().manual_seed(3),
-        ).square().mean()
+            torch.tensor(electrons)[None],
+            psf,
+            ONE,
+            one,
+            BANDS,
+            clipped,
+            one,
+            law="filter",
+            draws=64,
+            border=border,
+            read_noise=READ,
+            rng=torch.Generator().manual_seed(3),
+        )
+        .square()
+        .mean()
         for border in (1.0, 2.0)
-    ]  # fmt: skip
+    ]
     assert float(found[1]) == pytest.approx(dense_variance(posed(electrons, 2.0)), rel=0.15)
     assert float(found[0]) < 0.8 * float(found[1])

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from neusee.nodes.optics import image
 from neusee.nodes.restore import wiener
 from neusee.nodes.restore._inverse import _wiener
-from neusee.nodes.restore._inverse._fft_grid import DENSE
 from neusee.nodes.restore._inverse._glare import strengths
-from neusee.nodes.restore._inverse._grey_psf import effective_psf
+from neusee.nodes.restore._inverse._masked_blur import DENSE, effective_psf
 from neusee.nodes.sensor import crop
 from neusee.nodes.spectra import bands, illuminant, leaves, reflectances, responses
 from neusee.nodes.values import Bands, Psf
@@ -33,7 +32,9 @@ def scene(size=96):
     picture = torch.zeros(size, size)
     for width in (size // 3, size // 6, size // 12):
         n = size // width
-        picture += torch.rand(n, n, generator=rng).repeat_interleave(width, 0).repeat_interleave(width, 1)
+        picture += (
+            torch.rand(n, n, generator=rng).repeat_interleave(width, 0).repeat_interleave(width, 1)
+        )
     return 16000 * (picture / picture.max())[None]
 
 
@@ -47,7 +48,9 @@ def seen(truth, psf, border="reflect", seed=0):
 def run(electrons, psf, clipped=None, glare=None, **how):
     marked = torch.zeros(electrons.shape, dtype=torch.bool) if clipped is None else clipped
     channels = torch.ones(len(electrons), 1, dtype=torch.float64)
-    return wiener(electrons, psf, ONE, channels, BANDS, marked, glare, **{"read_noise": 10.5, **how})
+    return wiener(
+        electrons, psf, ONE, channels, BANDS, marked, glare, **{"read_noise": 10.5, **how}
+    )
 
 
 def error(a, b):
@@ -66,7 +69,9 @@ def test_restores_what_a_disc_blurred(radius, border):
 
 
 def test_light_that_came_over_the_edge_is_not_amplified():
-    """A PSF as wide as the picture, and nothing beyond the edge: worse than noise, and the mean is still safe."""
+    """A PSF as wide as the picture, and nothing beyond the edge: worse than noise, and the mean
+    is still safe.
+    """
     truth, psf = scene(), disc(40, 95)
     blurred = seen(truth, psf, "zero")
     assert error(run(blurred, psf), truth) < error(blurred, truth)
@@ -86,7 +91,9 @@ def test_lost_light_is_put_back():
 
 @pytest.mark.parametrize("power", [-30, -17, -10, 4])
 def test_a_grey_filter_scales_the_scene_of_the_same_electrons(power):
-    """A power of two divides and multiplies without rounding; floors of the program made strong filters too dark."""
+    """A power of two divides and multiplies without rounding; floors of the program made strong
+    filters too dark.
+    """
     psf = disc(2.0)
     electrons = seen(scene(48), psf)
     plain, dimmed = run(electrons, psf), run(electrons, Psf(psf.intensity * 2.0**power, ONE))
@@ -115,7 +122,9 @@ def test_a_clipped_laser_does_not_ring_everywhere():
 
 
 def test_each_channel_has_its_own_psf():
-    line = Bands(*(torch.tensor(x, dtype=torch.float64) for x in ([400e-9, 700e-9], [1e-8] * 2, [1.0] * 2)))
+    line = Bands(
+        *(torch.tensor(x, dtype=torch.float64) for x in ([400e-9, 700e-9], [1e-8] * 2, [1.0] * 2))
+    )
     psf = Psf(torch.stack([disc(1).intensity[0], disc(3).intensity[0]]), torch.ones(2))
     seen_by = torch.tensor([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
     found = effective_psf(psf, torch.tensor([3.0, 1.0]), seen_by, line)
@@ -126,7 +135,9 @@ def test_each_channel_has_its_own_psf():
 
 
 def photographs(count, size=16):
-    """Pictures of measured reflectances in daylight, as a camera's three channels see them: (channel, y, x)."""
+    """Pictures of measured reflectances in daylight, as a camera's three channels see them:
+    (channel, y, x).
+    """
     visible = bands(start=400e-9, stop=700e-9, count=31)
     seen_by = responses(visible) * illuminant(visible) * visible.centres
     seen_by, measured = (seen_by / seen_by.sum(1, keepdim=True)).float(), reflectances(visible)
@@ -136,7 +147,9 @@ def photographs(count, size=16):
         yield torch.tensordot(seen_by, leaves(spectra, visible, shape=(size, size), rng=rng), 1)
 
 
-def test_of_measured_colours_no_other_correlation_of_channels_tells_more_of_a_hidden_one(monkeypatch):
+def test_of_measured_colours_no_other_correlation_of_channels_tells_more_of_a_hidden_one(
+    monkeypatch,
+):
     errors, tried = {}, [0.0, 0.3, 0.6, 0.8, 0.99]
     for grey in ["as shipped", *tried]:
         if grey in tried:
@@ -146,7 +159,9 @@ def test_of_measured_colours_no_other_correlation_of_channels_tells_more_of_a_hi
             hidden = torch.zeros(picture.shape, dtype=torch.bool)
             hidden[n % 3, 4:12, 4:12] = True
             truth = 5000 * picture
-            raw = torch.cat([seen(channel[None], disc(0), seed=n + 10 * c) for c, channel in enumerate(truth)])
+            raw = torch.cat(
+                [seen(channel[None], disc(0), seed=n + 10 * c) for c, channel in enumerate(truth)]
+            )
             apart.append((run(raw, disc(0), hidden) - truth)[hidden].square().mean())
         errors[grey] = float(torch.stack(apart).mean().sqrt())
     assert errors["as shipped"] < 1.02 * min(errors.values())
@@ -165,7 +180,9 @@ def test_finite_at_every_extreme(y, x, size, value, share, read):
     electrons = torch.full((2, y, x), value)
     clipped = torch.rand(2, y, x, generator=torch.Generator().manual_seed(1)) < share
     for kernel in (torch.rand(1, size, size), torch.zeros(1, size, size)):
-        found = run(electrons, Psf(kernel, ONE), clipped, [torch.ones(2, y + 1, x + 2)], read_noise=read)
+        found = run(
+            electrons, Psf(kernel, ONE), clipped, [torch.ones(2, y + 1, x + 2)], read_noise=read
+        )
         assert found.shape == electrons.shape
         assert torch.isfinite(found).all()
 
@@ -186,7 +203,9 @@ def test_value_and_gradients_in_single_precision_are_those_of_double(size):
     clipped = bright > bright.quantile(0.7)
     values = []
     for dtype in (torch.float32, torch.float64):
-        leaves = [x.to(dtype).requires_grad_() for x in (bright.clone(), kernel.clone(), crossing.clone())]
+        leaves = [
+            x.to(dtype).requires_grad_() for x in (bright.clone(), kernel.clone(), crossing.clone())
+        ]
         found = run(leaves[0], Psf(leaves[1], ONE), clipped, [leaves[2]])
         weights = torch.rand(found.shape, generator=torch.Generator().manual_seed(5)).to(found)
         values.append([found.detach(), *torch.autograd.grad((weights * found).sum(), leaves)])
@@ -204,7 +223,10 @@ def crossed(size=96):
     """Glare of a laser: a cross of stripes, wider than the picture."""
     y = torch.arange(2 * size) - size
     wave = torch.cos(y / 3.0).square()
-    return (wave[:, None] * torch.exp(-((y[None] / 20.0) ** 2)) + wave * torch.exp(-((y[:, None] / 20.0) ** 2)))[None]
+    return (
+        wave[:, None] * torch.exp(-((y[None] / 20.0) ** 2))
+        + wave * torch.exp(-((y[:, None] / 20.0) ** 2))
+    )[None]
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-6, 1e6])
@@ -220,11 +242,15 @@ def test_a_laser_that_is_not_there_or_not_seen_changes_little():
     truth, psf = scene(), disc(4)
     alone = run(seen(truth, psf), psf)
     assert torch.equal(run(seen(truth, psf), psf, glare=[0 * crossed()]), alone)
-    assert error(run(seen(truth, psf), psf, glare=[crossed(), crossed()]), alone) < 0.1 * error(alone, truth)
+    assert error(run(seen(truth, psf), psf, glare=[crossed(), crossed()]), alone) < 0.1 * error(
+        alone, truth
+    )
 
 
 def test_what_lies_beyond_the_edge_is_unknown_not_mirrored():
-    """Half of the light of the rim comes from outside, and the picture is better than before even there."""
+    """Half of the light of the rim comes from outside, and the picture is better than before
+    even there.
+    """
     wide, psf = scene(192), disc(16, 65)
     truth, blurred = (x[:, 48:-48, 48:-48] for x in (wide, seen(wide, psf)))
     found = run(blurred, psf)
@@ -244,7 +270,9 @@ def test_check_says_what_was_not_seen():
     clipped[0, 0, 0] = True
     (line,) = wiener.hooks.check(electrons, electrons, None, None, None, None, clipped)
     assert line.text == f"{1 / 16:.2%} of pixels clipped, restored mean 1.00 of raw mean"
-    assert not wiener.hooks.check(electrons * math.nan, electrons, None, None, None, None, clipped)[0].ok
+    assert not wiener.hooks.check(electrons * math.nan, electrons, None, None, None, None, clipped)[
+        0
+    ].ok
 
 
 def test_the_first_guess_of_the_glare_is_least_squares_beside_a_constant():
@@ -255,14 +283,19 @@ def test_the_first_guess_of_the_glare_is_least_squares_beside_a_constant():
     fit_one, fit_two = strengths(electrons, known, [one, two])
     found = fit_one * one + fit_two * two
     seen = known.double()
-    centred = [p - (seen * p).sum((1, 2), keepdim=True) / seen.sum((1, 2), keepdim=True) for p in (one, two)]
+    centred = [
+        p - (seen * p).sum((1, 2), keepdim=True) / seen.sum((1, 2), keepdim=True)
+        for p in (one, two)
+    ]
     design = torch.stack([(seen * c).flatten() for c in centred], 1)
     fit = torch.linalg.solve(design.T @ design, design.T @ electrons.double().flatten())
     torch.testing.assert_close(found, (fit[0] * one + fit[1] * two).float(), rtol=1e-5, atol=1e-6)
 
 
 def test_a_narrow_psf_needs_no_coarser_grids():
-    """Dim light behind a grey filter: read noise of 10.5 e- and a fall of the PSF as wide as the window."""
+    """Dim light behind a grey filter: read noise of 10.5 e- and a fall of the PSF as wide as the
+    window.
+    """
     at = torch.arange(-32, 33).double()
     kernel = (1 + (at[:, None].square() + at.square()) / 1.5**2).pow(-1.5)
     psf = Psf((kernel / kernel.sum()).float()[None], ONE)
@@ -271,4 +304,5 @@ def test_a_narrow_psf_needs_no_coarser_grids():
     exact = run(electrons[..., :DENSE, :DENSE], psf)
     assert error(alone, nested) < 0.01 * float(nested.std())
     assert error(alone, nested) > 0  # another start of the iteration
-    assert run(electrons[..., :DENSE, :DENSE], psf, coarser_grids=False).equal(exact)  # solved without an iteration
+    # solved without an iteration
+    assert run(electrons[..., :DENSE, :DENSE], psf, coarser_grids=False).equal(exact)

@@ -1,7 +1,9 @@
-"""A camera and its lasers in NumPy alone, which shares no line with what it judges: direct sums, own noise, own scenes.
+"""A camera and its lasers in NumPy alone, which shares no line with what it judges: direct sums,
+own noise, own scenes.
 
-The field in the pupil is summed over all samples for each row and column of pixels. A scene is three smooth spectra,
-mixed by the colours of a picture; a lamp has a spectrum over all bands. Photons are Poisson, the converter rounds down.
+The field in the pupil is summed over all samples for each row and column of pixels. A scene is
+three smooth spectra, mixed by the colours of a picture; a lamp has a spectrum over all bands.
+Photons are Poisson, the converter rounds down.
 """
 
 from dataclasses import dataclass, field
@@ -14,7 +16,8 @@ from scipy.signal import fftconvolve
 FOCAL, PITCH, DIAMETER, SAMPLES = 0.11, 2.9e-6, 11e-3, 256
 BANDS = np.linspace(400e-9, 700e-9, 31)
 WELL, READ, GAIN, OFFSET, BITS = 25500.0, 6.0, 0.5, 60.0, 16  # e-, e-, DN/e-, e-
-PEAKS = np.array([[600e-9, 42e-9, 1.0], [540e-9, 45e-9, 1.0], [455e-9, 32e-9, 0.9]])  #: centre, sd, height of a channel
+#: centre, sd, height of a channel
+PEAKS = np.array([[600e-9, 42e-9, 1.0], [540e-9, 45e-9, 1.0], [455e-9, 32e-9, 0.9]])
 SAMPLE = Path(__file__).parents[4] / "recipes" / "samples" / "china.jpg"
 
 
@@ -28,7 +31,12 @@ def silica(wavelength):
 def response(wavelength):
     """Relative response of red, green and blue: (channel, ...)."""
     each = [h * np.exp(-0.5 * ((np.asarray(wavelength) - c) / s) ** 2) for c, s, h in PEAKS]
-    return np.stack([0.98 * e + 0.02 * np.exp(-0.5 * ((np.asarray(wavelength) - 560e-9) / 80e-9) ** 2) for e in each])
+    return np.stack(
+        [
+            0.98 * e + 0.02 * np.exp(-0.5 * ((np.asarray(wavelength) - 560e-9) / 80e-9) ** 2)
+            for e in each
+        ]
+    )
 
 
 def daylight(wavelength):
@@ -61,13 +69,16 @@ def pupil(mask):
 
 
 def pattern(mask, wavelength, spot, shape):
-    """Share of the clear pupil's light in each pixel; ``spot`` is in pixels from the middle pixel."""
+    """Share of the clear pupil's light in each pixel; ``spot`` is in pixels from the middle
+    pixel.
+    """
     inside, height = pupil(mask)
     field = inside * np.exp(2j * np.pi * silica(wavelength) * height / wavelength)
     reach = DIAMETER / SAMPLES * PITCH / (wavelength * FOCAL)
     at = np.arange(SAMPLES) - (SAMPLES - 1) / 2
     rows, columns = (
-        np.exp(-2j * np.pi * reach * np.outer(np.arange(n) - n // 2 - s, at)) for n, s in zip(shape, spot, strict=True)
+        np.exp(-2j * np.pi * reach * np.outer(np.arange(n) - n // 2 - s, at))
+        for n, s in zip(shape, spot, strict=True)
     )
     return np.abs(rows @ field @ columns.T) ** 2 * reach**2 / (inside**2).sum()
 
@@ -91,14 +102,17 @@ def scene_psf(mask, side):
 def clear_peak(wavelength):
     """The brightest pixel behind the clear lens."""
     inside, _ = pupil("plain")
-    return (inside.sum() * DIAMETER / SAMPLES * PITCH / (wavelength * FOCAL)) ** 2 / (inside**2).sum()
+    return (inside.sum() * DIAMETER / SAMPLES * PITCH / (wavelength * FOCAL)) ** 2 / (
+        inside**2
+    ).sum()
 
 
 @dataclass
 class Laser:
     spot: tuple[float, float]  #: pixels from the middle
     wavelength: float
-    strength: float  #: times the full well, at the peak behind the clear lens, in a channel of response 1
+    #: times the full well, at the peak behind the clear lens, in a channel of response 1
+    strength: float
     fwhm: float = 1e-9
 
     def electrons(self, mask, shape):
@@ -142,7 +156,9 @@ def picture(kind, side, rng):
 
 
 def irradiance(mask, kind, side, rng, lamps=0, lamp_strength=30.0):
-    """Electrons (channel, y, x) of a scene with lamps, with the brightest pixel of the scene at 0.7 full wells."""
+    """Electrons (channel, y, x) of a scene with lamps, with the brightest pixel of the scene at
+    0.7 full wells.
+    """
     rim = side // 2
     whole = picture(kind, side + 2 * rim, rng)
     basis = np.stack([np.exp(-0.5 * ((BANDS - c) / 45e-9) ** 2) for c in (610e-9, 545e-9, 460e-9)])
@@ -161,13 +177,17 @@ def irradiance(mask, kind, side, rng, lamps=0, lamp_strength=30.0):
         weight = band_response() * BANDS * warm
         peak = np.tensordot(weight, scene_psf("plain", 3), 1).max()
         # between pixels, and as far as the frame reaches
-        kernels = np.tensordot(weight, np.stack([pattern(mask, w, spot, (side, side)) for w in BANDS]), 1)
+        kernels = np.tensordot(
+            weight, np.stack([pattern(mask, w, spot, (side, side)) for w in BANDS]), 1
+        )
         found += lamp_strength * WELL * 10 ** rng.uniform(-1, 1) / peak * kernels
     return found
 
 
 def digitized(light, rng):
-    """The frame of a mean number of electrons: electrons above the offset, and the clipped pixels."""
+    """The frame of a mean number of electrons: electrons above the offset, and the clipped
+    pixels.
+    """
     charge = rng.poisson(np.minimum(light, 1e9)) + rng.normal(0, READ, light.shape) + OFFSET
     number = np.floor(np.clip(charge, 0, WELL) * GAIN)
     most = min(np.floor(WELL * GAIN), 2**BITS - 1)

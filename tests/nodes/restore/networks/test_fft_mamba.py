@@ -13,14 +13,28 @@ from torch.testing import assert_close
 from neusee.nodes import ParameterError
 from neusee.nodes.network_weights import file_metadata
 from neusee.nodes.restore import fft_mamba
-from neusee.nodes.restore._networks._fft_mamba import FFTMamba
-from neusee.nodes.restore._networks._mamba_blocks import SMALL, Block, Frequency, Spatial, _Phase, radial_order
+from neusee.nodes.restore._networks._fft_mamba import (
+    SMALL,
+    Block,
+    BothWays,
+    DualScan,
+    FFTMamba,
+    Frequency,
+    Scan,
+    Spatial,
+    _decay,
+    _Phase,
+    _step,
+    radial_order,
+)
 from neusee.nodes.restore._networks._restorer import start_network
-from neusee.nodes.restore._networks._scan_layer import BothWays, DualScan, Scan, _decay, _step
-from neusee.nodes.restore._scan._one_decay_scan import dual_scan
+from neusee.nodes.restore._scan._torch_scan import dual_scan
 
 CPU = torch.device("cpu")
-SCANS = [pytest.param(lambda: Scan(6, 4, 2), id="s6"), pytest.param(lambda: DualScan(6, 4, 2), id="ssd")]
+SCANS = [
+    pytest.param(lambda: Scan(6, 4, 2), id="s6"),
+    pytest.param(lambda: DualScan(6, 4, 2), id="ssd"),
+]
 
 
 def seeded(seed=0):
@@ -35,7 +49,9 @@ def begun(make):
     return start_network(make, seeded()).requires_grad_(False)
 
 
-def parameters(width, blocks, states, shuffle, ssm="s6", directions=2, pyramid=False, frequency="complex"):
+def parameters(
+    width, blocks, states, shuffle, ssm="s6", directions=2, pyramid=False, frequency="complex"
+):
     """Written out part by part, biases last in each."""
     rank = -(-width // 16)
 
@@ -46,14 +62,30 @@ def parameters(width, blocks, states, shuffle, ssm="s6", directions=2, pyramid=F
         return 2 * (d * (rank + 2 * states) + rank * d + d + d * states + d)
 
     inner = 2 * width
-    spatial = (width * 2 * inner + 2 * inner) + (9 * inner + inner) + directions // 2 * both_ways(inner) + 2 * inner
+    spatial = (
+        (width * 2 * inner + 2 * inner)
+        + (9 * inner + inner)
+        + directions // 2 * both_ways(inner)
+        + 2 * inner
+    )
     spatial += inner * width + width
-    spectral = 2 * inner + (inner * inner + inner) + both_ways(width) + 2 * width + (width * inner + inner) + 1
+    spectral = (
+        2 * inner
+        + (inner * inner + inner)
+        + both_ways(width)
+        + 2 * width
+        + (width * inner + inner)
+        + 1
+    )
     weigh = inner * width + width
     feed = (width * 4 * width + 4 * width) + (9 * 4 * width + 4 * width) + (inner * width + width)
     block = 2 * 2 * width + spatial + spectral + weigh + feed + 2 * width
     inside = 3 * shuffle**2
-    ends = (9 * 2 * inside * width + width) + (9 * width * width + width) + (9 * width * inside + inside)
+    ends = (
+        (9 * 2 * inside * width + width)
+        + (9 * width * width + width)
+        + (9 * width * inside + inside)
+    )
     return blocks * block + ends
 
 
@@ -85,13 +117,15 @@ def test_the_usual_network_has_938_thousand_parameters_in_eight_blocks():
 
 
 def test_four_directions_are_a_ninth_more_parameters():
-    assert parameters(64, 8, 16, 2, "s6", 4) - parameters(64, 8, 16, 2) == 8 * 2 * (128 * 36 + 4 * 128 + 128 + 128 * 17)
+    assert parameters(64, 8, 16, 2, "s6", 4) - parameters(64, 8, 16, 2) == 8 * 2 * (
+        128 * 36 + 4 * 128 + 128 + 128 * 17
+    )
     with torch.device("meta"):
         names = FFTMamba(20, 2, 5, 1).state_dict().keys()
     assert not any("across" in name for name in names), "files of before have none"
 
 
-# --- the line of frequencies ------------------------------------------------------------------------------------------
+# --- the line of frequencies ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 6), (8, 8), (7, 5), (6, 9), (18, 26)])
@@ -125,7 +159,7 @@ def test_the_order_made_where_nobody_learns_serves_those_who_learn():
     assert bool(net.strength.grad)
 
 
-# --- scans ------------------------------------------------------------------------------------------------------------
+# --- scans ----------------------------------------------------------------------------------------
 
 
 def test_steps_at_the_start_remember_ten_to_a_thousand_places():
@@ -229,16 +263,28 @@ def test_the_dual_scan_is_its_recurrence(length):
 
 @pytest.mark.parametrize("decays", [1e-6, 1e-3, 50.0, 200.0, "mixed"])
 def test_the_dual_scan_in_single_precision_is_that_in_double(decays):
-    logs = torch.rand(1, 700, 2, generator=seeded(), dtype=torch.float64) * math.log(5e7) + math.log(1e-6)
+    logs = torch.rand(1, 700, 2, generator=seeded(), dtype=torch.float64) * math.log(
+        5e7
+    ) + math.log(1e-6)
     dt = logs.exp() if decays == "mixed" else torch.full((1, 700, 2), decays, dtype=torch.float64)
     u, into, out = (drawn(1, 700, n, seed=seed).double() for n, seed in ((4, 4), (3, 5), (3, 6)))
-    decay, skip, weights = -torch.ones(2).double(), torch.zeros(2).double(), drawn(1, 700, 4, seed=9)
+    decay, skip, weights = (
+        -torch.ones(2).double(),
+        torch.zeros(2).double(),
+        drawn(1, 700, 4, seed=9),
+    )
     exact = [x.requires_grad_() for x in (u, dt, decay, into, out, skip)]
     single = [x.detach().float().requires_grad_() for x in exact]
     results = [dual_scan(*given) for given in (exact, single)]
-    slopes = [torch.autograd.grad((r * weights).sum(), g) for r, g in zip(results, (exact, single), strict=True)]
+    slopes = [
+        torch.autograd.grad((r * weights).sum(), g)
+        for r, g in zip(results, (exact, single), strict=True)
+    ]
     for one, other in zip((results[0], *slopes[0]), (results[1], *slopes[1]), strict=True):
-        assert float((one - other).detach().abs().max()) <= 2e-5 * float(one.detach().abs().max()) + 1e-30
+        assert (
+            float((one - other).detach().abs().max())
+            <= 2e-5 * float(one.detach().abs().max()) + 1e-30
+        )
 
 
 def test_the_dual_scan_has_true_slopes_of_both_orders():
@@ -255,7 +301,7 @@ def test_the_dual_scan_has_true_slopes_of_both_orders():
     assert torch.autograd.gradgradcheck(lambda *v: dual_scan(*v, chunk=2), inputs, fast_mode=True)
 
 
-# --- the spectrum -----------------------------------------------------------------------------------------------------
+# --- the spectrum ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("size", [(8, 8), (7, 5), (1, 6), (9, 1)])
@@ -272,7 +318,9 @@ def test_the_gate_of_a_frequency_is_drawn_from_the_lower_ones():
     drawn_gates = []
     part.leave.register_forward_hook(lambda *call: drawn_gates.append(call[-1]))
     before = drawn(1, 4, 12, 16)
-    wave = torch.cos(2 * torch.pi * (3 / 12 * torch.arange(12.0)[:, None] + 4 / 16 * torch.arange(16.0)))
+    wave = torch.cos(
+        2 * torch.pi * (3 / 12 * torch.arange(12.0)[:, None] + 4 / 16 * torch.arange(16.0))
+    )
     part(before)
     part(before + wave)
     change = (drawn_gates[1] - drawn_gates[0]).abs().amax((0, 2))
@@ -287,7 +335,8 @@ def test_a_gate_acts_on_the_frequency_that_it_was_drawn_for(size):
     part, x = begun(lambda: Frequency(4, 3)), drawn(1, 4, *size)
     order, _ = radial_order(size, CPU)
     columns = order % (size[1] // 2 + 1)
-    for rank in torch.nonzero((columns > 0) & (2 * columns < size[1]))[:, 0].tolist():  # whose mirror image is not here
+    # whose mirror image is not here
+    for rank in torch.nonzero((columns > 0) & (2 * columns < size[1]))[:, 0].tolist():
         gates = torch.zeros(1, len(order), 8)
         gates[:, rank] = 1
         part.leave.register_forward_hook(lambda *call, gates=gates: gates)
@@ -314,7 +363,7 @@ def test_a_small_spectrum_has_a_bounded_slope():
         assert float(x.grad.abs().max()) < 10
 
 
-# --- blocks and passes ------------------------------------------------------------------------------------------------
+# --- blocks and passes ----------------------------------------------------------------------------
 
 
 def test_a_block_weighs_both_and_adds_little_at_the_start():
@@ -330,9 +379,19 @@ def test_a_block_weighs_both_and_adds_little_at_the_start():
 def test_the_fine_pass_sees_the_coarse_one_and_both_have_the_same_weights():
     net, picture = begun(lambda: FFTMamba(4, 1, 2)), torch.rand(1, 3, 16, 16, generator=seeded())
     coarse, fine = net.pyramid(picture)
-    assert_close(coarse, net.improved(*2 * [torch.nn.functional.interpolate(
-        picture, size=(8, 8), mode="bicubic", antialias=True
-    )]), rtol=0, atol=1e-5)  # fmt: skip
+    assert_close(
+        coarse,
+        net.improved(
+            *2
+            * [
+                torch.nn.functional.interpolate(
+                    picture, size=(8, 8), mode="bicubic", antialias=True
+                )
+            ]
+        ),
+        rtol=0,
+        atol=1e-5,
+    )
     up = torch.nn.functional.interpolate(coarse, size=(16, 16), mode="bicubic", antialias=True)
     assert_close(fine, net.improved(picture, up), rtol=0, atol=1e-5)
     assert not torch.allclose(fine, net.improved(picture, picture), rtol=0, atol=1e-4)
@@ -353,7 +412,10 @@ def test_every_option_gives_two_scales_of_any_size_and_slopes(directions, pyrami
 
 
 def test_a_pyramid_has_one_pass_and_its_coarse_estimate_is_the_fine_one_made_smaller():
-    net, picture = begun(lambda: FFTMamba(4, 1, 2, pyramid=True)), torch.rand(1, 3, 16, 16, generator=seeded())
+    net, picture = (
+        begun(lambda: FFTMamba(4, 1, 2, pyramid=True)),
+        torch.rand(1, 3, 16, 16, generator=seeded()),
+    )
     passes = []
     net.blocks.register_forward_hook(lambda *call: passes.append(1))
     coarse, fine = net.pyramid(picture)
@@ -364,7 +426,9 @@ def test_a_pyramid_has_one_pass_and_its_coarse_estimate_is_the_fine_one_made_sma
 
 
 def test_four_directions_add_a_scan_across():
-    """With the scans of one way alone, a pixel changes what is right of it in its row, and below it in its column."""
+    """With the scans of one way alone, a pixel changes what is right of it in its row, and below
+    it in its column.
+    """
     part = begun(lambda: Spatial(4, 3, False, directions=4))
     part.scan.back, part.across.back, part.mix = (torch.nn.Identity() for _ in range(3))
     before = drawn(1, 4, 5, 6)
@@ -405,7 +469,14 @@ def test_a_constant_gate_of_amplitude_scales_the_picture_and_one_of_phase_turns_
 @pytest.mark.parametrize(
     ("option", "learnt", "said"),
     [
-        ("pyramid", True, "was trained with pyramid: true, and this network has pyramid: false; write pyramid: true"),
+        (
+            "pyramid",
+            True,
+            (
+                "was trained with pyramid: true, and this network has pyramid: false; write"
+                " pyramid: true"
+            ),
+        ),
         ("frequency", "amp_phase", "frequency: amp_phase, and this network has frequency: complex"),
         ("directions", 4, "directions: 4, and this network has directions: 2"),
         ("ssm", "ssd", "ssm: ssd, and this network has ssm: s6"),
@@ -421,4 +492,6 @@ def test_a_file_of_weights_tells_what_its_tensors_do_not(tmp_path, option, learn
     assert caught.value.parameter == "weights"
     assert fft_mamba.hooks.preflight(**sizes, **usual | {option: learnt}, weights=file) == []
     picture = torch.rand(3, 12, 16, generator=seeded())
-    assert torch.equal(fft_mamba(picture, **sizes, **{option: learnt}, weights=file), net(picture[None])[0])
+    assert torch.equal(
+        fft_mamba(picture, **sizes, **{option: learnt}, weights=file), net(picture[None])[0]
+    )

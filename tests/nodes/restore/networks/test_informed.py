@@ -1,4 +1,6 @@
-"""The informed network: untrained it is the filter, it sees what the filter knows, and node and training agree."""
+"""The informed network: untrained it is the filter, it sees what the filter knows, and node and
+training agree.
+"""
 
 from functools import partial
 
@@ -8,8 +10,15 @@ import torch
 from safetensors.torch import save_file
 
 from neusee.nodes import ParameterError
-from neusee.nodes.restore import Informed, filter_facts, informed, start_network, wiener, wiener_problem
-from neusee.nodes.restore._inverse._filter_facts import EACH
+from neusee.nodes.restore import (
+    Informed,
+    filter_facts,
+    informed,
+    start_network,
+    wiener,
+    wiener_problem,
+)
+from neusee.nodes.restore._inverse._wiener import EACH
 from tests.nodes.restore.networks.test_unrolled import frame, random
 
 READ = {"read_noise": 10.0}
@@ -18,7 +27,9 @@ READ = {"read_noise": 10.0}
 def network(change=0.0):
     net = start_network(partial(Informed, 2), torch.Generator().manual_seed(4))
     with torch.no_grad():
-        net.body.last.weight.add_(change * torch.randn(net.body.last.weight.shape, generator=torch.Generator()))
+        net.body.last.weight.add_(
+            change * torch.randn(net.body.last.weight.shape, generator=torch.Generator())
+        )
     return net
 
 
@@ -47,19 +58,26 @@ def test_the_training_computes_the_picture_of_the_node(tmp_path, size):
 
 
 def test_the_maps_say_what_the_filter_knows():
-    """Against the posed problem, with the information of the frame as a sum over its pixels in NumPy."""
+    """Against the posed problem, with the information of the frame as a sum over its pixels in
+    NumPy.
+    """
     given = frame()
     known, posed = filter_facts(*given, **READ), wiener_problem(*given, **READ)
     each = known.maps[: 3 * EACH].reshape(EACH, 3, 24, 24)
-    assert torch.allclose(known.answer * known.scale + known.mean, wiener(*given, **READ).double(), rtol=1e-6)
+    assert torch.allclose(
+        known.answer * known.scale + known.mean, wiener(*given, **READ).double(), rtol=1e-6
+    )
     assert torch.equal(each[0], known.answer)
     assert torch.equal(each[5] == 0, given[5])  # clipped pixels
-    assert torch.allclose(each[3], (posed.weight.sqrt() * (posed.picture - posed.seen)).asinh(), atol=1e-6)
+    assert torch.allclose(
+        each[3], (posed.weight.sqrt() * (posed.picture - posed.seen)).asinh(), atol=1e-6
+    )
     weight, kernel = posed.weight[0].numpy(), posed.psf[0].numpy() ** 2
     far = [n // 2 for n in kernel.shape]
     wide = np.pad(weight, [(n, n) for n in far])
     told = [
-        [(wide[y : y + kernel.shape[0], x : x + kernel.shape[1]] * kernel).sum() for x in range(24)] for y in range(24)
+        [(wide[y : y + kernel.shape[0], x : x + kernel.shape[1]] * kernel).sum() for x in range(24)]
+        for y in range(24)
     ]
     told = np.array(told)
     assert np.corrcoef(told.ravel(), known.deviation[0].numpy().ravel() ** -2)[0, 1] > 0.999

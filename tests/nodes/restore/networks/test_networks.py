@@ -1,4 +1,6 @@
-"""Every network that restores: any size, any light, near the picture at the start, and only with its own weights."""
+"""Every network that restores: any size, any light, near the picture at the start, and only with
+its own weights.
+"""
 
 import math
 from functools import partial
@@ -10,11 +12,10 @@ from torch import nn
 from torch.testing import assert_close
 
 from neusee.nodes import ParameterError, restore
-from neusee.nodes.bicubic_resize import resize
+from neusee.nodes.resampling import resize
 from neusee.nodes.restore._networks._fft_mamba import FFTMamba
-from neusee.nodes.restore._networks._nafnet import NAFBlock, NAFNet
 from neusee.nodes.restore._networks._restorer import parameter_groups, start_network
-from neusee.nodes.restore._networks._unet import UNet
+from neusee.nodes.restore._networks._unet_and_nafnet import NAFBlock, NAFNet, UNet
 
 SMALL = {"width": 4, "blocks": 2, "states": 3}
 MAKE = {
@@ -23,7 +24,12 @@ MAKE = {
     "unet": partial(UNet, 4),
     "nafnet": partial(NAFNet, 4),
 }
-PARAMS = {"fft_mamba": SMALL, "ssd": SMALL | {"ssm": "ssd"}, "unet": {"width": 4}, "nafnet": {"width": 4}}
+PARAMS = {
+    "fft_mamba": SMALL,
+    "ssd": SMALL | {"ssm": "ssd"},
+    "unet": {"width": 4},
+    "nafnet": {"width": 4},
+}
 every_network = pytest.mark.parametrize("name", MAKE)
 
 
@@ -118,7 +124,12 @@ def test_layers_start_orthogonal_with_zero_biases(name):
         if isinstance(part, nn.Conv2d | nn.ConvTranspose2d | nn.Linear):
             flat = part.weight.detach().flatten(1) * (10 if part is net.last else 1)
             product = flat @ flat.T if flat.shape[0] <= flat.shape[1] else flat.T @ flat
-            assert_close(product, (2 / 1.04 if name == "unet" else 1) * torch.eye(len(product)), rtol=0, atol=1e-5)
+            assert_close(
+                product,
+                (2 / 1.04 if name == "unet" else 1) * torch.eye(len(product)),
+                rtol=0,
+                atol=1e-5,
+            )
             assert part.bias is None or not part.bias.any()
 
 
@@ -183,7 +194,9 @@ def test_groups_hold_every_parameter_once_and_biases_of_layers_learn_faster(name
     net = fresh(name)
     weights, biases = parameter_groups(net)
     assert (weights["lr"], biases["lr"]) == (2e-4, 4e-4)
-    assert sorted(map(id, weights["params"] + biases["params"])) == sorted(map(id, net.parameters()))
+    assert sorted(map(id, weights["params"] + biases["params"])) == sorted(
+        map(id, net.parameters())
+    )
     names = {id(p): key for key, p in net.named_parameters()}
     kinds = {key: type(part) for key, part in net.named_modules()}
     wanted = {
@@ -216,7 +229,10 @@ def test_detail_passes_beside_what_is_small(name):
 
 
 def test_a_block_of_nafnet_multiplies_channels_and_weighs_them_by_their_mean():
-    block, x = start_network(lambda: NAFBlock(3), seeded()).requires_grad_(False).double(), drawn(2, 3, 5, 4).double()
+    block, x = (
+        start_network(lambda: NAFBlock(3), seeded()).requires_grad_(False).double(),
+        drawn(2, 3, 5, 4).double(),
+    )
 
     def normed(x):
         return (x - x.mean(1, keepdim=True)) / (x.var(1, keepdim=True, correction=0) + 1e-5).sqrt()
@@ -253,7 +269,8 @@ def test_the_node_gives_what_the_network_gives(name, saved):
         wanted = net(picture[None])[0]
     found = node(picture, **PARAMS[name], weights=path)
     assert torch.equal(found, node(picture, **PARAMS[name], weights=path))
-    assert_close(found, wanted, rtol=2e-6, atol=2e-6)  # weights lie elsewhere, by which some processors round
+    # weights lie elsewhere, by which some processors round
+    assert_close(found, wanted, rtol=2e-6, atol=2e-6)
     assert not found.requires_grad
     assert node.hooks.check(found, picture, **PARAMS[name], weights=path)[0].ok
     _, other = saved(name, 1)
@@ -276,10 +293,15 @@ def test_the_node_computes_in_single_precision_whatever_comes(name, saved):
 @every_network
 def test_weights_stored_in_half_precision_compute_in_single(name, saved, tmp_path):
     net, _ = saved(name)
-    save_file({key: v.bfloat16() for key, v in net.state_dict().items()}, tmp_path / "half.safetensors")
+    save_file(
+        {key: v.bfloat16() for key, v in net.state_dict().items()}, tmp_path / "half.safetensors"
+    )
     with torch.no_grad():
         wanted = net.bfloat16().float()(drawn(3, 16, 16)[None])[0]
-    assert torch.equal(node_of(name)(drawn(3, 16, 16), **PARAMS[name], weights=tmp_path / "half.safetensors"), wanted)
+    assert torch.equal(
+        node_of(name)(drawn(3, 16, 16), **PARAMS[name], weights=tmp_path / "half.safetensors"),
+        wanted,
+    )
 
 
 @every_network
@@ -339,7 +361,12 @@ def test_a_picture_that_is_not_finite_is_refused(saved):
 @pytest.mark.slow
 @every_network
 def test_the_full_size_works_on_an_odd_picture(name):
-    full = {"fft_mamba": FFTMamba, "ssd": partial(FFTMamba, ssm="ssd"), "unet": UNet, "nafnet": NAFNet}
+    full = {
+        "fft_mamba": FFTMamba,
+        "ssd": partial(FFTMamba, ssm="ssd"),
+        "unet": UNet,
+        "nafnet": NAFNet,
+    }
     net = start_network(full[name], seeded())
     picture = drawn(1, 3, 37, 53)
     coarse, fine = net.pyramid(picture)
@@ -347,4 +374,6 @@ def test_the_full_size_works_on_an_odd_picture(name):
     assert fine.shape == (1, 3, 37, 53)
     assert coarse.shape == (1, 3, 19, 27)
     assert float((fine - picture).detach().square().mean().sqrt()) < 0.3
-    assert not [key for key, p in net.named_parameters() if not p.grad.any() or not p.grad.isfinite().all()]
+    assert not [
+        key for key, p in net.named_parameters() if not p.grad.any() or not p.grad.isfinite().all()
+    ]

@@ -1,4 +1,6 @@
-"""A network of the user as a restorer: its sizes, its parameters, its first call, and the cost that this call shows."""
+"""A network of the user as a restorer: its sizes, its parameters, its first call, and the cost
+that this call shows.
+"""
 
 import sys
 import threading
@@ -8,9 +10,9 @@ import torch
 from torch import nn
 
 from neusee.nodes import ParameterError, restore
-from neusee.nodes.network_classes import Architecture, network_classes
+from neusee.nodes.own_modules import Architecture, network_classes
 from neusee.nodes.restore import own_network, try_network
-from neusee.workflows.contract.network_contract import whole_networks
+from neusee.workflows.contract.node_contract import whole_networks
 
 
 class Net(nn.Module):
@@ -82,18 +84,25 @@ def test_threads_that_build_at_once_get_the_weights_of_their_own_seeds():
 def test_the_options_of_a_class_are_its_arguments_with_the_defaults():
     net = own_network(NET, {"width": 4}, None)
     assert net.options == {"class": "Net", "parameters": {"width": 4, "groups": 1, "bias": True}}
-    with pytest.raises(ParameterError, match=r"mine.Net needs the argument width: write parameters: {width: VALUE}"):
+    with pytest.raises(
+        ParameterError, match=r"mine.Net needs the argument width: write parameters: {width: VALUE}"
+    ):
         own_network(NET, None, None)
-    with pytest.raises(ParameterError, match=r"mine.Net\(width=4, groups=3\): in_channels must be divisible by groups"):
+    with pytest.raises(
+        ParameterError,
+        match=r"mine.Net\(width=4, groups=3\): in_channels must be divisible by groups",
+    ):
         own_network(NET, {"width": 4, "groups": 3}, None)
 
 
 def test_the_operations_are_two_for_each_product_of_a_layer_and_one_for_each_other_number():
     trial = try_network(own_network(NET, {"width": 8, "groups": 2}, None))
     half, whole = 18 * 22, 36 * 44
-    products = half * 8 * (3 * 9 + 4 * 9 + 8 + 8 + 3 * 4)  # two convolutions, two matrices, one transposed convolution
+    # two convolutions, two matrices, one transposed convolution
+    products = half * 8 * (3 * 9 + 4 * 9 + 8 + 8 + 3 * 4)
     assert 2 * products <= trial.operations * whole <= 2 * products + 2 * 3 * whole + 2 * 8 * half
-    kept = 4 * (5 * 8 * half + 2 * 3 * whole)  # bytes: five results of 8 channels, the last layer and the sum
+    # bytes: five results of 8 channels, the last layer and the sum
+    kept = 4 * (5 * 8 * half + 2 * 3 * whole)
     assert kept <= trial.memory * whole <= 1.1 * kept
 
 
@@ -117,7 +126,10 @@ def test_a_network_may_draw_in_training_and_compute_in_float64():
             return super().forward(self.drop(picture))
 
     net = own_network(Architecture("mine.Dropping", Dropping), None, None)
-    with pytest.raises(ParameterError, match=r"fails for a picture 1 x 3 x 36 x 44: test_own_network.py:3\d: expected"):
+    with pytest.raises(
+        ParameterError,
+        match=r"fails for a picture 1 x 3 x 36 x 44: test_own_network.py:3\d: expected",
+    ):
         try_network(net, torch.float64)  # torch.eye is float32
     try_network(net)
 
@@ -125,4 +137,6 @@ def test_a_network_may_draw_in_training_and_compute_in_float64():
 def test_layers_of_a_file_that_builds_others_are_not_the_networks_of_a_family():
     found = network_classes(sys.modules[__name__])
     assert set(found) == {"Net"}
-    assert set(whole_networks(sys.modules["neusee.nodes.restore._networks._nafnet"])) == set()
+    assert (
+        set(whole_networks(sys.modules["neusee.nodes.restore._networks._unet_and_nafnet"])) == set()
+    )

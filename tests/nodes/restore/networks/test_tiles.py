@@ -1,4 +1,6 @@
-"""A picture in tiles: the same where a network sees no farther than a pixel, without seams where it does."""
+"""A picture in tiles: the same where a network sees no farther than a pixel, without seams where
+it does.
+"""
 
 import pytest
 import torch
@@ -9,10 +11,9 @@ from torch.nn import functional as F
 from torch.testing import assert_close
 
 from neusee.nodes import restore
-from neusee.nodes.bicubic_resize import resize
-from neusee.nodes.restore._networks._nafnet import NAFNet
-from neusee.nodes.restore._networks._restorer import start_network
-from neusee.nodes.restore._networks._tiles import tiled
+from neusee.nodes.resampling import resize
+from neusee.nodes.restore._networks._restorer import start_network, tiled
+from neusee.nodes.restore._networks._unet_and_nafnet import NAFNet
 
 
 def seeded():
@@ -59,7 +60,12 @@ def test_a_node_restores_a_large_picture_in_tiles(tmp_path):
     picture = torch.rand(3, 80, 40, generator=seeded())
     whole, parts = (restore.nafnet(picture, weights=file, width=4, tile=tile) for tile in (80, 48))
     assert torch.equal(whole, restore.nafnet(picture, weights=file, width=4))
-    assert_close(parts[:, :24], restore.nafnet(picture[:, :48], weights=file, width=4)[:, :24], rtol=1e-5, atol=1e-6)
+    assert_close(
+        parts[:, :24],
+        restore.nafnet(picture[:, :48], weights=file, width=4)[:, :24],
+        rtol=1e-5,
+        atol=1e-6,
+    )
     assert not torch.equal(parts, whole)
 
 
@@ -75,7 +81,9 @@ def test_a_node_restores_a_picture_made_smaller(tmp_path):
     small = resize(picture[None], 18, 11)
     kept = restore.nafnet(picture, weights=file, width=4, reduce=4, detail=True)
     with torch.no_grad():
-        assert_close(kept, (picture[None] + resize(net(small) - small, 70, 41))[0], rtol=1e-6, atol=1e-6)
+        assert_close(
+            kept, (picture[None] + resize(net(small) - small, 70, 41))[0], rtol=1e-6, atol=1e-6
+        )
 
 
 def test_detail_changes_nothing_where_nothing_is_made_smaller(tmp_path):
@@ -83,4 +91,6 @@ def test_detail_changes_nothing_where_nothing_is_made_smaller(tmp_path):
     save_file(start_network(lambda: NAFNet(4), seeded()).state_dict(), file)
     picture = torch.rand(3, 40, 41, generator=seeded())
     given = {"weights": file, "width": 4}
-    assert torch.equal(restore.nafnet(picture, **given, detail=True), restore.nafnet(picture, **given))
+    assert torch.equal(
+        restore.nafnet(picture, **given, detail=True), restore.nafnet(picture, **given)
+    )

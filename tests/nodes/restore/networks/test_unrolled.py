@@ -1,4 +1,6 @@
-"""The unrolled filter: untrained it is the filter, and node and training compute the same picture."""
+"""The unrolled filter: untrained it is the filter, and node and training compute the same
+picture.
+"""
 
 import re
 from functools import partial
@@ -20,27 +22,44 @@ def random(*shape, seed=0):
 
 
 def frame(*size):
-    """Electrons of three channels behind a lopsided blur, a clipped corner, and a pattern of glare within."""
+    """Electrons of three channels behind a lopsided blur, a clipped corner, and a pattern of
+    glare within.
+    """
     size = size or (24, 24)
     psf = Psf(random(1, 9, 9, seed=1) / 40.5, ONE)
     glare = random(3, *size, seed=2) ** 8
     clipped = torch.zeros(3, *size, dtype=torch.bool)
     clipped[:, :3, :4] = True
     electrons = (4000 * random(3, *size, seed=3) + 5000 * glare).float()
-    return (electrons, psf, ONE, torch.ones(3, 1, dtype=torch.float64), BANDS, clipped, [glare.float()])
+    return (
+        electrons,
+        psf,
+        ONE,
+        torch.ones(3, 1, dtype=torch.float64),
+        BANDS,
+        clipped,
+        [glare.float()],
+    )
 
 
 def network(change=0.0, width=2, steps=2):
     net = start_network(partial(Unrolled, width, steps), torch.Generator().manual_seed(4))
     with torch.no_grad():
         for prior in net.priors:
-            prior.last.weight.add_(change * torch.randn(prior.last.weight.shape, generator=torch.Generator()))
+            prior.last.weight.add_(
+                change * torch.randn(prior.last.weight.shape, generator=torch.Generator())
+            )
     return net
 
 
 def written(net, folder):
     save_file(net.state_dict(), folder / "weights.safetensors")
-    return {"weights": folder / "weights.safetensors", "width": 2, "steps": len(net.priors), "read_noise": 10.0}
+    return {
+        "weights": folder / "weights.safetensors",
+        "width": 2,
+        "steps": len(net.priors),
+        "read_noise": 10.0,
+    }
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -61,7 +80,10 @@ def test_the_problem_has_the_answer_of_the_filter_and_the_network_changes_it_ali
     problem = wiener_problem(*given, read_noise=10.0)
     assert torch.allclose(problem.answer * problem.scale + problem.mean, told, rtol=1e-6)
     with torch.no_grad():
-        fine, pyramid = net(told[None], problem, torch.eye(3)), net.pyramid(told[None], problem, torch.eye(3))
+        fine, pyramid = (
+            net(told[None], problem, torch.eye(3)),
+            net.pyramid(told[None], problem, torch.eye(3)),
+        )
     assert float((fine[0] - told).abs().max()) > 10.0
     assert torch.allclose(fine[0], expected, rtol=1e-5, atol=0.05)
     assert torch.equal(fine, pyramid[1])
@@ -69,7 +91,11 @@ def test_the_problem_has_the_answer_of_the_filter_and_the_network_changes_it_ali
 
 
 def test_other_colours_than_those_of_the_sensor_get_the_same_change():
-    problem, net, matrix = wiener_problem(*frame(), read_noise=10.0), network(0.2), random(3, 3, seed=5).float()
+    problem, net, matrix = (
+        wiener_problem(*frame(), read_noise=10.0),
+        network(0.2),
+        random(3, 3, seed=5).float(),
+    )
     nothing = torch.zeros(1, 3, 24, 24, dtype=torch.float64)
     with torch.no_grad():
         own, turned = net(nothing, problem, torch.eye(3))[0], net(nothing, problem, matrix)[0]
@@ -87,8 +113,16 @@ def test_sides_that_no_level_divides_and_one_step(tmp_path, size):
 
 def test_a_frame_that_is_clipped_altogether_stays_finite(tmp_path):
     electrons, psf, light, responses, bands, clipped, glare = frame()
-    found = unrolled(electrons, psf, light, responses, bands, torch.ones_like(clipped), glare,
-                     **written(network(0.2), tmp_path))  # fmt: skip
+    found = unrolled(
+        electrons,
+        psf,
+        light,
+        responses,
+        bands,
+        torch.ones_like(clipped),
+        glare,
+        **written(network(0.2), tmp_path),
+    )
     assert bool(torch.isfinite(found).all())
 
 
@@ -96,20 +130,25 @@ def test_gradients_reach_every_layer_of_every_step():
     problem, net = wiener_problem(*frame(), read_noise=10.0), network(0.2)
     picture = torch.zeros(1, 3, 24, 24)
     net(picture, problem, torch.eye(3)).square().mean().backward()
-    assert all(float(p.grad.abs().max()) > 0 for name, p in net.named_parameters() if "attend" not in name)
+    assert all(
+        float(p.grad.abs().max()) > 0 for name, p in net.named_parameters() if "attend" not in name
+    )
 
 
 def test_from_the_start_the_last_layers_have_gradients():
     net = network()
     (
-        net(torch.zeros(1, 3, 24, 24), wiener_problem(*frame(), read_noise=10.0), torch.eye(3)) - 100.0
+        net(torch.zeros(1, 3, 24, 24), wiener_problem(*frame(), read_noise=10.0), torch.eye(3))
+        - 100.0
     ).square().mean().backward()
     assert all(float(prior.last.weight.grad[:3].abs().max()) > 0 for prior in net.priors)
 
 
 @pytest.mark.slow
 def test_gradients_of_the_node_agree_with_differences(tmp_path, monkeypatch):
-    """With conjugate gradients that end: after ten steps, sums that nearly cancel are a third off."""
+    """With conjugate gradients that end: after ten steps, sums that nearly cancel are a third
+    off.
+    """
     monkeypatch.setattr(Unrolled.__init__, "__defaults__", (16, 2, 100))
     electrons, *others = frame(16, 16)
     how = written(network(0.2), tmp_path)
@@ -125,7 +164,8 @@ def test_gradients_of_the_node_agree_with_differences(tmp_path, monkeypatch):
 def test_other_weights_and_other_sensors_are_refused(tmp_path):
     how = written(network(), tmp_path)
     with pytest.raises(
-        ParameterError, match=re.escape("priors.0.down.0.0.attend.bias is (2,), this network (width 3)")
+        ParameterError,
+        match=re.escape("priors.0.down.0.0.attend.bias is (2,), this network (width 3)"),
     ):
         unrolled.hooks.preflight(**{**how, "width": 3})
     assert "is the Wiener filter" in unrolled.hooks.preflight(read_noise=10.0)[0]

@@ -1,7 +1,8 @@
-"""A camera in NumPy that shares no line with the package: a PSF that changes over the field, points, noise, clipping.
+"""A camera in NumPy that shares no line with the package: a PSF that changes over the field,
+points, noise, clipping.
 
-The PSF is a sum of Gaussians, each integrated over the area of a pixel in closed form. One of them moves with the place
-in the field, one with the colour.
+The PSF is a sum of Gaussians, each integrated over the area of a pixel in closed form. One of them
+moves with the place in the field, one with the colour.
 """
 
 import numpy as np
@@ -9,7 +10,13 @@ from scipy.signal import fftconvolve
 from scipy.special import erf
 
 GAIN, OFFSET, READ, FULL = 2.0, 50.0, 4.0, 20000.0  # DN/e-, e-, e-, e- without offset
-CAMERA = {"gain": GAIN, "offset": OFFSET, "full_well": FULL + OFFSET, "read_noise": READ, "bits": 16}
+CAMERA = {
+    "gain": GAIN,
+    "offset": OFFSET,
+    "full_well": FULL + OFFSET,
+    "read_noise": READ,
+    "bits": 16,
+}
 COLOURS = (1.0, 0.8, 0.6)
 
 
@@ -20,7 +27,9 @@ def over_pixel(at, deviation):
 
 
 def spread(down, right, field, channel, lobe=0.13, far=2.2):
-    """Give the share of the light at a distance from a point at ``field``, which runs from -0.5 to 0.5 of the frame."""
+    """Give the share of the light at a distance from a point at ``field``, which runs from -0.5
+    to 0.5 of the frame.
+    """
     v, u = field
     sharp = 1.15 + 0.05 * channel
     parts = (
@@ -28,7 +37,10 @@ def spread(down, right, field, channel, lobe=0.13, far=2.2):
         (lobe, 0.7 * far * v + 0.8, far * u + 0.1 * channel, 2.0, 2.4),
         (0.07, 0.0, 0.0, 4.0, 4.0),
     )
-    return sum(share * over_pixel(down - y, sy) * over_pixel(right - x, sx) for share, y, x, sy, sx in parts)
+    return sum(
+        share * over_pixel(down - y, sy) * over_pixel(right - x, sx)
+        for share, y, x, sy, sx in parts
+    )
 
 
 def place_in(place, shape):
@@ -36,9 +48,13 @@ def place_in(place, shape):
 
 
 def numbers(light, rng, dark=0.0):
-    """Draw photons, add read noise and offset, cut at the well, and round to whole digital numbers."""
+    """Draw photons, add read noise and offset, cut at the well, and round to whole digital
+    numbers.
+    """
     electrons = rng.poisson(light) + rng.normal(0, READ, light.shape) + dark
-    return np.clip(np.round((np.minimum(electrons, FULL) + OFFSET) * GAIN), 0, 65535).astype(np.uint16)
+    return np.clip(np.round((np.minimum(electrons, FULL) + OFFSET) * GAIN), 0, 65535).astype(
+        np.uint16
+    )
 
 
 def points(rng, shape, places, signals, ground=5.0, dark=0.0, channels=3, **kind):
@@ -53,18 +69,24 @@ def points(rng, shape, places, signals, ground=5.0, dark=0.0, channels=3, **kind
 
 
 def centred(field, window, **kind):
-    """Give the true PSF (channel, y, x) of sum 1, the centre of its squared mean shifted into the middle pixel."""
+    """Give the true PSF (channel, y, x) of sum 1, the centre of its squared mean shifted into
+    the middle pixel.
+    """
     y, x = (np.arange(n) - n // 2 for n in window)
     shift = np.zeros(2)
     for _ in range(30):
-        kernel = np.stack([spread(y[:, None] - shift[0], x - shift[1], field, c, **kind) for c in range(3)])
+        kernel = np.stack(
+            [spread(y[:, None] - shift[0], x - shift[1], field, c, **kind) for c in range(3)]
+        )
         power = kernel.mean(0) ** 2
         shift = shift - np.array([(power.sum(1) * y).sum(), (power.sum(0) * x).sum()]) / power.sum()
     return kernel / kernel.sum((1, 2), keepdims=True)
 
 
 def blurred(scene, shape, block=5, reach=16, **kind):
-    """Blur a scene (channel, y, x), wider than ``shape`` by the same rim on all sides, with the PSF of each block."""
+    """Blur a scene (channel, y, x), wider than ``shape`` by the same rim on all sides, with the
+    PSF of each block.
+    """
     rim = (scene.shape[1] - shape[0]) // 2
     side = np.arange(-reach, reach + 1)
     wide = np.zeros((len(scene), *(n + 2 * reach for n in scene.shape[1:])))

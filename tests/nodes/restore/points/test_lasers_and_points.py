@@ -1,7 +1,9 @@
-"""A laser that nobody told, in a camera whose blur frames of white points gave: the camera is in NumPy alone.
+"""A laser that nobody told, in a camera whose blur frames of white points gave: the camera is in
+NumPy alone.
 
-Its lens is out of focus by 0.4 waves, of which the model of the lens, which gives the pattern of the laser, knows
-nothing. Restored pictures are compared with the scene that the camera saw, after one gain for each channel.
+Its lens is out of focus by 0.4 waves, of which the model of the lens, which gives the pattern of
+the laser, knows nothing. Restored pictures are compared with the scene that the camera saw, after
+one gain for each channel.
 """
 
 import numpy as np
@@ -14,8 +16,12 @@ from tests.nodes.restore.lasers.as_inputs import LENS, inputs, pupil_of
 
 SIDE, WINDOW, RIM = 64, (25, 25), 8
 SENSOR = {
-    "gain": own.GAIN, "offset": own.OFFSET, "full_well": own.WELL, "read_noise": own.READ, "bits": own.BITS,
-}  # fmt: skip
+    "gain": own.GAIN,
+    "offset": own.OFFSET,
+    "full_well": own.WELL,
+    "read_noise": own.READ,
+    "bits": own.BITS,
+}
 clean_pupil, clean_psf = own.pupil, own.scene_psf
 
 
@@ -35,12 +41,16 @@ def sharp(mask, side):
 
 
 def white_points(folder):
-    """Take four frames of a white point at parts of a pixel, every other one thirty times as long, and a dark one."""
+    """Take four frames of a white point at parts of a pixel, every other one thirty times as
+    long, and a dark one.
+    """
     rng = np.random.default_rng(5)
     weight = own.band_response() * own.daylight(own.BANDS) * own.BANDS
     for number in range(4):
         spot = rng.uniform(-0.5, 0.5, 2)
-        seen = np.tensordot(weight, np.stack([own.pattern("soft", w, spot, (SIDE, SIDE)) for w in own.BANDS]), 1)
+        seen = np.tensordot(
+            weight, np.stack([own.pattern("soft", w, spot, (SIDE, SIDE)) for w in own.BANDS]), 1
+        )
         light = 0.6 * own.WELL * seen / seen.max() * (30 if number % 2 else 1)
         save(folder / f"p{number}.npy", light, rng)
     save(folder / "dark.npy", np.zeros((3, SIDE, SIDE)), rng)
@@ -57,7 +67,10 @@ def quality(picture, truth):
     errors = []
     for seen, scene in zip(np.asarray(picture, float), truth, strict=True):
         columns = np.stack([seen[inner].ravel(), np.ones(seen[inner].size)], 1)
-        rest = scene[inner].ravel() - columns @ np.linalg.lstsq(columns, scene[inner].ravel(), rcond=None)[0]
+        rest = (
+            scene[inner].ravel()
+            - columns @ np.linalg.lstsq(columns, scene[inner].ravel(), rcond=None)[0]
+        )
         errors.append((rest**2).mean() / scene.max() ** 2)
     return -10 * np.log10(np.mean(errors))
 
@@ -68,9 +81,14 @@ def test_a_laser_behind_a_measured_psf_is_found_and_removed(tmp_path, monkeypatc
     white_points(tmp_path)
     responses, seed = torch.ones(3, 31), torch.Generator().manual_seed
     measured = restore.measured_psf(
-        responses, files=tuple(sorted(tmp_path.iterdir())), window=WINDOW, shape=(SIDE, SIDE), draws=4, rng=seed(0),
+        responses,
+        files=tuple(sorted(tmp_path.iterdir())),
+        window=WINDOW,
+        shape=(SIDE, SIDE),
+        draws=4,
+        rng=seed(0),
         **SENSOR,
-    )  # fmt: skip
+    )
     told = {"read_noise": own.READ}
     for strength in (1e3, 0.0):
         lasers = [own.Laser((9.3, -7.8), 533e-9, strength)] if strength else []

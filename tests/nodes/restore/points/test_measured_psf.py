@@ -1,4 +1,6 @@
-"""The PSF from frames of point sources, against a camera in NumPy whose PSF is known in closed form."""
+"""The PSF from frames of point sources, against a camera in NumPy whose PSF is known in closed
+form.
+"""
 
 import numpy as np
 import pytest
@@ -6,9 +8,15 @@ import torch
 
 from neusee.nodes import ParameterError
 from neusee.nodes.restore import measured_psf
-from neusee.nodes.restore._points._point_fit import gauged
-from neusee.nodes.restore._points._point_frames import read_points
-from neusee.nodes.restore._points._point_model import State, hats, linear, node_weights, shifting
+from neusee.nodes.restore._measured_psf import gauged
+from neusee.nodes.restore._point_frames import (
+    State,
+    hats,
+    linear,
+    node_weights,
+    read_points,
+    shifting,
+)
 from tests.nodes.restore.points.independent_camera import CAMERA, centred, numbers, place_in, points
 
 TRIPLE = torch.ones(3, 5)
@@ -18,7 +26,9 @@ def measure(folder, shape, window, zones=(1, 1), draws=24, **other):
     given = {**CAMERA, **other}
     seed = torch.Generator().manual_seed(1)
     files = tuple(sorted(folder.iterdir()))
-    return measured_psf(TRIPLE, files=files, window=window, zones=zones, draws=draws, shape=shape, rng=seed, **given)
+    return measured_psf(
+        TRIPLE, files=files, window=window, zones=zones, draws=draws, shape=shape, rng=seed, **given
+    )
 
 
 def beside(place, rng):
@@ -31,11 +41,16 @@ def misfit(found, zone, truth):
 
 @pytest.fixture(scope="module")
 def one_zone(tmp_path_factory):
-    """One point in each of six frames: short exposures, and exposures five times as long with a clipped core."""
+    """One point in each of six frames: short exposures, and exposures five times as long with a
+    clipped core.
+    """
     folder, rng, shape = tmp_path_factory.mktemp("points"), np.random.default_rng(4), (44, 46)
     for number in range(6):
         long = number % 2
-        np.save(folder / f"p{number}.npy", points(rng, shape, [beside((22, 23), rng)], [6e5 if long else 1e5]))
+        np.save(
+            folder / f"p{number}.npy",
+            points(rng, shape, [beside((22, 23), rng)], [6e5 if long else 1e5]),
+        )
     return folder, shape, measure(folder, shape, (15, 15))
 
 
@@ -71,7 +86,8 @@ def test_points_are_where_they_were_drawn(tmp_path):
 def test_dark_frames_take_the_place_of_the_offset_and_hot_pixels_are_no_points(tmp_path):
     rng, shape = np.random.default_rng(1), (44, 44)
     pattern = rng.uniform(0, 40, (3, *shape))
-    pattern[:, 5, 5], pattern[:, 22, 25] = 5000, 900  # a hot pixel alone, and a warm one in the window
+    # a hot pixel alone, and a warm one in the window
+    pattern[:, 5, 5], pattern[:, 22, 25] = 5000, 900
     for number in range(4):
         frame = points(rng, shape, [beside((22, 22), rng)], [1.2e5], dark=pattern)
         np.save(tmp_path / f"p{number}.npy", frame)
@@ -83,7 +99,9 @@ def test_dark_frames_take_the_place_of_the_offset_and_hot_pixels_are_no_points(t
     alone = tuple(sorted(tmp_path.glob("p*.npy")))
     seed = torch.Generator().manual_seed(1)
     without = measured_psf(TRIPLE, files=alone, window=(11, 11), shape=shape, rng=seed, **CAMERA)
-    near, nearer = (abs(x.kernels[0, 0].numpy() - truth)[:, 4:7, 7:10].mean() for x in (without, found))
+    near, nearer = (
+        abs(x.kernels[0, 0].numpy() - truth)[:, 4:7, 7:10].mean() for x in (without, found)
+    )
     assert near > 2 * nearer
 
 
@@ -101,24 +119,36 @@ def test_a_psf_too_sharp_for_the_pixels_is_said_by_chi_square(tmp_path):
 
 
 def two_zones(folder, places, frames, lobe=0.0, **other):
-    """Measure two zones beside one another, of 50 x 100 pixels together, from one point in each of them."""
+    """Measure two zones beside one another, of 50 x 100 pixels together, from one point in each
+    of them.
+    """
     rng = np.random.default_rng(0)
     for number in range(frames):
         beside_them = [tuple(c + rng.uniform(-0.3, 0.3) for c in place) for place in places]
-        np.save(folder / f"p{number}.npy", points(rng, (50, 100), beside_them, [1e5, 1e5], lobe=lobe))
+        np.save(
+            folder / f"p{number}.npy", points(rng, (50, 100), beside_them, [1e5, 1e5], lobe=lobe)
+        )
     return measure(folder, (50, 100), zones=(1, 2), **other)
 
 
 @pytest.mark.parametrize(("away", "good"), [(25, True), (4, False)])
-def test_a_zone_whose_points_lie_far_from_its_middle_is_named_with_the_inflation_of_its_variance(tmp_path, away, good):
-    """The nodes are in the columns 24.5 and 74.5. For two points the numbers are those of two equations."""
-    found = two_zones(tmp_path, [(10.0, 49.5 - away), (38.0, 49.5 + away)], 2, window=(7, 7), draws=4)
+def test_a_zone_whose_points_lie_far_from_its_middle_is_named_with_the_inflation_of_its_variance(
+    tmp_path, away, good
+):
+    """The nodes are in the columns 24.5 and 74.5. For two points the numbers are those of two
+    equations.
+    """
+    found = two_zones(
+        tmp_path, [(10.0, 49.5 - away), (38.0, 49.5 + away)], 2, window=(7, 7), draws=4
+    )
     whole = found.places[:, 2].numpy().round()
     right = np.clip((whole - 24.5) / 50, 0, 1)
     normal = np.einsum("pi,pj->ij", *[np.stack([1 - right, right], 1)] * 2)
     inverse = np.linalg.inv(normal)
     np.testing.assert_allclose(found.support[0].numpy(), 1 / inverse.diagonal(), rtol=1e-6)
-    np.testing.assert_allclose(found.inflation[0].numpy(), inverse.diagonal() * normal.diagonal(), rtol=1e-6)
+    np.testing.assert_allclose(
+        found.inflation[0].numpy(), inverse.diagonal() * normal.diagonal(), rtol=1e-6
+    )
     (check,) = (each for each in measured_psf.hooks.check(found) if "points or more" in each.text)
     assert check.ok == good
     assert ("in zone (1, " in check.text) != good
@@ -127,7 +157,9 @@ def test_a_zone_whose_points_lie_far_from_its_middle_is_named_with_the_inflation
 @pytest.mark.slow
 @pytest.mark.parametrize("frames", [2, 5])
 def test_points_that_tell_two_psfs_at_once_tell_them_within_their_error(tmp_path, frames):
-    """The PSFs must stay in their middles: added, those that lie beside one another make a wider one."""
+    """The PSFs must stay in their middles: added, those that lie beside one another make a wider
+    one.
+    """
     found = two_zones(tmp_path, [(24.5, 38.5), (24.5, 60.5)], frames, window=(11, 11))
     assert 1.5 < float(found.inflation.max()) < 3
     truth = centred((0.0, 0.0), (11, 11), lobe=0.0)
@@ -139,25 +171,32 @@ def test_points_that_tell_two_psfs_at_once_tell_them_within_their_error(tmp_path
 
 @pytest.mark.slow
 def test_the_psf_by_field_agrees_within_its_error_at_every_node(tmp_path):
-    """Windows overlap, the long exposures are clipped; 1.09 is expected of 24 draws, for a deviation is drawn too."""
+    """Windows overlap, the long exposures are clipped; 1.09 is expected of 24 draws, for a
+    deviation is drawn too.
+    """
     rng, shape, window, zones = np.random.default_rng(3), (140, 140), (25, 25), (2, 2)
     grid = [(y, x) for y in (34.5, 104.5) for x in (34.5, 104.5)]
     for number in range(8):
         signals = [6e5 if number % 2 else 6e4] * 4
-        np.save(tmp_path / f"p{number}.npy", points(rng, shape, [beside(p, rng) for p in grid], signals))
+        np.save(
+            tmp_path / f"p{number}.npy", points(rng, shape, [beside(p, rng) for p in grid], signals)
+        )
     found, core = measure(tmp_path, shape, window, zones), []
     for number, place in enumerate(grid):
         wrong = misfit(found, divmod(number, 2), centred(place_in(place, shape), window))
         assert 0.8 < wrong.mean() < 1.5, (place, wrong.mean())
         core.append(wrong[:, 10:15, 10:15].mean())
-    assert 0.6 < np.mean(core) < 1.8, core  # few directions in 25 pixels: 0.99 to 1.43 on average over six such sets
+    # few directions in 25 pixels: 0.99 to 1.43 on average over six such sets
+    assert 0.6 < np.mean(core) < 1.8, core
     apart = misfit(found, (0, 0), centred(place_in(grid[1], shape), window)).mean()
     assert apart > 3  # the PSFs of two nodes are told apart
-    share = 1 - np.array([centred(place_in(p, shape), (95, 95))[:, 35:60, 35:60].sum((1, 2)) for p in grid])
+    share = 1 - np.array(
+        [centred(place_in(p, shape), (95, 95))[:, 35:60, 35:60].sum((1, 2)) for p in grid]
+    )
     assert (share.max(0) < found.outside.numpy()).all()
 
 
-# --- the model --------------------------------------------------------------------------------------------------------
+# --- the model ------------------------------------------------------------------------------------
 
 
 def test_shifting_is_exact_for_smooth_pictures_and_has_the_right_slope():
@@ -179,17 +218,24 @@ def test_the_slope_is_the_transpose_of_the_change_and_the_change_that_of_the_mod
     seen = read_points(tuple(sorted(folder.iterdir())), (15, 15), tuple(CAMERA[n] for n in _ORDER))
     share = node_weights(seen.middle, shape, (2, 2))
     draw = torch.Generator().manual_seed(0)
-    like = State(torch.rand(4, 3, 15, 15), torch.rand(6, 3), torch.rand(6, 2) - 0.5, torch.rand(6, 3))
-    state, by = (State(*(torch.rand(x.shape, generator=draw).double() for x in like)) for _ in range(2))
+    like = State(
+        torch.rand(4, 3, 15, 15), torch.rand(6, 3), torch.rand(6, 2) - 0.5, torch.rand(6, 3)
+    )
+    state, by = (
+        State(*(torch.rand(x.shape, generator=draw).double() for x in like)) for _ in range(2)
+    )
     near = linear(seen, state, share)
     pixels = torch.randn(seen.light.shape, generator=draw).double()
     there, back = float((near.change(by) * pixels).sum()), float(near.slope(pixels).dot(by))
     assert abs(there - back) < 1e-10 * abs(there)
     small = 1e-6
     ahead, behind = (
-        linear(seen, moved, share).model(moved.background) for moved in (state.plus(by, small), state.plus(by, -small))
+        linear(seen, moved, share).model(moved.background)
+        for moved in (state.plus(by, small), state.plus(by, -small))
     )
-    torch.testing.assert_close((ahead - behind) / (2 * small), near.change(by), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(
+        (ahead - behind) / (2 * small), near.change(by), rtol=1e-5, atol=1e-5
+    )
 
 
 _ORDER = ("gain", "offset", "full_well", "bits", "read_noise")
@@ -208,7 +254,7 @@ def test_the_centre_does_not_depend_on_where_the_points_were():
     torch.testing.assert_close(gauged(down[:, None] @ kernel), kernel, rtol=0, atol=2e-4)
 
 
-# --- what is refused --------------------------------------------------------------------------------------------------
+# --- what is refused ------------------------------------------------------------------------------
 
 
 def refused(folder, **other):
@@ -249,7 +295,8 @@ def test_zones_without_a_point_that_is_not_saturated_are_named(tmp_path):
     parameter, text = refused(tmp_path, zones=(2, 2))
     assert parameter == "zones"
     assert text.startswith(
-        "3 of 2 x 2 zones have no point with an unsaturated core, (row, column) (1, 2), (2, 1), (2, 2)"
+        "3 of 2 x 2 zones have no point with an unsaturated core, (row, column) (1, 2), (2, 1),"
+        " (2, 2)"
     )
 
 
@@ -264,8 +311,11 @@ def test_no_frames_and_dark_frames_alone_are_refused(tmp_path):
 def test_a_core_that_is_saturated_in_every_frame_is_refused(tmp_path):
     rng = np.random.default_rng(0)
     frame = points(rng, (40, 40), [(20, 20)], [1e5])
-    frame[:, 18, 18] = 65535  # a pixel that the point does not fill, in the window of the only point
+    # a pixel that the point does not fill, in the window of the only point
+    frame[:, 18, 18] = 65535
     frame[:, 22:24, 22:24] = int((CAMERA["full_well"]) * CAMERA["gain"])
     np.save(tmp_path / "a.npy", frame)
-    with pytest.raises(ValueError, match="pixels of the PSF are saturated, or beyond the edge, in every frame"):
+    with pytest.raises(
+        ValueError, match="pixels of the PSF are saturated, or beyond the edge, in every frame"
+    ):
         measure(tmp_path, (40, 40), (11, 11))

@@ -6,7 +6,7 @@ import torch
 
 from neusee.nodes.restore import measured_psf, spread_by_field, wiener_by_field
 from neusee.nodes.values import MeasuredPsf
-from neusee.workflows.engine.cost_laws import measured_size, shipped, size_of
+from neusee.workflows.engine.cost_model import measured_size, shipped, size_of
 from neusee.workflows.graph.step_shapes import form_of, without_values
 from tests.nodes.restore.points.independent_camera import CAMERA, READ, points
 
@@ -27,23 +27,43 @@ def settings(tmp_path_factory):
         np.save(folder / f"p{number}.npy", points(rng, (SIDE, SIDE), places, [8e4] * 4))
     np.save(folder / "dark.npy", points(rng, (SIDE, SIDE), [], []))
     files = tuple(sorted(folder.iterdir()))
-    return {"files": files, "window": (7, 7), "zones": (2, 2), "draws": 4, "shape": (SIDE, SIDE), **CAMERA}
+    return {
+        "files": files,
+        "window": (7, 7),
+        "zones": (2, 2),
+        "draws": 4,
+        "shape": (SIDE, SIDE),
+        **CAMERA,
+    }
 
 
 def test_shapes_and_sizes_before_a_run_are_those_of_the_run(settings):
     responses, seed = torch.ones(3, 5), torch.Generator().manual_seed
     found = measured_psf(responses, **settings, rng=seed(0))
     electrons = torch.tensor(np.random.default_rng(1).poisson(2000.0, (3, SIDE, SIDE))).float()
-    clipped, glare = torch.zeros(3, SIDE, SIDE, dtype=torch.bool), [torch.rand(3, SIDE, SIDE, generator=seed(1))]
+    clipped, glare = (
+        torch.zeros(3, SIDE, SIDE, dtype=torch.bool),
+        [torch.rand(3, SIDE, SIDE, generator=seed(1))],
+    )
     restored = wiener_by_field(electrons, found, clipped, glare, read_noise=READ)
-    spread = spread_by_field(electrons, found, clipped, torch.eye(3), glare, draws=2, read_noise=READ, rng=seed(0))
+    spread = spread_by_field(
+        electrons, found, clipped, torch.eye(3), glare, draws=2, read_noise=READ, rng=seed(0)
+    )
     steps = (
         (measured_psf, [responses], settings, found),
         (wiener_by_field, [electrons, found, clipped, glare], {"read_noise": READ}, restored),
-        (spread_by_field, [electrons, found, clipped, torch.eye(3), glare], {"draws": 2, "read_noise": READ}, spread),
+        (
+            spread_by_field,
+            [electrons, found, clipped, torch.eye(3), glare],
+            {"draws": 2, "read_noise": READ},
+            spread,
+        ),
     )
     for node, inputs, params, value in steps:
-        forms = [[without_values(y) for y in x] if isinstance(x, list) else without_values(x) for x in inputs]
+        forms = [
+            [without_values(y) for y in x] if isinstance(x, list) else without_values(x)
+            for x in inputs
+        ]
         form = form_of(node, forms, params)
         assert told(form) == told(value), node.path
         size = size_of(node, forms, params, form)
@@ -56,7 +76,12 @@ def test_shapes_and_sizes_before_a_run_are_those_of_the_run(settings):
 def test_larger_problems_take_longer_and_need_more(settings):
     def law_of(**change):
         given = {**settings, **change}
-        return size_of(measured_psf, [torch.ones(3, 5)], given, form_of(measured_psf, [torch.ones(3, 5)], given))
+        return size_of(
+            measured_psf,
+            [torch.ones(3, 5)],
+            given,
+            form_of(measured_psf, [torch.ones(3, 5)], given),
+        )
 
     usual, other = law_of(), law_of(draws=24)
     assert other.operations > 2.5 * usual.operations

@@ -1,4 +1,6 @@
-"""The selective scan against the loop that defines it: any length, any decay, both backends, one derivative."""
+"""The selective scan against the loop that defines it: any length, any decay, both backends, one
+derivative.
+"""
 
 import hashlib
 import os
@@ -37,7 +39,9 @@ def backend(request):
 
 
 def draw(length, d=4, n=4, *, batch=1, rate=None, kind=torch.float64, seed=0, even=False):
-    """u, dt, A, B, C with dt |A| about ``rate``, or spread by logarithms over 1e-6 to 50, or of many sizes."""
+    """u, dt, A, B, C with dt |A| about ``rate``, or spread by logarithms over 1e-6 to 50, or of
+    many sizes.
+    """
     rng = torch.Generator().manual_seed(seed)
     one = {"dtype": torch.float64, "generator": rng}
     u, B, C = (torch.randn(batch, length, m, **one) for m in (d, n, n))
@@ -46,7 +50,11 @@ def draw(length, d=4, n=4, *, batch=1, rate=None, kind=torch.float64, seed=0, ev
     if rate == "mix":
         A = -torch.logspace(-6, np.log10(50), d * n, dtype=torch.float64).view(d, n)
     else:
-        A = -torch.rand(d, n, **one) - 0.1 if rate is None else torch.full((d, n), -rate, dtype=torch.float64)
+        A = (
+            -torch.rand(d, n, **one) - 0.1
+            if rate is None
+            else torch.full((d, n), -rate, dtype=torch.float64)
+        )
     return [x.to(kind) for x in (u, dt, A, B, C)]
 
 
@@ -63,7 +71,9 @@ def loop(u, dt, A, B, C):
 
 @lru_cache(maxsize=24)
 def long_line(rate, kind, even, d=4, n=4, seed=0):
-    """A line of 65536 with its truth: the loop of as many steps is run once for all backends and plans."""
+    """A line of 65536 with its truth: the loop of as many steps is run once for all backends and
+    plans.
+    """
     values = draw(65_536, d, n, rate=rate, kind=kind, even=even, seed=seed)
     return values, loop(*values)
 
@@ -71,7 +81,10 @@ def long_line(rate, kind, even, d=4, n=4, seed=0):
 def worst(found, truth):
     assert found.shape == truth.shape
     assert bool(found.isfinite().all())
-    return float((found.detach().double() - truth.detach()).abs().max() / truth.detach().abs().max().clamp_min(1e-300))
+    return float(
+        (found.detach().double() - truth.detach()).abs().max()
+        / truth.detach().abs().max().clamp_min(1e-300)
+    )
 
 
 def gradients(scan, values, seen):
@@ -83,13 +96,17 @@ def gradients(scan, values, seen):
 @pytest.mark.parametrize("rate", RATES)
 def test_a_long_line_is_that_of_the_loop(rate, even, backend):
     values, truth = long_line(rate, torch.float32, even)
-    assert worst(selective_scan(*values, backend=backend), truth) < (8e-7 if backend == "torch" else 3e-7)
+    assert worst(selective_scan(*values, backend=backend), truth) < (
+        8e-7 if backend == "torch" else 3e-7
+    )
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("steps", [(16, 1), (10, 9)])
 def test_a_state_that_hardly_decays_is_not_rounded_away_in_wide_lines(monkeypatch, steps, seed):
-    """As many carries as lines of 1536 numbers and more have; 2e-6 where they are in single precision."""
+    """As many carries as lines of 1536 numbers and more have; 2e-6 where they are in single
+    precision.
+    """
     values, truth = long_line(1e-6, torch.float32, True, 2, 2, seed)
     monkeypatch.setattr(_torch_scan, "plan", lambda *_: _torch_scan.Plan(*steps))
     assert worst(selective_scan(*values, backend="torch"), truth) < 4e-7
@@ -107,7 +124,9 @@ def test_a_long_line_in_double_precision(rate, backend):
 )
 def test_any_size_and_its_gradients(length, d, n, batch, backend):
     values = draw(length, d, n, batch=batch)
-    seen = torch.randn(batch, length, d, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    seen = torch.randn(
+        batch, length, d, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    )
     assert worst(selective_scan(*values, backend=backend), reference(*values)) < 1e-13
     found = gradients(lambda *x: selective_scan(*x, backend=backend), values, seen)
     for one, truth in zip(found, gradients(reference, values, seen), strict=True):
@@ -137,7 +156,13 @@ def test_any_cut_of_the_length_gives_the_same(monkeypatch, steps):
 @pytest.mark.usefixtures("cpp")
 def test_both_backends_give_the_same_numbers():
     values = draw(3001, 19, 5, batch=2, kind=torch.float32)
-    assert worst(selective_scan(*values, backend="torch"), selective_scan(*values, backend="cpp").double()) < 1e-6
+    assert (
+        worst(
+            selective_scan(*values, backend="torch"),
+            selective_scan(*values, backend="cpp").double(),
+        )
+        < 1e-6
+    )
 
 
 @pytest.mark.usefixtures("cpp")
@@ -181,7 +206,9 @@ def test_decays_that_leave_nothing_and_lines_of_nothing(backend):
         values = (u_, dt_, A, B, C)
         y = selective_scan(*values, backend=backend)
         assert bool(y.isfinite().all())
-        found = gradients(lambda *x: selective_scan(*x, backend=backend), values, torch.ones_like(u))
+        found = gradients(
+            lambda *x: selective_scan(*x, backend=backend), values, torch.ones_like(u)
+        )
         assert all(bool(x.isfinite().all()) for x in found)
     assert not selective_scan(u * 0, dt, A, B, C, backend=backend).any()
 
@@ -210,7 +237,9 @@ def test_strided_inputs_and_the_direct_path(backend):
     u, dt, A, B, C = draw(60, 5, 3)
     D = torch.linspace(-1, 1, 5, dtype=torch.float64)
     turned = [x.transpose(1, 2).contiguous().transpose(1, 2) for x in (u, dt, B, C)]
-    y = selective_scan(turned[0], turned[1], A.T.contiguous().T, turned[2], turned[3], D, backend=backend)
+    y = selective_scan(
+        turned[0], turned[1], A.T.contiguous().T, turned[2], turned[3], D, backend=backend
+    )
     assert worst(y, loop(u, dt, A, B, C) + D * u) < 1e-13
     assert worst(y, reference(u, dt, A, B, C, D)) < 1e-13
 
@@ -222,13 +251,17 @@ def test_the_backward_of_the_reference_is_linear_in_length():
         if one is not None and one not in nodes:
             nodes.add(one)
             todo += [f for f, _ in one.next_functions]
-    assert sum(x.name() == "UnbindBackward0" for x in nodes) == 4, "one for each line, none for a row"
+    assert sum(x.name() == "UnbindBackward0" for x in nodes) == 4, (
+        "one for each line, none for a row"
+    )
     assert len(nodes) < 64 * 20
 
 
 @pytest.mark.parametrize("name", ["dt", "A", "B", "C", "D"])
 def test_shapes_that_do_not_fit_are_named(name):
-    values = dict(zip(("u", "dt", "A", "B", "C", "D"), (*draw(6, 3, 2), torch.zeros(3)), strict=True))
+    values = dict(
+        zip(("u", "dt", "A", "B", "C", "D"), (*draw(6, 3, 2), torch.zeros(3)), strict=True)
+    )
     values[name] = values[name][..., :1]
     with pytest.raises(ValueError, match=rf"^(B|{name}) is \("):
         selective_scan(**values)
@@ -252,7 +285,9 @@ def test_what_cannot_be_scanned_is_refused():
 def test_the_kernel_of_mamba_gets_the_length_last_and_one_derivative(monkeypatch):
     def kernel(u, dt, A, B, C):
         assert all(x.is_contiguous() for x in (u, dt, B, C))
-        return reference(*(x.transpose(1, 2) for x in (u, dt)), A, *(x.transpose(1, 2) for x in (B, C))).mT
+        return reference(
+            *(x.transpose(1, 2) for x in (u, dt)), A, *(x.transpose(1, 2) for x in (B, C))
+        ).mT
 
     name = "mamba_ssm.ops.selective_scan_interface"
     for part in ("mamba_ssm", "mamba_ssm.ops", name):
@@ -297,9 +332,13 @@ def test_on_a_gpu_what_is_installed_scans(monkeypatch, there, named, chosen):
     assert _selective_scan._auto(u, torch.float64) == "torch"
     if chosen == "torch":
         with pytest.warns(
-            UserWarning, match=r"^neither Triton nor mamba_ssm is installed.*: torch computes the scan"
+            UserWarning,
+            match=r"^neither Triton nor mamba_ssm is installed.*: torch computes the scan",
         ) as said:
-            assert [_selective_scan._auto(u, torch.float32), _selective_scan._auto(u, torch.float32)] == ["torch"] * 2
+            assert [
+                _selective_scan._auto(u, torch.float32),
+                _selective_scan._auto(u, torch.float32),
+            ] == ["torch"] * 2
         assert len(said) == 1
     else:
         assert _selective_scan._auto(u, torch.float32) == chosen
@@ -310,7 +349,9 @@ def test_without_a_compiler_torch_computes_and_it_is_said_once(monkeypatch, tmp_
     monkeypatch.setenv("CXX", str(tmp_path / "no-such-compiler"))
     _cpp_library._say_once.cache_clear()
     values = draw(20, 3, 2)
-    with pytest.warns(UserWarning, match="C\\+\\+ of the scan is not compiled and torch computes the scan") as said:
+    with pytest.warns(
+        UserWarning, match="C\\+\\+ of the scan is not compiled and torch computes the scan"
+    ) as said:
         found = [selective_scan(*values), selective_scan(*values, backend="cpp")]
     assert len(said) == 1
     assert "\n" not in str(said[0].message)
@@ -322,9 +363,15 @@ def test_without_a_compiler_torch_computes_and_it_is_said_once(monkeypatch, tmp_
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")
 def test_two_processes_that_compile_at_once_both_succeed(tmp_path):
-    code = "from neusee.nodes.restore._scan import _cpp_scan; print(_cpp_scan.operators().neusee_scan_steps())"
+    code = (
+        "from neusee.nodes.restore._scan import _cpp_scan;"
+        " print(_cpp_scan.operators().neusee_scan_steps())"
+    )
     env = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT / ".src")}
-    runs = [subprocess.Popen([sys.executable, "-c", code], env=env, stdout=subprocess.PIPE) for _ in range(2)]
+    runs = [
+        subprocess.Popen([sys.executable, "-c", code], env=env, stdout=subprocess.PIPE)
+        for _ in range(2)
+    ]
     assert [run.communicate()[0] for run in runs] == [b"32\n"] * 2
     assert [x.suffix for x in (tmp_path / "neusee" / "build").iterdir()] == [".so"]
 
@@ -337,6 +384,8 @@ def test_the_digest_of_the_source_is_that_of_the_source():
 def test_what_is_kept_for_the_way_back_is_little():
     u, *others = draw(4096, 96, 16, kind=torch.float32)
     kept = []
-    with torch.autograd.graph.saved_tensors_hooks(lambda x: (kept.append(x.numel()), x)[1], lambda x: x):
+    with torch.autograd.graph.saved_tensors_hooks(
+        lambda x: (kept.append(x.numel()), x)[1], lambda x: x
+    ):
         selective_scan(u.requires_grad_(), *others, backend="torch")
     assert sum(kept) < 0.2 * 4096 * 96 * 16

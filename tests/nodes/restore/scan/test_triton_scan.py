@@ -1,4 +1,6 @@
-"""The selective scan's Triton kernel: its numbers under Triton's interpreter, its code for a GPU, and on one if any."""
+"""The selective scan's Triton kernel: its numbers under Triton's interpreter, its code for a
+GPU, and on one if any.
+"""
 
 import importlib.util
 import os
@@ -21,14 +23,18 @@ needs_triton = pytest.mark.skipif(not HERE, reason="no Triton: it comes with tor
 
 
 def refuses_arrays():
-    """Return True where Triton's interpreter makes numbers of arrays of one element, which NumPy 2.5 refuses."""
+    """Return True where Triton's interpreter makes numbers of arrays of one element, which NumPy
+    2.5 refuses.
+    """
     triton, numpy = (tuple(map(int, version(name).split(".")[:2])) for name in ("triton", "numpy"))
     return triton <= (3, 6) and numpy >= (2, 5)
 
 
 @pytest.fixture
 def interpreted(monkeypatch):
-    """The module anew, as Triton decides when it reads one whether to interpret; with few channels and short chunks."""
+    """The module anew, as Triton decides when it reads one whether to interpret; with few
+    channels and short chunks.
+    """
     if refuses_arrays():
         pytest.skip("the interpreter of Triton up to 3.6 cannot run with NumPy 2.5")
     monkeypatch.setenv("TRITON_INTERPRET", "1")
@@ -43,7 +49,9 @@ def interpreted(monkeypatch):
 
 
 def draw(length, d, n, batch, rate):
-    """u, dt, A, B, C in float32, with dt |A| about ``rate``, or spread by logarithms from 1e-6 to 200."""
+    """u, dt, A, B, C in float32, with dt |A| about ``rate``, or spread by logarithms from 1e-6
+    to 200.
+    """
     rng = torch.Generator().manual_seed(length)
     u, B, C = (torch.randn(batch, length, m, generator=rng) for m in (d, n, n))
     dt = 0.5 + torch.rand(batch, length, d, generator=rng)
@@ -58,18 +66,23 @@ def gradients(scan, values, seen):
 
 
 def compare(scan, values, limit):
-    seen = torch.randn(values[0].shape, generator=torch.Generator().manual_seed(1)).to(values[0].device)
+    seen = torch.randn(values[0].shape, generator=torch.Generator().manual_seed(1)).to(
+        values[0].device
+    )
     truth = gradients(reference, [x.double() for x in values], seen.double())
     for one, true in zip(gradients(scan, values, seen), truth, strict=True):
         assert one.shape == true.shape
-        assert float((one - true).abs().max()) <= limit * float(true.abs().max()) + 1e-36  # what float32 has not
+        # what float32 has not
+        assert float((one - true).abs().max()) <= limit * float(true.abs().max()) + 1e-36
 
 
 @needs_triton
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [None, 1e-6, 1.0, 200.0])
 def test_interpreted_it_is_the_loop_in_float64(interpreted, rate):
-    """Two blocks of channels of which one is not full, three chunks of which one is not, a number of states between."""
+    """Two blocks of channels of which one is not full, three chunks of which one is not, a
+    number of states between.
+    """
     compare(interpreted.Scan.apply, draw(7, 3, 3, 2, rate), 1e-6)
 
 
@@ -103,15 +116,24 @@ for kernel in (module._forward, module._backward):
 @pytest.mark.slow
 def test_it_compiles_for_gpus_that_are_not_here_and_has_no_atomics(tmp_path):
     """In a process of its own, for who has interpreted cannot compile."""
-    env = {**os.environ, "TRITON_CACHE_DIR": str(tmp_path), "TRITON_INTERPRET": "0", "PYTHONPATH": str(ROOT / ".src")}
-    done = subprocess.run([sys.executable, "-c", COMPILE], env=env, capture_output=True, text=True, check=True)
+    env = {
+        **os.environ,
+        "TRITON_CACHE_DIR": str(tmp_path),
+        "TRITON_INTERPRET": "0",
+        "PYTHONPATH": str(ROOT / ".src"),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", COMPILE], env=env, capture_output=True, text=True, check=True
+    )
     assert done.stdout == "True True False False\n" * 4
 
 
 @pytest.mark.gpu
 @needs_triton
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-@pytest.mark.parametrize(("length", "d", "n"), [(1, 1, 1), (65, 17, 3), (1000, 128, 16), (4096, 64, 16)])
+@pytest.mark.parametrize(
+    ("length", "d", "n"), [(1, 1, 1), (65, 17, 3), (1000, 128, 16), (4096, 64, 16)]
+)
 @pytest.mark.parametrize("rate", [None, 1e-6, 1.0, 200.0])
 def test_on_a_gpu_it_is_the_loop_in_float64(length, d, n, rate):
     values = [x.cuda() for x in draw(length, d, n, 2, rate)]

@@ -1,4 +1,6 @@
-"""The shading of frames from a camera in NumPy: found within its interval, and left alone where frames cannot tell."""
+"""The shading of frames from a camera in NumPy: found within its interval, and left alone where
+frames cannot tell.
+"""
 
 import numpy as np
 import pytest
@@ -8,7 +10,13 @@ from neusee.nodes import ParameterError
 from neusee.nodes.restore import electrons, shading, wiener_spread
 
 SIDE, GAIN, OFFSET, NOISE = 48, 2.0, 100.0, 8.0
-CAMERA = {"shape": (SIDE, SIDE), "gain": GAIN, "offset": OFFSET, "full_well": 25000.0, "read_noise": NOISE}
+CAMERA = {
+    "shape": (SIDE, SIDE),
+    "gain": GAIN,
+    "offset": OFFSET,
+    "full_well": 25000.0,
+    "read_noise": NOISE,
+}
 THREE = torch.ones(3, 4)
 
 
@@ -23,18 +31,26 @@ def grains(rng, depth):
 
 
 def scene(rng):
-    """Rectangles and discs of random reflectance, one above the other, in three channels; at most 12 000 e-."""
+    """Rectangles and discs of random reflectance, one above the other, in three channels; at
+    most 12 000 e-.
+    """
     y, x = np.mgrid[:SIDE, :SIDE]
     picture = np.full((3, SIDE, SIDE), rng.uniform(0.1, 1))
     for _ in range(150):
         (cy, cx), size = rng.uniform(0, SIDE, 2), min(1.5 / rng.uniform(0.03, 1), SIDE)
-        inside = np.hypot(y - cy, x - cx) < size if rng.random() < 0.5 else np.maximum(abs(y - cy), abs(x - cx)) < size
+        inside = (
+            np.hypot(y - cy, x - cx) < size
+            if rng.random() < 0.5
+            else np.maximum(abs(y - cy), abs(x - cx)) < size
+        )
         picture[:, inside] = (rng.uniform(0.15, 1) * rng.uniform(0.7, 1, 3))[:, None]
     return 12000 * picture
 
 
 def shots(folder, rng, count, transmission, scenes=None, spots=0):
-    """Digital numbers of ``count`` frames in files: shot noise, read noise, offset, gain, well and converter."""
+    """Digital numbers of ``count`` frames in files: shot noise, read noise, offset, gain, well
+    and converter.
+    """
     for number in range(count):
         light = (scene(rng) if scenes is None else scenes[number]) * transmission
         if spots:
@@ -53,7 +69,9 @@ def truth_at(found, transmission):
 
 
 def score(found, transmission):
-    """Share of knots in the 90 % interval, and the rms error of the estimate over that of no estimate."""
+    """Share of knots in the 90 % interval, and the rms error of the estimate over that of no
+    estimate.
+    """
     error = found.estimate.numpy() - truth_at(found, transmission)
     held = np.abs(error) <= 1.645 * found.deviation.numpy()
     return held.mean(), np.sqrt((error**2).mean()) / truth_at(found, transmission).std()
@@ -115,7 +133,9 @@ def test_one_frame_says_how_little_it_tells(tmp_path):
 
 def test_frames_of_one_scene_count_as_one_frame(tmp_path):
     rng = np.random.default_rng(11)
-    found = shading(THREE, files=list(shots(tmp_path, rng, 12, 1.0, [scene(rng)] * 12).iterdir()), **CAMERA)
+    found = shading(
+        THREE, files=list(shots(tmp_path, rng, 12, 1.0, [scene(rng)] * 12).iterdir()), **CAMERA
+    )
     assert float(found.alike) > 0.9
     assert not bool(found.identifiable)
 
@@ -124,7 +144,9 @@ def test_frames_of_one_scene_count_as_one_frame(tmp_path):
 def test_saturated_cells_are_left_out(tmp_path):
     rng = np.random.default_rng(3)
     dirty = grains(rng, 0.7)
-    found = shading(THREE, files=list(shots(tmp_path, rng, 32, dirty, spots=12).iterdir()), **CAMERA)
+    found = shading(
+        THREE, files=list(shots(tmp_path, rng, 32, dirty, spots=12).iterdir()), **CAMERA
+    )
     held, left = score(found, dirty)
     assert held >= 0.75
     assert left < 0.75
@@ -138,14 +160,19 @@ def test_the_uncertainty_of_the_shading_reaches_the_picture(tmp_path):
     rng = np.random.default_rng(5)
     found = shading(THREE, files=list(shots(tmp_path, rng, 1, 1.0).iterdir()), **CAMERA)
     one = torch.ones(4).double()
-    bands, psf = Bands(torch.linspace(4e-7, 7e-7, 4).double(), 1e-7 * one, one), torch.zeros(4, 9, 9)
+    bands, psf = (
+        Bands(torch.linspace(4e-7, 7e-7, 4).double(), 1e-7 * one, one),
+        torch.zeros(4, 9, 9),
+    )
     psf[:, 4, 4] = 1.0
     frame = torch.from_numpy(scene(rng)).float()
     inputs = (frame, Psf(psf, one), one, torch.eye(3, 4), bands, frame > 1e9, torch.eye(3) / 12000)
     given = {"read_noise": NOISE, "draws": 2}
     plain = wiener_spread(*inputs, **given, rng=torch.Generator().manual_seed(0))
     restored = frame / 12000
-    wide = wiener_spread(*inputs, None, None, None, restored, found, **given, rng=torch.Generator().manual_seed(0))
+    wide = wiener_spread(
+        *inputs, None, None, None, restored, found, **given, rng=torch.Generator().manual_seed(0)
+    )
     expected = np.sqrt(plain.numpy() ** 2 + (restored.numpy() * found.spread.numpy()) ** 2)
     np.testing.assert_allclose(wide.numpy(), expected, rtol=1e-5)
     assert float(wide.mean()) > 1.2 * float(plain.mean())

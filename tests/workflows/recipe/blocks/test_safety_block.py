@@ -1,10 +1,13 @@
-"""The block `safety` of a recipe: what it reads, and one located line for each mistake, before any work."""
+"""The block `safety` of a recipe: what it reads, and one located line for each mistake, before
+any work.
+"""
 
 import pytest
 
 from neusee.workflows import RecipeError, load
 
-#: what is wrong, the changes of the recipe safety_pointer, the path of the value, and words of the message
+#: what is wrong, the changes of the recipe safety_pointer, the path of the value, and words of the
+#: message
 MISTAKES = [
     ("no distance", ["~lasers.pointer.distance"], "lasers.pointer", "needs distance"),
     ("no power", ["~lasers.pointer.power"], "lasers.pointer.power", "no power: give power, or pulse_energy"),
@@ -47,7 +50,9 @@ MISTAKES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("changes", "path", "words"), [m[1:] for m in MISTAKES], ids=[m[0] for m in MISTAKES])
+@pytest.mark.parametrize(
+    ("changes", "path", "words"), [m[1:] for m in MISTAKES], ids=[m[0] for m in MISTAKES]
+)
 def test_a_mistake_is_one_located_line(changes, path, words):
     from neusee.workflows.safety.safety_estimate import estimate
 
@@ -79,7 +84,10 @@ def test_a_block_that_is_no_mapping_is_a_mistake():
 
 
 def test_null_is_no_estimate_and_a_run_needs_no_block():
-    assert load("safety_car_lidar_1550", ["safety=null", "lasers.lidar={wavelength: 1550 nm}"]).safety is None
+    assert (
+        load("safety_car_lidar_1550", ["safety=null", "lasers.lidar={wavelength: 1550 nm}"]).safety
+        is None
+    )
     assert load("laser_free").safety is None
 
 

@@ -1,4 +1,6 @@
-"""Every law against SciPy and against samples by NumPy; wrong forms are refused once and where they stand."""
+"""Every law against SciPy and against samples by NumPy; wrong forms are refused once and where
+they stand.
+"""
 
 import math
 
@@ -11,8 +13,13 @@ from scipy import stats
 from neusee.workflows import load
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.recipe.distributions.law_text import KINDS, read_law
-from neusee.workflows.recipe.distributions.scalar import draw_laws
-from neusee.workflows.recipe.distributions.shapes import Discrete, Normal, scores_between, share_between
+from neusee.workflows.recipe.distributions.shapes import (
+    Discrete,
+    Normal,
+    draw_laws,
+    scores_between,
+    share_between,
+)
 from neusee.workflows.simulation.simulate_recipe import recipe_text
 
 LAWS = [
@@ -39,13 +46,15 @@ def table(tmp_path):
     return path
 
 
-# --- values ----------------------------------------------------------------------------------------------------------
+# --- values ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("text", "law"), LAWS, ids=[text for text, _ in LAWS])
 def test_quantiles_are_those_of_scipy(text, law):
     z = np.linspace(-4, 4, 41)
-    assert read_law(text).at(z) == pytest.approx(law.ppf(stats.norm.cdf(z)), rel=1e-8, abs=1e-12 * law.std())
+    assert read_law(text).at(z) == pytest.approx(
+        law.ppf(stats.norm.cdf(z)), rel=1e-8, abs=1e-12 * law.std()
+    )
 
 
 @pytest.mark.parametrize(("text", "law"), LAWS, ids=[text for text, _ in LAWS])
@@ -71,7 +80,9 @@ def test_a_truncated_lognormal_law_is_the_conditional_law():
 
 
 def test_bounds_far_in_a_tail_keep_their_accuracy():
-    """Beyond 12 standard deviations a truncated normal law is exponential: 1 / 12 of a deviation to the bound."""
+    """Beyond 12 standard deviations a truncated normal law is exponential: 1 / 12 of a deviation
+    to the bound.
+    """
     z = np.linspace(-8, 8, 17)
     for low, high, sign in ((12.0, math.inf, 1), (-math.inf, -12.0, -1)):
         x = sign * scores_between(z, low, high)
@@ -128,7 +139,9 @@ def test_a_file_of_one_column_needs_no_name(tmp_path, suffix):
 def test_a_gain_in_electrons_a_number_is_drawn_as_written():
     z = np.linspace(-3, 3, 13)
     law = read_law("truncated(normal(0.37 e-/DN, 0.2 e-/DN), 0.1 e-/DN, inf)")
-    assert 1 / law.at(z) == pytest.approx(stats.truncnorm(-1.35, math.inf, 0.37, 0.2).ppf(stats.norm.cdf(z)))
+    assert 1 / law.at(z) == pytest.approx(
+        stats.truncnorm(-1.35, math.inf, 0.37, 0.2).ppf(stats.norm.cdf(z))
+    )
     assert law.unit == "DN/e-"
 
 
@@ -145,27 +158,45 @@ def test_a_truncated_law_stays_between_its_bounds(low, width):
 @given(st.floats(-9, 9), st.floats(-9, 9))
 def test_probabilities_between_two_scores_are_accurate(a, b):
     low, high = sorted((a, b))
-    exact = stats.norm.cdf(high) - stats.norm.cdf(low) if low < 0 else stats.norm.sf(low) - stats.norm.sf(high)
+    exact = (
+        stats.norm.cdf(high) - stats.norm.cdf(low)
+        if low < 0
+        else stats.norm.sf(low) - stats.norm.sf(high)
+    )
     assert share_between(low, high) == pytest.approx(exact, rel=1e-9, abs=1e-15)
 
 
-#: first draws of each law with the seed 7, by another implementation: Generator(PCG64), then quantiles of SciPy
+#: first draws of each law with the seed 7, by another implementation: Generator(PCG64), then
+#: quantiles of SciPy
 def test_a_seed_has_the_same_draws_whatever_the_law_beside():
-    texts = {"a": "normal(2, 1)", "b": "beta(2, 5)", "c": "triangular(0, 1, 4)", "d": "truncated(normal(2, 1), 0, 3)"}
-    laws = [stats.norm(2, 1), stats.beta(2, 5), stats.triang(0.25, 0, 4), stats.truncnorm(-2, 1, 2, 1)]
+    texts = {
+        "a": "normal(2, 1)",
+        "b": "beta(2, 5)",
+        "c": "triangular(0, 1, 4)",
+        "d": "truncated(normal(2, 1), 0, 3)",
+    }
+    laws = [
+        stats.norm(2, 1),
+        stats.beta(2, 5),
+        stats.triang(0.25, 0, 4),
+        stats.truncnorm(-2, 1, 2, 1),
+    ]
     drawn = draw_laws({name: read_law(text) for name, text in texts.items()}, 5, [7, 1])
     z = np.random.Generator(np.random.PCG64(np.random.SeedSequence([7, 1]))).standard_normal((5, 4))
     for i, (name, law) in enumerate(zip(texts, laws, strict=True)):
         assert drawn[name] == pytest.approx(law.ppf(stats.norm.cdf(z[:, i])), rel=1e-9)
 
 
-# --- wrong forms -----------------------------------------------------------------------------------------------------
+# --- wrong forms ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("law", "message"),
     [
-        ("truncated(normal(2 e-, 1 e-), 0 e-)", "lower bound or -inf, and its upper bound or inf: write truncated"),
+        (
+            "truncated(normal(2 e-, 1 e-), 0 e-)",
+            "lower bound or -inf, and its upper bound or inf: write truncated",
+        ),
         ("truncated(normal(2 e-, 1 e-))", "lower bound or -inf"),
         ("truncated(2 e-, 0 e-, 3 e-)", "needs a distribution, its lower bound"),
         ("truncated(normal(2 e-, 1 e-), -inf, inf)", "needs a bound"),
@@ -174,14 +205,20 @@ def test_a_seed_has_the_same_draws_whatever_the_law_beside():
         ("truncated(normal(2 e-, 1 e-), 90 e-, inf)", "less than 1e-9 of the distribution"),
         ("truncated(uniform(2 e-, 3 e-), 4 e-, 5 e-)", "less than 1e-9 of the distribution"),
         ("truncated(discrete(1 e-, 2 e-), 2 e-, inf)", "fewer than two values"),
-        ("truncated(truncated(normal(2 e-, 1 e-), 0 e-, inf), 1 e-, inf)", "cannot be truncated again"),
+        (
+            "truncated(truncated(normal(2 e-, 1 e-), 0 e-, inf), 1 e-, inf)",
+            "cannot be truncated again",
+        ),
         ("truncated(normal(2 e-, 0 e-), 0 e-, inf)", "standard deviation must be greater than 0"),
         ("triangular(9 e-, 12 e-)", "least, most probable and largest value: write triangular"),
         ("triangular(9 e-, 13 e-, 12 e-)", "must stand in this order"),
         ("triangular(9 e-, 9 e-, 9 e-)", "must stand in this order"),
         ("triangular(9 e-, 10 nm, 12 e-)", "same unit"),
         ("beta(0, 2)", "shape parameters of a beta distribution must be greater than 0"),
-        ("beta(2, -1, 0 e-, 1 e-)", "shape parameters of a beta distribution must be greater than 0"),
+        (
+            "beta(2, -1, 0 e-, 1 e-)",
+            "shape parameters of a beta distribution must be greater than 0",
+        ),
         ("beta(2 e-, 1)", "a shape parameter is a number without a unit"),
         ("beta(2, 1, 0 e-)", "two shape parameters, then least and largest value"),
         ("beta(2, 1, 3 e-, 1 e-)", "least value must be smaller"),
@@ -191,7 +228,10 @@ def test_a_seed_has_the_same_draws_whatever_the_law_beside():
         ("discrete(10 e- weight 0.2, 12 e-)", "a weight for every value, or for none"),
         ("discrete(10 e- weight 0, 12 e- weight 1)", "every weight must be greater than 0"),
         ("discrete(10 e- weight -1, 12 e- weight 2)", "every weight must be greater than 0"),
-        ("discrete(10 e- weight 1 e-, 12 e- weight 2)", r"neither a number|without a unit|10 e- weight 1"),
+        (
+            "discrete(10 e- weight 1 e-, 12 e- weight 2)",
+            r"neither a number|without a unit|10 e- weight 1",
+        ),
         ("discrete(10 e-, 12 nm)", "same unit"),
         ("empirical()", "samples in a file"),
         ("empirical(none.csv)", "there is no file"),
@@ -212,15 +252,27 @@ def test_a_wrong_form_is_refused_once_and_where_it_stands(law, message):
     [
         ("1\n" * 20 + "nan\n" * 20, "empirical(a.csv, unit e-)", "sample 21 of a.csv is nan"),
         ("1\n" * 20 + "inf\n" * 20, "empirical(a.csv, unit e-)", "sample 21 of a.csv is inf"),
-        ("1\n2\n", "empirical(a.csv, unit e-)", "a.csv has 2 samples, which are too few: give 30 or more"),
+        (
+            "1\n2\n",
+            "empirical(a.csv, unit e-)",
+            "a.csv has 2 samples, which are too few: give 30 or more",
+        ),
         ("1\n" * 40, "empirical(a.csv, unit e-)", "all samples of a.csv are equal"),
         ("", "empirical(a.csv, unit e-)", "a.csv is empty"),
         ("x [e-]\n1\n\n3,4\n", "empirical(a.csv)", "line 4 of a.csv must have 1 values"),
         ("x [e-]\n1\ntwo\n", "empirical(a.csv)", "line 3 of a.csv must contain numbers, not 'two'"),
         ("1,2\n3,4\n", "empirical(a.csv, unit e-)", "must have a heading for each of its columns"),
-        ("x,y\n1,2\n", "empirical(a.csv, unit e-)", r"has the columns x, y: write empirical\(a.csv, column NAME\)"),
+        (
+            "x,y\n1,2\n",
+            "empirical(a.csv, unit e-)",
+            r"has the columns x, y: write empirical\(a.csv, column NAME\)",
+        ),
         ("x,y\n1,2\n", "empirical(a.csv, column z, unit e-)", "has no column z"),
-        ("x [e-]\n1\n", "empirical(a.csv, unit e-)", "gives the unit e- of x: remove the unit here"),
+        (
+            "x [e-]\n1\n",
+            "empirical(a.csv, unit e-)",
+            "gives the unit e- of x: remove the unit here",
+        ),
         ("x [bar]\n1\n", "empirical(a.csv)", "1 bar is neither a number nor a quantity"),
         ("x\n1\n", "empirical(a.csv, unit bar)", "1 bar is neither a number nor a quantity"),
         ("x\n1\n", "empirical(a.csv, x)", "samples in a file, its column, and their unit"),
@@ -247,7 +299,7 @@ def test_every_kind_has_an_example_that_is_valid(tmp_path):
         assert law.at(np.array(-2.0)) < law.at(np.array(2.0)), form
 
 
-# --- files -----------------------------------------------------------------------------------------------------------
+# --- files ----------------------------------------------------------------------------------------
 
 
 def test_the_content_of_a_file_of_samples_counts(table):
@@ -262,11 +314,18 @@ def test_the_content_of_a_file_of_samples_counts(table):
 
 
 def test_the_recipe_of_a_run_names_the_file_wherever_it_is_read(table, tmp_path):
-    recipe = load("first_light", ["sensor.read_noise=empirical(noise.csv, column read_noise)"], folder=table.parent)
+    recipe = load(
+        "first_light",
+        ["sensor.read_noise=empirical(noise.csv, column read_noise)"],
+        folder=table.parent,
+    )
     again = tmp_path / "elsewhere" / "again.yaml"
     again.parent.mkdir()
     again.write_text(recipe_text(recipe))
-    assert load(again).uncertain.laws["sensor.read_noise"].shape == recipe.uncertain.laws["sensor.read_noise"].shape
+    assert (
+        load(again).uncertain.laws["sensor.read_noise"].shape
+        == recipe.uncertain.laws["sensor.read_noise"].shape
+    )
 
 
 def test_equal_samples_weigh_together():

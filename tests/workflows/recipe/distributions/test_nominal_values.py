@@ -1,4 +1,6 @@
-"""Laws in the place of values, posteriors over several: read where they are right, and refused where they stand."""
+"""Laws in the place of values, posteriors over several: read where they are right, and refused
+where they stand.
+"""
 
 import json
 import math
@@ -12,7 +14,7 @@ from scipy import stats
 
 from neusee.workflows import load
 from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.recipe.distributions.joint import Joint, read_posterior, summary
+from neusee.workflows.recipe.distributions.joint_distribution import Joint, read_posterior, summary
 from neusee.workflows.recipe.distributions.law_text import is_law, read_law
 from neusee.workflows.simulation.simulate_recipe import recipe_text
 
@@ -38,18 +40,25 @@ def calibrated(tmp_path):
         folder = tmp_path / "found"
         folder.mkdir(exist_ok=True)
         columns = dict(zip(NAMES, drawn().T, strict=True))
-        rows = {name: {"kind": k, "unit": u} for name, k, u in zip(NAMES, kinds, units, strict=True)}
+        rows = {
+            name: {"kind": k, "unit": u} for name, k, u in zip(NAMES, kinds, units, strict=True)
+        }
         for name, unit in extra:
-            columns[name], rows[name] = 0.002 + 1e-4 * drawn()[:, 2], {"kind": "upper", "unit": unit}
+            columns[name], rows[name] = (
+                0.002 + 1e-4 * drawn()[:, 2],
+                {"kind": "upper", "unit": unit},
+            )
         np.savez(folder / "draws.npz", **columns)
         checks = [{"name": "chains agree", "mark": "fail" if failed else "pass"}]
-        (folder / "posterior.json").write_text(json.dumps({"parameters": rows, "failed": failed, "checks": checks}))
+        (folder / "posterior.json").write_text(
+            json.dumps({"parameters": rows, "failed": failed, "checks": checks})
+        )
         return folder
 
     return make
 
 
-# --- laws -------------------------------------------------------------------------------------------------------------
+# --- laws -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -78,7 +87,9 @@ def test_what_is_drawn_from_a_positive_law_is_positive_and_rises(first, factor, 
 
 @given(st.text(max_size=30))
 def test_no_text_breaks_the_reader(text):
-    """Hypothesis also tries constants of the modules that are loaded, and some of these are laws."""
+    """Hypothesis also tries constants of the modules that are loaded, and some of these are
+    laws.
+    """
     law, said = None, ""
     try:
         law = read_law(text) if is_law(text) else None
@@ -91,7 +102,10 @@ def test_no_text_breaks_the_reader(text):
 @pytest.mark.parametrize(
     ("law", "message"),
     [
-        ("normal(10.5 e-)", "the distribution normal needs mean and standard deviation: write normal"),
+        (
+            "normal(10.5 e-)",
+            "the distribution normal needs mean and standard deviation: write normal",
+        ),
         ("normal(10.5 e-, 1 nm)", "must have the same unit"),
         ("normal(10.5 e-, 0 e-)", "greater than 0"),
         ("normal(10.5 e-, -1 e-)", "greater than 0"),
@@ -129,7 +143,7 @@ def test_a_recipe_that_is_sure_of_all_is_what_it_was():
     assert recipe == load("first_light", ["posterior=null"])
 
 
-# --- joint laws -------------------------------------------------------------------------------------------------------
+# --- joint laws -----------------------------------------------------------------------------------
 
 
 def test_draws_come_back_from_their_numbers():
@@ -158,7 +172,9 @@ def test_a_normal_law_has_its_covariance(rho, a, b):
 
 def test_some_of_a_normal_law_is_that_of_all():
     covariance = np.cov(drawn().T)
-    joint = summary({"mean": dict.fromkeys(NAMES, 1.0), "covariance": covariance.tolist()}).joint.only(NAMES[1:])
+    joint = summary(
+        {"mean": dict.fromkeys(NAMES, 1.0), "covariance": covariance.tolist()}
+    ).joint.only(NAMES[1:])
     factor = joint.factor * joint.sd[:, None]
     assert factor @ factor.T == pytest.approx(covariance[1:, 1:], rel=1e-6, abs=1e-12)
 
@@ -184,7 +200,11 @@ def test_values_that_are_one_and_the_same_are_drawn_as_such():
         ("a.yaml", "mean: {gain: 1}", "needs mean"),
         ("a.yaml", "mean: {gain: 1}\nsd: {well: 1}", "sd must have a value for each name in mean"),
         ("a.yaml", "mean: {gain: 1}\nsd: {gain: 0}", "greater than 0"),
-        ("a.yaml", "mean: {a: 1, b: 1}\ncovariance: [[1, 2], [2, 1]]", "the least eigenvalue is -1, so that no distri"),
+        (
+            "a.yaml",
+            "mean: {a: 1, b: 1}\ncovariance: [[1, 2], [2, 1]]",
+            "the least eigenvalue is -1, so that no distri",
+        ),
         ("a.yaml", "mean: {a: 1, b: 1}\ncovariance: [[1, 0.5], [0.4, 1]]", "symmetric"),
         ("a.yaml", "mean: {a: 1, b: 1}\ncovariance: [[1, 0], [0, -1]]", "positive variances"),
         ("a.yaml", "mean: {a: 1, b: 1}\ncovariance: [[1, 2], [1]]", "matrix"),
@@ -216,7 +236,7 @@ def test_of_a_pattern_the_newest_is_read(tmp_path):
     assert read_posterior(tmp_path / "*.yaml").joint.mean == pytest.approx([1.0])
 
 
-# --- a posterior in a recipe ------------------------------------------------------------------------------------------
+# --- a posterior in a recipe ----------------------------------------------------------------------
 
 
 def gain_of(recipe):
@@ -224,7 +244,9 @@ def gain_of(recipe):
 
 
 def test_a_run_takes_the_mean_of_what_is_told_and_no_value_of_what_is_not(calibrated):
-    recipe = load("first_light", [f"posterior={calibrated(kinds=('estimate', 'estimate', 'upper'))}"])
+    recipe = load(
+        "first_light", [f"posterior={calibrated(kinds=('estimate', 'estimate', 'upper'))}"]
+    )
     assert gain_of(recipe) == pytest.approx((1 / drawn()[:, 0]).mean())
     assert recipe.steps["read[plain]"].params["read_noise"] == 10.5
     used = {s.path: s.why for s in recipe.uncertain.standings}
@@ -234,7 +256,9 @@ def test_a_run_takes_the_mean_of_what_is_told_and_no_value_of_what_is_not(calibr
 def test_a_run_takes_a_draw_with_all_that_goes_with_it(calibrated):
     recipe = load("first_light", posterior={"file": str(calibrated()), "use": 17})
     read = recipe.steps["read[mask]"].params
-    assert (1 / gain_of(recipe), read["offset"], read["read_noise"]) == pytest.approx(tuple(drawn()[17]))
+    assert (1 / gain_of(recipe), read["offset"], read["read_noise"]) == pytest.approx(
+        tuple(drawn()[17])
+    )
 
 
 def test_a_run_may_keep_its_own(calibrated):
@@ -268,23 +292,34 @@ def test_what_cannot_be_taken_of_a_posterior_is_refused(calibrated, said, messag
 
 
 def test_a_calibration_that_is_not_fit_for_use_is_refused(calibrated):
-    with pytest.raises(RecipeError, match="the calibration cannot be used: 1 check fails \\(chains agree\\)"):
+    with pytest.raises(
+        RecipeError, match="the calibration cannot be used: 1 check fails \\(chains agree\\)"
+    ):
         load("first_light", [f"posterior={calibrated(failed=1)}"])
 
 
 def test_numbers_of_another_convention_are_refused(calibrated):
-    with pytest.raises(RecipeError, match=r"the gain of the posterior has no unit: name its draws 'gain \[DN/e-\]'"):
+    with pytest.raises(
+        RecipeError, match=r"the gain of the posterior has no unit: name its draws 'gain \[DN/e-\]'"
+    ):
         load("first_light", [f"posterior={calibrated(units=('', 'e-', 'e-'))}"])
     recipe = load("first_light", [f"posterior={calibrated(units=('DN/e-', 'e-', 'e-'))}"])
     assert gain_of(recipe) == pytest.approx(drawn()[:, 0].mean())
-    with pytest.raises(RecipeError, match=r"the dark current is for 1 s in the posterior and 0.1 s in the recipe"):
+    with pytest.raises(
+        RecipeError, match=r"the dark current is for 1 s in the posterior and 0.1 s in the recipe"
+    ):
         load("first_light", [f"posterior={calibrated(extra=[('dark_current', 'e- in 1 s')])}"])
 
 
 def test_a_law_and_a_posterior_of_one_value_are_refused(calibrated, tmp_path):
     own = tmp_path / "own.yaml"
-    groups = "camera: neusee, scene: china, illuminant: daylight, lift: lmmse, laser: green, optics: small"
-    groups += ", sensor: small, doe: five_half_rings, flare: clean, restore: wiener, reading: coherent"
+    groups = (
+        "camera: neusee, scene: china, illuminant: daylight, lift: lmmse, laser: green, optics:"
+        " small"
+    )
+    groups += (
+        ", sensor: small, doe: five_half_rings, flare: clean, restore: wiener, reading: coherent"
+    )
     lines = [f"  - {group}" for group in groups.split(", ")]
     text = [
         "defaults:",
@@ -295,7 +330,8 @@ def test_a_law_and_a_posterior_of_one_value_are_refused(calibrated, tmp_path):
     ]
     own.write_text("\n".join(text))
     with pytest.raises(
-        RecipeError, match=r"own.yaml:13.*sensor.gain +the value has a distribution here and in the posterior"
+        RecipeError,
+        match=r"own.yaml:13.*sensor.gain +the value has a distribution here and in the posterior",
     ):
         load(own)
 
@@ -313,7 +349,7 @@ def test_values_may_have_other_names_and_a_summary_may_stand_in_the_recipe():
     assert "far from its posterior, 12 ± 0.5 e-" in " ".join(recipe.notes)
 
 
-# --- gains, and what 0.1 wrote ----------------------------------------------------------------------------------------
+# --- gains, and what 0.1 wrote --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -334,7 +370,9 @@ def test_a_law_in_electrons_a_number_is_drawn_as_written_and_read_as_k(text, law
 
 
 def test_a_median_in_electrons_a_number_is_to_the_last_bit_the_value_itself():
-    assert gain_of(load("first_light", ["sensor.gain=lognormal(0.37 e-/DN, 1.02)"])) == gain_of(load("first_light"))
+    assert gain_of(load("first_light", ["sensor.gain=lognormal(0.37 e-/DN, 1.02)"])) == gain_of(
+        load("first_light")
+    )
 
 
 @pytest.mark.parametrize(
@@ -351,7 +389,9 @@ def test_a_law_of_a_gain_says_its_unit(law, message):
 
 def test_a_summary_of_a_gain_is_of_k():
     said = {"mean": {"gain": "0.37 e-/DN"}, "sd": {"gain": "0.01 e-/DN"}}
-    with pytest.raises(RecipeError, match=r"0.37 e-/DN: write the mean and the sd of a gain in DN/e-"):
+    with pytest.raises(
+        RecipeError, match=r"0.37 e-/DN: write the mean and the sd of a gain in DN/e-"
+    ):
         load("first_light", posterior=said)
     with pytest.raises(RecipeError, match="the gain of the posterior has no unit"):
         load("first_light", posterior={"mean": {"gain": 2.7}, "sd": {"gain": 0.01}})
@@ -379,8 +419,16 @@ def by_0_1(tmp_path):
         folder = tmp_path / "by 0.1"
         folder.mkdir()
         np.savez(folder / "draws.npz", **dict(zip(names, drawn().T, strict=True)))
-        rows = {name: {"name": name, "unit": u, "kind": "estimate"} for name, u in zip(names, units, strict=True)}
-        doc = {"study": "calibrate", "failed": 0, "parameters": rows, "checks": [{"name": "fit", "mark": "pass"}]}
+        rows = {
+            name: {"name": name, "unit": u, "kind": "estimate"}
+            for name, u in zip(names, units, strict=True)
+        }
+        doc = {
+            "study": "calibrate",
+            "failed": 0,
+            "parameters": rows,
+            "checks": [{"name": "fit", "mark": "pass"}],
+        }
         (folder / "posterior.json").write_text(json.dumps(doc))
         return folder
 
@@ -388,7 +436,10 @@ def by_0_1(tmp_path):
 
 
 def test_the_posterior_of_a_sensor_by_0_1_is_read(by_0_1):
-    recipe = load("first_light", [f"posterior={by_0_1(('gain', 'pedestal', 'read_noise'), ('e-/DN', 'e-', 'e-'))}"])
+    recipe = load(
+        "first_light",
+        [f"posterior={by_0_1(('gain', 'pedestal', 'read_noise'), ('e-/DN', 'e-', 'e-'))}"],
+    )
     assert recipe.uncertain.joint.names == ("sensor.gain", "sensor.offset", "sensor.read_noise")
     assert gain_of(recipe) == pytest.approx((1 / drawn()[:, 0]).mean())
     assert recipe.steps["read[plain]"].params["offset"] == pytest.approx(drawn()[:, 1].mean())
@@ -401,11 +452,16 @@ def test_the_posterior_of_a_camera_by_0_1_is_read(by_0_1):
     assert gain_of(recipe) == pytest.approx(drawn()[:, 0].mean())
     assert recipe.steps["read[plain]"].params["read_noise"] == pytest.approx(drawn()[:, 2].mean())
     with pytest.raises(RecipeError, match="dark_noise is called temporal_dark_noise now"):
-        load("first_light", posterior={"file": str(folder), "values": {"sensor.read_noise": "dark_noise"}})
+        load(
+            "first_light",
+            posterior={"file": str(folder), "values": {"sensor.read_noise": "dark_noise"}},
+        )
 
 
 def test_the_draws_of_0_1_alone_say_no_unit_and_are_refused(by_0_1):
     folder = by_0_1(("gain", "pedestal", "read_noise"), ("e-/DN", "e-", "e-"))
-    message = r"the gain of the posterior has no unit.*the folder of `neusee calibrate` contains the unit"
+    message = (
+        r"the gain of the posterior has no unit.*the folder of `neusee calibrate` contains the unit"
+    )
     with pytest.raises(RecipeError, match=message):
         load("first_light", [f"posterior={folder / 'draws.npz'}"])

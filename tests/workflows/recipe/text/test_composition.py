@@ -29,7 +29,9 @@ def composed(files):
         if text is not None:
             (files / "mine.yaml").write_text(text)
         result = compose("mine.yaml", arguments, files)
-        return result.root.plain, [" | ".join((str(p.mark), p.path, p.message)) for p in result.diagnostics]
+        return result.root.plain, [
+            " | ".join((str(p.mark), p.path, p.message)) for p in result.diagnostics
+        ]
 
     return composed
 
@@ -97,9 +99,15 @@ def test_an_argument_sets_a_value(composed, argument, path, value):
 
 
 def test_a_parameter_of_a_step_can_be_set_though_no_one_wrote_it(composed):
-    root, diagnostics = composed("steps.a.with.bits=12", "steps.a.each=lasers", "steps.a.with.samples=5")
+    root, diagnostics = composed(
+        "steps.a.with.bits=12", "steps.a.each=lasers", "steps.a.with.samples=5"
+    )
     assert not diagnostics
-    assert root["steps"]["a"] == {"node": "toy.height", "each": "lasers", "with": {"samples": 5, "bits": 12}}
+    assert root["steps"]["a"] == {
+        "node": "toy.height",
+        "each": "lasers",
+        "with": {"samples": 5, "bits": 12},
+    }
 
 
 def test_a_value_can_be_taken_away(composed):
@@ -113,7 +121,11 @@ def test_a_value_can_be_taken_away(composed):
 def test_a_value_below_a_number_knows_its_place_as_the_file_has_it(files, write):
     """Written out again, `2` and `'2'` would be two keys."""
     write("steps:\n  a: {node: toy.height, with: {samples: 3}}\nlens: {2: {f: 1}}\n", "two.yaml")
-    leaves = compose("two.yaml", ["lens.2.f=5", "+lens.3=7", "+lens.2.g={h: 1}"], files).root.items["lens"].leaves()
+    leaves = (
+        compose("two.yaml", ["lens.2.f=5", "+lens.3=7", "+lens.2.g={h: 1}"], files)
+        .root.items["lens"]
+        .leaves()
+    )
     assert {leaf.path: leaf.plain for leaf in leaves} == {
         ("lens", 2, "f"): 5,
         ("lens", 2, "g", "h"): 1,
@@ -155,25 +167,55 @@ def test_a_step_that_is_null_is_absent(composed):
         ("+lens.f.x=1", "argument 1 | +lens.f.x=1 | lens.f is a single value, not a mapping"),
         ("outputs.4=b", "argument 1 | outputs.4=b | outputs has 1 values: 0 to 0"),
         ("lens=wde", "argument 1 | lens=wde | no option wde in lens; did you mean wide?"),
-        ("lens=../mine", "argument 1 | lens=../mine | no option ../mine in lens; there are: tele, wide"),
+        (
+            "lens=../mine",
+            "argument 1 | lens=../mine | no option ../mine in lens; there are: tele, wide",
+        ),
         ("+lens=tele", "argument 1 | +lens=tele | lens is already set to wide: remove the +"),
         (
             "scene=china",
-            "argument 1 | scene=china | this recipe has no group scene; to add the group, write +scene=china",
+            (
+                "argument 1 | scene=china | this recipe has no group scene; to add the group, write"
+                " +scene=china"
+            ),
         ),
         ("~scene", "argument 1 | ~scene | is not a group of this recipe; there are: laser, lens"),
         ("lens.f", "argument 1 | lens.f | the argument has no value: write lens.f=VALUE"),
-        ("lens.f=", "argument 1 | lens.f= | the value is empty: write lens.f=VALUE, or lens.f=null for none"),
-        ("lens.f=[1,2", "argument 1 | lens.f=[1,2 | is not YAML: expected ',' or ']', but got '<stream end>'"),
-        ("~lens.f=1", "argument 1 | ~lens.f=1 | ~ removes a value and cannot set one: write ~lens.f"),
-        ("=1", "argument 1 | =1 | is not an override: write path=value, +path=value, ~path or group=option"),
+        (
+            "lens.f=",
+            (
+                "argument 1 | lens.f= | the value is empty: write lens.f=VALUE, or lens.f=null for"
+                " none"
+            ),
+        ),
+        (
+            "lens.f=[1,2",
+            "argument 1 | lens.f=[1,2 | is not YAML: expected ',' or ']', but got '<stream end>'",
+        ),
+        (
+            "~lens.f=1",
+            "argument 1 | ~lens.f=1 | ~ removes a value and cannot set one: write ~lens.f",
+        ),
+        (
+            "=1",
+            (
+                "argument 1 | =1 | is not an override: write path=value, +path=value, ~path or"
+                " group=option"
+            ),
+        ),
         (
             "++lens.f=1",
-            "argument 1 | ++lens.f=1 | is not an override: write path=value, +path=value, ~path or group=option",
+            (
+                "argument 1 | ++lens.f=1 | is not an override: write path=value, +path=value, ~path"
+                " or group=option"
+            ),
         ),
         (
             "lens..f=1",
-            "argument 1 | lens..f=1 | is not an override: write path=value, +path=value, ~path or group=option",
+            (
+                "argument 1 | lens..f=1 | is not an override: write path=value, +path=value, ~path"
+                " or group=option"
+            ),
         ),
         ("--lens", "argument 1 | --lens | the argument has no value: write --lens=VALUE"),
     ],
@@ -185,11 +227,26 @@ def test_a_wrong_argument_is_shown_with_its_fix(composed, argument, problem):
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("defaults: {lens: wide}\n", "mine.yaml:1:11 | defaults | must be a list of `group: option`, not a mapping"),
-        ("defaults: [lens]\n", "mine.yaml:1:12 | defaults.0 | must be one `group: option`, such as `doe: axicon`"),
-        ("defaults: [lens: wide, lens: tele]\n", "mine.yaml:1:24 | defaults.lens | given twice, first in line 1"),
-        ("defaults: [lens: wyde]\n", "mine.yaml:1:18 | lens: wyde | no option wyde in lens; did you mean wide?"),
-        ("defaults: [lans: wide]\n", "mine.yaml:1:18 | lans: wide | no group lans; did you mean lens?"),
+        (
+            "defaults: {lens: wide}\n",
+            "mine.yaml:1:11 | defaults | must be a list of `group: option`, not a mapping",
+        ),
+        (
+            "defaults: [lens]\n",
+            "mine.yaml:1:12 | defaults.0 | must be one `group: option`, such as `doe: axicon`",
+        ),
+        (
+            "defaults: [lens: wide, lens: tele]\n",
+            "mine.yaml:1:24 | defaults.lens | given twice, first in line 1",
+        ),
+        (
+            "defaults: [lens: wyde]\n",
+            "mine.yaml:1:18 | lens: wyde | no option wyde in lens; did you mean wide?",
+        ),
+        (
+            "defaults: [lans: wide]\n",
+            "mine.yaml:1:18 | lans: wide | no group lans; did you mean lens?",
+        ),
     ],
 )
 def test_a_wrong_group_is_located(composed, text, problem):
@@ -200,11 +257,19 @@ def test_every_broken_file_is_reported(composed, write):
     write("a: [\n", "lens/wide.yaml")
     write("a: 1\na: 2\n", "laser/green.yaml")
     diagnostics = composed("laser=green", "lens.f=[")[1]
-    assert [p.partition(" ")[0] for p in diagnostics] == ["argument", "lens/wide.yaml:2:1", "laser/green.yaml:2:1"]
+    assert [p.partition(" ")[0] for p in diagnostics] == [
+        "argument",
+        "lens/wide.yaml:2:1",
+        "laser/green.yaml:2:1",
+    ]
 
 
 def test_an_unknown_recipe_gets_the_nearest(files):
-    for name, hint in (("first_lihgt", "first_light"), ("mine.yml", "mine.yaml"), ("../mine", "there are: ")):
+    for name, hint in (
+        ("first_lihgt", "first_light"),
+        ("mine.yml", "mine.yaml"),
+        ("../mine", "there are: "),
+    ):
         with pytest.raises(RecipeError, match=hint):
             compose(name, (), files)
 

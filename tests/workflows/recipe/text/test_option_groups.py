@@ -1,4 +1,6 @@
-"""Options of groups: they extend one another, and are found in the folders of the user before the packaged ones."""
+"""Options of groups: they extend one another, and are found in the folders of the user before
+the packaged ones.
+"""
 
 import os
 import sys
@@ -33,7 +35,9 @@ def composed(files):
         if text is not None:
             (files / "mine.yaml").write_text(text)
         result = compose("mine.yaml", arguments, files)
-        return result.root.plain, [" | ".join((str(p.mark), p.path, p.message)) for p in result.diagnostics]
+        return result.root.plain, [
+            " | ".join((str(p.mark), p.path, p.message)) for p in result.diagnostics
+        ]
 
     return composed
 
@@ -54,17 +58,26 @@ def test_later_options_come_over_earlier_ones_and_null_is_none(composed, write):
 
 
 WRONG = [
-    ("[mine]", "lens/mine.yaml:1:12 | lens: mine | options extend each other in a circle: {0} -> {0}"),
+    (
+        "[mine]",
+        "lens/mine.yaml:1:12 | lens: mine | options extend each other in a circle: {0} -> {0}",
+    ),
     ("[tle]", "lens/mine.yaml:1:12 | lens: tle | no option tle in lens; did you mean tele?"),
     ("[lser: green]", "lens/mine.yaml:1:18 | lser: green | no group lser; did you mean laser?"),
     ("[tele, lens: tele]", "lens/mine.yaml:1:18 | defaults.lens | given twice, first in line 1"),
     (
         "tele",
-        "lens/mine.yaml:1:11 | defaults | must be a list of options of this group, such as `[small]`, not a string",
+        (
+            "lens/mine.yaml:1:11 | defaults | must be a list of options of this group, such as"
+            " `[small]`, not a string"
+        ),
     ),
     (
         "[3]",
-        "lens/mine.yaml:1:12 | defaults.0 | must be an option of this group, such as `- small`, or one `group: option`",
+        (
+            "lens/mine.yaml:1:12 | defaults.0 | must be an option of this group, such as `- small`,"
+            " or one `group: option`"
+        ),
     ),
 ]
 
@@ -106,7 +119,9 @@ def test_options_are_found_in_order_and_what_is_hidden_is_said(places):
         [note] = composed.notes
         assert note.startswith("sensor: small is ")
     assert found == ["recipes", "two", "one", "beside"]
-    assert note == f"sensor: small is sensor/small.yaml, which hides {one / 'sensor' / 'small.yaml'}"
+    assert (
+        note == f"sensor: small is sensor/small.yaml, which hides {one / 'sensor' / 'small.yaml'}"
+    )
 
 
 def test_an_option_that_extends_its_own_name_extends_the_next_folder(places):
@@ -140,7 +155,9 @@ def test_a_recipe_of_the_user_is_found_by_its_name(places):
     (one / "first_light.yaml").write_text("# Mine.\nseed: 2\n")
     assert compose("night", (), beside).root.plain == {"seed": 1}
     composed = compose("first_light", (), beside)
-    assert composed.notes == (f"first_light is {one / 'first_light.yaml'}, which hides the packaged recipe",)
+    assert composed.notes == (
+        f"first_light is {one / 'first_light.yaml'}, which hides the packaged recipe",
+    )
     assert compose("laser_free", (), beside).notes == ()
 
 
@@ -150,8 +167,13 @@ def test_an_option_of_the_user_that_lacks_values_is_one_mistake_in_his_file(writ
         load("first_light", ["sensor=imx"], tmp_path)
     [problem] = caught.value.diagnostics
     assert str(problem.mark) == "sensor/imx.yaml:2:1"
-    assert problem.message.startswith("lacks arrivals, background, bits, c1, c2, camera and 8 more, which steps need")
-    write("# Mine.\ndefaults: [small]\nsensor:\n  gain: 0.5 e-/DN\n  read_noise: 2 e-\n", "sensor/imx.yaml")
+    assert problem.message.startswith(
+        "lacks arrivals, background, bits, c1, c2, camera and 8 more, which steps need"
+    )
+    write(
+        "# Mine.\ndefaults: [small]\nsensor:\n  gain: 0.5 e-/DN\n  read_noise: 2 e-\n",
+        "sensor/imx.yaml",
+    )
     recipe = load("first_light", ["sensor=imx"], tmp_path)
     assert recipe.steps["transfer"].params["gain"] == 2.0
     assert str(recipe.config["sensor.gain"].source) == "sensor/imx.yaml:4:9"
@@ -161,7 +183,9 @@ def test_an_option_of_the_user_that_lacks_values_is_one_mistake_in_his_file(writ
 def test_a_block_of_a_recipe_that_lacks_values_is_one_mistake(read):
     used = "{node: toy.spot, with: {a: '${sensor.x}', b: '${sensor.y}', c: '${sensor.z}'}}"
     with pytest.raises(RecipeError) as caught:
-        read(f"# Mine.\nsensor: {{}}\nsteps: {{a: {{node: toy.height}}, b: {used}}}\noutputs: [a]\n")
+        read(
+            f"# Mine.\nsensor: {{}}\nsteps: {{a: {{node: toy.height}}, b: {used}}}\noutputs: [a]\n"
+        )
     [problem] = [p for p in caught.value.diagnostics if p.path == "sensor"]
     assert str(problem.mark) == "mine.yaml:2:1"
     assert not [p for p in caught.value.diagnostics if "sensor." in p.message]

@@ -1,4 +1,6 @@
-"""What was called otherwise in 0.1: one located line says the new name, wherever the old one is written."""
+"""What was called otherwise in 0.1: one located line says the new name, wherever the old one is
+written.
+"""
 
 import functools
 import json
@@ -14,10 +16,13 @@ from neusee.workflows.recipe.node_families import families
 from neusee.workflows.recipe.text.renamed_keys import instead, new_name, old_names
 
 RECIPES = ("first_light", "calibrate", "calibrate_camera")
-BLOCKS = {"camera": "calibrate_camera"}  #: by the block of a key, the recipe that has it; else first_light
+#: by the block of a key, the recipe that has it; else first_light
+BLOCKS = {"camera": "calibrate_camera"}
 BLOCKS_OF_KEYS = ("sensor", "reading", "camera")
 ELEMENT = [old for old in old_names() if "element" in old]  #: a block, a step, words of `train`
-KEYS = [old for old in old_names() if old.count(".") == 1 and old.partition(".")[0] in BLOCKS_OF_KEYS]
+KEYS = [
+    old for old in old_names() if old.count(".") == 1 and old.partition(".")[0] in BLOCKS_OF_KEYS
+]
 KEYS.remove("sensor.gather")  # a node of the family `sensor`, not a key of the block
 KEYS += ["optics.start", "optics.stop"]
 KEYS += [f"element.{name}" for name in ("material", "wrap_at", "levels", "max_height")]
@@ -45,13 +50,27 @@ def refused(name, *arguments, folder=None):
 def using(node):
     """A recipe that has a step of this node, and that step."""
     steps = ((name, step) for name in RECIPES for step in load(name).steps.values())
-    return next((name, step.name.partition("[")[0]) for name, step in steps if step.node.path == node)
+    return next(
+        (name, step.name.partition("[")[0]) for name, step in steps if step.node.path == node
+    )
 
 
 def test_every_old_name_is_of_one_kind_and_is_one_no_more():
-    kinds = (*(old for old in KEYS if not old.startswith("element.")), *NODES, *PARAMETERS, *GRID, *ELEMENT, *LIFT)
+    kinds = (
+        *(old for old in KEYS if not old.startswith("element.")),
+        *NODES,
+        *PARAMETERS,
+        *GRID,
+        *ELEMENT,
+        *LIFT,
+    )
     assert sorted(kinds) == sorted(old_names())
-    assert sorted(ELEMENT) == ["element", "steps.element", "train.mask.kind=element", "train.rates.element"]
+    assert sorted(ELEMENT) == [
+        "element",
+        "steps.element",
+        "train.mask.kind=element",
+        "train.rates.element",
+    ]
     assert all(old.partition(".")[0] in families() for old in (*NODES, *PARAMETERS))
     assert not [old for old in old_names() if new_name(old) in old_names()]
 
@@ -109,14 +128,18 @@ def test_an_old_parameter(old):
 def test_an_old_parameter_in_place_of_the_new_one_is_one_mistake(old):
     node, _, parameter = old.rpartition(".")
     name, step = using(node)
-    found = refused(name, f"~steps.{step}.with.{new_name(old)}", f"+steps.{step}.with.{parameter}=1 e-")
+    found = refused(
+        name, f"~steps.{step}.with.{new_name(old)}", f"+steps.{step}.with.{parameter}=1 e-"
+    )
     assert [message for _, _, message in found] == [instead(old)]
 
 
 @pytest.mark.parametrize("node", ON_A_GRID)
 @pytest.mark.parametrize("new", [False, True], ids=["old", "with the new input"])
 def test_a_step_with_its_own_pupil_grid_is_one_mistake(node, new):
-    """However many parameters of the grid are given, and whether or not the step of the grid is wired."""
+    """However many parameters of the grid are given, and whether or not the step of the grid is
+    wired.
+    """
     assert {old.rpartition(".")[0] for old in GRID} == set(ON_A_GRID)
     grid = {"samples": 8, "pitch": "1 mm", "diameter": "8 mm", "aperture": "clipped"}
     step = ON_A_GRID[node]
@@ -138,7 +161,9 @@ def test_an_old_step(words):
 
 def test_an_old_step_in_an_argument():
     word = "steps.element.with.levels=4"
-    assert refused("first_light", word) == [("argument 1", word, "is called steps.fabricated.with.levels now")]
+    assert refused("first_light", word) == [
+        ("argument 1", word, "is called steps.fabricated.with.levels now")
+    ]
 
 
 @pytest.mark.parametrize(
@@ -157,8 +182,11 @@ def test_an_old_key_of_training_a_lift(old, tmp_path):
     assert refused("train_lift", f"{old}=1") == [("argument 1", f"{old}=1", instead(old))]
     text = (Path(recipes.__path__[0]) / "train_lift.yaml").read_text()
     key, now = old.rpartition(".")[2], new_name(old).rpartition(".")[2]
-    (tmp_path / "lift.yaml").write_text(re.sub(rf"\n  {now}:", f"\n  {key}:", text) if f"\n  {now}:" in text else
-                                        text.replace("train_lift:\n", f"train_lift:\n  {key}: 1\n"))  # fmt: skip
+    (tmp_path / "lift.yaml").write_text(
+        re.sub(rf"\n  {now}:", f"\n  {key}:", text)
+        if f"\n  {now}:" in text
+        else text.replace("train_lift:\n", f"train_lift:\n  {key}: 1\n")
+    )
     ((where, path, message),) = refused("lift.yaml", folder=tmp_path)
     assert where.startswith("lift.yaml:")
     assert (path, message) == (old, instead(old))

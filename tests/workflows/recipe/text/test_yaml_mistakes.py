@@ -4,7 +4,7 @@ import pytest
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError, YAMLStreamError
 
-from neusee.workflows.recipe.text.yaml_mistakes import directive_mistake, explained
+from neusee.workflows.recipe.text.yaml_values import directive_mistake, explained
 
 MISTAKES = [
     # a quote or a bracket that never closes, or closes lines later
@@ -13,21 +13,41 @@ MISTAKES = [
     ("a: 1\nlist: [1, 2\nb: 3\n", 2, 7, "the [ that opens here is not closed, or lacks a comma"),
     ("map: {a: 1\nb: 3\n", 1, 6, "the { that opens here is not closed, or lacks a comma"),
     # a key without a space behind its colon, or without a colon
-    ("seed:7\nextends: first_light\n", 1, 1, "seed:7 needs a space after the colon: write `seed: 7`"),
+    (
+        "seed:7\nextends: first_light\n",
+        1,
+        1,
+        "seed:7 needs a space after the colon: write `seed: 7`",
+    ),
     ("a: 1\nseed:7\nb: 2\n", 2, 1, "seed:7 needs a space after the colon: write `seed: 7`"),
-    ("sensor:\n  bits:12\n  gain: 3\n", 2, 3, "bits:12 needs a space after the colon: write `bits: 12`"),
+    (
+        "sensor:\n  bits:12\n  gain: 3\n",
+        2,
+        3,
+        "bits:12 needs a space after the colon: write `bits: 12`",
+    ),
     ("sensor:\n  bits: 12\n  gain:3\n  well: 2\n", 3, 3, "gain:3 needs a space after the colon"),
     ("list:\n - x\n - y:3\n   z: 4\n", 3, 4, "y:3 needs a space after the colon: write `y: 3`"),
     ("sensor\n  bits: 12\n", 1, 1, "sensor has no colon: write `key: value`"),
     # a wrong indent: the line fits no block above, or continues the value above
-    ("name: first\n  seed: 1\n", 2, 3, "a wrong indent: as it stands, this line is more of the value"),
+    (
+        "name: first\n  seed: 1\n",
+        2,
+        3,
+        "a wrong indent: as it stands, this line is more of the value",
+    ),
     (
         "note: hello\n  world\n  again: 5\n",
         3,
         3,
         "a wrong indent: as it stands, this line is more of the value in line 1",
     ),
-    ("a: 1\nsensor:\n  bits: 12\n    gain: 3\n", 4, 5, "a wrong indent: as it stands, this line is more of the value"),
+    (
+        "a: 1\nsensor:\n  bits: 12\n    gain: 3\n",
+        4,
+        5,
+        "a wrong indent: as it stands, this line is more of the value",
+    ),
     ("sensor:\n  bits: 12\n gain: 3\n", 3, 2, "a wrong indent: the 1 spaces before this line"),
     # several keys on one line
     ("a: b: c\n", 1, 5, "a second ':' on this line"),
@@ -50,7 +70,11 @@ def test_a_mistake_stands_where_a_reader_finds_it(text, line, column, message):
     [
         ("%YAML 1.3\n---\na: 1\n", 1, "recipes are YAML 1.2, not 1.3"),
         ("# a note\n%YAML 1.1\n---\na: 1\n", 2, "recipes are YAML 1.2, not 1.1"),
-        ("%TAG ! tag:example.org,2000:\n---\na: 1\n", 1, "the directive %TAG has no meaning in a recipe"),
+        (
+            "%TAG ! tag:example.org,2000:\n---\na: 1\n",
+            1,
+            "the directive %TAG has no meaning in a recipe",
+        ),
     ],
 )
 def test_a_directive_of_another_kind_is_refused_at_its_line(text, line, message):

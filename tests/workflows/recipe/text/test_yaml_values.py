@@ -18,7 +18,9 @@ def plain(text):
 def refused(text):
     with pytest.raises(RecipeError) as caught:
         parse(text, TOP)
-    return "\n".join(" / ".join(filter(None, (str(p.mark), p.path, p.message))) for p in caught.value.diagnostics)
+    return "\n".join(
+        " / ".join(filter(None, (str(p.mark), p.path, p.message))) for p in caught.value.diagnostics
+    )
 
 
 @pytest.mark.parametrize(
@@ -116,7 +118,8 @@ def test_an_alias_is_the_same_value_again():
 def test_a_bomb_of_aliases_is_refused_at_once():
     rows = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]"]
     rows += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 20)]
-    assert "aliases expand this value to more than" in refused("\n".join(rows))  # 10^20 values would take for ever
+    # 10^20 values would take for ever
+    assert "aliases expand this value to more than" in refused("\n".join(rows))
 
 
 @pytest.mark.parametrize(
@@ -154,7 +157,10 @@ def test_a_byte_order_mark_is_no_part_of_the_first_key(tmp_path):
 letters = st.characters(codec="utf-8").filter(lambda letter: not CONTROL.search(letter))
 scalars = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(letters)
 trees = st.recursive(
-    scalars, lambda t: st.lists(t, max_size=4) | st.dictionaries(st.text("abc%:#é ", min_size=1), t, max_size=4)
+    scalars,
+    lambda t: (
+        st.lists(t, max_size=4) | st.dictionaries(st.text("abc%:#é ", min_size=1), t, max_size=4)
+    ),
 )
 
 

@@ -1,4 +1,6 @@
-"""The study of accuracy: its knobs are the recipe's own, its errors closed forms, and it goes on where it stopped."""
+"""The study of accuracy: its knobs are the recipe's own, its errors closed forms, and it goes on
+where it stopped.
+"""
 
 import csv
 import importlib.util
@@ -12,15 +14,33 @@ import pytest
 import torch
 
 from neusee.workflows import load
-from neusee.workflows.recipe.changed_recipe import changed
+from neusee.workflows.recipe.loading import changed
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.accuracy.accuracy_figures import EXACT, Dot, Line, promises, steps, work_precision
-from neusee.workflows.studies.accuracy.accuracy_report import AccuracyResult, count_missed, lead, sections
+from neusee.workflows.studies.accuracy.accuracy_page import (
+    EXACT,
+    AccuracyResult,
+    Dot,
+    Line,
+    count_missed,
+    lead,
+    promises,
+    sections,
+    steps,
+    work_precision,
+)
 from neusee.workflows.studies.accuracy.accuracy_study import study, trials
-from neusee.workflows.studies.accuracy.pareto_line import ToleranceChoice, cheapest, median_ratio, pareto_front
 from neusee.workflows.studies.accuracy.recipe_knobs import finest, knobs
 from neusee.workflows.studies.accuracy.single_steps import cut_inputs, steps_that_matter, try_step
-from neusee.workflows.studies.accuracy.work_precision_points import TIMES, PointCache, Trial, WorkPrecisionPoint
+from neusee.workflows.studies.accuracy.work_precision_points import (
+    TIMES,
+    PointCache,
+    ToleranceChoice,
+    Trial,
+    WorkPrecisionPoint,
+    cheapest,
+    median_ratio,
+    pareto_front,
+)
 from neusee.workflows.studies.run_study import count_failures
 
 RECIPE = """\
@@ -45,7 +65,9 @@ outputs: [raw, cube]
 def nodes(monkeypatch):
     """The family ``measured``, as if it were one of the package."""
     name = "neusee.nodes.measured"
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[2] / "accuracy_nodes.py")
+    spec = importlib.util.spec_from_file_location(
+        name, Path(__file__).parents[2] / "accuracy_nodes.py"
+    )
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, name, module)
     spec.loader.exec_module(module)
@@ -67,7 +89,7 @@ def quadrature(count):
     return (1 / 3 - 1 / (12 * count**2)) / 3
 
 
-# --- knobs ------------------------------------------------------------------------------------------------------------
+# --- knobs ----------------------------------------------------------------------------------------
 
 
 def test_knobs_are_found_by_what_they_are_to_their_nodes(recipe):
@@ -94,12 +116,17 @@ def test_a_pupil_keeps_its_width(recipe):
 def test_a_value_that_something_else_reads_is_no_knob(nodes, write, tmp_path):
     text = RECIPE.replace("amount: 5e-3", 'amount: "${optics.window.0}"')
     shared = load(write(text), folder=tmp_path)
-    assert "optics.window" in {k.name for k in knobs(shared).found}  # its first number alone is another value
+    # its first number alone is another value
+    assert "optics.window" in {k.name for k in knobs(shared).found}
     both = RECIPE.replace(
-        "outputs:", '  again: {node: scene.targets, with: {kind: edge, shape: "${optics.window}"}}\noutputs:'
+        "outputs:",
+        '  again: {node: scene.targets, with: {kind: edge, shape: "${optics.window}"}}\noutputs:',
     )
     found = knobs(
-        load(write(both.replace("  again", "  again", 1).replace("seed: 3\ntolerance: 1e-3\n", "")), folder=tmp_path)
+        load(
+            write(both.replace("  again", "  again", 1).replace("seed: 3\ntolerance: 1e-3\n", "")),
+            folder=tmp_path,
+        )
     )
     assert "optics.window" not in {k.name for k in found.found}
     assert "window of the PSF: optics.window is also a parameter of the step again" in found.without
@@ -107,7 +134,9 @@ def test_a_value_that_something_else_reads_is_no_knob(nodes, write, tmp_path):
 
 def test_a_recipe_without_a_knob_says_so(nodes, write, tmp_path):
     text = RECIPE[: RECIPE.index("  pupil:")] + "outputs: [bands]\n"
-    text = text.replace(", samples: 8, pitch: 1 mm, window: [6, 8]", "").replace("sensor: {sigma: 0.1}\n", "")
+    text = text.replace(", samples: 8, pitch: 1 mm, window: [6, 8]", "").replace(
+        "sensor: {sigma: 0.1}\n", ""
+    )
     found = knobs(load(write(text), folder=tmp_path))
     assert [k.name for k in found.found] == ["optics.bands"]
     assert "precision: this recipe has no such value" in found.without
@@ -121,13 +150,15 @@ def test_the_reference_is_the_same_sampling_in_double_with_everything_kept(recip
     assert (best.name, best.seed, best.outputs) == (recipe.name, recipe.seed, recipe.outputs)
 
 
-# --- points -----------------------------------------------------------------------------------------------------------
+# --- points ---------------------------------------------------------------------------------------
 
 
 def test_errors_are_the_closed_forms(recipe, store):
     cache = PointCache(finest(recipe), store, seeds=1)
     coarse = cache.point(Trial("bands", "3", changed(recipe, ["optics.bands=3"])))
-    assert coarse.found.errors["raw"][0] == pytest.approx(1 - quadrature(3) / quadrature(9), rel=1e-4)
+    assert coarse.found.errors["raw"][0] == pytest.approx(
+        1 - quadrature(3) / quadrature(9), rel=1e-4
+    )
     assert "cube" not in coarse.found.errors  # of another shape
     single = cache.point(Trial("own", "", recipe))
     assert 1e-9 < single.error < 1e-7  # a third in float32
@@ -171,7 +202,9 @@ def test_a_quick_point_is_timed_again_each_time_once(nodes, recipe, store):
 
 def test_what_cannot_run_is_a_point_that_says_why(recipe, store):
     cache = PointCache(finest(recipe), store, seeds=1)
-    point = cache.point(Trial("samples", "4", changed(recipe, ["optics.samples=4", "optics.pitch=2 mm"])))
+    point = cache.point(
+        Trial("samples", "4", changed(recipe, ["optics.samples=4", "optics.pitch=2 mm"]))
+    )
     assert point.found.refused == "pupil: 4 samples are too few"
     assert not point.sound
 
@@ -191,7 +224,7 @@ def test_a_point_is_another_with_another_tolerance_recipe_seed_or_number_of_seed
     assert cache.key(recipe) == PointCache(finest(recipe), store, seeds=2).key(recipe)
 
 
-# --- the Pareto front -------------------------------------------------------------------------------------------------
+# --- the Pareto front -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -201,7 +234,14 @@ class Spot:
 
 
 def test_the_pareto_line_has_what_no_other_point_beats():
-    points = [Spot(1, 1e-1), Spot(2, 1e-3), Spot(2, 1e-2), Spot(3, 5e-3), Spot(4, 1e-3), Spot(5, 1e-6)]
+    points = [
+        Spot(1, 1e-1),
+        Spot(2, 1e-3),
+        Spot(2, 1e-2),
+        Spot(3, 5e-3),
+        Spot(4, 1e-3),
+        Spot(5, 1e-6),
+    ]
     assert pareto_front(points) == [Spot(1, 1e-1), Spot(2, 1e-3), Spot(5, 1e-6)]
     assert cheapest(points, 1e-2) == Spot(2, 1e-3)
     assert cheapest(points, 1e-7) is None
@@ -218,12 +258,15 @@ def test_a_choice_is_weighed_against_the_cheapest_that_holds():
     assert median_ratio(made) == 1.5
 
 
-# --- steps ------------------------------------------------------------------------------------------------------------
+# --- steps ----------------------------------------------------------------------------------------
 
 
 def test_steps_that_matter_are_the_slowest_items(recipe):
     seconds = {"cube": 6.0, "image": 3.98, "psf": 0.02, "elsewhere": 5.0}
-    assert steps_that_matter(recipe, seconds) == [("cube", pytest.approx(0.4)), ("image", pytest.approx(3.98 / 15))]
+    assert steps_that_matter(recipe, seconds) == [
+        ("cube", pytest.approx(0.4)),
+        ("image", pytest.approx(3.98 / 15)),
+    ]
 
 
 def test_a_step_is_tried_in_its_forms_against_its_reference(nodes, recipe, store):
@@ -244,7 +287,9 @@ def test_a_step_without_a_reference_says_so(recipe, store):
 
 
 def test_a_part_of_the_inputs_is_their_middle_and_bands_from_all_over(nodes):
-    cube = torch.arange(9.0)[:, None, None] * 100 + torch.arange(6.0)[:, None] * 10 + torch.arange(8.0)
+    cube = (
+        torch.arange(9.0)[:, None, None] * 100 + torch.arange(6.0)[:, None] * 10 + torch.arange(8.0)
+    )
     psf = nodes.Psf(cube, torch.arange(9.0))
     (part,) = cut_inputs(nodes.weighed, [psf], (4, 3))
     assert part.intensity.shape == (3, 4, 4)
@@ -253,7 +298,7 @@ def test_a_part_of_the_inputs_is_their_middle_and_bands_from_all_over(nodes):
     assert cut_inputs(nodes.weighed, [psf], (0, 0))[0].intensity.shape == (9, 6, 8)
 
 
-# --- the whole --------------------------------------------------------------------------------------------------------
+# --- the whole ------------------------------------------------------------------------------------
 
 
 def rows_of(folder):
@@ -271,20 +316,38 @@ def test_a_study_that_was_stopped_goes_on_and_writes_its_folder(nodes, recipe, s
     assert "bands 4" in nodes.CALLS
     nodes.CALLS.clear()
     lines.clear()
-    folder = study(recipe, store, tmp_path / "runs", ["neusee", "study"], lines.append, seeds=1, quick=True)
+    folder = study(
+        recipe, store, tmp_path / "runs", ["neusee", "study"], lines.append, seeds=1, quick=True
+    )
     assert "bands 17" in nodes.CALLS
     assert nodes.CALLS.count("bands 4") == TIMES - 1  # known from before, and only timed again
     points = len(list(trials(recipe, knobs(recipe, True), True)))
     words = [line.partition(" ")[0] for line in lines]
-    assert words[: points + 3] == [str(points), *(f"{i + 1}/{points}" for i in range(points)), "timed", "timed"]
+    assert words[: points + 3] == [
+        str(points),
+        *(f"{i + 1}/{points}" for i in range(points)),
+        "timed",
+        "timed",
+    ]
     assert "step cube: 2 variants" in lines
     _look_at(folder)
 
 
 def _look_at(folder):
-    names = {"figures", "provenance.json", "recipe.yaml", "report.html", "ro-crate-metadata.json", "table.csv"}
+    names = {
+        "figures",
+        "provenance.json",
+        "recipe.yaml",
+        "report.html",
+        "ro-crate-metadata.json",
+        "table.csv",
+    }
     assert {p.name for p in folder.iterdir()} == names
-    assert {p.stem for p in (folder / "figures").iterdir()} == {"work_precision", "promises", "steps"}
+    assert {p.stem for p in (folder / "figures").iterdir()} == {
+        "work_precision",
+        "promises",
+        "steps",
+    }
     assert json.loads((folder / "provenance.json").read_text())["command"] == "neusee study"
     assert count_failures(folder) == 0
     rows = rows_of(folder)
@@ -310,13 +373,20 @@ def test_what_the_budget_leaves_is_said_and_measured_the_next_time(nodes, recipe
 def test_a_tolerance_finer_than_the_arithmetic_is_told_from_one_that_was_missed(recipe, store):
     cache = PointCache(finest(recipe), store, seeds=1)
     points = [
-        cache.point(t) for t in trials(recipe, knobs(recipe, True), True) if t.line in ("tolerance", "everything kept")
+        cache.point(t)
+        for t in trials(recipe, knobs(recipe, True), True)
+        if t.line in ("tolerance", "everything kept")
     ]
     fine = cache.point(Trial("tolerance", "1e-9", replace(recipe, tolerance=1e-9), value=1e-9))
     assert fine.most > 1e-9  # a third in float32
     said = lead(recipe, [*points, fine])
-    assert "4 of 5 tolerances were held. 1 cannot be tested: rounding gives the full computation" in said
-    off = WorkPrecisionPoint(replace(fine.trial, value=1e-9), replace(fine.found, errors={"raw": [1e-3]}))
+    assert (
+        "4 of 5 tolerances were held. 1 cannot be tested: rounding gives the full computation"
+        in said
+    )
+    off = WorkPrecisionPoint(
+        replace(fine.trial, value=1e-9), replace(fine.found, errors={"raw": [1e-3]})
+    )
     assert "cannot be tested" not in lead(recipe, [*points, off])
     assert (count_missed([*points, fine]), count_missed([*points, off])) == (0, 1)
 
@@ -324,10 +394,18 @@ def test_a_tolerance_finer_than_the_arithmetic_is_told_from_one_that_was_missed(
 def test_a_table_of_many_outputs_is_cut_to_the_width_of_the_page(recipe, store):
     point = PointCache(finest(recipe), store, seeds=1).point(Trial("samples", "10", recipe))
     names = [f"output[{i}]" for i in range(15)]
-    many = WorkPrecisionPoint(point.trial, replace(point.found, errors={name: [1e-3] for name in names}))
+    many = WorkPrecisionPoint(
+        point.trial, replace(point.found, errors={name: [1e-3] for name in names})
+    )
     result = AccuracyResult(load("laser_free"), (many,), (), (), 1)
-    parts = [s for s in sections(result, {"promises": b"PNG"}) if s.heading.startswith("Every output")]
-    assert [s.heading for s in parts] == ["Every output", "Every output, part 2 of 3", "Every output, part 3 of 3"]
+    parts = [
+        s for s in sections(result, {"promises": b"PNG"}) if s.heading.startswith("Every output")
+    ]
+    assert [s.heading for s in parts] == [
+        "Every output",
+        "Every output, part 2 of 3",
+        "Every output, part 3 of 3",
+    ]
     assert [bool(s.picture) for s in parts] == [True, False, False]
     assert [name for s in parts for name in s.columns[2:]] == names
     assert max(len(s.columns) for s in parts) <= 8
@@ -336,7 +414,8 @@ def test_a_table_of_many_outputs_is_cut_to_the_width_of_the_page(recipe, store):
 
 def test_many_outputs_can_be_told_apart():
     outputs = {f"output {i}": [1e-3, 1e-4] for i in range(20)}
-    promises([1e-2, 1e-3], outputs, [None, None])  # the legend is checked wherever a figure is drawn
+    # the legend is checked wherever a figure is drawn
+    promises([1e-2, 1e-3], outputs, [None, None])
 
 
 def test_a_study_without_seeds_is_refused(recipe, store, tmp_path):
@@ -346,16 +425,25 @@ def test_a_study_without_seeds_is_refused(recipe, store, tmp_path):
 
 def test_a_diagram_is_drawn_of_errors_that_are_zero(tmp_path):
     dots = [Dot(1.0, 0.0, "exact"), Dot(0.1, 1e-3, "1e-3", 5e-4, 2e-3, own=True)]
-    picture = work_precision([Line("tolerance", dots)], [(0.1, 1e-3), (1.0, EXACT / 2)], 1e-3, "title")
+    picture = work_precision(
+        [Line("tolerance", dots)], [(0.1, 1e-3), (1.0, EXACT / 2)], 1e-3, "title"
+    )
     assert picture.startswith(b"\x89PNG")
 
 
 @pytest.mark.slow
 def test_first_light_in_small(tmp_path):
-    small = ["optics.samples=96", "optics.pitch=84.15 um", "optics.bands=7", "optics.window=[24, 24]"]
+    small = [
+        "optics.samples=64",
+        "optics.pitch=126.2 um",
+        "optics.bands=4",
+        "optics.window=[24, 24]",
+    ]
     small += ["scene.shape=[32, 32]", "sensor.shape=[24, 24]", "laser=none", "outputs=[raw, lsr]"]
     recipe = load("first_light", small)
-    folder = study(recipe, Store(tmp_path / "store"), tmp_path / "runs", [], print, seeds=2, quick=True)
+    folder = study(
+        recipe, Store(tmp_path / "store"), tmp_path / "runs", [], print, seeds=1, quick=True
+    )
     asked = [r for r in rows_of(folder) if r["line"] == "tolerance"]
     assert asked
     assert all(float(r["error"]) <= float(r["setting"]) for r in asked)
@@ -363,5 +451,8 @@ def test_first_light_in_small(tmp_path):
 
 @pytest.mark.parametrize("error", [3e-17, 2e-7, 0.0])
 def test_errors_that_differ_in_their_last_digit_alone_are_drawn_without_a_warning(error):
-    dots = [Dot(0.1, error, "a"), Dot(0.1, math.nextafter(error, 1.0), "b", error, math.nextafter(error, 1.0))]
+    dots = [
+        Dot(0.1, error, "a"),
+        Dot(0.1, math.nextafter(error, 1.0), "b", error, math.nextafter(error, 1.0)),
+    ]
     assert steps([("image", [Line("precision", dots)], 0.1)])

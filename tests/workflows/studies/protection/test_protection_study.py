@@ -1,4 +1,6 @@
-"""The study of equal protection: page, gains below their bounds, pictures under attack, and what is refused."""
+"""The study of equal protection: page, gains below their bounds, pictures under attack, and what
+is refused.
+"""
 
 import json
 import math
@@ -9,14 +11,18 @@ from typer.testing import CliRunner
 
 from neusee.workflows import load
 from neusee.workflows.cli.app import app
-from neusee.workflows.protection import front_optics
-from neusee.workflows.protection.camera_parts import ProtectionCamera
+from neusee.workflows.protection import protection_camera as front_optics
 from neusee.workflows.protection.equal_rivals import MEASURES
-from neusee.workflows.protection.front_optics import Front, FrontBench, FrontSettings
+from neusee.workflows.protection.protection_camera import (
+    Front,
+    FrontBench,
+    FrontSettings,
+    ProtectionCamera,
+)
 from neusee.workflows.protection.protection_result import LIGHTS
 from neusee.workflows.protection.unknown_conditions import usual_condition
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.protection.protection_page import crossing
+from neusee.workflows.studies.protection.protection_study import crossing
 from neusee.workflows.studies.run_study import study_recipe
 
 SMALL = ["optics.samples=128", "optics.pitch=63.125 um", "optics.bands=3", "optics.window=[64, 64]"]
@@ -33,7 +39,14 @@ def store(tmp_path_factory):
 @pytest.fixture(scope="module")
 def folder(store, tmp_path_factory):
     """A finished study of two draws."""
-    return study_recipe("protection", load("axicon", SMALL), store, tmp_path_factory.mktemp("runs"), draws=2, bands=3)
+    return study_recipe(
+        "protection",
+        load("axicon", SMALL),
+        store,
+        tmp_path_factory.mktemp("runs"),
+        draws=2,
+        bands=3,
+    )
 
 
 def found(folder):
@@ -43,7 +56,12 @@ def found(folder):
 @pytest.mark.slow
 def test_the_study_writes_page_table_figures_and_a_paragraph(folder):
     assert (folder / "report.html").stat().st_size > 10_000
-    assert {path.stem for path in (folder / "figures").glob("*.png")} == {"region", "gain", "neq", "attack"}
+    assert {path.stem for path in (folder / "figures").glob("*.png")} == {
+        "region",
+        "gain",
+        "neq",
+        "attack",
+    }
     rows = (folder / "table.csv").read_text().splitlines()
     assert len(rows) == 1 + 8 * len(LIGHTS) * len(MEASURES)
     said = (folder / "paragraph.txt").read_text()
@@ -59,16 +77,22 @@ def test_the_gains_of_the_document_are_mask_less_rival_and_stay_below_the_bounds
         assert pair["gain"] <= pair["bound"] * 1.001, n
     for n in ("10", "300", "10000"):
         gain, quiet = document["gain"][n], document["quiet"]
-        assert gain["error"] >= quiet["mask"][n]["error"] - quiet["best stop and filter"][n]["error"] - 1e-9
+        assert (
+            gain["error"]
+            >= quiet["mask"][n]["error"] - quiet["best stop and filter"][n]["error"] - 1e-9
+        )
         for rival in ("grey filter", "smaller stop"):
             assert quiet["best stop and filter"][n]["error"] >= quiet[rival][n]["error"]
         assert quiet["open lens"][n]["error"] >= quiet["best stop and filter"][n]["error"]
-    assert document["gain"]["10"]["NEQ"] > document["gain"]["10000"]["NEQ"]  # masks lead in the dark
+    # masks lead in the dark
+    assert document["gain"]["10"]["NEQ"] > document["gain"]["10000"]["NEQ"]
 
 
 @pytest.mark.slow
 def test_the_smaller_stop_protects_as_the_mask_with_hardly_a_filter(folder):
-    """Pixels average less of the wider spot of a stop away, so that its diameter is not the fourth root of the peak."""
+    """Pixels average less of the wider spot of a stop away, so that its diameter is not the
+    fourth root of the peak.
+    """
     document = found(folder)
     stop, _, grey = document["rivals"]["smaller stop"].removeprefix("stop ").partition(", filter ")
     assert float(grey or 1) > 0.975
@@ -108,10 +132,18 @@ def test_the_light_at_which_a_gain_ends():
         ("calibrate", None, {}, "has no step psf\\[mask\\]: study a recipe of the camera"),
     ],
 )
-def test_an_unsuitable_recipe_is_refused_with_the_fix(recipe, changes, options, said, store, tmp_path):
-    words = [] if changes is None else [*changes, *(w for w in SMALL if recipe == "axicon" or "doe." not in w)]
+def test_an_unsuitable_recipe_is_refused_with_the_fix(
+    recipe, changes, options, said, store, tmp_path
+):
+    words = (
+        []
+        if changes is None
+        else [*changes, *(w for w in SMALL if recipe == "axicon" or "doe." not in w)]
+    )
     with pytest.raises(ValueError, match=said):
-        study_recipe("protection", load(recipe, words), store, tmp_path, draws=2, bands=3, **options)
+        study_recipe(
+            "protection", load(recipe, words), store, tmp_path, draws=2, bands=3, **options
+        )
 
 
 def test_a_wrong_option_is_refused_by_the_command():
@@ -129,6 +161,8 @@ def test_equal_heat_asks_for_a_darker_rival_than_equal_peak(store, tmp_path):
     assert one.heat > 2 * one.peak
     stop = heated.measure(Front(False, 0.5), usual_condition())
     assert stop.heat == pytest.approx(0.5**3, rel=0.2)
-    folder = study_recipe("protection", load("axicon", SMALL), store, tmp_path, draws=2, bands=3, light="continuous")
+    folder = study_recipe(
+        "protection", load("axicon", SMALL), store, tmp_path, draws=2, bands=3, light="continuous"
+    )
     assert found(folder)["protection"] == pytest.approx(one.heat, rel=1e-6)
     assert "heat of a laser" in found(folder)["paragraph"]

@@ -7,13 +7,13 @@ import pytest
 
 from neusee.workflows import Store, load
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.studies.stability.case_recipe import CaseRecipe
 from neusee.workflows.studies.stability.case_result import judge_step
-from neusee.workflows.studies.stability.extreme_cases import CASES
+from neusee.workflows.studies.stability.extreme_cases import CASES, CaseRecipe
 from neusee.workflows.studies.stability.stability_study import study
 
 RECIPES = sorted(path.stem for path in (Path(__file__).parents[4] / "recipes").glob("*.yaml"))
-CHANGED = ["first_light +damage=published", "first_light flare=dirty_stray_light"]  #: with steps that no recipe has
+#: with steps that no recipe has
+CHANGED = ["first_light +damage=published", "first_light flare=dirty_stray_light"]
 
 
 @pytest.fixture(scope="module")
@@ -43,20 +43,27 @@ def test_no_cell_of_a_shipped_recipe_fails(recipe, store, tmp_path):
 @pytest.mark.parametrize(
     ("recipe", "case", "step", "mark"),
     [
-        ("hdr_night", "gain / 1e4", "deconvolved", "pass"),  # the gradient overflowed at scene pixels that are dark
-        ("laser_free", "400 nm", "outside[plain]", "pass"),  # the difference of 1 and a sum in float32
-        ("laser_free", "1 pixel", "loss background_loss of bsr[mask]", "pass"),  # a gradient of 0 in a loss of 1e4
+        # the gradient overflowed at scene pixels that are dark
+        ("hdr_night", "gain / 1e4", "deconvolved", "pass"),
+        # the difference of 1 and a sum in float32
+        ("laser_free", "400 nm", "outside[plain]", "pass"),
+        # a gradient of 0 in a loss of 1e4
+        ("laser_free", "1 pixel", "loss background_loss of bsr[mask]", "pass"),
         ("plain_lens", "700 nm", "spectral", "pass"),  # PSFs in float32 that differ by 1e-6
-        # a picture of 1e15 has no noise, so that the filter inverts lens and pixel: the covariance lost 3.3e-5. The
-        # gradient is off by 1e-16 of the ratio of scene and noise, as stated, which is more than itself
+        # a picture of 1e15 has no noise, so that the filter inverts lens and pixel: the covariance
+        # lost 3.3e-5. The gradient is off by 1e-16 of the ratio of scene and noise, as stated,
+        # which is more than itself
         ("plain_lens", "huge", "deconvolved", "warn"),
-        # the slope of a maximum: a warning where its two largest elements are equal to rounding, which depends on the
-        # optics and may depend on the machine
+        # the slope of a maximum: a warning where its two largest elements are equal to rounding,
+        # which depends on the optics and may depend on the machine
         ("axicon", "steps past pi", "level", "warn or pass"),
         ("train_small", "two levels", "laser_psf[mask,drawn]", "pass"),  # 2.1e-6 in speckle, once
-        ("first_light +damage=published", "NaN", "dazzle[plain]", "pass"),  # counted as a dark pixel
-        ("first_light +damage=published", "float16", "dead[mask]", "pass"),  # white exceeded float16
-        ("first_light flare=dirty_stray_light", "Inf", "stray_shares[plain]", "pass"),  # 0 beside 2e-57
+        # counted as a dark pixel
+        ("first_light +damage=published", "NaN", "dazzle[plain]", "pass"),
+        # white exceeded float16
+        ("first_light +damage=published", "float16", "dead[mask]", "pass"),
+        # 0 beside 2e-57
+        ("first_light flare=dirty_stray_light", "Inf", "stray_shares[plain]", "pass"),
     ],
 )
 def test_cells_that_failed_once(recipe, case, step, mark, tmp_path):

@@ -19,11 +19,16 @@ from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.node_families import find_node
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.stability import case_result, extreme_cases, stability_study
-from neusee.workflows.studies.stability.case_recipe import CaseRecipe, unchanged_steps
 from neusee.workflows.studies.stability.case_result import judge_step
-from neusee.workflows.studies.stability.extreme_cases import CASES, USUAL, Case, Size
-from neusee.workflows.studies.stability.stability_figures import cell_text, short_number
-from neusee.workflows.studies.stability.stability_study import study
+from neusee.workflows.studies.stability.extreme_cases import (
+    CASES,
+    USUAL,
+    Case,
+    CaseRecipe,
+    Size,
+    unchanged_steps,
+)
+from neusee.workflows.studies.stability.stability_study import cell_text, short_number, study
 
 BY_NAME = {case.name: case for case in CASES}
 
@@ -78,13 +83,21 @@ def test_a_step_within_its_bound_passes_with_both_numbers(picture):
 
 @pytest.mark.parametrize(
     ("fn", "case"),
-    [(cancelling, "usual"), (rooted, "usual"), (hiding, "NaN"), (breaking, "usual"), (breaking, "NaN")],
+    [
+        (cancelling, "usual"),
+        (rooted, "usual"),
+        (hiding, "NaN"),
+        (breaking, "usual"),
+        (breaking, "NaN"),
+    ],
 )
 def test_what_is_wrong_fails(fn, case, picture):
     assert judge_step(step_of(fn), [picture], BY_NAME[case], 0).mark == "fail"
 
 
-@pytest.mark.parametrize(("fn", "case"), [(refusing, "NaN"), (doubled, "NaN"), (doubled, "Inf"), (doubled, "float16")])
+@pytest.mark.parametrize(
+    ("fn", "case"), [(refusing, "NaN"), (doubled, "NaN"), (doubled, "Inf"), (doubled, "float16")]
+)
 def test_what_is_refused_seen_or_of_its_precision_passes(fn, case, picture):
     assert judge_step(step_of(fn), [picture], BY_NAME[case], 0).mark == "pass"
 
@@ -105,7 +118,9 @@ def test_a_case_that_changes_nothing_of_a_step_has_no_cell(picture):
 def test_names_and_groups_of_the_catalogue_are_in_order():
     assert len(BY_NAME) == len(CASES)
     groups = [case.group for case in CASES]
-    assert len(dict.fromkeys(groups)) == sum(a != b for a, b in zip(groups, ["", *groups], strict=False))
+    assert len(dict.fromkeys(groups)) == sum(
+        a != b for a, b in zip(groups, ["", *groups], strict=False)
+    )
 
 
 def test_small_chains_keep_the_pupil_and_know_what_a_case_touches(tmp_path):
@@ -123,26 +138,45 @@ def test_small_chains_keep_the_pupil_and_know_what_a_case_touches(tmp_path):
 def test_a_mask_from_a_file_has_a_stand_in_of_its_depth_so_that_what_follows_is_tested(tmp_path):
     recipe = load("demonstration", [])
     chain = CaseRecipe.of(recipe, USUAL, Code(tmp_path / "code.json"))
-    (pupil,) = (step for step in chain.steps.values() if step.node.path == "optics.pupil" and "[mask]" in step.name)
+    (pupil,) = (
+        step
+        for step in chain.steps.values()
+        if step.node.path == "optics.pupil" and "[mask]" in step.name
+    )
     mask = chain.inputs(pupil.name)[0]
     assert mask.shape == (64, 64)
-    (depth,) = (step.params["depth"] for step in recipe.steps.values() if step.node.path == "doe.pixelwise")
+    (depth,) = (
+        step.params["depth"] for step in recipe.steps.values() if step.node.path == "doe.pixelwise"
+    )
     assert 0.5 * depth < float(mask.max()) <= depth
     assert judge_step(pupil, chain.inputs(pupil.name), USUAL, recipe.seed).mark == "pass"
-    assert "takes the\nplace of a mask from a file" in stability_study._HOW
+    assert "takes the place of a mask from a file" in " ".join(stability_study._HOW.split())
 
 
 def _without_restoration(recipe):
     """It is half of the time, and what is tested is the study."""
-    steps = {n: s for n, s in recipe.steps.items() if n not in ("deconvolved", "restored", "restored_quality")}
+    steps = {
+        n: s
+        for n, s in recipe.steps.items()
+        if n not in ("deconvolved", "restored", "restored_quality")
+    }
     return replace(recipe, steps=steps)
 
 
 def test_the_study_writes_its_folder_and_counts_what_fails(tmp_path, monkeypatch):
-    recipe, store, told = _without_restoration(load("laser_free", [])), Store(tmp_path / "store"), []
+    recipe, store, told = (
+        _without_restoration(load("laser_free", [])),
+        Store(tmp_path / "store"),
+        [],
+    )
     cases = [Case("usual", "as it is", "usual", size=Size(16, 16, 3)), BY_NAME["NaN"]]
     folder = study(recipe, store, tmp_path / "runs", ["neusee"], told.append, cases=cases)
-    assert {p.name for p in folder.iterdir()} >= {"report.html", "table.csv", "provenance.json", "figures"}
+    assert {p.name for p in folder.iterdir()} >= {
+        "report.html",
+        "table.csv",
+        "provenance.json",
+        "figures",
+    }
     assert (folder / "figures/stability.png").read_bytes().startswith(b"\x89PNG")
     with (folder / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -153,7 +187,9 @@ def test_the_study_writes_its_folder_and_counts_what_fails(tmp_path, monkeypatch
     assert len(told) == 2
     before = {row["step"]: row["error"] for row in rows}
     monkeypatch.setattr(stability_study, "judge_step", None)  # what is stored is not judged again
-    again = study(recipe, Store(tmp_path / "store"), tmp_path / "runs", ["neusee"], told.append, cases=cases)
+    again = study(
+        recipe, Store(tmp_path / "store"), tmp_path / "runs", ["neusee"], told.append, cases=cases
+    )
     with (again / "table.csv").open() as file:
         assert {row["step"]: row["error"] for row in csv.DictReader(file)} == before
 
@@ -229,7 +265,11 @@ def test_a_picture_that_two_inputs_share_counts_once(picture):
 def test_a_slope_beyond_the_type_of_its_picture_is_no_fault_of_the_step(picture):
     @node()
     def steep(x: torch.Tensor) -> torch.Tensor:
-        return 1 + 1e7 * (x.float() - x.float().detach()) if x.dtype != torch.float64 else 1 + 1e7 * (x - x.detach())
+        return (
+            1 + 1e7 * (x.float() - x.float().detach())
+            if x.dtype != torch.float64
+            else 1 + 1e7 * (x - x.detach())
+        )
 
     assert judge_step(step_of(steep), [picture], BY_NAME["float16"], 0).mark == "pass"
 
@@ -244,7 +284,9 @@ def test_cancellation_counts_in_each_scalar_of_a_result(left, picture):
 
     @node()
     def wrong(x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return x.abs().mean(), x.sum() + (1e-3 * x.abs().sum().detach() if x.dtype == torch.float32 else 0.0)
+        return x.abs().mean(), x.sum() + (
+            1e-3 * x.abs().sum().detach() if x.dtype == torch.float32 else 0.0
+        )
 
     assert judge_step(step_of(exact), [signed], BY_NAME["usual"], 0).mark != "fail"
     assert judge_step(step_of(wrong), [signed], BY_NAME["usual"], 0).mark == "fail"
@@ -253,7 +295,9 @@ def test_cancellation_counts_in_each_scalar_of_a_result(left, picture):
 @pytest.mark.parametrize(("white", "off", "mark"), [
     (1.0, 0.0, "pass"), (1.0, 1e-2, "fail"), (1e8, 0.0, "pass"), (1e8, 3e-7, "fail"),
 ])  # fmt: skip
-def test_a_picture_that_is_white_in_place_of_black_has_a_psnr_of_zero_decibels(white, off, mark, monkeypatch):
+def test_a_picture_that_is_white_in_place_of_black_has_a_psnr_of_zero_decibels(
+    white, off, mark, monkeypatch
+):
     """The rounding of a pixel counts in the PSNR; a pixel that is cut off at white has none."""
     quality = find_node("metrics.quality")
     fn, params = quality.fn, quality.params().model_dump()
@@ -264,7 +308,9 @@ def test_a_picture_that_is_white_in_place_of_black_has_a_psnr_of_zero_decibels(w
 
     monkeypatch.setattr(quality, "fn", changed)
     step = Step("quality", quality, params, {}, Location("test"), {})
-    cell = judge_step(step, [torch.full((3, 12, 12), white), torch.zeros(3, 12, 12)], extreme_cases.USUAL, 0)
+    cell = judge_step(
+        step, [torch.full((3, 12, 12), white), torch.zeros(3, 12, 12)], extreme_cases.USUAL, 0
+    )
     assert cell.mark == mark, cell
 
 
@@ -279,7 +325,9 @@ def test_no_result_is_excused_by_the_rounding_of_its_inputs(picture):
     assert cell.bound == 1e-6
 
 
-@pytest.mark.parametrize(("turns", "off", "mark"), [(1e17, 2.0**-48, "warn"), (1e4, 2.0**-24, "fail")])
+@pytest.mark.parametrize(
+    ("turns", "off", "mark"), [(1e17, 2.0**-48, "warn"), (1e4, 2.0**-24, "fail")]
+)
 def test_a_gradient_that_nobody_knows_in_double_precision_is_a_warning(turns, off, mark, picture):
     @node()
     def wavy(x: torch.Tensor) -> torch.Tensor:
@@ -295,16 +343,28 @@ def _plate(side=24):
     """The pupil of a mask of 10 mm, whose phase turns some 8600 times."""
     steps = torch.arange(side) - (side - 1) / 2
     disc = (steps[:, None] ** 2 + steps**2 <= (side / 2) ** 2).float()
-    height = (10e-3 + 1e-4 * torch.rand(side, side, generator=torch.Generator().manual_seed(3))).float()
+    height = (
+        10e-3 + 1e-4 * torch.rand(side, side, generator=torch.Generator().manual_seed(3))
+    ).float()
     one = torch.tensor([0.46], dtype=torch.float64), torch.tensor([532e-9], dtype=torch.float64)
     return Pupil(disc, disc, height, 0 * height, *one, torch.tensor(1e-4, dtype=torch.float64))
 
 
 @pytest.mark.parametrize("fault", ["phase", "backward", "constant"])
 def test_a_fault_planted_in_the_light_fails_on_a_plate(fault, monkeypatch):
-    """A phase in single precision, in the result or in the gradient alone, and a constant that is wrong by 1e-5."""
-    step = Step("psf", psf, {"focal_length": 0.1, "pixel_pitch": 4e-6, "shape": (12, 12)}, {}, Location("test"), {})
-    monkeypatch.setattr(_intensity, "available", lambda device: False)  # the faults are planted in the torch path
+    """A phase in single precision, in the result or in the gradient alone, and a constant that
+    is wrong by 1e-5.
+    """
+    step = Step(
+        "psf",
+        psf,
+        {"focal_length": 0.1, "pixel_pitch": 4e-6, "shape": (12, 12)},
+        {},
+        Location("test"),
+        {},
+    )
+    # the faults are planted in the torch path
+    monkeypatch.setattr(_intensity, "available", lambda device: False)
     assert judge_step(step, [_plate(), None], USUAL, 0).mark == "pass"
     usual = _pupil_field.Field.__init__
 

@@ -1,4 +1,6 @@
-"""Sobol indices against closed forms, their intervals against repetitions, and what a polynomial cannot tell."""
+"""Sobol indices against closed forms, their intervals against repetitions, and what a polynomial
+cannot tell.
+"""
 
 import math
 
@@ -8,14 +10,20 @@ from scipy.special import ndtr
 
 from neusee.workflows.recipe.distributions.law_text import read_law
 from neusee.workflows.recipe.distributions.shapes import Discrete, LogNormal, Normal, Uniform
-from neusee.workflows.studies.uncertainty.polynomial_fit import Candidates, OrthonormalPolynomials, fit_polynomial
-from neusee.workflows.studies.uncertainty.sobol_indices import indices
+from neusee.workflows.studies.uncertainty.sobol_indices import (
+    Candidates,
+    OrthonormalPolynomials,
+    fit_polynomial,
+    indices,
+)
 
 RNG = np.random.default_rng
 
 
 def ishigami(z):
-    """Ishigami and Homma, First Int. Symp. on Uncertainty Modeling and Analysis (1990), with a = 7 and b = 0.1."""
+    """Ishigami and Homma, First Int. Symp. on Uncertainty Modeling and Analysis (1990), with a =
+    7 and b = 0.1.
+    """
     x = math.pi * (2 * ndtr(z) - 1)
     return np.sin(x[:, 0]) + 7 * np.sin(x[:, 1]) ** 2 + 0.1 * x[:, 2] ** 4 * np.sin(x[:, 0])
 
@@ -60,13 +68,17 @@ def test_indices_are_those_of_the_closed_form(name, count, error):
         assert [row.value for row in rows] == pytest.approx(exact, abs=error)
 
 
-@pytest.mark.parametrize(("name", "count"), [("ishigami", 64), ("ishigami", 128), ("g", 64), ("g", 128)])
+@pytest.mark.parametrize(
+    ("name", "count"), [("ishigami", 64), ("ishigami", 128), ("g", 64), ("g", 128)]
+)
 def test_intervals_contain_the_closed_form_in_95_of_100(name, count):
     inside = []
     for seed in range(10):
         found = found_indices(name, count, 100 + seed)
         for rows, exact in zip((found.first, found.total), CASES[name][1], strict=True):
-            inside += [row.low - 1e-12 <= x <= row.high + 1e-12 for row, x in zip(rows, exact, strict=True)]
+            inside += [
+                row.low - 1e-12 <= x <= row.high + 1e-12 for row, x in zip(rows, exact, strict=True)
+            ]
     assert np.mean(inside) >= 0.95
 
 
@@ -103,8 +115,12 @@ def test_shares_of_a_polynomial_are_exact():
     found = indices([Normal()] * 4, z, 3 * a + 2 * b + 2 * a * b + c**2 / 2)
     whole = 9 + 4 + 4 + 0.5
     assert found.explains_enough
-    assert [row.value for row in found.total] == pytest.approx([13 / whole, 8 / whole, 0.5 / whole, 0.0], abs=1e-9)
-    assert [row.value for row in found.first] == pytest.approx([9 / whole, 4 / whole, 0.5 / whole, 0.0], abs=1e-9)
+    assert [row.value for row in found.total] == pytest.approx(
+        [13 / whole, 8 / whole, 0.5 / whole, 0.0], abs=1e-9
+    )
+    assert [row.value for row in found.first] == pytest.approx(
+        [9 / whole, 4 / whole, 0.5 / whole, 0.0], abs=1e-9
+    )
     assert max(row.high - row.low for row in found.first) < 1e-6
 
 
@@ -120,7 +136,9 @@ def test_shares_of_a_polynomial_are_exact():
     ],
 )
 def test_each_law_has_polynomials_of_its_own(text, values):
-    """y = f(x) + w with an exact polynomial f: the share of x is var(f) / (var(f) + 1), by quadrature."""
+    """y = f(x) + w with an exact polynomial f: the share of x is var(f) / (var(f) + 1), by
+    quadrature.
+    """
     shape = read_law(text).shape
     z = RNG(2).standard_normal((200, 2))
     found = indices([shape, Normal()], z, values(shape.at(z[:, 0])) + z[:, 1])
@@ -136,7 +154,9 @@ def _scores(u):
     return ndtri(u)
 
 
-@pytest.mark.parametrize("shape", [Normal(), Uniform(0.0, 3.0), LogNormal(2.0, 3.0)], ids=["normal", "uniform", "log"])
+@pytest.mark.parametrize(
+    "shape", [Normal(), Uniform(0.0, 3.0), LogNormal(2.0, 3.0)], ids=["normal", "uniform", "log"]
+)
 def test_polynomials_are_orthonormal_to_the_tenth_degree(shape):
     basis = OrthonormalPolynomials.of(shape)
     nodes, weights = np.polynomial.hermite_e.hermegauss(80)
@@ -149,7 +169,9 @@ def test_polynomials_are_orthonormal_to_the_tenth_degree(shape):
 
 
 def test_a_few_separate_values_have_as_few_polynomials():
-    basis = OrthonormalPolynomials.of(Discrete.of(np.array([1.0, 2.0, 7.0]), np.array([0.2, 0.5, 0.3])))
+    basis = OrthonormalPolynomials.of(
+        Discrete.of(np.array([1.0, 2.0, 7.0]), np.array([0.2, 0.5, 0.3]))
+    )
     assert basis.degree == 2
 
 
@@ -160,7 +182,9 @@ def test_a_fit_is_that_of_least_squares():
     candidates = Candidates.of([Normal()] * 2, z)
     fit = fit_polynomial(candidates, y)
     matrix = np.concatenate([np.ones((60, 1)), candidates.columns[:, fit.terms]], 1)
-    assert fit.at(candidates.columns) == pytest.approx(matrix @ np.linalg.lstsq(matrix, y, rcond=None)[0], abs=1e-9)
+    assert fit.at(candidates.columns) == pytest.approx(
+        matrix @ np.linalg.lstsq(matrix, y, rcond=None)[0], abs=1e-9
+    )
     assert {candidates.powers[term] for term in fit.terms} >= {(1, 0), (1, 1)}
 
 
@@ -177,5 +201,7 @@ def test_shares_of_one_draw_that_differs_are_numbers():
     y[0] = 4.0
     found = indices([Normal()], z, y)
     (first,), (total,) = found.first, found.total
-    assert np.isfinite([first.low, first.value, first.high, total.low, total.value, total.high]).all()
+    assert np.isfinite(
+        [first.low, first.value, first.high, total.low, total.value, total.high]
+    ).all()
     assert not found.explains_enough

@@ -1,11 +1,13 @@
-"""Figures of the uncertainty study: each mark is explained, and no title touches the numbers above it."""
+"""Figures of the uncertainty study: each mark is explained, and no title touches the numbers
+above it.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 
-from neusee.workflows.studies.uncertainty import uncertainty_figures
+from neusee.workflows.studies.uncertainty import uncertainty_page as uncertainty_figures
 
 NAMES = [f"quality[mask].{name}" for name in ("l1", "psnr", "ssim", "peak")]
 
@@ -13,17 +15,25 @@ NAMES = [f"quality[mask].{name}" for name in ("l1", "psnr", "ssim", "peak")]
 def test_the_line_of_a_histogram_has_a_legend():
     draws = {name: np.random.default_rng(i).random(50) for i, name in enumerate(NAMES)}
     figure = uncertainty_figures.histograms.__wrapped__(draws, dict.fromkeys(NAMES, 0.5))
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["value with every input at its median"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "value with every input at its median"
+    ]
     assert_titles_are_apart(figure)
 
 
 def test_titles_of_a_tornado_are_apart_from_the_numbers_above():
-    swings = {name: [(f"sensor.value_{i}", 0.1 * i, 1.0 - 0.1 * i) for i in range(5)] for name in NAMES}
-    assert_titles_are_apart(uncertainty_figures.tornado.__wrapped__(swings, dict.fromkeys(NAMES, 0.5)))
+    swings = {
+        name: [(f"sensor.value_{i}", 0.1 * i, 1.0 - 0.1 * i) for i in range(5)] for name in NAMES
+    }
+    assert_titles_are_apart(
+        uncertainty_figures.tornado.__wrapped__(swings, dict.fromkeys(NAMES, 0.5))
+    )
 
 
 def test_the_scale_of_a_standard_deviation_has_a_label():
-    figure = uncertainty_figures.pictures.__wrapped__({"raw": (torch.rand(3, 8, 8), torch.rand(3, 8, 8))})
+    figure = uncertainty_figures.pictures.__wrapped__(
+        {"raw": (torch.rand(3, 8, 8), torch.rand(3, 8, 8))}
+    )
     assert figure.axes[-1].get_ylabel() == "in the unit of the picture"
 
 
@@ -54,7 +64,10 @@ def test_numbers_below_a_histogram_or_a_tornado_are_apart_and_upright():
     draws = {name: 0.04573 + 1e-4 * rng.random(50) for name in NAMES}
     middles = dict.fromkeys(NAMES, 0.04578)
     swings = {name: [("sensor.read_noise", 0.04575, 0.04582)] for name in NAMES}
-    for draw, given in ((uncertainty_figures.histograms, draws), (uncertainty_figures.tornado, swings)):
+    for draw, given in (
+        (uncertainty_figures.histograms, draws),
+        (uncertainty_figures.tornado, swings),
+    ):
         draw(given, middles)  # texts that overlap are found wherever a figure is drawn
         for ax in draw.__wrapped__(given, middles).axes:
             assert {label.get_rotation() for label in ax.get_xticklabels()} == {0.0}

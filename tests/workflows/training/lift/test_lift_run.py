@@ -1,4 +1,6 @@
-"""Learning a lift: from measured reflectances to weights that the node takes, and a kill that costs nothing."""
+"""Learning a lift: from measured reflectances to weights that the node takes, and a kill that
+costs nothing.
+"""
 
 import csv
 import json
@@ -21,15 +23,23 @@ from neusee.workflows.training.lift.lift_run import train_lift
 
 ROOT = Path(__file__).parents[4]
 TINY = [
-    "patch.shape=[8, 8]", "patch.leaves=8", "train_lift.iterations=4", "train_lift.batch=1", "train_lift.keep=2",
-    "train_lift.warmup=2", "train_lift.validation_batches=2", "train_lift.ema_decay=0.5",
-]  # fmt: skip
+    "patch.shape=[8, 8]",
+    "patch.leaves=8",
+    "train_lift.iterations=4",
+    "train_lift.batch=1",
+    "train_lift.keep=2",
+    "train_lift.warmup=2",
+    "train_lift.validation_batches=2",
+    "train_lift.ema_decay=0.5",
+]
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def trained(recipe, folder, watch=None):
-    return train_lift(recipe, Store(folder / "store"), folder / "runs", ["neusee"], lambda line: None, watch=watch)
+    return train_lift(
+        recipe, Store(folder / "store"), folder / "runs", ["neusee"], lambda line: None, watch=watch
+    )
 
 
 def losses(folder):
@@ -61,7 +71,9 @@ def test_the_weights_are_those_that_the_lift_takes(whole):
 
 def same(again, whole):
     assert again.name == whole.name
-    assert (again / "mst_plus_plus.safetensors").read_bytes() == (whole / "mst_plus_plus.safetensors").read_bytes()
+    assert (again / "mst_plus_plus.safetensors").read_bytes() == (
+        whole / "mst_plus_plus.safetensors"
+    ).read_bytes()
     assert losses(again) == losses(whole)
 
 
@@ -92,13 +104,17 @@ here = Path({str(tmp_path)!r})
 train_lift(load("train_lift", {TINY!r}), Store(here / "store"), here / "runs", [], print, watch=watch)
 """
     env = {**os.environ, "PYTHONPATH": str(ROOT / ".src"), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False
+    )
     assert done.returncode == -signal.SIGKILL, done.stderr
     same(trained(load("train_lift", TINY), tmp_path), whole)
 
 
 def test_a_finished_training_is_not_repeated(whole):
-    before = {path: path.stat().st_mtime_ns for path in whole.rglob("*.*") if path.name != "losses.csv"}
+    before = {
+        path: path.stat().st_mtime_ns for path in whole.rglob("*.*") if path.name != "losses.csv"
+    }
     trained(load("train_lift", [*TINY, "train_lift.keep=1"]), whole.parents[1])
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert len(losses(whole)) == 4
@@ -120,7 +136,8 @@ def test_a_pair_is_that_of_its_number_and_renders_as_the_steps_do(tmp_path):
 @pytest.mark.parametrize("start", ["linear", "random"])
 def test_a_few_iterations_lower_the_error(tmp_path, start):
     recipe = load(
-        "train_lift", [*TINY, f"train_lift.start={start}", "train_lift.iterations=12", "train_lift.rate=2e-3"]
+        "train_lift",
+        [*TINY, f"train_lift.start={start}", "train_lift.iterations=12", "train_lift.rate=2e-3"],
     )
     pairs = Pairs(recipe, recipe.lifting, Store(tmp_path), "cpu")
     learner = LiftLearner(recipe.lifting, pairs, recipe.seed, "cpu")
@@ -134,10 +151,15 @@ def test_a_few_iterations_lower_the_error(tmp_path, start):
 
 @pytest.mark.parametrize("clip", [10.0, 0.5, None])
 def test_the_gradient_of_all_weights_has_at_most_the_norm_clip(tmp_path, clip):
-    words = ["train_lift.start=random", *([] if clip == 10.0 else [f"train_lift.clip={clip or 'null'}"])]
+    words = [
+        "train_lift.start=random",
+        *([] if clip == 10.0 else [f"train_lift.clip={clip or 'null'}"]),
+    ]
     recipe = load("train_lift", [*TINY, *words])
     assert recipe.lifting.clip == clip
-    learner = LiftLearner(recipe.lifting, Pairs(recipe, recipe.lifting, Store(tmp_path), "cpu"), recipe.seed, "cpu")
+    learner = LiftLearner(
+        recipe.lifting, Pairs(recipe, recipe.lifting, Store(tmp_path), "cpu"), recipe.seed, "cpu"
+    )
     with torch.no_grad():
         for weight in learner.net.parameters():
             weight.mul_(2)  # so that the gradient is long
@@ -153,14 +175,18 @@ def test_a_limit_of_the_gradient_that_is_not_positive_is_refused(value):
         load("train_lift", [f"train_lift.clip={value}"])
 
 
-def test_every_setting_and_file_of_a_lift_is_in_the_name_of_its_folder_and_a_display_setting_is_not(tmp_path):
+def test_every_setting_and_file_of_a_lift_is_in_the_name_of_its_folder_and_a_display_setting_is_not(
+    tmp_path,
+):
     """Reflectances in a file, which another content under the old name makes another training."""
     table = tmp_path / "paints.csv"
     table.write_text("nm,one,two\n380,0.1,0.2\n780,0.3,0.4\n")
 
     def key(*words):
         recipe = load("train_lift", [*TINY, f"measured.files={table}", *words])
-        return lift_run.lift_inputs(recipe, recipe.lifting, Code(Store(tmp_path / "store").code_memo)).key
+        return lift_run.lift_inputs(
+            recipe, recipe.lifting, Code(Store(tmp_path / "store").code_memo)
+        ).key
 
     first = key()
     assert key("train_lift.show=7", "train_lift.keep=3", "train_lift.validation_batches=2") == first
@@ -175,10 +201,14 @@ def test_what_is_not_a_number_stops_and_is_kept(tmp_path, monkeypatch):
     from neusee.nodes import losses as nodes
 
     monkeypatch.setattr(nodes, "mrae", lambda a, b, floor: (a - b).mean() * float("nan"))
-    with pytest.raises(ArithmeticError, match=r"iteration 0, picture 0: these numbers are NaN or infinite: MRAE"):
+    with pytest.raises(
+        ArithmeticError, match=r"iteration 0, picture 0: these numbers are NaN or infinite: MRAE"
+    ):
         trained(load("train_lift", TINY), tmp_path)
     (folder,) = (tmp_path / "runs").iterdir()
-    assert {"net", "optimiser"} <= torch.load(folder / "not_finite_0.pt", weights_only=True)["parts"].keys()
+    assert {"net", "optimiser"} <= torch.load(folder / "not_finite_0.pt", weights_only=True)[
+        "parts"
+    ].keys()
     assert not (folder / "mst_plus_plus.safetensors").exists()
 
 
@@ -226,7 +256,16 @@ def test_the_command_learns_a_lift_and_knows_no_stages(tmp_path, capsys, monkeyp
     assert error.value.code == 2
     assert "neither stages nor a mesh" in capsys.readouterr().err
     with pytest.raises(SystemExit) as done:
-        main(["train", "train_lift", *TINY, "train_lift.iterations=1", "--out", str(tmp_path / "runs")])
+        main(
+            [
+                "train",
+                "train_lift",
+                *TINY,
+                "train_lift.iterations=1",
+                "--out",
+                str(tmp_path / "runs"),
+            ]
+        )
     assert done.value.code == 0
     out = capsys.readouterr().out
     assert "lift=mst_plus_plus lift.weights=" in out

@@ -1,4 +1,6 @@
-"""A stop that is learnt with the mask: its gradient, its price in light, and the recipe that repeats the result."""
+"""A stop that is learnt with the mask: its gradient, its price in light, and the recipe that
+repeats the result.
+"""
 
 import json
 
@@ -9,14 +11,23 @@ from safetensors.torch import load_file
 
 from neusee.nodes import losses
 from neusee.workflows import load
-from neusee.workflows.recipe.blocks.mask_design_block import MaskTraining
+from neusee.workflows.recipe.blocks.train_block import MaskTraining
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.mask_design import design_page, gradient_descent
+from neusee.workflows.training.mask_design import design_page
+from neusee.workflows.training.mask_design import mask_optimisers as gradient_descent
 from neusee.workflows.training.mask_design.design_run import design, mask_figures
 from neusee.workflows.training.mask_design.design_terms import Terms
 
-SMALL = ["optics.samples=48", "optics.pitch=168 um", "optics.window=[48, 48]", "optics.bands=3", "doe=shaded",
-         "scene.shape=[48, 48]", "sensor.shape=[32, 32]", "lasers.green.angle=[0 mrad, 0 mrad]"]  # fmt: skip
+SMALL = [
+    "optics.samples=48",
+    "optics.pitch=168 um",
+    "optics.window=[48, 48]",
+    "optics.bands=3",
+    "doe=shaded",
+    "scene.shape=[48, 48]",
+    "sensor.shape=[32, 32]",
+    "lasers.green.angle=[0 mrad, 0 mrad]",
+]
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +48,9 @@ def how(**values):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["polynomial", "streak"])
-def test_the_loss_falls_with_mask_and_stop_and_the_recipe_repeats_it(kind, recipe, store, tmp_path, monkeypatch):
+def test_the_loss_falls_with_mask_and_stop_and_the_recipe_repeats_it(
+    kind, recipe, store, tmp_path, monkeypatch
+):
     monkeypatch.setattr(design_page, "pictures", lambda *_: {})
     given, said = how(kind=kind, iterations=12, learning_rate=0.1), []
     terms = Terms(recipe, given, store)
@@ -65,9 +78,14 @@ def test_the_light_that_a_stop_takes_lowers_signal_and_noise(recipe, store):
     passed = float(terms.passed()["transmittance"])
     assert passed == pytest.approx(0.8 * 0.25, rel=0.05)
     expected = losses.filtered_error(
-        half.run(store, outputs=["psf[mask]"])["psf[mask]"], *terms.seen(), light=30, read_noise=10.5, limit=0.03,
-        transmittance=passed, power=16.0,
-    )  # fmt: skip
+        half.run(store, outputs=["psf[mask]"])["psf[mask]"],
+        *terms.seen(),
+        light=30,
+        read_noise=10.5,
+        limit=0.03,
+        transmittance=passed,
+        power=16.0,
+    )
     assert float(terms.parts(flat)["filtered_error"]) == pytest.approx(float(expected), abs=1e-6)
 
 
@@ -86,7 +104,10 @@ def test_a_stop_has_a_gradient_in_light_and_in_peak(recipe, store):
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        ({"limit": None, "weights": {"lsr": 1}}, "learn_stop = true: only weights.filtered_error and"),
+        (
+            {"limit": None, "weights": {"lsr": 1}},
+            "learn_stop = true: only weights.filtered_error and",
+        ),
         ({"kind": "five_half_rings"}, "learn_stop = true: kind five_half_rings has no gradient"),
         ({"degree": 1}, "greater than or equal to 2"),
         ({"wavelength_spread": "-1 nm"}, "greater than or equal to 0"),

@@ -1,4 +1,6 @@
-"""Designing a mask without images: every kind learns, an interrupted one goes on bit for bit, the file is the mask."""
+"""Designing a mask without images: every kind learns, an interrupted one goes on bit for bit,
+the file is the mask.
+"""
 
 import csv
 import json
@@ -13,13 +15,26 @@ from neusee.nodes.doe import half_rings
 from neusee.workflows import load
 from neusee.workflows.report.figures import optics
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.loop.checkpoint import StateFile
-from neusee.workflows.training.mask_design import design_page, gradient_descent
-from neusee.workflows.training.mask_design.design_run import DesignError, MaskTraining, design, mask_figures
+from neusee.workflows.training.loop.resumable_loop import StateFile
+from neusee.workflows.training.mask_design import design_page
+from neusee.workflows.training.mask_design import mask_optimisers as gradient_descent
+from neusee.workflows.training.mask_design.design_run import (
+    DesignError,
+    MaskTraining,
+    design,
+    mask_figures,
+)
 from neusee.workflows.training.mask_design.design_terms import Terms
 
-SMALL = ["optics.samples=64", "optics.pitch=126 um", "optics.window=[80, 80]", "optics.bands=5",
-         "scene.shape=[80, 80]", "sensor.shape=[64, 64]", "lasers.green.angle=[0 mrad, 0 mrad]"]  # fmt: skip
+SMALL = [
+    "optics.samples=64",
+    "optics.pitch=126 um",
+    "optics.window=[80, 80]",
+    "optics.bands=5",
+    "scene.shape=[80, 80]",
+    "sensor.shape=[64, 64]",
+    "lasers.green.angle=[0 mrad, 0 mrad]",
+]
 QUICK = {"bands": 3, "grid": 32, "width": 4, "modes": 20, "rings": 10, "waves": 1.0, "noise": 0.3, "scale": 0.2,
          "max_height": "4 um", "polish": 10, "weights": {"lsr": 1.0, "bsr": 2.0, "contrast": 0.5}}  # fmt: skip
 
@@ -75,10 +90,14 @@ def test_every_kind_lowers_its_loss_on_all_bands(kind, recipe, store, tmp_path):
 
 def test_the_file_is_the_mask_and_the_bounds_hold_on_it(recipe, store, tmp_path, monkeypatch):
     given, draw = {}, optics.suppression
-    monkeypatch.setattr(optics, "suppression", lambda **values: given.update(values) or draw(**values))
+    monkeypatch.setattr(
+        optics, "suppression", lambda **values: given.update(values) or draw(**values)
+    )
     folder = design(recipe, how(iterations=10), store, tmp_path, quiet)
     found = read(folder)
-    again = load("first_light", [*SMALL, "doe=pixelwise", f"doe.file={folder / 'mask.safetensors'}"])
+    again = load(
+        "first_light", [*SMALL, "doe=pixelwise", f"doe.file={folder / 'mask.safetensors'}"]
+    )
     lsr = again.run(store, outputs=["lsr[mask]"])["lsr[mask]"]
     assert lsr.tolist() == pytest.approx(found["bands"]["lsr"], rel=1e-5)
     bands = {name: torch.tensor(values) for name, values in found["bands"].items()}
@@ -89,8 +108,11 @@ def test_the_file_is_the_mask_and_the_bounds_hold_on_it(recipe, store, tmp_path,
     assert not list(tmp_path.glob(".*state*"))
     assert (tmp_path / "latest").exists()
     assert {path.name for path in (folder / "figures").iterdir()} == {
-        "height.png", "psf.png", "suppression.png", "history.png"
-    }  # fmt: skip
+        "height.png",
+        "psf.png",
+        "suppression.png",
+        "history.png",
+    }
     text = (folder / "report.html").read_text()
     assert "median MTF" in text
     assert "even light" in text
@@ -98,7 +120,9 @@ def test_the_file_is_the_mask_and_the_bounds_hold_on_it(recipe, store, tmp_path,
 
 
 def test_the_losses_of_several_starts_have_a_legend():
-    rows = [{"start": i, "iteration": n, "loss": 1.0 + i, "lsr": -n} for i in range(3) for n in range(4)]
+    rows = [
+        {"start": i, "iteration": n, "loss": 1.0 + i, "lsr": -n} for i in range(3) for n in range(4)
+    ]
     figure = design_page.history.__wrapped__(rows)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["0", "1", "2"]
     assert design_page.history.__wrapped__(rows[:4]).legends == []
@@ -163,10 +187,14 @@ def test_what_is_learnt_on_few_samples_is_made_on_all(recipe, store, tmp_path):
 def test_pixels_start_from_the_relief_of_another_kind(recipe, store, tmp_path):
     first = design(recipe, how(kind="rings", iterations=2), store, tmp_path, quiet)
     file, deep = str(first / "mask.safetensors"), read(first)["depth"] * 1e6
-    given = how(iterations=8, grid=64, start=file, max_height=f"{1.2 * deep} um", learning_rate=1e-4)
+    given = how(
+        iterations=8, grid=64, start=file, max_height=f"{1.2 * deep} um", learning_rate=1e-4
+    )
     second = design(recipe, given, store, tmp_path, quiet)
     assert read(second)["loss"] < read(first)["loss"]
-    with pytest.raises(DesignError, match=r"start: mask mask.safetensors is .* deep: set a larger max_height"):
+    with pytest.raises(
+        DesignError, match=r"start: mask mask.safetensors is .* deep: set a larger max_height"
+    ):
         design(recipe, how(iterations=1, start=file, max_height="1 um"), store, tmp_path, quiet)
 
 
@@ -180,11 +208,19 @@ def test_all_bands_are_seen_in_time(recipe, store):
 
 
 def test_the_recipes_own_relief_is_learnt_sample_by_sample_until_it_is_enough(store, tmp_path):
-    """From a half-ring on: what a filter leaves wrong falls, and an LSR that is enough pulls no more."""
+    """From a half-ring on: what a filter leaves wrong falls, and an LSR that is enough pulls no
+    more.
+    """
     ring = load("half_ring", [*SMALL, "doe.waves=[2]"])
     weights = {"lsr": 2.0, "bsr": 1.0, "wiener": 1.0}
     given = how(
-        kind="recipe_mask", iterations=12, weights=weights, up_to=0.1, enough=0.3, bands=None, learning_rate=0.02
+        kind="recipe_mask",
+        iterations=12,
+        weights=weights,
+        up_to=0.1,
+        enough=0.3,
+        bands=None,
+        learning_rate=0.02,
     )
     terms = Terms(ring, given, store)
     start = ring.run(store, outputs=["height"])["height"]
@@ -213,7 +249,9 @@ def test_a_filter_leaves_the_same_wrong_of_all_bands_chosen_or_not(recipe, store
 
 def test_a_relief_that_is_not_learnt_is_refused(store, tmp_path):
     flat = load("plain_lens", SMALL)
-    with pytest.raises(DesignError, match=r"kind: the step height \(doe.flat\) has no trainable parameters"):
+    with pytest.raises(
+        DesignError, match=r"kind: the step height \(doe.flat\) has no trainable parameters"
+    ):
         design(flat, how(kind="recipe_mask", iterations=1), store, tmp_path, quiet)
 
 
@@ -231,7 +269,9 @@ def test_what_is_not_in_the_recipe_is_said(values, said, recipe, store, tmp_path
 
 @pytest.mark.parametrize("kind", ["pixelwise", "five_half_rings"])
 def test_a_loss_that_is_not_finite_stops_with_its_place(kind, recipe, store, tmp_path, monkeypatch):
-    monkeypatch.setattr(Terms, "total", lambda self, parts: next(iter(parts.values())) * float("nan"))
+    monkeypatch.setattr(
+        Terms, "total", lambda self, parts: next(iter(parts.values())) * float("nan")
+    )
     with pytest.raises(DesignError, match=r"(iteration 0|mask number 0).*is NaN or infinite"):
         design(recipe, how(kind=kind, iterations=2), store, tmp_path, quiet)
 

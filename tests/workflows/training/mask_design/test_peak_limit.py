@@ -1,4 +1,6 @@
-"""Masks designed for the picture behind a peak limit: the loss falls, the limit holds, the rival is told."""
+"""Masks designed for the picture behind a peak limit: the loss falls, the limit holds, the rival
+is told.
+"""
 
 import json
 import math
@@ -12,12 +14,20 @@ from safetensors.torch import load_file
 from neusee.nodes import losses
 from neusee.workflows import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.mask_design import design_page, gradient_descent
+from neusee.workflows.training.mask_design import design_page
+from neusee.workflows.training.mask_design import mask_optimisers as gradient_descent
 from neusee.workflows.training.mask_design.design_run import MaskTraining, design
 from neusee.workflows.training.mask_design.design_terms import Terms
 
-SMALL = ["optics.samples=64", "optics.pitch=126 um", "optics.window=[80, 80]", "optics.bands=3",
-         "scene.shape=[80, 80]", "sensor.shape=[64, 64]", "lasers.green.angle=[0 mrad, 0 mrad]"]  # fmt: skip
+SMALL = [
+    "optics.samples=64",
+    "optics.pitch=126 um",
+    "optics.window=[80, 80]",
+    "optics.bands=3",
+    "scene.shape=[80, 80]",
+    "sensor.shape=[64, 64]",
+    "lasers.green.angle=[0 mrad, 0 mrad]",
+]
 PROTECTED = {"bands": None, "grid": 32, "scale": 0.2, "max_height": "4 um", "limit": 0.03, "light": "30 e-",
              "weights": {"lsr": 0, "bsr": 0, "filtered_error": 1}}  # fmt: skip
 
@@ -37,7 +47,9 @@ def how(**values):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("weights", [{"filtered_error": 1}, {"information": 1}], ids=lambda w: next(iter(w)))
+@pytest.mark.parametrize(
+    "weights", [{"filtered_error": 1}, {"information": 1}], ids=lambda w: next(iter(w))
+)
 def test_the_loss_falls_and_the_page_has_the_rival(weights, recipe, store, tmp_path, monkeypatch):
     monkeypatch.setattr(design_page, "pictures", lambda *_: {})
     given = how(weights={"lsr": 0, "bsr": 0, **weights}, iterations=8)
@@ -85,7 +97,10 @@ def test_a_law_of_defocus_is_drawn_in_learning_and_averaged_in_the_end(recipe, s
     assert float(exact) == pytest.approx(_by_numpy(terms, height), abs=1e-6)
     whole = float(terms.parts(height)["filtered_error"])
     assert whole != pytest.approx(sharp, abs=1e-6)
-    far = [float(terms._parts(height, None, (x, 0, 0, 0), None)["filtered_error"]) for x in (-(3**0.5), 3**0.5)]
+    far = [
+        float(terms._parts(height, None, (x, 0, 0, 0), None)["filtered_error"])
+        for x in (-(3**0.5), 3**0.5)
+    ]
     assert whole == pytest.approx(2 / 3 * sharp + sum(far) / 6, abs=1e-5)
 
 

@@ -1,4 +1,6 @@
-"""Several processes learn what one learns: gradients, resumption, and an end for all where one fails."""
+"""Several processes learn what one learns: gradients, resumption, and an end for all where one
+fails.
+"""
 
 import json
 import os
@@ -14,8 +16,8 @@ from safetensors.torch import load_file
 
 from neusee.nodes import doe
 from neusee.workflows import Store, load
-from neusee.workflows.training.parallel.band_shards import Shards
-from neusee.workflows.training.parallel.process_mesh import Mesh, MeshError, shape_of
+from neusee.workflows.training.band_shards import Shards
+from neusee.workflows.training.process_mesh import Mesh, MeshError, shape_of
 from neusee.workflows.training.run_training import _photographs, train
 from neusee.workflows.training.training_pictures import TrainingStream
 from tests.workflows.training.noise_photographs import noise_photograph
@@ -28,8 +30,15 @@ SMALL = [
     "steps.laser_psf.with.precision=double",
 ]  # fmt: skip
 EVERY = [*SMALL, "tolerance=0"]  #: each band of each picture is imaged
-FEW = [*SMALL, "train.stages.1.lsr=0", "train.stages.1.bsr=0"]  #: a few planes are; nothing drowns the network
-SHORT = [*EVERY, "train.stages.1.iterations=3", "train.stages.2.iterations=1", "train.keep=1", "train.show=2"]
+#: a few planes are; nothing drowns the network
+FEW = [*SMALL, "train.stages.1.lsr=0", "train.stages.1.bsr=0"]
+SHORT = [
+    *EVERY,
+    "train.stages.1.iterations=3",
+    "train.stages.2.iterations=1",
+    "train.keep=1",
+    "train.show=2",
+]
 JOBS = [
     ("every", "1x1", "step", EVERY), ("every", "2x1", "step", EVERY), ("every", "1x2", "step", EVERY),
     ("broken", "2x1", "fail", SHORT),
@@ -37,19 +46,34 @@ JOBS = [
 
 
 def processes(folder, jobs):
-    """Do the jobs, one after another, each in processes of its own; by what it is called and its mesh, its folder."""
+    """Do the jobs, one after another, each in processes of its own; by what it is called and its
+    mesh, its folder.
+    """
     made = [
-        {"folder": str(folder / f"{name} {mesh}"), "store": str(folder / "store"), "runs": str(folder / name),
-         "mesh": mesh, "do": do, "words": words}
+        {
+            "folder": str(folder / f"{name} {mesh}"),
+            "store": str(folder / "store"),
+            "runs": str(folder / name),
+            "mesh": mesh,
+            "do": do,
+            "words": words,
+        }
         for name, mesh, do, words in jobs
-    ]  # fmt: skip
+    ]
     (folder / "jobs.json").write_text(json.dumps(made))
     script = Path(__file__).parents[2] / "mesh_processes.py"
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / ".src")}
-    done = subprocess.run([sys.executable, script, folder / "jobs.json"], env=environment, capture_output=True,
-                          text=True, check=False)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, script, folder / "jobs.json"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
-    return {(name, mesh): Path(job["folder"]) for (name, mesh, *_), job in zip(jobs, made, strict=True)}
+    return {
+        (name, mesh): Path(job["folder"]) for (name, mesh, *_), job in zip(jobs, made, strict=True)
+    }
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +126,13 @@ def test_two_processes_find_the_gradients_of_one(done):
     same(data, one)
     same(band, one)
     assert not data["shared"]["steps"]
-    assert band["shared"]["steps"] == ["bsr[mask]", "image[mask]", "image[plain]", "psf[mask]", "radiance"]
+    assert band["shared"]["steps"] == [
+        "bsr[mask]",
+        "image[mask]",
+        "image[plain]",
+        "psf[mask]",
+        "radiance",
+    ]
     assert band["shared"]["cut"] == ["bsr[mask]", "image[mask]", "image[plain]"]
     assert band["shared"]["sums"] == ["image[mask]", "image[plain]"]
 
@@ -113,21 +143,42 @@ def test_what_is_imaged_in_a_few_planes_needs_the_gathered_psf(tmp_path):
     done = processes(tmp_path, [("few", mesh, "step", read) for mesh in ("1x1", "1x2")])
     one, band = (stepped(done["few", mesh]) for mesh in ("1x1", "1x2"))
     same(band, one)
-    assert band["shared"] == {"steps": ["bsr[mask]", "psf[mask]", "radiance"], "cut": ["bsr[mask]"], "sums": []}
+    assert band["shared"] == {
+        "steps": ["bsr[mask]", "psf[mask]", "radiance"],
+        "cut": ["bsr[mask]"],
+        "sums": [],
+    }
 
 
 @pytest.mark.slow
 def test_a_pool_is_simulated_once_under_every_mesh_and_with_a_camera_that_is_not_known(tmp_path):
-    """Each process has the pictures of one process, of which it draws the values in the first round alone."""
+    """Each process has the pictures of one process, of which it draws the values in the first
+    round alone.
+    """
     defocus = "train.mismatch={optics.defocus: 'normal(0 waves, 0.3 waves)'}"
-    words = [*EVERY, "doe=half_ring", "train.learn=null", "train.pool=4", "train.keep_pool=false", defocus,
-             "train.picture=restored"]  # fmt: skip
+    words = [
+        *EVERY,
+        "doe=half_ring",
+        "train.learn=null",
+        "train.pool=4",
+        "train.keep_pool=false",
+        defocus,
+        "train.picture=restored",
+    ]
     done = processes(tmp_path, [("pool", mesh, "pool", words) for mesh in ("1x1", "1x2", "2x1")])
-    assert not any(code for folder in done.values() for code in codes(folder)), [errors(f) for f in done.values()]
-    (one,), band, data = ([torch.load(file, weights_only=True) for file in sorted(done["pool", mesh].glob("pool_*"))]
-                          for mesh in ("1x1", "1x2", "2x1"))  # fmt: skip
+    assert not any(code for folder in done.values() for code in codes(folder)), [
+        errors(f) for f in done.values()
+    ]
+    (one,), band, data = (
+        [torch.load(file, weights_only=True) for file in sorted(done["pool", mesh].glob("pool_*"))]
+        for mesh in ("1x1", "1x2", "2x1")
+    )
     assert [each["by band"] for each in band] == [True, True]
-    assert (one["drawn"], [each["drawn"] for each in band], [each["drawn"] for each in data]) == (4, [4, 4], [2, 2])
+    assert (one["drawn"], [each["drawn"] for each in band], [each["drawn"] for each in data]) == (
+        4,
+        [4, 4],
+        [2, 2],
+    )
     for each in (band, data):
         for rank in range(2):
             mine = [tensors for i, tensors in one["pictures"] if i == rank]
@@ -159,7 +210,10 @@ def test_another_mesh_goes_on_to_the_same_weights(tmp_path):
         expected, made = (load_file(folder / f"{file}.safetensors") for folder in (one, two))
         for name, x in expected.items():
             assert float((made[name] - x).norm()) <= 1e-9 * float(x.norm()), name
-    rows = [[line.split(",")[:-1] for line in (f / "losses.csv").read_text().splitlines()] for f in (one, two)]
+    rows = [
+        [line.split(",")[:-1] for line in (f / "losses.csv").read_text().splitlines()]
+        for f in (one, two)
+    ]
     assert rows[0] == rows[1]
     assert len(rows[0]) == 1 + 4
     assert json.loads((two / "training.json").read_text())["mesh"] == "1x2"
@@ -182,16 +236,37 @@ def test_four_processes_find_the_gradients_of_one(tmp_path):
 @pytest.mark.slow
 def test_torchrun_starts_it_and_stops_all_where_one_fails(tmp_path):
     words = [word.replace("float64", "float32") for word in SHORT]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / ".src"),
-                   "NEUSEE_CACHE": str(tmp_path / "cache")}  # fmt: skip
-    start = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m",
-             "neusee.workflows.cli", "train", "train_small", *words, "--out", str(tmp_path / "runs")]  # fmt: skip
-    once = subprocess.run([*start, "--mesh", "1x2"], env=environment, capture_output=True, text=True, check=False)
+    environment = {
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+        "PYTHONPATH": str(ROOT / ".src"),
+        "NEUSEE_CACHE": str(tmp_path / "cache"),
+    }
+    start = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node",
+        "2",
+        "-m",
+        "neusee.workflows.cli",
+        "train",
+        "train_small",
+        *words,
+        "--out",
+        str(tmp_path / "runs"),
+    ]
+    once = subprocess.run(
+        [*start, "--mesh", "1x2"], env=environment, capture_output=True, text=True, check=False
+    )
     assert once.returncode == 0, once.stderr
     (folder,) = (tmp_path / "runs").iterdir()
     assert once.stdout.splitlines().count(str(folder)) == 1
     assert json.loads((folder / "training.json").read_text())["command"][-2:] == ["--mesh", "1x2"]
-    wrong = subprocess.run([*start, "--mesh", "2x2"], env=environment, capture_output=True, text=True, check=False)
+    wrong = subprocess.run(
+        [*start, "--mesh", "2x2"], env=environment, capture_output=True, text=True, check=False
+    )
     assert wrong.returncode != 0
     assert "--mesh 2x2 is for 4 processes and there are 2" in wrong.stderr
 
@@ -201,7 +276,7 @@ import sys
 from pathlib import Path
 import torch
 import torch.distributed as dist
-from neusee.workflows.training.parallel.process_mesh import joined
+from neusee.workflows.training.process_mesh import joined
 
 def threads():
     return [path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm")]
@@ -214,19 +289,27 @@ Path(sys.argv[1], str(mesh.rank)).write_text(" ".join(threads()))  # the mesh is
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads the names of threads from /proc")
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="reads the names of threads from /proc"
+)
 def test_no_thread_of_a_mesh_runs_on_after_it(tmp_path):
-    """Such a thread may ask for Python's lock while Python shuts down, and then ends the process with SIGABRT."""
+    """Such a thread may ask for Python's lock while Python shuts down, and then ends the process
+    with SIGABRT.
+    """
     (tmp_path / "leaves.py").write_text(LEAVES)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / ".src")}
     start = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    done = subprocess.run([*start, tmp_path / "leaves.py", tmp_path], env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [*start, tmp_path / "leaves.py", tmp_path], env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     for rank in "01":
         assert "gloo" not in (tmp_path / rank).read_text()
 
 
-@pytest.mark.parametrize(("text", "world", "shape"), [("", 1, (1, 1)), ("", 4, (4, 1)), ("2x4", 8, (2, 4))])
+@pytest.mark.parametrize(
+    ("text", "world", "shape"), [("", 1, (1, 1)), ("", 4, (4, 1)), ("2x4", 8, (2, 4))]
+)
 def test_a_mesh_is_read(text, world, shape):
     assert shape_of(text, world) == shape
 
@@ -246,26 +329,37 @@ def test_a_mesh_that_does_not_fit_is_refused(text, world, said):
 
 def test_a_batch_that_cannot_be_shared_is_refused_where_it_stands(tmp_path):
     recipe = load("train_small", [*EVERY, "train.stages.1.batch=3"])
-    with pytest.raises(MeshError, match=r"argument \d+   train\.stages\.1\.batch   3 pictures .* multiple of 2"):
+    with pytest.raises(
+        MeshError, match=r"argument \d+   train\.stages\.1\.batch   3 pictures .* multiple of 2"
+    ):
         train(recipe, Store(tmp_path), tmp_path, [], print, mesh=Mesh(2, 1))
 
 
 def test_more_processes_than_bands_are_refused_where_the_bands_stand(tmp_path):
     recipe = load("train_small", EVERY)
-    with pytest.raises(MeshError, match=r"neusee\.yaml:\d+:\d+: bands has only 5 bands for 6 processes"):
+    with pytest.raises(
+        MeshError, match=r"neusee\.yaml:\d+:\d+: bands has only 5 bands for 6 processes"
+    ):
         samples(recipe, tmp_path, Mesh(1, 6))
 
 
 def test_a_psf_that_couples_its_bands_is_named(tmp_path):
     recipe = load("train_small", EVERY)
-    coupled = replace(recipe, steps={**recipe.steps, "psf[mask]": replace(recipe.steps["psf[mask]"], node=doe.flat)})
-    with pytest.raises(MeshError, match=r"psf\[mask\] \(doe.flat\) computes all bands together.* write --mesh 2x1"):
+    coupled = replace(
+        recipe,
+        steps={**recipe.steps, "psf[mask]": replace(recipe.steps["psf[mask]"], node=doe.flat)},
+    )
+    with pytest.raises(
+        MeshError, match=r"psf\[mask\] \(doe.flat\) computes all bands together.* write --mesh 2x1"
+    ):
         Shards.of(coupled, "psf[mask]", ["psf[mask]"], {"psf[mask]"}, Store(tmp_path), Mesh(1, 2))
 
 
 def samples(recipe, folder, mesh):
     how = recipe.training
-    return TrainingStream(recipe, how, _photographs(recipe, how, True), Store(folder), "cpu", None, mesh)
+    return TrainingStream(
+        recipe, how, _photographs(recipe, how, True), Store(folder), "cpu", None, mesh
+    )
 
 
 @pytest.mark.slow
@@ -273,8 +367,13 @@ def test_all_processes_hold_out_the_same_photographs(tmp_path):
     (tmp_path / "photographs").mkdir()
     for i in range(4):
         noise_photograph(40 + 20 * i, i).save(tmp_path / "photographs" / f"{i}.png")
-    words = [*SHORT, "train.stages.2.iterations=2", "train.held_out=0.5", "train.validate_every=2",
-             f"train.photographs={tmp_path / 'photographs'}"]  # fmt: skip
+    words = [
+        *SHORT,
+        "train.stages.2.iterations=2",
+        "train.held_out=0.5",
+        "train.validate_every=2",
+        f"train.photographs={tmp_path / 'photographs'}",
+    ]
     found = processes(tmp_path, [(mesh, mesh, "train", words) for mesh in ("1x1", "2x1", "1x2")])
     rows = {}
     for name, mesh in found:
@@ -283,9 +382,14 @@ def test_all_processes_hold_out_the_same_photographs(tmp_path):
         table = [line.split(",")[:-1] for line in (folder / "losses.csv").read_text().splitlines()]
         rows[name] = table
         about = json.loads((folder / "training.json").read_text())
-        assert (about["photographs"], len(about["held_out"]), about["best"]["iterations"]) == (2, 2, 2)
+        assert (about["photographs"], len(about["held_out"]), about["best"]["iterations"]) == (
+            2,
+            2,
+            2,
+        )
     assert rows["2x1"] == rows["1x2"] == rows["1x1"]
-    one = [*words, "train.held_out_pictures=1", "train.validate_every=1"]  # one process has no picture to restore
+    # one process has no picture to restore
+    one = [*words, "train.held_out_pictures=1", "train.validate_every=1"]
     again = processes(tmp_path, [("alone", "1x2", "train", one)])["alone", "1x2"]
     assert not any(codes(again)), errors(again)
     place = rows["1x1"][0].index("held_out_PSNR")

@@ -1,0 +1,461 @@
+"""Quantities of the linear model of EMVA 1288, from photon transfer to dark current."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neusee.nodes.values import Levels
+
+# --- quantity -------------------------------------------------------------------------------------
+
+# A quantity of the EMVA 1288 sheet: a value, a limit, or the reason why there is neither.
+
+
+Bound = Literal["", "<", ">"]
+_WHOLE = (1e3, 1e7)  #: values that are shown as whole numbers
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity of a sheet by the name, symbol and unit of EMVA 1288; ``value`` is None if the
+    frames do not tell it.
+
+    With a ``bound`` the frames give a limit only: the quantity is below (``<``) or above (``>``)
+    the value. Without a value, or with a bound, ``reason`` says why.
+    """
+
+    key: str
+    symbol: str
+    name: str
+    unit: str = ""
+    value: float | None = None
+    bound: Bound = ""
+    reason: str = ""
+
+    @property
+    def text(self) -> str:
+        """Value and unit with four digits or as a whole number, such as ``< 1.4 e-``, or ``not
+        measured``.
+        """
+        if self.value is None:
+            return "not measured"
+        number = (
+            f"{self.value:.0f}" if _WHOLE[0] <= abs(self.value) < _WHOLE[1] else f"{self.value:.4g}"
+        )
+        return f"{self.bound} {number} {self.unit}".strip()
+
+    def told(self, value: float, bound: Bound = "", reason: str = "") -> Quantity:
+        """Return the quantity with a value; a value that is not finite counts as none, and needs
+        a reason.
+        """
+        if not math.isfinite(value):
+            return self.untold(reason or "no finite value follows from these frames")
+        return replace(self, value=float(value), bound=bound, reason=reason)
+
+    def untold(self, reason: str) -> Quantity:
+        """Return the quantity without a value, and why."""
+        return replace(self, value=None, bound="", reason=reason)
+
+
+# --- photon transfer ------------------------------------------------------------------------------
+
+# The photon transfer of EMVA 1288: lit levels with their darks, the saturation point, and the
+# ranges of fits.
+
+
+FloatArray = NDArray[np.float64]
+SENSITIVITY = 0.7  #: share of saturation up to which gain and responsivity are fitted
+LINEARITY = (0.05, 0.95)  #: shares of saturation between which the response is compared with a line
+#: a maximum of the variance below this share of the greatest one is noise of saturated levels
+_PLATEAU = 0.5
+
+
+@dataclass(frozen=True)
+class PhotonTransfer:
+    """Lit levels (level,) in rising order of light, the dark of each, and all darks (dark,) in
+    rising exposure.
+    """
+
+    photons: FloatArray  #: mu_p, per pixel and exposure
+    exposure: FloatArray  #: s
+    mean: FloatArray  #: mu_y, DN
+    variance: FloatArray  #: sigma_y^2, DN2
+    mean_dark: FloatArray  #: mu_y.dark of the nearest exposure, DN
+    variance_dark: FloatArray  #: DN2
+    dark_exposure: FloatArray  #: s
+    dark_mean: FloatArray  #: DN
+    dark_variance: FloatArray  #: DN2
+    saturation: int  #: index of the lit level at saturation
+    #: False if the variance rises up to the brightest level, which then only bounds saturation
+    saturated: bool
+
+    @property
+    def signal(self) -> FloatArray:
+        """mu_y - mu_y.dark of each lit level, DN."""
+        return np.asarray(self.mean - self.mean_dark)
+
+    @property
+    def excess(self) -> FloatArray:
+        """sigma_y^2 - sigma_y.dark^2 of each lit level, DN2."""
+        return np.asarray(self.variance - self.variance_dark)
+
+    @property
+    def fitted(self) -> NDArray[np.bool_]:
+        """True for the lit levels from 0 to 70 % of saturation."""
+        return np.asarray(self.signal <= SENSITIVITY * self.signal[self.saturation])
+
+    @property
+    def linear(self) -> NDArray[np.bool_]:
+        """True for the lit levels from 5 to 95 % of saturation."""
+        low, high = (share * self.signal[self.saturation] for share in LINEARITY)
+        return np.asarray((self.signal >= low) & (self.signal <= high))
+
+
+def photon_transfer(levels: Levels) -> PhotonTransfer:
+    """Return the photon-transfer measurement of light levels, each lit level with the dark of the
+    nearest exposure.
+
+    Shapes: levels (level,).
+    Units:  as in `PhotonTransfer`.
+    Raises: ValueError without a dark level or without two lit levels.
+    Source: EMVA Standard 1288, release 4.0 Linear.
+    """
+    photons, exposure, mean, variance = (
+        np.asarray(x, dtype=np.float64)
+        for x in (levels.photons, levels.exposure, levels.mean, levels.variance)
+    )
+    dark = np.flatnonzero(photons == 0)
+    dark = dark[np.argsort(exposure[dark], kind="stable")]
+    lit = np.flatnonzero(photons > 0)
+    lit = lit[np.lexsort((exposure[lit], photons[lit]))]
+    if not len(dark):
+        raise ValueError("a sheet of EMVA 1288 needs dark frames: give a level without light")
+    if len(lit) < 2:
+        raise ValueError(
+            f"a sheet of EMVA 1288 needs lit levels, and there is {len(lit)}: give two or more"
+        )
+    below = dark[np.abs(exposure[lit, None] - exposure[dark]).argmin(1)]
+    top = saturation_point(variance[lit])
+    return PhotonTransfer(
+        photons[lit],
+        exposure[lit],
+        mean[lit],
+        variance[lit],
+        mean[below],
+        variance[below],
+        exposure[dark],
+        mean[dark],
+        variance[dark],
+        top,
+        top < len(lit) - 1,
+    )
+
+
+def saturation_point(variance: FloatArray) -> int:
+    """Return the index of saturation: from the brightest level, the first variance that exceeds the
+    next two below it.
+
+    A peak below half of the greatest variance is noise of levels that are saturated, and does not
+    count.
+    """
+    top = len(variance) - 1
+    for i in range(len(variance) - 2, -1, -1):
+        if variance[i] >= variance[top]:
+            top = i
+        elif i == 0 or variance[i - 1] < variance[top]:
+            break
+    return top if variance[top] >= _PLATEAU * variance.max() else int(variance.argmax())
+
+
+def slope_through_origin(x: FloatArray, y: FloatArray) -> float:
+    """Return the slope of the line through the origin that fits (x, y) best, each point with
+    equal weight.
+    """
+    return float(x @ y / (x @ x))
+
+
+def line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Return slope and value at 0 of the line that fits (x, y) best."""
+    apart = x - x.mean()
+    slope = float(apart @ y / (apart @ apart))
+    return slope, float(y.mean() - slope * x.mean())
+
+
+def relative_line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Return slope and value at 0 of the line with the least squares of relative deviations,
+    which is linear in y.
+    """
+    columns = np.stack([x / y, 1 / y], axis=1)
+    solved: Any = np.linalg.lstsq(
+        columns / np.linalg.norm(columns, axis=0), np.ones_like(y), rcond=None
+    )[0]
+    slope, start = solved / np.linalg.norm(columns, axis=0)
+    return float(slope), float(start)
+
+
+# --- sensitivity ----------------------------------------------------------------------------------
+
+# Sensitivity, noise, saturation, linearity and dark current of the EMVA 1288 sheet.
+
+
+QUANTIZATION = 1.0 / 12.0  #: sigma_q^2, DN2
+#: DN2, least temporal dark variance that rounding leaves measurable; its root is 0.49 DN
+COARSE = 0.24
+_LINE = 2  #: exposures that a slope needs more than
+_SURE = 2.0  #: standard errors of a slope below which no slope is told
+_NO_GAIN = "K is not told, so that no value in electrons is"
+_NO_LIGHT = "the photons of the levels are not told"
+
+
+@dataclass(frozen=True)
+class Linearity:
+    """The line of least relative deviation through the response, and the deviation from it in
+    percent (level,).
+    """
+
+    slope: float  #: DN per photon
+    start: float  #: DN, at no light
+    deviation: FloatArray  #: %, of each level from 5 to 95 % of saturation
+
+
+def gain(transfer: PhotonTransfer) -> Quantity:
+    """Return K, DN/e-, from the levels up to 70 % of saturation."""
+    blank = Quantity("K", "K", "overall system gain", "DN/e-")
+    fitted = transfer.fitted
+    if fitted.sum() < 2:
+        return blank.untold(
+            f"{int(fitted.sum())} lit levels lie below 70 % of saturation, and a line needs two"
+        )
+    slope = slope_through_origin(transfer.signal[fitted], transfer.excess[fitted])
+    return (
+        blank.told(slope)
+        if slope > 0
+        else blank.untold("the variance does not rise with the signal")
+    )
+
+
+def sensitivity(transfer: PhotonTransfer, photons_told: bool = True) -> list[Quantity]:
+    """Return gain, responsivity, efficiency, noise, thresholds, saturation, SNR and dynamic range.
+
+    Shapes: scalars.
+    Units:  as in each `Quantity`.
+    Source: EMVA Standard 1288, release 4.0 Linear.
+    """
+    k = gain(transfer)
+    response = _responsivity(transfer, k, photons_told)
+    eta = _efficiency(response, k, photons_told)
+    noise, coarse = dark_noise(transfer)
+    thresholds = _least(transfer, k, eta, noise, coarse)
+    return [
+        eta,
+        k,
+        _inverse(k),
+        response,
+        *_dark(transfer, k, noise, coarse),
+        *thresholds,
+        *_greatest(transfer, k, eta, thresholds),
+    ]
+
+
+def dark_noise(transfer: PhotonTransfer) -> tuple[float, bool]:
+    """Return sigma_y.dark in DN at exposure 0, and True if rounding hides it, so that 0.49 DN is
+    only a limit.
+    """
+    if len(np.unique(transfer.dark_exposure)) > _LINE:
+        variance = line(transfer.dark_exposure, transfer.dark_variance)[1]
+    else:
+        variance = float(transfer.dark_variance[0])
+    return math.sqrt(max(variance, COARSE)), variance < COARSE
+
+
+def linearity(transfer: PhotonTransfer) -> Linearity | None:
+    """Return the deviation of the response from a line, or None with fewer than three levels in
+    the range.
+    """
+    linear = transfer.linear
+    if linear.sum() < 3 or len(np.unique(transfer.photons[linear])) < 3:
+        return None
+    x, y = transfer.photons[linear], transfer.signal[linear]
+    slope, start = relative_line(x, y)
+    fitted = slope * x + start
+    return Linearity(slope, start, 100 * (y - fitted) / fitted)
+
+
+def linearity_errors(transfer: PhotonTransfer) -> list[Quantity]:
+    """Return LE_min and LE_max, the extreme relative deviations in percent."""
+    ends = (("LE_min", "LE.min", "least"), ("LE_max", "LE.max", "greatest"))
+    blanks = [
+        Quantity(key, symbol, f"linearity error, {name} deviation", "%")
+        for key, symbol, name in ends
+    ]
+    line = linearity(transfer)
+    if line is None:
+        count = int(transfer.linear.sum())
+        return [
+            b.untold(f"{count} levels lie from 5 to 95 % of saturation, and three are needed")
+            for b in blanks
+        ]
+    values = (float(line.deviation.min()), float(line.deviation.max()))
+    return [blank.told(value) for blank, value in zip(blanks, values, strict=True)]
+
+
+def dark_current(transfer: PhotonTransfer) -> list[Quantity]:
+    """Return mu_I from the means and from the variances of dark frames, e-/s.
+
+    Source: EMVA Standard 1288, release 4.0 Linear.
+    """
+    of_mean = Quantity("mu_I_mean", "μ_I.mean", "dark current, from the means", "e-/s")
+    of_variance = Quantity("mu_I_var", "μ_I.var", "dark current, from the variances", "e-/s")
+    k, times = gain(transfer).value, transfer.dark_exposure
+    count = len(np.unique(times))
+    why = "" if k else _NO_GAIN
+    if count <= _LINE:
+        why = f"dark frames at {count} exposure{'s' * (count > 1)}: three or more are needed"
+    if why or not k:
+        return [of_mean.untold(why), of_variance.untold(why)]
+    from_means = _slope(of_mean, times, transfer.dark_mean, k)
+    if dark_noise(transfer)[1]:
+        return [from_means, of_variance.untold("rounding hides the variance of the dark")]
+    return [from_means, _slope(of_variance, times, transfer.dark_variance, k**2)]
+
+
+def _slope(blank: Quantity, times: FloatArray, values: FloatArray, scale: float) -> Quantity:
+    """Return the slope of values over exposures in units of ``scale``, if it is at least twice
+    its standard error.
+    """
+    slope, start = line(times, values)
+    left = values - start - slope * times
+    error = math.sqrt(
+        float(left @ left) / (len(times) - 2) / float(((times - times.mean()) ** 2).sum())
+    )
+    if slope > 0 and slope >= _SURE * error:
+        return blank.told(slope / scale)
+    return blank.untold(
+        f"no rise with the exposure: {slope / scale:.3g} {blank.unit}, with a standard error of"
+        f" {error / scale:.2g}"
+    )
+
+
+def _responsivity(transfer: PhotonTransfer, k: Quantity, photons_told: bool) -> Quantity:
+    blank = Quantity("R", "R", "responsivity", "DN/photon")
+    fitted = transfer.fitted
+    if not photons_told or fitted.sum() < 2:
+        return blank.untold(k.reason if photons_told else _NO_LIGHT)
+    return blank.told(slope_through_origin(transfer.photons[fitted], transfer.signal[fitted]))
+
+
+def _efficiency(response: Quantity, k: Quantity, photons_told: bool) -> Quantity:
+    blank = Quantity("eta", "η", "quantum efficiency", "%")
+    if response.value is None or k.value is None:
+        return blank.untold(_NO_GAIN if photons_told else _NO_LIGHT)
+    return blank.told(100 * response.value / k.value)
+
+
+def _inverse(k: Quantity) -> Quantity:
+    blank = Quantity("inverse_K", "1/K", "inverse of the overall system gain", "e-/DN")
+    return blank.untold(k.reason) if k.value is None else blank.told(1 / k.value)
+
+
+def _dark(transfer: PhotonTransfer, k: Quantity, noise: float, coarse: bool) -> list[Quantity]:
+    """Return temporal dark noise and dark signal in DN and in electrons."""
+    why = (
+        f"the dark noise is below the {math.sqrt(COARSE):.2f} DN that the standard sets, because"
+        " rounding hides it"
+    )
+    bound: Bound = "<" if coarse else ""
+    in_numbers = Quantity("sigma_y_dark", "σ_y.dark", "temporal dark noise", "DN").told(
+        noise, bound, why * coarse
+    )
+    blank = Quantity("sigma_d", "σ_d", "temporal dark noise", "e-")
+    signal = Quantity("mu_d", "μ_d", "dark signal, with the offset of the converter", "e-")
+    mean = Quantity("mu_y_dark", "μ_y.dark", "dark signal", "DN").told(float(transfer.dark_mean[0]))
+    if k.value is None:
+        return [in_numbers, blank.untold(_NO_GAIN), mean, signal.untold(_NO_GAIN)]
+    electrons = math.sqrt(noise**2 - QUANTIZATION) / k.value
+    return [
+        in_numbers,
+        blank.told(electrons, bound, why * coarse),
+        mean,
+        signal.told(float(transfer.dark_mean[0]) / k.value),
+    ]
+
+
+def _least(
+    transfer: PhotonTransfer, k: Quantity, eta: Quantity, noise: float, coarse: bool
+) -> list[Quantity]:
+    """Return the absolute sensitivity threshold in photons and in electrons."""
+    photons = Quantity("mu_p_min", "μ_p.min", "absolute sensitivity threshold", "photons")
+    electrons = Quantity("mu_e_min", "μ_e.min", "absolute sensitivity threshold", "e-")
+    if k.value is None:
+        return [photons.untold(_NO_GAIN), electrons.untold(_NO_GAIN)]
+    value, bound = noise / k.value + 0.5, "<" if coarse else ""
+    why = "a limit, as the dark noise is" if coarse else ""
+    limit: Bound = "<" if bound else ""
+    threshold = electrons.told(value, limit, why)
+    if eta.value is None:
+        return [photons.untold(eta.reason), threshold]
+    return [photons.told(100 * value / eta.value, limit, why), threshold]
+
+
+def _greatest(
+    transfer: PhotonTransfer, k: Quantity, eta: Quantity, thresholds: list[Quantity]
+) -> list[Quantity]:
+    """Return saturation in photons and in electrons, the greatest SNR, and the dynamic range."""
+    saturation = transfer.saturation
+    bound: Bound = "" if transfer.saturated else ">"
+    why = (
+        ""
+        if transfer.saturated
+        else "the variance rises up to the brightest level: saturation was not reached"
+    )
+    in_photons = Quantity("mu_p_sat", "μ_p.sat", "saturation capacity", "photons")
+    in_electrons = Quantity("mu_e_sat", "μ_e.sat", "saturation capacity", "e-")
+    photons = in_photons.untold(eta.reason)
+    if eta.value is not None:
+        photons = in_photons.told(float(transfer.photons[saturation]), bound, why)
+    if k.value is None:
+        electrons = in_electrons.untold(_NO_GAIN)
+    elif eta.value is not None:
+        electrons = in_electrons.told(
+            eta.value / 100 * float(transfer.photons[saturation]), bound, why
+        )
+    else:
+        electrons = in_electrons.told(float(transfer.signal[saturation]) / k.value, bound, why)
+    return [photons, electrons, *_ratios(electrons, thresholds)]
+
+
+def _ratios(electrons: Quantity, thresholds: list[Quantity]) -> list[Quantity]:
+    """Return SNR_max and the dynamic range, each as a number, in dB and in bits."""
+    threshold = thresholds[1]
+    best = Quantity("SNR_max", "SNR.max", "maximum signal-to-noise ratio", "")
+    if electrons.value is None:
+        best = best.untold(electrons.reason)
+    else:
+        best = best.told(math.sqrt(electrons.value), electrons.bound, electrons.reason)
+    span = Quantity("DR", "DR", "dynamic range", "")
+    why = "; ".join(dict.fromkeys(q.reason for q in (electrons, threshold) if q.reason))
+    if electrons.value is None or threshold.value is None:
+        span = span.untold(why)
+    else:
+        limited: Bound = ">" if electrons.bound or threshold.bound else ""
+        span = span.told(electrons.value / threshold.value, limited, why)
+    return [*_on_three_scales(best), *_on_three_scales(span)]
+
+
+def _on_three_scales(ratio: Quantity) -> list[Quantity]:
+    """Return a ratio as a number, in dB and in bits."""
+    in_decibels = replace(ratio, key=f"{ratio.key}_dB", unit="dB")
+    in_bits = replace(ratio, key=f"{ratio.key}_bit", unit="bit")
+    if ratio.value is not None:
+        in_decibels = replace(in_decibels, value=_decibel(ratio.value))
+        in_bits = replace(in_bits, value=math.log2(ratio.value))
+    return [ratio, in_decibels, in_bits]
+
+
+def _decibel(ratio: float) -> float:
+    return 20 * math.log10(ratio)

@@ -1,0 +1,197 @@
+"""The whole sheet of EMVA 1288, with the general model that needs no line."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from neusee.nodes.calibrate._emva_quantities import (
+    COARSE,
+    Bound,
+    FloatArray,
+    Linearity,
+    PhotonTransfer,
+    Quantity,
+    dark_current,
+    gain,
+    linearity,
+    linearity_errors,
+    photon_transfer,
+    sensitivity,
+)
+from neusee.nodes.calibrate._nonuniformity import Nonuniformity, nonuniformity
+from neusee.nodes.values import Levels
+
+# --- general model --------------------------------------------------------------------------------
+
+# The general model of EMVA 1288, which needs no line: the local slope of the response refers noise
+# to the light.
+
+
+#: least number of levels of a local fit, and the share of all levels that a fit takes
+_WINDOW, _SHARE = 5, 0.25
+_KNOWN = 0.03  #: relative standard error of a slope above which nothing follows from it
+
+
+class GeneralModel(NamedTuple):
+    """The response at the lit levels up to saturation, in rising order of light."""
+
+    photons: FloatArray  #: (level,) per pixel and exposure
+    slope: FloatArray  #: (1 + level,) DN per photon, local; the first is that of the dark
+    #: (1 + level,) relative standard error of the slope, from the scatter about the local fits
+    error: FloatArray
+    #: (level,) light over the standard deviation of the light that the noise in time stands for
+    ratio: FloatArray
+
+
+def general_model(transfer: PhotonTransfer) -> GeneralModel | None:
+    """Return local slope and signal-to-noise ratio of the light at each level up to saturation;
+    None below 3 levels.
+
+    The slope is that of a parabola through five or more neighbouring levels, the dark among them.
+    The light scatters from level to level, by the same share at all levels; its scatter about the
+    parabolas gives the errors.
+
+    Source: EMVA Standard 1288, release 4.0 General (characteristic curve, and noise referred to the
+            input).
+    """
+    below = slice(0, transfer.saturation + 1)
+    light = np.concatenate([[0.0], transfer.photons[below]])
+    signal = np.concatenate([[0.0], transfer.signal[below]])
+    if len(np.unique(light)) < 4 or len(np.unique(light)) < len(light):
+        return None
+    slope, error = _slopes(light, signal)
+    ratio = light[1:] * slope[1:] / np.sqrt(transfer.variance[below].clip(np.finfo(float).tiny))
+    return GeneralModel(light[1:], slope, error, np.asarray(ratio))
+
+
+def general_quantities(transfer: PhotonTransfer, photons_told: bool = True) -> list[Quantity]:
+    """Return threshold, greatest signal-to-noise ratio and dynamic range without a linear model.
+
+    The threshold is the light whose signal equals the noise; from dark to the first level the
+    variance is taken as a line over the light.
+
+    Units:  photons; a number; dB.
+    Source: EMVA Standard 1288, release 4.0 General.
+    """
+    dimmest = Quantity(
+        "mu_p_min_general", "μ_p.min", "absolute sensitivity threshold, no linear model", "photons"
+    )
+    best = Quantity("SNR_max_general", "SNR.max", "maximum SNR of the light, no linear model", "dB")
+    span = Quantity("DR_general", "DR", "dynamic range, no linear model", "dB")
+    model = general_model(transfer)
+    if model is None or not (model.slope > 0).all():
+        why = (
+            "three or more levels of different light up to saturation, all brighter than those"
+            " below, are needed"
+        )
+        return [blank.untold(why) for blank in (dimmest, best, span)]
+    at_dark, at_best = float(model.error[0]), float(model.error[1 + int(model.ratio.argmax())])
+    top, cut = _end_of_light(transfer)
+    first = best.untold(_SCATTERS.format(at_best))
+    if at_best <= _KNOWN:
+        first = best.told(20 * math.log10(float(model.ratio.max())), top, cut)
+    if at_dark > _KNOWN:
+        why = _SCATTERS.format(at_dark)
+        return [dimmest.untold(why), first, span.untold(why)]
+    threshold = _threshold(transfer, model)
+    decibels = 20 * math.log10(float(model.photons[-1]) / threshold)
+    if float(transfer.dark_variance[0]) < COARSE:
+        rounded = "rounding hides the dark noise"
+        low, last = dimmest.told(threshold, "<", rounded), span.told(decibels, ">", rounded)
+    else:
+        low, last = dimmest.told(threshold), span.told(decibels, top, cut)
+    return [low if photons_told else dimmest.untold("the photons are not told"), first, last]
+
+
+#: why a slope of the general model is not told
+_SCATTERS = "the light scatters from level to level, so that the slope is known to {:.0%} only"
+
+
+def _end_of_light(transfer: PhotonTransfer) -> tuple[Bound, str]:
+    """Return the bound of what follows from the brightest level, and the reason of the bound."""
+    return ("", "") if transfer.saturated else (">", "saturation was not reached")
+
+
+def _slopes(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the slope at each point of a parabola through the nearest points, and its relative
+    standard error.
+    """
+    count = min(len(x), max(_WINDOW, 2 * round(_SHARE * len(x) / 2) + 1))
+    slopes, spreads, scatter = [], [], []
+    for index in range(len(x)):
+        first = min(max(0, index - count // 2), len(x) - count)
+        near = slice(first, first + count)
+        scale = float(np.ptp(x[near]))
+        fit = np.linalg.pinv(np.vander((x[near] - x[index]) / scale, 3, increasing=True))
+        slopes.append(float(fit[1] @ y[near]) / scale)
+        spreads.append(float(np.linalg.norm(fit[1] * y[near])) / scale)
+        left = -fit[0]
+        left[index - first] += 1
+        if weight := float(np.linalg.norm(left * y[near])):
+            scatter.append(float(left @ y[near]) / weight)
+    error = math.sqrt(float(np.mean(np.square(scatter)))) * np.array(spreads) / np.abs(slopes)
+    return np.array(slopes), np.asarray(error)
+
+
+def _threshold(transfer: PhotonTransfer, model: GeneralModel) -> float:
+    """Return the light whose signal equals its noise in time, in photons."""
+    dark = max(float(transfer.variance_dark[0]), COARSE)
+    rise = max(0.0, float(transfer.excess[0]) / float(model.photons[0]))
+    slope = float(model.slope[0])
+    near = (rise + math.sqrt(rise**2 + 4 * dark * slope**2)) / (2 * slope**2)
+    if near <= model.photons[0] or not (model.ratio < 1).any():
+        return near
+    last = int(np.flatnonzero(model.ratio < 1).max())  # the brightest level below the threshold
+    if last + 1 == len(model.ratio):
+        return float(model.photons[last])
+    ends = slice(last, last + 2)
+    return float(
+        np.exp(np.interp(0.0, np.log(model.ratio[ends].clip(1e-300)), np.log(model.photons[ends])))
+    )
+
+
+# --- sheet ----------------------------------------------------------------------------------------
+
+# The whole sheet of EMVA 1288: all quantities that frames tell, and for the others the reason.
+
+
+@dataclass(frozen=True)
+class EmvaSheet:
+    """The sheet of EMVA 1288 of a camera at one operating point."""
+
+    transfer: PhotonTransfer
+    linearity: Linearity | None
+    spatial: Nonuniformity
+    quantities: tuple[Quantity, ...]  #: in the order of the standard
+
+    def __getitem__(self, key: str) -> Quantity:
+        return next(quantity for quantity in self.quantities if quantity.key == key)
+
+
+def emva_sheet(
+    levels: Levels, spatial: Nonuniformity | None = None, *, photons_told: bool = True
+) -> EmvaSheet:
+    """Compute every quantity of the sheet of EMVA 1288 from light levels and from series of frames.
+
+    ``levels`` are the pairs of the photon-transfer measurement, whose variance is the one in time;
+    ``spatial`` has the averaged frames. With ``photons_told`` False the light is known up to a
+    factor, and no quantity in photons follows.
+
+    Shapes: levels (level,); frames (y, x).
+    Units:  with each quantity.
+    Raises: ValueError without a dark level or without two lit levels.
+    Source: EMVA Standard 1288, release 4.0 Linear.
+    """
+    transfer, patterns = photon_transfer(levels), spatial or Nonuniformity(None, None)
+    quantities = [
+        *sensitivity(transfer, photons_told),
+        *general_quantities(transfer, photons_told),
+        *linearity_errors(transfer),
+        *dark_current(transfer),
+        *nonuniformity(patterns, gain(transfer).value),
+    ]
+    return EmvaSheet(transfer, linearity(transfer), patterns, tuple(quantities))

@@ -1,0 +1,486 @@
+"""Files of raw frames: readers, the check before the run, and what headers say."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import re
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neusee.nodes import ParameterError
+from neusee.nodes.file_headers import exr_needs, fits_needs, npy_needs, pages_need, refuse_packed
+from neusee.nodes.input_files import VALUES, head_of, once_per_version, refuse_other_than_file
+from neusee.nodes.scene._spectral_exr import exr_header
+
+# --- image files ----------------------------------------------------------------------------------
+
+# Readers of frames from image files, which keep the numbers of the camera unchanged.
+
+
+#: pixel modes that Pillow reads without conversion
+_GREY = ("L", "I", "I;16", "I;16B", "I;16L", "F")
+FITS = (".fits", ".fit", ".fts")  #: suffixes
+_TOP = 1 << 24  #: DN; above any converter
+_WHOLE = 11  #: bytes of a number while it is compared with a whole number: 8, and 3 of flags
+
+
+def read(file: Path) -> NDArray[np.int32]:
+    """Read the frames of a file, (frame, y, x) int32; raise ValueError for a file without raw
+    frames.
+    """
+    reader = readable(file)
+    refuse_other_than_file(file)
+    stack = reader(file)
+    if stack.ndim not in (2, 3) or not stack.size:
+        raise ValueError(
+            f"{file}: shape {stack.shape} is neither (y, x) nor (frame, y, x): give raw frames"
+        )
+    with np.errstate(invalid="ignore"):
+        numbers = stack.astype(np.int64)
+    bad = (numbers != stack) | (numbers < 0) | (numbers >= _TOP)
+    if bad.any():
+        raise ValueError(
+            f"{file} holds {stack[bad][0]}, not a digital number: give raw frames, whole numbers "
+            f"from 0 to {_TOP - 1}"
+        )
+    return numbers.astype(np.int32).reshape(-1, *stack.shape[-2:])
+
+
+def readable(file: Path) -> Callable[[Path], NDArray[Any]]:
+    """Return the function that reads files of this suffix; raise ValueError for an unknown
+    suffix.
+    """
+    suffix = file.suffix.lower()
+    if suffix in FITS and importlib.util.find_spec("astropy") is None:
+        raise ValueError(f"{file.name} needs astropy: pip install 'neusee[fits]'")
+    if suffix not in _READERS:
+        raise ValueError(
+            f"{file.name}: frames cannot be read from {suffix or 'such files'}: give"
+            f" {', '.join(_READERS)}"
+        )
+    return _READERS[suffix]
+
+
+def _picture(file: Path) -> NDArray[Any]:
+    from PIL import Image, ImageSequence, UnidentifiedImageError
+
+    try:
+        with Image.open(file) as image:
+            pages_need(file, image, 2.0, _WHOLE)
+            pages = [_page(file, page) for page in ImageSequence.Iterator(image)]
+    except UnidentifiedImageError:
+        raise ValueError(
+            f"{file} is not a readable picture: save the frame as 16-bit grey PNG"
+        ) from None
+    if len({page.shape for page in pages}) > 1:
+        raise ValueError(f"{file}: the pages of the file differ in size: give frames of one size")
+    return np.stack(pages)
+
+
+def _page(file: Path, page: Any) -> NDArray[Any]:
+    refuse_page(file, page)
+    return np.array(page)
+
+
+def refuse_page(file: Path, page: Any) -> None:
+    """Raise ValueError for a page of a picture file that does not hold raw grey numbers."""
+    depth = head_of(file, 25)[24:] if page.format == "PNG" else b"\x08"
+    if (
+        page.mode not in _GREY
+        or page.format not in ("PNG", "TIFF")
+        or depth not in (b"\x08", b"\x10")
+    ):
+        raise ValueError(
+            f"{file} is {page.format} with pixels of kind {page.mode}, not raw grey of 8 or 16"
+            " bits: save one channel as PNG or TIFF, without colour and without lossy compression"
+        )
+
+
+def _exr(file: Path) -> NDArray[Any]:
+    import OpenEXR
+
+    exr_needs(file, 4 + _WHOLE)
+    with OpenEXR.File(str(file), separate_channels=True) as opened:
+        channels = opened.channels()
+        if len(channels) != 1:
+            raise ValueError(
+                f"{file} has the channels {', '.join(channels)}: save one channel alone"
+            )
+        return np.array(next(iter(channels.values())).pixels)
+
+
+def _fits(file: Path) -> NDArray[Any]:
+    """Read the first image of a FITS file, with the zero point and scale of the header applied."""
+    from astropy.io import fits
+
+    shape, bits = fits_header(file)
+    fits_needs(file, shape, bits)
+    with fits.open(file) as opened:
+        return np.array(_first_image(file, opened).data)
+
+
+def _npy(file: Path) -> NDArray[Any]:
+    npy_needs(file, 1.0, _WHOLE)
+    values: NDArray[Any] = np.load(file, allow_pickle=False)
+    return values
+
+
+def fits_header(file: Path) -> tuple[tuple[int, ...], int]:
+    """Return the shape of the first image of a FITS file, and the bits of its numbers; only
+    headers are read.
+    """
+    from astropy.io import fits
+
+    refuse_packed(file)
+    with fits.open(file) as opened:
+        image = _first_image(file, opened)
+        return tuple(image.shape), int(image.header["BITPIX"])
+
+
+def fits_image(file: Path) -> tuple[tuple[int, ...], int, bool]:
+    """Return the shape of the first image of a FITS file, its last byte, and True if it may hold
+    other than counts.
+
+    The type of the numbers and their scale tell whether they may be fractions, negative or too
+    large for a converter.
+
+    Only headers are read. Raises ValueError for a file without an image.
+    """
+    from astropy.io import fits
+
+    refuse_packed(file)
+    with fits.open(file) as opened:
+        image = _first_image(file, opened)
+        header, about = image.header, image.fileinfo()
+        bits, zero = int(header["BITPIX"]), float(header.get("BZERO", 0))
+        lowest = zero - (2 ** (bits - 1) if bits > 8 else 0)  # eight bits have no sign
+        scaled = float(header.get("BSCALE", 1)) != 1 or zero % 1 != 0 or "BLANK" in header
+        doubtful = scaled or bits < 0 or lowest < 0 or lowest + 2**bits > _TOP
+        # its blocks of 2880 bytes, of which the last one may be short
+        packed = isinstance(image, fits.CompImageHDU)
+        size = about["datSpan"] - 2879 if packed else math.prod(image.shape) * abs(bits) // 8
+        return tuple(image.shape), int(about["datLoc"] + size), doubtful
+
+
+def _first_image(file: Path, opened: Any) -> Any:
+    image = next((unit for unit in opened if getattr(unit, "is_image", False) and unit.shape), None)
+    if image is None:
+        raise ValueError(f"{file} holds no image: give a FITS file with an image")
+    return image
+
+
+_READERS: dict[str, Callable[[Path], NDArray[Any]]] = {
+    ".png": _picture,
+    ".tif": _picture,
+    ".tiff": _picture,
+    ".exr": _exr,
+    ".npy": _npy,
+    **dict.fromkeys(FITS, _fits),
+}
+
+
+# --- damaged frames -------------------------------------------------------------------------------
+
+# The check of a file of raw frames before the run, which reads the pixels only if their type has
+# other than counts.
+
+
+_STRIP_STARTS, _STRIP_LENGTHS = 273, 279  #: TIFF tags
+
+
+@once_per_version
+def frame_problem(file: Path) -> str:
+    """Return a message for a file that is damaged or holds no raw frames, as far as headers show
+    it, else nothing.
+    """
+    check = _CHECKS.get(file.suffix.lower())
+    try:
+        refuse_other_than_file(file)
+        return check(file) if check else ""
+    except (OSError, SyntaxError, ValueError, EOFError) as error:
+        return (
+            str(error)
+            if isinstance(error, ValueError)
+            else f"{file} is damaged ({error}): copy the file again"
+        )
+
+
+def _check_picture(file: Path) -> str:
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(file) as image:
+            refuse_page(file, image)
+            pages_need(file, image, 2.0)
+            ends = zip(
+                *(_numbers(image, tag) for tag in (_STRIP_STARTS, _STRIP_LENGTHS)), strict=False
+            )
+            if image.format == "PNG":
+                image.verify()
+            elif (last := max(map(sum, ends), default=0)) > file.stat().st_size:
+                return (
+                    f"{file} is damaged (its pixels end at byte {last}, after its end): copy the"
+                    " file again"
+                )
+            elif image.mode in ("I", "F"):
+                read(file)
+    except UnidentifiedImageError:
+        return f"{file} is not a readable picture: save the frame as 16-bit grey PNG"
+    except Image.DecompressionBombError:
+        return f"{file} states more pixels than can be read: give frames of one sensor"
+    return ""
+
+
+def _numbers(image: Any, tag: int) -> tuple[int, ...]:
+    return tuple(getattr(image, "tag_v2", {}).get(tag, ()))
+
+
+def _numpy(file: Path) -> str:
+    npy_needs(file, 1.0)
+    head = np.load(file, mmap_mode="r", allow_pickle=False)
+    if head.dtype.kind not in "uif":
+        return f"{file} holds values of type {head.dtype}: save raw frames as whole numbers"
+    doubtful = head.dtype.kind != "u" or head.dtype.itemsize > 2
+    return _too_large(file, head.shape) or _wrong_numbers(file, head.shape, doubtful)
+
+
+def _check_fits(file: Path) -> str:
+    """Return a message for a FITS file without an image, cut short, too large, or with other
+    than whole numbers.
+    """
+    with warnings.catch_warnings():
+        # astropy warns of a file that is cut short, which is refused here
+        warnings.simplefilter("ignore")
+        shape, end, doubtful = fits_image(file)
+    if end > (size := file.stat().st_size):
+        return (
+            f"{file} is damaged (its image ends at byte {end}, after its end at {size}): copy the"
+            " file again"
+        )
+    return _too_large(file, shape) or _wrong_numbers(file, shape, doubtful)
+
+
+def _too_large(file: Path, shape: tuple[int, ...]) -> str:
+    count = math.prod(map(int, shape))
+    if count <= VALUES:
+        return ""
+    return (
+        f"{file} has {count} values, more than the limit of {VALUES}: divide the frames among"
+        " several files"
+    )
+
+
+def _wrong_numbers(file: Path, shape: tuple[int, ...], doubtful: bool) -> str:
+    """Return a message for an array that is no stack of frames, or holds no digital numbers, else
+    an empty text.
+
+    Numbers of a type that has counts of a converter alone, such as uint16, are not read before the
+    run.
+    """
+    if doubtful or len(shape) not in (2, 3) or not math.prod(shape):
+        try:
+            read(file)
+        except ValueError as error:
+            return str(error)
+    return ""
+
+
+def _check_exr(file: Path) -> str:
+    try:
+        _, names, size = exr_header(file)
+    except ParameterError as error:
+        return str(error)
+    if len(names) != 1:
+        return f"{file} has the channels {', '.join(names)}: save one channel alone"
+    return _wrong_numbers(file, size, True)
+
+
+_CHECKS: dict[str, Callable[[Path], str]] = {
+    ".png": _check_picture,
+    ".tif": _check_picture,
+    ".tiff": _check_picture,
+    ".npy": _numpy,
+    ".exr": _check_exr,
+    **dict.fromkeys(FITS, _check_fits),
+}
+
+
+# --- frame headers --------------------------------------------------------------------------------
+
+# What the header of a file of frames says: size, bits of a number, exposure and light.
+
+
+_EXIF, _EXPOSURE, _DESCRIPTION = 0x8769, 33434, 270  #: tags of TIFF and Exif
+#: keys of an exposure, in seconds without a unit
+_TIMES = ("exposuretime", "exptime", "exposure", "integrationtime")
+_LIGHTS = ("photons", "photonsperpixel")
+_SECONDS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9}
+_NUMBER = re.compile(r"\s*([-+]?[\d.]+(?:e[-+]?\d+)?)\s*(s|ms|us|µs|μs|ns)?\s*", re.IGNORECASE)
+#: 1/200 s
+_FRACTION = re.compile(r"\s*(\d+)\s*[/⁄]\s*([1-9]\d*(?:\.\d+)?)\s*(s|sec)?\s*", re.IGNORECASE)
+_PAIR = re.compile(
+    r"([A-Za-z"
+    r" _]+?)\s*[=:]\s*"
+    r"(\d+\s*[/⁄]\s*\d[\d.]*\s*s?|[-+.\deE]+\s*(?:ms|us|µs|μs|ns|s)?)(?![A-Za-z/⁄\d])"
+)
+
+
+class FrameHeader(NamedTuple):
+    """What the header of a file of frames says; None for what it does not say."""
+
+    frames: int
+    shape: tuple[int, int]  #: (y, x)
+    bits: int  #: of a number in the file
+    exposure: float | None  #: s
+    photons: float | None  #: per pixel and exposure
+
+
+@once_per_version
+def frame_header(file: Path) -> FrameHeader:
+    """Return what the header of a file of raw frames says; raise ValueError for a file without raw
+    frames.
+
+    Exposure and light are read from Exif, TIFF descriptions, texts of a PNG, FITS keywords and
+    attributes of OpenEXR.
+
+    Shapes: scalars.
+    Units:  exposure s, as Exif, FITS and OpenEXR have it without a unit; photons per pixel and
+            exposure.
+    Raises: ValueError for an unknown kind of file, a damaged file, colour, and numbers that are not
+            counts.
+    """
+    readable(file)
+    if problem := frame_problem(file):
+        raise ValueError(problem)
+    suffix = file.suffix.lower()
+    count, shape, bits, said = _HEADERS.get(suffix, _header_of_fits if suffix in FITS else _plain)(
+        file
+    )
+    values = {re.sub(r"[^a-z]", "", str(key).lower()): value for key, value in said.items()}
+    light = next((_number(values[key], False) for key in _LIGHTS if key in values), None)
+    return FrameHeader(
+        count,
+        shape,
+        bits,
+        next((_number(values[key]) for key in _TIMES if key in values), None),
+        light,
+    )
+
+
+def _number(value: Any, is_time: bool = True) -> float | None:
+    match = _NUMBER.fullmatch(str(value))
+    try:
+        number = float(match[1]) if match else float(value)
+    except (TypeError, ValueError):
+        return _fraction(value) if is_time else None
+    if not is_time:
+        return number if number >= 0 else None
+    unit = (match[2] or "").lower() if match else ""
+    return number * _SECONDS[unit] if number > 0 else None
+
+
+def _fraction(value: Any) -> float | None:
+    """Return the seconds of a text such as ``1/200 s``."""
+    match = _FRACTION.fullmatch(str(value))
+    return float(match[1]) / float(match[2]) or None if match else None
+
+
+_Found = tuple[int, tuple[int, int], int, Mapping[str, Any]]
+
+
+def _header_of_picture(file: Path) -> _Found:
+    from PIL import Image
+
+    with Image.open(file) as image:
+        pages_need(file, image, 1.0, 0.0)
+        exif = image.getexif()
+        said: dict[str, Any] = {**_texts(image.info), **_described(str(exif.get(_DESCRIPTION, "")))}
+        for tags in (exif, exif.get_ifd(_EXIF)):
+            if _EXPOSURE in tags:
+                said["exposuretime"] = float(tags[_EXPOSURE])
+        bits = (
+            8
+            if image.mode == "L"
+            else 16
+            if image.mode.startswith("I;16") or image.format == "PNG"
+            else 32
+        )
+        return int(getattr(image, "n_frames", 1)), (image.height, image.width), bits, said
+
+
+def _texts(info: Mapping[Any, Any]) -> dict[str, Any]:
+    return {str(key): value for key, value in info.items() if isinstance(value, str | int | float)}
+
+
+def _described(text: str) -> dict[str, str]:
+    """Return the pairs such as ``ExposureTime=0.01 s`` in a text."""
+    return {key.strip(): value for key, value in _PAIR.findall(text)}
+
+
+def _header_of_fits(file: Path) -> _Found:
+    from astropy.io import fits
+
+    refuse_packed(file)
+    with fits.open(file) as opened:
+        header = next(
+            unit.header for unit in opened if getattr(unit, "is_image", False) and unit.shape
+        )
+        said = {
+            key: header[key] for key in header if key and isinstance(header[key], int | float | str)
+        }
+        bits = abs(int(header["BITPIX"]))
+    shape = fits_image(file)[0]
+    return *_stack(shape), bits, said
+
+
+def _header_of_exr(file: Path) -> _Found:
+    import OpenEXR
+
+    exr_needs(file)
+    with OpenEXR.File(str(file), separate_channels=True) as opened:
+        header = dict(opened.header())
+        shape = next(iter(opened.channels().values())).pixels.shape
+    said = {"exposuretime" if key == "expTime" else key: value for key, value in header.items()}
+    return *_stack(shape), 32, said
+
+
+def _plain(file: Path) -> _Found:
+    npy_needs(file, 1.0)
+    head = np.load(file, mmap_mode="r", allow_pickle=False)
+    return *_stack(head.shape), 8 * head.dtype.itemsize, {}
+
+
+def _stack(shape: tuple[int, ...]) -> tuple[int, tuple[int, int]]:
+    return (1 if len(shape) == 2 else int(shape[0])), (int(shape[-2]), int(shape[-1]))
+
+
+def frame_means(file: Path) -> list[tuple[float, float]]:
+    """Return the mean of each frame of a file and its standard error by the scatter of the
+    pixels, DN.
+    """
+    return [
+        (float(x.mean(dtype=np.float64)), float(x.std(dtype=np.float64)) / x.size**0.5)
+        for x in read(file)
+    ]
+
+
+def frame_divisor(file: Path) -> int:
+    """Return the greatest common divisor of the numbers of a file of frames; 0 for numbers that
+    are all 0.
+    """
+    return int(np.gcd.reduce(np.unique(read(file))))
+
+
+_HEADERS = {
+    ".png": _header_of_picture,
+    ".tif": _header_of_picture,
+    ".tiff": _header_of_picture,
+    ".exr": _header_of_exr,
+    ".npy": _plain,
+}

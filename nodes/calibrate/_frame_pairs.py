@@ -1,0 +1,452 @@
+"""Frames of the light levels as pairs, and the verdict of a test of these frames."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.calibrate._frame_statistics import Scatter, histogram
+
+# --- hidden faults --------------------------------------------------------------------------------
+
+# Faults that change the variance of noise in proportion: the error that frames leave open, found by
+# a test or not.
+
+
+_POINTS, _REACH = 2001, 8.0  #: points of a posterior, and standard errors beyond estimate and zero
+_SOUND = 9.0  #: odds of no fault at all, before frames of at least `CLEAN_PAIRS` are seen
+#: pairs of pixels in the lit levels of the fit from which frames that show no fault hide little
+CLEAN_PAIRS = 4e6
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """A fault that changes the measured variance, and what the frames say of its size.
+
+    The logarithm of the true over the measured variance has a normal likelihood about `estimate`.
+    Before the frames are seen it is 0 with the probability `sound`, and else has a Cauchy
+    distribution about 0, which leaves large values to the frames. Nothing is corrected by it: its
+    root mean square is an error that gain and noise may have, so that a fault that is found widens
+    by its whole size. Frames of many pixels that show nothing leave almost nothing open; with few
+    pixels `sound` is small, and the whole standard error counts.
+    """
+
+    fault: str  #: "mixing", "lag" or "pattern"
+    estimate: float
+    error: float  #: standard error of `estimate`
+    scale: float  #: of the Cauchy distribution
+    gain: float = 0.0  #: change of the logarithm of the gain for 1
+    noise: float = 0.0  #: change of the logarithm of the dark noise in DN for 1
+    positive: bool = False  #: True if the logarithm cannot be negative
+    sound: float = 0.0  #: probability of no fault, from `probably_sound`
+
+    def posterior(self) -> tuple[Tensor, Tensor]:
+        """Return points of the logarithm and their probabilities, both (point,)."""
+        low = min(0.0, self.estimate) - _REACH * self.error
+        high = max(0.0, self.estimate) + _REACH * self.error
+        points = torch.linspace(0.0 if self.positive else low, high, _POINTS, dtype=torch.float64)
+        density = 1 / (math.pi * self.scale * (1 + (points / self.scale).square()))
+        if self.positive:
+            density = 2 * density
+        weight = self._likelihood(points) * density * (points[1] - points[0]) * (1 - self.sound)
+        points = torch.cat([points, points.new_zeros(1)])
+        weight = torch.cat([weight, self.sound * self._likelihood(points[-1:])])
+        return points, weight / weight.sum()
+
+    def size(self) -> float:
+        """Return the root mean square of the logarithm."""
+        points, weight = self.posterior()
+        return math.sqrt(float(weight @ points.square()))
+
+    def _likelihood(self, points: Tensor) -> Tensor:
+        """Return the likelihood of points relative to that of the likeliest value that is
+        possible.
+        """
+        best = max(0.0, self.estimate) if self.positive else self.estimate
+        offset = ((best - self.estimate) / self.error) ** 2
+        return (-0.5 * (((points - self.estimate) / self.error).square() - offset)).exp()
+
+
+def probably_sound(pairs: float) -> float:
+    """Return the probability of no fault before frames are seen, for a number of pairs of pixels in
+    lit levels.
+
+    Frames of few pixels cannot show a fault that would matter: then nobody should believe that
+    there is none. The odds rise with the square of the pairs, up to 9 at `CLEAN_PAIRS`.
+    """
+    odds = _SOUND * min(1.0, pairs / CLEAN_PAIRS) ** 2
+    return odds / (1 + odds)
+
+
+def open_errors(hidden: Sequence[Hidden]) -> dict[str, float]:
+    """Return the relative errors that independent faults leave open, by the names "gain" and
+    "noise" (in DN).
+    """
+    sizes = [fault.size() for fault in hidden]
+    gain = math.hypot(*(fault.gain * size for fault, size in zip(hidden, sizes, strict=True)), 0.0)
+    noise = math.hypot(
+        *(fault.noise * size for fault, size in zip(hidden, sizes, strict=True)), 0.0
+    )
+    return {"gain": gain, "noise": noise}
+
+
+# --- frame pairs ----------------------------------------------------------------------------------
+
+# Frames of the light levels of a calibration as pairs, and the verdict of a test of these frames.
+
+
+Verdict = Literal["passed", "modelled", "widened", "refused"]
+ALARM = 1e-3  #: probability with which chance alone fails one test of a whole measurement
+#: relative error of gain or dark noise above which frames are refused, and below which intervals
+#: widen
+REFUSED = 0.02
+_WINDOW = 1024  #: pixels of the central window on a side, in which patterns and noise are tested
+_TESTED = 1 << 21  #: pixels of a level in all tested frames together
+_BLOCK = 8  #: pixels by which the window is aligned, as blocks of a compressed picture are
+_PILED = 5.0  #: standard deviations of counting by which numbers pile up at an end
+_LEAST = 20  #: least count of pixels that pile up
+_FLAT = 0.5  #: share of the greatest variance below which a brighter level is saturated
+_AT_ZERO = 5e-3  #: share of the pixels at 0, which hides numbers below 0
+_MOST = 16  #: frames of a level whose noise and patterns are tested
+#: what to do about refused frames, by the name of the test
+_REMEDIES = {
+    "white noise": "take raw frames: without denoising, sharpening, interpolation and compression",
+    "no blocks": "save the frames without compression",
+    "no lag": "reset the sensor, or take a frame that is not used, before each frame",
+    "no row noise": "remove the interference from the readout",
+    "no column noise": "remove the interference from the readout",
+    "no drift within a level": "write `scatter: steady`, or let the lamp settle",
+    "homogeneity of the light": "light the sensor evenly, or cut the frames to their even part",
+}
+_FLOOR = 1e-12  #: DN2, so that frames without noise divide by more than 0
+
+
+class Stack(NamedTuple):
+    """The frames of one light level, as `reduce` receives them."""
+
+    name: str
+    photons: float  #: per pixel and exposure; 0 in the dark
+    exposure: float  #: s
+    scatter: Scatter  #: which variance `reduce` computes
+    frames: Tensor  #: (frame, y, x) DN, whole numbers
+    mask: Tensor | None = None  #: (y, x) True for a pixel that is left out
+
+
+class Level(NamedTuple):
+    """One light level: pairs of frames in the central window, and the histogram of the whole
+    frames.
+    """
+
+    name: str
+    photons: float
+    exposure: float  #: s
+    scatter: Scatter
+    #: (pair, y, x) float32, DN, with the mean of each frame removed; 0 in pixels that are left out
+    first: Tensor
+    second: Tensor  #: (pair, y, x), as `first`
+    #: (pair, y, x) DN, second less first, without what the lamp changed from the first to the
+    #: second
+    apart: Tensor
+    drift: Tensor  #: (pair,) DN, mean of the second frame less mean of the first
+    variance: float  #: DN2, temporal, without the drift of the mean
+    mean: float  #: DN
+    value: Tensor  #: (code,) digital numbers that occur, rising
+    pixels: Tensor  #: (code,) count of each number
+    flicker: float = 0.0  #: DN2, variance by the flicker of the lamp over light that is uneven
+    fitted: bool = True  #: True if the likelihood uses the level
+
+    @property
+    def dark(self) -> bool:
+        """Return True for a level without light."""
+        return self.photons == 0
+
+    @property
+    def paired(self) -> bool:
+        """Return True for a level of two or more frames."""
+        return len(self.apart) > 0
+
+    @property
+    def low(self) -> bool:
+        """Return True if numbers pile up at the lowest number, or if 0 is a number of more than
+        a few pixels.
+        """
+        at_zero = float(self.pixels[self.value == 0].sum())
+        return at_zero > _AT_ZERO * float(self.pixels.sum()) or _piled(
+            self, self.value, self.pixels
+        )
+
+    @property
+    def high(self) -> bool:
+        """Return True if numbers pile up at the highest number."""
+        return _piled(self, -self.value.flip(0), self.pixels.flip(0))
+
+
+@dataclass(frozen=True)
+class FrameTest:
+    """The result of one test of the frames of a measurement."""
+
+    name: str
+    number: float  #: in the unit of the limit
+    limit: float  #: above the limit chance alone does not explain the number
+    verdict: Verdict
+    sentence: str
+    #: relative errors of "gain" and "noise" that may follow
+    shifts: Mapping[str, float] = field(default_factory=dict)
+    explains_all: bool = False  #: True if other tests would only find consequences of this fault
+    #: faults of which the frames tell a size, whether the test finds them or not
+    hidden: tuple[Hidden, ...] = ()
+
+
+class Evidence(NamedTuple):
+    """The strongest of several standard normal deviations, and the value that chance alone
+    exceeds rarely.
+    """
+
+    strength: float  #: standard deviations
+    limit: float
+
+    @property
+    def found(self) -> bool:
+        """Return True if chance alone does not explain the strength."""
+        return self.strength > self.limit
+
+
+def prepared(stack: Stack) -> Level:
+    """Return the pairs and the histogram of a light level; frame 0 forms a pair with 1, 2 with
+    3, and so on.
+    """
+    pixels = stack.frames if stack.mask is None else stack.frames[:, ~stack.mask]
+    value, count = histogram(pixels)
+    frames = _window(stack.frames)
+    pairs = len(frames) // 2
+    means, centred = _centred(frames, stack.mask)
+    first, second = centred[: 2 * pairs : 2], centred[1 : 2 * pairs : 2]
+    apart = second - first
+    return Level(
+        name=stack.name,
+        photons=stack.photons,
+        exposure=stack.exposure,
+        scatter=stack.scatter,
+        first=first,
+        second=second,
+        apart=apart,
+        drift=means[1 : 2 * pairs : 2] - means[: 2 * pairs : 2],
+        variance=_variance(apart),
+        mean=float((value * count).sum()) / float(count.sum()),
+        value=value,
+        pixels=count,
+    )
+
+
+def fitted_levels(levels: Sequence[Level], share: float | None) -> list[Level]:
+    """Return the levels with what the fit uses: dark levels, and lit levels up to ``share`` of
+    saturation.
+
+    Saturation is at the lit level of the greatest variance, as for the likelihood. Without a
+    ``share`` each level is used. What the lamp changed from frame to frame, which is proportional
+    to the light of each pixel, is taken off the differences of the pairs.
+    """
+    dark = min((level.mean for level in levels if level.dark), default=0.0)
+    lit = [level for level in levels if not level.dark and level.paired]
+    full = max(lit, key=lambda level: level.variance).mean - dark if lit else math.inf
+    limit = math.inf if share is None else share * full
+    return [
+        _steadied(level, dark)._replace(fitted=level.dark or level.mean - dark <= limit)
+        for level in levels
+    ]
+
+
+def saturated(levels: Sequence[Level]) -> list[Level]:
+    """Return the levels whose numbers pile up at the highest number, or whose variance has fallen
+    above its maximum.
+
+    A well that differs from pixel to pixel, or that fills before the read noise is added, makes no
+    pile.
+    """
+    lit = [level for level in levels if not level.dark and level.paired]
+    peak = max(lit, key=lambda level: level.variance, default=None)
+    return [level for level in levels if level.high or (peak is not None and _is_flat(level, peak))]
+
+
+def tested(levels: Sequence[Level]) -> list[Level]:
+    """Return the paired levels whose noise is tested: those that the fit uses, without a pile at
+    an end.
+    """
+    return [
+        level
+        for level in levels
+        if level.paired and level.fitted and not level.high and not level.low
+    ]
+
+
+def _is_flat(level: Level, peak: Level) -> bool:
+    return (
+        level.paired
+        and not level.dark
+        and level.mean > peak.mean
+        and level.variance < _FLAT * peak.variance
+    )
+
+
+def _steadied(level: Level, dark: float) -> Level:
+    """Return a lit level without what a change of the lamp between the frames of a pair adds to
+    their difference.
+
+    The light of the second frame is that of the first, times the ratio of their means above the
+    dark.
+    """
+    signal = level.mean - dark
+    if level.dark or not level.paired or signal <= 0:
+        return level
+    change = (level.drift / signal)[:, None, None]
+    apart = level.second * (1 - change / 2) - level.first * (1 + change / 2)
+    light = (level.first * level.second).mean((1, 2)).clamp_min(0.0)
+    flicker = float((change[:, 0, 0].square() * light).mean()) / 2
+    return level._replace(apart=apart, variance=_variance(apart), flicker=flicker)
+
+
+def _variance(apart: Tensor) -> float:
+    """Return the temporal variance of differences (pair, y, x), without the drift of the mean;
+    NaN without a pair.
+    """
+    return (
+        float(apart.square().sum()) / 2 / max(1, apart.numel() - len(apart))
+        if len(apart)
+        else math.nan
+    )
+
+
+def _centred(frames: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the means (frame,) of frames, and the frames (frame, y, x) less their means, 0 in
+    masked pixels.
+    """
+    numbers = frames.double()
+    if mask is None:
+        means = numbers.mean((1, 2))
+        return means, (numbers - means[:, None, None]).float()
+    unmasked = ~_window(mask[None])[0]
+    means = (numbers * unmasked).sum((1, 2)) / unmasked.sum().clamp_min(1)
+    return means, ((numbers - means[:, None, None]) * unmasked).float()
+
+
+def without_lines(x: Tensor) -> Tensor:
+    """Return frames (frame, y, x) without the means of their rows and columns."""
+    return x - x.mean(2, keepdim=True) - x.mean(1, keepdim=True) + x.mean((1, 2), keepdim=True)
+
+
+def _window(frames: Tensor) -> Tensor:
+    """Return the middle of at most 16 frames, and fewer frames where they are large."""
+    starts = [max(0, n - _WINDOW) // 2 // _BLOCK * _BLOCK for n in frames.shape[1:]]
+    middle = frames[:, starts[0] : starts[0] + _WINDOW, starts[1] : starts[1] + _WINDOW]
+    frame_count = _TESTED // max(1, middle[0].numel()) // 2 * 2
+    return middle[: min(_MOST, max(2, frame_count))]
+
+
+def _piled(level: Level, value: Tensor, count: Tensor) -> bool:
+    """Return True if the lowest number occurs more often than the next number.
+
+    The counts of numbers without a limit fall towards the ends. A full well fills two neighbouring
+    numbers.
+    """
+    last, at_zero = int(value[0]), int(value[0]) == 0
+    counts = [float(count[value == last + i].sum()) for i in range(4)]
+    if sum(counts) < _LEAST:
+        return False
+    single_numbers, two = counts[:2], (counts[0] + counts[1], counts[2] + counts[3])
+    wide = level.paired and level.variance > 1.0 and len(value) > 8
+    tests = [single_numbers] * (wide or at_zero) + [two] * wide
+    return any(a >= _LEAST and a - b - 2 > _PILED * math.sqrt(a + b) for a, b in tests)
+
+
+def strongest(
+    z: Sequence[Sequence[float]], others: Sequence[float] = (), sides: int = 1
+) -> Evidence:
+    """Return the strongest evidence of independent standard normal numbers (statistic, level), and
+    its limit.
+
+    Each number counts alone, and all numbers of a statistic count together by their sum over the
+    square root of their count; ``others`` are further standard normal numbers. The limit is
+    Bonferroni's for all of these, and for both signs with two ``sides``.
+    """
+    together = [sum(row) / math.sqrt(len(row)) for row in z if len(row) > 1]
+    every = [*chain.from_iterable(z), *together, *others]
+    strengths = [abs(x) for x in every] if sides == 2 else every
+    return Evidence(max(strengths, default=0.0), normal_limit(ALARM / sides / max(1, len(every))))
+
+
+def normal_limit(probability: float) -> float:
+    """Return the number of standard deviations that a standard normal number exceeds with a
+    probability.
+    """
+    return -float(torch.special.ndtri(torch.tensor(probability, dtype=torch.float64)))
+
+
+def studentised(product: Tensor) -> float:
+    """Return the sum of independent numbers of mean 0 in its own standard deviations."""
+    return float(product.sum()) / math.sqrt(float(product.square().sum()) + _FLOOR)
+
+
+def outcome(
+    name: str,
+    evidence: Evidence,
+    sentence: str,
+    shifts: Mapping[str, float],
+    passed: str,
+    modelled: str = "",
+) -> FrameTest:
+    """Return the result of a test: passed, modelled, widened, or refused where an error exceeds
+    2 %.
+    """
+    if not evidence.found:
+        return FrameTest(name, evidence.strength, evidence.limit, "passed", passed)
+    if modelled:
+        return FrameTest(
+            name, evidence.strength, evidence.limit, "modelled", f"{sentence}: {modelled}", shifts
+        )
+    worst = max(shifts.values(), default=math.inf)
+    verdict: Verdict = "refused" if worst > REFUSED else "widened"
+    means = (
+        f"an error of {100 * worst:.2g} % may follow"
+        if math.isfinite(worst)
+        else "no model describes such frames"
+    )
+    text = f"{sentence}: {means}{_remedy(name, verdict)}"
+    return FrameTest(name, evidence.strength, evidence.limit, verdict, text, shifts)
+
+
+def _remedy(name: str, verdict: Verdict) -> str:
+    return f"; {_REMEDIES[name]}" if verdict == "refused" and name in _REMEDIES else ""
+
+
+def bounded(
+    name: str,
+    evidence: Evidence,
+    hidden: Sequence[Hidden],
+    sentence: str,
+    passed: str,
+    modelled: str = "",
+) -> FrameTest:
+    """Return the result of a test of a fault of which the frames tell a size, found or not.
+
+    Nothing is corrected. A fault that is found is refused where gain or noise may be wrong by more
+    than 2 %, and else widens by its whole size.
+    """
+    worst = max(open_errors(hidden).values())
+    if not evidence.found:
+        text = f"{passed}; the frames may hide {100 * worst:.2g} %" if hidden else passed
+        return FrameTest(
+            name, evidence.strength, evidence.limit, "passed", text, hidden=tuple(hidden)
+        )
+    verdict: Verdict = "refused" if worst > REFUSED else "modelled" if modelled else "widened"
+    text = (
+        f"{sentence}: an error of {100 * worst:.2g} % may follow, and nothing is"
+        f" corrected{_remedy(name, verdict)}"
+    )
+    text = f"{sentence}: {modelled}" if verdict == "modelled" else text
+    return FrameTest(name, evidence.strength, evidence.limit, verdict, text, hidden=tuple(hidden))

@@ -1,0 +1,323 @@
+"""DSNU, PRNU, spectrograms, profiles and defect pixels of the EMVA 1288 sheet."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from neusee.nodes.calibrate._emva_quantities import Quantity
+
+# --- nonuniformity --------------------------------------------------------------------------------
+
+# DSNU and PRNU of the EMVA 1288 sheet: variances of averaged frames in total, by rows, by columns
+# and by pixels.
+
+
+FloatArray = NDArray[np.float64]
+_SURE = 2.0  #: standard errors of a variance below which only a limit follows
+_LEAST = 8  #: pixels, side of the smallest frame
+PARTS = ("total", "row", "column", "pixel")
+
+
+@dataclass(frozen=True)
+class SpatialSeries:
+    """The sum of a series of frames of one illumination, from which spatial quantities are
+    computed.
+    """
+
+    photons: float  #: per pixel and exposure; 0 in the dark
+    exposure: float  #: s
+    count: int  #: L, number of frames
+    total: NDArray[np.int64]  #: (y, x) DN, sum of the frames
+    temporal: float  #: sigma_y.stack^2, DN2, mean over the pixels of the variance in time
+
+    @property
+    def average(self) -> FloatArray:
+        """The averaged frame (y, x), DN."""
+        return np.asarray(self.total / self.count)
+
+
+class SpatialVariances(NamedTuple):
+    """Spatial variances of an averaged frame without what noise in time leaves in the average,
+    DN2.
+    """
+
+    total: float
+    row: float
+    column: float
+    pixel: float
+
+
+class Nonuniformity(NamedTuple):
+    """The dark and the lit series of a sheet; either is None if there is no such series."""
+
+    dark: SpatialSeries | None
+    lit: SpatialSeries | None
+
+
+def spatial_series(photons: float, exposure: float, frames: Iterable[Tensor]) -> SpatialSeries:
+    """Sum frames (y, x) of whole numbers, one by one, to a series.
+
+    Shapes: each frame (y, x).
+    Units:  DN; exposure s.
+    Raises: ValueError for fewer than two frames, for frames of fewer than 8 x 8 pixels or of
+            different sizes.
+    Source: EMVA Standard 1288, release 4.0 Linear.
+    """
+    total, squares, count = torch.zeros(0), torch.zeros(0), 0
+    for frame in frames:
+        numbers = frame.to(torch.int64)
+        if count and numbers.shape != total.shape:
+            raise ValueError(
+                f"frames of {tuple(total.shape)} and of {tuple(numbers.shape)} are no series"
+            )
+        total, squares = (total + numbers, squares + numbers**2) if count else (numbers, numbers**2)
+        count += 1
+    if count < 2:
+        raise ValueError(f"{count} frame(s) are no series: give two or more")
+    if min(total.shape) < _LEAST:
+        raise ValueError(
+            f"frames of {tuple(total.shape)} are too small for a series: give {_LEAST} x {_LEAST}"
+            " or more"
+        )
+    spread = (count * squares - total**2).double() / (count * (count - 1))
+    return SpatialSeries(photons, exposure, count, total.cpu().numpy(), float(spread.mean()))
+
+
+def spatial_variances(series: SpatialSeries) -> SpatialVariances:
+    """Split the spatial variance of an averaged frame into the parts of rows, columns and single
+    pixels.
+
+    Shapes: -> scalars.
+    Units:  DN2.
+    Error:  the rest of the noise in time is subtracted, so that a part that is smaller may come out
+            negative; see `chance_of_variances`.
+    Source: EMVA Standard 1288, release 4.0 Linear (rows, columns and pixels that add up to the
+            total).
+    """
+    rows, columns = series.total.shape
+    left = series.temporal / series.count
+    measured = _measured(series)
+    total, by_row, by_column = (
+        measured.total - left,
+        measured.row - left / columns,
+        measured.column - left / rows,
+    )
+    pixels = rows * columns
+    freedom = pixels - rows - columns
+    return SpatialVariances(
+        total,
+        ((pixels - columns) * by_row - rows * (total - by_column)) / freedom,
+        ((pixels - rows) * by_column - columns * (total - by_row)) / freedom,
+        pixels * (total - by_column - by_row) / freedom,
+    )
+
+
+def chance_of_variances(series: SpatialSeries) -> SpatialVariances:
+    """Return the standard errors of `spatial_variances`, DN2, for normal noise and a normal
+    nonuniformity.
+    """
+    rows, columns = series.total.shape
+    measured = _measured(series)
+    noise = series.temporal / series.count * math.sqrt(2 / (rows * columns * (series.count - 1)))
+    pixel = math.hypot(measured.total * math.sqrt(2 / (rows * columns)), noise)
+    row, column = measured.row * math.sqrt(2 / rows), measured.column * math.sqrt(2 / columns)
+    return SpatialVariances(
+        math.hypot(pixel, row, column),
+        math.hypot(row, pixel / columns),
+        math.hypot(column, pixel / rows),
+        pixel,
+    )
+
+
+def _measured(series: SpatialSeries) -> SpatialVariances:
+    """Return the variances of the averaged frame, of the means of its rows and of the means of
+    its columns.
+    """
+    image = series.average
+    rows, columns = float(image.mean(1).var()), float(image.mean(0).var())
+    return SpatialVariances(float(image.var(ddof=1)), rows, columns, math.nan)
+
+
+def nonuniformity(patterns: Nonuniformity, gain: float | None) -> list[Quantity]:
+    """Return DSNU1288 in DN and e-, PRNU1288 in percent, each in total and of rows, columns and
+    pixels.
+
+    Shapes: scalars.
+    Units:  as in each `Quantity`.
+    Source: EMVA Standard 1288, release 4.0 Linear.
+    """
+    return [*_dark(patterns.dark, gain), *_lit(patterns)]
+
+
+def _dark(series: SpatialSeries | None, gain: float | None) -> list[Quantity]:
+    quantities: list[Quantity] = []
+    for i, pattern in enumerate(PARTS):
+        names = _names("DSNU", pattern, "dark signal nonuniformity")
+        in_numbers = Quantity(f"{names[0]}_DN", f"{names[1]}.DN", names[2], "DN")
+        in_electrons = Quantity(names[0], names[1], names[2], "e-")
+        if series is None:
+            why = "no series of dark frames is given, only pairs"
+            quantities += [in_numbers.untold(why), in_electrons.untold(why)]
+            continue
+        numbers = _root(in_numbers, spatial_variances(series)[i], chance_of_variances(series)[i])
+        quantities.append(numbers)
+        if numbers.value is None or gain is None:
+            quantities.append(
+                in_electrons.untold(
+                    numbers.reason or "K is not told, so that no value in electrons is"
+                )
+            )
+        else:
+            quantities.append(
+                in_electrons.told(numbers.value / gain, numbers.bound, numbers.reason)
+            )
+    return quantities
+
+
+def _lit(patterns: Nonuniformity) -> list[Quantity]:
+    blanks = [
+        Quantity(*_names("PRNU", pattern, "photo response nonuniformity"), "%") for pattern in PARTS
+    ]
+    if patterns.dark is None or patterns.lit is None:
+        which = "lit frames" if patterns.lit is None else "dark frames"
+        return [blank.untold(f"no series of {which} is given, only pairs") for blank in blanks]
+    signal = float(patterns.lit.average.mean() - patterns.dark.average.mean())
+    if not signal > 0:
+        return [blank.untold("the lit series is no brighter than the dark one") for blank in blanks]
+    scale = (100 / signal) ** 2
+    variances = zip(spatial_variances(patterns.lit), spatial_variances(patterns.dark), strict=True)
+    chance = zip(chance_of_variances(patterns.lit), chance_of_variances(patterns.dark), strict=True)
+    both = zip(blanks, variances, chance, strict=True)
+    return [
+        _root(blank, (lit - dark) * scale, math.hypot(*errors) * scale)
+        for blank, (lit, dark), errors in both
+    ]
+
+
+def _names(kind: str, pattern: str, name: str) -> tuple[str, str, str]:
+    if pattern == "total":
+        return f"{kind}1288", f"{kind}1288", f"{name}, total"
+    return f"{kind}1288_{pattern}", f"{kind}1288.{pattern}", f"{name}, {pattern}s"
+
+
+def _root(blank: Quantity, variance: float, error: float) -> Quantity:
+    """Return the root of a variance, or a limit if the variance is less than two of its standard
+    errors.
+    """
+    if variance >= _SURE * error and variance > 0:
+        return blank.told(math.sqrt(variance))
+    limit = math.sqrt(max(variance, 0.0) + _SURE * error)
+    return blank.told(limit, "<", "no more than what noise in time leaves in the averaged frames")
+
+
+# --- patterns -------------------------------------------------------------------------------------
+
+# Spectrograms, profiles and histograms of defect pixels of the EMVA 1288 sheet.
+
+
+_MOST = 256  #: classes of a histogram
+_BOX = 5  #: pixels, side of the box whose mean is subtracted against uneven light
+
+
+class Spectrogram(NamedTuple):
+    """The root of the mean power of the lines of a frame, in the unit of the frame."""
+
+    frequency: FloatArray  #: (half,) cycles per pixel, 0 to 0.5
+    amplitude: FloatArray  #: (half,)
+
+
+class Profiles(NamedTuple):
+    """Four lines through a frame, each (pixel,) in the unit of the frame."""
+
+    middle: FloatArray
+    mean: FloatArray
+    least: FloatArray
+    greatest: FloatArray
+
+
+class DefectHistogram(NamedTuple):
+    """The distribution of pixels over their deviation from the mean, and the share of pixels
+    beyond each deviation.
+    """
+
+    deviation: FloatArray  #: (class,) lower end of each class, in the unit of the frame
+    pixels: NDArray[np.int64]  #: (class,)
+    #: (class,) pixels of a normal distribution of the same mean and standard deviation
+    normal: FloatArray
+    distance: FloatArray  #: (class,) rising amount of the deviation
+    beyond: FloatArray  #: (class,) %, pixels whose deviation amounts to that much or more
+
+
+def spectrogram(image: FloatArray, vertical: bool = False) -> Spectrogram:
+    """Return the spectrogram of a frame (y, x) along its rows, or with ``vertical`` along its
+    columns.
+
+    White noise of standard deviation s has the amplitude s at every frequency.
+
+    Source: EMVA Standard 1288, release 4.0 Linear.
+    """
+    lines = (image - image.mean()).T if vertical else image - image.mean()
+    power = np.abs(np.fft.rfft(lines, axis=1)) ** 2 / lines.shape[1]
+    return Spectrogram(
+        np.asarray(np.fft.rfftfreq(lines.shape[1])), np.asarray(np.sqrt(power.mean(0)))
+    )
+
+
+def profiles(image: FloatArray, vertical: bool = False) -> Profiles:
+    """Return the middle row of a frame (y, x), and mean, least and greatest number of each column;
+    or the transposed.
+
+    Source: EMVA Standard 1288, release 4.0 Linear.
+    """
+    lines = image.T if vertical else image
+    return Profiles(lines[len(lines) // 2], lines.mean(0), lines.min(0), lines.max(0))
+
+
+def without_trend(total: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return 25 times a frame less the mean of 5 x 5 pixels, without a rim of two pixels; whole
+    numbers stay exact.
+
+    Source: EMVA Standard 1288, release 4.0 Linear (highpass filtering of the lit frame).
+    """
+    rim = _BOX // 2
+    windows = np.lib.stride_tricks.sliding_window_view(total, (_BOX, _BOX))
+    return np.asarray(_BOX**2 * total[rim:-rim, rim:-rim] - windows.sum((2, 3)))
+
+
+def defects(total: NDArray[np.int64], unit: float) -> DefectHistogram:
+    """Return the histogram of the numbers (y, x) of a frame about their mean; ``unit`` is the value
+    of the number 1.
+
+    Shapes: -> (class,), at most 256 classes of equal whole width.
+    Source: EMVA Standard 1288, release 4.0 Linear (logarithmic and accumulated histograms).
+    """
+    low, high = int(total.min()), int(total.max())
+    width = 1 if high - low < _MOST else (high - low) // _MOST + 1
+    index = (total - low) // width
+    count = np.bincount(index.reshape(-1))
+    starts = low + width * np.arange(len(count))
+    mean, sigma = float(total.mean()), float(total.std())
+    normal = np.zeros(len(count))
+    if sigma > 0:
+        centre = starts + (width - 1) / 2
+        normal = (
+            total.size
+            * width
+            / (math.sqrt(2 * math.pi) * sigma)
+            * np.exp(-(((centre - mean) / sigma) ** 2) / 2)
+        )
+    apart = np.sort(np.abs(total.reshape(-1) - mean))
+    distance = np.linspace(0.0, float(apart[-1]), min(_MOST, len(apart)))
+    beyond = np.asarray(
+        100 * (len(apart) - np.searchsorted(apart, distance, side="left")) / len(apart)
+    )
+    deviation, distance = np.asarray((starts - mean) * unit), np.asarray(distance * unit)
+    return DefectHistogram(deviation, count, normal, distance, beyond)

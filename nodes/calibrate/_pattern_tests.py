@@ -1,0 +1,389 @@
+"""Tests of what frames share: fixed patterns, uneven light, lag, mosaic of colours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from neusee.nodes.calibrate._frame_pairs import (
+    Evidence,
+    FrameTest,
+    Hidden,
+    Level,
+    bounded,
+    outcome,
+    probably_sound,
+    saturated,
+    strongest,
+    studentised,
+    tested,
+    without_lines,
+)
+
+# --- lag test -------------------------------------------------------------------------------------
+
+# A test of frames for lag: noise of a frame that persists in the next frame, apart from the
+# patterns that stay.
+
+
+_RARE = 4.5  #: standard deviations beyond which a pixel is defective, and left out
+_LEAST = 3  #: least levels in excess of the patterns that are fitted
+_CURVED = 6  #: lit levels from which a pattern may be a parabola of the signal
+_KEPT = 0.02  #: scale of the prior of the share of the variance that lag takes
+
+
+def lag(levels: Sequence[Level]) -> list[FrameTest]:
+    """Test if the noise of a frame persists in the next frame of the same light.
+
+    The pattern of each pixel is fitted over the levels, separately for first and for second frames:
+    an offset, a part in proportion to the signal and to its square, and one in proportion to the
+    exposure. What is left of the first frames and of the second frames is independent noise, unless
+    the first frame persists in the second. With a share L that stays, the variance of a pair falls
+    by the factor (1 - L)**2 / (1 + L).
+
+    Shapes: a list of levels -> a list of one test, or of none.
+    Units:  number and limit in standard deviations of chance.
+    Error:  the test fails by chance with a probability of 1e-3. It needs three levels more than the
+            parts of a pattern.
+    Source: Janesick, Photon Transfer, SPIE Press 2007, chapter 8 (image lag); weighted least
+            squares.
+    """
+    group = _comparable(levels)
+    patterns = _patterns(group)
+    if len(group) < patterns.shape[1] + _LEAST - 1:
+        return []
+    weight = torch.tensor(
+        [max(level.variance, 1e-12) for level in group], dtype=torch.float64
+    ).rsqrt()
+    basis = torch.linalg.qr(weight[:, None] * patterns).Q
+    lit = torch.tensor([not level.dark for level in group])
+    lit = lit if bool(lit.any()) else ~lit
+    pairs = min(len(level.apart) for level in group)
+    first, second = [level.first for level in group], [level.second for level in group]
+    products, powers = [], 0.0
+    for pair in range(pairs):
+        u = _noise_of_pair(first, pair, weight, basis)[lit]
+        v = _noise_of_pair(second, pair, weight, basis)[lit]
+        product_of_pair, power = _product_and_power(u, v)
+        products.append(product_of_pair)
+        powers += power
+    product = torch.stack(products)
+    evidence = strongest([[studentised(product)]], sides=2)
+    share, error = float(product.sum()) / powers, math.sqrt(float(product.square().sum())) / powers
+    inside = min(max(share, -0.9), 0.9)
+    lost = math.log((1 + inside) / (1 - inside) ** 2)
+    sound = probably_sound(pairs * int(lit.sum()) * group[0].first[0].numel())
+    width = max(3 * error, 1e-9)
+    hidden = [Hidden("lag", lost, width, _KEPT, gain=1.0, noise=0.5, positive=True, sound=sound)]
+    sentence = f"{share:.1%} of the noise of a frame persists in the next frame, as by lag"
+    passed = f"the noise of a frame does not persist in the next frame ({share:.2%} ± {error:.2%})"
+    return [bounded("no lag", evidence, hidden, sentence, passed)]
+
+
+def _noise_of_pair(frames: Sequence[Tensor], pair: int, weight: Tensor, basis: Tensor) -> Tensor:
+    """Return what the patterns leave of one frame of each level."""
+    return _left(torch.stack([of_level[pair].double() for of_level in frames]), weight, basis)
+
+
+def _product_and_power(u: Tensor, v: Tensor) -> tuple[Tensor, float]:
+    """Return the product of the noise of two frames, summed over the levels, and its mean power,
+    both without outliers.
+    """
+    inliers = (u.abs() < _RARE * _width(u)) & (v.abs() < _RARE * _width(v))
+    power = 0.5 * float(((u.square() + v.square()) * inliers).sum())
+    return (u * v * inliers).sum(0), power
+
+
+def _comparable(levels: Sequence[Level]) -> list[Level]:
+    """Return the levels of frames of the most frequent shape, up to the level of the greatest
+    variance.
+    """
+    shapes = [level.apart.shape[1:] for level in levels]
+    common = max(shapes, key=shapes.count)
+    top = max(levels, key=lambda level: level.variance).mean
+    candidates = zip(levels, shapes, strict=True)
+    return [
+        level
+        for level, shape in candidates
+        if shape == common and (level.dark or level.mean <= top)
+    ]
+
+
+def _patterns(levels: Sequence[Level]) -> Tensor:
+    """Return the size (level, part) of each part of a pattern in each level, with as many parts
+    as levels allow.
+    """
+    offset = min((level.mean for level in levels), default=0.0)
+    signal = torch.tensor([level.mean - offset for level in levels], dtype=torch.float64)
+    exposure = torch.tensor([level.exposure for level in levels], dtype=torch.float64)
+    dark = torch.tensor([level.dark for level in levels])
+    parts = [torch.ones_like(signal)]
+    if not bool(dark.all()):
+        parts.append(signal / signal.max().clamp_min(1e-12))
+    if int((~dark).sum()) >= _CURVED:
+        parts.append(parts[-1].square())
+    times = exposure[dark] if bool(dark.any()) else exposure
+    if len(set(times.tolist())) > 1:
+        parts.append(exposure / exposure.max())
+    return torch.stack(parts[: max(1, len(levels) - _LEAST + 1)], 1)
+
+
+def _left(frames: Tensor, weight: Tensor, basis: Tensor) -> Tensor:
+    """Return frames (level, y, x) over their standard deviations, without patterns and without
+    means of lines.
+    """
+    flat = weight[:, None] * without_lines(frames).flatten(1)
+    return (flat - basis @ (basis.T @ flat)).view_as(frames)
+
+
+def _width(x: Tensor) -> Tensor:
+    """Return a robust standard deviation (level, 1, 1) of each level."""
+    return 1.4826 * x.abs().flatten(1).median(1).values[:, None, None] + 1e-9
+
+
+# --- mosaic test ----------------------------------------------------------------------------------
+
+# A test of frames for a mosaic of colours, whose pixels have several quantum efficiencies.
+
+
+_PERIODS = {
+    2: "2 x 2 pixels, as of Bayer",
+    4: "4 x 4 pixels, as of a quad mosaic",
+    6: "6 x 6 pixels, as of X-Trans",
+}
+#: largest relative difference of the positions of a monochrome sensor with several readouts
+_UNLIKE = 0.05
+_CHANCE = 8.0  #: standard errors by which the brightest and the darkest position differ by chance
+
+
+def mosaic(levels: Sequence[Level]) -> Iterator[FrameTest]:
+    """Test if the light of pixels depends on their position in a small cell that repeats over the
+    frame.
+
+    Shapes: a list of levels -> a test, or none without light.
+    Units:  number and limit: relative difference of the brightest and the darkest position of the
+            cell.
+    Error:  positions of a monochrome sensor that differ by more than 5 % count as a mosaic.
+    Source: Bayer, US patent 3971065 (1976), for the cell of 2 x 2 pixels.
+    """
+    dark = min((level.mean for level in levels if level.dark), default=math.inf)
+    bright = max(tested(levels), key=lambda level: level.mean, default=None)
+    if bright is None or bright.dark or bright.mean <= dark:
+        return
+    signal = bright.mean - dark
+    picture = (bright.first + bright.second).double().mean(0) / 2
+    for period, cell in _PERIODS.items():
+        number = _difference(picture, period) / signal
+        if number > _UNLIKE:
+            colours = f"the light of pixels differs by {number:.0%} over a cell of {cell}"
+            text = (
+                f"{colours}: the frames are a mosaic of colours, whose calibration is not offered;"
+                " give frames of"
+            )
+            text += " one colour alone, such as every second pixel of every second row"
+            yield FrameTest("one colour", number, _UNLIKE, "refused", text, explains_all=True)
+            return
+
+
+def _difference(picture: Tensor, period: int) -> float:
+    """Return the difference of the brightest and the darkest position of a cell, DN; 0 if chance
+    explains it.
+    """
+    if min(picture.shape) < 2 * period:
+        return 0.0
+    means, error = _positions(picture, period)
+    difference = float(means.max() - means.min())
+    return difference if difference > _CHANCE * error else 0.0
+
+
+def _positions(picture: Tensor, period: int) -> tuple[Tensor, float]:
+    """Return the mean of each position of a cell (y, x), and the standard error of a mean."""
+    high, wide = (n // period for n in picture.shape)
+    cells = picture[: high * period, : wide * period].reshape(high, period, wide, period)
+    within = cells - cells.mean((1, 3), keepdim=True)
+    means = cells.mean((0, 2))
+    spread = (within - (means - means.mean())[None, :, None, :]).square().mean()
+    return means, math.sqrt(float(spread) / (high * wide))
+
+
+# --- pattern tests --------------------------------------------------------------------------------
+
+# Tests of what two frames of the same light have in common: fixed patterns, uneven light, and lag
+# between frames.
+
+
+_BLOCKS = 8  #: blocks of a frame on a side, whose means show how even the light is
+#: difference of the largest and least irradiance that EMVA 1288 allows, relative to the mean
+_EVEN = 0.03
+_UNLIKE_PATTERN = 0.01  #: scale of the prior of the share of the variance that is of patterns
+_BENT = 0.1  #: largest relative bend of a response, by which uneven light shifts the gain
+_NEARLY_FULL = 0.95  #: share of the well above which a part of a frame is nearly full
+_SMALL = 5  #: pixels, over which uneven light is even
+#: standard errors by which the means of the brightest and the darkest block differ by chance
+_NOISE = 8.0
+
+
+def pattern_tests(levels: Sequence[Level]) -> list[FrameTest]:
+    """Test frames of the same light for fixed patterns, for lag, and for uneven light.
+
+    Only levels that the fit uses are tested. The covariance of two frames of a level is that of the
+    patterns that stay.
+
+    Shapes: a list of levels -> a list of tests.
+    Units:  numbers and limits in standard deviations of chance, and the difference of the light as
+            a share of its mean.
+    Error:  each test fails by chance with a probability of 1e-3.
+    Source: EMVA Standard 1288, release 4.0 Linear, sections 2.5 (non-uniformity) and 6.4
+            (homogeneity).
+    """
+    paired = tested(levels)
+    if not paired:
+        return []
+    return [_pattern(paired), *lag(paired), *_uneven(paired, saturated(levels))]
+
+
+def _pattern(levels: Sequence[Level]) -> FrameTest:
+    """Test if the pixels of a level differ from each other in all frames, by DSNU and PRNU."""
+    products = [level.first * level.second for level in levels]
+    evidence = strongest([[studentised(x) for x in products]])
+    offset = min((level.mean for level in levels if level.dark), default=0.0)
+    dsnu, prnu = _dsnu_and_prnu(levels, [float(x.mean()) for x in products], offset)
+    sentence = (
+        f"pixels differ by {dsnu:.2g} DN in the dark (DSNU) and by {prnu:.2%} in light (PRNU and"
+        " uneven light)"
+    )
+    passed = "the pixels are alike: the total variance is the temporal variance"
+    if all(level.scatter != "all" for level in levels):
+        modelled = "the temporal variance leaves these differences out"
+        lit = [level for level in levels if not level.dark]
+        shifts = {"gain": _pixel_response(lit, offset) ** 2}
+        return outcome(
+            "total against temporal variance", evidence, sentence, shifts, passed, modelled
+        )
+    sentence += (
+        ", which `scatter: all` counts as noise; use calibrate.camera with `scatter: steady`"
+    )
+    hidden = list(_counted_as_noise(levels, products))
+    return bounded("total against temporal variance", evidence, hidden, sentence, passed)
+
+
+def _dsnu_and_prnu(
+    levels: Sequence[Level], common: Sequence[float], offset: float
+) -> tuple[float, float]:
+    """Return how much pixels differ in the dark, in DN, and in light, relative to the signal, from
+    the variance of the pattern that is ``common`` to the frames of each level.
+    """
+    pairs = list(zip(common, levels, strict=True))
+    dark = min((variance for variance, level in pairs if level.dark), default=0.0)
+    dsnu = math.sqrt(max(0.0, dark))
+    lit = [(variance - dsnu**2, level.mean) for variance, level in pairs if not level.dark]
+    relative = [
+        math.sqrt(max(0.0, variance)) / (mean - offset) for variance, mean in lit if mean > offset
+    ]
+    return dsnu, sorted(relative)[len(relative) // 2] if relative else 0.0
+
+
+def _pixel_response(lit: Sequence[Level], offset: float) -> float:
+    """Return by how much the responses of neighbouring pixels differ, relative to the mean; uneven
+    light is smooth.
+
+    Pixels whose gains differ by a share s have a mean gain that is too large by s**2.
+    """
+    shares = []
+    for level in lit:
+        first_frames, other = (frames.diff(dim=2) for frames in (level.first, level.second))
+        shares.append(
+            max(0.0, float((first_frames * other).mean()) / 2) / (level.mean - offset) ** 2
+        )
+    return math.sqrt(sorted(shares)[len(shares) // 2]) if shares else 0.0
+
+
+def _counted_as_noise(levels: Sequence[Level], products: Sequence[Tensor]) -> Iterator[Hidden]:
+    """Yield the share of patterns in the slope of the total variance over the mean, and in the
+    total dark variance.
+    """
+    mean = torch.tensor([level.mean for level in levels], dtype=torch.float64)
+    pattern = torch.tensor([float(x.mean()) for x in products], dtype=torch.float64)
+    error = torch.tensor(
+        [math.sqrt(float(x.square().sum())) / x.numel() for x in products], dtype=torch.float64
+    )
+    total = pattern + torch.tensor([level.variance for level in levels], dtype=torch.float64)
+    lit = torch.tensor([not level.dark for level in levels])
+    if len(levels) > 2 and float(mean.max()) > float(mean.min()):
+        weight = total.clamp_min(1e-12).reciprocal()
+        design = torch.stack([torch.ones_like(mean), mean], 1) * weight[:, None]
+        slope = torch.linalg.pinv(design)[1] * weight
+        yield _share(
+            float(slope @ pattern), float((slope * error).norm()), float(slope @ total), gain=-1.0
+        )
+    if bool((~lit).any()):
+        pattern_variance, unsure, total_variance = (
+            pattern[~lit].mean(),
+            error[~lit].norm() / int((~lit).sum()),
+            total[~lit].mean(),
+        )
+        yield _share(float(pattern_variance), float(unsure), float(total_variance), noise=-0.5)
+
+
+def _share(
+    pattern: float, error: float, total: float, gain: float = 0.0, noise: float = 0.0
+) -> Hidden:
+    """Return the fault of a part of the variance that is no noise in time."""
+    left = max(1 - pattern / max(total, 1e-12), 1e-3)
+    error = max(error / max(total, 1e-12) / left, 1e-9)
+    return Hidden("pattern", -math.log(left), error, _UNLIKE_PATTERN, gain, noise, positive=True)
+
+
+def _uneven(levels: Sequence[Level], full: Sequence[Level]) -> Iterator[FrameTest]:
+    """Test if the light of the brightest level is even enough for the standard.
+
+    Light that is uneven leaves the gain alone as long as the response is straight: mean and
+    variance of each pixel grow alike. It does not where the brightest part of the frame is full
+    before the mean is, which ``full`` levels show.
+    """
+    lit, dark = ([level for level in levels if level.dark == is_dark] for is_dark in (False, True))
+    bright = max(lit, key=lambda level: level.mean, default=None)
+    if bright is None or not dark or min(bright.first.shape[1:]) < 2 * _BLOCKS:
+        return
+    below = min(dark, key=lambda level: abs(level.exposure - bright.exposure))
+    signal = bright.mean - below.mean
+    if signal <= 0:
+        return
+    means, chance = _block_means(bright)
+    number = max(0.0, float(means.max() - means.min()) - _NOISE * math.sqrt(chance)) / signal
+    variation = max(0.0, float(means.var()) - chance) / signal**2
+    shift = _BENT * variation + _filled(bright, full, below.mean)
+    sentence = (
+        f"the brightest and the darkest part of the light differ by {number:.1%}, not at most"
+        f" {_EVEN:.0%}"
+    )
+    passed = f"the parts of the light differ by less than the {_EVEN:.0%} that the standard allows"
+    yield outcome(
+        "homogeneity of the light", Evidence(number, _EVEN), sentence, {"gain": shift}, passed
+    )
+
+
+def _block_means(level: Level) -> tuple[Tensor, float]:
+    """Return the means (by, bx) of the parts of a level, DN less that of the level, and their
+    variance by chance.
+    """
+    picture = (level.first + level.second).mean(0)[None, None] / 2
+    side = [n // _BLOCKS for n in picture.shape[2:]]
+    left = picture - avg_pool2d(picture, _SMALL, stride=1, padding=_SMALL // 2)
+    return avg_pool2d(picture, side)[0, 0], float(left.var()) / math.prod(side)
+
+
+def _filled(bright: Level, full: Sequence[Level], dark: float) -> float:
+    """Return the share of the light of the brightest level that is in parts of the frame that
+    are nearly full.
+    """
+    lit = [level for level in full if level.paired and level.first.shape == bright.first.shape]
+    if not lit:
+        return 0.0
+    well = max(level.mean + float(_block_means(level)[0].max()) for level in lit) - dark
+    signal = bright.mean - dark + _block_means(bright)[0]
+    return float(signal[signal > _NEARLY_FULL * well].sum() / signal.sum())

@@ -1,0 +1,474 @@
+"""Priors of sensor and camera, the coordinates of a sampler, and its first guess."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.calibrate._emva_fit import least_squares, without_histograms
+from neusee.nodes.calibrate._sensor_likelihood import ROUNDED, Sufficient
+from neusee.nodes.sensor._saturation import Well
+from neusee.nodes.units import Efficiency, Electrons, Gain, Real
+from neusee.nodes.values import Levels
+
+# --- free parameters ------------------------------------------------------------------------------
+
+# The priors of free parameters, and the common base of the coordinates in which a sampler moves.
+
+
+#: one standard deviation of the logarithm, as a ratio
+Factor = Annotated[float, Field(gt=1, le=1e6)]
+Positive = Annotated[float, Field(ge=1e-12, le=1e12)]
+Pair = tuple[float, float]
+Known = Literal["unknown", "none"]  #: what is known of a fault of the frames before any frame
+#: faults that may hide in frames: each changes the variance in proportion
+FAULTS = ("mixing", "lag", "pattern")
+
+
+class Ridge(NamedTuple):
+    """Parameters far from a fit that may fit the same data as well, and what is known if they
+    do.
+    """
+
+    place: Tensor  #: (free,) coordinates
+    kinds: Mapping[str, str]  #: from a parameter to "upper" or "lower", the limit that is known
+    text: str  #: a sentence
+
+
+class Prior(NamedTuple):
+    """Independent normal distributions, one for each parameter of a sensor; NaN stands for a
+    fixed parameter.
+    """
+
+    centre: Tensor  #: (parameter,) float64, mean of the logarithm, or of a linear parameter itself
+    width: Tensor  #: (parameter,) float64, standard deviation of the same quantity
+    #: 1 for each of `FAULTS` that may hide, 0 for none
+    hidden: Tensor = torch.ones(len(FAULTS), dtype=torch.float64)
+
+    @property
+    def may_hide(self) -> tuple[str, ...]:
+        """Return the names of the faults that may hide in the frames."""
+        return tuple(fault for fault, may in zip(FAULTS, self.hidden.tolist(), strict=True) if may)
+
+
+def believed(
+    pairs: Mapping[str, Pair | None], linear: frozenset[str], **faults_known: Known
+) -> Prior:
+    """Build a prior from a pair of numbers for each free parameter, and None for each fixed
+    parameter.
+
+    The pair is median and factor, or mean and standard deviation for a parameter in ``linear``. A
+    fault of the frames that is ``faults_known`` to be "none" cannot hide in them.
+    """
+    normals = [_normal(name, pair, name in linear) for name, pair in pairs.items()]
+    if all(math.isnan(width) for _, width in normals):
+        raise ValueError(
+            f"no parameter is free: give a prior of at least one of {', '.join(pairs)}"
+        )
+    centre, width = torch.tensor(normals, dtype=torch.float64).unbind(1)
+    hidden = [float(faults_known.get(fault, "unknown") == "unknown") for fault in FAULTS]
+    return Prior(centre, width, torch.tensor(hidden, dtype=torch.float64))
+
+
+def freed(names: tuple[str, ...], prior: Prior) -> tuple[str, ...]:
+    """Return the names of the parameters that have a prior; ``names`` are the names of all
+    parameters.
+    """
+    return tuple(
+        name
+        for name, width in zip(names, prior.width.tolist(), strict=True)
+        if not math.isnan(width)
+    )
+
+
+def _normal(name: str, pair: Pair | None, linear: bool) -> Pair:
+    if pair is None:
+        return math.nan, math.nan
+    if not pair[1] > 0 or not (linear or pair[0] > 0):
+        raise ValueError(
+            f"{name}: [{pair[0]:g}, {pair[1]:g}] is not a prior: median and width must be positive"
+        )
+    return pair if linear else (math.log(pair[0]), math.log(pair[1]))
+
+
+@dataclass(frozen=True)
+class Free:
+    """Free parameters and their prior; each subclass defines the coordinates for a sampler."""
+
+    every: ClassVar[tuple[str, ...]]  #: the names of all parameters, free or held
+    linear: ClassVar[frozenset[str]]  #: the parameters that may be 0 or negative
+    #: the parameters that are widths of the noise of the levels
+    widths: ClassVar[frozenset[str]] = frozenset()
+    edged: ClassVar[frozenset[str]] = frozenset()  #: the parameters that rounded numbers
+    #: constrain by edges and not by a slope: the last row of `Likelihood.scaled` describes the free
+    #: one of these
+
+    #: True if data may leave a posterior that is long, bent, or in several parts
+    bent: ClassVar[bool] = False
+
+    names: tuple[str, ...]  #: names of the free parameters
+    prior: Prior
+    held: Mapping[str, float]  #: values of the held parameters
+
+    @classmethod
+    def of(cls, prior: Prior, nominal: Mapping[str, float]) -> Self:
+        """Build sampler coordinates for the free parameters of a prior; others keep the
+        ``nominal`` values.
+        """
+        free = freed(cls.every, prior)
+        return cls(
+            free, prior, {name: float(nominal[name]) for name in cls.every if name not in free}
+        )
+
+    def draw(self, count: int, rng: torch.Generator) -> dict[str, Tensor]:
+        """Draw ``count`` values of each free parameter from the prior."""
+        return self.from_whitened(
+            torch.randn(count, len(self.names), generator=rng, dtype=torch.float64)
+        )
+
+    def whitened(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Convert parameters to distances from the prior's centre, in standard deviations of the
+        prior.
+        """
+        return (self.scaled(parameters) - self._normals.centre) / self._normals.width
+
+    def from_whitened(self, z: Tensor) -> dict[str, Tensor]:
+        """Convert distances from the prior's centre, in standard deviations of the prior, to
+        parameters.
+        """
+        return self.unscaled(self._normals.centre + self._normals.width * z)
+
+    def scaled(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Return the logarithm of each free parameter, or the value of a parameter that may be 0
+        or negative.
+        """
+        values = ((name, parameters[name]) for name in self.names)
+        return torch.stack([x if name in self.linear else x.log() for name, x in values], -1)
+
+    def unscaled(self, values: Tensor) -> dict[str, Tensor]:
+        """Return the free parameters from logarithms, or from the values of parameters that may
+        be 0 or negative.
+        """
+        pairs = zip(self.names, values.unbind(-1), strict=True)
+        return {name: x if name in self.linear else x.exp() for name, x in pairs}
+
+    def ridges(self, place: Tensor) -> list[Ridge]:
+        """Return parameters far from ``place`` (free,) that some data cannot distinguish from
+        it; by default none.
+        """
+        return []
+
+    @cached_property
+    def _normals(self) -> Prior:
+        free = self.prior.width.isfinite()
+        return Prior(self.prior.centre[free], self.prior.width[free], self.prior.hidden)
+
+
+# --- sensor prior ---------------------------------------------------------------------------------
+
+# The prior of a sensor's parameters, and the coordinates that frames constrain independently.
+
+
+_LINEAR = "offset"  #: the only parameter that may be 0 or negative
+
+
+@node()
+def prior(
+    *,
+    gain: tuple[Gain, Factor] | None = None,
+    offset: tuple[Electrons, Electrons] | None = None,
+    read_noise: tuple[Electrons, Factor] | None = None,
+    dark_current: tuple[Electrons, Factor] | None = None,
+    full_well: tuple[Well, Factor] | None = None,
+    quantum_efficiency: tuple[Efficiency, Factor] | None = None,
+    spread: tuple[Positive, Factor] | None = None,
+    mixing: Known = "unknown",
+    lag: Known = "unknown",
+    pattern: Known = "unknown",
+) -> Prior:
+    """Collect the priors of the free parameters of a sensor; a parameter without a prior is held at
+    a fixed value.
+
+    A prior is a median and a factor: [0.37, 2] means half to twice the median with a probability of
+    two thirds. The prior of the offset is a mean and a standard deviation. Mixing of neighbouring
+    pixels, lag between frames and patterns of unequal pixels are `none` for a sensor that is known
+    to have none of it, such as a simulated one; else intervals include what may hide in the frames.
+
+    Shapes: -> (7,).
+    Units:  those of `density`.
+    Error:  exact.
+    Raises: ValueError where no parameter is free, or where a median or width is not positive.
+    Source: log-normal and normal distributions.
+    """
+    pairs = (gain, offset, read_noise, dark_current, full_well, quantum_efficiency, spread)
+    return believed(
+        dict(zip(NAMES, pairs, strict=True)),
+        frozenset({_LINEAR}),
+        mixing=mixing,
+        lag=lag,
+        pattern=pattern,
+    )
+
+
+#: the parameters of `density` that may be free
+NAMES = tuple(n for n in inspect.signature(prior.fn).parameters if n not in FAULTS)
+
+
+@prior.check
+def _(result: Prior, **params: object) -> list[Check]:
+    free = freed(NAMES, result)
+    return [Check(f"{len(free)} free: {', '.join(free)}")]
+
+
+@dataclass(frozen=True)
+class Coordinates(Free):
+    """Coordinates of the free parameters of a sensor, in digital numbers, which frames constrain
+    independently.
+
+    Frames constrain the slope of the photon-transfer curve, the offset in DN, the dark variance,
+    the response and the saturation level independently. Frames constrain gain, offset in electrons,
+    read noise and well only jointly, with a correlation of 1 - 1e-3. All coordinates except the
+    offset in DN are logarithms.
+    """
+
+    every: ClassVar[tuple[str, ...]] = NAMES
+    linear: ClassVar[frozenset[str]] = frozenset({_LINEAR})
+    edged: ClassVar[frozenset[str]] = frozenset({"full_well"})
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Return a readable name of each sampler coordinate."""
+        of = {
+            "gain": "ln slope of the photon-transfer curve",
+            "offset": "offset, DN",
+            "spread": "ln spread",
+        }
+        return tuple(of.get(name, f"ln {name.replace('_', ' ')} in numbers") for name in self.names)
+
+    def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
+        """Convert sensor parameters to sampler coordinates (..., free parameter)."""
+        full = {
+            name: torch.as_tensor(parameters.get(name, self.held.get(name)), dtype=torch.float64)
+            for name in NAMES
+        }
+        slope = full["gain"].log()
+        return torch.stack([self._coordinate(name, full, slope) for name in self.names], -1)
+
+    def parameters(self, place: Tensor) -> dict[str, Tensor]:
+        """Convert sampler coordinates (..., free parameter) to sensor parameters."""
+        free = dict(zip(self.names, place.unbind(-1), strict=True))
+        held = {name: math.log(self.held[name]) for name in ("gain", "spread") if name in self.held}
+        logs = {name: torch.tensor(x, dtype=torch.float64) for name, x in held.items()} | free
+        slope = logs["gain"] - 2.0 * logs["spread"] if "gain" in free else logs["gain"]
+        parameters = {}
+        for name, x in free.items():
+            if name == "gain":
+                parameters[name] = slope.exp()
+            elif name == _LINEAR:
+                parameters[name] = x * (-slope).exp()
+            else:
+                parameters[name] = (x if name == "spread" else x - slope).exp()
+        return parameters
+
+    def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Return the log prior density per unit of the sampler coordinates, up to a constant."""
+        total = -0.5 * self.whitened(parameters).square().sum(-1)
+        if _LINEAR in self.names and "gain" in self.names:
+            total = total - parameters["gain"].log()  # Jacobian from offset in DN to electrons
+        return total
+
+    def _coordinate(self, name: str, full: Mapping[str, Tensor], slope: Tensor) -> Tensor:
+        if name == "gain":
+            return slope + 2.0 * full["spread"].log()
+        if name == _LINEAR:
+            return full[name] * slope.exp()
+        return full[name].log() + (0.0 if name == "spread" else slope)
+
+
+# --- camera prior ---------------------------------------------------------------------------------
+
+# The prior of a real camera's parameters, and the coordinates in which a sampler moves.
+
+
+_LINEAR_OF_CAMERA = frozenset({"dark_signal", "bend", "twist"})
+
+
+@node()
+def camera_prior(
+    *,
+    gain: tuple[Gain, Factor] | None = None,
+    quantum_efficiency: tuple[Efficiency, Factor] | None = None,
+    dark_signal: tuple[Real, Positive] | None = None,
+    temporal_dark_noise: tuple[Electrons, Factor] | None = None,
+    dark_current: tuple[Electrons, Factor] | None = None,
+    scatter: tuple[Positive, Factor] | None = None,
+    lamp: tuple[Positive, Factor] | None = None,
+    drift: tuple[Positive, Factor] | None = None,
+    bend: tuple[Real, Positive] | None = None,
+    twist: tuple[Real, Positive] | None = None,
+    mixing: Known = "unknown",
+    lag: Known = "unknown",
+) -> Prior:
+    """Collect the priors of the free parameters of a camera; a parameter without a prior is held at
+    a fixed value.
+
+    A prior is a median and a factor: [0.37, 2] means half to twice the median with a probability of
+    two thirds. The priors of the dark signal and of the two terms of the response are a mean and a
+    standard deviation. Mixing of neighbouring pixels and lag between frames are `none` for a camera
+    that is known to have neither; else intervals include what of both may hide in the frames.
+
+    Shapes: -> (10,).
+    Units:  those of `camera`.
+    Error:  exact.
+    Raises: ValueError where no parameter is free, or where a median or width is not positive.
+    Source: log-normal and normal distributions.
+    """
+    dark = (dark_signal, temporal_dark_noise, dark_current)
+    pairs = (gain, quantum_efficiency, *dark, scatter, lamp, drift, bend, twist)
+    return believed(
+        dict(zip(CAMERA_NAMES, pairs, strict=True)), _LINEAR_OF_CAMERA, mixing=mixing, lag=lag
+    )
+
+
+#: the parameters of `camera` that may be free
+CAMERA_NAMES = tuple(n for n in inspect.signature(camera_prior.fn).parameters if n not in FAULTS)
+
+
+@camera_prior.check
+def _(result: Prior, **params: object) -> list[Check]:
+    free = freed(CAMERA_NAMES, result)
+    return [Check(f"{len(free)} free: {', '.join(free)}")]
+
+
+@dataclass(frozen=True)
+class CameraCoordinates(Free):
+    """Coordinates of the free parameters of a camera: logarithms, or values of parameters that
+    may be 0 or negative.
+    """
+
+    every: ClassVar[tuple[str, ...]] = CAMERA_NAMES
+    linear: ClassVar[frozenset[str]] = _LINEAR_OF_CAMERA
+    widths: ClassVar[frozenset[str]] = frozenset({"scatter", "lamp", "drift"})
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Return a readable name of each sampler coordinate."""
+        return tuple(
+            ("" if name in self.linear else "ln ") + name.replace("_", " ") for name in self.names
+        )
+
+    def place(self, parameters: Mapping[str, float | Tensor]) -> Tensor:
+        """Convert camera parameters to sampler coordinates (..., free parameter)."""
+        return self.scaled(
+            {name: torch.as_tensor(parameters[name], dtype=torch.float64) for name in self.names}
+        )
+
+    def parameters(self, place: Tensor) -> dict[str, Tensor]:
+        """Convert sampler coordinates (..., free parameter) to camera parameters."""
+        return self.unscaled(place)
+
+    def log_prior(self, parameters: Mapping[str, Tensor]) -> Tensor:
+        """Return the log prior density per unit of the sampler coordinates, up to a constant."""
+        return -0.5 * self.whitened(parameters).square().sum(-1)
+
+
+# --- first guess ----------------------------------------------------------------------------------
+
+# First guesses of the parameters of a sensor or camera, from measured light levels.
+
+
+_ABOVE = 1.3  #: factor on the brightest number, for a full well that no level reaches
+_LEAST = 1e-3  #: least dark current or read noise, relative to the believed value
+
+
+def guess(
+    levels: Sufficient, believed: Mapping[str, float], params: Mapping[str, Any]
+) -> dict[str, float]:
+    """Return a least-squares estimate of each sensor parameter, or the ``believed`` value if there
+    is no estimate.
+
+    ``params`` are the fixed parameters of `density`.
+
+    Shapes: levels (level,); numbers by name, with the names of ``believed``.
+    Units:  those of `density`.
+    Error:  a start for a search, not an estimate.
+    Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
+    """
+    values = dict(believed)
+    try:
+        fit = least_squares(without_histograms(Levels(*levels), levels.pixels > 0))
+    except ValueError:
+        return values | {"full_well": _well(levels, values, params)}
+    gain = float(fit.gain)
+    dark = float(fit.dark_current) * params["dark_exposure"]
+    first = levels.exposure[levels.photons == 0].min()
+    ahead = float(first) / params["dark_exposure"] * (dark if dark > 0 else 0.0)
+    values |= {
+        "gain": gain,
+        "quantum_efficiency": float(fit.efficiency),
+        "offset": (float(fit.dark_signal) - ROUNDED[params["rounding"]][0]) / gain - ahead,
+        "read_noise": max(float(fit.temporal_dark_noise), _LEAST * believed["read_noise"]),
+        "dark_current": dark if dark > 0 else _LEAST * believed["dark_current"],
+    }
+    return values | {"full_well": _well(levels, values, params)}
+
+
+def guess_camera(
+    levels: Levels, believed: Mapping[str, float], params: Mapping[str, Any]
+) -> dict[str, float]:
+    """Return a least-squares estimate of each camera parameter, or the ``believed`` value if there
+    is no estimate.
+
+    ``params`` are the fixed parameters of `camera`.
+
+    Shapes: levels (level,); numbers by name, with the names of ``believed``.
+    Units:  those of `camera`.
+    Error:  a start for a search, not an estimate.
+    Raises: ValueError where `least_squares` raises ValueError.
+    Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
+    """
+    fit = least_squares(levels, share=params["share"])
+    gain = float(fit.gain)
+    values = {
+        "gain": gain,
+        "quantum_efficiency": float(fit.efficiency),
+        "dark_signal": float(fit.dark_signal),
+        "temporal_dark_noise": float(fit.temporal_dark_noise),
+        "dark_current": float(fit.dark_current) * params["dark_exposure"],
+    }
+    usable = {
+        name: x
+        for name, x in values.items()
+        if math.isfinite(x) and (x > 0 or name == "dark_signal")
+    }
+    return {**believed, **usable}
+
+
+def _well(levels: Sufficient, values: Mapping[str, float], params: Mapping[str, Any]) -> float:
+    """Return the full well at which numbers pile up, or, if none pile up, a full well above
+    every number.
+    """
+    top, shift, gain = (
+        2 ** params["bits"] - 1,
+        ROUNDED[params["rounding"]][0],
+        float(values["gain"]),
+    )
+    means = levels.mean[levels.pixels > 0]
+    brightest = max([*means.tolist(), *levels.cell_value.tolist()], default=0.0)
+    top_cells = levels.cell_value >= brightest - 2
+    piled = bool(top_cells.any()) and float(levels.cell_count[top_cells].sum()) > 0.5 * float(
+        levels.cell_count.max()
+    )
+    if piled and brightest < top:
+        weight = levels.cell_count[top_cells]
+        return float((levels.cell_value[top_cells] * weight).sum() / weight.sum() - shift) / gain
+    return max(values["full_well"], _ABOVE * min(brightest + 1, torch.inf) / gain)

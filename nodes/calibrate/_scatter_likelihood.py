@@ -1,0 +1,435 @@
+"""The scatter of a lens: rings about an overexposed point source, and likelihood."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from torch import Tensor
+from torch.special import log_ndtr
+
+from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.calibrate._level_frames import refuse_unreadable, stack
+from neusee.nodes.calibrate._sensor_likelihood import Likelihood, without_details
+from neusee.nodes.flare._harvey_shack import lobe, on_far_pixels, scattered_share
+from neusee.nodes.sensor._digitization import Bits
+from neusee.nodes.sensor._saturation import Well, refuse_without_room, refuse_without_steps
+from neusee.nodes.units import (
+    DataFiles,
+    Diameter,
+    Electrons,
+    FocalLength,
+    Gain,
+    PixelPitch,
+    Real,
+    Wavelength,
+)
+
+# --- point source ---------------------------------------------------------------------------------
+
+# Reduction of overexposed frames of a point source to rings of pixels, from which the scatter of a
+# lens is fitted.
+
+
+Place = Annotated[float, Field(ge=0, le=1e6)]  #: pixels, from the middle of the first pixel
+Numbers = NDArray[np.float64]
+_CUT = 0.95  #: share of saturation from which a number says only that the pixel holds more
+_BELOW = 5.0  #: standard deviations by which a ring must lie below this cut to be averaged
+_WIDER = 1.04  #: ratio of the radii of a ring, from the radius at which this is wider than a pixel
+_PARTS = 4  #: parts of a ring, each of which has a radius of its own
+_LEAST = 16.0  #: pixels from the source to the first ring, below which pixels are not small
+_RINGS = 6  #: least number of rings that can tell anything of the scatter
+
+
+class Rings(NamedTuple):
+    """The mean signal in rings of pixels about an overexposed point source, and the rings that
+    are cut off.
+    """
+
+    mean: Tensor  #: (ring,) float64, e- of a pixel in one exposure, without offset
+    pixels: Tensor  #: (ring,) float64, number of pixels, of all frames
+    ring: Tensor  #: (part,) int64, ring of each part
+    square: Tensor  #: (part,) float64, pixels², mean squared distance from the source
+    weight: Tensor  #: (part,) float64, number of pixels
+    cut_square: Tensor  #: (cut,) float64, pixels², of each ring whose every pixel is cut off
+    cut: Tensor  #: () float64, e-: a pixel that is cut off has at least this signal
+    centre: Tensor  #: (2,) float64, y and x of the source, from the middle of the first pixel
+
+
+class _Camera(NamedTuple):
+    gain: float
+    offset: float
+    full_well: float
+    bits: int
+    read_noise: float
+
+    @property
+    def cut(self) -> float:
+        """Return the digital number above which a pixel says only that it holds more."""
+        return _CUT * min(2.0**self.bits - 1, self.full_well * self.gain)
+
+
+@node()
+def point_source(
+    *,
+    files: DataFiles,
+    gain: Gain,
+    offset: Electrons,
+    full_well: Well,
+    read_noise: Electrons,
+    bits: Bits = 16,
+    centre: tuple[Place, Place] | None = None,
+) -> Rings:
+    """Average the signal of an overexposed point source over rings about the source, and find the
+    rings cut off.
+
+    The source is at ``centre``, or in the middle of the saturated pixels. A pixel above 95 % of
+    saturation says only that it holds more. Averaged rings begin beyond 16 pixels, where the mean
+    lies five standard deviations below that cut; of the rings inside, those whose every pixel is
+    cut off are kept as a limit.
+
+    Shapes: files of (y, x) numbers -> rings (ring,), parts of rings (part,).
+    Units:  DN -> e-.
+    Error:  the centre from saturated pixels: 0.1 pixels, which changes a ring by (0.1 / r)**2. Lone
+            bright pixels beyond the core are left out.
+    Raises: ParameterError before the run, or ValueError, for frames without a saturated pixel, a
+            source that is not in the frame, numbers above the converter, and too few rings.
+    Source: photon-transfer model of EMVA Standard 1288, release 4.0 Linear; Peterson, Proc. SPIE
+            5178 (2004), 184.
+    """
+    camera = _Camera(gain, offset, full_well, bits, read_noise)
+    return reduce_rings(stack(files).astype(np.float64), camera, centre)
+
+
+@point_source.preflight
+def _(*, files: Sequence[Path], centre: tuple[float, float] | None, **params: Any) -> list[str]:
+    refuse_unreadable("files", files)
+    refuse_without_room(
+        params["full_well"], offset=params["offset"], read_noise=params["read_noise"]
+    )
+    refuse_without_steps(params["full_well"], gain=params["gain"], bits=params["bits"])
+    camera = _Camera(**{name: params[name] for name in _Camera._fields})
+    try:
+        reduce_rings(stack(files).astype(np.float64), camera, centre)
+    except ValueError as error:
+        raise ParameterError("files", str(error)) from None
+    return []
+
+
+@point_source.check
+def _(result: Rings, *others: Any, **params: Any) -> list[Check]:
+    first, last = (float(result.square[i].sqrt()) for i in (0, -1))
+    y, x = result.centre.tolist()
+    text = (
+        f"{len(result.mean)} rings from {first:.0f} to {last:.0f} pixels about the source at"
+        f" ({y:.1f}, {x:.1f})"
+    )
+    return [Check(text, bool((result.pixels > 0).all()))]
+
+
+def reduce_rings(frames: Numbers, camera: _Camera, centre: tuple[float, float] | None) -> Rings:
+    """Return the rings of frames (frame, y, x) of digital numbers; raise ValueError for frames
+    that tell nothing.
+    """
+    _refuse_numbers(frames, camera)
+    size = frames.shape[1:]
+    place = _middle(frames, camera) if centre is None else centre
+    if not all(-0.5 <= c <= n - 0.5 for c, n in zip(place, size, strict=True)):
+        raise ValueError(
+            f"the source at ({place[0]:g}, {place[1]:g}) is not in the frame of {size[0]} x"
+            f" {size[1]} pixels: give `centre` as y and x, in pixels"
+        )
+    y, x = np.ogrid[: size[0], : size[1]]
+    square = ((y - place[0]) ** 2 + (x - place[1]) ** 2).astype(np.float64)
+    sector = _part(square)
+    signal = frames / camera.gain - camera.offset
+    cut: NDArray[np.bool_] = np.asarray((frames >= camera.cut).any(0))
+    first = _first_ring(frames, sector // _PARTS, camera)
+    unsaturated = (sector >= first * _PARTS) & ~cut
+    hidden = _cut_rings(square, sector // _PARTS, cut, first)
+    below = (hidden, camera.cut / camera.gain - camera.offset, place)
+    rings = _averaged(signal, square, sector, unsaturated)
+    return Rings(*rings, *(torch.as_tensor(x, dtype=torch.float64) for x in below))
+
+
+def _refuse_numbers(frames: Numbers, camera: _Camera) -> None:
+    top = float(frames.max())
+    if top > 2**camera.bits - 1:
+        raise ValueError(
+            f"the frames hold {top:.0f} DN, which {camera.bits} bits cannot: give the `bits` of the"
+            " files"
+        )
+    if top < camera.cut:
+        raise ValueError(
+            f"no pixel is saturated: the brightest has {top:.0f} DN of {camera.cut / _CUT:.0f} DN:"
+            " expose longer, or check `bits`, `full_well` and `gain`"
+        )
+
+
+def _middle(frames: Numbers, camera: _Camera) -> tuple[float, float]:
+    """Return the middle of the saturated pixels; a median first excludes lone pixels far from
+    the source.
+    """
+    y, x = np.nonzero((frames >= camera.cut).all(0))
+    if not len(y):
+        raise ValueError(
+            "no pixel is saturated in every frame: give frames of one exposure, or give `centre`"
+        )
+    away = np.hypot(y - np.median(y), x - np.median(x))
+    near = away <= 3 * max(float(np.median(away)), 1.0)
+    return float(y[near].mean()), float(x[near].mean())
+
+
+def _part(square: Numbers) -> NDArray[np.int64]:
+    """Return the number of the part of a ring to which each pixel belongs, for rings that grow
+    from one pixel.
+    """
+    radius = np.sqrt(square)
+    turn = 1 / (_WIDER - 1)  # below this radius rings are one pixel wide
+    beyond = turn + np.log(np.maximum(radius, turn) / turn) / math.log(_WIDER)
+    ring: NDArray[np.int64] = np.floor(_PARTS * np.where(radius < turn, radius, beyond)).astype(
+        np.int64
+    )
+    return ring
+
+
+def _first_ring(frames: Numbers, ring: NDArray[np.int64], camera: _Camera) -> int:
+    """Return the first ring beyond which every ring lies clearly below saturation, lone bright
+    pixels aside.
+    """
+    count = np.bincount(ring.ravel())
+    cut = (frames >= camera.cut).any(0)
+    mean = np.bincount(ring.ravel(), frames.mean(0).ravel()) / count.clip(1)
+    noise = np.sqrt(np.maximum(mean * camera.gain, 0) + (camera.read_noise * camera.gain) ** 2)
+    many = np.bincount(ring.ravel(), cut.ravel()) > 0.05 * count
+    bright = (mean + _BELOW * noise >= camera.cut) | many
+    return max(int(np.flatnonzero(bright & (count > 0)).max(initial=-1)) + 1, int(_LEAST))
+
+
+def _cut_rings(
+    square: Numbers, ring: NDArray[np.int64], cut: NDArray[np.bool_], first: int
+) -> Numbers:
+    """Return the mean squared distance of each ring inside ``first`` and beyond 16 pixels whose
+    every pixel is cut.
+    """
+    count, lost, total = (
+        np.bincount(ring.ravel(), x.ravel()) for x in (np.ones_like(square), cut, square)
+    )
+    numbers = np.arange(len(count))
+    hidden = (numbers < first) & (numbers >= _LEAST) & (count > 0) & (lost == count)
+    mean: Numbers = total[hidden] / count[hidden]
+    return mean
+
+
+def _averaged(
+    signal: Numbers, square: Numbers, sector: NDArray[np.int64], unsaturated: NDArray[np.bool_]
+) -> tuple[Tensor, ...]:
+    """Return mean and number of pixels of each ring, and ring, mean squared distance and pixels
+    of each part.
+    """
+    numbers, group = np.unique(sector[unsaturated], return_inverse=True)
+    count = np.bincount(group).astype(np.float64)
+    distance, mean = (
+        np.bincount(group, values[unsaturated]) / count for values in (square, signal.mean(0))
+    )
+    ring, of = np.unique(numbers // _PARTS, return_inverse=True)
+    if len(ring) < _RINGS:
+        raise ValueError(
+            f"only {len(ring)} rings of pixels lie between the saturated pixels and the edge of the"
+            " frame: expose less, or give a larger frame with the source in it"
+        )
+    pixels = np.bincount(of, count)
+    columns = (
+        np.bincount(of, count * mean) / pixels,
+        pixels * len(signal),
+        of.astype(np.int64),
+        distance,
+        count,
+    )
+    return tuple(torch.as_tensor(x) for x in columns)
+
+
+# --- scatter likelihood ---------------------------------------------------------------------------
+
+# The likelihood of the rings about an overexposed point source under the Harvey-Shack scatter of a
+# lens.
+
+
+Positive = Annotated[float, Field(ge=1e-12, le=1e12)]
+Scattered = Annotated[float, Field(ge=0, le=100)]  #: a standard deviation; 0 for none
+#: relative: how well the mean wing of the core is that of a ring that is one pixel wide
+_FRINGES = 0.02
+
+
+@node()
+def stray_light(
+    rings: Rings,
+    *,
+    b0: Positive,
+    l: Positive,  # noqa: E741 (the symbol of the literature)
+    s: Real,
+    electrons: Annotated[Electrons, Field(gt=0)],
+    background: Real = 0.0,
+    core: Scattered = 1.0,
+    scatter: Scattered = 0.0,
+    read_noise: Electrons,
+    gain: Gain,
+    focal_length: FocalLength,
+    diameter: Diameter,
+    pixel_pitch: PixelPitch,
+    wavelength: Wavelength,
+    told: bool = True,
+) -> Likelihood:
+    """Compute the likelihood of the rings about a point source under one Harvey-Shack surface at
+    the entrance pupil.
+
+    The mean of a pixel is ``electrons`` times ((1 - TIS) core + scattered light) plus
+    ``background``; ``electrons`` are those of the whole source in one exposure, and the distance r
+    stands for the direction cosine r / focal_length. The core is ``core`` times the mean
+    diffraction wing of a round aperture, wavelength N pitch**2 / (pi**3 r**3) with N = focal_length
+    / diameter. The mean of a ring is normal, with shot noise, ``read_noise``, rounding, and a
+    relative standard deviation ``scatter`` for what the model lacks, such as fringes and unequal
+    pixels. The mean of a ring whose every pixel is cut off is at least the cut. Any number may be a
+    tensor (walker,).
+
+    Shapes: rings -> log (walker,), deviance (walker, ring), scaled (walker, row).
+    Units:  b0 1/sr; electrons, background, read_noise e- of one exposure; log in nats.
+    Error:  parts of rings are averaged over squared distance, 1e-4 of a ring. Diffraction fringes
+            are averaged; a ring one fringe wide keeps a few per cent of them, which ``scatter``
+            must cover.
+    Source: Harvey, thesis, Univ. of Arizona (1976); Peterson, Proc. SPIE 5178 (2004), 184; wing of
+            the core: Born and Wolf, Principles of Optics, 7th ed., section 8.5.2, the energy
+            outside a radius for large radii.
+    """
+    source = {"electrons": electrons, "background": background, "core": core, "scatter": scatter}
+    scatter_values = {"b0": b0, "l": l, "s": s, **source}
+    numbers = {
+        name: torch.as_tensor(x, dtype=torch.float64)[..., None]
+        for name, x in scatter_values.items()
+    }
+    lens = (wavelength * focal_length / (diameter * pixel_pitch), pixel_pitch / focal_length)
+    mean = _averaged_rings(_light(numbers, rings.square, *lens), rings) + numbers["background"]
+    alone = mean.clamp_min(0) + read_noise**2 + 1 / (12 * gain**2)
+    variance = alone / rings.pixels + (numbers["scatter"] * (mean - numbers["background"])).square()
+    away = (rings.mean - mean) / variance.sqrt()
+    hidden = _light(numbers, rings.cut_square, *lens) + numbers["background"]
+    above = log_ndtr((hidden - rings.cut) / (hidden * torch.hypot(numbers["scatter"], _ripple())))
+    log = -0.5 * (away.square() + variance.log()).sum(-1) + above.sum(-1)
+    total = log.where(_total(numbers)[..., 0] < 1, -torch.inf)
+    if not told:
+        return without_details(total)
+    # squared derivatives of a residual and of its log width sum, on average, to the Fisher
+    # information
+    rows = torch.cat(torch.broadcast_tensors(away, 0.5 * variance.log()), -1)  # type: ignore[no-untyped-call]
+    return Likelihood(total, away.square(), torch.ones_like(rings.mean), rows, mean, variance)
+
+
+@stray_light.check
+def _(result: Likelihood, rings: Rings, **params: Any) -> list[Check]:
+    if not len(result.degrees_of_freedom):
+        return []
+    return [Check(f"deviance {float(result.deviance.sum()):.4g} of {len(rings.mean)} rings")]
+
+
+def _ripple() -> Tensor:
+    return torch.tensor(_FRINGES, dtype=torch.float64)
+
+
+def _total(numbers: Mapping[str, Tensor]) -> Tensor:
+    return scattered_share(numbers["b0"], numbers["l"], numbers["s"])
+
+
+def _light(numbers: dict[str, Tensor], square: Tensor, fringe: float, scale: float) -> Tensor:
+    """Return the electrons of the source in pixels at squared distances; ``fringe`` is
+    wavelength N in pixels.
+    """
+    light: Tensor = numbers["electrons"] * share_of_light(numbers, square, fringe, scale)
+    return light
+
+
+def share_of_light(
+    numbers: Mapping[str, Tensor], square: Tensor, fringe: float, scale: float
+) -> Tensor:
+    """Return the share of the light that core and scatter send into pixels at squared distances
+    from the source.
+
+    ``fringe`` is wavelength N in pixels, and ``scale`` the direction cosine of a pixel.
+    """
+    b0, l, s = (numbers[name] for name in ("b0", "l", "s"))  # noqa: E741
+    veil = on_far_pixels(lobe(b0, l, s, torch.tensor(scale, dtype=torch.float64)), square)
+    return (1 - _total(numbers).clamp_max(1)) * numbers["core"] * diffraction_wing(
+        square, fringe
+    ) + veil
+
+
+def diffraction_wing(square: Tensor, fringe: float) -> Tensor:
+    """Return the mean share of light per pixel of a round aperture far from the source, with the
+    pixel integrated.
+    """
+    return fringe / (math.pi**3 * square**1.5) * (1 + 9 / (24 * square))
+
+
+def _averaged_rings(parts: Tensor, rings: Rings) -> Tensor:
+    """Return the mean over the parts of each ring, (..., ring)."""
+    share = (
+        rings.weight
+        / torch.zeros_like(rings.mean).index_add(0, rings.ring, rings.weight)[rings.ring]
+    )
+    return parts.new_zeros(*parts.shape[:-1], len(rings.mean)).index_add(
+        -1, rings.ring, parts * share
+    )
+
+
+def guess_scatter(
+    rings: Rings, believed: Mapping[str, float], params: Mapping[str, Any]
+) -> dict[str, float]:
+    """Return a first guess of the scatter: over a grid of l and s, the b0 and background that fit
+    the rings best.
+
+    Guesses that scatter more than all light are left out.
+
+    Shapes: rings; numbers by name, with the names of ``believed``; ``params`` are those of
+            `stray_light`.
+    Units:  those of `stray_light`.
+    Error:  a start for a search, not an estimate.
+    Source: linear least squares.
+    """
+    scale, best, lowest = params["pixel_pitch"] / params["focal_length"], dict(believed), math.inf
+    weight = (
+        rings.pixels
+        / (rings.mean.clamp_min(0) + params["read_noise"] ** 2 + 1 / params["gain"] ** 2)
+    ).sqrt()
+    fringe = (
+        params["wavelength"] * params["focal_length"] / (params["diameter"] * params["pixel_pitch"])
+    )
+    wing = diffraction_wing(rings.square, fringe)
+    for l in (believed["l"] * 3.0**n for n in range(-4, 5)):  # noqa: E741
+        for s in (believed["s"] + 0.35 * n for n in range(-4, 5)):
+            unit = lobe(*(torch.tensor(x, dtype=torch.float64) for x in (1.0, l, s, scale)))
+            rows = torch.stack(
+                [
+                    _averaged_rings(on_far_pixels(unit, rings.square), rings),
+                    torch.ones_like(rings.mean),
+                ],
+                1,
+            )
+            rows[:, 0] *= believed["electrons"]
+            scattered = rings.mean - believed["electrons"] * believed["core"] * _averaged_rings(
+                wing, rings
+            )
+            fit = torch.linalg.lstsq(
+                rows * weight[:, None], (scattered * weight)[:, None]
+            ).solution[:, 0]
+            off = float(((rows @ fit - scattered) * weight).square().sum())
+            share = float(fit[0]) * float(
+                scattered_share(*(torch.tensor(x, dtype=torch.float64) for x in (1.0, l, s)))
+            )
+            if off < lowest and 0 < share < 1:
+                lowest, best = off, best | {"b0": float(fit[0]), "l": l, "s": s}
+    return best

@@ -1,0 +1,438 @@
+"""Uncertainty budgets of the quantities of the EMVA 1288 sheet, and their sources."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from neusee.nodes.calibrate._camera_likelihood import CAMERA_PARAMETERS, _Camera, _signal, _used
+from neusee.nodes.calibrate._emva_fit import without_histograms
+from neusee.nodes.calibrate._emva_quantities import SENSITIVITY, Quantity
+from neusee.nodes.calibrate._emva_sheet import EmvaSheet, emva_sheet
+from neusee.nodes.calibrate._laboratory import Laboratory, laboratory_contributions
+from neusee.nodes.calibrate._nonuniformity import chance_of_variances
+from neusee.nodes.calibrate._uncertainty_budget import (
+    NOT_INVOLVED,
+    NOT_STATED,
+    Budget,
+    Contribution,
+    welch_satterthwaite,
+)
+from neusee.nodes.values import Levels
+
+# --- camera sources -------------------------------------------------------------------------------
+
+# The sources of the scatter of a real camera's levels: statistics of the frames, lamp, dark signal
+# and variances.
+
+
+STATISTICS = "statistics of the frames"
+LAMP = "lamp, from level to level"
+DRIFT = "dark signal, from level to level"
+SCATTER = "variances, beyond sampling"
+SOURCES = (STATISTICS, LAMP, DRIFT, SCATTER)
+
+
+def camera_sources(levels: Levels, params: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Return the share of each source in the variance of each row of `Likelihood.scaled` of
+    `camera`.
+
+    ``params`` are the parameters of `camera` at the mode.
+
+    Shapes: levels (level,) -> (row,) by source; the shares of a row add up to 1.
+    Units:  none.
+    Error:  exact for the model of `camera`.
+    Source: the variance of a mean and of a log variance in `camera`, term by term.
+    """
+    fitted, top, _ = _used(levels, params["share"])
+    fitted_levels = without_histograms(levels, fitted)
+    camera = _Camera(
+        *(torch.as_tensor(params[name], dtype=torch.float64) for name in CAMERA_PARAMETERS)
+    )
+    signal = _signal(fitted_levels.mean - camera.signal, top, camera)
+    light = camera.lamp * camera.efficiency * fitted_levels.photons * signal.slope
+    chance, drift = (
+        fitted_levels.variance / fitted_levels.pixels,
+        camera.drift.square() * torch.ones_like(light),
+    )
+    means = {STATISTICS: chance, LAMP: light.square(), DRIFT: drift}
+    variances = {
+        STATISTICS: 2.0 / fitted_levels.degrees_of_freedom,
+        SCATTER: camera.scatter.square() * torch.ones_like(light),
+    }
+    parts = [_shares(squares) for squares in (variances, means)]
+    none = torch.zeros_like(light)
+    rows = {source: [shares.get(source, none) for shares in parts] for source in SOURCES}
+    return {source: torch.cat([a, a, b, b]) for source, (a, b) in rows.items()}
+
+
+def source_freedom(
+    levels: Levels, params: Mapping[str, Any], free: tuple[str, ...]
+) -> dict[str, float]:
+    """Return the degrees of freedom of each source: observations that scatter, less the ``free``
+    parameters they fit.
+
+    Shapes: scalars by source.
+    Units:  none.
+    Source: JCGM 100:2008 (GUM), section 4.2.6 and G.3.3.
+    """
+    fitted, _, _ = _used(levels, params["share"])
+    lit = int((levels.photons[fitted] > 0).sum())
+    response = [name in free for name in ("quantum_efficiency", "bend", "twist")]
+    dark = [name in free for name in ("dark_signal", "dark_current")]
+    noise = [name in free for name in ("gain", "temporal_dark_noise")]
+    return {
+        STATISTICS: float(levels.degrees_of_freedom[fitted].sum()),
+        LAMP: float(max(1, lit - sum(response))),
+        DRIFT: float(max(1, len(fitted) - lit - sum(dark))),
+        SCATTER: float(max(1, len(fitted) - sum(noise))),
+    }
+
+
+def variance_shares(
+    slopes: Tensor, sources: Mapping[str, Tensor], along: Tensor
+) -> dict[str, float]:
+    """Return the share of each source, and of the prior, in the variance of a function of the
+    parameters.
+
+    The estimate is linear in the scattering rows, so that its covariance is a sum over sources: C
+    J^T F J C for the shares F of a source in the rows, and C C for the prior, with C = (J^T J +
+    1)^-1.
+
+    Shapes: slopes (row, free) derivatives per standard deviation of the prior; sources (row,)
+            shares; along (free,) derivative of the function per standard deviation of the prior ->
+            shares that add up to 1.
+    Units:  none.
+    Source: JCGM 100:2008 (GUM), section 5.1, for a least-squares estimate with a prior.
+    """
+    free = slopes.shape[1]
+    root = torch.linalg.cholesky(slopes.T @ slopes + torch.eye(free, dtype=slopes.dtype))
+    gradient = torch.cholesky_solve(along[:, None], root)[:, 0]
+    response = slopes @ gradient
+    parts = {name: float((share * response.square()).sum()) for name, share in sources.items()}
+    parts["prior"] = float(gradient @ gradient)
+    total = math.fsum(parts.values())
+    return {name: variance / total for name, variance in parts.items()}
+
+
+def _shares(parts: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    total = torch.stack(list(parts.values())).sum(0)
+    return {name: variance / total for name, variance in parts.items()}
+
+
+# --- sheet budget ---------------------------------------------------------------------------------
+
+# The uncertainty budgets of the quantities of an EMVA 1288 sheet, by the law of propagation of
+# uncertainty.
+
+
+MODEL = "model of the response"
+SPACING = "spacing of the light levels"
+_STEP = 0.1  #: standard uncertainties of an input, half the step of a derivative
+_SCALE = 1e-4  #: half the step of a derivative by the photons, relative
+_NOTHING = 1e-6  #: share of a value below which a change is rounding
+_HALF = 0.5 * SENSITIVITY  #: share of saturation up to which the second model fits its lines
+#: change of a slope from 70 % of saturation to no light, over that from 70 to 35 %, if it is
+#: proportional
+_BENT = 2.0
+#: by key of the sheet: the parameter of `camera` whose temperature coefficient counts, and its sign
+_COEFFICIENTS = {
+    "K": ("gain", 1.0),
+    "inverse_K": ("gain", -1.0),
+    "eta": ("quantum_efficiency", 1.0),
+    "sigma_d": ("temporal_dark_noise", 1.0),
+    "mu_y_dark": ("dark_signal", 1.0),
+    "mu_I_mean": ("dark_current", 1.0),
+    "mu_I_var": ("dark_current", 1.0),
+}
+
+#: by key: dy/ds for a relative change s of the saturation, over y, or as it stands for a logarithm
+_SATURATION = {"mu_p_sat": 1.0, "mu_e_sat": 1.0, "SNR_max": 0.5, "DR": 1.0}
+_LOGARITHMS = {
+    "SNR_max_dB": 10 / math.log(10),
+    "SNR_max_bit": 0.5 / math.log(2),
+    "DR_dB": 20 / math.log(10),
+    "DR_bit": 1 / math.log(2),
+    "SNR_max_general": 10 / math.log(10),
+    "DR_general": 20 / math.log(10),
+}
+
+Values = dict[str, float]
+
+
+@dataclass(frozen=True)
+class _Propagation:
+    """How far all quantities of a sheet move with its levels, the light of each level, all
+    photons and the model.
+    """
+
+    levels: Levels
+    sheet: EmvaSheet
+    photons_told: bool  #: True if the photons are known
+
+    def values(self, levels: Levels) -> Values:
+        """Return the quantities of levels that have a value, without those of series of frames."""
+        quantities = emva_sheet(levels, None, photons_told=self.photons_told).quantities
+        return {q.key: q.value for q in quantities if q.value is not None}
+
+    @cached_property
+    def statistics(self) -> dict[str, list[Contribution]]:
+        """Return the contributions of the mean and of the variance of each level, by key."""
+        levels = self.levels
+        parts: dict[str, list[Contribution]] = {}
+        for name, error, freedom in (
+            ("mean", (levels.variance / levels.pixels).sqrt(), levels.pixels - 1),
+            (
+                "variance",
+                levels.variance * (2 / levels.degrees_of_freedom).sqrt(),
+                levels.degrees_of_freedom,
+            ),
+        ):
+            for i, (u, nu) in enumerate(zip(error.tolist(), freedom.tolist(), strict=True)):
+                if u > 0:
+                    for key, slope in self._slopes(self._moved(name, i), _STEP * u).items():
+                        parts.setdefault(key, []).append(
+                            Contribution("", "A", "", u, "", slope, nu)
+                        )
+        return parts
+
+    @cached_property
+    def light(self) -> Values:
+        """Return the root of the sum of squares of dy/de over the lit levels, e the relative
+        light of one level.
+        """
+        sums: Values = {}
+        for i in (self.levels.photons > 0).nonzero().squeeze(1).tolist():
+            for key, slope in self._slopes(self._lit(i), _SCALE).items():
+                sums[key] = sums.get(key, 0.0) + slope**2
+        return {key: math.sqrt(x) for key, x in sums.items()}
+
+    @cached_property
+    def photons(self) -> Values:
+        """Return dy/ds for a relative change s of all numbers of photons."""
+        return self._slopes(
+            lambda s: self.levels._replace(photons=self.levels.photons * (1 + s)), _SCALE
+        )
+
+    @cached_property
+    def other_model(self) -> Values:
+        """Return the quantities with lines that are fitted up to 35 % of saturation only."""
+        levels, transfer = self.levels, self.sheet.transfer
+        full = float(transfer.signal[transfer.saturation])
+        darkest = float(transfer.mean_dark.min())
+        above = levels.mean - darkest
+        used_levels = (levels.photons == 0) | (above <= _HALF * full) | (above > SENSITIVITY * full)
+        try:
+            return self.values(without_histograms(levels, used_levels))
+        except ValueError:
+            return {}
+
+    @cached_property
+    def lamp(self) -> tuple[float, float]:
+        """Return the relative scatter of the light from level to level beyond chance, and its
+        degrees of freedom.
+        """
+        transfer, line = self.sheet.transfer, self.sheet.linearity
+        if line is None:
+            return math.nan, math.nan
+        linear_levels = transfer.linear
+        order = _lit_order(self.levels)
+        chance = (self.levels.variance / self.levels.pixels).numpy()[order][
+            linear_levels
+        ] / transfer.signal[linear_levels] ** 2
+        freedom = len(line.deviation) - 2
+        square = float(((line.deviation / 100) ** 2).sum()) / freedom - float(chance.mean())
+        return math.sqrt(max(square, 0.0)), float(freedom)
+
+    @cached_property
+    def spacing(self) -> float:
+        """Return the standard uncertainty of the saturation, relative, that lies between its two
+        neighbouring levels.
+
+        The distribution is rectangular, from the level before to the level after.
+        """
+        photons, top = self.sheet.transfer.photons, self.sheet.transfer.saturation
+        around = photons[[max(0, top - 1), min(len(photons) - 1, top + 1)]]
+        return float(np.abs(around - photons[top]).max() / photons[top] / math.sqrt(3))
+
+    def _slopes(self, levels_at: Callable[[float], Levels], step: float) -> Values:
+        high, low = self.values(levels_at(step)), self.values(levels_at(-step))
+        return {key: (high[key] - low[key]) / (2 * step) for key in high.keys() & low.keys()}
+
+    def _moved(self, name: str, i: int) -> Callable[[float], Levels]:
+        def at(step: float) -> Levels:
+            return self.levels._replace(**{name: _added(getattr(self.levels, name), i, step)})
+
+        return at
+
+    def _lit(self, i: int) -> Callable[[float], Levels]:
+        """Return the levels as a function of the relative light of level ``i``, which moves mean
+        and variance.
+        """
+        levels, dark = self.levels, self.levels.photons == 0
+        nearest = torch.where(
+            dark, (levels.exposure - levels.exposure[i]).abs(), torch.inf
+        ).argmin()
+        signal, excess = (float(x[i] - x[nearest]) for x in (levels.mean, levels.variance))
+
+        def at(step: float) -> Levels:
+            mean, variance = (
+                _added(levels.mean, i, step * signal),
+                _added(levels.variance, i, step * excess),
+            )
+            return levels._replace(mean=mean, variance=variance)
+
+        return at
+
+
+def sheet_budgets(
+    levels: Levels, sheet: EmvaSheet, laboratory: Laboratory, photons_told: bool = True
+) -> list[Budget]:
+    """Return the uncertainty budget of each quantity of a sheet that has a value and no mere limit.
+
+    Derivatives are central differences of the whole sheet. The sources are the sampling of means
+    and variances, the scatter of the light from level to level, which the deviations from the line
+    of linearity give, the spacing of the levels, the model of the response, and what ``laboratory``
+    states. For the model the lines are fitted up to 35 % of saturation too. A slope that changes in
+    proportion to the range changes twice as much down to no light, and the quantity may lie
+    anywhere within that.
+
+    Shapes: levels (level,).
+    Units:  those of each quantity.
+    Error:  first order in the uncertainties.
+    Source: JCGM 100:2008 (GUM), equation 10; EMVA Standard 1288, release 4.0 Linear.
+    """
+    plain = without_histograms(levels, torch.arange(len(levels.mean)))
+    moves = _Propagation(plain, sheet, photons_told)
+    stated = [q for q in sheet.quantities if q.value is not None and not q.bound]
+    gain = sheet["K"]
+    of_measurement = {}
+    for q in stated:
+        own = list(_spatial(q, sheet, moves) if _is_spatial(q) else _of_levels(q, moves))
+        of_measurement[q.key] = own
+    return [_budget(q, of_measurement[q.key], moves, laboratory, gain) for q in stated]
+
+
+def _budget(
+    q: Quantity,
+    own: list[Contribution],
+    moves: _Propagation,
+    laboratory: Laboratory,
+    gain: Quantity,
+) -> Budget:
+    assert q.value is not None
+    name, sign = _COEFFICIENTS.get(q.key, (q.key, 1.0))
+    key = q.key if q.key in laboratory.coefficients else name
+    photons = moves.photons.get(q.key, 0.0)
+    photons = photons if abs(photons) > _NOTHING * abs(q.value) else 0.0
+    of_laboratory = laboratory_contributions(key, sign * q.value, photons, laboratory)
+    return Budget(q.key, q.name, q.symbol, q.unit, q.value, (*own, *of_laboratory))
+
+
+def _of_levels(q: Quantity, moves: _Propagation) -> Iterator[Contribution]:
+    assert q.value is not None
+    parts = moves.statistics.get(q.key, [])
+    u = math.hypot(*(c.share or 0.0 for c in parts), 0.0)
+    freedom = welch_satterthwaite(parts)
+    if u > _NOTHING * abs(q.value):
+        yield Contribution(STATISTICS, "A", "normal", u, q.unit, 1.0, freedom)
+    else:
+        yield Contribution(STATISTICS, "A", reason=NOT_INVOLVED)
+    yield _of_lamp(moves.light.get(q.key, 0.0), q.value, moves)
+    if sensitivity := _LOGARITHMS.get(q.key, _SATURATION.get(q.key, 0.0) * q.value):
+        yield Contribution(SPACING, "B", "rectangular", moves.spacing, "relative", sensitivity)
+    other = moves.other_model.get(q.key)
+    if other is None:
+        yield Contribution(
+            MODEL, "B", reason=f"{NOT_STATED}: too few levels up to 35 % of saturation"
+        )
+    elif abs(other - q.value) <= _NOTHING * abs(q.value):
+        yield Contribution(MODEL, "B", reason=NOT_INVOLVED)
+    else:
+        yield Contribution(
+            MODEL, "B", "rectangular", _BENT * abs(other - q.value) / math.sqrt(3), q.unit
+        )
+
+
+def _of_lamp(sensitivity: float, value: float, moves: _Propagation) -> Contribution:
+    scatter, freedom = moves.lamp
+    if sensitivity <= _NOTHING * abs(value):
+        return Contribution(LAMP, "A", reason=NOT_INVOLVED)
+    if not math.isfinite(scatter):
+        return Contribution(LAMP, "A", reason=f"{NOT_STATED}: fewer than three levels on the line")
+    return Contribution(LAMP, "A", "normal", scatter, "relative", sensitivity, freedom)
+
+
+def _is_spatial(q: Quantity) -> bool:
+    return q.key.startswith(("DSNU1288", "PRNU1288"))
+
+
+def _chance_of_pattern(q: Quantity, sheet: EmvaSheet) -> float:
+    """Return the standard error of the square of a quantity of series of frames, by chance."""
+    lit, dark = sheet.spatial.lit, sheet.spatial.dark
+    pattern = q.key.removesuffix("_DN").partition("_")[2]
+    index = ("", "row", "column", "pixel").index(pattern)
+    of_response = q.key.startswith("PRNU")
+    series = (dark, lit) if of_response else (dark,)
+    error = math.hypot(*(chance_of_variances(frames)[index] for frames in series if frames))
+    if of_response and lit is not None and dark is not None:
+        return error * (100 / float(lit.average.mean() - dark.average.mean())) ** 2
+    return error
+
+
+def _spatial(q: Quantity, sheet: EmvaSheet, moves: _Propagation) -> Iterator[Contribution]:
+    """Yield the contributions of a quantity of series of frames; one in electrons has those of
+    the gain too.
+    """
+    assert q.value is not None
+    gain = sheet["K"].value if q.unit == "e-" else None
+    own = _chance_of_pattern(q, sheet) / (2 * q.value) / (gain or 1.0) ** 2
+    dark = sheet.spatial.dark
+    pixels = float(dark.total.size if dark else 1) - 1
+    if not gain:
+        yield Contribution(STATISTICS, "A", "normal", own, q.unit, 1.0, pixels)
+        yield Contribution(LAMP, "A", reason=NOT_INVOLVED)
+        yield Contribution(MODEL, "B", reason=NOT_INVOLVED)
+        return
+    chance, lamp, model = _of_levels(sheet["K"], moves)
+    ratio = q.value / gain
+    parts = [Contribution("", "A", "", own, "", 1.0, pixels), _scaled(chance, ratio)]
+    u = math.hypot(*(c.share or 0.0 for c in parts))
+    yield Contribution(STATISTICS, "A", "normal", u, q.unit, 1.0, welch_satterthwaite(parts))
+    yield _scaled(lamp, ratio)
+    yield _scaled(model, ratio)
+
+
+def _scaled(c: Contribution, by: float) -> Contribution:
+    return Contribution(
+        c.source,
+        c.kind,
+        c.distribution,
+        c.uncertainty,
+        c.unit,
+        c.sensitivity * by,
+        c.freedom,
+        c.reason,
+    )
+
+
+def _added(values: Tensor, i: int, step: float) -> Tensor:
+    moved = values.clone()
+    moved[i] += step
+    return moved
+
+
+def _lit_order(levels: Levels) -> NDArray[np.int64]:
+    """Return the indices of the lit levels in the order of `PhotonTransfer`."""
+    photons, exposure = levels.photons.numpy(), levels.exposure.numpy()
+    lit = np.flatnonzero(photons > 0)
+    order: NDArray[np.int64] = lit[np.lexsort((exposure[lit], photons[lit]))]
+    return order

@@ -1,0 +1,377 @@
+"""Fabrication of a mask: wrapping, depth, levels, smallest feature, and random errors."""
+
+import math
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import Check, ParameterError, TensorStats, node
+from neusee.nodes.doe._refractive_index import (
+    AnyGlass,
+    Glass,
+    height_checks,
+    nearest_known,
+    refuse_material,
+    wave_height,
+)
+from neusee.nodes.optics._pupil_grid import grid_of, refuse_other_grid, stripes
+from neusee.nodes.optics._zernike import factors
+from neusee.nodes.precision import refuse_half
+from neusee.nodes.units import Depth, Length, PupilPitch, Wavelength
+from neusee.nodes.values import Stop
+
+# --- fabrication limits ---------------------------------------------------------------------------
+
+# Fabrication limits of a mask: wrapping, limited depth, discrete heights.
+
+
+Levels = Annotated[int, Field(ge=2, le=65536)]
+_VIOLET = 400e-9  #: m, wavelength at which a change of height is converted to a change of phase
+
+
+def _quantize(height: Tensor, step: float, levels: int, cyclic: bool) -> Tensor:
+    """Round each height to the nearest of ``levels`` discrete heights; the gradient passes
+    through unchanged.
+    """
+    with torch.no_grad():
+        level = (height / step).round()
+        level = level.remainder(levels) if cyclic else level.clamp(0, levels - 1)
+        change = level * step - height
+    return height + change.detach()  # without a tangent too
+
+
+def _refuse(
+    material: AnyGlass, wrap_at: float | None, levels: int | None, max_height: float | None
+) -> None:
+    if (
+        wrap_at is not None
+        and max_height is not None
+        and wave_height(material, wrap_at) > max_height
+    ):
+        wave = f"{wave_height(material, wrap_at) * 1e6:.3f} um"
+        text = (
+            f"{max_height * 1e6:.3g} um is less than one wave of wrap_at in {_name(material)}:"
+            f" needs at least {wave}"
+        )
+        raise ParameterError("max_height", text)
+    if levels is not None and wrap_at is None and max_height is None:
+        raise ParameterError(
+            "levels", f"{levels} levels need a total depth: set wrap_at or max_height"
+        )
+
+
+def _name(material: AnyGlass) -> str:
+    return material if isinstance(material, str) else "this glass"
+
+
+@node(rtol=1e-5)
+def fabricate(
+    height: Tensor,
+    *,
+    material: Glass = "fused silica",
+    wrap_at: Wavelength | None = None,
+    levels: Levels | None = None,
+    max_height: Depth | None = None,
+) -> Tensor:
+    """Wrap the height map at one wave of ``wrap_at`` or limit it to ``max_height``, then round to
+    ``levels`` heights.
+
+    The levels of a wrapped height map divide one wave, whose top equals its bottom. The levels of a
+    limited height map run from 0 to ``max_height`` inclusive. Wrapping and rounding have the
+    gradient 1; a height that is cut off has 0.
+
+    Shapes: (v, u) -> (v, u).
+    Units:  m.
+    Error:  1e-7 of the result (float32), for any number of wraps.
+    Raises: ParameterError where one wave is deeper than ``max_height``, or levels have no depth to
+            divide; ValueError for a height in half precision.
+    Source: Swanson, MIT Lincoln Laboratory Technical Report 854 (1989), for multi-level elements.
+    """
+    _refuse(material, wrap_at, levels, max_height)
+    refuse_half(height=height)
+    if wrap_at is not None:
+        period = wave_height(material, wrap_at)
+        # the period too is rounded in float32
+        wrapped = height.double().remainder(period).to(height.dtype)
+        return (
+            wrapped if levels is None else _quantize(wrapped, period / levels, levels, cyclic=True)
+        )
+    if max_height is None:
+        return height
+    limited = height.clamp(0, max_height)
+    return (
+        limited
+        if levels is None
+        else _quantize(limited, max_height / (levels - 1), levels, cyclic=False)
+    )
+
+
+@fabricate.reference
+def _(
+    height: Tensor,
+    *,
+    material: AnyGlass,
+    wrap_at: float | None,
+    levels: int | None,
+    max_height: float | None,
+) -> Tensor:
+    """Compare each height with every allowed height, and return the nearest allowed height."""
+    wave = None if wrap_at is None else wave_height(material, wrap_at)
+    x = height.to(torch.float64)
+    x = x if wave is None else x - wave * (x / wave).floor()
+    x = x if max_height is None else torch.minimum(x, torch.full_like(x, max_height)).clamp(min=0)
+    top = wave or max_height
+    if levels is None or top is None:
+        return x
+    allowed = [
+        top * k / (levels if wave else levels - 1) for k in range(levels + 1 if wave else levels)
+    ]
+    table = torch.tensor(allowed, dtype=torch.float64, device=x.device)
+    nearest = table[(x[..., None] - table).abs().argmin(-1)]
+    return nearest if wave is None else torch.where(nearest == wave, 0.0, nearest)
+
+
+@fabricate.skip_bound
+def _(
+    height: TensorStats,
+    *,
+    material: AnyGlass,
+    wrap_at: float | None,
+    levels: int | None,
+    max_height: float | None,
+) -> float:
+    """Return an upper bound of the relative change of a height map by fabrication; 0 if every
+    height fits.
+
+    A small change of height may be a large phase: the bound is never below the phase, in radians,
+    of that change at 400 nm, or at the nearest wavelength at which the glass is known. Wrapping
+    turns no phase at ``wrap_at``, and counts in full all the same.
+    """
+    top = max_height if wrap_at is None else wave_height(material, wrap_at)
+    if not height.finite or top is None:
+        return 0.0 if height.finite else math.inf
+    ends = torch.tensor([height.min, height.max], dtype=getattr(torch, height.dtype))
+    change = _largest_change(ends, top, levels, cyclic=wrap_at is not None)
+    if change == 0:
+        return 0.0
+    fabricated = fabricate(
+        ends, material=material, wrap_at=wrap_at, levels=levels, max_height=max_height
+    )
+    deepest, phase = (
+        float(fabricated.abs().max()),
+        2 * math.pi * change / wave_height(material, nearest_known(material, _VIOLET)),
+    )
+    return max(phase, change / deepest if deepest > 0 else math.inf)
+
+
+def _largest_change(ends: Tensor, top: float, levels: int | None, cyclic: bool) -> float:
+    """Return an upper bound, in m, of the change of any height within ``ends`` by fabrication;
+    exact without levels.
+    """
+    low, high = (float(end) for end in ends)
+    if not cyclic:
+        # the limit in the precision of the height map
+        top = float(torch.tensor(top, dtype=ends.dtype))
+        return max(high - top, -low, 0.0 if levels is None else top / (levels - 1) / 2)
+    waves = max(abs(math.floor(low / top)), abs(math.floor(high / top)))
+    if levels is None:
+        return top * waves
+    # to a whole wave, which is 0
+    rounded_up = high >= top * (1 - 0.5 / levels) * (1 - 4 * torch.finfo(ends.dtype).eps)
+    return top * (waves + rounded_up + 0.5 / levels)
+
+
+@fabricate.preflight
+def _(
+    *, material: AnyGlass, wrap_at: float | None, levels: int | None, max_height: float | None
+) -> list[str]:
+    refuse_material(
+        "wrap_at",
+        material,
+        None if wrap_at is None else torch.tensor([wrap_at], dtype=torch.float64),
+    )
+    _refuse(material, wrap_at, levels, max_height)
+    if max_height is not None and wrap_at is None:
+        return [
+            f"heights above max_height {max_height * 1e6:.3g} um are cut flat: set wrap_at to wrap"
+            " the heights instead"
+        ]
+    return []
+
+
+@fabricate.check
+def _(
+    result: Tensor, height: Tensor, *, wrap_at: float | None, max_height: float | None, **_: Any
+) -> list[Check]:
+    checks = [
+        Check(
+            f"mask {float(height.max()) * 1e6:.4g} um deep, {float(result.max()) * 1e6:.4g} um as"
+            " fabricated"
+        )
+    ]
+    if max_height is not None and wrap_at is None:
+        share = float((height > max_height).double().mean())
+        checks.append(
+            Check(f"heights cut flat at max_height: {share:.2%} of the pupil grid", share == 0)
+        )
+    return checks
+
+
+# --- minimum feature ------------------------------------------------------------------------------
+
+# Smallest feature of a fabrication tool: the average of a height map over the spot of the tool.
+
+
+_REACH = 6.0  #: standard deviations beyond which the spot holds 1e-9 of its dose
+
+
+@node(rtol=1e-5)
+def smooth(height: Tensor, stop: Stop, *, feature: PupilPitch) -> Tensor:
+    """Average the height map over the round Gaussian spot of a tool, whose full width at half
+    maximum is ``feature``.
+
+    Depth follows dose, and dose is the wanted height averaged over the spot: steps get flanks of
+    ``feature``, pillars that are narrower vanish, planes and wide features stay. An average lies
+    between the least and the greatest height under the spot, so the mask does not become deeper. At
+    the edge of the grid, the average covers only the samples inside the grid. The spot is a
+    Gaussian and not a disc, whose transfer function has negative lobes: with a Gaussian, features
+    that are too small fade, and no feature is inverted.
+
+    Shapes: (v, u), stop -> (v, u).
+    Units:  m.
+    Error:  1e-6 of the deepest height (float32). A spot below 1.5 samples is not resolved by the
+            grid.
+    Raises: ValueError for a height in half precision, or of another shape than the pupil grid.
+    Source: Gaussian spot of laser lithography: Gale et al., Opt. Eng. 33, 3556 (1994).
+    """
+    refuse_half(height=height)
+    grid = grid_of(stop)
+    refuse_other_grid(height, grid)
+    average = _average(grid.samples, feature / grid.pitch).to(height)
+    return average @ height @ average.T
+
+
+def _average(samples: int, feature: float) -> Tensor:
+    """Return the float64 matrix that averages along one axis over a tool spot of ``feature``
+    samples; each row sums to 1.
+    """
+    sigma = feature / math.sqrt(8 * math.log(2))
+    index = torch.arange(samples, dtype=torch.float64)
+    weights = torch.exp(-((index[:, None] - index) ** 2) / (2 * sigma**2))
+    weights = weights.where((index[:, None] - index).abs() <= _REACH * sigma + 0.5, 0.0)
+    return weights / weights.sum(1, keepdim=True)
+
+
+@smooth.reference
+def _(height: Tensor, stop: Stop, *, feature: float) -> Tensor:
+    """Compute the average of the height map over the tool's spot, for the samples of one row
+    after another.
+    """
+    samples, pitch, _ = grid_of(stop)
+    sigma = feature / pitch / math.sqrt(8 * math.log(2))
+    x, index = height.double(), torch.arange(samples, dtype=torch.float64)
+    across = (index[:, None, None] - index).square()  # of each spot, over all columns
+    rows = []
+    for v in range(samples):
+        spots = torch.exp(-((index[:, None] - v).square() + across) / (2 * sigma**2))
+        rows.append((spots * x).sum((1, 2)) / spots.sum((1, 2)))
+    return torch.stack(rows)
+
+
+@smooth.preflight
+def _(*, stop: Stop | None, feature: float) -> list[str]:
+    if stop is not None and feature < 1.5 * float(stop.pitch):
+        pitch = f"{float(stop.pitch) * 1e6:.3g} um"
+        return [f"feature {feature * 1e6:.3g} um is less than 1.5 samples of {pitch}: not resolved"]
+    return []
+
+
+@smooth.check
+def _(result: Tensor, height: Tensor, *_: Any, feature: float, **__: Any) -> list[Check]:
+    change = float((result - height).detach().double().square().mean().sqrt())
+    text = f"features below {feature * 1e6:.3g} um smoothed: {change * 1e9:.3g} nm root mean square"
+    return [Check(text), *height_checks(result)]
+
+
+# --- height error ---------------------------------------------------------------------------------
+
+# The error of a mask that was made: the whole depth, and a smooth random error of the height.
+
+
+Rms = Annotated[Length, Field(ge=0, le=1e-3)]
+Scale = Annotated[float, Field(ge=0.01, le=1)]  #: share of the pupil's diameter
+Excess = Annotated[float, Field(gt=-1, le=1)]  #: share of the height
+_ROUNDING = 1.2e-7  #: of the height, float32
+#: times its standard deviation, no sample of a smooth random field is larger; as for `flare.dirt`
+_LARGEST = 31
+
+
+@node()
+def height_error(
+    height: Tensor,
+    stop: Stop,
+    *,
+    rms: Rms = 0.0,
+    scale: Scale = 0.1,
+    depth: Excess = 0.0,
+    rng: torch.Generator,
+) -> Tensor:
+    """Return the height map as it was made: ``depth`` deeper as a whole, with a smooth random error
+    of the height.
+
+    An etching that takes too long, or a dose that is too high, makes every height greater by the
+    same share ``depth``. The random error is a Gaussian field with the root mean square ``rms``
+    over many masks and the correlation exp(-(d / ``scale``)**2) at the distance d, both in
+    diameters of the pupil. Its draw does not depend on the sampling of the pupil. It may make a
+    height negative, which moves the surface below the substrate and not the light.
+
+    Shapes: (v, u), stop -> (v, u).
+    Units:  rms m; scale in diameters of the pupil; depth as a share of the height; result m.
+    Error:  1e-7 of the deepest height (float32); the correlation is exact to 1e-4 on a lattice of
+            half a ``scale``.
+    Raises: ValueError for a height in half precision, or of another shape than the pupil grid.
+    Source: by definition; a depth error as a share of the depth: Swanson, MIT Lincoln Laboratory
+            Technical Report 854 (1989), section on fabrication errors.
+    """
+    refuse_half(height=height)
+    grid = grid_of(stop)
+    refuse_other_grid(height, grid)
+    deeper = height if depth == 0 else height * (1 + depth)
+    if rms == 0:
+        return deeper
+    rows, columns = factors(grid, scale, rng, height.device)
+    bumps = torch.cat(
+        [(rms * (rows[stripe] @ columns)).to(height.dtype) for stripe in stripes(grid)]
+    )
+    return deeper + bumps
+
+
+@height_error.skip_bound
+def _(height: TensorStats, *_: Any, rms: float, depth: float, **__: Any) -> float:
+    """Return an upper bound of the relative change of a height map, which is never below its phase
+    at 400 nm in rad.
+
+    The phase is that of a change of optical path by as much as the height, as for an index of 2.
+    """
+    if not (height.finite and math.isfinite(rms)):
+        return math.inf
+    deepest = max(abs(height.min), abs(height.max))
+    if not (depth and deepest) and not rms:
+        return 0.0
+    change = (abs(depth) + _ROUNDING) * deepest + _LARGEST * rms
+    return max(
+        2 * math.pi * change / _VIOLET,
+        change / (deepest - change) if deepest > change else math.inf,
+    )
+
+
+@height_error.check
+def _(result: Tensor, height: Tensor, *_: Any, **__: Any) -> list[Check]:
+    change = (result - height).detach().double()
+    text = (
+        f"{float(change.square().mean().sqrt()) * 1e9:.3g} nm root mean square from the height of"
+        " the design"
+    )
+    return [Check(text, bool(torch.isfinite(change).all()))]

@@ -1,0 +1,541 @@
+"""Bytes that arrays and pictures take in memory, from the headers of their files."""
+
+import json
+import math
+import os
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+
+from neusee.nodes import ParameterError
+from neusee.nodes.input_files import SMALL, in_bytes, needs, opened
+
+# --- array bytes ----------------------------------------------------------------------------------
+
+# Bytes that arrays take in memory, from the headers of .npy, .npz, .mat, .safetensors, .pt and HDF5
+# files.
+
+
+__depends__ = ["unaffected:file"]  #: the size of an open file
+_MAT_MATRIX, _MAT_COMPRESSED, _MAT_INT32 = 14, 15, 5  #: types of elements
+_MAT_COMPLEX = 0x0800
+#: bytes of a value by the class of an array; a cell, a struct or a sparse array has none
+_MAT_CLASSES = {4: 4, 6: 8, 7: 4, 8: 1, 9: 1, 10: 2, 11: 2, 12: 4, 13: 4, 14: 8, 15: 8}
+#: errors of an archive that is damaged or none, whose reader says what is wrong
+_BROKEN = (
+    zipfile.BadZipFile,
+    ValueError,
+    EOFError,
+    SyntaxError,
+    OSError,
+    NotImplementedError,
+    RuntimeError,
+    zlib.error,
+)
+_CHUNK = 1 << 18  #: bytes that are decompressed at once to count them
+_HEADER = 100_000_000  #: bytes of the header of a .safetensors file, at most, as its library has it
+
+
+def npy_needs(
+    file: Path | str, copies: float, beside: float = 0.0, parameter: str = "file"
+) -> None:
+    """Ask for the memory of a .npy file: ``copies`` of its numbers, and ``beside`` bytes for each
+    of them.
+
+    Raises ParameterError for a file that is shorter than its header says.
+    """
+    with opened(file, parameter) as raw:
+        try:
+            shape, dtype = _npy_header(raw)
+        except (ValueError, EOFError, SyntaxError, TypeError):
+            return  # NumPy says what a damaged file lacks
+        after = os.fstat(raw.fileno()).st_size - raw.tell()
+    count = math.prod(map(int, shape))
+    if not dtype.hasobject and count * dtype.itemsize > after:
+        text = (
+            f"its header states {in_bytes(count * dtype.itemsize)} of numbers, and"
+            f" {in_bytes(after)} follow"
+        )
+        raise ParameterError(
+            parameter, f"{file} cannot be read: {text}: copy or save the file again"
+        )
+    needs(count * (copies * dtype.itemsize + beside), file, _numbers(shape, dtype), parameter)
+
+
+def _numbers(shape: tuple[int, ...], dtype: Any) -> str:
+    return f"{' x '.join(map(str, shape)) or 'one'} numbers of type {dtype}"
+
+
+def _npy_header(raw: Any) -> tuple[tuple[int, ...], "np.dtype[Any]"]:
+    version = np.lib.format.read_magic(raw)
+    read = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
+    shape, _, dtype = read(raw)
+    return shape, dtype
+
+
+# --- archives -------------------------------------------------------------------------------------
+
+
+def npz_needs(
+    file: Path | str, copies: float, beside: float = 0.0, parameter: str = "file"
+) -> None:
+    """Ask for the memory of all arrays in a .npz file, as `npy_needs` does.
+
+    Raises ParameterError for an array of more bytes than the archive states for it.
+    """
+    archive_needs(file, copies, parameter)
+    total, count = 0.0, 0
+    for name, after, shape, dtype in _npz_headers(file, parameter):
+        size = math.prod(map(int, shape))
+        if not dtype.hasobject and size * dtype.itemsize > after:
+            text = f"its array {name} states {_numbers(shape, dtype)}, and {in_bytes(after)} follow"
+            raise ParameterError(
+                parameter, f"{file} cannot be read: {text}: copy or save the file again"
+            )
+        total, count = total + size * (copies * dtype.itemsize + beside), count + 1
+    needs(total, file, f"{count} arrays", parameter)
+
+
+def _npz_headers(
+    file: Path | str, parameter: str
+) -> list[tuple[str, int, tuple[int, ...], "np.dtype[Any]"]]:
+    """Return name, stated bytes, shape and type of each array in a .npz file, as far as its
+    headers can be read.
+    """
+    headers = []
+    with opened(file, parameter) as raw, suppress(*_BROKEN), zipfile.ZipFile(raw) as archive:
+        for entry in archive.infolist():
+            with archive.open(entry) as inner:
+                headers.append((entry.filename, entry.file_size, *_npy_header(inner)))
+    return headers
+
+
+def archive_needs(file: Path | str, copies: float, parameter: str = "file") -> None:
+    """Ask for the memory of all that a zip archive holds when it is decompressed, such as a .pt,
+    .pt2 or .npz file.
+
+    Readers of archives stop at the size that the archive states for each file. Any other file
+    counts as it is.
+    """
+    sizes = list[int]()
+    with opened(file, parameter) as raw:
+        packed = os.fstat(raw.fileno()).st_size
+        needs(copies * packed, file, f"a file of {in_bytes(packed)}", parameter)
+        with suppress(*_BROKEN), zipfile.ZipFile(raw) as archive:
+            sizes = [entry.file_size for entry in archive.infolist()]
+    content = f"{len(sizes)} files of {in_bytes(sum(sizes))} in {in_bytes(packed)}"
+    needs(copies * sum(sizes), file, content, parameter)
+
+
+# --- .safetensors ---------------------------------------------------------------------------------
+
+
+def safetensors_need(file: Path | str, copies: float = 1.0, parameter: str = "file") -> None:
+    """Ask for the memory of all tensors in a .safetensors file, and of its header.
+
+    Raises ParameterError for a file whose header states more bytes than the file has.
+    """
+    with opened(file, parameter) as raw:
+        size, first = os.fstat(raw.fileno()).st_size, raw.read(8)
+        length = int.from_bytes(first, "little")
+        if len(first) < 8 or length > min(size - 8, _HEADER):
+            text = f"{in_bytes(length)} of header, and the file has {in_bytes(size)}"
+            raise _not_whole(file, text, parameter)
+        needs(16.0 * length + copies * size, file, f"tensors of {in_bytes(size)}", parameter)
+        stated = _last_byte(raw.read(length))
+    if stated > size - 8 - length:
+        text = f"{in_bytes(stated)} of tensors, and {in_bytes(size - 8 - length)} follow"
+        raise _not_whole(file, text, parameter)
+
+
+def _not_whole(file: Path | str, why: str, parameter: str) -> ParameterError:
+    text = (
+        f"{Path(file).name} is not a safetensors file and cannot be read: its header states {why}"
+    )
+    return ParameterError(parameter, f"{text}: copy or save the file again")
+
+
+def _last_byte(header: bytes) -> int:
+    """Return the byte at which the tensors end, or 0 for a header that the library refuses."""
+    try:
+        return max(
+            (int(entry["data_offsets"][1]) for entry in _entries(json.loads(header))), default=0
+        )
+    except (ValueError, TypeError, LookupError, RecursionError):
+        return 0
+
+
+def _entries(header: Any) -> Iterator[Any]:
+    return (entry for name, entry in header.items() if name != "__metadata__")
+
+
+# --- .mat -----------------------------------------------------------------------------------------
+
+
+def mat_needs(
+    file: Path | str, copies: float = 2.0, together: bool = False, parameter: str = "file"
+) -> None:
+    """Ask for the memory of the largest variable in a .mat file, or of all variables ``together``.
+
+    There are ``copies`` of the numbers as they are stored or as they are read, whichever are more.
+    Compressed variables are decompressed in small parts to be counted, because a part of one can
+    state more than the variable does.
+    """
+    with opened(file, parameter) as raw:
+        size = os.fstat(raw.fileno()).st_size
+        total, largest, asked = 0.0, 0.0, float(SMALL)
+        for begins, size_of_part in _mat_sizes(raw, size):
+            total = total + size_of_part if together or not begins else size_of_part
+            largest = max(largest, total)
+            if copies * largest > asked:
+                needs(
+                    copies * largest, file, f"variables of {in_bytes(largest)} or more", parameter
+                )
+                asked = copies * largest + SMALL
+    needs(copies * largest, file, f"variables of {in_bytes(largest)}", parameter)
+
+
+def _mat_sizes(raw: BinaryIO, size: int) -> Iterator[tuple[bool, int]]:
+    """Yield the bytes of each variable of a file of version 5 or older, compressed ones in parts.
+
+    The first value is True where a variable begins.
+    """
+    head = raw.read(128)
+    order = {b"IM": "<", b"MI": ">"}.get(head[126:128])
+    if order is None:
+        yield True, size  # version 4 has no compression
+        return
+    while len(tag := raw.read(8)) == 8:
+        kind, length = struct.unpack(f"{order}II", tag)
+        after = raw.tell() + length
+        if kind == _MAT_COMPRESSED:
+            stored, stated = 0, 0
+            for piece in _inflated(raw, length):
+                stated = stated or _mat_stated(piece[8:], order)
+                before, stored = stored, stored + len(piece)
+                yield before == 0, max(stored, stated) - (max(before, stated) if before else 0)
+        elif kind == _MAT_MATRIX:
+            yield True, max(min(length, size), _mat_stated(raw.read(min(length, 4096)), order))
+        else:
+            return  # scipy says what is damaged
+        raw.seek(after)
+
+
+def _mat_stated(piece: bytes, order: str) -> int:
+    """Return the bytes of the numbers of a variable as they are read, from its flags and
+    dimensions; 0 if unknown.
+    """
+    if len(piece) < 24:
+        return 0
+    flags, _, kind, length = struct.unpack(f"{order}8x4I", piece[:24])
+    bytes_each = _MAT_CLASSES.get(flags & 0xFF, 0) * (2 if flags & _MAT_COMPLEX else 1)
+    if kind != _MAT_INT32 or not bytes_each or length > len(piece) - 24:
+        return 0
+    return bytes_each * math.prod(
+        int(n) for n in struct.unpack(f"{order}{length // 4}i", piece[24 : 24 + length // 4 * 4])
+    )
+
+
+def _inflated(raw: BinaryIO, length: int) -> Iterator[bytes]:
+    """Yield each part of a compressed variable of ``length`` bytes."""
+    stream, left, packed = zlib.decompressobj(), length, b""
+    with suppress(zlib.error):  # scipy says what is damaged
+        while not stream.eof:
+            packed = packed or raw.read(min(left, _CHUNK))
+            if not packed:
+                return
+            left -= 0 if stream.unconsumed_tail else len(packed)
+            yield stream.decompress(packed, _CHUNK)
+            packed = stream.unconsumed_tail
+
+
+# --- FITS and HDF5, whose libraries read headers alone --------------------------------------------
+
+
+def fits_needs(
+    file: Path | str, shape: tuple[int, ...], bits: int, parameter: str = "file"
+) -> None:
+    """Ask for the memory of an image of a FITS file: its numbers, scaled to float64, and the
+    copy of the caller.
+    """
+    count = math.prod(map(int, shape))
+    needs(
+        count * (abs(bits) / 8 + 16),
+        file,
+        f"{' x '.join(map(str, shape))} numbers of {abs(bits)} bits",
+        parameter,
+    )
+
+
+def refuse_packed(file: Path | str, parameter: str = "file") -> None:
+    """Raise ParameterError for a file that is compressed as a whole, which a library would
+    unpack without a limit.
+    """
+    with opened(file, parameter) as raw:
+        head = raw.read(6)
+    if head.startswith((b"\x1f\x8b", b"BZh", b"PK\x03\x04", b"\xfd7zXZ", b"\x1f\x9d")):
+        raise ParameterError(
+            parameter, f"{file} is compressed as a whole: unpack it, such as by gunzip"
+        )
+
+
+def hdf5_needs(file: Path | str, groups: Any, copies: float = 1.0) -> None:
+    """Ask for the memory of all data in the opened ``groups`` of an HDF5 file, from their shapes
+    and types.
+    """
+    total = 0.0
+    for group in groups:
+        for data in group.values():
+            if hasattr(data, "shape"):
+                total += math.prod(map(int, data.shape)) * data.dtype.itemsize
+    needs(copies * total, file, f"data of {in_bytes(total)}")
+
+
+# --- picture bytes --------------------------------------------------------------------------------
+
+# Bytes that pictures take in memory, from the headers of PNG, JPEG, TIFF and OpenEXR files.
+
+
+#: bytes of a pixel of Pillow
+_IN_MEMORY = {"1": 1, "L": 1, "P": 1, "LA": 4, "I;16": 2, "I;16B": 2, "I;16L": 2}
+_COEFFICIENTS = 6  #: bytes of a pixel of a JPEG that is stored in several scans
+_WIDTH, _HEIGHT, _BITS, _SAMPLES, _TILE_WIDTH, _TILE_LENGTH = 256, 257, 258, 277, 322, 323
+_TIFF_TAGS = frozenset((_WIDTH, _HEIGHT, _BITS, _SAMPLES, _TILE_WIDTH, _TILE_LENGTH))
+#: of the types of a TIFF tag that are whole numbers
+_TIFF_SIZES = {1: "B", 3: "H", 4: "I", 16: "Q"}
+_EXR_SIZES = {0: 4, 1: 2, 2: 4}  #: bytes of a number, by the type of the channel
+_MULTIPART, _DEEP = 1 << 12, 1 << 11
+_LONGEST = 1 << 20  #: bytes of a list of channels, at most
+
+
+def picture_needs(file: Path, image: Any, beside: float, parameter: str = "file") -> None:
+    """Ask for the memory of the first picture that Pillow has opened, with ``beside`` bytes for
+    each of its pixels.
+    """
+    bytes_a_pixel = _IN_MEMORY.get(image.mode, 4) + beside
+    bytes_a_pixel += _COEFFICIENTS if image.format in ("JPEG", "MPO") else 0
+    needs(
+        bytes_a_pixel * image.width * image.height,
+        file,
+        f"{image.width} x {image.height} pixels",
+        parameter,
+    )
+
+
+def pages_need(
+    file: Path, image: Any, copies: float, beside: float = 0.0, parameter: str = "file"
+) -> None:
+    """Ask for the memory of all pages of a file that Pillow has opened.
+
+    There are ``copies`` of the numbers of each page, and ``beside`` bytes for each of its pixels.
+    """
+    if image.format == "TIFF":
+        tiff_needs(file, copies, beside, parameter)
+        return
+    pages, size = int(getattr(image, "n_frames", 1)), image.width * image.height
+    bytes_a_pixel = copies * _IN_MEMORY.get(image.mode, 4) + beside
+    needs(
+        pages * size * bytes_a_pixel,
+        file,
+        f"{pages} pages of {image.width} x {image.height} pixels",
+        parameter,
+    )
+
+
+# --- TIFF -----------------------------------------------------------------------------------------
+
+
+class Page(NamedTuple):
+    """The size of a page of a TIFF file."""
+
+    width: int
+    height: int
+    sample: int  #: bits of a sample
+    samples: int  #: of a pixel
+    tile: int  #: pixels of a tile; 0 for strips
+
+    @property
+    def bytes(self) -> float:
+        return self.samples * max(self.sample, 8) / 8 * max(self.width * self.height, self.tile)
+
+
+def tiff_needs(
+    file: Path, copies: float, beside: float = 0.0, parameter: str = "file", first: bool = False
+) -> None:
+    """Ask for the memory of all pages of a TIFF file, or of the ``first`` one, as `pages_need`
+    does.
+    """
+    count, total, page = 0, 0.0, Page(0, 0, 8, 1, 0)
+    # the reader says what a damaged file lacks
+    with opened(file, parameter) as raw, suppress(struct.error):
+        for page in tiff_pages(raw):
+            count += 1
+            total += copies * page.bytes + beside * page.width * page.height
+            if first:
+                break
+    needs(
+        total,
+        file,
+        f"{count} page{'s' * (count != 1)} of {page.width} x {page.height} pixels",
+        parameter,
+    )
+
+
+def tiff_pages(raw: BinaryIO) -> Iterator[Page]:
+    """Yield the size of each page of an open TIFF file, in its order; end where a page was there
+    before.
+    """
+    head = raw.read(16)
+    order = {b"II": "<", b"MM": ">"}.get(head[:2])
+    if order is None:
+        return
+    big = struct.unpack(f"{order}H", head[2:4])[0] == 43
+    (place,) = (
+        struct.unpack(f"{order}Q", head[8:16]) if big else struct.unpack(f"{order}I", head[4:8])
+    )
+    visited, end = set[int](), os.fstat(raw.fileno()).st_size
+    while 0 < place < end and place not in visited:
+        visited.add(place)
+        page, place = _tiff_page(raw, place, order, big)
+        yield page
+
+
+def _tiff_page(raw: BinaryIO, place: int, order: str, big: bool) -> tuple[Page, int]:
+    """Return the page whose directory begins at ``place``, and the place of the next directory."""
+    counting, entry, address = ("Q", "HHQ8s", "Q") if big else ("H", "HHI4s", "I")
+    raw.seek(place)
+    (count,) = struct.unpack(f"{order}{counting}", raw.read(8 if big else 2))
+    form = struct.Struct(f"{order}{entry}")
+    values: dict[int, int] = {}
+    for _ in range(min(count, 65536)):
+        tag, kind, length, value = form.unpack(raw.read(form.size))
+        if tag in _TIFF_TAGS and kind in _TIFF_SIZES:
+            values[tag] = _tiff_number(raw, order, _TIFF_SIZES[kind], length, value)
+    after = raw.read(8 if big else 4)
+    (following,) = (
+        struct.unpack(f"{order}{address}", after) if len(after) == (8 if big else 4) else (0,)
+    )
+    page = Page(
+        values.get(_WIDTH, 0),
+        values.get(_HEIGHT, 0),
+        values.get(_BITS, 8),
+        values.get(_SAMPLES, 1),
+        values.get(_TILE_WIDTH, 0) * values.get(_TILE_LENGTH, 0),
+    )
+    return page, following
+
+
+def _tiff_number(raw: BinaryIO, order: str, kind: str, length: int, value: bytes) -> int:
+    """Return the first number of a tag, which stands in the entry or where the entry says."""
+    size = struct.calcsize(f"{order}{kind}")
+    if size * length > len(value):
+        back = raw.tell()
+        raw.seek(int.from_bytes(value, "little" if order == "<" else "big"))
+        value = raw.read(size)
+        raw.seek(back)
+    return int(struct.unpack(f"{order}{kind}", value[:size])[0])
+
+
+# --- OpenEXR --------------------------------------------------------------------------------------
+
+
+class ExrPart(NamedTuple):
+    """What the header of a part of an OpenEXR file says of its size."""
+
+    width: int
+    height: int
+    channels: Mapping[str, int]  #: bytes of a pixel by name
+    deep: bool
+
+    @property
+    def bytes(self) -> int:
+        return self.width * self.height * sum(self.channels.values())
+
+
+def exr_needs(file: Path | str, beside: float = 8.0, parameter: str = "file") -> None:
+    """Ask for the memory of an OpenEXR file: all channels of all parts, which the library reads at
+    once.
+
+    ``beside`` are the bytes for each value of the largest part that the caller makes of them. A
+    part with deep samples is refused, because its header does not say how many there are.
+    """
+    with opened(file, parameter) as raw:
+        try:
+            parts = list(exr_part_sizes(raw))
+        except (struct.error, ValueError):
+            return  # the library says what a damaged file lacks
+    if any(exr_part.deep for exr_part in parts):
+        raise ParameterError(
+            parameter, f"{file} has deep samples, several a pixel: flatten the picture"
+        )
+    values = max(
+        (exr_part.width * exr_part.height * len(exr_part.channels) for exr_part in parts), default=0
+    )
+    largest = max(parts, key=lambda exr_part: exr_part.bytes, default=ExrPart(0, 0, {}, False))
+    content = f"{largest.width} x {largest.height} pixels in {len(largest.channels)} channels"
+    content += f", and {len(parts) - 1} other parts" if len(parts) > 1 else ""
+    needs(sum(exr_part.bytes for exr_part in parts) + beside * values, file, content, parameter)
+
+
+def exr_part_sizes(raw: BinaryIO) -> Iterator[ExrPart]:
+    """Yield the size of each part of an open OpenEXR file, from its headers; nothing for another
+    file.
+    """
+    magic, version = struct.unpack("<iI", raw.read(8))
+    if magic != 20000630:
+        return
+    end = os.fstat(raw.fileno()).st_size
+    while True:
+        attributes = _exr_attributes(raw, end)
+        if not attributes:
+            return
+        left, top, right, bottom = struct.unpack("<4i", attributes.get("dataWindow", b""))
+        channels = dict(_exr_channels(attributes.get("channels", b"")))
+        deep = bool(version & _DEEP) or attributes.get("type", b"").startswith(b"deep")
+        yield ExrPart(max(right - left + 1, 0), max(bottom - top + 1, 0), channels, deep)
+        if not version & _MULTIPART:
+            return
+
+
+def _exr_attributes(raw: BinaryIO, end: int) -> dict[str, bytes]:
+    """Return the attributes of a header that say its size; nothing at the end of the headers."""
+    attributes: dict[str, bytes] = {}
+    while name := _exr_text(raw):
+        _exr_text(raw)  # the type
+        (size,) = struct.unpack("<i", raw.read(4))
+        if not 0 <= size <= end - raw.tell():
+            raise ValueError("an attribute is longer than the file")
+        if name in ("dataWindow", "channels", "type") and size <= _LONGEST:
+            attributes[name] = raw.read(size)
+        else:
+            raw.seek(size, os.SEEK_CUR)
+    return attributes
+
+
+def _exr_text(raw: BinaryIO) -> str:
+    """Read a text that ends with a zero; raise ValueError for one that is no name."""
+    letters = bytearray()
+    while (letter := raw.read(1)) != b"\0":
+        letters += letter
+        if not letter or len(letters) > 255:
+            raise ValueError("a name that does not end")
+    return letters.decode("latin-1")
+
+
+def _exr_channels(data: bytes) -> Iterator[tuple[str, int]]:
+    place = 0
+    while place < len(data) and data[place]:
+        end = data.index(b"\0", place)
+        (kind,) = struct.unpack_from("<i", data, end + 1)
+        yield data[place:end].decode("latin-1"), _EXR_SIZES.get(kind, 4)
+        place = end + 17

@@ -1,0 +1,296 @@
+"""The light of a laser on the sensor: peak irradiance, saturated pixels, and heating."""
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from neusee.nodes import Check, node
+from neusee.nodes.sensor._digitization import Bits, clipping_number
+from neusee.nodes.sensor._exposure import weighted
+from neusee.nodes.sensor._saturation import Well, refuse_without_steps, saturation
+from neusee.nodes.units import Efficiency, Exposure, Gain, PixelPitch, Time
+from neusee.nodes.values import Bands, Channels, Psf
+
+# --- saturated pixels -----------------------------------------------------------------------------
+
+# Count of pixels at the full well or at the largest output of the analogue-to-digital converter.
+
+
+class Saturated(NamedTuple):
+    """The number and the share of pixels with at least one clipped channel."""
+
+    pixels: Tensor  #: () float64
+    share: Tensor  #: () float64, relative to all pixels
+
+
+@node(rtol=1e-6)
+def saturated(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> Saturated:
+    """Count the pixels with a channel at the full well or at the largest output of the
+    analogue-to-digital converter.
+
+    Shapes: raw (..., channel, y, x) -> two scalars, float64.
+    Units:  raw DN; pixels.
+    Error:  a pixel within one DN of the full well counts as saturated, and so does a pixel that is
+            NaN.
+    Source: NeuSee, Eq. (SensorImage).
+    """
+    full = clipped(raw, full_well=full_well, gain=gain, bits=bits).any(-3)
+    pixels = full.sum().double()
+    return Saturated(pixels, pixels / full.numel())
+
+
+@saturated.preflight
+def _(*, full_well: float, gain: float, bits: int = 16, **params: object) -> list[str]:
+    refuse_without_steps(full_well, gain=gain, bits=bits)
+    return []
+
+
+@saturated.check
+def _(result: Saturated, *inputs: Tensor, **params: Any) -> list[Check]:
+    return [
+        Check(f"{int(result.pixels)} saturated pixels, {float(result.share):.2%} of all pixels")
+    ]
+
+
+def clipped(raw: Tensor, *, full_well: float, gain: float, bits: int) -> Tensor:
+    """Return True for raw values in DN at the full well or at the largest output of the
+    converter, and for NaN.
+    """
+    marked: Tensor = ~(raw < clipping_number(full_well, gain, bits))  # NaN counts as clipped
+    return marked
+
+
+# --- peak irradiance ------------------------------------------------------------------------------
+
+# Irradiance of the brightest pixel of the sensor, compared with saturation and with a multiple of
+# saturation.
+
+
+class Peak(NamedTuple):
+    """The irradiance of the brightest pixel, in multiples of the saturation irradiance, and of
+    the lasers there.
+    """
+
+    irradiance: Tensor  #: () float64, multiple of saturation
+    #: () float64, 1 where the irradiance exceeds `multiple` times saturation; NaN without
+    #: `multiple`
+    above: Tensor
+    laser: Tensor  #: () float64, W/m2 that all lasers together send to this pixel
+
+
+@node(
+    rtol=1e-6,
+    accepts_channel_sums=("image",),
+    needs_band_invariant=("level",),
+    additive_inputs=[("spots", "lines")],
+)
+def peak_irradiance(
+    image: Tensor | Channels,
+    bands: Bands,
+    level: Tensor,
+    spots: list[Tensor] | None = None,
+    lines: list[Bands] | None = None,
+    *,
+    full_well: Well,
+    quantum_efficiency: Efficiency,
+    pixel_pitch: PixelPitch,
+    exposure: Exposure,
+    multiple: Annotated[float, Field(gt=0, le=1e18)] | None = 1e6,
+) -> Peak:
+    """Find the brightest pixel: the largest sum of I / I_sat over wavelengths, for the scene and
+    all lasers together.
+
+    Saturation is that of ``exposure``: the same light is ten times as many multiples in ten times
+    the exposure. ``multiple`` is the multiple of saturation at which the paper expects damage. It
+    is a reading of the paper and no verdict: at the exposure of the paper 1e6 are 2 W/cm2, far
+    below every threshold that is known, and it falls with a longer exposure and a smaller well, as
+    no damage does. `laser.damage` compares W/cm2 and J/cm2 with thresholds.
+
+    Shapes: image (band, y, x), level (band,), each spot (line band, y, x) -> three scalars,
+            float64.
+    Units:  irradiance and multiple in multiples of saturation; laser W/m2.
+    Error:  computed before the colour filters: a real channel receives less.
+    Raises: ValueError where spots and lines differ in number, or where the `Channels` of an image
+            hold no row of the well.
+    Source: NeuSee, Eq. (peak_irrad_coded), which expects damage above 1e6.
+    """
+    spots, lines = spots or [], lines or []
+    _refuse_unpaired(spots, lines)
+    sensor = {
+        "full_well": full_well,
+        "quantum_efficiency": quantum_efficiency,
+        "pixel_pitch": pixel_pitch,
+        "exposure": exposure,
+    }
+    total = _in_wells(image, saturation(bands, **sensor) / level)
+    for spot, line in zip(spots, lines, strict=True):
+        total = total + _in_wells(spot, saturation(line, **sensor))
+    brightest = total.flatten().argmax()
+    top = total.flatten().take(brightest).double()
+    return Peak(top, _above(top, multiple), _of_lasers(spots, brightest, top))
+
+
+def _refuse_unpaired(spots: Sequence[Tensor], lines: Sequence[Bands]) -> None:
+    """Raise ValueError unless each spot has its laser line."""
+    if len(spots) != len(lines):
+        raise ValueError(
+            f"{len(spots)} spots and {len(lines)} laser lines: give one line for each spot"
+        )
+
+
+def _above(top: Tensor, multiple: float | None) -> Tensor:
+    """Return 1 where the irradiance exceeds a multiple of saturation, else 0; NaN without a
+    multiple.
+    """
+    if multiple is None:
+        return torch.full_like(top, math.nan)
+    return (top > multiple).double()
+
+
+def _of_lasers(spots: Sequence[Tensor], pixel: Tensor, like: Tensor) -> Tensor:
+    """Return the W/m2 that all lasers together send to a pixel, summed over their bands."""
+    total = torch.zeros_like(like)
+    for spot in spots:
+        total = total + spot.sum(-3).flatten().take(pixel).double()
+    return total
+
+
+def _in_wells(irradiance: Tensor | Channels, saturating: Tensor) -> Tensor:
+    """Return the irradiance of each pixel in multiples of saturation: the sum of I / I_sat over
+    wavelengths.
+    """
+    return weighted(irradiance, (1.0 / saturating)[None])[0]
+
+
+@peak_irradiance.check
+def _(
+    result: Peak, *inputs: Any, exposure: float, multiple: float | None = 1e6, **params: Any
+) -> list[Check]:
+    density = (
+        f", {float(result.laser) * 1e-4:.3g} W/cm2 of lasers" if float(result.laser) > 0 else ""
+    )
+    text = (
+        f"brightest pixel {float(result.irradiance):.3g} times the saturation irradiance of"
+        f" {exposure:g} s{density}"
+    )
+    if not float(result.above) > 0:
+        return [Check(text)]
+    return [
+        Check(
+            f"{text}; above the {multiple:g} that the paper names (C10), which is no threshold of"
+            " damage"
+        )
+    ]
+
+
+# --- heat ratio -----------------------------------------------------------------------------------
+
+# The heating of the hottest point of a sensor behind a mask, relative to the clear lens.
+
+
+Diffusivity = Annotated[float, Field(ge=1e-9, le=1)]  #: m2/s
+SILICON = 8.8e-5  #: m2/s, thermal diffusivity of silicon at 300 K
+
+
+@node(rtol=1e-6)
+def heat_ratio(
+    psf: Psf,
+    plain_psf: Psf,
+    *,
+    pixel_pitch: PixelPitch,
+    dwell: Time,
+    diffusivity: Diffusivity = SILICON,
+) -> Tensor:
+    """Compute the temperature rise of the hottest pixel after a dwell time, divided by that behind
+    the clear lens.
+
+    A half-space that absorbs at its surface warms by the sum of irradiance times erfc(r / w) / r
+    over distances r, with w = sqrt(4 diffusivity dwell). For a pulse of nanoseconds w is shorter
+    than a pixel, and the ratio is that of the peaks (`metrics.lsr`). For continuous light a small
+    spot cools faster: at one peak, the wider spot is hotter.
+
+    Shapes: psf.intensity (band, y, x), plain_psf.intensity (band, y, x) -> (band,) float64.
+    Units:  pixel_pitch m; dwell s; diffusivity m2/s; result 1 for the clear lens.
+    Error:  heat from outside the window is left out; within a pixel the light counts as even: 3 %
+            for lambda f / D above 2 pixels. Silicon's thin layers on top, and melting, are left
+            out.
+    Raises: ValueError where the PSFs differ in shape.
+    Source: Carslaw and Jaeger, Conduction of Heat in Solids, 2nd ed., section 10.4 (continuous
+            point source).
+    """
+    if psf.intensity.shape != plain_psf.intensity.shape:
+        shapes = f"{tuple(psf.intensity.shape)} and {tuple(plain_psf.intensity.shape)}"
+        raise ValueError(
+            f"the PSFs with and without the mask have the shapes {shapes}: use one window and one"
+            " `bands` step"
+        )
+    y, x = psf.intensity.shape[-2:]
+    kernel = _kernel((2 * y, 2 * x), pixel_pitch, math.sqrt(4 * diffusivity * dwell)).to(
+        psf.intensity.device
+    )
+    spectrum = torch.fft.rfft2(kernel)
+    hottest = [
+        torch.stack(
+            [_warmed(band_light, spectrum).amax() for band_light in light.intensity.double()]
+        )
+        for light in (psf, plain_psf)
+    ]
+    return hottest[0] / hottest[1]
+
+
+def _warmed(light: Tensor, spectrum: Tensor) -> Tensor:
+    y, x = light.shape
+    padded: Tensor = torch.fft.irfft2(
+        torch.fft.rfft2(light, s=(2 * y, 2 * x)) * spectrum, s=(2 * y, 2 * x)
+    )
+    return padded[:y, :x]
+
+
+def _kernel(shape: tuple[int, int], pitch: float, reach: float) -> Tensor:
+    """Return erfc(r / w) / r over the pixels of an FFT, with the mean over a disc of one pixel's
+    area in the middle.
+    """
+    fy, fx = (torch.fft.fftfreq(n, 1 / n, dtype=torch.float64) * pitch for n in shape)
+    r = torch.hypot(fy[:, None], fx)
+    kernel = torch.erfc(r / reach) / r.where(r > 0, 1.0)
+    disc = pitch / math.sqrt(math.pi)
+    inner = disc * math.erfc(disc / reach) + reach * (
+        1 - math.exp(-((disc / reach) ** 2))
+    ) / math.sqrt(math.pi)
+    kernel[0, 0] = 2 * math.pi * inner / pitch**2
+    return kernel
+
+
+@heat_ratio.reference
+def _(
+    psf: Psf, plain_psf: Psf, *, pixel_pitch: float, dwell: float, diffusivity: float = SILICON
+) -> Tensor:
+    """Sum the heat of every pixel at every pixel, row by row of the window."""
+    reach = math.sqrt(4 * diffusivity * dwell)
+    disc = pixel_pitch / math.sqrt(math.pi)
+    fine = (torch.arange(20000, dtype=torch.float64) + 0.5) * (disc / 20000)
+    # 2 pi r erfc / r over the area of the disc
+    middle = float(2 * torch.special.erfc(fine / reach).mean() / disc)
+    y, x = psf.intensity.shape[-2:]
+    position = torch.cartesian_prod(torch.arange(y), torch.arange(x)).double() * pixel_pitch
+    apart = torch.cdist(position, position, compute_mode="donot_use_mm_for_euclid_dist")
+    heat = torch.where(
+        apart > 0, torch.special.erfc(apart / reach) / apart.where(apart > 0, 1.0), middle
+    )
+    hottest = [(light.intensity.double().flatten(1) @ heat).amax(1) for light in (psf, plain_psf)]
+    return hottest[0] / hottest[1]
+
+
+@heat_ratio.check
+def _(result: Tensor, *inputs: Any, dwell: float, **params: Any) -> list[Check]:
+    low, high = float(result.min()), float(result.max())
+    return [
+        Check(
+            f"after {dwell:.3g} s the hottest pixel is {low:.3g} to {high:.3g} times as hot",
+            high < 1.01,
+        )
+    ]

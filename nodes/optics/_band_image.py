@@ -1,0 +1,317 @@
+"""The image of the scene, band by band, and the light that stays in the field."""
+
+import math
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d, pad
+
+from neusee.nodes import Check, node
+from neusee.nodes.optics._transform._fft_transforms import smooth
+from neusee.nodes.torch_func import one_by_one
+from neusee.nodes.values import Psf
+
+# --- band image -----------------------------------------------------------------------------------
+
+# The image of the scene: each band convolved with its point-spread function.
+
+
+Border = Literal["zero", "reflect"]
+Corner = tuple[int, int]
+#: ratio of a scene's root mean square to its typical value, from which float32 is too short
+_DEEP = 100.0
+
+
+@node(rtol=1e-5, bands={"radiance": -3, "psf": 0, "return": -3})
+def image(radiance: Tensor, psf: Psf, *, border: Border = "zero") -> Tensor:
+    """Convolve each band with its PSF linearly, so that light that leaves one edge does not return
+    at the other edge.
+
+    Shapes: radiance (..., band, y, x), psf.intensity (band, any, any) -> (..., band, y, x).
+    Units:  those of the radiance, times the share of the pupil's light that reaches each pixel.
+    Error:  float32 FFT: rms 2e-7 of the scene's root mean square or less. A band whose root mean
+            square exceeds 100 times its typical value (lamps at night) is transformed in float64,
+            in twice the time, so that round-off of the lamps does not hide the dark parts. Lasers
+            are added as spots and are not convolved. A PSF wider than twice the scene is cropped to
+            the part that reaches the scene. `reflect` needs up to four times the memory of `zero`.
+    Raises: ValueError where scene and PSF have different bands.
+    Source: Goodman, Introduction to Fourier Optics, 4th ed., ch. 7 (incoherent imaging).
+    """
+    scene, kernel, corner = _fitted(radiance, psf.intensity, border)
+    size = (radiance.shape[-2], radiance.shape[-1])
+    flat = scene.reshape(-1, *scene.shape[-3:])
+    done = [_by_contrast(scene_of_batch, kernel, corner, size) for scene_of_batch in flat]
+    return (
+        done[0].reshape(radiance.shape)
+        if len(done) == 1
+        else torch.stack(done).reshape(radiance.shape)
+    )
+
+
+@image.reference
+def _(radiance: Tensor, psf: Psf, *, border: Border = "zero") -> Tensor:
+    scene, kernel, _ = _fitted(
+        radiance.double(), psf.intensity.double(), "reflect" if border == "reflect" else "zero"
+    )
+    m, n = kernel.shape[-2:]
+    if border == "zero":
+        scene = pad(scene, (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2))
+    flat = scene.reshape(-1, *scene.shape[-3:])
+    return conv2d(flat, kernel.flip(-1, -2)[:, None], groups=len(kernel)).reshape(radiance.shape)
+
+
+@image.check
+def _(result: Tensor, radiance: Tensor, psf: Psf, **params: Any) -> list[Check]:
+    before, after = (float(x.sum(-1).sum(dtype=torch.float64)) for x in (radiance, result))
+    if before <= 0:
+        return [Check("the scene holds no light")]
+    largest_sum = float(psf.intensity.sum(-1).sum(-1, dtype=torch.float64).amax())
+    return [
+        Check(
+            f"flux kept in the image {after / before:.2%}",
+            ok=params.get("border") == "reflect" or after <= before * largest_sum * 1.001,
+        )
+    ]
+
+
+def _fitted(radiance: Tensor, intensity: Tensor, border: Border) -> tuple[Tensor, Tensor, Corner]:
+    """Return the padded scene, the PSF that reaches the scene, and the first image pixel within
+    their convolution.
+    """
+    if radiance.ndim < 3 or radiance.shape[-3] != intensity.shape[0]:
+        raise ValueError(
+            f"radiance {tuple(radiance.shape)} and PSF {tuple(intensity.shape)} must have the same"
+            " bands: compute both from the same `bands` step"
+        )
+    dtype = torch.promote_types(torch.promote_types(radiance.dtype, intensity.dtype), torch.float32)
+    kernel = reach(reach(intensity, -2, radiance.shape[-2]), -1, radiance.shape[-1]).to(dtype)
+    m, n = kernel.shape[-2:]
+    if border == "zero":
+        return radiance.to(dtype), kernel, (m // 2, n // 2)
+    around = (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2)
+    flat = pad(radiance.to(dtype).reshape(-1, *radiance.shape[-3:]), around, mode="reflect")
+    return flat.reshape(*radiance.shape[:-2], *flat.shape[-2:]), kernel, (m - 1, n - 1)
+
+
+def reach(kernel: Tensor, dim: int, size: int) -> Tensor:
+    """Crop a PSF along one axis to the samples that are at most one scene width from the centre
+    of the PSF.
+    """
+    centre = kernel.shape[dim] // 2
+    low, high = max(0, centre - size + 1), min(kernel.shape[dim], centre + size)
+    return kernel.narrow(dim, low, high - low)
+
+
+def _by_contrast(scene: Tensor, kernel: Tensor, corner: Corner, size: Corner) -> Tensor:
+    """Convolve each band of the scene with its PSF, in float64 if the contrast of the band is
+    too high for float32.
+    """
+    deep = _deep(scene) if scene.dtype == torch.float32 else []
+    if not any(deep):
+        return _convolve(scene, kernel, corner, size)
+    if all(deep):
+        return _convolve(scene.double(), kernel.double(), corner, size).to(scene.dtype)
+    wide = (torch.float64 if d else scene.dtype for d in deep)
+    images = [
+        _convolve(s[None].to(d), k[None].to(d), corner, size)
+        for s, k, d in zip(scene, kernel, wide, strict=True)
+    ]
+    return torch.cat([band.to(scene.dtype) for band in images])
+
+
+def _deep(scene: Tensor) -> list[bool]:
+    """Return, for each band of the scene, True if its bright pixels make float32 round-off hide
+    its other pixels.
+    """
+    flat = scene.detach().flatten(1)
+    few = flat[:, :: max(1, flat.shape[1] >> 16)]
+    mostly = few.abs().sqrt().mean(1).square()
+    bright = torch.linalg.vector_norm(flat, dim=1) / math.sqrt(flat.shape[1])
+    deep: list[bool] = (bright > _DEEP * mostly).tolist()
+    return deep
+
+
+def _convolve(scene: Tensor, kernel: Tensor, corner: Corner, size: Corner) -> Tensor:
+    """Return a window of the convolution of scene and PSF, by the shortest FFT without
+    wrap-around in the window.
+    """
+    length = [
+        smooth(max(s, a + w, s + k - 1 - a))
+        for s, k, a, w in zip(scene.shape[1:], kernel.shape[1:], corner, size, strict=True)
+    ]
+    result: Tensor = _Product.apply(
+        scene, kernel, (0, 0), (0, 0), corner, size, False, tuple(length)
+    )  # type: ignore[no-untyped-call]
+    return result
+
+
+class _Product(torch.autograd.Function):
+    """The convolution or correlation of two pictures, band by band, as a product of their FFTs,
+    cropped to a window.
+
+    ``a`` and ``b`` are padded with zeros around their corners. Both gradients are products of the
+    same kind, so only the inputs are stored and derivatives of every order exist.
+    """
+
+    @staticmethod
+    def forward(a: Tensor, b: Tensor, *settings: Any) -> Tensor:
+        at_a, at_b, corner, size, conjugate, length = settings
+        plane, result = _Plane(length, a), a.new_empty(len(a), *size)
+        for picture, kernel, out in zip(a, b, result, strict=True):
+            out.copy_(
+                plane.window(plane.product(picture, at_a, kernel, at_b, conjugate), corner, size)
+            )
+        return result
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        """Save the inputs for the backward pass outside of `forward`, as `torch.func` requires."""
+        ctx.save_for_backward(*inputs[:2])
+        ctx.save_for_forward(*inputs[:2])
+        ctx.settings = inputs[2:]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        (a, b), (at_a, at_b, corner, _, conjugate, length), grad = (
+            ctx.saved_tensors,
+            ctx.settings,
+            grads[0],
+        )
+        of_a = of_b = None
+        if ctx.needs_input_grad[0]:
+            of_a = _Product.apply(
+                grad, b, corner, at_b, at_a, tuple(a.shape[1:]), not conjugate, length
+            )  # type: ignore[no-untyped-call]
+        if ctx.needs_input_grad[1]:
+            first, second, first_corner, second_corner = (
+                (a, grad, at_a, corner) if conjugate else (grad, a, corner, at_a)
+            )
+            of_b = _Product.apply(
+                first, second, first_corner, second_corner, at_b, tuple(b.shape[1:]), True, length
+            )  # type: ignore[no-untyped-call]
+        return of_a, of_b, *(None for _ in ctx.settings)
+
+    @staticmethod
+    def jvp(ctx: Any, a: Tensor | None, b: Tensor | None, *_: None) -> Any:
+        """Return the change of a product: that by the first factor, and that by the second."""
+        first, second = ctx.saved_tensors
+        pairs = [(x, y) for x, y in ((a, second), (first, b)) if x is not None and y is not None]
+        changes = [_Product.apply(x, y, *ctx.settings) for x, y in pairs]  # type: ignore[no-untyped-call]
+        return sum(changes[1:], changes[0])
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> Any:
+        return one_by_one(
+            _Product.apply, info.batch_size, (*in_dims[:2], *(None for _ in inputs[2:])), inputs
+        )
+
+
+class _Plane:
+    """Memory for the FFT of one zero-padded band of a picture, reused for the next band.
+
+    The transform of the columns does not use ``out=``, which makes a copy: 21 ms instead of 12 ms
+    at 3072 x 1537.
+    """
+
+    def __init__(self, length: Corner, like: Tensor) -> None:
+        dtype = torch.complex128 if like.dtype == torch.float64 else torch.complex64
+        self.length = length
+        self.real = like.new_empty(length)
+        self.rows = like.new_empty((length[0], length[1] // 2 + 1), dtype=dtype)
+
+    def product(self, a: Tensor, at_a: Corner, b: Tensor, at_b: Corner, conjugate: bool) -> Tensor:
+        first, second = self._spectrum(a, at_a), self._spectrum(b, at_b)
+        both: Tensor = first.mul_(second.conj_physical_() if conjugate else second)
+        return both
+
+    def _spectrum(self, x: Tensor, corner: Corner) -> Tensor:
+        """Return the FFT of a zero-padded picture: first along the rows that hold samples, then
+        along all columns.
+        """
+        (y, left), (h, w) = corner, x.shape
+        for edge in (
+            self.rows[:y],
+            self.rows[y + h :],
+            self.real[:h, :left],
+            self.real[:h, left + w :],
+        ):
+            edge.zero_()
+        self.real[:h, left : left + w] = x
+        torch.fft.rfft(self.real[:h], out=self.rows[y : y + h])
+        spectrum: Tensor = torch.fft.fft(self.rows, dim=0)
+        return spectrum
+
+    def window(self, spectrum: Tensor, corner: Corner, size: Corner) -> Tensor:
+        (top, left), (h, w) = corner, size
+        columns = torch.fft.ifft(spectrum, dim=0)
+        torch.fft.irfft(columns[top : top + h], n=self.length[1], out=self.real[:h])
+        return self.real[:h, left : left + w]
+
+
+# --- light in field -------------------------------------------------------------------------------
+
+# The light of a scene that stays in the field of view, computed without an image.
+#
+# Each PSF sample moves a box of the scene into the field of view.
+
+
+_ROWS = 32  #: rows of the scene whose sums are in float64 at a time
+
+
+def light_in_field(intensity: Tensor, radiance: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the light of a scene (..., band, y, x) that its PSF leaves in the field, and all light
+    of the scene.
+
+    Both are sums over pixels, (..., band) float64. No light enters from outside the field. Raises
+    ValueError if scene and PSF (band, any, any) have different bands.
+    """
+    shape = tuple(radiance.shape)
+    if len(shape) < 3 or shape[-3] != len(intensity):
+        raise ValueError(
+            f"radiance {shape} and PSF {tuple(intensity.shape)} must have the same bands: "
+            "compute both from the same `bands` step"
+        )
+    kernel, size = reach(reach(intensity, -2, shape[-2]), -1, shape[-1]), (shape[-2], shape[-1])
+    scene, kernel = _alike(radiance, kernel)
+    in_field = []
+    for planes in scene.reshape(-1, *shape[-3:]):
+        for plane, band in zip(planes, kernel, strict=True):
+            light = _boxes(plane, band.shape, size) * band
+            in_field.append(light.sum(-1).sum(-1, dtype=torch.float64))
+    return torch.stack(in_field).reshape(shape[:-2]), scene.sum(-1).sum(-1, dtype=torch.float64)
+
+
+def _alike(scene: Tensor, kernel: Tensor) -> tuple[Tensor, Tensor]:
+    """Return scene and PSF in the more precise of their types, at least float32."""
+    dtype = torch.promote_types(torch.promote_types(scene.dtype, kernel.dtype), torch.float32)
+    return scene.to(dtype), kernel.to(dtype)
+
+
+def _boxes(plane: Tensor, kernel: torch.Size, size: tuple[int, int]) -> Tensor:
+    """Return, for each PSF sample, the sum (m, n) of a plane over the box that the sample moves
+    into the field of view.
+
+    The plane is rotated by 180 degrees, so that its boxes follow the order of the samples. The sums
+    are in float64, a few rows at a time, because allocating whole float64 planes takes longer than
+    the sums.
+    """
+    above = torch.ones(_ROWS, _ROWS, dtype=torch.float64, device=plane.device).tril()
+    down, parts = plane.new_zeros(kernel[1], dtype=torch.float64), []
+    for end in range(len(plane), 0, -_ROWS):
+        rows = plane[max(0, end - _ROWS) : end].flip(0, 1).cumsum(1, dtype=torch.float64)
+        sums = above[: len(rows), : len(rows)] @ _along(rows, 1, kernel[1], size[1]) + down
+        down = sums[-1]
+        parts.append(sums.to(plane.dtype))
+    return _along(torch.cat(parts), 0, kernel[0], size[0])
+
+
+def _along(sums: Tensor, dim: int, kernel: int, size: int) -> Tensor:
+    """Return sums over the boxes along the axis ``dim``, each of which starts or ends at an edge
+    of the scene.
+    """
+    before = kernel // 2
+    first = sums.narrow(dim, size - before - 1, before + 1)
+    return torch.cat(
+        [first, sums.narrow(dim, -1, 1) - sums.narrow(dim, 0, kernel - before - 1)], dim
+    )

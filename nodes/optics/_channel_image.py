@@ -1,0 +1,455 @@
+"""Weighted sums over the bands of an image, summed before the convolution."""
+
+import math
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, max_pool2d, pad
+
+from neusee.nodes import Check, ErrorBound, TensorStats, node
+from neusee.nodes.optics._band_image import Border, image, reach
+from neusee.nodes.optics._convolution_plan import (
+    ImageFacts,
+    Mix,
+    Passed,
+    Plan,
+    Where,
+    centred,
+    choose,
+    passed,
+    spread,
+    summed,
+    transform,
+    with_windows,
+)
+from neusee.nodes.values import Channels, FewBands, LowRankCube, Psf
+
+# --- convolve plan --------------------------------------------------------------------------------
+
+# The convolution of a scene with PSFs by a chosen plan, with borders, kernels and an estimate of
+# the round-off.
+
+
+_CELL = 8  #: pixels along the side of the cells in which the largest error of a pixel is bounded
+_SOME = 16  #: rows of the PSF summed at a time; these rows of 31 bands fit in the cache
+
+
+def convolved(planes: Tensor, intensity: Tensor, facts: ImageFacts, plan: Plan) -> Tensor:
+    """Return weighted sums (row, y, x) over the bands of the image, from the basis images and
+    kernels of ``plan``.
+    """
+    scene = bordered(planes[: plan.planes], facts, plan.window)
+    return summed(scene, _kernels(intensity, facts, plan), plan.mix, _where(facts, plan.window))
+
+
+def _where(facts: ImageFacts, window: tuple[int, int]) -> Where:
+    """Return the zero padding of scene and kernel, and the window of their convolution that is
+    the image.
+    """
+    (m, n), zero = window, (0, 0)
+    corner = (m - 1, n - 1) if facts.reflect else (m // 2, n // 2)
+    return Where(zero, zero, corner, facts.size, transform(facts, window))
+
+
+def majorant(off: Tensor, intensity: Tensor, facts: ImageFacts) -> Tensor:
+    """Return an upper bound (y, x) of the image error from an error ``off`` (y, x) in every band
+    of the scene.
+    """
+    window, kernel = (intensity.shape[1], intensity.shape[2]), _heaviest(intensity, facts)
+    reached = summed(
+        bordered(off[None], facts, window), kernel, Mix(None, None, None), _where(facts, window)
+    )
+    return reached[0].clamp_min_(0)
+
+
+def majorant_by_cell(off: Tensor, intensity: Tensor, facts: ImageFacts) -> Tensor:
+    """Return an upper bound of `majorant` over cells of 8 x 8 pixels: (cell, cell) float64, far
+    faster.
+
+    A part of the kernel in one cell takes light to the pixels of a cell from four neighbouring
+    cells of the scene, and from none of their pixels more than from the one with the largest error.
+    """
+    window, kernel = (intensity.shape[1], intensity.shape[2]), _heaviest(intensity, facts)[0]
+    corner = _where(facts, window).at
+    before = [-k % _CELL for k in corner]  # so that the middle of the kernel begins a cell
+    around = [-(k + b) % _CELL for k, b in zip(window, before, strict=True)]
+    wide = pad(kernel.double(), (before[1], around[1], before[0], around[0]))
+    light = avg_pool2d(wide[None], _CELL)[0] * _CELL**2
+    worst = max_pool2d(pad(cells(bordered(off[None], facts, window))[None], (1, 1, 1, 1)), 2, 1)[
+        0, 0
+    ].to(light)
+    length = [a + b for a, b in zip(light.shape, worst.shape, strict=True)]
+    product = torch.fft.irfft2(
+        torch.fft.rfft2(light, length) * torch.fft.rfft2(worst, length), length
+    )
+    first = [(k + b) // _CELL for k, b in zip(corner, before, strict=True)]
+    y, x = (slice(f, f + -(-n // _CELL)) for f, n in zip(first, facts.size, strict=True))
+    inside: Tensor = product[y, x]
+    return inside.clamp_min_(0)
+
+
+def cells(planes: Tensor) -> Tensor:
+    """Return the largest number in each cell of planes (k, y, x): (k, cell, cell); the last
+    cells may be smaller.
+    """
+    largest: Tensor = max_pool2d(planes[None], _CELL, ceil_mode=True)
+    return largest[0]
+
+
+def _heaviest(intensity: Tensor, facts: ImageFacts) -> Tensor:
+    """Return the PSF (1, y, x) of all bands together, each with its largest weight in any row."""
+    heaviest = facts.rows.abs().amax(0).to(intensity)
+    weights = heaviest[None] if facts.share is None else heaviest[None] @ facts.share.to(heaviest)
+    return _summed_bands(weights, intensity, facts.passed.signed)
+
+
+def bordered(planes: Tensor, facts: ImageFacts, window: tuple[int, int]) -> Tensor:
+    """Return the basis images of the scene, with a mirrored border if the convolution with the
+    PSF needs a border.
+    """
+    if not facts.reflect:
+        return planes
+    m, n = window
+    around = (n - 1 - n // 2, n // 2, m - 1 - m // 2, m // 2)
+    wide: Tensor = pad(planes, around, mode="reflect")
+    return wide
+
+
+def _kernels(intensity: Tensor, facts: ImageFacts, plan: Plan) -> Tensor:
+    stack = centred(intensity, plan.window)
+    if plan.kernels is None:
+        return stack if plan.number == len(stack) else stack[plan.bands.to(stack.device)]
+    weights = plan.kernels.new_zeros(len(plan.kernels), len(facts.basis))
+    weights = weights.index_copy_(1, plan.bands, plan.kernels)
+    weights = weights if facts.share is None else weights @ facts.share
+    return _summed_bands(weights.to(stack), stack)
+
+
+def _summed_bands(weights: Tensor, stack: Tensor, absolute: bool = False) -> Tensor:
+    """Return weighted sums (kernel, y, x) over the bands of a PSF, or over the absolute values of a
+    PSF.
+
+    A stack that must be copied is copied in slabs of a few rows.
+    """
+    if stack.requires_grad or (stack.is_contiguous() and not absolute):
+        return (weights @ stack.flatten(1)).view(-1, *stack.shape[1:])
+    sums = stack.new_empty(len(weights), *stack.shape[1:])
+    for y in range(0, stack.shape[1], _SOME):
+        rows = stack[:, y : y + _SOME]
+        rows = rows.abs() if absolute else rows
+        sums[:, y : y + _SOME] = (weights @ rows.flatten(1)).view(-1, *rows.shape[1:])
+    return sums
+
+
+def guessed(planes: Tensor, facts: ImageFacts) -> Tensor:
+    """Return an estimate of the brightest pixel of each weighted sum over the image bands.
+
+    The estimate is the smaller of two numbers: a quarter of the brightest pixel without blur, and
+    half of an upper bound of the brightest pixel with blur.
+    """
+    through = facts.passed.total
+    room, sharp = planes.new_empty(planes[0].numel()), torch.zeros_like(facts.rows[:, 0])
+    for i, weights in enumerate((facts.rows * through @ facts.basis).to(planes)):
+        bright = torch.mv(planes.flatten(1).T, weights, out=room)
+        sharp[i] = torch.maximum(bright.amax(), -bright.amin())
+    power = ((facts.basis @ facts.gram) * facts.basis).sum(1).clamp_min(0) * facts.copies
+    blurred = facts.rows.abs() @ (power * through * facts.passed.peak).sqrt()
+    return torch.minimum(sharp / 4, blurred / 2)
+
+
+def rounding(facts: ImageFacts, plan: Plan, brightest: Tensor, eps: float) -> Tensor:
+    """Return an estimate of the largest FFT round-off in each weighted sum over the image bands.
+
+    The round-off is close to white: a share eps sqrt(log2 N) / 2 of the power, spread over all N
+    samples. The estimate takes eight standard deviations of that noise. It adds ten roundings of
+    the brightest pixel for errors that are not spread: sums over the bands, planes and rows of a
+    PSF, of which five roundings were measured.
+    """
+    count = math.prod(transform(facts, plan.window))
+    u, x, y, _ = plan.mix
+    plane = facts.gram.diagonal()[: plan.planes].clamp_min(0).sqrt() * math.sqrt(facts.copies)
+    kernel = (facts.passed.total * facts.passed.peak).sqrt()
+    if plan.kernels is not None:
+        kernel = plan.kernels.abs() @ kernel[plan.bands]
+    else:  # the band of each PSF, or the band in which a PSF has the weight 1
+        kernel = kernel[plan.bands if facts.share is None else facts.share.argmax(0)]
+    terms = (plane if x is None else x.abs() @ plane) * (kernel if y is None else y.abs() @ kernel)
+    white = terms[None].sum(1) if u is None else u.abs() @ terms
+    return eps * (8 * math.sqrt(math.log2(count + 1)) * white / math.sqrt(count) + 10 * brightest)
+
+
+# --- channel image --------------------------------------------------------------------------------
+
+# Weighted sums over the bands of an image, from few convolutions because bands are summed before
+# the convolution.
+
+
+Share = Annotated[float, Field(ge=0, le=1)]  #: as a share of the brightest pixel
+#: share of the error up to which the bound of the brightest pixel may come from cells of pixels
+_QUICKLY = 0.25
+#: expected brightness of the darkest pixel; photographs have 1e-2, scenes at night 2e-5
+_DARKEST = 1e-3
+_LARGE = 512  #: pixels along the sides of an image from which cells of pixels save time
+#: plans tried: with the brightest pixels estimated, then measured, then with nothing omitted
+_TRIES = 3
+
+
+@node(rtol=1e-5)
+def image_channels(
+    radiance: LowRankCube,
+    psf: Psf,
+    rows: Tensor,
+    few: FewBands | None = None,
+    *,
+    border: Border = "zero",
+    within: Share = 0.0,
+    largest: bool = False,
+) -> Channels:
+    """Compute weighted sums over the bands of the image, with few convolutions instead of one
+    convolution for each band.
+
+    Plane i is the sum over k of planes[k] convolved with sum_b rows[i, b] basis[b, k] psf[b]: three
+    planes and three rows take 15 transforms where 31 bands take 93. Planes, kernels, bands and the
+    tails of the PSF are omitted as far as the root mean square error `within` allows, whichever
+    saves the most time; 0 omits nothing. With `largest` only the error of the low-rank cube is
+    allowed, and the error of the brightest pixel is bounded as well. With `few`, the PSFs are those
+    of few bands, and the PSF of every other band is interpolated between two of these.
+
+    Shapes: radiance k planes (y, x), psf.intensity (band, any, any), rows (row, band) -> planes
+            (row, y, x).
+    Units:  those of the radiance times those of the rows.
+    Error:  `bound`, as a share of the brightest pixel of each row. Proved upper bounds: the
+            residual of the cube, by the sum of each PSF (Young's inequality, as for the root mean
+            square; where the border reflects, three times that of the scene); of the brightest
+            pixel, the image of the largest residual of each pixel; tails, by Young's inequality;
+            kernels, by the sum of their residuals. Estimated, not proved: round-off of the
+            transforms, from the powers of planes and kernels, never less than was measured; and
+            `estimated`, the error by few bands. Planes and PSF receive gradients; basis and rows
+            are constants.
+    Raises: ValueError where scene, PSF and rows have different bands, or the scene is a batch.
+    Source: linearity of incoherent imaging, Goodman, Introduction to Fourier Optics, 4th ed., ch.
+            7.
+    """
+    share = (
+        None
+        if few is None or few.share.shape[0] == few.share.shape[1]
+        else few.share.double().cpu()
+    )
+    planes, intensity = _fitted(radiance, psf, rows, share)
+    unit = rows.detach().abs().amax(1).double().cpu()
+    unit = unit.where(unit > 0, 1.0)
+    scaled = rows.detach().double().cpu() / unit[:, None]
+    facts = _given(
+        radiance, planes, scaled, border, spread(passed(intensity.detach()), share), share
+    )
+    result, bound, sizes = _formed(planes, intensity, facts, 0.0 if largest else within)
+    top = _top(result, radiance, intensity, facts, within * _QUICKLY) if largest else math.inf
+    brightest = torch.tensor(top, dtype=torch.float64)
+    scale = unit.to(result)[:, None, None]
+    result = result * scale if result.requires_grad else result.mul_(scale)
+    estimated = (
+        torch.zeros(2, dtype=torch.float64)
+        if few is None
+        else torch.stack([few.error, few.largest]).cpu()
+    )
+    return Channels(result, rows.detach().double(), bound, sizes, brightest, estimated)
+
+
+@image_channels.reference
+def _(
+    radiance: LowRankCube,
+    psf: Psf,
+    rows: Tensor,
+    few: FewBands | None = None,
+    *,
+    border: Border = "zero",
+    **_: Any,
+) -> Channels:
+    assert image.hooks.reference is not None
+    if few is not None:
+        psf = psf._replace(intensity=torch.einsum("bj,jyx->byx", few.share, psf.intensity.double()))
+    cube = torch.tensordot(radiance.basis.double(), radiance.planes.double(), 1)
+    bands = image.hooks.reference(cube, psf, border=border)
+    zero = torch.zeros((), dtype=torch.float64)
+    return Channels(torch.tensordot(rows.double(), bands, 1), rows.double(), zero)
+
+
+@image_channels.approximation_error
+def _(result: Channels) -> tuple[float, float]:
+    error, top = result.estimated.tolist()
+    return float(result.bound) + error, float(result.largest) + top
+
+
+@image.propagate_error
+@image_channels.propagate_error
+def _(
+    radiance: ErrorBound,
+    psf: ErrorBound,
+    rows: ErrorBound | None = None,
+    few: ErrorBound | None = None,
+    *,
+    result: TensorStats,
+    **params: Any,
+) -> float | ErrorBound:
+    """Return the error by what was left out of the PSF, which `Channels.bound` does not count.
+
+    The share of the PSF is that of each pixel of a picture relative to its brightest pixel, as
+    `flare.stray_light` states it. The error by few bands is in `Channels.estimated`, and is not
+    counted a second time.
+    """
+    if radiance.rms or (rows is not None and rows.rms):
+        return math.inf
+    share = psf.share
+    peak = share / (1.0 - share) if share < 1.0 else math.inf
+    return ErrorBound(share * max(abs(result.min), abs(result.max)), peak=peak)
+
+
+@image_channels.expected_range
+def _(*inputs: Any, **params: Any) -> tuple[float, float]:
+    """Return the range of an image whose brightest pixel counts as 1, as
+    `nodes/sensor/_expected_ranges.py` says.
+    """
+    return _DARKEST, 1.0
+
+
+@image_channels.check
+def _(result: Channels, *inputs: Any, within: float = 0.0, **params: Any) -> list[Check]:
+    planes, kernels, bands, y, x = result.kept.tolist()
+    text = (
+        f"{planes} planes and {kernels} kernels of {y} x {x} for {result.rows.shape[1]} bands, "
+        f"{result.rows.shape[1] - bands} left out, within {float(result.bound):.2g}"
+    )
+    if float(result.estimated[0]):
+        text = f"{text}; PSFs of few bands, estimated error {float(result.estimated[0]):.2g}"
+    return [Check(text, within == 0 or float(result.bound) <= within)]
+
+
+def _fitted(
+    radiance: LowRankCube, psf: Psf, rows: Tensor, share: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Return the basis images of the scene, and the part of the PSF that reaches the scene, in
+    the same precision.
+    """
+    count = len(psf.intensity)
+    psf_bands = count if share is None else len(share) if share.shape[1] == count else -1
+    bands = {len(radiance.basis), psf_bands, rows.shape[-1]}
+    if len(bands) > 1 or radiance.planes.ndim != 3 or psf.intensity.ndim != 3 or rows.ndim != 2:
+        raise ValueError(
+            f"radiance of {len(radiance.basis)} bands in planes {tuple(radiance.planes.shape)}, PSF"
+            f" {tuple(psf.intensity.shape)} and rows {tuple(rows.shape)} must have the same bands,"
+            " without a batch: compute all three from the same `bands` step"
+        )
+    planes, dtype = radiance.planes, torch.promote_types(radiance.planes.dtype, psf.intensity.dtype)
+    kernel = reach(reach(psf.intensity, -2, planes.shape[-2]), -1, planes.shape[-1])
+    dtype = torch.promote_types(dtype, torch.float32)
+    return planes.to(dtype), kernel.to(dtype)
+
+
+def _given(
+    radiance: LowRankCube,
+    planes: Tensor,
+    rows: Tensor,
+    border: Border,
+    through: Passed,
+    share: Tensor | None,
+) -> ImageFacts:
+    flat = planes.detach().flatten(1)
+    gram = (flat @ flat.T).double().cpu()
+    copies = 9 if border == "reflect" else 1
+    if radiance.residual_rms.numel():
+        residual = radiance.residual_rms.double().cpu() * math.sqrt(copies)
+        norm = (gram.diagonal() * (1.001 * copies / flat.shape[1])).clamp_min(0).sqrt()
+    else:
+        residual, norm = (
+            radiance.residual_max.double().cpu(),
+            torch.maximum(flat.amax(1), -flat.amin(1)).double().cpu(),
+        )
+    return ImageFacts(
+        rows,
+        radiance.basis.detach().double().cpu(),
+        residual,
+        norm,
+        gram,
+        copies,
+        through,
+        (planes.shape[1], planes.shape[2]),
+        border == "reflect",
+        share,
+    )
+
+
+def _formed(
+    planes: Tensor, intensity: Tensor, facts: ImageFacts, within: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the summed image, its error bound, and the sizes of the first convolution plan of
+    error at most ``within``.
+    """
+    eps = torch.finfo(planes.dtype).eps
+    brightest, allowed = facts.rows.new_zeros(len(facts.rows)), within / (1 + within) - 16 * eps
+    if within > 0:
+        brightest = guessed(planes.detach(), facts)
+        facts = with_windows(facts, intensity.detach(), brightest, allowed)
+    for attempt in range(_TRIES):
+        plan = choose(facts, brightest, allowed if attempt < _TRIES - 1 else 0.0)
+        result = convolved(planes, intensity, facts, plan)
+        brightest_found = result.detach().abs().amax((1, 2)).double().cpu()
+        lost = rounding(facts, plan, brightest_found, eps)
+        bound = _share(plan.off + lost, brightest_found)
+        if plan.whole or bound <= within:
+            break
+        brightest = (brightest_found - plan.off - lost).clamp_min(0)
+        allowed = within / (1 + within) - _share(lost, brightest_found) - eps
+    return result, torch.tensor(bound, dtype=torch.float64), torch.tensor(plan.kept)
+
+
+def _top(
+    result: Tensor, radiance: LowRankCube, intensity: Tensor, facts: ImageFacts, quickly: float
+) -> float:
+    """Return the largest relative error of the brightest pixel over all weighted sums of the image
+    bands.
+
+    All bands together form the image of the cube's largest residual at each pixel. The true image
+    differs from the computed image by at most that image of the residual. The true maximum is
+    therefore at most the maximum of computed image plus residual. The true maximum is at least the
+    computed maximum less the residual at the same pixel, and this second error is never the larger
+    one. In a large image, a bound of at most ``quickly`` comes from cells of 8 x 8 pixels.
+    """
+    if not radiance.residual_map.numel():
+        return math.inf
+    image, residual = result.detach(), radiance.residual_map.to(result)
+    low, highest = (
+        torch.stack(ends).double().cpu() for ends in zip(*map(torch.aminmax, image), strict=True)
+    )
+    lost = rounding(
+        facts,
+        choose(facts, highest, 0.0),
+        torch.maximum(highest, -low),
+        torch.finfo(image.dtype).eps,
+    )
+    if quickly > 0 and min(image.shape[1:]) >= _LARGE:
+        above = (
+            (cells(image) + majorant_by_cell(residual, intensity.detach(), facts))
+            .amax((1, 2))
+            .double()
+            .cpu()
+        )
+        if (top := _share(above - highest + lost, highest)) <= quickly:
+            return top
+    lacks = majorant(residual, intensity.detach(), facts)
+    room = torch.empty_like(lacks)
+    above = torch.stack([torch.add(row, lacks, out=room).amax() for row in image]).double().cpu()
+    return _share(above - highest + lost, highest)
+
+
+def _share(off: Tensor, peak: Tensor) -> float:
+    """Return the largest relative error of the brightest pixels, given computed values ``peak``
+    and error bounds ``off``.
+    """
+    share = torch.where(off > 0, torch.where(off < peak, off / (peak - off), math.inf), 0.0)
+    worst = float(share.amax()) if bool(torch.isfinite(off + peak).all()) else math.inf
+    return worst
+
+
+image.channel_sum_form = image_channels

@@ -1,0 +1,584 @@
+"""Weighted sums of convolutions, and the cheapest plan with a bounded error."""
+
+import math
+from collections.abc import Iterator
+from itertools import chain, pairwise
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.optics._transform._fft_transforms import smooth
+from neusee.nodes.torch_func import one_by_one
+
+# --- psf energy -----------------------------------------------------------------------------------
+
+# The light of a PSF inside and outside of windows about the centre of the PSF.
+
+
+_LADDER = (1.0, 0.75, 0.5, 0.375, 0.25, 0.1875, 0.125, 0.0625, 0.03125, 0.015625)
+#: relative round-off of a float32 sum: a few nested sums of a few dozen additions each
+_ROUNDED = 4e-6
+
+
+class Passed(NamedTuple):
+    """Sums and maxima of the PSF of each band, inside and outside of windows, as float64 tensors
+    on the CPU.
+    """
+
+    windows: list[tuple[int, int]]  #: the largest first
+    total: Tensor  #: (band,) sum of |PSF|
+    peak: Tensor  #: (band,) maximum of |PSF|
+    beyond: Tensor  #: (window, band) sum of |PSF| outside the window
+    above: Tensor  #: (window, band) maximum of |PSF| outside the window
+    signed: bool  #: the PSF is negative somewhere
+
+
+def passed(intensity: Tensor) -> Passed:
+    """Return the sums and maxima of PSFs (band, y, x), with the whole PSF as the only window."""
+    # a maximum over several dimensions takes three times as long
+    ends = [torch.aminmax(band) for band in intensity]
+    low, high = (torch.stack(columns).double().cpu() for columns in zip(*ends, strict=True))
+    signed = not bool((low >= 0).all())  # True for NaN too
+    rows = (intensity.abs() if signed else intensity).sum(2)
+    total = rows.sum(1, dtype=torch.float64).cpu() * (1 + _ROUNDED)
+    nothing = torch.zeros_like(total)[None]
+    window = (intensity.shape[1], intensity.shape[2])
+    return Passed([window], total, torch.maximum(high, -low), nothing, nothing, signed)
+
+
+def by_window(intensity: Tensor, signed: bool) -> Passed:
+    """Return the sums and maxima of PSFs (band, y, x) for nested windows.
+
+    The edges of the windows cut each PSF into pieces, and each piece is read once.
+    """
+    m, n = intensity.shape[1:]
+    windows = list(dict.fromkeys((max(1, round(m * f)), max(1, round(n * f))) for f in _LADDER))
+    tall, wide = ([_inside(length, w[axis]) for w in windows] for axis, length in enumerate((m, n)))
+    sums, tops = _pieces(intensity.abs() if signed else intensity, _cuts(tall), _cuts(wide))
+    beyond, above = torch.zeros(2, len(windows), len(intensity), dtype=torch.float64)
+    for j, (y, x) in enumerate(zip(tall, wide, strict=True)):
+        outside = ~torch.outer(_covered(y, _cuts(tall)), _covered(x, _cuts(wide)))
+        if bool(outside.any()):
+            beyond[j], above[j] = sums[:, outside].sum(1), tops[:, outside].amax(1)
+    return Passed(windows, sums.sum((1, 2)), tops.amax((1, 2)), beyond, above, signed)
+
+
+def spread(of: Passed, share: Tensor | None) -> Passed:
+    """Return bounds for bands whose PSFs are weighted means, with weights ``share`` (band, j),
+    of the measured PSFs.
+    """
+    if share is None:
+        return of
+    beyond, above = of.beyond @ share.T, of.above @ share.T
+    return Passed(of.windows, share @ of.total, share @ of.peak, beyond, above, of.signed)
+
+
+def centred(stack: Tensor, window: tuple[int, int]) -> Tensor:
+    """Return the samples of each PSF in a window about the central sample n // 2."""
+    (top, bottom), (left, right) = (
+        _inside(n, w) for n, w in zip(stack.shape[1:], window, strict=True)
+    )
+    return stack[:, top:bottom, left:right]
+
+
+def _inside(length: int, window: int) -> tuple[int, int]:
+    first = length // 2 - window // 2
+    return first, first + window
+
+
+def _cuts(spans: list[tuple[int, int]]) -> list[int]:
+    return sorted(set(chain.from_iterable(spans)))
+
+
+def _covered(span: tuple[int, int], cuts: list[int]) -> Tensor:
+    """Return True for each interval between two neighbouring cuts that lies inside the span."""
+    return torch.tensor([span[0] <= cut < span[1] for cut in cuts[:-1]])
+
+
+def _pieces(size: Tensor, rows: list[int], columns: list[int]) -> tuple[Tensor, Tensor]:
+    """Return the sum, rounded up, and the maximum of each rectangular piece of a PSF, both (band,
+    rows, columns).
+
+    A few large calls are faster than many small calls, each of which waits for other work on the
+    machine.
+    """
+    along = [(size[:, a:b].sum(1), size[:, a:b].amax(1)) for a, b in pairwise(rows)]
+    sums, tops = (
+        torch.stack(row_parts, 1).double().cpu() for row_parts in zip(*along, strict=True)
+    )
+    total = torch.stack([sums[..., a:b].sum(-1) for a, b in pairwise(columns)], -1) * (1 + _ROUNDED)
+    return total, torch.stack([tops[..., a:b].amax(-1) for a, b in pairwise(columns)], -1)
+
+
+# --- summed convolution ---------------------------------------------------------------------------
+
+# Weighted sums of convolutions of a few pictures with a few kernels, computed in blocks of spectrum
+# columns.
+#
+# Result i is ``sum_s U[i, s] (X a)_s * (Y b)_s`` with planes a and kernels b. First all planes and
+# kernels are transformed along their rows. Then a few columns of all of them at a time are
+# transformed, multiplied and transformed back, in memory that fits in the cache. At 3072 x 3072
+# this takes 11 ms for the columns of a plane, on two cores; a transform of all columns in place
+# takes 35 ms.
+
+
+Corner = tuple[int, int]
+
+_COLUMNS = 16  #: columns of each spectrum at a time; on a GPU all columns
+#: rows of a picture at a time: whole pictures would take new memory, which costs more than their
+#: FFTs
+_SOME = 64
+
+
+class Mix(NamedTuple):
+    """The matrices that combine pictures and kernels into products, and products into results;
+    None is the identity.
+    """
+
+    u: Tensor | None  #: (result, s)
+    x: Tensor | None  #: (s, plane)
+    y: Tensor | None  #: (s, kernel)
+    #: number of results, where each has its own kernel for each plane, in this order
+    results: int = 0
+
+    def to(self, like: Tensor) -> "Mix":
+        """Return the matrices, converted to the precision and the device of the tensor ``like``."""
+        u, x, y = (m if m is None else m.to(like) for m in self[:3])
+        return Mix(u, x, y, self.results)
+
+
+class Where(NamedTuple):
+    """The positions of pictures and kernels in zero-padded arrays, and the window of the
+    convolution to return.
+    """
+
+    at_a: Corner
+    at_b: Corner
+    at: Corner
+    size: Corner
+    length: Corner
+    conjugate: bool = False  #: of F(b): correlation instead of convolution
+
+
+class Summed(torch.autograd.Function):
+    """A sum of convolutions. Its gradients are sums of convolutions too, so that derivatives of
+    all orders exist.
+    """
+
+    @staticmethod
+    def forward(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
+        return _summed(a, b, mix, where)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        """Save the inputs for the backward pass outside of `forward`, as `torch.func` requires."""
+        ctx.save_for_backward(*inputs[:2])
+        ctx.save_for_forward(*inputs[:2])
+        ctx.how = inputs[2:]
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        (a, b), (mix, where), grad = ctx.saved_tensors, ctx.how, grads[0]
+        u, x, y = (m if m is None else m.T for m in mix[:3])
+        flip = not where.conjugate
+        of_a = of_b = None
+        if ctx.needs_input_grad[0]:
+            back = where._replace(
+                at_a=where.at, at=where.at_a, size=tuple(a.shape[1:]), conjugate=flip
+            )
+            of_a = summed(grad, b, Mix(x, u, mix.y), back)
+        if ctx.needs_input_grad[1]:
+            back = where._replace(at=where.at_b, size=tuple(b.shape[1:]), conjugate=True)
+            if where.conjugate:
+                of_b = summed(a, grad, Mix(y, mix.x, u), back._replace(at_b=where.at))
+            else:
+                of_b = summed(
+                    grad, a, Mix(y, u, mix.x), back._replace(at_a=where.at, at_b=where.at_a)
+                )
+        return of_a, of_b, None, None
+
+    @staticmethod
+    def jvp(ctx: Any, a: Tensor | None, b: Tensor | None, *_: None) -> Any:
+        """Return the change of a product: that by the first factor, and that by the second."""
+        first, second = ctx.saved_tensors
+        pairs = [(x, y) for x, y in ((a, second), (first, b)) if x is not None and y is not None]
+        changes = [Summed.apply(x, y, *ctx.how) for x, y in pairs]  # type: ignore[no-untyped-call]
+        return sum(changes[1:], changes[0])
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[int | None, ...], *inputs: Any) -> Any:
+        return one_by_one(Summed.apply, info.batch_size, (*in_dims[:2], None, None), inputs)
+
+
+def summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
+    """Return weighted sums (r, y, x) of convolutions of pictures (k, y, x) with kernels (q, y,
+    x).
+    """
+    result: Tensor = Summed.apply(a, b, mix, where)  # type: ignore[no-untyped-call]
+    return result
+
+
+def _summed(a: Tensor, b: Tensor, mix: Mix, where: Where) -> Tensor:
+    mix, (high, wide) = mix.to(a), where.length
+    columns = wide // 2 + 1
+    step = columns if a.is_cuda else min(columns, _COLUMNS)
+    pictures = _Columns(_rows(a, where.at_a[1], wide, step), where.at_a[0], high)
+    kernels = _Columns(_rows(b, where.at_b[1], wide, step), where.at_b[0], high)
+    result = pictures.room.new_empty(_results(mix, a), where.size[0], columns)
+    for i, c in enumerate(range(0, columns, step)):
+        x, y = pictures.spectra(i), _times(mix.y, kernels.spectra(i))
+        block = torch.fft.ifft(_mixed(mix, x, y.conj() if where.conjugate else y))
+        block = block[:, : columns - c, where.at[0] : where.at[0] + where.size[0]]
+        result[:, :, c : c + step] = block.transpose(1, 2)
+    return _pixels(result, wide, slice(where.at[1], where.at[1] + where.size[1]))
+
+
+def _results(mix: Mix, a: Tensor) -> int:
+    return next(len(m) for m in (mix.u, mix.x, a) if m is not None)
+
+
+def _mixed(mix: Mix, x: Tensor, y: Tensor) -> Tensor:
+    """Return the spectra of the sums of convolutions, from the spectra ``x`` of pictures and
+    ``y`` of kernels.
+    """
+    if not mix.results:
+        return _times(mix.u, _times(mix.x, x) * y)
+    kernels = y.view(mix.results, len(x), *y.shape[1:])
+    total = x[0] * kernels[:, 0]
+    for k in range(1, len(x)):
+        total.addcmul_(x[k], kernels[:, k])
+    return total
+
+
+def _rows(x: Tensor, left: int, wide: int, step: int) -> Tensor:
+    """Return the FFT of each picture row, shifted by ``left`` zeros, as (plane, block, row,
+    ``step`` columns).
+
+    A block of columns is contiguous: in rows 12 kB apart, each element would lie in another memory
+    page.
+    """
+    count, tall, broad = x.shape
+    full_blocks, remainder = divmod(wide // 2 + 1, step)
+    some = _few_rows(x, tall)
+    room = x.new_zeros(some, wide)
+    blocks = room.new_empty(
+        count, full_blocks + (remainder > 0), tall, step, dtype=x.dtype.to_complex()
+    )
+    if remainder:
+        blocks[:, full_blocks, :, remainder:] = 0.0
+    for plane, block in zip(x, blocks, strict=True):
+        for y in range(0, tall, some):
+            rows = slice(y, min(y + some, tall))
+            inside = room[: rows.stop - y]
+            inside[:, left : left + broad] = plane[rows]
+            spectrum: Tensor = torch.fft.rfft(inside)
+            block[:full_blocks, rows] = (
+                spectrum[:, : full_blocks * step]
+                .view(len(inside), full_blocks, step)
+                .transpose(0, 1)
+            )
+            block[full_blocks:, rows, :remainder] = spectrum[:, full_blocks * step :]
+    return blocks
+
+
+def _pixels(spectrum: Tensor, wide: int, columns: slice) -> Tensor:
+    """Return the wanted columns of pictures, given the spectrum of each row."""
+    size = spectrum.shape[1]
+    pixels = spectrum.real.new_empty(*spectrum.shape[:2], columns.stop - columns.start)
+    some = _few_rows(spectrum, size)
+    for plane, rows in zip(pixels, spectrum, strict=True):
+        for y in range(0, size, some):
+            plane[y : y + some] = torch.fft.irfft(rows[y : y + some], n=wide)[:, columns]
+    return pixels
+
+
+def _few_rows(x: Tensor, count: int) -> int:
+    """Return how many rows are transformed at a time: as many as fit in the cache; on a GPU all."""
+    return count if x.is_cuda else min(count, _SOME)
+
+
+class _Columns:
+    """Blocks of spectrum columns, transformed in reused memory, because allocation takes longer
+    than the FFTs.
+    """
+
+    def __init__(self, blocks: Tensor, top: int, high: int) -> None:
+        self.blocks = blocks
+        self.room = blocks.new_zeros(len(blocks), blocks.shape[3], high)
+        self.inside = self.room[..., top : top + blocks.shape[2]]
+        self.found = torch.empty_like(self.room)
+
+    def spectra(self, block: int) -> Tensor:
+        """Return the FFT along each column of one block of columns: (plane, column, frequency)."""
+        self.inside.copy_(self.blocks[:, block].transpose(1, 2))
+        torch.fft.fft(self.room, out=self.found)
+        return self.found
+
+
+def _times(matrix: Tensor | None, spectra: Tensor) -> Tensor:
+    """Multiply complex spectra by a real matrix."""
+    if matrix is None:
+        return spectra
+    pairs = torch.view_as_real(spectra)
+    return torch.view_as_complex(
+        (matrix @ pairs.reshape(len(spectra), -1)).reshape(-1, *pairs.shape[1:])
+    )
+
+
+# --- collapsed plan -------------------------------------------------------------------------------
+
+# The choice of the cheapest way to compute weighted sums over the bands of an image with a bounded
+# error.
+
+
+_SMALL = 0.05  #: share of the error bound that is spent on omitting weak bands
+_FARTHER = 6  #: numbers of planes that are tried, from the least sufficient number on
+_EVERY = 8  #: one band of this many is tested first for a smaller window
+
+
+class ImageFacts(NamedTuple):
+    """The properties of scene, PSF and weights from which a convolution plan is chosen; float64,
+    on the CPU.
+    """
+
+    rows: Tensor  #: (row, band)
+    basis: Tensor  #: (band, k)
+    #: (k + 1, band) norm of the residual of each band after the first 0, 1, ... k planes
+    residual: Tensor
+    norm: Tensor  #: (k,) the same norm of each plane
+    gram: Tensor  #: (k, k) products of the planes
+    copies: int  #: the largest number of copies of a scene point: 9 where the border reflects
+    passed: Passed
+    size: tuple[int, int]
+    reflect: bool
+    #: (band, j) weights of the PSFs in each band, where only few bands have a PSF
+    share: Tensor | None = None
+
+
+class Plan(NamedTuple):
+    """A way to convolve a scene with a PSF: basis images, kernels, bands and PSF window, with
+    error bound and cost.
+    """
+
+    planes: int
+    bands: Tensor  #: indices of the bands that are not omitted
+    window: tuple[int, int]
+    kernels: Tensor | None  #: (kernel, bands used); None: each PSF is a kernel
+    mix: Mix
+    off: Tensor  #: (row,) upper bound of the omitted light
+    number: int  #: of kernels
+    cost: float  #: estimated seconds on two cores
+    whole: bool  #: nothing but zeros is omitted
+
+    @property
+    def kept(self) -> list[int]:
+        """Return the numbers of planes, kernels and bands, and the PSF window's size, as in
+        `Channels.kept`.
+        """
+        return [self.planes, self.number, len(self.bands), *self.window]
+
+
+class Fewer(NamedTuple):
+    """A small set of convolution kernels, brightest first, whose weighted sums approximate a
+    larger set of kernels.
+    """
+
+    kernels: Tensor  #: (q, band)
+    mixed: Tensor  #: (row x plane, q)
+    off: Tensor  #: (q - 1, row) upper bound of the light that the first 1, 2, ... kernels omit
+
+
+def with_windows(
+    facts: ImageFacts, intensity: Tensor, brightest: Tensor, within: float
+) -> ImageFacts:
+    """Return ``facts`` with the light that smaller PSF windows omit, or unchanged if these
+    windows omit too much.
+    """
+    few, signed = slice(_EVERY // 2, None, _EVERY), facts.passed.signed
+    if facts.share is None and len(intensity) > _EVERY:
+        some = facts._replace(
+            rows=facts.rows[:, few], basis=facts.basis[few], residual=facts.residual[:, few]
+        )
+        if not _narrow(some._replace(passed=by_window(intensity[few], signed)), within * brightest):
+            return facts
+    return facts._replace(passed=spread(by_window(intensity, signed), facts.share))
+
+
+def _narrow(facts: ImageFacts, limit: Tensor) -> bool:
+    """Return True if the second largest PSF window omits little enough light for some number of
+    basis images.
+    """
+    bands, planes = torch.arange(len(facts.basis)), range(1, len(facts.norm) + 1)
+    return len(facts.passed.windows) > 1 and any(
+        bool((facts.rows.abs() @ _tail(facts, bands, k, 1) <= limit).all()) for k in planes
+    )
+
+
+def choose(facts: ImageFacts, brightest: Tensor, within: float) -> Plan:
+    """Return the cheapest convolution plan that omits at most ``within`` of the brightest pixel,
+    or a complete plan.
+    """
+    bands, lost = _strong(facts, brightest, within)
+    complete = min(_plans(facts, bands, lost, len(facts.norm), 0), key=lambda plan: plan.cost)
+    best = complete._replace(whole=True)
+    if within <= 0:
+        return best
+    for k in _enough(facts, bands, lost, brightest, within):
+        fewer = _fewer(facts, bands, k, brightest)
+        for j in range(len(facts.passed.windows)):
+            plans = _plans(facts, bands, lost, k, j, (within * brightest, fewer))
+            best = min([best, *plans], key=lambda plan: plan.cost)
+    return best
+
+
+def _strong(facts: ImageFacts, brightest: Tensor, within: float) -> tuple[Tensor, Tensor]:
+    """Return the bands to convolve, and an upper bound of the light that the omitted bands add
+    to each weighted sum.
+    """
+    may = facts.rows.abs() * (facts.residual[0] * facts.passed.total)
+    share = torch.where(may > 0, may / brightest.clamp_min(1e-300)[:, None], 0.0).amax(0)
+    order = share.argsort()
+    weak = order[share[order].cumsum(0) <= _SMALL * max(within, 0.0)]
+    bands = torch.ones_like(share, dtype=torch.bool).index_fill_(0, weak, False)
+    if not bool(bands.any()):
+        bands[int(share.argmax())] = True
+    return bands.nonzero()[:, 0], may[:, ~bands].sum(1)
+
+
+def _enough(
+    facts: ImageFacts, bands: Tensor, lost: Tensor, brightest: Tensor, within: float
+) -> list[int]:
+    """Return how many basis images each picture needs for an error of at most ``within`` times
+    the brightest pixel.
+    """
+    off = (
+        lost + (facts.residual[:, bands] * facts.passed.total[bands]) @ facts.rows[:, bands].abs().T
+    )
+    fits = [k for k in range(1, len(facts.norm) + 1) if bool((off[k] <= within * brightest).all())]
+    return fits[:_FARTHER]
+
+
+def _plans(
+    facts: ImageFacts,
+    bands: Tensor,
+    lost: Tensor,
+    k: int,
+    j: int,
+    within: tuple[Tensor, Fewer] | None = None,
+) -> Iterator[Plan]:
+    """Yield up to three convolution plans that use the first ``k`` basis images and the PSF window
+    number ``j``.
+
+    The kernels of the three plans are one for each plane and row, one for each PSF, and fewer
+    kernels to mix.
+    """
+    rows, basis, through = facts.rows[:, bands], facts.basis[bands, :k], facts.passed.total[bands]
+    off = (
+        lost
+        + rows.abs() @ (facts.residual[k, bands] * through)
+        + rows.abs() @ _tail(facts, bands, k, j)
+    )
+    if within is not None and not bool((off <= within[0]).all()):
+        return
+    count = len(rows)
+    u = torch.eye(count, dtype=torch.float64).repeat_interleave(k, 1)
+    x = torch.eye(k, dtype=torch.float64).repeat(count, 1)
+    sums = _sums(rows, basis)
+
+    def plan(kernels: Tensor | None, mix: Mix, off: Tensor) -> Plan:
+        window = facts.passed.windows[j]
+        psfs = len(bands) if facts.share is None else facts.share.shape[1]
+        cost = _cost(facts, window, k, psfs, kernels, mix)
+        return Plan(
+            k,
+            bands,
+            window,
+            kernels,
+            mix,
+            off,
+            psfs if kernels is None else len(kernels),
+            cost,
+            False,
+        )
+
+    yield plan(sums, Mix(u, x, None, count), off)
+    if facts.share is None:
+        yield plan(None, Mix(rows, basis, None), off)
+    else:
+        yield plan(None, Mix(u, x, sums @ facts.share[bands], count), off)
+    if within is not None:
+        limit, few = within
+        for q in (few.off + off <= limit).all(1).nonzero()[:1, 0].tolist():
+            yield plan(
+                few.kernels[: q + 1], Mix(u, x, few.mixed[:, : q + 1], count), off + few.off[q]
+            )
+
+
+def _fewer(facts: ImageFacts, bands: Tensor, k: int, brightest: Tensor) -> Fewer:
+    """Return a small set of kernels: singular vectors of the matrix that sums the bands of the
+    PSF to kernels.
+    """
+    rows, band = facts.rows[:, bands], facts.passed.total[bands]
+    plane = torch.where(brightest[:, None] > 0, facts.norm[:k] / brightest[:, None], 0.0).flatten()
+    scaled = plane[:, None] * _sums(rows, facts.basis[bands, :k]) * band
+    a, s, b = torch.linalg.svd(scaled, full_matrices=False)
+    off = [
+        (scaled - (a[:, :q] * s[:q]) @ b[:q]).abs().sum(1).reshape(len(rows), -1).sum(1)
+        for q in range(1, len(s))
+    ]
+    kernels = torch.where(band > 0, b / band, 0.0)
+    mixed = torch.where(plane[:, None] > 0, a * s / plane[:, None], 0.0)
+    # a row without weight above
+    unknown = torch.where((brightest == 0) & (rows != 0).any(1), math.inf, 0.0)
+    return Fewer(
+        kernels, mixed, torch.stack(off) * brightest + unknown if off else brightest[None][:0]
+    )
+
+
+def _sums(rows: Tensor, basis: Tensor) -> Tensor:
+    """Return the weight of each PSF band in the convolution kernel of each weighted sum and each
+    basis image.
+    """
+    return (rows[:, None, :] * basis.T).flatten(0, 1)
+
+
+def _tail(facts: ImageFacts, bands: Tensor, k: int, j: int) -> Tensor:
+    """Return, for each band, an upper bound of the light that the PSF outside the window adds to an
+    image pixel.
+
+    The bound is Young's inequality in three norms.
+    """
+    basis = facts.basis[bands, :k]
+    beyond, above = facts.passed.beyond[j, bands], facts.passed.above[j, bands]
+    top = facts.residual[0, bands] + facts.residual[k, bands]
+    power = ((basis @ facts.gram[:k, :k]) * basis).sum(1).clamp_min(0) * facts.copies
+    return torch.minimum(top * beyond, (power * beyond * above).sqrt() * (1 + 1e-6))
+
+
+def _cost(
+    facts: ImageFacts, window: tuple[int, int], k: int, bands: int, kernels: Tensor | None, mix: Mix
+) -> float:
+    """Return the seconds that a convolution plan is expected to take on two cores: FFTs,
+    products and kernel sums.
+    """
+    area = math.prod(transform(facts, window))
+    count = bands if kernels is None else len(kernels)
+    terms = len(mix.x) if mix.x is not None else k
+    products = terms * (k + len(facts.rows) + (count if mix.y is not None else 0) + 8)
+    sums = 0 if kernels is None else count * bands * math.prod(window)
+    return area * (2e-9 * (k + count + len(facts.rows)) + 3e-11 * products) + 1.4e-11 * sums
+
+
+def transform(facts: ImageFacts, window: tuple[int, int]) -> tuple[int, int]:
+    """Return the shortest FFT lengths (y, x) for which the convolution has no wrap-around within
+    the image.
+    """
+    if facts.reflect:
+        y, x = (smooth(s + w - 1) for s, w in zip(facts.size, window, strict=True))
+    else:
+        y, x = (
+            smooth(max(s + w // 2, s + w - 1 - w // 2))
+            for s, w in zip(facts.size, window, strict=True)
+        )
+    return y, x

@@ -1,0 +1,458 @@
+"""The choice of few bands whose PSFs represent those of all bands."""
+
+import math
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, pad
+
+from neusee.nodes import Check, node
+from neusee.nodes.optics._channel_image import Share
+from neusee.nodes.optics._convolution_plan import centred
+from neusee.nodes.optics._psf import psf
+from neusee.nodes.optics._psf_definition import SensorSampling
+from neusee.nodes.optics._pupil import pupil_has_large_steps
+from neusee.nodes.units import FocalLength, PixelPitch, Shape
+from neusee.nodes.values import FewBands, LowRankCube, Psf, Pupil
+
+# --- band thumbnail -------------------------------------------------------------------------------
+
+# Small PSFs and small parts of a scene, on which the error of fewer bands is estimated.
+
+
+SIDE = 120  #: cells, along each side of a PSF about the axis
+_PART = 240  #: cells, along each side of a part of the scene, with a margin for light from beside
+_BINS = (1, 2, 4)  #: pixels along the side of a cell, the least first
+#: least ratio of the area of the PSF window to that of the thumbnail, below which a choice saves
+#: nothing
+_GAIN = 4
+_HELD = 0.9  #: share of the light that a window of cells must hold
+_SAMPLES = 256  #: least number of pupil samples across, of which a larger pupil keeps every k-th
+_TILE = 32  #: cells, of the tiles of which the brightest and the one of the most contrast are found
+_PLANES = 4  #: strongest planes of the scene in which the error is estimated
+_SCREENS = ("aperture", "amplitude", "height", "path")  #: what a pupil holds for each sample
+
+Lens = Mapping[str, Any]  #: the parameters of `optics.psf` but its window
+
+
+class Parts(NamedTuple):
+    """Parts of a scene as spectra, and the kernels of all bands: what the estimate of each
+    choice shares.
+    """
+
+    scene: Tensor  #: (part, plane, y, x) spectra
+    weights: Tensor  #: (row x plane, band)
+    kernels: Tensor  #: (row x plane, m n) of all bands
+    image: Tensor  #: (part, row, y, x) with the PSFs of all bands
+    top: Tensor  #: (row,) brightest pixel of all parts
+
+
+def without_gradients(
+    pupil: Pupil, radiance: LowRankCube, rows: Tensor
+) -> tuple[Pupil, LowRankCube, Tensor]:
+    """Return the inputs of a choice, which is constant for gradients."""
+    still = pupil._replace(**{name: getattr(pupil, name).detach() for name in _SCREENS})
+    return still, radiance._replace(planes=radiance.planes.detach()), rows.detach().double().cpu()
+
+
+class Thumbnail(NamedTuple):
+    """A thinned pupil, and the window of cells in which its PSFs are small pictures of those of
+    the whole pupil.
+    """
+
+    pupil: Pupil
+    pixels: int  #: along the side of a cell
+    lens: Lens
+
+    def light(self, bands: Tensor) -> Tensor:
+        """Return the PSFs (band, cell, cell) of some bands about the axis."""
+        some = self.pupil._replace(
+            index=self.pupil.index[bands], wavelengths=self.pupil.wavelengths[bands]
+        )
+        return binned(
+            focused(some, (self.pixels * SIDE, self.pixels * SIDE), self.lens), self.pixels
+        )
+
+
+def thumbnail(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> Thumbnail | None:
+    """Return the thumbnail of the PSFs of a pupil in a window of ``shape``.
+
+    Return None if no window of cells holds the light, or if the PSFs of ``shape`` take little
+    longer.
+    """
+    # square pixels of a thinned pupil would be too wide
+    small, lens = _thinned(pupil), {**lens, "pixel": "point"}
+    ends = torch.tensor(sorted({0, len(pupil.wavelengths) // 2, len(pupil.wavelengths) - 1}))
+    some = small._replace(index=small.index[ends], wavelengths=small.wavelengths[ends])
+    reach = (
+        float(small.wavelengths.min())
+        * lens["focal_length"]
+        / (float(small.pitch) * lens["pixel_pitch"])
+    )
+    clear, through = small.aperture.double().square().sum(), small.amplitude.double().square().sum()
+    for pixels in _BINS:
+        side = pixels * SIDE
+        if side > reach or side**2 * _GAIN > shape[0] * shape[1]:
+            return None
+        if float(focused(some, (side, side), lens).sum((1, 2)).min()) >= _HELD * float(
+            through / clear
+        ):
+            return Thumbnail(small, pixels, lens)
+    return None
+
+
+def focused(pupil: Pupil, shape: tuple[int, int], lens: Lens) -> Tensor:
+    """Return the PSFs (band, y, x) of a pupil in a window."""
+    result: Psf = psf(pupil, **lens, shape=shape)
+    return result.intensity
+
+
+def binned(stack: Tensor, pixels: int) -> Tensor:
+    """Return the light of each cell of ``pixels`` along its side; pixels beyond the last whole
+    cell are left out.
+    """
+    return stack if pixels == 1 else avg_pool2d(stack, pixels) * pixels**2
+
+
+def bins_of(stack: Tensor) -> int:
+    """Return the least number of pixels along the side of a cell at which the cells hold the
+    light of the PSFs.
+    """
+    total = stack.sum((1, 2))
+    for pixels in _BINS:
+        if bool(
+            (centred(stack, (pixels * SIDE, pixels * SIDE)).sum((1, 2)) >= _HELD * total).all()
+        ):
+            break
+    return pixels
+
+
+def _thinned(pupil: Pupil) -> Pupil:
+    """Return every k-th sample of a large pupil, as long as the samples that are left can follow
+    the phase.
+    """
+    step = max(1, len(pupil.height) // _SAMPLES)
+    while step > 1 and pupil_has_large_steps(_every(pupil, step)):
+        step //= 2
+    return _every(pupil, step)
+
+
+def _every(pupil: Pupil, step: int) -> Pupil:
+    return pupil._replace(
+        **{name: getattr(pupil, name)[::step, ::step] for name in _SCREENS},
+        pitch=pupil.pitch * step,
+    )
+
+
+def share_of_bands(bands: Tensor, count: int) -> Tensor:
+    """Return the weights (band, j) float64 that interpolate linearly between the bands ``bands``,
+    which rise.
+    """
+    band = torch.arange(count, dtype=torch.float64)
+    if len(bands) == 1:
+        return torch.ones(count, 1, dtype=torch.float64)
+    high = torch.searchsorted(bands.double(), band).clamp(1, len(bands) - 1)
+    low = high - 1
+    weight = ((band - bands[low]) / (bands[high] - bands[low])).clamp(0.0, 1.0)[:, None]
+    share = torch.zeros(count, len(bands), dtype=torch.float64)
+    return share.scatter_(1, low[:, None], 1 - weight).scatter_(1, high[:, None], weight)
+
+
+def parts_of(radiance: LowRankCube, rows: Tensor, light: Tensor, pixels: int) -> Parts:
+    """Return three parts of the scene, about the brightest tile, about the tile of most contrast
+    and in the middle.
+
+    ``light`` has the PSFs (band, m, n) of all bands in cells of ``pixels`` along each side.
+    """
+    planes = binned(radiance.planes[:_PLANES], pixels) / pixels**2
+    basis = radiance.basis[:, :_PLANES].detach().double().cpu()
+    white = torch.tensordot((rows.sum(0) @ basis).to(planes), planes, 1)[None]
+    tile = (min(_TILE, white.shape[1]), min(_TILE, white.shape[2]))
+    mean = avg_pool2d(white[None], tile)[0, 0]
+    spread = avg_pool2d(white[None].square(), tile)[0, 0] - mean.square()
+    tiles = [divmod(int(x.argmax()), x.shape[1]) for x in (mean, spread)]
+    about = [(y * tile[0] + tile[0] // 2, x * tile[1] + tile[1] // 2) for y, x in tiles]
+    middle = (white.shape[1] // 2, white.shape[2] // 2)
+    scene = torch.stack([_cut(planes, place) for place in dict.fromkeys([*about, middle])]).to(
+        light
+    )
+    weights = (rows[:, None, :] * basis.T).flatten(0, 1)
+    kernels = weights.to(light) @ light.flatten(1)
+    spectra = torch.fft.rfft2(scene)
+    image = _imaged(spectra, kernels, light)
+    return Parts(spectra, weights, kernels, image, image.amax((0, 2, 3)))
+
+
+def _cut(planes: Tensor, place: tuple[int, int]) -> Tensor:
+    """Return a part of the scene about a pixel; a smaller scene is filled up with zeros."""
+    spans = []
+    for middle, size in zip(place, planes.shape[1:], strict=True):
+        side = min(_PART, size)
+        first = min(max(middle - side // 2, 0), size - side)
+        spans.append(slice(first, first + side))
+    cut = planes[:, spans[0], spans[1]]
+    return pad(cut, (0, _PART - cut.shape[2], 0, _PART - cut.shape[1]))
+
+
+def estimated(parts: Parts, share: Tensor, light: Tensor) -> tuple[float, float]:
+    """Return the errors of the image if the PSF of each band is the mean of few PSFs ``light`` by
+    weights ``share``.
+
+    The first is the root mean square of the worst part and row, the second the change of the
+    brightest pixel, or a quarter of the first where that is larger; both are relative to the
+    brightest pixel of all parts.
+    """
+    off = (parts.weights @ share).to(light) @ light.flatten(1) - parts.kernels
+    error = _imaged(parts.scene, off, light)
+    scale = parts.top.where(parts.top > 0, 1.0)
+    rms = error.square().mean((2, 3)).sqrt() / scale
+    change = ((parts.image + error).amax((0, 2, 3)) - parts.top).abs() / scale
+    return float(rms.max()), max(float(rms.max()) / 4, float(change.max()))
+
+
+def _imaged(spectra: Tensor, kernels: Tensor, like: Tensor) -> Tensor:
+    """Return the image (part, row, y, x) of parts of a scene, without the margin to which light
+    comes from outside.
+    """
+    rows = kernels.view(-1, spectra.shape[1], *like.shape[1:])
+    size = (_PART, _PART)
+    image = torch.fft.irfft2((spectra[:, None] * torch.fft.rfft2(rows, size)).sum(2), size)
+    spans = [slice(m - 1, _PART) for m in like.shape[1:]]
+    inner: Tensor = image[..., spans[0], spans[1]]
+    return inner
+
+
+# --- few bands ------------------------------------------------------------------------------------
+
+# The choice of few bands whose PSFs represent the PSFs of all bands, by an estimate of the error in
+# the picture.
+
+
+_RUNGS = (2, 3, 4, 5, 6, 8, 11, 16, 21)  #: numbers of bands that are tried, the fewest first
+_MOST = 0.7  #: largest share of the bands that is worth a choice
+_FINER = 3  #: least ratio of the bands of a comparison to the bands that are compared
+_SAFETY = 2.0  #: factor on the estimate, for the thumbnail is not the picture
+
+
+@node(rtol=1e-5)
+def few_bands(
+    pupil: Pupil,
+    radiance: LowRankCube,
+    rows: Tensor,
+    *,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
+    shape: Shape,
+    pixel: Literal["point", "zoh"] = "point",
+    sensor: SensorSampling = "point",
+    within: Share = 0.0,
+    largest: bool = False,
+) -> FewBands:
+    """Choose the fewest bands whose PSFs, interpolated linearly between the bands, give the image
+    of the scene within an error.
+
+    The error is estimated: PSFs of a thinned pupil, of every second band where at least three times
+    as many as few bands are enough to compare with, else of all, are convolved with three parts of
+    the scene: the brightest, the one of the most contrast, and the middle. Their window holds 90 %
+    of the light, in cells of 1, 2 or 4 pixels along each side. The estimate is twice the error of
+    the worst part. With `largest`, the error of the brightest pixel is held too. All bands are kept
+    where no such window is much smaller than that of the PSF.
+
+    Shapes: pupil (v, u), radiance k planes (y, x), rows (row, band) -> used (j,), share (band, j)
+            float64.
+    Units:  errors relative to the brightest pixel of each row.
+    Error:  an estimate, not a bound: `optics.few_bands_checked` compares it with a finer choice.
+            The choice is constant for gradients.
+    Raises: ValueError where pupil, scene and rows have different bands.
+    Source: composite trapezoidal rule over wavelengths: Dahlquist and Bjorck, Numerical Methods,
+            section 7.2 (1974).
+    """
+    count = _same_count(pupil, radiance, rows)
+    rungs = [few for few in _RUNGS if few <= _MOST * count]
+    if not rungs or within <= 0:
+        return _all_bands(count)
+    pupil, radiance, rows = without_gradients(pupil, radiance, rows)
+    lens = {
+        "focal_length": focal_length,
+        "pixel_pitch": pixel_pitch,
+        "pixel": pixel,
+        "sensor": sensor,
+    }
+    small = thumbnail(pupil, shape, lens)
+    if small is None:
+        return _all_bands(count)
+    half = _evenly(count // 2 + 1, count)
+    light_of_half = small.light(half)
+    light = _interpolated(light_of_half, half, count)
+    rungs_of_half = [few for few in rungs if _FINER * few <= len(half)]
+    choice = _fewest(
+        rungs_of_half, parts_of(radiance, rows, light, small.pixels), light, within, largest
+    )
+    if choice is None:
+        light = _completed(light_of_half, half, count, small)
+        choice = _fewest(
+            rungs, parts_of(radiance, rows, light, small.pixels), light, within, largest
+        )
+    return choice or _all_bands(count)
+
+
+def _same_count(pupil: Pupil, radiance: LowRankCube, rows: Tensor) -> int:
+    """Return the number of bands; raise ValueError where pupil, radiance and rows differ in it."""
+    counts = len(pupil.wavelengths), len(radiance.basis), rows.shape[-1]
+    if len(set(counts)) > 1:
+        text = f"{counts[0]}, {counts[1]} and {counts[2]}"
+        raise ValueError(
+            f"pupil, radiance and rows have {text} bands: compute all from the same `bands` step"
+        )
+    return counts[0]
+
+
+def _interpolated(light: Tensor, some: Tensor, count: int) -> Tensor:
+    """Return the PSFs (band, y, x) of all bands from those of some bands, linearly between the
+    bands.
+    """
+    planes = share_of_bands(some, count).to(light) @ light.flatten(1)
+    return planes.view(count, *light.shape[1:])
+
+
+def _completed(light: Tensor, some: Tensor, count: int, small: Thumbnail) -> Tensor:
+    """Return the PSFs (band, y, x) of all bands, of which those of some bands are there already."""
+    others = torch.tensor(sorted({*range(count)} - {*some.tolist()}))
+    together = torch.cat([light, small.light(others)])
+    return together[torch.cat([some, others]).argsort()]
+
+
+def _fewest(
+    rungs: list[int], parts: Parts, light: Tensor, within: float, largest: bool
+) -> FewBands | None:
+    """Return the first number of bands whose estimated error is within the limit, or None."""
+    count = len(light)
+    for few in rungs:
+        computed = _evenly(few, count)
+        share = share_of_bands(computed, count)
+        error, top = (_SAFETY * x for x in estimated(parts, share, light[computed]))
+        if max(error, top if largest else 0.0) <= within:
+            return FewBands(share, computed, _number(error), _number(top))
+    return None
+
+
+def _evenly(few: int, count: int) -> Tensor:
+    """Return ``few`` indices of ``count`` bands, the first and the last among them."""
+    return torch.linspace(0, count - 1, few, dtype=torch.float64).round().long()
+
+
+@few_bands.check
+def _(result: FewBands, *inputs: object, **params: object) -> list[Check]:
+    bands, few = result.share.shape
+    if few == bands:
+        return [
+            Check(f"all {bands} bands: fewer would not be within the tolerance, or save nothing")
+        ]
+    return [
+        Check(
+            f"{few} of {bands} bands: estimated error {float(result.error):.2g} of the brightest"
+            " pixel"
+        )
+    ]
+
+
+@node(rtol=1e-12)
+def pupil_of_bands(pupil: Pupil, few: FewBands) -> Pupil:
+    """Return the pupil of some bands: the factors of all bands, and index and wavelengths of the
+    bands in use.
+
+    Shapes: pupil (v, u) -> (v, u), with one index and one wavelength for each band in use.
+    Units:  as the pupil.
+    Error:  exact.
+    Source: the pupil function of `optics.pupil`, band by band.
+    """
+    bands = few.used.to(pupil.index.device)
+    return pupil._replace(index=pupil.index[bands], wavelengths=pupil.wavelengths[bands])
+
+
+@node(rtol=1e-5)
+def few_bands_checked(
+    few: FewBands,
+    psf: Psf,
+    pupil: Pupil,
+    radiance: LowRankCube,
+    rows: Tensor,
+    *,
+    focal_length: FocalLength,
+    pixel_pitch: PixelPitch,
+    pixel: Literal["point", "zoh"] = "point",
+    sensor: SensorSampling = "point",
+) -> FewBands:
+    """Compare PSFs of few bands with about twice as many bands, on parts of the scene, and raise
+    the error estimate where it was too low.
+
+    The PSFs are those of the run, and those of the bands halfway between them, from the pupil in
+    full. The new estimate is the larger of the old one and twice the difference.
+
+    Shapes: psf.intensity (j, y, x), pupil (v, u), radiance k planes (y, x), rows (row, band) -> as
+            `few`.
+    Units:  errors relative to the brightest pixel of each row.
+    Error:  an estimate, not a bound: for a smooth change with the wavelength the difference is 3/4
+            of the error.
+    Source: comparison of two composite rules: Dahlquist and Bjorck, Numerical Methods, section 7.2
+            (1974).
+    """
+    count, computed = len(few.share), few.used.tolist()
+    between = [(a + b) // 2 for a, b in pairwise(computed) if b - a > 1]
+    if not between:
+        return few
+    pupil, radiance, rows = without_gradients(pupil, radiance, rows)
+    lens = {
+        "focal_length": focal_length,
+        "pixel_pitch": pixel_pitch,
+        "pixel": pixel,
+        "sensor": sensor,
+    }
+    between_bands, pixels = few._replace(used=torch.tensor(between)), bins_of(psf.intensity)
+    window = (pixels * SIDE, pixels * SIDE)
+    own = binned(centred(psf.intensity.detach(), window), pixels)
+    added = binned(focused(pupil_of_bands(pupil, between_bands), window, lens), pixels)
+    order = sorted(range(len(computed) + len(between)), key=[*computed, *between].__getitem__)
+    light = torch.cat([own, added])[order]
+    finer = share_of_bands(torch.tensor(sorted([*computed, *between])), count).to(
+        light
+    ) @ light.flatten(1)
+    parts = parts_of(radiance, rows, finer.view(count, *light.shape[1:]), pixels)
+    error, top = estimated(parts, few.share.cpu(), own)
+    raised = (
+        max(float(old), _SAFETY * new) for old, new in ((few.error, error), (few.largest, top))
+    )
+    return few._replace(**dict(zip(("error", "largest"), map(_number, raised), strict=True)))
+
+
+@few_bands_checked.approximation_error
+def _(result: FewBands) -> tuple[float, float]:
+    return float(result.error), float(result.largest)
+
+
+few_bands_checked.hooks.estimated = True
+
+
+@few_bands_checked.check
+def _(result: FewBands, few: FewBands, *inputs: object, **params: object) -> list[Check]:
+    bands, count = result.share.shape
+    if count == bands:
+        return [Check(f"all {bands} bands are in use")]
+    text = (
+        f"{count} of {bands} bands, compared with the next finer choice: estimated error"
+        f" {float(result.error):.2g}"
+    )
+    return [Check(text, math.isfinite(float(result.error)))]
+
+
+def _all_bands(count: int) -> FewBands:
+    return FewBands(
+        torch.eye(count, dtype=torch.float64), torch.arange(count), _number(0.0), _number(0.0)
+    )
+
+
+def _number(value: float) -> Tensor:
+    return torch.tensor(value, dtype=torch.float64)

@@ -1,0 +1,413 @@
+"""The prior of the Wiener filter: noise, power spectrum, and the level of the scene."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Generator, Tensor
+from torch.nn.functional import avg_pool2d
+
+from neusee.nodes.restore._inverse._conjugate_gradients import pieces
+from neusee.nodes.restore._inverse._glare import Light, average
+from neusee.nodes.restore._inverse._masked_blur import Blurred, Size, variance
+from neusee.nodes.restore._inverse._masked_blur import variance as variance_of
+
+# --- picture scale --------------------------------------------------------------------------------
+
+# What scales a picture before its deconvolution: the variance of its noise, the prior, and what the
+# prior expects.
+
+
+#: the power spectrum of pictures falls with frequency to this power, like that of edges
+_FALL = 3.0
+_NO_LIGHT = 1e-12  #: share of the light below which a PSF counts as one without light
+#: trust in a channel, at which its own level counts as much as that of the other channels
+_TOLD = 0.05
+
+
+def picture_noise(electrons: Tensor, mean: Tensor, read: float) -> Tensor:
+    """Return the noise variance of each pixel, from the larger of the local mean and the mean of
+    the picture.
+    """
+    around = electrons[None]
+    for window, rim in (((9, 1), (4, 0)), ((1, 9), (0, 4))):
+        around = avg_pool2d(around, window, stride=1, padding=rim, count_include_pad=False)
+    return (torch.maximum(around[0], mean) + read**2).clamp_min(1e-3)
+
+
+def expected_variance(transfer: Tensor, power: Tensor, size: Size) -> Tensor:
+    """Return the expected variance (channel, 1, 1) of a blurred picture, summed over a few
+    spectrum rows at a time.
+    """
+    total = power.new_zeros(len(transfer))
+    for rows in pieces(transfer):
+        through = transfer[:, rows]
+        total = total + variance(
+            (through.real.square() + through.imag.square()) * power[rows], size
+        )
+    return total[:, None, None]
+
+
+def fall(size: Size, period: Size | None = None) -> Tensor:
+    """Return the power spectrum that the prior of the scene assumes, as half a spectrum of mean 1.
+
+    Below one cycle in ``period`` pixels, those of the torus without a number, it hardly rises.
+    """
+    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) for n in size)
+    squared = (
+        fy[:, None].square()
+        + fx[None, : size[1] // 2 + 1].square()
+        + 1.0 / math.prod(period or size)
+    )
+    power: Tensor = squared.pow_(-_FALL / 2.0)
+    power /= variance(power, size)
+    return power
+
+
+def about_mean(power: Tensor, frame: Size, torus: Size) -> Tensor:
+    """Return half a power spectrum on a periodic grid, without the variance that the mean over a
+    frame has.
+    """
+    rows, columns = (torch.ones(n, dtype=power.dtype, device=power.device) / n for n in frame)
+    share = (
+        torch.fft.fft(rows, torus[0]).abs().square()[:, None]
+        * torch.fft.rfft(columns, torus[1]).abs().square()
+    )
+    left: Tensor = power * (1.0 - share)
+    return left
+
+
+def power_of_two(x: Tensor) -> Tensor:
+    """Return the powers of two nearest to ``x`` by ratio; 1 for a PSF without light, whose
+    slopes overflow.
+    """
+    return torch.where(x > _NO_LIGHT, x, 1.0).log2().round().exp2()
+
+
+def shared_level(level: Tensor, trust: Tensor, white: Tensor) -> Tensor:
+    """Return the mean or the contrast of each channel, (channel, 1, 1), with that of others where
+    trust is small.
+
+    ``trust`` is the share of a channel that noise, not glare, rules; ``white`` what the channels
+    see of a grey scene.
+    """
+    grey = level / white
+    weight = trust.clamp_min(1e-12)
+    common = ((weight * grey.log()).sum() / weight.sum()).exp()
+    own = trust / (trust + _TOLD)
+    shared: Tensor = white * (own * grey.log() + (1.0 - own) * common.log()).exp()
+    return shared
+
+
+# --- scene level ----------------------------------------------------------------------------------
+
+# What is not known of a scene behind glare besides its details: its mean, its contrast, and
+# blotches of the glare.
+#
+# The mean of a picture without its estimated glare is wrong by the light that the glare is wrong
+# by, of the same sign in all pixels. Where glare covers most pixels, this is more than the light of
+# the scene. Then a prior decides: a camera is mostly exposed such that the mean is a seventh of the
+# fullest pixel, to a factor of three, and the standard deviation of a scene is 0.8 of its mean, to
+# a factor of 1.6. Channels see nearly a grey scene.
+
+
+#: mean of a scene over the fullest pixel, and deviation of its logarithm
+_EXPOSED, _EXPOSURE = 0.15, math.log(3.0)
+#: deviation of a scene over its mean, and deviation of the logarithm of this ratio
+_CONTRAST, _CONTRASTS = 0.8, 0.5
+_COLOUR = 0.3  #: deviation of the mean of a channel, over what it sees of a grey scene
+_TINT = 0.2  #: deviation of the contrast of a channel, over what it sees of a grey scene
+_ALONE = 0.1  #: part of the variance of an error that is not the same in all channels
+_ROUGH = 0.1  #: relative error of a variance that is estimated from one picture
+_GRID = 241  #: logarithms that are tried
+_WIDE = 4.0  #: deviations of the prior, over which they are tried
+_BLOTCHES = 0.3  #: deviation of scattered light over blotches, over that of a pixel of it
+_BLOTCH = 16  #: pixels from one blotch to the next
+
+
+class Told(NamedTuple):
+    """What a picture tells of a quantity of its channels."""
+
+    value: Tensor  #: (channel, 1, 1)
+    #: (error, channel, 1, 1), deviations; each error has the same sign in all channels
+    errors: Tensor
+
+
+class Level(NamedTuple):
+    """Mean or variance of each channel of a scene, (channel, 1, 1) each."""
+
+    value: Tensor
+    deviation: Tensor
+
+
+class SceneDoubt(NamedTuple):
+    """What a filter does not know of a scene behind glare, in units of its own scale."""
+
+    mean: float  #: expected square of the error of the mean
+    contrast: float  #: expected variance of the scene
+    blotches: Tensor  #: (channel, y, x), deviation of light that is the same over some pixels
+
+
+@torch.no_grad()
+def scene_doubt(
+    mean_and_scale: tuple[Tensor, Tensor],
+    evidence: tuple[Told, Told],
+    white: Tensor | None,
+    full: float,
+    light: Light,
+) -> SceneDoubt | None:
+    """Return what is not known of a scene of which the filter uses a mean and a scale; None where
+    glare is known.
+
+    ``mean_and_scale`` (channel, 1, 1) are those of the filter, ``evidence`` is that of the picture
+    on mean and variance. Without ``white``, what the channels see of a grey scene, mean and scale
+    count as known.
+    """
+    if not light.modes:
+        return None
+    mean, scale = mean_and_scale
+    blotches = _BLOTCHES * light.variance.sqrt() / scale
+    if white is None:
+        return SceneDoubt(0.0, 1.0, blotches)
+    level, squares = level_and_variance(*evidence, white, full)
+    wrong = (level.deviation.square() + (level.value - mean).square()) / scale.square()
+    return SceneDoubt(float(wrong.mean()), float((squares.value / scale.square()).mean()), blotches)
+
+
+def told_of_scene(
+    mean: Tensor, variance: Tensor, wrong: Tensor, light: Light, weights: Tensor, unseen: Tensor
+) -> tuple[Told, Told]:
+    """Return what a picture without glare tells of the mean and the variance of its scene.
+
+    ``wrong`` (channel, 1, 1) is the variance that may be glare, ``weights`` those of the pixels in
+    the mean, and ``unseen`` the light that a channel may have of which no pixel is known.
+    """
+    errors = torch.stack([*(average(mode, weights) for mode in light.modes), unseen])
+    return Told(mean, errors), Told(variance, (wrong + unseen.square())[None])
+
+
+def level_and_variance(
+    mean: Told, variance: Told, white: Tensor, full: float
+) -> tuple[Level, Level]:
+    """Return the mean and the variance of a scene in each channel, with what is not known of both.
+
+    ``white`` (channel, 1, 1) is what channels see of a grey scene, ``full`` the light of the
+    fullest pixel.
+    """
+    grey = white.flatten().double()
+    level, log, spread = _likely(mean, grey, math.log(_EXPOSED * full), _EXPOSURE, _COLOUR)
+    ratio = 2.0 * (log + math.log(_CONTRAST))
+    width = 2.0 * math.hypot(spread, _CONTRASTS)
+    squares, _, _ = _likely(variance, grey.square(), ratio, width, 2.0 * _TINT, _ROUGH)
+    return level, squares
+
+
+def drawn_blotches(blotches: Tensor, rng: Generator) -> Tensor:
+    """Return a draw of light (channel, y, x) that is nearly the same over some pixels, and of
+    one colour.
+    """
+    y, x = (_hats(n).to(blotches) for n in blotches.shape[-2:])
+    drawn = torch.randn(len(y), len(x), generator=rng, device=rng.device, dtype=blotches.dtype).to(
+        blotches
+    )
+    field: Tensor = blotches * (y.T @ drawn @ x)
+    return field
+
+
+def _hats(size: int) -> Tensor:
+    """Return the weights (blotch, pixel) of blotches in the pixels of an axis, whose squares add
+    up to 1.
+    """
+    position = torch.arange(size) / _BLOTCH
+    hats = (1.0 - (position - torch.arange(size // _BLOTCH + 2)[:, None]).abs()).clamp_min(0.0)
+    return hats / hats.square().sum(0).sqrt()
+
+
+def _likely(
+    evidence: Told, grey: Tensor, middle: float, width: float, own: float, rough: float = 0.0
+) -> tuple[Level, float, float]:
+    """Return a quantity of each channel, and mean and deviation of the logarithm of what the
+    channels share.
+
+    The shared logarithm is normal, of mean ``middle`` and deviation ``width``; a channel differs
+    from ``grey`` times the shared quantity by a relative deviation ``own``.
+    """
+    value, errors = evidence.value.flatten().double(), evidence.errors.flatten(1).double()
+    error_covariance = errors.T @ errors
+    error_covariance = error_covariance + (_ALONE * error_covariance.diagonal() + 1.0).diag()
+    logs = (
+        torch.linspace(-_WIDE, _WIDE, _GRID, dtype=torch.float64, device=value.device) * width
+        + middle
+    )
+    expected = logs.exp()[:, None] * grey
+    free = (own * expected).square()
+    covariance = error_covariance + (free + (rough * expected).square()).diag_embed()
+    deviation = value - expected
+    lower = torch.linalg.cholesky(covariance)
+    solved = torch.cholesky_solve(deviation[..., None], lower)[..., 0]
+    half = -0.5 * ((logs - middle) / width).square() - lower.diagonal(dim1=-2, dim2=-1).log().sum(
+        -1
+    )
+    share = torch.softmax(half - 0.5 * (deviation * solved).sum(-1), 0)[:, None]
+    posterior_mean = (expected + free * solved).clamp_min(0.0)
+    left = free - free.square() * torch.cholesky_inverse(lower).diagonal(dim1=-2, dim2=-1)
+    mean = (share * posterior_mean).sum(0)
+    variance = (share * (left.clamp_min(0.0) + (posterior_mean - mean).square())).sum(0)
+    log = float((share[:, 0] * logs).sum())
+    spread = float((share[:, 0] * (logs - log).square()).sum().sqrt())
+    level = (x[:, None, None].to(evidence.value) for x in (mean, variance.sqrt()))
+    return Level(*level), log, spread
+
+
+# --- frame spectrum -------------------------------------------------------------------------------
+
+# The power spectrum of a scene, fitted to a blurred and noisy frame of it: how fast it falls, and
+# how strong it is.
+
+
+#: first, last and number of the exponents that are tried; scenes have 2 to 4
+_SLOPES = (2.0, 4.0, 9)
+_POWERS = (-7.0, 1.0, 25)  #: of e, times the variance that explains the whole frame
+#: times the variance of the noise that the filter assumes
+_NOISES = tuple(2.0**n for n in range(8))
+_MOST = 20_000  #: frequencies that count, at most
+_LOWEST = 3.0  #: cycles in the picture, below which the window mixes frequencies
+_SURE = 0.75  #: quantile of the weights of pixels, above which a pixel counts fully
+_SAMPLE = 1 << 20  #: pixels from which this quantile is taken, at most
+#: standard deviation of the logarithm of the variance of a scene, over that of the filter
+_PRIOR = 1.0
+_ALIKE = 4.0  #: frequencies of a window that tell the same
+
+
+class FrameLaw(NamedTuple):
+    """The law of a frame: the power spectrum of its scene, and its noise."""
+
+    power: Tensor  #: half a spectrum of the torus
+    noise: float  #: variance of the noise over the variance that the filter assumes
+    #: factor of the power, at least 1, by which the variance is not below that of the prior
+    low: float = 1.0
+
+
+def fitted_law(problem: Blurred, doubt: SceneDoubt | None = None) -> FrameLaw:
+    """Return the law of a frame of the highest debiased Whittle likelihood.
+
+    The power of the scene is A (f^2 + 1 / pixels)^(-b / 2), as the prior of the filter, whose b is
+    3. The likelihood compares the periodogram of the frame with its exact expectation: the
+    correlation of the blurred scene times that of the window. So light that the window or a hole
+    moves to other frequencies, such as the zeros of a PSF, is expected there. The window falls to
+    the edges and, with the weight of a pixel, near glare that is not known. ``doubt`` says what is
+    not known of mean and variance of the scene; without it the variance is nearly 1 before the
+    frame is seen.
+    Source: Sykulski, Olhede, Guillaumin, Lilly and Early, Biometrika 106, 251 (2019).
+    """
+    window = _window(problem)
+    size = (window.shape[-2], window.shape[-1])
+    area = window.square().sum((-2, -1), keepdim=True)
+    picture = problem.picture.detach()
+    contrast = picture - (picture * window).sum((-2, -1), keepdim=True) / window.sum(
+        (-2, -1), keepdim=True
+    )
+    far = _squared(size).to(window) > (_LOWEST / min(size)) ** 2
+    step = max(1, int(far.sum()) * len(window) // _MOST)
+    periodogram = _sampled(torch.fft.rfft2(contrast * window).abs().square() / area, far, step)
+    variance = torch.where(problem.weight > 0, 1.0 / problem.weight.clamp_min(1e-30), 0.0).detach()
+    noise = (window.square() * variance).sum((-2, -1), keepdim=True) / area
+    level = _sampled(noise.expand(-1, *far.shape), far, step)
+    twice = (2 * size[0], 2 * size[1])
+    lags = torch.fft.irfft2(torch.fft.rfft2(window, s=twice).abs().square(), s=twice) / area
+    best, slope, strength, factor = float("inf"), 3.0, 0.0, 1.0
+    for exponent in torch.linspace(*_SLOPES[:2], int(_SLOPES[2])).tolist():
+        law = _sampled(_expected(problem, exponent, lags), far, step)
+        unit = float(periodogram.sum() / law.sum().clamp_min(1e-30))
+        loss, times, extra = _likeliest(
+            periodogram, unit * law, level, _before(problem, doubt, exponent) - math.log(unit)
+        )
+        if loss < best:
+            best, slope, strength, factor = loss, exponent, unit * times, extra
+    power = strength * _law(problem, slope)
+    low = max(1.0, math.exp(_before(problem, doubt, slope)) / max(strength, 1e-30))
+    power[0, 0] += doubt.mean * problem.torus[0] * problem.torus[1] if doubt else 0.0
+    return FrameLaw(power, factor, low)
+
+
+def _before(problem: Blurred, doubt: SceneDoubt | None, slope: float) -> float:
+    """Return the logarithm of the strength of a law that gives a scene the variance it is
+    expected to have.
+    """
+    expected = doubt.contrast if doubt else 1.0
+    return math.log(expected / float(variance_of(_law(problem, slope), problem.torus)))
+
+
+def _window(problem: Blurred) -> Tensor:
+    """Return the window (channel, y, x) of the periodogram."""
+    y, x = problem.picture.shape[-2:]
+    weight = problem.weight.detach()
+    falling = (torch.hann_window(n + 2, periodic=False)[1:-1].to(weight) for n in (y, x))
+    sure = []
+    for channel_weight in weight:
+        unclipped = channel_weight[channel_weight > 0]
+        sure.append(torch.quantile(unclipped[:: max(1, len(unclipped) // _SAMPLE)], _SURE))
+    own = weight / torch.stack(sure)[:, None, None]
+    rows, columns = falling
+    return rows[:, None] * columns * own / (1.0 + own)
+
+
+def _expected(problem: Blurred, slope: float, lags: Tensor) -> Tensor:
+    """Return the expected periodogram of a blurred scene of power 1 / f^slope, given the
+    correlation of the window.
+    """
+    through = problem.transfer.detach().abs().square()
+    correlation = torch.fft.irfft2(_law(problem, slope) * through, s=problem.torus)
+    down, right = (
+        _lags(n).to(lags.device) % side
+        for n, side in zip(lags.shape[-2:], problem.torus, strict=True)
+    )
+    spectrum: Tensor = torch.fft.rfft2(correlation[:, down[:, None], right] * lags).real
+    return spectrum[:, ::2, ::2].clamp_min(0.0)
+
+
+def _lags(size: int) -> Tensor:
+    return (torch.arange(size) + size // 2) % size - size // 2
+
+
+def _law(problem: Blurred, slope: float) -> Tensor:
+    y, x = problem.picture.shape[-2:]
+    law: Tensor = (_squared(problem.torus).to(problem.picture) + 1.0 / (y * x)) ** (-slope / 2)
+    return law
+
+
+def _sampled(spectrum: Tensor, far: Tensor, step: int) -> Tensor:
+    sampled: Tensor = spectrum[:, far].flatten()[::step].double()
+    return sampled
+
+
+def _likeliest(
+    periodogram: Tensor, law: Tensor, noise: Tensor, middle: float
+) -> tuple[float, float, float]:
+    """Return the least loss of a law, its strength, and the factor of the noise, which grows while
+    the loss falls.
+
+    The logarithm of the strength has the mean ``middle`` before the frame is seen.
+    """
+    best = (float("inf"), 0.0, 1.0)
+    many = len(periodogram) / _ALIKE
+    for factor in _NOISES:
+        here = (float("inf"), 0.0, factor)
+        for strength in torch.linspace(*_POWERS[:2], int(_POWERS[2])).exp().tolist():
+            expected = strength * law + factor * noise
+            loss = float((expected.log() + periodogram / expected).mean())
+            loss += ((math.log(strength) - middle) / _PRIOR) ** 2 / many
+            here = min(here, (loss, strength, factor))
+        if here[0] >= best[0]:
+            break
+        best = here
+    return best
+
+
+def _squared(size: Size) -> Tensor:
+    """Return the squared frequencies in cycles per pixel, half a spectrum."""
+    fy, fx = torch.fft.fftfreq(size[0]), torch.fft.rfftfreq(size[1])
+    squared: Tensor = fy[:, None].square() + fx.square()
+    return squared

@@ -1,0 +1,534 @@
+"""The PSF of a camera by field: the most likely one for measured frames of point sources."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from pydantic import AfterValidator, Field
+from torch import Generator, Tensor
+from torch.nn.functional import avg_pool2d, conv2d, pad
+
+from neusee.nodes import Check, ParameterError, node
+from neusee.nodes.restore._point_frames import (
+    Camera,
+    Layout,
+    Linear,
+    Seen,
+    State,
+    linear,
+    moved,
+    node_weights,
+    read_points,
+    refuse_bad_frames,
+)
+from neusee.nodes.sensor._digitization import Bits
+from neusee.nodes.sensor._frame_file import Curve
+from neusee.nodes.sensor._saturation import Well, refuse_without_room, refuse_without_steps
+from neusee.nodes.units import DataFiles, Electrons, Gain, Shape
+from neusee.nodes.values import MeasuredPsf
+
+# --- point fit ------------------------------------------------------------------------------------
+
+# The PSF of highest likelihood for frames of point sources, and draws of its error.
+#
+# Places, signals, backgrounds and PSFs are fitted together by Gauss-Newton steps (Bjoerck,
+# Numerical Methods for Least Squares Problems, 1996, ch. 9), so that the error of the centring is
+# part of the error of the PSF.
+
+
+_SEARCH = 6  #: pixels by which a point may lie beside the first guess
+_STEPS = 30  #: Gauss-Newton steps, at most
+_ENOUGH = 1e-4  #: pixels by which no point moves any more at the end
+_MOST = 0.4  #: pixels by which a point may move in one step
+_HALVED = 8  #: times that a step is halved, at most
+_SURE = 4.0  #: standard deviations below saturation from which a pixel counts
+_CALM = 1e-9  #: share of the largest curvature that is added to each, in a step alone
+_ITERATIONS = 300  #: of conjugate gradients
+_RESIDUAL = 1e-8  #: squared residual over the first, at which they end
+_SHARED = 1.02  #: inflation of a variance from which points tell several PSFs
+_CORE = 2  #: pixels around the middle of a PSF, in which points are counted
+_ALONE = 1e-9  #: least eigenvalue of the products of weights, below which nodes are not told apart
+_LOCAL = 5  #: pixels a side over which chi-square is averaged
+
+
+class Fit(NamedTuple):
+    """The fitted PSFs and draws of them, in the form of `MeasuredPsf`."""
+
+    kernels: Tensor  #: (node, channel, y, x)
+    draws: Tensor  #: (draw, node, channel, y, x)
+    state: State
+    chi: Tensor  #: (channel,)
+    support: Tensor  #: (node,)
+    inflation: Tensor  #: (node,)
+
+
+def fitted(pixels: Seen, layout: Layout, count: int, rng: Generator) -> Fit:
+    """Return the PSFs at the nodes and draws of them; raise ValueError where no pixel tells of a
+    part of a PSF.
+    """
+    share = node_weights(pixels.middle, layout.shape, layout.zones)
+    state, weight = _start(pixels, share, layout.window)
+    hold = _hold(linear(pixels, state, share), state.kernels, weight)
+    _refuse_unseen(linear(pixels, state, share), weight)
+    for _ in range(_STEPS):
+        near = linear(pixels, state, share)
+        residual = pixels.light - near.model(state.background)
+        step = _solved(near, hold, weight, _slope(near, state, weight, residual))
+        before = state.offset
+        state = _ahead(
+            pixels, state, share, weight, step._replace(offset=step.offset.clamp(-_MOST, _MOST))
+        )
+        weight = _weight(pixels, linear(pixels, state, share).model(state.background))
+        if float((state.offset - before).abs().max()) < _ENOUGH:
+            break
+    near = linear(pixels, state, share)
+    residual = pixels.light - near.model(state.background)
+    _refuse_unseen(near, weight)
+    kernels = gauged(state.kernels)
+    local = _misfit(near, weight, residual)
+    draws = []
+    for _ in range(count):
+        noise = _normal(weight, rng) * weight.sqrt()
+        slope = near.slope(noise)
+        slope = slope._replace(
+            background=slope.background + _normal(pixels.doubt, rng) / pixels.doubt.sqrt()
+        )
+        other = gauged(state.plus(_solved(near, hold, weight, slope)).kernels)
+        draws.append((kernels + local * (other - kernels)).float())
+    return Fit(
+        kernels, torch.stack(draws), state, _chi(weight, residual, near), *_support(near, weight)
+    )
+
+
+def gauged(kernels: Tensor) -> Tensor:
+    """Return kernels of sum 1 whose centres are in the middle of the window.
+
+    The centre is the mean place, weighted by the square of the sum of the channels; noise in the
+    wings hardly moves it.
+    """
+    offset = kernels.new_zeros(len(kernels), 2)
+    centred = kernels
+    for _ in range(6):
+        offset = offset - centre(centred)
+        centred = moved(kernels, offset)
+    return centred / centred.sum((-2, -1), keepdim=True)
+
+
+def centre(kernels: Tensor) -> Tensor:
+    """Return the centre (node, 2) of kernels (node, channel, y, x), from the middle pixel."""
+    power = kernels.mean(1).square()
+    y, x = (torch.arange(n, dtype=power.dtype) - n // 2 for n in power.shape[-2:])
+    power_sum = power.sum((-2, -1))
+    return torch.stack(
+        [(power.sum(-1) * y).sum(-1) / power_sum, (power.sum(-2) * x).sum(-1) / power_sum], -1
+    )
+
+
+# --- start ----------------------------------------------------------------------------------------
+
+
+def _start(pixels: Seen, share: Tensor, window: tuple[int, int]) -> tuple[State, Tensor]:
+    """Return a first guess: one PSF for all nodes, from the points that are not saturated."""
+    points, channels, nodes = len(pixels.owner), len(pixels.light), share.shape[1]
+    kernels = pixels.light.new_zeros(nodes, channels, *window)
+    state = State(
+        kernels,
+        pixels.light.new_zeros(points, channels),
+        pixels.light.new_zeros(points, 2),
+        pixels.background,
+    )
+    near = linear(pixels, state, share)
+    stamps = near.stamps_of(pixels.light - pixels.background.T[:, pixels.frame])
+    weight = _weight(pixels, pixels.light)
+    weights = near.stamps_of(weight)
+    good = (near.stamps_of(pixels.clipped.double()) == 0).all(1).flatten(1).all(1)
+    valid = (weights[good] > 0).double()
+    guess = (stamps[good] * valid).sum(0) / (valid * stamps[good].sum((-2, -1), keepdim=True)).sum(
+        0
+    ).clamp_min(1e-9)
+    guess = guess.clamp_min(0.0)
+    guess = guess / guess.sum((-2, -1), keepdim=True).clamp_min(1e-9)
+    for _ in range(2):
+        offset, signal = _registered(stamps, weights, guess)
+    return State(guess.expand_as(kernels).contiguous(), signal, offset, pixels.background), weight
+
+
+def _registered(stamps: Tensor, weights: Tensor, guess: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the whole-pixel offset of each point at which the guess explains most, and the
+    signal of each channel.
+    """
+    channels, wide = len(guess), (_SEARCH,) * 4
+    product = conv2d(pad(weights * stamps, wide), guess[:, None], groups=channels)
+    norm = conv2d(pad(weights, wide), guess.square()[:, None], groups=channels).clamp_min(1e-30)
+    best = (product.clamp_min(0.0).square() / norm).sum(1).flatten(1).argmax(1)
+    signal = (
+        (product / norm).flatten(2).gather(2, best[:, None, None].expand(-1, channels, 1))[..., 0]
+    )
+    side = 2 * _SEARCH + 1
+    offset = torch.stack([best // side, best % side], 1).double() - _SEARCH
+    return offset, signal.clamp_min(1e-3)
+
+
+# --- steps ----------------------------------------------------------------------------------------
+
+
+def _weight(pixels: Seen, expected: Tensor) -> Tensor:
+    """Return 1 / variance of each pixel; 0 where it is clipped, or may be clipped by chance."""
+    ground = pixels.background.T[:, pixels.frame]
+    variance = pixels.floor.T[:, pixels.frame] + (expected - ground).clamp_min(0.0)
+    censored = pixels.clipped | (expected > pixels.level - _SURE * variance.sqrt())
+    return torch.where(censored, 0.0, 1.0 / variance)
+
+
+def _slope(near: Linear, state: State, weight: Tensor, residual: Tensor) -> State:
+    slope = near.slope(weight * residual)
+    pull_to_background = (near.seen.background - state.background) / near.seen.doubt
+    return slope._replace(background=slope.background + pull_to_background)
+
+
+def _ahead(pixels: Seen, state: State, share: Tensor, weight: Tensor, step: State) -> State:
+    """Return the state after a step, halved until the frames fit better; the state itself if
+    none does.
+    """
+    worst = _square(pixels, state, linear(pixels, state, share), weight)
+    for _ in range(_HALVED):
+        ahead = state.plus(step)
+        if float(_square(pixels, ahead, linear(pixels, ahead, share), weight)) < float(worst):
+            return ahead
+        step = State(*(0.5 * entry for entry in step))
+    return state
+
+
+def _square(pixels: Seen, state: State, near: Linear, weight: Tensor) -> Tensor:
+    """Return chi-square of the frames and of what is known of their backgrounds."""
+    background_misfit = (pixels.background - state.background).square() / pixels.doubt
+    return (
+        weight * (pixels.light - near.model(state.background)).square()
+    ).sum() + background_misfit.sum()
+
+
+def _curvature(near: Linear, weight: Tensor) -> State:
+    """Return the diagonal of the matrix of the step, roughly: that of the PSFs as if no point
+    were shifted.
+    """
+    stamps = near.stamps_of(weight)
+    kernels = torch.tensordot(
+        near.share.square(), near.signal.square()[..., None, None] * stamps, ([0], [0])
+    )
+    signal = (stamps * near.patterns[0].square()).sum((-2, -1))
+    offset = (stamps * near.patterns[1:].square()).sum((-3, -2, -1)).T
+    count = weight.new_zeros(len(near.seen.background), len(weight)).index_add(
+        0, near.seen.frame, weight.T
+    )
+    diagonal = State(kernels, signal, offset, count + 1.0 / near.seen.doubt)
+    return State(*(x + 1e-3 * x.amax() * (x <= 0) + _CALM * x.amax() for x in diagonal))
+
+
+def _solved(near: Linear, hold: Hold, weight: Tensor, right: State) -> State:
+    """Return the step for a slope, by conjugate gradients that the curvature of each entry speeds
+    up.
+
+    A shift of all points is a shift of the PSFs, and a factor of a PSF is one of the signals:
+    ``hold`` decides.
+    """
+    diagonal = _curvature(near, weight)
+    inverse = State(*(1.0 / x for x in diagonal))
+    calm = State(*(_CALM * x.amax() * torch.ones_like(x) for x in diagonal))
+    x = State(*(torch.zeros_like(entry) for entry in right))
+    residual = _free(right, hold)
+    way = _free(residual.times(inverse), hold)
+    size = residual.dot(way)
+    first = size
+    for _ in range(_ITERATIONS):
+        if float(size) <= _RESIDUAL * float(first):
+            break
+        image = near.slope(weight * near.change(way)).plus(way.times(calm))
+        image = image._replace(background=image.background + way.background / near.seen.doubt)
+        image = _free(image, hold)
+        step = size / way.dot(image)
+        x, residual = x.plus(way, step), residual.plus(image, -step)
+        turned = _free(residual.times(inverse), hold)
+        size, before = residual.dot(turned), size
+        way = turned.plus(way, size / before)
+    return x
+
+
+class Hold(NamedTuple):
+    """What stays where it is, because a shift of all points is a shift of the PSFs."""
+
+    points: Tensor  #: (point, point), projects on the moves of the points that are left to the PSFs
+    #: (way, node, channel, y, x), changes of the PSFs that are left to the points
+    ways: Tensor | None
+
+
+def _hold(near: Linear, kernels: Tensor, weight: Tensor) -> Hold:
+    """Return what stays where it is at the nodes.
+
+    Where each point tells one PSF, the points stay, so that a PSF need not be known between pixels.
+    Where points tell several, the PSFs stay in the middle: those that lie beside one another would
+    add to a wider one.
+    """
+    if float(_support(near, weight)[1].max()) > _SHARED:
+        return Hold(torch.zeros_like(near.share @ near.share.T), _ways(kernels))
+    return Hold(near.share @ torch.linalg.pinv(near.share), None)
+
+
+def _free(change: State, hold: Hold) -> State:
+    """Return a change without the part that does not change the frames, which would have no end."""
+    kernels = change.kernels - change.kernels.mean((-2, -1), keepdim=True)
+    for way in () if hold.ways is None else hold.ways:
+        kernels = kernels - (way * kernels).sum((-3, -2, -1), keepdim=True) * way
+    return change._replace(kernels=kernels, offset=change.offset - hold.points @ change.offset)
+
+
+def _ways(kernels: Tensor) -> Tensor:
+    """Return two changes (2, node, channel, y, x) of each PSF, of unit length, that move it down
+    and to the right.
+    """
+    directions = list[Tensor]()
+    for way in torch.gradient(kernels, dim=(-2, -1)):
+        way = way - way.mean((-2, -1), keepdim=True)
+        for other in directions:
+            way = way - (way * other).sum((-3, -2, -1), keepdim=True) * other
+        directions.append(
+            way / way.square().sum((-3, -2, -1), keepdim=True).sqrt().clamp_min(1e-30)
+        )
+    return torch.stack(directions)
+
+
+def _refuse_unseen(near: Linear, weight: Tensor) -> None:
+    """Raise ValueError where a pixel of a PSF is saturated or beyond the frame in all frames."""
+    information = torch.tensordot(
+        near.share.square(), (near.stamps_of(weight) > 0).double(), ([0], [0])
+    )
+    if missing := int((information <= 0).any(1).sum()):
+        raise ValueError(
+            f"{missing} pixels of the PSF are saturated, or beyond the edge, in every frame: add"
+            " frames of a shorter exposure, move points from the edge, or choose a smaller window"
+            " or fewer zones"
+        )
+
+
+# --- error ----------------------------------------------------------------------------------------
+
+
+def _misfit(near: Linear, weight: Tensor, residual: Tensor) -> Tensor:
+    """Return the root of chi-square around each pixel of the window (y, x), at least 1."""
+    square, count = (
+        near.stamps_of(x).sum((0, 1)) for x in (weight * residual.square(), (weight > 0).double())
+    )
+    mean = [
+        avg_pool2d(x[None, None], _LOCAL, 1, _LOCAL // 2, count_include_pad=False)[0, 0]
+        for x in (square, count)
+    ]
+    free = 1.0 - _unknowns(near) / float((weight > 0).sum())
+    return (mean[0] / (free * mean[1]).clamp_min(1e-9)).clamp_min(1.0).sqrt()
+
+
+def _chi(weight: Tensor, residual: Tensor, near: Linear) -> Tensor:
+    free = 1.0 - _unknowns(near) / float((weight > 0).sum())
+    return (weight * residual.square()).sum(1) / ((weight > 0).sum(1) * free).clamp_min(1.0)
+
+
+def _support(near: Linear, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return how many points at each node would tell its PSF as well, and the inflation of its
+    variance.
+
+    The worst of the pixels in the middle. With A the bilinear weights of the points that show a
+    pixel, the number is 1 over the diagonal of the inverse of A^T A, and the inflation the product
+    of this diagonal and that of A^T A (Kutner et al., Applied Linear Statistical Models, 5th ed.,
+    2005, sec. 10.5): 1 for points in the middles of zones.
+    """
+    shown = near.stamps_of(weight) > 0
+    y, x = (n // 2 for n in shown.shape[-2:])
+    core = shown[..., y - _CORE : y + _CORE + 1, x - _CORE : x + _CORE + 1].flatten(1).double()
+    patterns = torch.unique(core, dim=1).T
+    normal = near.share.T @ (patterns[:, :, None] * near.share)
+    sizes, ways = torch.linalg.eigh(normal)
+    inverse = (ways.square() / sizes.clamp_min(_ALONE)[:, None]).sum(-1)
+    return (1.0 / inverse).amin(0), (inverse * normal.diagonal(dim1=-2, dim2=-1)).amax(0)
+
+
+def _unknowns(near: Linear) -> float:
+    """Return the number of fitted values, at most nine tenths of the pixels."""
+    points, channels = near.signal.shape
+    window = near.patterns.shape[-2] * near.patterns.shape[-1]
+    number = near.share.shape[1] * channels * window + points * (channels + 2)
+    return min(float(number), 0.9 * near.seen.light.numel())
+
+
+def _normal(like: Tensor, rng: Generator) -> Tensor:
+    drawn = torch.randn(like.shape, generator=rng, device=rng.device, dtype=like.dtype)
+    return drawn.to(like)
+
+
+# --- measured psf ---------------------------------------------------------------------------------
+
+# The PSF of a camera by field, measured from frames of point sources.
+
+
+_GOOD = 1.5  #: chi-square per pixel above which the model is said not to fit
+#: inflation of a variance above which the deviation was seen to be smaller than the error
+_INFLATED = 4.0
+
+
+def _odd(window: tuple[int, int]) -> tuple[int, int]:
+    if any(n % 2 == 0 or n < 5 for n in window):
+        raise ValueError(f"{list(window)} must be two odd numbers of at least 5")
+    return window
+
+
+Window = Annotated[Shape, AfterValidator(_odd)]
+Draws = Annotated[int, Field(ge=4, le=1000)]
+
+
+@node(device="cpu")
+def measured_psf(
+    responses: Tensor,
+    *,
+    files: DataFiles | None = None,
+    window: Window = (65, 65),
+    zones: Shape = (1, 1),
+    draws: Draws = 24,
+    shape: Shape,
+    gain: Gain,
+    offset: Electrons,
+    full_well: Well,
+    read_noise: Electrons,
+    bits: Bits = 16,
+    curve: Curve | None = None,
+    rng: Generator,
+) -> MeasuredPsf:
+    """Measure the PSF of each channel by field from frames of point sources.
+
+    Each frame shows one or several points. A file whose name begins with `dark` has no light: the
+    mean of these files takes the place of `offset`. The signal, place and background of each point
+    are free, so that exposures may have different lengths: a long one tells of the wings, a short
+    one of the core. Pixels that are clipped, or expected within four standard deviations of
+    clipping, do not count. The PSF is known at the middles of ``zones`` equal parts of the frame,
+    and bilinear between them. All is fitted together: least squares, with the noise of the model.
+
+    Shapes: responses (channel, band), of which only the number of channels counts
+            -> kernels (row, column, channel, *window), with draws and deviation.
+    Units:  files DN; kernels a share of the light in the window. Each kernel has the sum 1, and its
+            centre, weighted by the square of the mean of the channels, is the middle pixel:
+            distortion and an absolute shift are not measured, lateral colour is. ``outside`` bounds
+            the light beyond the window if it falls as 1 / r^3 or faster from the rim, which light
+            bent by the edge of a pupil does.
+    Error:  `deviation`, from draws of the noise of photons, converter, background and centring: a
+            relative standard deviation of 1 / sqrt(2 draws). Where the frames fit worse than their
+            noise, the deviation grows by the root of chi-square in 5 x 5 pixels. Points far from
+            the middles of the zones tell the PSFs of several nodes at once and inflate the
+            variance. Up to an ``inflation`` of 3 the deviation was right; at 7 the error was up to
+            1.7 times the deviation. Points between pixels are interpolated: 1e-4 for an image with
+            up to 0.4 periods in a pixel; a sharper image shows as chi-square. The background beyond
+            the windows counts as free of the light of points; pixels beyond windows twice as wide
+            give it where there are enough.
+    Raises: ParameterError before the run with every frame that cannot be used, and every zone
+            without a point that is not saturated; ValueError where a pixel of the PSF is saturated
+            in every frame.
+    Source: Anderson and King, Publ. Astron. Soc. Pac. 112, 1360 (2000), an effective PSF from
+            undersampled stars; Papandreou and Yuille, NIPS 23 (2010), for the draws.
+    """
+    camera = gain, offset, full_well, bits, read_noise
+    layout = Layout(_two(shape), _two(window), _two(zones))
+    refuse_bad_frames(files or (), len(responses), layout, camera, curve)
+    pixels = read_points(files or (), layout.window, camera)
+    fit = fitted(pixels, layout, draws, rng)
+    kernels = fit.kernels.reshape(*zones, *fit.kernels.shape[1:])
+    drawn = fit.draws.reshape(-1, *kernels.shape)
+    deviation = (drawn.double() - kernels).square().mean(0).sqrt()
+    places = pixels.middle + fit.state.offset
+    points = torch.cat(
+        [pixels.owner[:, None].double(), places, fit.state.signal.sum(1, keepdim=True)], 1
+    )
+    counts = (x.reshape(*zones) for x in (fit.support, fit.inflation))
+    return MeasuredPsf(
+        kernels, deviation, drawn, points, fit.chi, _outside(kernels, drawn.double()), *counts
+    )
+
+
+@measured_psf.preflight
+def _(
+    *,
+    responses: Tensor | None = None,
+    files: Sequence[Path] | None,
+    window: tuple[int, int],
+    zones: tuple[int, int],
+    shape: tuple[int, int],
+    **params: Any,
+) -> list[str]:
+    if files is None:
+        raise ParameterError("files", "give the folder with frames of point sources")
+    names = ("gain", "offset", "full_well", "bits", "read_noise")
+    gain, offset, full_well, bits, read_noise = (params[name] for name in names)
+    refuse_without_room(full_well, offset=offset, read_noise=read_noise)
+    refuse_without_steps(full_well, gain=gain, bits=bits)
+    camera: Camera = gain, offset, full_well, bits, read_noise
+    channels = None if responses is None else len(responses)
+    layout = Layout(_two(shape), _two(window), _two(zones))
+    refuse_bad_frames(files, channels, layout, camera, params.get("curve"))
+    return []
+
+
+@measured_psf.check
+def _(result: MeasuredPsf, *inputs: Any, **params: Any) -> list[Check]:
+    peak = (result.deviation.amax((-2, -1)) / result.kernels.amax((-2, -1))).max()
+    fit = ", ".join(f"{x:.2f}" for x in result.fit.tolist())
+    finite = all(math.isfinite(float(x.sum())) for x in result)
+    return [
+        Check(
+            f"{len(result.places)} points; chi-square per pixel {fit}",
+            float(result.fit.max()) < _GOOD,
+        ),
+        _counted(result),
+        Check(f"deviation at most {float(peak):.2g} of the peak", finite),
+        Check(
+            f"light beyond the window at most {float(result.outside.max()):.2g}, if it falls as 1 /"
+            " r^3 or faster"
+        ),
+    ]
+
+
+def _counted(result: MeasuredPsf) -> Check:
+    """Return how many points tell each PSF, and the zone in which they tell several PSFs at
+    once.
+    """
+    fewest, worst = float(result.support.min()), float(result.inflation.max())
+    row, column = divmod(int(result.inflation.argmax()), result.inflation.shape[1])
+    text = (
+        f"each zone has {fewest:.2g} points or more in effect, inflation of variance at most"
+        f" {worst:.3g}"
+    )
+    if worst <= _INFLATED:
+        return Check(text)
+    why = (
+        f" in zone ({row + 1}, {column + 1}), more than {_INFLATED:g}: its points lie far from the"
+        " middle of the zone and tell several PSFs at once, so that the deviation may be too"
+        " small; take frames with points near the middles of the zones, or choose fewer zones"
+    )
+    return Check(text + why, False)
+
+
+def _two(numbers: Sequence[int]) -> tuple[int, int]:
+    y, x = numbers
+    return y, x
+
+
+def _outside(kernels: Tensor, draws: Tensor) -> Tensor:
+    """Return  2 pi R^2  times the mean at the rim plus two deviations, the largest of all zones,
+    for each channel.
+    """
+    y, x = kernels.shape[-2:]
+    rim = torch.ones(y, x, dtype=torch.bool)
+    rim[2:-2, 2:-2] = False
+    rim_level, spread = (
+        kernels[..., rim].mean(-1),
+        (draws - kernels)[..., rim].mean(-1).square().mean(0).sqrt(),
+    )
+    bound = 2.0 * math.pi * (min(y, x) / 2.0) ** 2 * (rim_level.clamp_min(0.0) + 2.0 * spread)
+    return bound.amax((0, 1))

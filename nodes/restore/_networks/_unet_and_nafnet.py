@@ -1,0 +1,201 @@
+"""Restoring networks of convolutions alone: a standard UNet, and a small NAFNet."""
+
+from collections.abc import Sequence
+from functools import partial
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from neusee.nodes import node
+from neusee.nodes.restore._networks._restorer import (
+    LEAK,
+    LEAKY,
+    ChannelNorm,
+    Flat,
+    Scale,
+    Tile,
+    fitting,
+    restored,
+    restorer_checks,
+)
+from neusee.nodes.units import Count, DataFile, Layers
+
+# --- unet -----------------------------------------------------------------------------------------
+
+# A standard UNet, a baseline for restoring networks that use spectra and selective scans.
+
+
+class UNet(Flat):
+    """A network whose encoder halves size and doubles channels three times, with skips to a
+    mirrored decoder.
+    """
+
+    multiple, gain = 8, LEAKY
+
+    def __init__(self, width: int = 32) -> None:
+        super().__init__()
+        sizes = [width, 2 * width, 4 * width, 8 * width]
+        self.down = nn.ModuleList(_pair(a, b) for a, b in pairwise([3, *sizes]))
+        self.shrink = nn.MaxPool2d(2)
+        self.grow = nn.ModuleList(nn.ConvTranspose2d(2 * b, b, 2, 2) for b in sizes[2::-1])
+        self.up = nn.ModuleList(_pair(2 * b, b) for b in sizes[2::-1])
+        self.last = nn.Conv2d(width, 3, 1)
+
+    def change(self, picture: Tensor) -> Tensor:
+        passed = [self.down[0](picture)]
+        for level in self.down[1:]:
+            passed.append(level(self.shrink(passed[-1])))
+        x = passed[-1]
+        for grow, level, skip in zip(self.grow, self.up, passed[-2::-1], strict=True):
+            x = level(torch.cat([grow(x), skip], 1))
+        result: Tensor = self.last(x)
+        return result
+
+
+def _pair(inputs: int, outputs: int) -> nn.Sequential:
+    first, second = (
+        nn.Conv2d(inputs, outputs, 3, padding=1),
+        nn.Conv2d(outputs, outputs, 3, padding=1),
+    )
+    return nn.Sequential(first, nn.LeakyReLU(LEAK), second, nn.LeakyReLU(LEAK))
+
+
+@node()
+def unet(
+    picture: Tensor,
+    *,
+    weights: DataFile | None = None,
+    width: Layers = 32,
+    tile: Tile | None = None,
+    reduce: Count = 1,
+    detail: bool = False,
+) -> Tensor:
+    """Restore a colour picture with a standard UNet, a baseline.
+
+    ``tile``, ``reduce`` and ``detail`` as in `fft_mamba`.
+
+    Shapes: picture (3, y, x) of any size -> (3, y, x).
+    Units:  linear sRGB, as in the training of the weights.
+    Error:  float32, 1e-5; of the restoration, the error that the training reached.
+    Raises: ParameterError before the run without weights, or where the weights do not fit;
+            ValueError for a picture that is not a colour picture or not finite.
+    Source: Ronneberger et al., U-Net, MICCAI 2015; four levels, padded convolutions and the added
+            picture are ours.
+    """
+    return restored(picture, partial(UNet, width), weights, tile, reduce, detail)
+
+
+unet.preflight(partial(fitting, UNet))
+unet.check(restorer_checks)
+
+
+# --- nafnet ---------------------------------------------------------------------------------------
+
+# A small NAFNet, a restoring network without activation functions.
+
+
+class NAFBlock(nn.Module):
+    """A block that multiplies pairs of channels, instead of an activation, and scales channels
+    by their means.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm, self.second_norm = ChannelNorm(width), ChannelNorm(width)
+        self.widen = nn.Conv2d(width, 2 * width, 1)
+        self.mix = nn.Conv2d(2 * width, 2 * width, 3, padding=1, groups=2 * width)
+        self.attend = nn.Conv2d(width, width, 1)
+        self.narrow = nn.Conv2d(width, width, 1)
+        self.feed, self.fed = nn.Conv2d(width, 2 * width, 1), nn.Conv2d(width, width, 1)
+        self.scale, self.second_scale = Scale(width), Scale(width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = _multiplied(self.mix(self.widen(self.norm(x))))
+        y = self.narrow(y * self.attend(y.mean((-2, -1), keepdim=True)))
+        x = x + self.scale(y)
+        result: Tensor = x + self.second_scale(
+            self.fed(_multiplied(self.feed(self.second_norm(x))))
+        )
+        return result
+
+
+class NAFNet(Flat):
+    """A network whose encoder levels halve the size and double the channels, with skips to a
+    mirrored decoder.
+    """
+
+    def __init__(
+        self,
+        width: int = 16,
+        levels: Sequence[int] = (1, 1, 2, 4),
+        middle: int = 2,
+        inputs: int = 3,
+        outputs: int = 3,
+    ) -> None:
+        super().__init__()
+        self.multiple = 2 ** len(levels)
+        widths = [width * 2**i for i in range(len(levels))]
+        self.enter, self.last = (
+            nn.Conv2d(inputs, width, 3, padding=1),
+            nn.Conv2d(width, outputs, 3, padding=1),
+        )
+        self.down = nn.ModuleList(_blocks(c, n) for c, n in zip(widths, levels, strict=True))
+        self.shrink = nn.ModuleList(nn.Conv2d(c, 2 * c, 2, 2) for c in widths)
+        self.middle = _blocks(2 * widths[-1], middle)
+        self.grow = nn.ModuleList(
+            nn.Sequential(nn.Conv2d(2 * c, 4 * c, 1, bias=False), nn.PixelShuffle(2))
+            for c in widths[::-1]
+        )
+        self.up = nn.ModuleList(_blocks(c, 1) for c in widths[::-1])
+
+    def change(self, picture: Tensor) -> Tensor:
+        x, passed = self.enter(picture), []
+        for blocks, shrink in zip(self.down, self.shrink, strict=True):
+            passed.append(blocks(x))
+            x = shrink(passed[-1])
+        x = self.middle(x)
+        for grow, blocks, skip in zip(self.grow, self.up, passed[::-1], strict=True):
+            x = blocks(grow(x) + skip)
+        result: Tensor = self.last(x)
+        return result
+
+
+def _blocks(width: int, count: int) -> nn.Sequential:
+    return nn.Sequential(*(NAFBlock(width) for _ in range(count)))
+
+
+def _multiplied(x: Tensor) -> Tensor:
+    first, second = x.chunk(2, 1)
+    return first * second
+
+
+@node()
+def nafnet(
+    picture: Tensor,
+    *,
+    weights: DataFile | None = None,
+    width: Layers = 16,
+    tile: Tile | None = None,
+    reduce: Count = 1,
+    detail: bool = False,
+) -> Tensor:
+    """Restore a colour picture with a small NAFNet, a strong baseline.
+
+    ``tile``, ``reduce`` and ``detail`` as in `fft_mamba`.
+
+    Shapes: picture (3, y, x) of any size -> (3, y, x).
+    Units:  linear sRGB, as in the training of the weights.
+    Error:  float32, 1e-5; of the restoration, the error that the training reached. Channels are
+            scaled by a function of their mean over the whole picture, so a crop is not restored
+            like the whole picture.
+    Raises: ParameterError before the run without weights, or where the weights do not fit;
+            ValueError for a picture that is not a colour picture or not finite.
+    Source: Chen et al., Simple Baselines for Image Restoration, ECCV 2022; fewer blocks, and
+            factors that start at 0.1.
+    """
+    return restored(picture, partial(NAFNet, width), weights, tile, reduce, detail)
+
+
+nafnet.preflight(partial(fitting, NAFNet))
+nafnet.check(restorer_checks)

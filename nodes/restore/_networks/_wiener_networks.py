@@ -1,0 +1,360 @@
+"""Networks that go on from the answer of the Wiener filter, or alternate with the filter."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from neusee.nodes import Check, node
+from neusee.nodes.network_weights import loaded, same_layout
+from neusee.nodes.precision import exact_convolutions, single
+from neusee.nodes.resampling import mirrored, resize
+from neusee.nodes.restore._inverse._hidden_pixels import PULLED_STEPS, most_likely, pulled
+from neusee.nodes.restore._inverse._masked_blur import Blurred
+from neusee.nodes.restore._inverse._wiener import (
+    MAPS,
+    Doubt,
+    LaserLight,
+    LeastDoubt,
+    Settings,
+    View,
+    facts,
+    pose,
+    unpacked,
+)
+from neusee.nodes.restore._networks._restorer import Restorer
+from neusee.nodes.restore._networks._unet_and_nafnet import NAFNet
+from neusee.nodes.units import Count, DataFile, Electrons, Layers
+from neusee.nodes.values import Bands, Psf
+
+# --- informed -------------------------------------------------------------------------------------
+
+# A network that goes on from the answer of the Wiener filter, and sees what the filter knows.
+
+
+class Informed(Restorer):
+    """A NAFNet that changes the answer of the Wiener filter, given the maps of
+    `restore.filter_facts`.
+    """
+
+    def __init__(self, width: int = 16) -> None:
+        super().__init__()
+        self.body = NAFNet(width, (1, 1, 1), 1, inputs=MAPS, outputs=9)
+        self.multiple = self.body.multiple
+
+    def begin(self) -> None:
+        self.body.last.weight.zero_()
+
+    def pyramid(self, picture: Tensor, *conditions: Any) -> tuple[Tensor, Tensor]:
+        """Return the restored picture at half and at full size: ``picture`` (n, 3, y, x) and what
+        the network changes.
+
+        ``picture`` is what the filter restores; ``conditions`` are its `FilterFacts`, and the
+        matrix (3, channel) from electrons to colours, of a single picture or of n pictures along a
+        first axis.
+        """
+        value, matrix = conditions
+        change = self.change(value.answer, value.deviation, value.maps) * value.scale
+        fine = picture + torch.einsum("...oc,...cyx->...oyx", matrix.to(change), change).to(picture)
+        return resize(fine, -(-picture.shape[-2] // 2), -(-picture.shape[-1] // 2)), fine
+
+    def change(self, answer: Tensor, deviation: Tensor, maps: Tensor) -> Tensor:
+        """Return what the network adds to the answer of the filter (3, y, x), or to n of them, in
+        units of its scale.
+
+        It is the sum of three parts, each with a map of the network for each channel: a change,
+        multiplied by the root of the predicted error, so that what is certain hardly changes; a
+        share of the answer, which draws it to the mean of the scene; and a share of the mean of its
+        channels, which draws it to grey.
+        """
+        rows, columns = maps.shape[-2:]
+        batch = maps.to(self.body.last.weight).reshape(-1, *maps.shape[-3:])
+        padded = mirrored(batch, -rows % self.multiple, -columns % self.multiple)
+        numbers: Tensor = self.body.change(padded)[..., :rows, :columns].to(answer)
+        free, share, grey = torch.tensor_split(
+            numbers.reshape(*answer.shape[:-3], -1, rows, columns), 3, -3
+        )
+        result: Tensor = (
+            free * deviation.sqrt() + share * answer + grey * answer.mean(-3, keepdim=True)
+        )
+        return result
+
+
+@node(rtol=1e-5, additive_inputs=[("glare", "nearby"), ("ghosts",)])
+def informed(
+    electrons: Tensor,
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    clipped: Tensor,
+    glare: list[Tensor] | None = None,
+    nearby: list[Tensor] | None = None,
+    ghosts: list[Tensor] | None = None,
+    *,
+    weights: DataFile | None = None,
+    width: Layers = 16,
+    balance: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0,
+    doubt: Doubt = 0.0,
+    least_doubt: LeastDoubt = 0.0,
+    scatter: bool = False,
+    read_noise: Electrons,
+) -> Tensor:
+    """Deconvolve a picture by `restore.wiener`, and correct the answer by a network that sees what
+    the filter knows.
+
+    A small NAFNet sees the maps of `restore.filter_facts`: the answer and its brightness, the
+    residual, which pixels are clipped and how certain they are, the glare and what is not known of
+    it, and what the frame tells of each pixel and each octave of frequency. So one network serves
+    several masks, lasers and noises. Without ``weights`` the restorer is the filter. ``scatter`` as
+    `restore.wiener`; the weights that ship were trained without it.
+
+    Shapes: as `restore.wiener`, of three channels -> (channel, y, x).
+    Units:  as `restore.wiener`.
+    Error:  the filter's own; the network is float32, 1e-5. The weights receive no gradients. Of the
+            restoration, the error that the training reached: a network may invent what the frame
+            does not tell.
+    Raises: ParameterError before the run where the weights do not fit; ValueError as
+            `restore.wiener`, and for a sensor without three channels.
+    Source: Chen et al., Simple Baselines for Image Restoration, ECCV 2022 (NAFNet), with fewer
+            blocks; the maps are ours.
+    """
+    electrons, light = single(electrons), LaserLight(glare, nearby, ghosts)
+    if len(electrons) != 3:
+        raise ValueError(
+            f"electrons {tuple(electrons.shape)} have {len(electrons)} channels, and the network"
+            " needs 3"
+        )
+    view = View(psf, illuminant, responses, bands)
+    settings = Settings(balance, read_noise, doubt, least_doubt, scatter)
+    filtered = facts(pose(electrons, clipped, view, light, settings))
+    result = filtered.answer * filtered.scale
+    if weights is not None:
+        net = (
+            loaded(partial(Informed, width), weights)
+            .requires_grad_(False)
+            .eval()
+            .to(electrons.device)
+        )
+        with (
+            exact_convolutions(electrons, deterministic=True),
+            torch.autocast(electrons.device.type, enabled=False),
+        ):
+            result = (
+                result
+                + net.change(filtered.answer, filtered.deviation, filtered.maps) * filtered.scale
+            )
+    return (result + filtered.mean).to(electrons)
+
+
+@informed.preflight
+def _(*, weights: Path | None = None, width: int = 16, **others: Any) -> list[str]:
+    """Raise ParameterError if the file of weights belongs to another network; say where there is
+    none.
+    """
+    if weights is None:
+        return [
+            "without weights the informed restorer is the Wiener filter: train them, and give"
+            " restore.weights"
+        ]
+    same_layout(partial(Informed, width), weights, width)
+    return []
+
+
+@informed.check
+def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: Any) -> list[Check]:
+    share = float(inputs[4].any(-3).double().mean())
+    ratio = float(result.mean() / electrons.mean())
+    finite = bool(torch.isfinite(result).all())
+    return [Check(f"{share:.2%} of pixels clipped, restored mean {ratio:.2f} of raw mean", finite)]
+
+
+# --- unrolled -------------------------------------------------------------------------------------
+
+# The Wiener filter unrolled: steps that alternate a learned prior and the filter, and the node that
+# runs them.
+
+
+Steps = Annotated[Count, Field(le=16)]
+_MAPS = 15  #: maps that a prior sees: five of each of three channels
+#: of what a network says, at first, and the range of its logarithm to either side
+_PRECISION, _REACH = 10.0, 5.0
+_BRIGHT = 1e3  #: of a glare pattern of maximum 1, so that its far rings are seen
+
+
+class Unrolled(Restorer):
+    """Steps of the Wiener filter, each with a second prior that a network finds in the picture of
+    the step before.
+
+    In step k a network says what the picture is, c, and how precisely it knows this; the step
+    returns the most likely picture under the frame, the prior of the filter, and c. A network with
+    precision 0 leaves the filter's answer.
+    """
+
+    def __init__(self, width: int = 16, steps: int = 2, iterations: int = PULLED_STEPS) -> None:
+        super().__init__()
+        self.iterations = iterations  #: of the conjugate gradients in each step
+        self.priors = nn.ModuleList(
+            NAFNet(width, (1, 1, 1), 1, inputs=_MAPS, outputs=6) for _ in range(steps)
+        )
+        self.multiple = 8
+
+    def begin(self) -> None:
+        for prior in self.priors:
+            assert isinstance(prior, NAFNet)
+            prior.last.weight.zero_()
+
+    def pyramid(self, picture: Tensor, *conditions: Any) -> tuple[Tensor, Tensor]:
+        """Return the restored picture at half and at full size: ``picture`` (1, 3, y, x) and what
+        the network changes.
+
+        ``picture`` is what the filter restores; ``conditions`` are the `WienerProblem` whose answer
+        it is, and the matrix (3, channel) from electrons to colours.
+        """
+        value, matrix = conditions
+        change = self.change(unpacked(value), value.answer, value.seen) * value.scale
+        fine = picture + torch.tensordot(matrix.to(change), change, 1).to(picture)
+        return resize(fine, -(-picture.shape[-2] // 2), -(-picture.shape[-1] // 2)), fine
+
+    def change(self, problem: Blurred, answer: Tensor, blurred: Tensor) -> Tensor:
+        """Return what the steps add to the filter's answer (3, y, x), given this answer and its
+        blur by the camera.
+        """
+        added = of_added = torch.zeros_like(answer)
+        for prior in self.priors:
+            pull, precision = _found(prior, problem, answer + added, blurred + of_added)
+            added, of_added = pulled(problem, added + pull, precision, self.iterations)
+        return added
+
+
+def _found(prior: nn.Module, problem: Blurred, x: Tensor, blurred: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the change of the picture of the step before that a network wants, and its
+    precision (channel, y, x).
+    """
+    rows, columns = problem.picture.shape[-2:]
+    weight = next(prior.parameters())
+    maps = mirrored(_maps(problem, x, blurred).to(weight)[None], -rows % 8, -columns % 8)
+    change, certain = prior.change(maps)[0, :, :rows, :columns].to(x).split(3)  # type: ignore[operator]
+    return change, _PRECISION * torch.exp(
+        _REACH * torch.tanh(certain.mean((-2, -1), keepdim=True))
+    ).expand_as(change)
+
+
+def _maps(problem: Blurred, x: Tensor, blurred: Tensor) -> Tensor:
+    """Return what a prior sees (15, y, x): picture, residual over its noise, certainty, seen
+    pixels, and glare.
+    """
+    unclipped = problem.weight > 0
+    root = (
+        torch.where(unclipped, problem.weight, 1.0).sqrt() * unclipped
+    )  # the slope of sqrt is infinite at 0
+    residual = root * (problem.picture - blurred)
+    glare = sum(problem.glare, torch.zeros_like(residual))
+    brightest = glare.detach().amax().clamp_min(1e-30)
+    # 0 for a clipped pixel, 1 for a noise of 0.7 % of the contrast of the scene
+    certain = problem.weight.log1p() / 10.0
+    return torch.cat(
+        [
+            x,
+            residual.asinh(),
+            certain,
+            unclipped.to(residual),
+            (_BRIGHT / brightest * glare).asinh(),
+        ]
+    )
+
+
+@node(rtol=1e-5, additive_inputs=[("glare", "nearby"), ("ghosts",)])
+def unrolled(
+    electrons: Tensor,
+    psf: Psf,
+    illuminant: Tensor,
+    responses: Tensor,
+    bands: Bands,
+    clipped: Tensor,
+    glare: list[Tensor] | None = None,
+    nearby: list[Tensor] | None = None,
+    ghosts: list[Tensor] | None = None,
+    *,
+    weights: DataFile | None = None,
+    width: Layers = 16,
+    steps: Steps = 2,
+    balance: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0,
+    doubt: Doubt = 0.0,
+    least_doubt: LeastDoubt = 0.0,
+    read_noise: Electrons,
+) -> Tensor:
+    """Deconvolve a picture by `restore.wiener` with a learned prior: the filter and a network take
+    turns.
+
+    Each of the ``steps`` asks a small NAFNet of its own what the picture is, c, and how precisely
+    it knows this (one precision R for each channel), and gives the most likely picture under the
+    frame, the prior of the filter and a Gaussian prior of mean c and precision R in the frame.
+    Beyond the frame the precision is 0. The network sees the picture of the step before, the
+    residual y - B x over its noise, how certain each pixel is, which pixels are not clipped, and
+    the glare. Without ``weights`` the restorer is the filter, and so it is where the network's
+    precision is 0.
+
+    Shapes: as `restore.wiener`, of three channels -> (channel, y, x).
+    Units:  as `restore.wiener`.
+    Error:  the filter's own; in each step conjugate gradients leave 2e-3 to 4e-3 of what the
+            network adds (64 pixels a side, behind a half-ring and five half-rings); the network is
+            float32, 1e-5. Gradients of first order only; the weights receive none. Of the
+            restoration, the error that the training reached: a network may invent what the frame
+            does not tell.
+    Raises: ParameterError before the run where the weights do not fit; ValueError as
+            `restore.wiener`, and for a sensor without three channels.
+    Source: unrolling with a data term in each step: Aggarwal et al., MoDL, IEEE Trans. Med. Imaging
+            38, 394 (2019); Chen et al., Simple Baselines for Image Restoration, ECCV 2022 (NAFNet);
+            the maps are ours.
+    """
+    electrons, light = single(electrons), LaserLight(glare, nearby, ghosts)
+    if len(electrons) != 3:
+        raise ValueError(
+            f"electrons {tuple(electrons.shape)} have {len(electrons)} channels, and the network"
+            " needs 3"
+        )
+    view = View(psf, illuminant, responses, bands)
+    settings = Settings(balance, read_noise, doubt, least_doubt)
+    scaled = pose(electrons, clipped, view, light, settings)
+    problem, spectrum = scaled.problem, most_likely(scaled.problem)
+    result = scaled.pixels(spectrum)
+    if weights is not None:
+        net = (
+            loaded(partial(Unrolled, width, steps), weights)
+            .requires_grad_(False)
+            .eval()
+            .to(electrons.device)
+        )
+        with (
+            exact_convolutions(electrons, deterministic=True),
+            torch.autocast(electrons.device.type, enabled=False),
+        ):
+            change = net.change(problem, problem.first(spectrum), problem.blur(spectrum))
+        result = result + change * scaled.scale / scaled.share
+    return (result + scaled.mean).to(electrons)
+
+
+@unrolled.preflight
+def _(*, weights: Path | None = None, width: int = 16, steps: int = 2, **others: Any) -> list[str]:
+    """Raise ParameterError if the file of weights belongs to another network; say where there is
+    none.
+    """
+    if weights is None:
+        return [
+            "without weights the unrolled restorer is the Wiener filter: train them, and give"
+            " restore.weights"
+        ]
+    same_layout(partial(Unrolled, width, steps), weights, width)
+    return []
+
+
+@unrolled.check
+def _(result: Tensor, electrons: Tensor, *inputs: Any, **params: Any) -> list[Check]:
+    share = float(inputs[4].any(-3).double().mean())
+    ratio = float(result.mean() / electrons.mean())
+    finite = bool(torch.isfinite(result).all())
+    return [Check(f"{share:.2%} of pixels clipped, restored mean {ratio:.2f} of raw mean", finite)]

@@ -1,0 +1,472 @@
+"""Frames of point sources: how they are read, and their model as a function of the PSF."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d, pad
+
+from neusee.nodes import ParameterError
+from neusee.nodes.input_files import once_per_version
+from neusee.nodes.metrics._sensor_load import clipped
+from neusee.nodes.sensor._frame_file import Curve, frame_problem, read_frame
+
+# --- point frames ---------------------------------------------------------------------------------
+
+# Frames of point sources, read from files: where the points are, and the pixels in the windows
+# around them.
+
+
+_SIGNIFICANT = 8.0  #: standard deviations by which a point stands out of the noise
+_FAINTEST = 0.03  #: of the brightest point of the frame: what is fainter is a lobe or a reflection
+_RIM = 3  #: pixels from the edge of the frame within which a point is not used
+_MOST = 400  #: points of a frame
+_AROUND = 500  #: pixels beyond all windows that a frame must have, because they give its background
+_OUTLIER = 4.0  #: standard deviations beyond which a pixel does not count for the background
+_DARK = "dark"  #: beginning of the name of a file without light
+Camera = tuple[float, float, float, int, float]  #: gain, offset, full well, bits, read noise
+
+
+class Seen(NamedTuple):
+    """The pixels in the windows of all points, and what is known of each frame."""
+
+    light: Tensor  #: (channel, pixel) float64, e-
+    clipped: Tensor  #: (channel, pixel) bool
+    frame: Tensor  #: (pixel,) int64, the frame of each pixel
+    #: (point, y * x) int64, pixel of each place in a window; their number where there is none
+    pixels: Tensor
+    owner: Tensor  #: (point,) int64, the frame of each point
+    middle: Tensor  #: (point, 2) int64, the pixel in the middle of each window
+    background: Tensor  #: (frame, channel) float64, e-, mean beyond all windows
+    doubt: Tensor  #: (frame, channel) float64, e-2, variance of this mean
+    floor: Tensor  #: (frame, channel) float64, e-2, variance of the noise without light of points
+    level: float  #: e-, at which a pixel is clipped
+
+
+def lit_and_dark(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Return the frames with points and the dark frames, whose names begin with `dark`."""
+    dark = [file for file in files if file.name.lower().startswith(_DARK)]
+    return [file for file in files if file not in dark], dark
+
+
+class Layout(NamedTuple):
+    """Sizes of the PSFs that are measured, and where, (y, x) each."""
+
+    shape: tuple[int, int]  #: pixels of a frame
+    window: tuple[int, int]  #: pixels of a PSF
+    zones: tuple[int, int]
+
+
+def refuse_bad_frames(
+    files: Sequence[Path],
+    channels: int | None,
+    layout: Layout,
+    camera: Camera,
+    curve: Curve | None = None,
+) -> None:
+    """Raise ParameterError with the names of all frames that cannot be used, and of all zones
+    without a point.
+    """
+    lit, dark = lit_and_dark(files)
+    if not lit:
+        raise ParameterError(
+            "files", "there is no frame with points: only names that begin with dark"
+        )
+    shape, window, zones = layout
+    bits = camera[3]
+    _refuse_problems(
+        files, [frame_problem(file, channels, shape, bits, curve) for file in [*lit, *dark]]
+    )
+    points = {file: _found(file, window, camera) for file in lit}
+    _refuse_problems(files, [_unusable(file, points[file], shape, window) for file in lit])
+    empty = _empty_zones(points.values(), shape, zones)
+    if empty:
+        raise ParameterError("zones", _without_point(empty, zones))
+
+
+def _refuse_problems(files: Sequence[Path], problems: Sequence[str]) -> None:
+    """Raise ParameterError with the problems of all frames that have one."""
+    stated = [problem for problem in problems if problem]
+    if stated:
+        head = f"{len(stated)} of {len(files)} frames cannot be used: " if len(files) > 1 else ""
+        raise ParameterError("files", head + "; ".join(stated))
+
+
+def _empty_zones(
+    points_by_file: Iterable[Sequence[tuple[tuple[int, int], bool]]],
+    shape: tuple[int, int],
+    zones: tuple[int, int],
+) -> list[tuple[int, int]]:
+    """Return the zones without a sharp point, (row, column) from 1."""
+    full = set()
+    for points in points_by_file:
+        full |= {_zone(place, shape, zones) for place, sharp in points if sharp}
+    every = itertools.product(range(zones[0]), range(zones[1]))
+    return [(row + 1, column + 1) for row, column in every if (row, column) not in full]
+
+
+def points_in(files: Sequence[Path], window: tuple[int, int], camera: Camera) -> int:
+    """Return the number of points in the frames that are not dark."""
+    return sum(len(_found(file, window, camera)) for file in lit_and_dark(files)[0])
+
+
+def read_points(files: Sequence[Path], window: tuple[int, int], camera: Camera) -> Seen:
+    """Read all frames and keep the pixels in the windows of their points; subtract the mean of
+    the dark frames.
+    """
+    gain, offset, full_well, bits, read_noise = camera
+    lit, dark = lit_and_dark(files)
+    base = (
+        sum((read_frame(file).values / gain for file in dark), np.zeros(1)) / len(dark)
+        if dark
+        else offset
+    )
+    parts, first = [], 0
+    for number, file in enumerate(lit):
+        raw = torch.from_numpy(np.ascontiguousarray(read_frame(file).values, dtype=np.float64))
+        ends = clipped(raw, full_well=full_well, gain=gain, bits=bits)
+        light = raw / gain - torch.as_tensor(base)
+        places = [place for place, _ in _found(file, window, camera)]
+        parts.append(_kept(light, ends, places, window, number, first))
+        first += parts[-1][0].shape[-1]
+    lights, cut, frames, indices, middle, owner, background, doubt, spread = zip(
+        *parts, strict=True
+    )
+    index, ground = torch.cat(indices), torch.stack(background)
+    level = min(full_well, (2.0**bits - 1) / gain) - float(np.mean(base))
+    read_variance = read_noise**2 * (1 + (1 / len(dark) if dark else 0)) + 1 / (12 * gain**2)
+    floor = torch.maximum(torch.stack(spread), read_variance + ground.clamp_min(0.0))
+    return Seen(
+        torch.cat(lights, 1),
+        torch.cat(cut, 1),
+        torch.cat(frames),
+        torch.where(index < 0, first, index),
+        torch.cat(owner),
+        torch.cat(middle),
+        ground,
+        torch.stack(doubt),
+        floor,
+        level,
+    )
+
+
+def _kept(
+    light: Tensor,
+    ends: Tensor,
+    places: list[tuple[int, int]],
+    window: tuple[int, int],
+    number: int,
+    first: int,
+) -> tuple[Tensor, ...]:
+    """Return the pixels of one frame in the windows of its points, and the background of the
+    frame beyond them.
+    """
+    y, x = light.shape[-2:]
+    middle = torch.tensor(places, dtype=torch.int64).reshape(-1, 2)
+    rows = middle[:, :1] + torch.arange(window[0]) - window[0] // 2
+    columns = middle[:, 1:] + torch.arange(window[1]) - window[1] // 2
+    inside = ((rows >= 0) & (rows < y))[:, :, None] & ((columns >= 0) & (columns < x))[:, None]
+    flat = rows.clamp(0, y - 1)[:, :, None] * x + columns.clamp(0, x - 1)[:, None]
+    covered = _covered((y, x), places, window).flatten()
+    wide = _covered((y, x), places, (2 * window[0], 2 * window[1])).flatten()
+    lit = wide if int((~wide).sum()) >= _AROUND else covered
+    order = covered.cumsum(0) - 1 + first
+    index = torch.where(inside, order[flat], -1).flatten(1)
+    pairs = zip(light.flatten(1), ends.flatten(1), strict=True)
+    level, doubt, spread = map(
+        torch.stack, zip(*(_average(c[~lit & ~e]) for c, e in pairs), strict=True)
+    )
+    return (
+        light.flatten(1)[:, covered],
+        ends.flatten(1)[:, covered],
+        torch.full((int(covered.sum()),), number),
+        index,
+        middle,
+        torch.full((len(places),), number),
+        level,
+        doubt,
+        spread,
+    )
+
+
+def _covered(
+    shape: tuple[int, int], places: list[tuple[int, int]], window: tuple[int, int]
+) -> Tensor:
+    """Return True for the pixels (y, x) in windows around places."""
+    covered, (down, right) = torch.zeros(shape, dtype=torch.bool), (n // 2 for n in window)
+    for y, x in places:
+        covered[max(y - down, 0) : y + down + 1, max(x - right, 0) : x + right + 1] = True
+    return covered
+
+
+def _average(values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the mean without outliers, the variance of this mean, and the variance of a pixel."""
+    for _ in range(4):
+        mean, spread = values.mean(), values.std()
+        values = values[(values - mean).abs() <= _OUTLIER * spread + 1e-12]
+    return values.mean(), values.var() / len(values), values.var()
+
+
+# --- points ---------------------------------------------------------------------------------------
+
+
+@once_per_version
+def _found(
+    file: Path, window: tuple[int, int], camera: Camera
+) -> list[tuple[tuple[int, int], bool]]:
+    """Return the middle pixel of each point of a frame, the brightest first, and True for one
+    that is not clipped.
+    """
+    gain, _, full_well, bits, read_noise = camera
+    raw = torch.from_numpy(np.ascontiguousarray(read_frame(file).values, dtype=np.float64))
+    ends = clipped(raw, full_well=full_well, gain=gain, bits=bits).any(0)
+    light = (raw / gain).sum(0)
+    calm = _median(light)
+    ground = calm.median()
+    noise = 1.4826 * float((light - light.median()).abs().median())
+    noise = max(noise, read_noise * math.sqrt(len(raw)), 1e-6)
+    above = calm - ground
+    high = above > max(_SIGNIFICANT * noise, _FAINTEST * float(above.max()))
+    top = high & (above >= max_pool2d(above[None], 7, 1, 3)[0])
+    above = torch.where(top, above, 0.0)
+    points = list[tuple[tuple[int, int], bool]]()
+    while len(points) < _MOST and float(above.max()) > 0:
+        y, x = divmod(int(above.argmax()), above.shape[1])
+        near = ends[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
+        points.append(((y, x), not bool(near.any())))
+        above[
+            max(y - window[0] // 2, 0) : y + window[0] // 2 + 1,
+            max(x - window[1] // 2, 0) : x + window[1] // 2 + 1,
+        ] = 0
+    inner = [
+        p
+        for p in points
+        if all(_RIM <= c < n - _RIM for c, n in zip(p[0], above.shape, strict=True))
+    ]
+    return inner
+
+
+def _median(picture: Tensor) -> Tensor:
+    """Return the median of three by three pixels, in which a single hot pixel does not show."""
+    wide = pad(picture[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
+    return wide.unfold(0, 3, 1).unfold(1, 3, 1).flatten(-2).median(-1).values
+
+
+def _unusable(
+    file: Path,
+    points: list[tuple[tuple[int, int], bool]],
+    shape: tuple[int, int],
+    window: tuple[int, int],
+) -> str:
+    """Return why a frame does not show points, or an empty text."""
+    if not points:
+        return (
+            f"{file.name} shows no point source: nothing stands out of the noise by"
+            f" {_SIGNIFICANT:g} deviations (a frame without light needs a name that begins with"
+            " dark)"
+        )
+    if (free := int((~_covered(shape, [place for place, _ in points], window)).sum())) < _AROUND:
+        return (
+            f"{file.name} has {free} pixels beyond the windows of its {len(points)} points, but its"
+            f" background needs {_AROUND}: choose a smaller window, or fewer points a frame"
+        )
+    return ""
+
+
+def _zone(
+    place: tuple[int, int], shape: tuple[int, int], zones: tuple[int, int]
+) -> tuple[int, int]:
+    row, column = (c * z // n for c, z, n in zip(place, zones, shape, strict=True))
+    return row, column
+
+
+def _without_point(empty: list[tuple[int, int]], zones: tuple[int, int]) -> str:
+    names = ", ".join(f"({i}, {j})" for i, j in empty)
+    return (
+        f"{len(empty)} of {zones[0]} x {zones[1]} zones have no point with an unsaturated core,"
+        f" (row, column) {names}: take frames with points there, a shorter exposure, or choose"
+        " fewer zones"
+    )
+
+
+# --- point model ----------------------------------------------------------------------------------
+
+# The frames of point sources as a function of the PSF at the nodes of a grid, and of each point's
+# place and signal.
+
+
+_REACH = 12  #: pixels on each side of a pixel that its interpolated value uses
+_BETA = 8.0  #: of the Kaiser window
+
+
+class State(NamedTuple):
+    """What is fitted: also a change of it, and a slope with respect to it."""
+
+    kernels: Tensor  #: (node, channel, y, x)
+    signal: Tensor  #: (point, channel), e-
+    offset: Tensor  #: (point, 2), pixels from the middle of the window
+    background: Tensor  #: (frame, channel), e-
+
+    def plus(self, other: State, times: float | Tensor = 1.0) -> State:
+        """Return the sum of this and a multiple of another."""
+        return State(*(a + times * b for a, b in zip(self, other, strict=True)))
+
+    def dot(self, other: State) -> Tensor:
+        """Return the sum of the products of all entries."""
+        return torch.stack([(a * b).sum() for a, b in zip(self, other, strict=True)]).sum()
+
+    def times(self, other: State) -> State:
+        """Return the products of all entries."""
+        return State(*(a * b for a, b in zip(self, other, strict=True)))
+
+
+def node_weights(places: Tensor, shape: tuple[int, int], zones: tuple[int, int]) -> Tensor:
+    """Return the bilinear weight of each node at places (point, 2): (point, rows * columns),
+    with a sum of 1.
+    """
+    down, right = (hats(places[:, k], shape[k], zones[k]) for k in (0, 1))
+    return (down[:, :, None] * right[:, None]).flatten(1)
+
+
+def hats(position: Tensor, size: int, count: int) -> Tensor:
+    """Return the linear weights (place, node) of ``count`` nodes in the middles of equal parts
+    of ``size`` pixels.
+    """
+    along = ((position.double() + 0.5) * count / size - 0.5).clamp(0, count - 1)
+    return (1.0 - (along[:, None] - torch.arange(count, dtype=torch.float64)).abs()).clamp_min(0.0)
+
+
+def shifting(offset: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Return matrices (point, size, size) that shift samples by ``offset`` (point,), and their
+    slopes.
+
+    The interpolation is a sinc with a Kaiser window: its error is below 1e-4 for up to 0.4 periods
+    in a pixel. The slope of the samples is continued beyond their ends.
+    """
+    apart = torch.arange(size)[:, None] - torch.arange(size + 2 * _REACH) + _REACH
+    distance = apart.double() - offset[:, None, None]
+    inside = (1.0 - (distance / (_REACH + 1.0)).square()).clamp_min(0.0)
+    root = inside.sqrt()
+    taper = torch.special.i0(_BETA * root) / torch.special.i0(
+        torch.tensor(_BETA, dtype=torch.float64)
+    )
+    bent = torch.special.i1(_BETA * root) / torch.special.i0(
+        torch.tensor(_BETA, dtype=torch.float64)
+    )
+    wave, x = torch.sinc(distance), math.pi * distance
+    small = distance.abs() < 1e-4
+    rise = torch.where(
+        small, -math.pi * x / 3.0, (torch.cos(x) - wave) / torch.where(small, 1.0, distance)
+    )
+    fall = -_BETA * distance / (_REACH + 1.0) ** 2 * bent / root.clamp_min(1e-6)
+    outside = inside <= 0
+    value = (wave * taper).masked_fill(outside, 0.0)
+    slope = -(rise * taper + wave * fall).masked_fill(outside, 0.0)
+    return _folded(value), _folded(slope)
+
+
+def _folded(matrix: Tensor) -> Tensor:
+    """Return matrices whose columns beyond the ends act on the samples within, mirrored at the
+    ends and turned over.
+    """
+    inner = matrix[..., _REACH:-_REACH].clone()
+    reach = min(_REACH, inner.shape[-1] - 1)
+    left, right = (
+        matrix[..., _REACH - reach : _REACH],
+        matrix[..., -_REACH : matrix.shape[-1] - _REACH + reach],
+    )
+    inner[..., 0] += 2.0 * left.sum(-1)
+    inner[..., 1 : reach + 1] -= left.flip(-1)
+    inner[..., -1] += 2.0 * right.sum(-1)
+    inner[..., -1 - reach : -1] -= right.flip(-1)
+    return inner
+
+
+def moved(kernels: Tensor, offset: Tensor) -> Tensor:
+    """Return kernels (kernel, channel, y, x), shifted by ``offset`` (kernel, 2)."""
+    down, _ = shifting(offset[:, 0], kernels.shape[-2])
+    right, _ = shifting(offset[:, 1], kernels.shape[-1])
+    return _applied(down, kernels, right)
+
+
+class Linear(NamedTuple):
+    """The frames near a state: the model, and its derivative as a matrix that is never formed."""
+
+    seen: Seen
+    share: Tensor  #: (point, node)
+    signal: Tensor  #: (point, channel)
+    down: Tensor  #: (point, y, y)
+    right: Tensor  #: (point, x, x)
+    #: (3, point, channel, y, x): each point of signal 1, and its slopes with y and x times the
+    #: signal
+    patterns: Tensor
+
+    def change(self, by: State) -> Tensor:
+        """Return the change (channel, pixel) of the frames for a small change of the state."""
+        kernels = torch.tensordot(self.share, by.kernels, 1)
+        stamps = self.signal[..., None, None] * _applied(self.down, kernels, self.right)
+        stamps = stamps + by.signal[..., None, None] * self.patterns[0]
+        stamps = stamps + (by.offset.T[:, :, None, None, None] * self.patterns[1:]).sum(0)
+        return self._scattered(stamps) + by.background.T[:, self.seen.frame]
+
+    def slope(self, pixels: Tensor) -> State:
+        """Return the transpose of `change`, applied to pixels (channel, pixel)."""
+        stamps = self.stamps_of(pixels)
+        signal = (stamps * self.patterns[0]).sum((-2, -1))
+        offset = (stamps * self.patterns[1:]).sum((-3, -2, -1)).T
+        back = self.down.mT[:, None] @ (self.signal[..., None, None] * stamps) @ self.right[:, None]
+        kernels = torch.tensordot(self.share, back, ([0], [0]))
+        background = pixels.new_zeros(len(self.seen.background), len(pixels)).index_add(
+            0, self.seen.frame, pixels.T
+        )
+        return State(kernels, signal, offset, background)
+
+    def stamps_of(self, pixels: Tensor) -> Tensor:
+        """Return pixels (channel, pixel) as windows (point, channel, y, x); 0 beyond the frame."""
+        held = torch.cat([pixels, pixels.new_zeros(len(pixels), 1)], 1)[
+            :, self.seen.pixels
+        ].transpose(0, 1)
+        return held.reshape(*held.shape[:2], *self.patterns.shape[-2:])
+
+    def _scattered(self, stamps: Tensor) -> Tensor:
+        flat = stamps.transpose(0, 1).flatten(1)
+        count = self.seen.light.shape[-1]
+        with_outside = flat.new_zeros(len(flat), count + 1).index_add(
+            1, self.seen.pixels.flatten(), flat
+        )
+        return with_outside[:, :count]
+
+    def model(self, background: Tensor) -> Tensor:
+        """Return the expected frames (channel, pixel)."""
+        return (
+            self._scattered(self.signal[..., None, None] * self.patterns[0])
+            + background.T[:, self.seen.frame]
+        )
+
+
+def linear(pixels: Seen, state: State, share: Tensor) -> Linear:
+    """Return the frames near a state."""
+    y, x = state.kernels.shape[-2:]
+    (down, steep), (right, steep_x) = (
+        shifting(state.offset[:, 0], y),
+        shifting(state.offset[:, 1], x),
+    )
+    kernels, size = torch.tensordot(share, state.kernels, 1), state.signal[..., None, None]
+    patterns = _applied(down, kernels, right)
+    slopes = size * _applied(steep, kernels, right), size * _applied(down, kernels, steep_x)
+    return Linear(pixels, share, state.signal, down, right, torch.stack([patterns, *slopes]))
+
+
+def _applied(down: Tensor, kernels: Tensor, right: Tensor) -> Tensor:
+    """Return kernels (point, channel, y, x), multiplied from both sides by the matrices of each
+    point.
+    """
+    products: Tensor = down[:, None] @ kernels @ right.mT[:, None]
+    return products

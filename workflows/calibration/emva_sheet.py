@@ -1,0 +1,691 @@
+"""The EMVA 1288 sheet: its frames, its patterns of defects, and the page of quantities."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from neusee.nodes.calibrate import (
+    DefectHistogram,
+    EmvaSheet,
+    FrameTest,
+    Nonuniformity,
+    Profiles,
+    Quantity,
+    SpatialSeries,
+    Spectrogram,
+    Stack,
+    Traceability,
+    coarse,
+    defects,
+    descriptor,
+    descriptor_frames,
+    descriptor_release,
+    descriptor_series,
+    inspect_frames,
+    levels,
+    profiles,
+    reduce,
+    refuse_descriptor,
+    spatial_series,
+    spectrogram,
+    without_trend,
+)
+from neusee.nodes.values import Levels
+from neusee.workflows.calibration.frame_validity import frame_section
+from neusee.workflows.calibration.uncertainty_budget import of_traceability
+from neusee.workflows.engine.runner import run
+from neusee.workflows.frames.folder_recipe import quoted
+from neusee.workflows.graph.recipe_graph import Recipe, Step
+from neusee.workflows.recipe.loading import load
+from neusee.workflows.report.study_folder import CsvTable
+from neusee.workflows.report.study_page import Mark, Section
+from neusee.workflows.store.result_store import Store
+
+# --- emva frames ----------------------------------------------------------------------------------
+
+# Light levels and series of frames of a recipe, as the sheet of EMVA 1288 needs them.
+
+
+Release = Literal["4", "3"]
+#: release of EMVA 1288 since which the variance in time excludes the difference of means
+_STEADY = 3.1
+#: what the standard wants to be told of the operating point
+OPERATING_POINT = {
+    "camera": "camera",
+    "sensor": "sensor",
+    "gain_setting": "gain setting",
+    "offset_setting": "offset setting",
+    "pixel_pitch": "pixel pitch",
+    "wavelength": "centroid wavelength of the light",
+    "bandwidth": "width of its spectrum (FWHM)",
+    "spectrum": "spectrum of the lamp",
+    "photometer": "calibration of the light: instrument and certificate",
+    "temperature": "temperature",
+    "laboratory": "laboratory and date",
+}
+_HALF = 0.5  #: share of saturation at which the lit series is taken
+_TEXT = """# EMVA 1288: the sheet of the measurement {name}.
+steps:
+  measured: {{node: calibrate.descriptor, with: {{file: {file}, scatter: steady}}}}
+outputs: [measured]
+"""
+
+
+class EmvaFrames(NamedTuple):
+    """The input of a sheet."""
+
+    levels: Levels
+    spatial: Nonuniformity
+    frames: int  #: least number of frames of a level
+    tests: Sequence[FrameTest] = ()  #: of the frames themselves
+    release: Release = "4"  #: whose variance in time the levels have
+    stated: str = ""  #: release that the descriptor states
+
+
+def descriptor_recipe(file: Path, changes: Sequence[str] = ()) -> Recipe:
+    """Return the recipe of a sheet of the measurement that an EMVA 1288 descriptor file describes.
+
+    Raises: ValueError for a descriptor or an image that is missing or cannot be read, `RecipeError`
+            with all mistakes
+    of ``changes``.
+    """
+    refuse_descriptor(file)
+    name = "".join(c if c.isalnum() else "_" for c in file.parent.absolute().name or file.stem)
+    text = _TEXT.format(name=file.name, file=quoted(str(file.absolute())))
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"{name}.yaml"
+        path.write_text(text, encoding="utf-8")
+        return load(path, changes)
+
+
+def frames_of_recipe(recipe: Recipe, store: Store, release: Release | None = None) -> EmvaFrames:
+    """Return levels with the variance in time, and the dark and the lit series, of a recipe that
+    reads frames.
+
+    In release 4 the variance of a level excludes the difference of the means of its frames; in 3 it
+    includes it. By default the release is that which the descriptor states, and 4 where no
+    descriptor states one.
+    Raises: ValueError for a recipe that reads neither frames, a descriptor nor a table.
+    """
+    if described := _steps_of(recipe, "calibrate.descriptor"):
+        stated = descriptor_release(described[0].params["file"])
+        release = release or ("3" if stated and float(stated) < _STEADY else "4")
+        return _described(described[0], _SCATTER[release])._replace(release=release, stated=stated)
+    release = release or "4"
+    if reduced := _steps_of(recipe, "calibrate.reduce"):
+        return _reduced(recipe, store, reduced, _SCATTER[release])._replace(release=release)
+    if tables := _steps_of(recipe, "calibrate.table"):
+        return _tabled(recipe, store, tables[0].name)
+    raise ValueError(
+        f"{recipe.name} has no step of the nodes {', '.join(_READERS)}, so that it has no frames"
+        " of a sheet of EMVA 1288: give a descriptor, or a recipe as in `neusee run calibrate`"
+    )
+
+
+def _steps_of(recipe: Recipe, node: str) -> list[Step]:
+    return [step for step in recipe.steps.values() if step.node.path == node]
+
+
+def _tabled(recipe: Recipe, store: Store, name: str) -> EmvaFrames:
+    """Return the levels of a table of moments, which has no series."""
+    measured = run(recipe, store, (name,)).values[name]
+    dark = measured.variance[measured.photons == 0]
+    tests = [coarse(float(dark.min()), exact=False)] if len(dark) else []
+    return EmvaFrames(measured, Nonuniformity(None, None), 2, tests)
+
+
+_READERS = ("calibrate.descriptor", "calibrate.reduce", "calibrate.table")
+_FITTED = 0.7  #: share of saturation up to which the sheet fits its lines
+#: parameter of the nodes that reduce frames
+_SCATTER: dict[Release, Any] = {"4": "steady", "3": "temporal"}
+
+
+def _described(step: Step, scatter: Any) -> EmvaFrames:
+    files = step.params["file"]
+    measured = descriptor(file=files, scatter=scatter)
+    series = [spatial_series(*entry) for entry in descriptor_series(files)]
+    stacks = (
+        Stack(name, light, time, scatter, frames)
+        for name, light, time, frames in descriptor_frames(files)
+    )
+    return EmvaFrames(
+        measured, _nearest_half(series, measured), 2, inspect_frames(stacks, False, _FITTED)
+    )
+
+
+def _reduced(recipe: Recipe, store: Store, steps: Sequence[Step], scatter: Any) -> EmvaFrames:
+    """Return levels and series of the steps that reduce frames; the levels of most frames are
+    the series.
+    """
+    parts, counts = [], []
+    for step in steps:
+        frames = _frames(recipe, store, step)
+        parts.append(reduce(frames, photons=_of(step)[0], exposure=_of(step)[1], scatter=scatter))
+        counts.append(len(frames))
+    measured: Levels = levels(parts)
+    largest = max(counts)
+    fullest = [step for step, count in zip(steps, counts, strict=True) if count == largest]
+    pair = _dark_and_half([_of(step) for step in fullest], measured)
+    series = (spatial_series(*_of(fullest[i]), _frames(recipe, store, fullest[i])) for i in pair)
+    stacks = (Stack(step.name, *_of(step), scatter, _frames(recipe, store, step)) for step in steps)
+    return EmvaFrames(measured, _pair(series), min(counts), inspect_frames(stacks, False, _FITTED))
+
+
+def _of(step: Step) -> tuple[float, float]:
+    return float(step.params["photons"]), float(step.params["exposure"])
+
+
+def _frames(recipe: Recipe, store: Store, step: Step) -> Any:
+    source = str(step.wires["frames"])
+    return run(recipe, store, (source,)).values[source]
+
+
+def _nearest_half(series: Sequence[SpatialSeries], measured: Levels) -> Nonuniformity:
+    return _pair(
+        series[i] for i in _dark_and_half([(s.photons, s.exposure) for s in series], measured)
+    )
+
+
+def _pair(series: Iterator[SpatialSeries]) -> Nonuniformity:
+    dark: SpatialSeries | None = None
+    lit: SpatialSeries | None = None
+    for averaged in series:
+        dark, lit = (dark, averaged) if averaged.photons else (averaged, lit)
+    return Nonuniformity(dark, lit)
+
+
+def _dark_and_half(light: Sequence[tuple[float, float]], measured: Levels) -> list[int]:
+    """Return the indices of the dark and of the lit series nearest to half of saturation, with one
+    exposure if can be.
+
+    ``light`` has photons and exposure of each series.
+    """
+    dark = [i for i, (photons, _) in enumerate(light) if photons == 0]
+    dark_times = [light[i][1] for i in dark]
+    top = float(measured.photons[measured.variance.argmax()])
+    half = _half_of_saturation(light, top, dark_times)
+    indices = [] if half is None else [half]
+    if dark:
+        time = min(dark_times) if half is None else light[half][1]
+        nearest = int(np.abs(np.array(dark_times) - time).argmin())
+        indices.insert(0, dark[nearest])
+    return indices
+
+
+def _half_of_saturation(
+    light: Sequence[tuple[float, float]], top: float, dark_times: Sequence[float]
+) -> int | None:
+    """Return the index of the lit series nearest to half of ``top``, if can be among those with
+    the exposure of a dark one; None without a lit series.
+    """
+    lit = [i for i, (photons, _) in enumerate(light) if photons > 0]
+    with_dark = [i for i in lit if light[i][1] in dark_times]
+    return min(with_dark or lit, key=lambda i: abs(light[i][0] - _HALF * top), default=None)
+
+
+# --- emva patterns --------------------------------------------------------------------------------
+
+# Spectrograms, profiles and histograms of defect pixels of an EMVA 1288 sheet, for its pictures and
+# its tables.
+
+
+_DIRECTIONS = {"horizontal": False, "vertical": True}
+_HIGHPASS = 25  #: by which `without_trend` multiplies
+_SPECTROGRAMS = ("frame", "unit", "direction", "cycles_per_pixel", "amplitude")
+_PROFILES = ("frame", "direction", "pixel", *Profiles._fields)
+_DEFECTS = ("frame", "unit", "deviation", "pixels", "normal")
+_BEYOND = ("frame", "unit", "distance", "percent_beyond")
+
+
+def spectrograms(sheet: EmvaSheet) -> dict[tuple[str, str], dict[str, Spectrogram]]:
+    """Return the spectrograms by name and unit of the frame, DSNU in DN and PRNU in percent, and
+    by direction.
+    """
+    dark, lit = sheet.spatial
+    images: dict[tuple[str, str], Any] = {}
+    if dark is not None:
+        images["DSNU", "DN"] = dark.average
+    if dark is not None and lit is not None and (signal := signal_of(dark, lit)) > 0:
+        images["PRNU", "%"] = (lit.average - dark.average) * (100 / signal)
+    return {
+        key: {name: spectrogram(image, way) for name, way in _DIRECTIONS.items()}
+        for key, image in images.items()
+    }
+
+
+def line_profiles(sheet: EmvaSheet) -> dict[str, dict[str, Profiles]]:
+    """Return the profiles in DN by the name of the averaged frame and by direction."""
+    dark, lit = sheet.spatial
+    images = {} if dark is None else {"dark": dark.average}
+    if lit is not None:
+        images["lit" if dark is None else "lit, less the dark"] = lit.average - (
+            0.0 if dark is None else dark.average
+        )
+    return {
+        key: {name: profiles(image, way) for name, way in _DIRECTIONS.items()}
+        for key, image in images.items()
+    }
+
+
+def defect_histograms(sheet: EmvaSheet) -> dict[tuple[str, str], DefectHistogram]:
+    """Return the histograms of defect pixels by name and unit, DSNU in DN and PRNU in percent of
+    the signal.
+    """
+    dark, lit = sheet.spatial
+    histograms = {}
+    if dark is not None:
+        histograms["DSNU", "DN"] = defects(dark.total, 1 / dark.count)
+    if dark is not None and lit is not None and (signal := signal_of(dark, lit)) > 0:
+        parts = math.gcd(dark.count, lit.count)
+        trendless = without_trend((lit.total * dark.count - dark.total * lit.count) // parts)
+        histograms["PRNU", "%"] = defects(
+            trendless, 100 * parts / (_HIGHPASS * dark.count * lit.count * signal)
+        )
+    return histograms
+
+
+def noise_in_time(sheet: EmvaSheet, name: str) -> tuple[float, float]:
+    """Return the standard deviations in time of a frame and of the average, in the unit of the
+    spectrogram.
+    """
+    dark, lit = sheet.spatial
+    assert dark is not None
+    if name == "DSNU" or lit is None:
+        return math.sqrt(dark.temporal), math.sqrt(dark.temporal / dark.count)
+    share = 100 / signal_of(dark, lit)
+    return share * math.sqrt(lit.temporal), share * math.sqrt(
+        lit.temporal / lit.count + dark.temporal / dark.count
+    )
+
+
+def signal_of(dark: SpatialSeries, lit: SpatialSeries) -> float:
+    """Return the mean signal of the lit series above the dark one, DN."""
+    return float(lit.average.mean() - dark.average.mean())
+
+
+def pattern_tables(sheet: EmvaSheet) -> Mapping[str, CsvTable]:
+    """Return the curves as tables by file name; without a series there is none."""
+    if not (histograms := defect_histograms(sheet)):
+        return {}
+    return {
+        "spectrograms.csv": (_SPECTROGRAMS, _spectrogram_rows(sheet)),
+        "profiles.csv": (_PROFILES, _profile_rows(sheet)),
+        "defects.csv": (_DEFECTS, _histogram_rows(histograms, slice(3))),
+        "defects_accumulated.csv": (_BEYOND, _histogram_rows(histograms, slice(3, None))),
+    }
+
+
+def _histogram_rows(
+    histograms: Mapping[tuple[str, str], DefectHistogram], fields: slice
+) -> Iterator[tuple[Any, ...]]:
+    """Yield name, unit and some fields of each class of each histogram."""
+    for key, histogram in histograms.items():
+        yield from ((*key, *row) for row in zip(*map(_plain, histogram[fields]), strict=True))
+
+
+def _spectrogram_rows(sheet: EmvaSheet) -> Iterator[tuple[Any, ...]]:
+    for key, directions in spectrograms(sheet).items():
+        for direction, transform in directions.items():
+            yield from (
+                (*key, direction, *row) for row in zip(*map(_plain, transform), strict=True)
+            )
+
+
+def _profile_rows(sheet: EmvaSheet) -> Iterator[tuple[Any, ...]]:
+    for key, directions in line_profiles(sheet).items():
+        for direction, profile in directions.items():
+            yield from (
+                (key, direction, position, *row)
+                for position, row in enumerate(zip(*map(_plain, profile), strict=True))
+            )
+
+
+def _plain(values: Any) -> list[Any]:
+    listed: list[Any] = values.tolist()
+    return listed
+
+
+# --- emva page ------------------------------------------------------------------------------------
+
+# The page of the EMVA 1288 sheet: quantities, pictures, and what of the standard was measured and
+# told.
+
+
+_LEVELS, _EXPOSURES, _SERIES = (
+    50,
+    6,
+    16,
+)  #: lit levels, exposures of darks, frames of a series that the standard asks for
+#: name of the test of frames that says the same as `_COARSE`
+_ROUNDING = "the dark noise exceeds rounding"
+_COARSE = """the temporal dark noise is below 0.49 DN; the standard asks for more, because \
+rounding hides the noise: \
+dark noise, thresholds and dynamic range are limits only, and K is doubtful"""
+_TESTED = """Each test asks if the frames are such as the model of the standard describes. Modelled:
+the quantities allow for it. Widened: it is found, and the error of K or of the noise that may
+follow is small. Refused: this error may exceed 2 %, or is unknown. Numbers and limits of noise and
+patterns are in standard deviations of chance."""
+_MOMENTS = (
+    "Only moments are given, so that noise, patterns and numbers of the frames are not tested."
+)
+_VARIANCE: dict[Release, str] = {
+    "3": "includes the difference of the means of its frames, as in release 3.0",
+    "4": "excludes the difference of the means of its frames, as since release 3.1",
+}
+_HALF_OF_PAGE = (0.45, 0.55)  #: shares of saturation that count as 50 %
+_TABLES = {
+    "Quantities": ("eta", "DR_bit"),
+    "General model": ("mu_p_min_general", "DR_general"),
+    "Linearity": ("LE_min", "LE_max"),
+    "Dark current": ("mu_I_mean", "mu_I_var"),
+    "Spatial nonuniformity": ("DSNU1288_DN", "PRNU1288_pixel"),
+}
+#: heading, picture and text of each section, in the order of the standard
+_SECTIONS = (
+    (
+        "Quantities",
+        "",
+        """Sensitivity, noise, saturation, signal-to-noise ratio and dynamic range, with the symbols
+        of the standard.""",
+    ),
+    (
+        "Photon transfer",
+        "photon_transfer",
+        """The variance in time over the signal, both above the dark. The slope up to 70 % of
+        saturation is the system gain K; saturation is where the variance is greatest.""",
+    ),
+    (
+        "Response",
+        "sensitivity",
+        """The signal over the photons. The slope up to 70 % of saturation is the responsivity R,
+        and R over K the quantum efficiency η.""",
+    ),
+    (
+        "Signal-to-noise ratio",
+        "snr",
+        """Measured in time at each level, and of the linear model with the quantities above. The
+        total SNR has the spatial nonuniformity in its noise too. At μ_p.min the model is 1.""",
+    ),
+    (
+        "General model",
+        "general_model",
+        """As release 4.0 General, which needs no linear camera and no K: the slope of the response
+        at each level refers the noise in time to the light. For a linear camera it agrees with the
+        linear model.""",
+    ),
+    (
+        "Linearity",
+        "linearity",
+        """The line has the least squares of relative deviations from 5 to 95 % of saturation; its
+        greatest deviations are the linearity errors.""",
+    ),
+    (
+        "Dark current",
+        "dark_current",
+        """Mean and variance of dark frames over the exposure, with lines of least squares.""",
+    ),
+    (
+        "Spatial nonuniformity",
+        "",
+        """DSNU1288 and PRNU1288 of averaged frames, without what noise in time leaves in the
+        average: in total, and of rows, columns and single pixels, which add up to the total in
+        squares.""",
+    ),
+    (
+        "Spectrograms",
+        "spectrograms",
+        """Root of the mean power of all rows and of all columns, of the averaged frames. White
+        noise is a level line at its standard deviation; a peak is a periodic pattern.""",
+    ),
+    (
+        "Profiles",
+        "profiles",
+        "Middle line, mean, least and greatest number of the averaged frames, "
+        "along rows and along columns.",
+    ),
+    (
+        "Defect pixels",
+        "defect_pixels",
+        """Logarithmic and accumulated histograms of the averaged frames. Of the lit frame the mean
+        of 5 x 5 pixels is subtracted first, against uneven light. Pixels beyond the normal
+        distribution are candidates for defects.""",
+    ),
+)
+
+
+class Requirement(NamedTuple):
+    """A demand of the standard, what was found, and if it is met."""
+
+    demand: str
+    found: str
+    mark: Mark
+
+
+def banner(sheet: EmvaSheet, tests: Sequence[FrameTest] = ()) -> str:
+    """Return why the linear model of the standard does not hold for these frames, or an empty
+    text.
+    """
+    coarse = sheet["sigma_y_dark"].bound != ""
+    reasons = (
+        [_COARSE]
+        if coarse
+        else [f"K is not told: {sheet['K'].reason}"]
+        if sheet["K"].value is None
+        else []
+    )
+    wrong = (
+        test
+        for test in tests
+        if test.verdict == "refused" and not (coarse and test.name == _ROUNDING)
+    )
+    reasons += [f"{test.name}: {test.sentence}" for test in wrong]
+    return f"Not fit for use: {'; '.join(reasons)}." if reasons else ""
+
+
+def temporal_variance(frames: EmvaFrames, by_user: bool) -> str:
+    """Return which variance in time the sheet has, and why; ``by_user`` is True if the user chose
+    the release.
+    """
+    text = f"The variance of a level {_VARIANCE[frames.release]}"
+    if not frames.stated:
+        return f"{text}."
+    if by_user:
+        return (
+            f"{text}: `--release {frames.release}`. The descriptor states release {frames.stated}."
+        )
+    other = {"3": "`--release 4` excludes it", "4": "`--release 3` includes it"}
+    return (
+        f"{text}, because the descriptor states release {frames.stated}; {other[frames.release]}."
+    )
+
+
+def lead(sheet: EmvaSheet, variance: str) -> str:
+    """Return the summary of the page; ``variance`` is the sentence of `temporal_variance`."""
+    named = (
+        "eta",
+        "K",
+        "sigma_d",
+        "mu_p_min",
+        "mu_e_sat",
+        "SNR_max_dB",
+        "DR_dB",
+        "DSNU1288",
+        "PRNU1288",
+    )
+    quantities = "; ".join(
+        f"{sheet[key].symbol} {sheet[key].text}" for key in named if sheet[key].value is not None
+    )
+    return f"The quantities of EMVA 1288, release 4.0 Linear: {quantities}. {variance}"
+
+
+def sections(
+    sheet: EmvaSheet,
+    frames: EmvaFrames,
+    statements: Mapping[str, Any],
+    pictures: Mapping[str, bytes],
+    budget: Sequence[Section] = (),
+) -> list[Section]:
+    """Return the sections of the page in the order of the standard, without plots that the frames
+    do not allow.
+
+    The sections ``budget`` have the uncertainty of the quantities.
+    """
+    candidates = (
+        _section(sheet, heading, text, pictures.get(name)) for heading, name, text in _SECTIONS
+    )
+    filled = (s for s in candidates if s.rows or s.picture)
+    tested = replace(
+        frame_section(frames.tests), text=_TESTED if len(frames.tests) > 1 else _MOMENTS
+    )
+    return [*filled, *budget, tested, _compliance(sheet, frames, statements)]
+
+
+def requirements(
+    sheet: EmvaSheet, frames: EmvaFrames, statements: Mapping[str, Any]
+) -> list[Requirement]:
+    """Return each demand of the standard on the frames and on what is told of them."""
+    return [*_of_transfer(sheet, frames), *_of_series(sheet), *_of_told(statements), *_elsewhere()]
+
+
+def operating_point(
+    statements: Sequence[str], traced: Traceability | None = None
+) -> dict[str, str | None]:
+    """Return what statements such as ``temperature=25 °C`` tell of the operating point; None where
+    nothing is told.
+
+    What the recipe states in the block ``traceability`` counts where no statement says otherwise.
+    Raises: ValueError for a statement that is not a key of `OPERATING_POINT`, ``=`` and a text.
+    """
+    point: dict[str, str | None] = {
+        **dict.fromkeys(OPERATING_POINT),
+        **(of_traceability(traced) if traced else {}),
+    }
+    for statement in statements:
+        key, sign, value = (text.strip() for text in statement.partition("="))
+        if key not in point or not sign or not value:
+            raise ValueError(
+                f"--state {statement!r}: write one of {', '.join(point)}, then = and a text"
+            )
+        point[key] = value
+    return point
+
+
+def group_of(quantity: Quantity, sheet: EmvaSheet) -> str:
+    """Return the heading under which the sheet has a quantity."""
+    keys = [row.key for row in sheet.quantities]
+    position = keys.index(quantity.key)
+    return next(
+        name
+        for name, (first, last) in _TABLES.items()
+        if keys.index(first) <= position <= keys.index(last)
+    )
+
+
+def _section(sheet: EmvaSheet, heading: str, text: str, picture: bytes | None) -> Section:
+    rows: list[Sequence[Any]] = []
+    marks: dict[tuple[int, int], Mark] = {}
+    columns: Sequence[str] = ("symbol", "quantity", "value", "why not, or why a limit")
+    for quantity in (
+        q for q in sheet.quantities if heading in _TABLES and group_of(q, sheet) == heading
+    ):
+        if quantity.reason:
+            marks[len(rows), 2] = "warn"
+        rows.append((quantity.symbol, quantity.name, quantity.text, quantity.reason))
+    if not marks:
+        columns, rows = columns[:-1], [row[:-1] for row in rows]
+    return Section(heading, text, columns if rows else (), rows, picture, marks)
+
+
+def _compliance(sheet: EmvaSheet, frames: EmvaFrames, statements: Mapping[str, Any]) -> Section:
+    demands = requirements(sheet, frames, statements)
+    marks: dict[tuple[int, int], Mark] = {(i, 2): row.mark for i, row in enumerate(demands)}
+    rows = [(row.demand, row.found, "yes" if row.mark == "pass" else "no") for row in demands]
+    open_ones = sum(row.mark != "pass" for row in demands)
+    text = f"""The quantities are computed as EMVA 1288, release 4.0 Linear, says. This is a
+        computation from frames and no certificate: geometry, homogeneity and calibration of the
+        light are the laboratory's part, and frames do not show them.
+
+        {open_ones} of {len(rows)} demands of the standard are not met, or not shown here. Only
+        those who measured can state that the measurement complies."""
+    return Section(
+        "Compliance: what was measured and told",
+        text,
+        ("demand", "found", "met"),
+        rows,
+        marks=marks,
+    )
+
+
+def _of_transfer(sheet: EmvaSheet, frames: EmvaFrames) -> Iterator[Requirement]:
+    transfer, noise = sheet.transfer, sheet["sigma_y_dark"]
+    count, times = len(transfer.photons), len(np.unique(transfer.dark_exposure))
+    pairs = set(transfer.exposure.tolist()) <= set(transfer.dark_exposure.tolist())
+    top = "reached" if transfer.saturated else "not reached"
+    yield _asked(f"{_LEVELS} or more lit levels", f"{count}", count >= _LEVELS)
+    yield _asked("two frames or more at each level", f"{frames.frames}", frames.frames >= 2)
+    yield _asked(
+        "dark frames at the exposure of each lit level",
+        "yes" if pairs else "of the nearest exposure",
+        pairs,
+    )
+    yield _asked("levels from dark to saturation", f"saturation {top}", transfer.saturated)
+    yield Requirement(
+        "temporal dark noise of 0.49 DN or more", noise.text, "fail" if noise.bound else "pass"
+    )
+    text = f"{times} exposure{'s' * (times != 1)}"
+    yield _asked(f"dark current from {_EXPOSURES} or more exposures", text, times >= _EXPOSURES)
+
+
+def _of_series(sheet: EmvaSheet) -> Iterator[Requirement]:
+    dark, lit = sheet.spatial
+    for name, series in (("dark", dark), ("lit", lit)):
+        demand = f"series of {_SERIES} or more {name} frames for spatial quantities"
+        count = 0 if series is None else series.count
+        yield _asked(demand, f"{count} frames" if count else "no series", count >= _SERIES)
+    if dark is not None and lit is not None:
+        yield _asked(
+            "both series at one exposure", _exposures(dark, lit), dark.exposure == lit.exposure
+        )
+        full = float(sheet.transfer.signal[sheet.transfer.saturation])
+        share = float(lit.average.mean() - dark.average.mean()) / full
+        yield _asked(
+            "lit series at 50 % of saturation",
+            f"{share:.1%}",
+            _HALF_OF_PAGE[0] <= share <= _HALF_OF_PAGE[1],
+        )
+
+
+def _of_told(statements: Mapping[str, Any]) -> Iterator[Requirement]:
+    for key, name in OPERATING_POINT.items():
+        value = statements.get(key)
+        yield _asked(
+            f"stated: {name}", "not stated" if value is None else str(value), value is not None
+        )
+
+
+def _elsewhere() -> Iterator[Requirement]:
+    """Yield what the standard asks for, or offers, that frames of one light and one temperature
+    cannot show.
+    """
+    yield Requirement("spectral sensitivity η(λ)", "not measured: one light", "warn")
+    yield Requirement("dark current over temperature", "not measured: one temperature", "warn")
+    yield Requirement(
+        "homogeneity of the light better than 3 %, from a disk at f/8",
+        "not shown by frames",
+        "warn",
+    )
+
+
+def _asked(demand: str, text: str, met: bool) -> Requirement:
+    return Requirement(demand, text, "pass" if met else "warn")
+
+
+def _exposures(dark: SpatialSeries, lit: SpatialSeries) -> str:
+    return f"{dark.exposure:.4g} s and {lit.exposure:.4g} s"

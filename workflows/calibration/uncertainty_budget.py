@@ -1,0 +1,521 @@
+"""The uncertainty budget of each parameter: its sources, tables and picture."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+
+from neusee.nodes.calibrate import (
+    COVERAGE,
+    MODEL,
+    NOT_INVOLVED,
+    NOT_STATED,
+    STATISTICS,
+    Budget,
+    Contribution,
+    Laboratory,
+    Traceability,
+    camera_sources,
+    laboratory_contributions,
+    source_freedom,
+    variance_shares,
+)
+from neusee.nodes.values import Levels
+from neusee.workflows.calibration.frame_validity import TERMS, errors_of_parameters, width_of_mean
+from neusee.workflows.calibration.laboratory import EFFICIENCY
+from neusee.workflows.recipe.distributions.joint_distribution import Z_90
+from neusee.workflows.report.figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    VERMILION,
+    canvas,
+    drawn,
+)
+from neusee.workflows.report.study_page import Mark, Section, with_uncertainty
+
+if TYPE_CHECKING:
+    from neusee.workflows.calibration.calibration_page import CalibrationResult, ParameterEstimate
+    from neusee.workflows.calibration.log_posterior import FloatArray
+
+
+# --- budget page ----------------------------------------------------------------------------------
+
+# The uncertainty budget as sections of a page, as a table, as JSON and as a picture.
+
+
+COLUMNS = (
+    "quantity",
+    "symbol",
+    "unit",
+    "value",
+    "source",
+    "type",
+    "distribution",
+    "u(x)",
+    "unit of x",
+    "c",
+    "nu",
+    "u(y)",
+    "reason",
+)
+_COLOURS = (
+    BLUE,
+    ORANGE,
+    GREEN,
+    VERMILION,
+    "#CC79A7",
+    "#56B4E9",
+    "#F0E442",
+    BLACK,
+    "#999999",
+    "#882255",
+    "#44AA99",
+)
+#: keys of the quantities of a sheet whose budget the page shows
+BUDGETED = (
+    "eta",
+    "K",
+    "sigma_d",
+    "mu_p_min",
+    "mu_p_sat",
+    "mu_e_sat",
+    "SNR_max",
+    "DR",
+    "DSNU1288",
+    "PRNU1288",
+)
+_LEAST = 1e-4  #: share of a variance below which a source is not drawn
+_TEXT = f"""By the Guide to the expression of uncertainty in measurement (JCGM 100). The combined
+    standard uncertainty u_c has all sources that are stated. The expanded uncertainty U is k u_c
+    and holds the value with {COVERAGE:.0%}; the coverage factor k is that of Student's t
+    distribution with ν_eff degrees of freedom (Welch and Satterthwaite). A source that is not
+    stated is missing in u_c: it is not 0."""
+_LINES = """Each source with its type (A: from a series of observations; B: by other means), its
+    distribution, the standard uncertainty u(x) of the input, the sensitivity c = dy/dx, the degrees
+    of freedom ν, the contribution u(y) = c u(x), and its share in the variance of the quantity.
+    Sources that do not enter a quantity have no line."""
+
+
+def budget_sections(
+    budgets: Sequence[Budget], traceability: Traceability, picture: bytes | None, note: str = ""
+) -> list[Section]:
+    """Return the sections of a page with the budgets, their sources, and what the laboratory
+    states.
+
+    ``note`` is a sentence on where other budgets are.
+    """
+    if not budgets:
+        return [
+            Section("Uncertainty budget", "No quantity has a value, so that none has a budget."),
+            *_traced(traceability),
+        ]
+    columns = (
+        "quantity",
+        "value",
+        "unit",
+        "u_c",
+        "u_c / value",
+        "ν_eff",
+        "k",
+        f"U ({COVERAGE:.0%})",
+        "not stated",
+    )
+    rows = [_row(budget) for budget in budgets]
+    marks: dict[tuple[int, int], Mark] = {
+        (i, 8): "warn" for i, budget in enumerate(budgets) if budget.missing
+    }
+    return [
+        Section("Uncertainty budget", _TEXT + note, columns, rows, picture, marks),
+        Section(
+            "Sources of uncertainty",
+            _LINES,
+            _LINE_COLUMNS,
+            list(itertools.chain(*map(_lines, budgets))),
+        ),
+        *_traced(traceability),
+    ]
+
+
+_LINE_COLUMNS = (
+    "quantity",
+    "source",
+    "type",
+    "distribution",
+    "u(x)",
+    "unit of x",
+    "c",
+    "ν",
+    "u(y)",
+    "share",
+)
+
+
+def _row(budget: Budget) -> tuple[Any, ...]:
+    value, _, error = with_uncertainty(budget.value, budget.combined).partition(" ± ")
+    relative = f"{budget.combined / abs(budget.value):.2%}" if budget.value else "–"
+    return (
+        _named(budget),
+        value,
+        budget.unit,
+        error,
+        relative,
+        _freedom(budget.freedom),
+        f"{budget.factor:.2f}",
+        budget.expanded,
+        ", ".join(budget.missing) or "–",
+    )
+
+
+def _lines(budget: Budget) -> Iterator[tuple[Any, ...]]:
+    name = budget.symbol or budget.name
+    for c in budget.contributions:
+        if c.reason == NOT_INVOLVED:
+            continue
+        if c.share is None:
+            yield name, c.source, c.kind, c.reason, None, "", None, "", None, ""
+        else:
+            variance_share = (c.share / budget.combined) ** 2 if budget.combined else 0.0
+            yield (
+                name,
+                c.source,
+                c.kind,
+                c.distribution,
+                c.uncertainty,
+                c.unit,
+                c.sensitivity,
+                _freedom(c.freedom),
+                c.share,
+                f"{variance_share:.1%}",
+            )
+
+
+def _named(budget: Budget) -> str:
+    return f"{budget.symbol}, {budget.name}" if budget.symbol else budget.name
+
+
+def _freedom(freedom: float) -> str:
+    return f"{freedom:.3g}" if freedom < 1e4 else "∞" if math.isinf(freedom) else f"{freedom:.0e}"
+
+
+def _traced(traceability: Traceability) -> list[Section]:
+    text = """What the block `traceability` of the recipe states of the light and of the
+        temperature, so that a value can be traced to a standard."""
+    rows = [
+        (name, "not stated" if value is None else value) for name, value in statements(traceability)
+    ]
+    marks: dict[tuple[int, int], Mark] = {
+        (i, 1): "warn" for i, (_, value) in enumerate(rows) if value == "not stated"
+    }
+    return [Section("Traceability", text, ("statement", "value"), rows, marks=marks)]
+
+
+def statements(traceability: Traceability) -> list[tuple[str, str | None]]:
+    """Return each statement of a laboratory by its name, with None for what is not stated."""
+    photons, lamp, temperature = traceability.photons, traceability.lamp, traceability.temperature
+    relative = photons.relative_uncertainty
+    coefficients = "; ".join(f"{name} {x:g} /K" for name, x in temperature.coefficients.items())
+    return [
+        ("photons", "known up to a factor only" if photons.known == "relative" else "absolute"),
+        (
+            "relative standard uncertainty of the photons",
+            None if relative is None else f"{relative:.3%}",
+        ),
+        ("certificate of the photometric calibration", photons.certificate),
+        ("date of the calibration", photons.date),
+        ("laboratory", photons.laboratory),
+        ("instrument", photons.instrument),
+        ("spectrum of the lamp", lamp.spectrum),
+        ("centroid wavelength", _nm(lamp.centroid, lamp.centroid_uncertainty)),
+        ("width of the spectrum (FWHM)", _nm(lamp.fwhm)),
+        (
+            "drift of the lamp since its calibration",
+            None if lamp.drift is None else f"{lamp.drift:.3%}",
+        ),
+        ("temperature of the sensor", _kelvin(temperature.text, temperature.uncertainty)),
+        ("temperature coefficients", coefficients or None),
+    ]
+
+
+def of_traceability(traceability: Traceability) -> dict[str, str | None]:
+    """Return what a laboratory states of the operating point of a sheet, by the keys of its
+    statements.
+    """
+    photons, lamp, temperature = traceability.photons, traceability.lamp, traceability.temperature
+    return {
+        "wavelength": _nm(lamp.centroid, lamp.centroid_uncertainty),
+        "bandwidth": _nm(lamp.fwhm),
+        "spectrum": lamp.spectrum,
+        "photometer": ", ".join(filter(None, (photons.instrument, photons.certificate))) or None,
+        "temperature": _kelvin(temperature.text, temperature.uncertainty),
+        "laboratory": ", ".join(filter(None, (photons.laboratory, photons.date))) or None,
+    }
+
+
+def _nm(length: float | None, width: float | None = None) -> str | None:
+    return (
+        None
+        if length is None
+        else f"{1e9 * length:g}" + f" ± {1e9 * (width or 0):g}" * bool(width) + " nm"
+    )
+
+
+def _kelvin(text: str | None, width: float | None) -> str | None:
+    return None if text is None else text + f" ± {width or 0:g} K" * bool(width)
+
+
+def budget_rows(budgets: Sequence[Budget]) -> Iterator[tuple[Any, ...]]:
+    """Yield the rows of ``budget.csv``: one for each source of each quantity."""
+    for b in budgets:
+        for c in b.contributions:
+            numbers = [c.uncertainty, c.unit, c.sensitivity, c.freedom, c.share]
+            if c.share is None:
+                numbers = [""] * 5
+            yield (
+                b.key,
+                b.symbol,
+                b.unit,
+                b.value,
+                c.source,
+                c.kind,
+                c.distribution,
+                *numbers,
+                c.reason,
+            )
+
+
+def budget_document(budgets: Sequence[Budget], traceability: Traceability) -> dict[str, Any]:
+    """Return the content of ``budget.json``; infinite degrees of freedom are the text
+    ``infinite``.
+    """
+    return {
+        "guide": "JCGM 100:2008 (GUM)",
+        "coverage probability": COVERAGE,
+        "traceability": {
+            name: "not stated" if value is None else value
+            for name, value in statements(traceability)
+        },
+        "quantities": {b.key: _budget(b) for b in budgets},
+    }
+
+
+def _budget(b: Budget) -> dict[str, Any]:
+    return {
+        "name": b.name,
+        "symbol": b.symbol,
+        "unit": b.unit,
+        "value": b.value,
+        "combined standard uncertainty": b.combined,
+        "effective degrees of freedom": _finite(b.freedom),
+        "coverage factor": b.factor,
+        "expanded uncertainty": b.expanded,
+        "not stated": list(b.missing),
+        "sources": [_contribution(c) for c in b.contributions],
+    }
+
+
+def _contribution(c: Contribution) -> dict[str, Any]:
+    if c.share is None:
+        return {"source": c.source, "kind": c.kind, "reason": c.reason}
+    values = {name: value for name, value in asdict(c).items() if name != "reason"}
+    return {**values, "freedom": _finite(c.freedom), "contribution": c.share}
+
+
+def _finite(freedom: float) -> float | str:
+    return freedom if math.isfinite(freedom) else "infinite"
+
+
+def two_digits(uncertainty: float) -> str:
+    """Return an uncertainty as text of two significant digits, of large numbers without an
+    exponent: 1000, 710.
+    """
+    return f"{float(f'{uncertainty:.2g}'):.6g}"
+
+
+def budget_figure(budgets: Sequence[Budget]) -> Any:
+    """Draw the share of each source in the variance of each quantity, as bars that add up to 100
+    %.
+    """
+    sources = _shown_sources(budgets)
+    colours = {source: _COLOURS[i % len(_COLOURS)] for i, source in enumerate(sources)}
+    figure, axes = canvas(9.0, 1.5 + 0.36 * len(budgets) + 0.24 * len(sources))
+    ax, shown = axes[0, 0], set[str]()
+    for i, budget in enumerate(budgets):
+        left = 0.0
+        for source, percent in _percentages(budget):
+            label = None if source in shown else source
+            shown.add(source)
+            ax.barh(i, percent, left=left, color=colours[source], label=label, height=0.7)
+            left += percent
+        text = f"U = {two_digits(budget.expanded)} {budget.unit}".rstrip()
+        ax.text(101, i, text, va="center", fontsize=9)
+    ax.set_yticks(range(len(budgets)), [b.symbol or b.name for b in budgets])
+    ax.set(xlim=(0, 100), xlabel="share of the variance (%)", title="Sources of uncertainty")
+    ax.invert_yaxis()
+    ax.grid(axis="y", visible=False)
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return figure
+
+
+def _shown_sources(budgets: Sequence[Budget]) -> list[str]:
+    """Return the sources with a share in any budget, each once."""
+    sources = dict[str, None]()
+    for budget in budgets:
+        sources |= dict.fromkeys(c.source for c in budget.contributions if c.share)
+    return list(sources)
+
+
+def _percentages(budget: Budget) -> Iterator[tuple[str, float]]:
+    """Yield each source that is wide enough to be drawn, with its share of the variance in %."""
+    for c in budget.contributions:
+        percent = 100 * ((c.share or 0.0) / budget.combined) ** 2 if budget.combined else 0.0
+        if percent > 100 * _LEAST:
+            yield c.source, percent
+
+
+#: from budgets to the PNG bytes of the picture
+budget_picture = drawn(budget_figure)
+
+
+# --- calibration budget ---------------------------------------------------------------------------
+
+# The uncertainty budget of each parameter of a calibration, whose sources add up to what the
+# calibration states.
+
+
+_TESTS = "what the tests of the frames leave open"
+_PRIOR = "prior of the recipe"
+_STEP = 1e-4  #: standard deviations of the prior, step of a derivative
+
+
+class _Estimate(NamedTuple):
+    """What is stated of a parameter, and the standard uncertainty that its posterior and its
+    models give.
+    """
+
+    value: float
+    posterior: float  #: of the mean of two models, before any widening
+    #: half the distance of two models of the response; None where there is one model
+    model: float | None
+
+
+def budgets(result: CalibrationResult, laboratory: Laboratory) -> list[Budget]:
+    """Return the uncertainty budget of each parameter of which the calibration states a value.
+
+    The variance of the posterior is split among the sources of the levels' scatter by the linear
+    law of propagation.
+    """
+    rows = [row for row in result.rows() if row.kind == "estimate"]
+    shares = _shares(result)
+    freedom = _calibration_freedom(result)
+    return [_calibration_budget(result, row, shares[row.name], freedom, laboratory) for row in rows]
+
+
+def _calibration_budget(
+    result: CalibrationResult,
+    row: ParameterEstimate,
+    shares: Mapping[str, float],
+    freedom: Mapping[str, float],
+    laboratory: Laboratory,
+) -> Budget:
+    estimate = _estimate(result, row)
+    photons = -estimate.value if row.name == EFFICIENCY else 0.0
+    lines = (
+        *_of_posterior(estimate, row.unit, shares, freedom),
+        _of_model(row.name, estimate, row.unit),
+        _of_tests(result, row, estimate.value),
+        *laboratory_contributions(row.name, estimate.value, photons, laboratory),
+    )
+    return Budget(row.name, row.name.replace("_", " "), "", row.unit, estimate.value, lines)
+
+
+def _of_posterior(
+    estimate: _Estimate, unit: str, shares: Mapping[str, float], freedom: Mapping[str, float]
+) -> Iterator[Contribution]:
+    for source, share in shares.items():
+        kind: Literal["A", "B"] = "B" if source == _PRIOR else "A"
+        nu = math.inf if source == _PRIOR else freedom.get(source, math.inf)
+        deviation = estimate.posterior * math.sqrt(share)
+        yield Contribution(source, kind, "normal", deviation, unit, 1.0, nu)
+
+
+def _of_model(name: str, estimate: _Estimate, unit: str) -> Contribution:
+    if name in TERMS:
+        return Contribution(MODEL, "B", reason=NOT_INVOLVED)
+    if estimate.model is None:
+        return Contribution(MODEL, "B", reason=f"{NOT_STATED}: one model only")
+    return Contribution(MODEL, "B", "two points", estimate.model, unit)
+
+
+def _of_tests(result: CalibrationResult, row: ParameterEstimate, value: float) -> Contribution:
+    if len(result.frames) < 2:
+        return Contribution(_TESTS, "B", reason=f"{NOT_STATED}: only moments are given")
+    errors = errors_of_parameters(result.frames, result.problem.coordinates.prior.may_hide)
+    width = errors.get(row.name, 0.0)
+    if not width:
+        return Contribution(_TESTS, "B", reason=NOT_INVOLVED)
+    return Contribution(_TESTS, "B", "normal", width, "relative", value)
+
+
+def _estimate(result: CalibrationResult, row: ParameterEstimate) -> _Estimate:
+    models = {model.name: model for model in result.models}
+    if row.name not in models:
+        return _Estimate(row.mean, result.unwidened[row.name], None)
+    model = models[row.name]
+    linear = row.name in result.problem.coordinates.linear
+    pairs = [
+        _centre_and_width(variant.value, variant.low, variant.high, linear)
+        for variant in model.models[-2:]
+    ]
+    (fewer, narrow), (richer, wide) = pairs[0], pairs[-1]
+    scale = 1.0 if linear else model.stated.value
+    apart = abs(fewer - richer) / 2
+    return _Estimate(model.stated.value, scale * width_of_mean(narrow, wide), scale * apart)
+
+
+def _centre_and_width(value: float, low: float, high: float, linear: bool) -> tuple[float, float]:
+    if linear:
+        return value, (high - low) / (2 * Z_90)
+    return math.log(value), math.log(high / low) / (2 * Z_90)
+
+
+def _shares(result: CalibrationResult) -> dict[str, dict[str, float]]:
+    """Return the share of each source in the variance of the posterior of each parameter."""
+    problem, mode = result.problem, result.mode
+    slopes = torch.from_numpy(mode.scaled_slopes)
+    sources = {STATISTICS: torch.ones(len(slopes), dtype=torch.float64)}
+    if isinstance(problem.levels, Levels):
+        values = {name: float(x) for name, x in problem.parameters(mode.theta).items()}
+        sources = camera_sources(problem.levels, {**result.params, **values})
+    z = torch.from_numpy(problem.whitened(mode.theta))
+    return {
+        name: {
+            (_PRIOR if source == "prior" else source): share
+            for source, share in variance_shares(slopes, sources, torch.from_numpy(along)).items()
+        }
+        for name, along in _derivatives(result, z.numpy()).items()
+    }
+
+
+def _derivatives(result: CalibrationResult, z: FloatArray) -> dict[str, FloatArray]:
+    """Return the derivative (free,) of each parameter per standard deviation of each prior, at
+    the mode.
+    """
+    coordinates = result.problem.coordinates
+    step = _STEP * np.eye(len(z))
+    high, low = (coordinates.from_whitened(torch.from_numpy(z + sign * step)) for sign in (1, -1))
+    return {name: ((high[name] - low[name]) / (2 * _STEP)).numpy() for name in high}
+
+
+def _calibration_freedom(result: CalibrationResult) -> dict[str, float]:
+    levels = result.problem.levels
+    if isinstance(levels, Levels):
+        return source_freedom(levels, dict(result.params), result.problem.names)
+    return {}

@@ -1,0 +1,559 @@
+"""Digest of one module: from its source or its installed package, kept in sealed files."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib
+import json
+import os
+import re
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from importlib.machinery import SourceFileLoader
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import xxhash
+from pydantic import TypeAdapter
+
+from neusee.nodes.import_times import import_time
+from neusee.workflows.keys import module_origin
+from neusee.workflows.keys.module_origin import distributions_of
+from neusee.workflows.keys.sealed_files import (
+    bytes_of,
+    inherit,
+    make_folders,
+    opened,
+    seal_file,
+    seal_record,
+    secrets,
+    unseal_file,
+    unseal_record,
+)
+from neusee.workflows.keys.source_summary import Summary
+
+# --- code memo ------------------------------------------------------------------------------------
+
+# Sealed files about code: the summaries of source files, so that a run from the cache parses no
+# source.
+#
+# A file that is damaged, of another format, or without the signature that is asked for is ignored
+# and written again.
+
+
+#: files of the code that summarises a source file
+_SUMMARISING = ("source_syntax", "unfollowed_constructs", "source_summary")
+#: digest of the code that summarises a source file, so that an older summary is not used
+EDITION = xxhash.xxh3_64_hexdigest(
+    b"".join(Path(__file__).with_name(f"{n}.py").read_bytes() for n in _SUMMARISING)
+)
+_KEPT = 1000  #: number of summaries in the file
+#: stamps of files of digests that this process has read or written
+_right: dict[Path, tuple[int, ...]] = {}
+
+#: digests of definitions, versions or contents, by module or other dependency
+Parts = dict[str, dict[str, str]]
+
+
+class Outline(NamedTuple):
+    """Digest of the syntax of a source file of the program, and the import statements at its top
+    level.
+    """
+
+    digest: str
+    imports: list[tuple[str, list[str]]]  #: of ``from a import b``: the module and the names
+
+
+#: of source files of the program, by the edition and the digest of the source
+outlines: dict[str, Outline] = {}
+#: digests of the files of packages, by the digest of the stamps of the files
+known_contents: dict[str, str] = {}
+
+
+class _Known(NamedTuple):
+    """What is noted of packages and of the program, beside the summaries."""
+
+    distributions: dict[str, list[str]]
+    outlines: dict[str, Outline]
+    contents: dict[str, str]
+
+
+_SUMMARIES = TypeAdapter(dict[str, Summary])
+_KNOWN = TypeAdapter(_Known)
+_PARTS = TypeAdapter(Parts)
+_saved: dict[Path, int] = {}  #: number of outlines and of digests of packages in each memo
+
+
+def read_memo(memo: Path) -> dict[str, Summary]:
+    """Return the saved summaries of source files, or an empty dict if their file is missing or
+    damaged.
+    """
+    _saved[memo] = 0
+    try:
+        memory, summaries = _read(memo.name, bytes_of(memo), secrets())
+    except (OSError, ValueError):
+        return {}
+    for module, distributions in memory.distributions.items():
+        distributions_of.setdefault(module, distributions)
+    for name, outline in memory.outlines.items():
+        outlines.setdefault(name, outline)
+    for stamps, content in memory.contents.items():
+        known_contents.setdefault(stamps, content)
+    _saved[memo] = len(memory.outlines) + len(memory.contents)
+    return dict(summaries)
+
+
+@functools.lru_cache(4)
+def _read(name: str, raw: bytes, signed_by: tuple[bytes, ...]) -> tuple[_Known, dict[str, Summary]]:
+    """Return what a memo says; the same bytes are read once in a process, for each list of
+    secrets.
+    """
+    seal, _, content = raw.partition(b"\n")
+    memory, text = unseal_file("sources", name, seal, content).split(b"\n", 1)
+    return _KNOWN.validate_json(memory), _SUMMARIES.validate_json(text)
+
+
+def is_complete(memo: Path) -> bool:
+    """Return True if a memo has an outline of each source file of the program, and of each
+    package, that was read.
+    """
+    return _saved.get(memo, 0) >= len(outlines) + len(known_contents)
+
+
+def write_memo(memo: Path, summaries: Mapping[str, Summary]) -> None:
+    """Save the newest summaries of source files; do nothing if the folder cannot be written."""
+    newest = dict(list(outlines.items())[-_KEPT:])
+    packages = dict(list(known_contents.items())[-_KEPT:])
+    _saved[memo] = len(outlines) + len(known_contents)
+    memory = _KNOWN.dump_json(_Known(distributions_of, newest, packages))
+    text = json.dumps(dict(list(summaries.items())[-_KEPT:])).encode()
+    content = b"\n".join([memory, text])
+    _write(
+        memo, b"\n".join([seal_file("sources", memo.name, content), content]), memo.parent / "tmp"
+    )
+
+
+def read_parts(root: Path, code: str) -> Parts:
+    """Return the digest of each definition that the digest ``code`` covers; {} if the record is
+    missing or damaged.
+    """
+    try:
+        record = unseal_record("definitions", bytes_of(root / "code" / f"{code}.json"))
+        return _PARTS.validate_python(record) if record.pop("key", "") == f"code/{code}" else {}
+    except (OSError, ValueError):
+        return {}
+
+
+def write_parts(root: Path, code: str, parts: Parts) -> None:
+    """Save the digest of each definition that the digest ``code`` covers, unless an undamaged
+    record exists.
+    """
+    path = root / "code" / f"{code}.json"
+    with suppress(OSError):
+        stamp = _stamp(path)
+        if _right.get(path) == stamp or read_parts(root, code):
+            _right[path] = stamp
+            return
+    _write(path, seal_record("definitions", {**parts, "key": f"code/{code}"}), root / "tmp")
+
+
+def _stamp(path: Path) -> tuple[int, ...]:
+    stat = os.stat(path)
+    return stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
+
+
+def _write(path: Path, content: bytes, folder: Path) -> None:
+    """Write a file by atomic rename; do nothing if the folder cannot be written.
+
+    ``folder`` is that of temporary files, in the root of the store.
+    """
+    root = str(folder.parent)
+    partial = folder / f"{path.name}.{os.getpid()}.{threading.get_ident()}"
+    with suppress(OSError):
+        make_folders(str(folder), root)
+        make_folders(str(path.parent), root)
+        partial.write_bytes(content)
+        inherit(str(partial), root, 0o444)
+        os.replace(partial, path)
+
+
+# --- installed content ----------------------------------------------------------------------------
+
+# Content of installed packages that code of a user imports: which files have they, and what do they
+# import?
+#
+# A version does not say which files a package has: a helper that is installed again under the same
+# version, or edited in place, is other code. The packages that neusee itself declares count by
+# their version alone, because their wheels differ between platforms and devices, and machines share
+# results. Any other package counts by the content of its files, with the packages that it requires.
+# Byte code, scripts and metadata do not count, so machines with equal wheels agree.
+
+
+#: distributions that neusee declares for its users, in pyproject.toml, in the form of `plain`
+BY_VERSION = frozenset(
+    {
+        *(
+            "arviz",
+            "astropy",
+            "colour_science",
+            "dask",
+            "dask_jobqueue",
+            "deepinv",
+            "distributed",
+            "emcee",
+            "fsspec",
+        ),
+        *(
+            "h5netcdf",
+            "h5py",
+            "jinja2",
+            "kornia",
+            "kornia_rs",
+            "matplotlib",
+            "numpy",
+            "onnx",
+            "onnxscript",
+        ),
+        *(
+            "openexr",
+            "pillow",
+            "pydantic",
+            "rich",
+            "ruamel_yaml",
+            "safetensors",
+            "scipy",
+            "tensorboard",
+        ),
+        *("torch", "typer", "xarray", "xxhash"),
+    }
+)
+#: ns after a change of a file in which a second change may not change its time stamp
+_SETTLED = 2_000_000_000
+_REQUIRED = re.compile(r"^Requires-Dist: *([\w.-]+)(.*)$", re.MULTILINE)
+_OF_AN_EXTRA = re.compile(r";.*\bextra *==")
+_PROGRAM = "neusee"
+_LEFT_OUT = (".pyc", ".pyo", ".pyi", ".pth")
+
+
+class Content(NamedTuple):
+    """The digest of the files of a distribution, and when the newest of them was changed (ns)."""
+
+    digest: str
+    changed: int
+
+
+class Counted(NamedTuple):
+    """What the packages behind an imported module add to a digest."""
+
+    parts: Parts
+    edited: str  #: a package whose files were changed after its import, or nothing
+
+
+def counted(module: str, version: str) -> Counted:
+    """Return what an imported module of an installed package adds: its distributions, and those
+    that they require.
+
+    ``version`` is what the module counts by if neusee declares its package.
+    """
+    top = module.partition(".")[0]
+    names = module_origin.distributions_with(top)
+    if not names or BY_VERSION.issuperset(map(module_origin.plain, names)):
+        return Counted({f"package {top}": {"version": version}}, "")
+    return _counted(top, version)
+
+
+@functools.cache
+def _counted(top: str, version: str) -> Counted:
+    """Return what a top-level module of a package adds that neusee does not declare, as it was
+    when first asked.
+    """
+    own = [module_origin.plain(name) for name in module_origin.distributions_with(top)]
+    contents = {name: _content(name, top) for name in own}
+    parts = {f"package {top}": {"version": version, "content": _joined(contents.values())}}
+    edited = top in sys.modules and max(
+        content.changed for content in contents.values()
+    ) > import_time(top)
+    for name in sorted(_required(own)):
+        about = {"version": module_origin.released(name)}
+        if name not in BY_VERSION:
+            about["content"] = _content(name, name).digest
+        parts.setdefault(f"package {name}", about)
+    return Counted(parts, top if edited else "")
+
+
+def _joined(contents: Iterable[Content]) -> str:
+    return " ".join(content.digest for content in contents)
+
+
+def _required(names: Iterable[str]) -> set[str]:
+    """Return the installed distributions that some distributions require, directly or not, without
+    their extras.
+
+    What a package that neusee declares requires does not count, as it does not where a node imports
+    that package.
+    """
+    first = set(names)
+    distributions, todo = set(first), [*first]
+    while todo:
+        text = (
+            module_origin.metadata_text(todo.pop(), "METADATA")
+            .decode(errors="replace")
+            .partition("\n\n")[0]
+        )
+        for name, marker in _REQUIRED.findall(text):
+            requirement = module_origin.plain(name)
+            if (
+                requirement in distributions
+                or _OF_AN_EXTRA.search(marker)
+                or requirement == _PROGRAM
+                or not module_origin.released(requirement)
+            ):
+                continue
+            distributions.add(requirement)
+            todo += [] if requirement in BY_VERSION else [requirement]
+    return distributions - first
+
+
+def _content(name: str, top: str) -> Content:
+    """Return the digest of the files of a distribution; ``top`` is its module if no record lists
+    its files.
+
+    A digest is noted with the stamps of the files, so that the next process reads none of them.
+    """
+    files = sorted(_files(name, top).items())
+    stamps = [(path, _content_stamp(file)) for path, file in files]
+    changed = max((max(stamp[-2:]) for _, stamp in stamps if stamp), default=0)
+    mark = xxhash.xxh3_128_hexdigest(repr([name, stamps]).encode(errors="replace"))
+    if mark in known_contents:
+        return Content(known_contents[mark], changed)
+    text = xxhash.xxh3_128()
+    for path, file in files:
+        text.update(path.encode(errors="replace") + b"\0" + _digest_of(file) + b"\n")
+    if time.time_ns() - changed > _SETTLED:
+        known_contents[mark] = text.hexdigest()
+    return Content(text.hexdigest(), changed)
+
+
+def _files(name: str, top: str) -> dict[str, str]:
+    """Return the path of each file that the code of a distribution may be or read, by its path in
+    the distribution.
+
+    The files are those of the record of its installation, and modules that stand in its packages
+    without a record.
+    """
+    site = os.path.dirname(module_origin.metadata_folder(name))
+    recorded = [*_recorded(module_origin.metadata_text(name, "RECORD").decode(errors="replace"))]
+    if recorded:
+        folders = {path.rpartition("/")[0] for path in recorded if path.endswith("/__init__.py")}
+        for package in sorted(
+            folder for folder in folders if folder.rpartition("/")[0] not in folders
+        ):
+            recorded += filter(_is_module, _below(site, package))
+    else:
+        recorded += [
+            entry
+            for entry in os.listdir(site)
+            if entry.partition(".")[0] == top and _is_module(entry)
+        ]
+        recorded += _below(site, top)
+    return {path: os.path.join(site, path) for path in recorded}
+
+
+def _recorded(record: str) -> Iterator[str]:
+    """Yield the files of a record: not metadata, byte code, or scripts outside of the folder of
+    packages.
+    """
+    for line in record.splitlines():
+        path = line.rsplit(",", 2)[0].strip('"').replace("\\", "/")
+        outside = path.startswith(("..", "/")) or path.partition("/")[0].endswith(
+            (".dist-info", ".data")
+        )
+        if path and not outside and not path.endswith(_LEFT_OUT):
+            yield path
+
+
+def _below(site: str, package: str) -> Iterator[str]:
+    """Yield the files in the folder of a package, as a record names them."""
+    for folder, inside, files in os.walk(os.path.join(site, package)):
+        inside[:] = [subfolder for subfolder in inside if subfolder != "__pycache__"]
+        where = os.path.relpath(folder, site)
+        yield from (f"{where}/{file}" for file in files if not file.endswith(_LEFT_OUT))
+
+
+def _is_module(file: str) -> bool:
+    return file.endswith((".py", ".so", ".pyd"))
+
+
+def _content_stamp(file: str) -> tuple[int, ...]:
+    """Return what changes whenever a file is changed, last the times of its content and entry;
+    nothing if missing.
+    """
+    try:
+        stat = os.stat(file)
+    except OSError:
+        return ()
+    return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
+
+
+def _digest_of(file: str) -> bytes:
+    try:
+        with opened(file) as content:
+            return hashlib.file_digest(content, xxhash.xxh3_128).digest()
+    except OSError:
+        return b"missing"
+
+
+# --- loaded source --------------------------------------------------------------------------------
+
+# Source of a loaded module: its file is read once, and a file that was edited after the import is
+# told.
+#
+# Python runs the code that it loaded, whatever the file says later. The first reading holds for
+# this process.
+
+
+_edited_since: set[str] = set()  #: loaded modules whose source was edited after the import
+#: spec, source and its digest at the first reading, by module
+_frozen: dict[str, tuple[Any, bytes, str]] = {}
+_said: set[tuple[str, str]] = set()  #: warnings of this process
+
+
+def source_of(module: str, path: Path) -> tuple[bytes, str]:
+    """Return the source of a module and its xxh3 digest; a loaded module is read only once.
+
+    Warn if the source was edited after the import of the module.
+    """
+    spec = getattr(sys.modules.get(module), "__spec__", None)
+    if module in _frozen and _frozen[module][0] is spec and spec is not None:
+        return _frozen[module][1:]
+    source = path.read_bytes()
+    source_and_digest = source, xxhash.xxh3_128_hexdigest(source)
+    _edited_since.discard(module)
+    if spec is not None:
+        _frozen[module] = (spec, *source_and_digest)
+        if _edited(module, spec, path):
+            _edited_since.add(module)
+            say_once(
+                module, f"{path} was edited after its import: restart Python to reuse new results"
+            )
+    return source_and_digest
+
+
+def edited_since(module: str) -> bool:
+    """Return True if the source of a loaded module was edited after the import."""
+    return module in _edited_since
+
+
+def imported(module: str) -> bool:
+    """Import a module that a function imports later, so that its values count at once; return
+    False if it fails.
+    """
+    if module not in sys.modules:
+        with suppress(Exception):
+            importlib.import_module(module)
+    return module in sys.modules
+
+
+def compiled_as_written(module: str) -> bool:
+    """Return True if the loader of a module compiles its source without a change, as an
+    assertion rewriter does not.
+    """
+    return type(getattr(sys.modules.get(module), "__loader__", None)) is SourceFileLoader
+
+
+def say_once(module: str, text: str) -> None:
+    """Warn of a module whose results are not stored, once for each text."""
+    if (module, text) not in _said:
+        _said.add((module, text))
+        warnings.warn(text, stacklevel=2)
+
+
+def _edited(module: str, spec: Any, path: Path) -> bool:
+    """Return True if a source file was changed after the import began, or after Python wrote the
+    byte code.
+    """
+    stat = os.stat(path)
+    if stat.st_ctime_ns > import_time(module):
+        return True
+    try:
+        with open(spec.cached or "", "rb") as file:
+            head = file.read(16)
+        writable = os.access(os.path.dirname(spec.cached), os.W_OK) and not sys.dont_write_bytecode
+    except OSError:
+        return False
+    stamp = b"".join(
+        (int(n) & 0xFFFFFFFF).to_bytes(4, "little") for n in (stat.st_mtime, stat.st_size)
+    )
+    return writable and head[4:8] == bytes(4) and head[8:] != stamp
+
+
+# --- module look ----------------------------------------------------------------------------------
+
+# What one module adds to the digest of a node, and the digest of a module with all that it imports.
+
+
+OURS = frozenset({"neusee"})  #: packages that are followed by source for a node of neusee
+#: names that are used of each module; an empty name stands for all of them
+Names = dict[str, set[str]]
+
+
+class Look(NamedTuple):
+    """What one module adds to a digest, and the modules that it leads to."""
+
+    parts: Parts
+    imports: Names
+    summary: Summary | None = None  #: None for a module that counts by its version
+    path: Path | None = None
+    state: str = ""
+    #: loaded objects that no digest covers, such as generators, and why, by name
+    changing: Mapping[str, str] = {}
+    private: bool = False  #: True if the loaded code is not that of the file
+
+
+class Whole(NamedTuple):
+    """The digest of a module with all that it imports."""
+
+    code: str
+    looks: dict[str, Look]
+    names: Names
+    parts: Parts
+
+
+def parts_of(looks: dict[str, Look]) -> Parts:
+    return {name: content for look in looks.values() for name, content in look.parts.items()}
+
+
+def digest_of(look: Look, documents: bool) -> list[Any]:
+    """Return what a module adds to the digest of a node."""
+    if look.summary is None:
+        return [look.parts]
+    source = look.summary.whole if documents else look.summary.tree
+    other = {
+        name: content
+        for name, content in look.parts.items()
+        if name.startswith(("file ", "environment "))
+    }
+    return [source, look.state, other]
+
+
+def installed_look(module: str, version: str, packages: frozenset[str]) -> Look:
+    """Return what a module of an installed package adds, where ``packages`` are followed by source;
+    without a version, that it is missing.
+    """
+    if not version or packages == OURS:
+        return Look(
+            {f"package {module.partition('.')[0]}": {"version": version or "not installed"}}, {}
+        )
+    package = counted(module, version)
+    if package.edited:
+        say_once(
+            module,
+            f"the package {package.edited} was changed after its import: restart Python to store"
+            " results",
+        )
+    return Look(package.parts, {}, private=bool(package.edited))

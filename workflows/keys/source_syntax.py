@@ -1,0 +1,625 @@
+"""Syntax of a source file: its blocks, what its names stand for, texts and scratch files."""
+
+from __future__ import annotations
+
+import ast
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, Literal, NamedTuple
+
+# --- syntax pass ----------------------------------------------------------------------------------
+
+# One pass over the syntax tree of a source file, which finds all that a summary of the file needs.
+#
+# The text of a tree says the same as `ast.dump`: kinds, names and constants in order, without
+# docstrings and positions.
+
+
+_FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
+_DOCUMENTED = frozenset({ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef})
+#: fields that other fields decide, or nothing
+_UNSEEN = frozenset({"ctx", "kind", "type_comment", "type_ignores"})
+_NOT_RUN = {
+    "TYPE_CHECKING": "TYPE_CHECKING",
+    "typing": "typing.TYPE_CHECKING",
+    "__name__": "__name__ == '__main__'",
+}  #: tests of blocks that no process runs, by their first name
+
+Scope = tuple[ast.AST, ...]  #: the functions around an expression, the outermost first
+Kinds = dict[type, list[Any]]  #: parts of a tree by their type, each before its own parts
+
+
+class Block(NamedTuple):
+    """A statement at the top level of a module that a process runs, with its parts."""
+
+    item: ast.stmt
+    kinds: Kinds
+
+
+class Syntax:
+    """The texts of the statements of a module, its docstrings, and its parts that a process runs.
+
+    Blocks for type checkers alone, and for a file that is run as a program, have texts and no
+    parts.
+    """
+
+    def __init__(self, tree: ast.Module) -> None:
+        self.texts: list[tuple[ast.stmt, str]] = []  #: statements at the top level with their texts
+        self.documents: list[tuple[int, int, str]] = []  #: the place and the text of each docstring
+        #: calls that a process runs, with the functions around them
+        self.calls: list[tuple[Scope, ast.Call]] = []
+        #: sums, paths that are put together, and so on, likewise
+        self.joins: list[tuple[Scope, ast.BinOp]] = []
+        self.blocks: list[Block] = []
+        self.all: Kinds = defaultdict(list)  #: the parts of every block
+        self.not_run: Kinds = defaultdict(list)
+        self._words: list[str] = []
+        self._kinds: Kinds = self.all
+        for item in self._without_docstring(tree):
+            self._top(item)
+        for block in self.blocks:
+            for kind, nodes in block.kinds.items():
+                self.all[kind] += nodes
+
+    def _top(self, item: ast.stmt) -> None:
+        """Add a statement at the top level: its text, and its blocks that a process runs."""
+        self._words = []
+        if isinstance(item, ast.If) and _is_not_run(item.test):
+            self._words.append("If")
+            self._visit_quietly(item.test)
+            self._visit_quietly(*item.body)
+            self._words.append(f"[{len(item.orelse)}")
+            for statement in item.orelse:
+                self._block(statement)
+            if not item.orelse:
+                self.blocks.append(Block(ast.copy_location(ast.Pass(), item), {}))
+        else:
+            self._block(item)
+        self.texts.append((item, " ".join(self._words)))
+
+    def _block(self, item: ast.stmt) -> None:
+        self._kinds = defaultdict(list)
+        self._visit(item, ())
+        self.blocks.append(Block(item, self._kinds))
+
+    def _visit(self, item: ast.AST, scope: Scope) -> None:
+        """Add a part of the tree, and then its own parts."""
+        kind = type(item)
+        name, fields = _SHAPES.get(kind) or _shape(kind)
+        words = self._words
+        words.append(name)
+        self._kinds[kind].append(item)
+        if kind is ast.Call:
+            self.calls.append((scope, item))  # type: ignore[arg-type]
+        elif kind is ast.BinOp:
+            self.joins.append((scope, item))  # type: ignore[arg-type]
+        elif kind in _FUNCTIONS:
+            scope = (*scope, item)
+        elif kind is ast.If and _is_not_run(item.test):  # type: ignore[attr-defined]
+            return self._visit_else(item, scope)  # type: ignore[arg-type]
+        for field in fields:
+            value = getattr(item, field)
+            if isinstance(value, ast.AST):
+                if value._fields:
+                    self._visit(value, scope)
+                else:
+                    words.append(type(value).__name__)
+            elif type(value) is list:
+                if field == "body" and kind in _DOCUMENTED:
+                    value = self._without_docstring(item)
+                words.append(f"[{len(value)}")
+                for child in value:
+                    if isinstance(child, ast.AST):
+                        self._visit(child, scope)
+                    else:
+                        words.append(repr(child))
+            else:
+                words.append(repr(value))
+
+    def _visit_else(self, item: ast.If, scope: Scope) -> None:
+        """Add a branch that no process runs by its text alone, and the other branch with its
+        parts.
+        """
+        self._kinds[ast.If].pop()
+        self._visit_quietly(item.test)
+        self._visit_quietly(*item.body)
+        self._words.append(f"[{len(item.orelse)}")
+        for statement in item.orelse:
+            self._visit(statement, scope)
+
+    def _visit_quietly(self, *items: ast.AST) -> None:
+        """Add the text of items that no process runs."""
+        kinds, calls, joins = self._kinds, len(self.calls), len(self.joins)
+        self._kinds = self.not_run
+        self._words.append(f"[{len(items)}")
+        for item in items:
+            self._visit(item, ())
+        self._kinds = kinds
+        del self.calls[calls:], self.joins[joins:]
+
+    def _without_docstring(self, item: Any) -> list[ast.stmt]:
+        """Return the statements of a definition or a module without its docstring, which is
+        noted.
+        """
+        body: list[ast.stmt] = item.body
+        first = body[0] if body else None
+        if (
+            isinstance(first, ast.Expr)
+            and isinstance(first.value, ast.Constant)
+            and isinstance(first.value.value, str)
+        ):
+            self.documents.append((len(self.texts), len(self._words), first.value.value))
+            return body[1:]
+        return body
+
+
+def each(kinds: Kinds, *types: type) -> Iterator[Any]:
+    """Yield the parts of the given types, those of the first type first."""
+    for kind in types:
+        yield from kinds.get(kind, ())
+
+
+def _is_not_run(test: ast.expr) -> bool:
+    """Return True for the test of a block for type checkers, or of a file that is run as a
+    program.
+    """
+    first = (
+        test.left
+        if isinstance(test, ast.Compare)
+        else test.value
+        if isinstance(test, ast.Attribute)
+        else test
+    )
+    return (
+        isinstance(first, ast.Name)
+        and first.id in _NOT_RUN
+        and ast.unparse(test) in _NOT_RUN.values()
+    )
+
+
+_SHAPES: dict[type, tuple[str, tuple[str, ...]]] = {}  #: name and fields of each kind of part
+
+
+def _shape(kind: type[ast.AST]) -> tuple[str, tuple[str, ...]]:
+    return _SHAPES.setdefault(
+        kind, (kind.__name__, tuple(field for field in kind._fields if field not in _UNSEEN))
+    )
+
+
+# --- scopes of names ------------------------------------------------------------------------------
+
+# What a name in a function or a module stands for: an import, an argument, something of the module,
+# or a new object.
+#
+# A name that is assigned stands for all that the expressions on the right side are parts of.
+
+_INNER = (*_FUNCTIONS, ast.ClassDef)
+_SELF, _CLASS = frozenset({"self", "ctx"}), frozenset({"cls", "mcs", "metacls"})
+#: give a part of what they get
+_THROUGH = ("getattr", "vars", "iter", "reversed", "enumerate", "zip", "list", "tuple")
+#: packages whose functions return new objects
+_NEW = frozenset(
+    {
+        "torch",
+        "numpy",
+        "scipy",
+        "math",
+        "copy",
+        "json",
+        "neusee",
+        "collections",
+        "functools",
+        "itertools",
+    }
+)
+
+
+class Root(NamedTuple):
+    """What the first name of an expression stands for."""
+
+    kind: Literal["import", "own", "argument", "class"]
+    #: full name of an import, with the attributes that follow; ``()`` stands for the result of a
+    #: call
+    name: str
+
+
+class NameScope:
+    """The names that a module, a class or a function binds."""
+
+    def __init__(self, item: ast.AST, above: NameScope | None) -> None:
+        self.above = above
+        self.is_module = above is None
+        inner = getattr(item, "args", None) if isinstance(item, _FUNCTIONS) else None
+        self.arguments = (
+            {argument.arg for argument in ast.walk(inner) if isinstance(argument, ast.arg)}
+            if inner
+            else set[str]()
+        )
+        self.values: dict[str, list[ast.expr | None]] = defaultdict(list)
+        body = getattr(item, "body", [])
+        for statement in _inside(body if isinstance(body, list) else [body]):
+            for target, value in _bindings(statement):
+                self.values[target].append(value)
+
+    def holder(self, name: str) -> NameScope | None:
+        """Return the scope that binds a name, the innermost first."""
+        here: NameScope | None = self
+        while here is not None and name not in here.arguments and name not in here.values:
+            here = here.above
+        return here
+
+
+def roots(
+    item: ast.expr,
+    scope: NameScope,
+    bound: Mapping[str, str],
+    visited: frozenset[str] = frozenset(),
+) -> list[Root]:
+    """Return what an expression is part of; nothing for a new object."""
+    attributes: list[str] = []
+    while isinstance(item, ast.Attribute | ast.Subscript | ast.Starred):
+        if isinstance(item, ast.Attribute):
+            attributes.append(item.attr)
+        item = item.value
+    if isinstance(item, ast.Call):
+        return _of_call(item, scope, bound, visited)
+    if not isinstance(item, ast.Name):
+        return _of_all(_parts(item), scope, bound, visited)
+    if item.id in visited:
+        return []
+    if "__class__" in attributes:
+        return [Root("class", item.id)]
+    return [
+        Root(root.kind, ".".join([root.name, *reversed(attributes)]))
+        if root.kind == "import"
+        else root
+        for root in _of_name(item.id, scope, bound, visited | {item.id})
+    ]
+
+
+def _of_all(
+    items: Iterable[ast.expr], scope: NameScope, bound: Mapping[str, str], visited: frozenset[str]
+) -> list[Root]:
+    """Return what some expressions are part of, one after another."""
+    origins: list[Root] = []
+    for item in items:
+        origins += roots(item, scope, bound, visited)
+    return origins
+
+
+def last_name(item: ast.expr) -> str:
+    """Return the last word of an expression such as ``a.b.c``."""
+    return (
+        item.attr
+        if isinstance(item, ast.Attribute)
+        else item.id
+        if isinstance(item, ast.Name)
+        else ""
+    )
+
+
+def _of_name(
+    name: str, scope: NameScope, bound: Mapping[str, str], visited: frozenset[str]
+) -> list[Root]:
+    imported = [Root("import", bound[name])] if name in bound else []
+    holder = scope.holder(name)
+    if holder is None or (holder.is_module and name in bound):
+        return imported
+    if name in holder.arguments:
+        kind: Literal["class", "argument"] = "class" if name in _CLASS else "argument"
+        return [] if name in _SELF else [Root(kind, name)]
+    values = [value for value in holder.values[name] if value is not None]
+    origins = _of_all(values, holder, bound, visited)
+    if None in holder.values[name]:  # an import inside of a function
+        origins += imported
+    return [*origins, Root("own", name)] if holder.is_module else origins
+
+
+def _of_call(
+    call: ast.Call, scope: NameScope, bound: Mapping[str, str], visited: frozenset[str]
+) -> list[Root]:
+    """Return what the result of a call may be part of: of the object whose method it is, unless
+    it is a new object.
+    """
+    name = last_name(call.func)
+    if isinstance(call.func, ast.Name) and name in _THROUGH:
+        return _of_all(call.args, scope, bound, visited)
+    if isinstance(call.func, ast.Name) and name in ("globals", "type"):
+        return [Root("own" if name == "globals" else "class", name)]
+    origins = roots(call.func, scope, bound, visited)
+    if name[:1].isupper() or name in _COPYING:
+        return []
+    old = [root.name for root in origins if _is_of_library(root)]
+    return [Root("import", name if name.endswith("()") else f"{name}()") for name in old]
+
+
+#: functions and methods whose result is a new object
+_COPYING = ("copy", "clone", "deepcopy", "detach", "tolist", "item")
+
+
+def _is_of_library(root: Root) -> bool:
+    return root.kind == "import" and root.name.partition(".")[0] not in _NEW
+
+
+def _parts(item: ast.expr) -> list[ast.expr]:
+    """Return the expressions of which a value may be one, such as those of a list or of ``a if b
+    else c``.
+    """
+    if isinstance(item, ast.Tuple | ast.List | ast.Set):
+        return item.elts
+    if isinstance(item, ast.IfExp):
+        return [item.body, item.orelse]
+    if isinstance(item, ast.BoolOp):
+        return item.values
+    if isinstance(item, ast.Dict):
+        return item.values
+    return [item.value] if isinstance(item, ast.NamedExpr | ast.Await) else []
+
+
+def _inside(items: list[ast.AST]) -> Iterator[ast.AST]:
+    """Yield the parts of a body, without those inside of inner functions and classes."""
+    todo = list(items)
+    while todo:
+        item = todo.pop()
+        yield item
+        if not isinstance(item, _INNER):
+            todo.extend(ast.iter_child_nodes(item))
+
+
+def _bindings(item: ast.AST) -> Iterator[tuple[str, ast.expr | None]]:
+    """Yield each name that a statement binds, with the value; None for an import and a
+    definition.
+    """
+    if isinstance(item, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        yield item.name, None
+    elif isinstance(item, ast.Import | ast.ImportFrom):
+        yield from ((alias.asname or alias.name.partition(".")[0], None) for alias in item.names)
+    for target, value in _assigned(item):
+        if isinstance(item, _LOOPS) and value is not None:
+            value = ast.Starred(value)  # one of its parts
+        for child in ast.walk(target):
+            if isinstance(child, ast.Name) and isinstance(child.ctx, ast.Store):
+                yield child.id, value
+
+
+_LOOPS = (ast.For, ast.AsyncFor, ast.comprehension)
+
+
+def _assigned(item: ast.AST) -> Iterator[tuple[ast.expr, ast.expr | None]]:
+    """Yield each target of a statement with the expression that gives it its value."""
+    if isinstance(item, ast.Assign):
+        yield from ((target, item.value) for target in item.targets)
+    elif isinstance(item, ast.AnnAssign | ast.AugAssign | ast.NamedExpr):
+        yield item.target, item.value
+    elif isinstance(item, _LOOPS):
+        yield item.target, item.iter
+    elif isinstance(item, ast.withitem) and item.optional_vars is not None:
+        yield item.optional_vars, item.context_expr
+
+
+# --- local names ----------------------------------------------------------------------------------
+
+# Names in a function: what an expression is called in full, and what gives a local name its value.
+
+
+def dotted(item: ast.expr, bound: Mapping[str, str]) -> str:
+    """Return the full name of an expression such as ``np.random.rand``, or an empty text for any
+    other expression.
+    """
+    parts: list[str] = []
+    while isinstance(item, ast.Attribute):
+        parts.append(item.attr)
+        item = item.value
+    if not isinstance(item, ast.Name):
+        return ""
+    return ".".join([bound.get(item.id, item.id), *reversed(parts)]).removeprefix("builtins.")
+
+
+def arguments(function: ast.AST) -> set[str]:
+    inner = getattr(function, "args", None)
+    return (
+        {argument.arg for argument in ast.walk(inner) if isinstance(argument, ast.arg)}
+        if inner is not None
+        else set()
+    )
+
+
+def assigned(function: ast.AST) -> Iterator[tuple[str, ast.expr]]:
+    """Yield each local name of a function with an expression that gives it its value."""
+    for item in ast.walk(function):
+        for target, value in _assigned(item):
+            names = [child.id for child in ast.walk(target) if isinstance(child, ast.Name)]
+            if value is not None:
+                yield from ((name, value) for name in names)
+
+
+def read_by(call: ast.Call) -> ast.expr | None:
+    """Return what a function of a library reads: an open file, or the first argument."""
+    files = [word.value for word in call.keywords if word.arg in ("fileobj", "fp")]
+    return next(iter([*files, *call.args, *(word.value for word in call.keywords)]), None)
+
+
+# --- literal texts --------------------------------------------------------------------------------
+
+# Texts that an expression of literals gives, such as ``"__do" + "c__"``, and names that only a run
+# knows.
+
+
+#: functions that are given the name of an attribute
+_NAMING = frozenset({"getattr", "attrgetter", "getattr_static"})
+#: functions that give all attributes of an object
+_ALL = frozenset({"vars", "getmembers", "getmembers_static"})
+_HOLDING = frozenset({"__dict__", "__getattribute__"})
+
+
+def texts(kinds: Kinds) -> Iterator[tuple[str, int]]:
+    """Yield each text of a module with its line, also one that is put together of literals."""
+    for item in each(kinds, ast.Constant, ast.BinOp, ast.JoinedStr, ast.Call):
+        if text := text_of(item):
+            yield text, item.lineno
+
+
+def text_of(item: ast.expr) -> str | None:
+    """Return the text of an expression of literals, or None for any other expression."""
+    if isinstance(item, ast.Constant):
+        return item.value if isinstance(item.value, str) else None
+    if isinstance(item, ast.BinOp) and isinstance(item.op, ast.Add):
+        return _joined([item.left, item.right])
+    if isinstance(item, ast.JoinedStr):
+        return _joined(map(_without_format, item.values))
+    if isinstance(item, ast.Call) and isinstance(item.func, ast.Attribute):
+        return _text_of_join(item, item.func)
+    return None
+
+
+def _without_format(piece: ast.expr) -> ast.expr:
+    return piece.value if isinstance(piece, ast.FormattedValue) else piece
+
+
+def _text_of_join(call: ast.Call, method: ast.Attribute) -> str | None:
+    """Return the text of ``", ".join(["a", "b"])``, or None for another call."""
+    if method.attr != "join" or not call.args:
+        return None
+    between, parts = text_of(method.value), call.args[0]
+    return _joined(parts.elts, between) if isinstance(parts, ast.List | ast.Tuple) else None
+
+
+def reads_attributes_unnamed(kinds: Kinds) -> bool:
+    """Return True for code that reads attributes whose names it does not spell out, perhaps
+    ``__doc__``.
+    """
+    if any(item.attr in _HOLDING for item in each(kinds, ast.Attribute)):
+        return True
+    for call in each(kinds, ast.Call):
+        name = last_name(call.func)
+        names = call.args[1:2] if name != "attrgetter" else call.args
+        if (name in _ALL and call.args) or (
+            name in _NAMING and any(text_of(argument) is None for argument in names)
+        ):
+            return True
+    return False
+
+
+def _joined(parts: Iterable[ast.expr], between: str | None = "") -> str | None:
+    values = [text_of(piece) for piece in parts]
+    literals = [text for text in values if text is not None]
+    return between.join(literals) if between is not None and len(literals) == len(values) else None
+
+
+# --- scratch files --------------------------------------------------------------------------------
+
+# Files that a function makes for itself: in a folder of `tempfile`, under a name that it drew, or
+# in memory.
+
+
+_MADE = frozenset(
+    {
+        *("io.BytesIO", "io.StringIO"),
+        *(
+            f"tempfile.{name}"
+            for name in ("TemporaryDirectory", "NamedTemporaryFile", "TemporaryFile", "mkdtemp")
+        ),
+        *("tempfile.mkstemp", "tempfile.SpooledTemporaryFile"),
+    }
+)
+#: functions that give a path or an open file of what they get first
+_THROUGH_FILES = frozenset(
+    {
+        *(
+            "str",
+            "os.fspath",
+            "os.fsencode",
+            "os.path.join",
+            "os.path.abspath",
+            "os.path.realpath",
+            "os.fdopen",
+        ),
+        *(
+            "pathlib.Path",
+            "pathlib.PurePath",
+            "contextlib.closing",
+            "io.TextIOWrapper",
+            "io.BufferedReader",
+        ),
+        *("enter_context", "gzip.GzipFile", "iter", "sorted", "list", "next", "enumerate"),
+    }
+)
+
+
+class Scratch:
+    """What in a module is a path of a temporary file, or a file in memory; false if nothing
+    makes one.
+    """
+
+    def __init__(self, bound: Mapping[str, str], reads: Callable[[str], bool]) -> None:
+        """Tell by the full names of imported names; ``reads`` says whether a function opens a
+        file.
+        """
+        self._bound, self._reads = bound, reads
+        self._makes = any(name.partition(".")[0] in ("io", "tempfile") for name in bound.values())
+
+    def __bool__(self) -> bool:
+        return self._makes
+
+    def holds(self, item: ast.expr, scope: Scope) -> bool:
+        """Return True if an expression can be nothing but such a path or file."""
+        return self._makes and self._is_made(item, scope, frozenset())
+
+    def texts(self, tree: Syntax) -> set[int]:
+        """Return the ids of the texts that name a file in a temporary folder, or in an archive
+        in memory.
+        """
+        joins = [item.right for scope, item in tree.joins if self.holds(item.left, scope)]
+        calls = [(scope, call) for scope, call in tree.calls if self._is_below_made(call, scope)]
+        return {
+            id(argument)
+            for argument in [*joins, *(argument for _, call in calls for argument in call.args)]
+        }
+
+    def _is_below_made(self, call: ast.Call, scope: Scope) -> bool:
+        """Return True for a call that joins words to a temporary path, and for a method of an
+        object in memory.
+        """
+        if isinstance(call.func, ast.Attribute) and self.holds(call.func.value, scope):
+            return True
+        joins = dotted(call.func, self._bound) in _THROUGH_FILES
+        return joins and bool(call.args) and self.holds(call.args[0], scope)
+
+    def _is_made(self, item: ast.expr, scope: Scope, visited: frozenset[str]) -> bool:
+        if isinstance(item, ast.Attribute | ast.Subscript | ast.Starred | ast.NamedExpr):
+            return self._is_made(item.value, scope, visited)
+        if isinstance(item, ast.BinOp):
+            return self._is_made(item.left, scope, visited)
+        if isinstance(item, ast.JoinedStr):
+            first = item.values[0] if item.values else item
+            return isinstance(first, ast.FormattedValue) and self._is_made(
+                first.value, scope, visited
+            )
+        if isinstance(item, ast.Call):
+            return self._is_made_by(item, scope, visited)
+        return isinstance(item, ast.Name) and self._is_name_made(item.id, scope, visited)
+
+    def _is_made_by(self, call: ast.Call, scope: Scope, visited: frozenset[str]) -> bool:
+        full = dotted(call.func, self._bound)
+        last = call.func.attr if isinstance(call.func, ast.Attribute) else ""
+        if full in _MADE:
+            return True
+        if full in _THROUGH_FILES or last in _THROUGH_FILES or self._reads(full):
+            first = read_by(call)
+            return first is not None and self._is_made(first, scope, visited)
+        return bool(last) and self._is_made(call.func, scope, visited)
+
+    def _is_name_made(self, name: str, scope: Scope, visited: frozenset[str]) -> bool:
+        """Return True if all that gives a local name its value is made."""
+        if name in visited:
+            return True  # a path that is lengthened
+        for depth in range(len(scope), 0, -1):
+            function = scope[depth - 1]
+            if name in arguments(function):
+                return False
+            values = [value for target, value in assigned(function) if target == name]
+            if values:
+                return all(
+                    self._is_made(value, scope[:depth], visited | {name}) for value in values
+                )
+        return False

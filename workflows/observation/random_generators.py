@@ -1,0 +1,353 @@
+"""Sources of chance that an observed call asks: generators of NumPy, torch and the system."""
+
+from __future__ import annotations
+
+import abc
+import os
+import pickle
+import random
+import sys
+import tempfile
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from neusee.workflows.observation.python_watch import watch_here
+
+# --- drawn names ----------------------------------------------------------------------------------
+
+# Names that libraries draw by ``uuid4`` for things of their own, and that no result has.
+#
+# A library may as well draw a seed in this way, or an identifier that it writes into a file. So
+# each is listed here, with the reason why its names decide nothing.
+
+
+#: modules, with what they name
+NAMING = {
+    "dask": "tasks of a graph, where an object has no token of its own",
+    "distributed": "tasks, clients, locks and messages",
+    "xarray.backends": "locks, and open files in a cache",
+    "fsspec": "temporary files",
+    "joblib": "folders of workers, and calls",
+    "tempfile": "temporary files",
+}
+_BETWEEN = ("uuid", "cloudpickle")  #: modules that draw for the one that calls them
+
+
+def draws_name(depth: int) -> bool:
+    """Return True if the function that asks for chance draws a name; ``depth`` counts the calls
+    up to it.
+    """
+    frame = sys._getframe(depth + 1)
+    if _module(frame) != "uuid":
+        return False
+    while frame.f_back is not None and _module(frame).startswith(_BETWEEN):
+        frame = frame.f_back
+    return any(f"{_module(frame)}.".startswith(f"{name}.") for name in NAMING)
+
+
+def _module(frame: object) -> str:
+    return str(getattr(frame, "f_globals", {}).get("__name__"))
+
+
+# --- asked chance ---------------------------------------------------------------------------------
+
+# The sources of chance that a call asks, such as the system, a process or a device.
+
+
+class WatchedChance:
+    """The functions through which Python code asks for chance, wrapped while a call is observed.
+
+    The kernel sees most of it too, but not where the library of C draws without a system call.
+    """
+
+    def __init__(self) -> None:
+        # temporary files have drawn names, which no result has: their generator is made before
+        next(tempfile._get_candidate_names())  # type: ignore[attr-defined]
+        places: list[tuple[Any, str]] = [
+            (os, "urandom"),
+            (random, "_urandom"),
+            (random.Random, "seed"),
+        ]
+        self._before = [
+            (place, name, getattr(place, name)) for place, name in places if hasattr(place, name)
+        ]
+
+    def __enter__(self) -> None:
+        for place, name, function in self._before:
+            setattr(place, name, _seeding(function) if name == "seed" else _asking(function))
+
+    def __exit__(self, *_: object) -> None:
+        for place, name, function in self._before:
+            setattr(place, name, function)
+
+
+def _note(source: str) -> None:
+    watch = watch_here()
+    if watch is not None and watch.trusted():
+        watch.kept.drew = True
+    elif watch is not None:
+        watch.draws.add(source)
+
+
+def _asking(function: Callable[[int], bytes]) -> Callable[[int], bytes]:
+    def urandom(size: int, /) -> bytes:
+        watch = watch_here()
+        if watch is None or not draws_name(1):
+            _note("os.urandom")
+            return function(size)
+        before = watch.trust(True)
+        try:
+            return function(size)
+        finally:
+            watch.trust(before)
+
+    return urandom
+
+
+def _seeding(function: Callable[..., None]) -> Callable[..., None]:
+    def seed(self: random.Random, a: Any = None, *arguments: Any, **named: Any) -> None:
+        if a is None:
+            _note("random.Random without a seed")
+        function(self, a, *arguments, **named)
+
+    return seed
+
+
+# --- legacy numpy ---------------------------------------------------------------------------------
+
+# Legacy generators of NumPy: ``RandomState(3)`` asks for chance first, and only then for its seed.
+#
+# So does all that takes ``random_state=3``. While a call is observed, such a generator says whether
+# a seed followed.
+
+
+_PLACE: Any = np.random.mtrand
+#: what ``RandomState`` begins with; where it is missing, a seeded one counts as chance
+_NAME = "_MT19937"
+
+
+class _Replacement(abc.ABCMeta):
+    """Class of a class that stands for `MT19937`: a ``RandomState`` asks whether its generator
+    is an instance.
+    """
+
+    def __instancecheck__(cls, instance: object) -> bool:
+        return isinstance(instance, np.random.MT19937)
+
+
+class LegacyGenerator(np.random.MT19937, metaclass=_Replacement):
+    """The generator of a ``RandomState`` that an observed call makes."""
+
+    def __init__(self, *seed: Any) -> None:
+        """Make the generator; what it takes from the system counts at the end of the call, if no
+        seed followed.
+        """
+        self._seeded, self._first = bool(seed), b""
+        watch = watch_here()
+        if watch is None or seed:
+            super().__init__(*seed)
+            return
+        if watch.trusted():  # an import of a package, which keeps it for itself
+            watch.kept.keep(self, str(sys._getframe(1).f_globals.get("__name__")))
+        else:
+            watch.generators.append(self)
+        before = watch.trust(True)
+        try:
+            super().__init__()
+            self._first = pickle.dumps(self.state)
+        finally:
+            watch.trust(before)
+
+    def _legacy_seeding(self, seed: Any) -> None:
+        self._seeded = self._seeded or seed is not None
+        super()._legacy_seeding(seed)
+
+    def is_seeded(self) -> bool:
+        """Return True if a seed decides what the generator draws."""
+        return self._seeded
+
+    def has_drawn_by_chance(self) -> bool:
+        """Return True if the generator has drawn without a seed."""
+        return not self._seeded and pickle.dumps(self.state) != self._first
+
+    def __reduce__(self) -> Any:
+        """Return what a file keeps: the generator of NumPy that this is."""
+        made: tuple[Any, ...] = super().__reduce__()
+        make, arguments, *state = made
+        return (
+            make,
+            tuple(
+                np.random.MT19937 if argument is LegacyGenerator else argument
+                for argument in arguments
+            ),
+            *state,
+        )
+
+
+# its state names its class, and a file keeps its state
+LegacyGenerator.__name__ = np.random.MT19937.__name__
+
+
+class WatchedLegacyGenerators:
+    """The generator of ``RandomState``, replaced while a call is observed."""
+
+    def __enter__(self) -> None:
+        if getattr(_PLACE, _NAME, None) is np.random.MT19937:
+            setattr(_PLACE, _NAME, LegacyGenerator)
+
+    def __exit__(self, *_: object) -> None:
+        if getattr(_PLACE, _NAME, None) is LegacyGenerator:
+            setattr(_PLACE, _NAME, np.random.MT19937)
+
+
+# --- shared generators ----------------------------------------------------------------------------
+
+# Generators that all code of a process shares: did an observed call draw from one before it had set
+# the seed?
+#
+# ``torch.manual_seed(3)`` and ``np.random.seed(3)`` determine all numbers that follow. A call that
+# draws before it depends on what the process drew earlier, also if it puts the state back at the
+# end, as ``torch.random.fork_rng`` does.
+
+
+_By = Literal["seed", "state", "system"]  #: what determines the numbers that follow
+_TORCH: Any = torch.random
+#: what the functions of torch for seeds ask; where it is missing, each draw counts
+_GENERATOR = "default_generator"
+
+
+class Shared:
+    """One shared generator during an observed call."""
+
+    def __init__(self, state: Callable[[], Any]) -> None:
+        """Watch a generator; ``state`` returns its state, which is the first one now."""
+        self._state, self._first = state, state()
+        #: what it draws now is determined by a seed, or by a state, that the call has set
+        self._seeded = False
+        self._drew = False
+
+    def drew(self) -> bool:
+        """Return True if the call drew, up to now, what no seed of its own decides."""
+        self._drew = self._drew or (not self._seeded and _differs(self._state(), self._first))
+        return self._drew
+
+    def set(self, change: Callable[[], Any], by: _By) -> Any:
+        """Let a call set the generator; the state that it had at the beginning determines
+        nothing.
+        """
+        self.drew()
+        value, state = change(), self._state()
+        disturbed = watch_here() is None and bool(state)  # by a thread that is not of the call
+        self._drew = self._drew or by == "system" or disturbed
+        self._seeded = by == "seed" or _differs(state, self._first)
+        return value
+
+
+class SharedGenerators:
+    """The shared generators during an observed call, with the functions that set their seeds and
+    states wrapped.
+    """
+
+    def __init__(self) -> None:
+        self._shared = {
+            "torch": Shared(lambda: torch.default_generator.get_state().numpy().tobytes()),
+            "torch.cuda": Shared(_of_cuda),
+            "numpy.random": Shared(_of_numpy),
+            "random": Shared(random.getstate),
+        }
+        replaced = [function for function in self._replaced() if hasattr(function[0], function[1])]
+        self._after = replaced
+        self._before = [(place, name, getattr(place, name)) for place, name, _ in replaced]
+
+    def __enter__(self) -> SharedGenerators:
+        for place, name, function in self._after:
+            setattr(place, name, function)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for place, name, function in self._before:
+            setattr(place, name, function)
+
+    def drawn(self) -> list[str]:
+        """Return the names of the generators that drew what no seed decides."""
+        return [name for name, shared in self._shared.items() if shared.drew()]
+
+    def _replaced(self) -> list[tuple[Any, str, Any]]:
+        """Return places, names, and what stands there during the call."""
+        cuda, numpy = self._shared["torch.cuda"], self._shared["numpy.random"]
+        generator = _Seeded(getattr(_TORCH, _GENERATOR, None), self._shared["torch"])
+        of_numpy = {
+            "seed": _setting(np.random.seed, numpy, "seed"),
+            "set_state": _setting(np.random.set_state, numpy, "state"),
+        }
+        of_cuda = {
+            "manual_seed_all": _setting(torch.cuda.manual_seed_all, cuda, "seed"),
+            "set_rng_state": _setting(torch.cuda.set_rng_state, cuda, "state"),
+        }
+        places = (
+            (np.random, of_numpy),
+            (np.random.mtrand, of_numpy),
+            (torch.cuda, of_cuda),
+            (torch.cuda.random, of_cuda),
+        )
+        wrapped: list[tuple[Any, str, Any]] = []
+        for place, functions in places:
+            wrapped += [(place, name, function) for name, function in functions.items()]
+        return [(_TORCH, _GENERATOR, generator), *wrapped]
+
+
+class _Seeded:
+    """The generator of torch, as the functions that set its seed see it."""
+
+    def __init__(self, generator: Any, shared: Shared) -> None:
+        self._generator, self._shared = generator, shared
+
+    def manual_seed(self, seed: int) -> Any:
+        return self._shared.set(lambda: self._generator.manual_seed(seed), "seed")
+
+    def set_state(self, state: Any) -> Any:
+        return self._shared.set(lambda: self._generator.set_state(state), "state")
+
+    def seed(self) -> Any:
+        return self._shared.set(self._generator.seed, "system")
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._generator, name)
+
+
+def _setting(function: Callable[..., Any], shared: Shared, by: _By) -> Callable[..., Any]:
+    """Return a function that sets a seed or a state, wrapped; without a value, or with None, the
+    system gives it.
+    """
+
+    def set_generator(*arguments: Any, **named: Any) -> Any:
+        without = next(iter((*arguments, *named.values())), None) is None
+        return shared.set(lambda: function(*arguments, **named), "system" if without else by)
+
+    return set_generator
+
+
+def _differs(state: Any, first: Any) -> bool:
+    """Return True if a generator has another state; a graphics processor that came into use has
+    drawn nothing yet.
+    """
+    if isinstance(state, dict):
+        return any(now != first.get(number, (now[0], 0)) for number, now in state.items())
+    return bool(state != first)
+
+
+def _of_numpy() -> tuple[Any, ...]:
+    state: Any = np.random.get_state()
+    return (state[0], state[1].tobytes(), *state[2:])
+
+
+def _of_cuda() -> dict[int, tuple[int, int]]:
+    """Return seed and count of the draws of each graphics processor in use."""
+    generators = torch.cuda.default_generators if torch.cuda.is_initialized() else ()  # type: ignore[no-untyped-call]
+    return {
+        number: (generator.initial_seed(), generator.get_offset())
+        for number, generator in enumerate(generators)
+    }

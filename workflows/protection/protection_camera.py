@@ -1,0 +1,420 @@
+"""The camera of the protection study: its parts, and what is measured of each front."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neusee.nodes import Node, metrics, optics
+from neusee.nodes.doe import shade
+from neusee.nodes.flare import dirt, stray_light
+from neusee.nodes.metrics import (
+    TARGETS,
+    GlareLevels,
+    PictureSpectrum,
+    PixelNoise,
+    detail_energy,
+    glare_levels,
+    picture_spectrum,
+    radial_contrast,
+)
+from neusee.nodes.values import Bands, Psf, Pupil, Stop
+from neusee.workflows.engine.runner import run
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.keys.cache_key import digest, file_digest, plain
+from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.protection.unknown_conditions import Condition
+from neusee.workflows.store.result_store import Store, compute_once
+
+# --- camera parts ---------------------------------------------------------------------------------
+
+# The parts of a recipe's camera that the protection study needs: lens, mask, sensor, light, and
+# their nodes.
+
+
+_NEEDED = (
+    "psf[mask]",
+    "pupil[mask]",
+    "pupil[plain]",
+    "illuminant",
+    "responses",
+    "read[mask]",
+    "well[mask]",
+)
+_LEAST_MASK = 0.9  #: laser suppression ratio above which a recipe has no mask to compare
+
+
+@dataclass(frozen=True)
+class ProtectionCamera:
+    """Lens, mask and sensor of a recipe, as values and parameters from which PSFs of any shade
+    are computed.
+    """
+
+    recipe: Recipe
+    height: Tensor
+    flat: Tensor
+    stop: Stop
+    bands: Bands  #: a few bands of the recipe, from end to end, for the scene
+    laser_bands: Bands  #: all bands of the recipe, for a laser that may have any wavelength
+    illuminant: Tensor
+    responses: Tensor
+    keys: tuple[str, ...]  #: cache keys of these values
+
+    @classmethod
+    def of(cls, recipe: Recipe, store: Store, count: int) -> ProtectionCamera:
+        """Return the camera of a recipe with ``count`` of its bands; raise ValueError for an
+        unsuitable recipe.
+        """
+        _refuse_unsuitable(recipe)
+        pupil, plain = (recipe.steps[f"pupil[{arm}]"].wires for arm in ("mask", "plain"))
+        names = [str(w) for w in (pupil["height"], plain["height"], pupil["stop"], pupil["bands"])]
+        names += ["illuminant", "responses"]
+        result = run(recipe, store, dict.fromkeys(names))
+        height, flat, stop, bands, illuminant, responses = (result.values[name] for name in names)
+        which = (
+            torch.linspace(0, len(bands.centres) - 1, min(count, len(bands.centres))).round().long()
+        )
+        few = Bands(*(values[which] for values in bands))
+        keys = tuple(result.keys[name] for name in names)
+        return cls(
+            recipe, height, flat, stop, few, bands, illuminant[which], responses[:, which], keys
+        )
+
+    @property
+    def lens(self) -> Mapping[str, Any]:
+        """Return the parameters of the recipe's PSF."""
+        step = self.recipe.steps["psf[mask]"]
+        if step.node.path == "flare.stray_light":
+            step = self.recipe.steps[str(step.wires["psf"])]
+        return step.params
+
+    @property
+    def noise(self) -> Mapping[str, float]:
+        """Return the read noise and the full well of the recipe's sensor, in e-."""
+        read, well = (self.recipe.steps[name].params for name in ("read[mask]", "well[mask]"))
+        return {"read_noise": float(read["read_noise"]), "full_well": float(well["capacity"])}
+
+    def pixel(self, prnu: float, residual_glare: float) -> PixelNoise:
+        """Return the noise of a pixel of the recipe's sensor."""
+        return PixelNoise(**self.noise, prnu=prnu, residual_glare=residual_glare)
+
+    def psf(
+        self,
+        masked: bool,
+        diameter: float,
+        bands: Bands,
+        condition: Condition | None = None,
+        **options: Any,
+    ) -> Psf:
+        """Return the PSF with or without the mask, in a stop of a relative ``diameter``, under a
+        condition.
+        """
+        notches = {name: options.pop(name) for name in ("notches", "depth") if name in options}
+        psf: Psf = optics.psf(
+            self._front(masked, diameter, bands, condition, **notches), **{**self.lens, **options}
+        )
+        return psf
+
+    def laser_psf(
+        self, masked: bool, diameter: float, line: Bands, condition: Condition, **options: Any
+    ) -> Psf:
+        """Return the PSF of a laser from the ``angle`` of its direction, with the light that the
+        lens scatters.
+        """
+        notches = {name: options.pop(name) for name in ("notches", "depth") if name in options}
+        front, lens = (
+            self._front(masked, diameter, line, condition, **notches),
+            {**self.lens, **options},
+        )
+        sizes = {name: lens[name] for name in ("focal_length", "pixel_pitch", "angle")}
+        aperture = float(self.stop.diameter)
+        psf: Psf = stray_light(
+            optics.psf(front, **lens),
+            front,
+            surfaces=condition.surfaces,
+            diameter=aperture,
+            **sizes,
+        )
+        return psf
+
+    def _front(
+        self,
+        masked: bool,
+        diameter: float,
+        bands: Bands,
+        condition: Condition | None,
+        **notches: Any,
+    ) -> Pupil:
+        pupil = self.recipe.steps["pupil[mask]"]
+        index = self.recipe.steps[str(pupil.wires["index"])]
+        height = self.height if masked else self.flat
+        params = dict(pupil.params)
+        film = None
+        if condition is not None:
+            params["defocus"] = float(params.get("defocus", 0.0)) + condition.defocus
+            film = self._film(condition)
+        shaded = shade(self.stop, diameter=diameter, **notches)
+        front: Pupil = optics.pupil(
+            height,
+            index.node(bands, **index.params),
+            bands,
+            self.stop,
+            film,
+            shade=shaded,
+            **params,
+        )
+        return front
+
+    def _film(self, condition: Condition) -> Any:
+        if not condition.grease:
+            return None
+        return dirt(
+            self.stop, grease=condition.grease, rng=torch.Generator().manual_seed(condition.seed)
+        )
+
+    def laser_line(self, wavelength: float) -> Bands:
+        """Return one narrow band at the wavelength of a laser."""
+        unit = torch.ones(1, dtype=torch.float64)
+        return Bands(unit * wavelength, unit * 1e-9, unit)
+
+    def laser_colour(self, line: Bands) -> Tensor:
+        """Return the response of each channel to a laser relative to the channel that responds
+        most: (channel,).
+        """
+        step = self.recipe.steps["responses"]
+        response: Tensor = step.node(line, **step.params)[:, 0].double()
+        return response / response.max() if float(response.max()) > 0 else torch.ones_like(response)
+
+    @property
+    def nodes(self) -> tuple[Node, ...]:
+        """Return the nodes whose code determines a PSF, or a measure of it."""
+        index = self.recipe.steps[str(self.recipe.steps["pupil[mask]"].wires["index"])].node
+        own = (
+            optics.psf,
+            optics.pupil,
+            shade,
+            dirt,
+            stray_light,
+            metrics.lsr,
+            metrics.heat_ratio,
+            metrics.filtered_picture,
+        )
+        return (*own, index, self.recipe.steps["responses"].node)
+
+
+def _refuse_unsuitable(recipe: Recipe) -> None:
+    """Raise ValueError where the recipe lacks a step, or its mask is shaded already."""
+    missing = [name for name in _NEEDED if name not in recipe.steps]
+    if missing:
+        raise ValueError(
+            f"the recipe {recipe.name} has no step {missing[0]}: study a recipe of the camera with"
+            " the arms plain and mask, such as five_half_rings"
+        )
+    if recipe.steps["pupil[mask]"].wires.get("shade"):
+        raise ValueError(
+            "the mask of this recipe is shaded already: choose the mask alone, such as doe=axicon,"
+            " because the study adds filters and stops itself"
+        )
+
+
+def refuse_no_mask(lsr: float) -> None:
+    """Raise ValueError for a mask that lowers the peak too little to compare."""
+    if lsr > _LEAST_MASK:
+        raise ValueError(
+            f"the mask of this recipe lowers the peak of a laser to {lsr:.3g} only: choose a mask,"
+            " such as doe=axicon"
+        )
+
+
+# --- front optics ---------------------------------------------------------------------------------
+
+# Fronts, which are a lens with or without the mask in a stop of some diameter, and what is measured
+# of each once.
+#
+# A grey filter needs no front of its own: it scales the light of scene and laser.
+
+
+_ABOUT = {"step": "study protection"}
+_SOURCES = (picture_spectrum, detail_energy, glare_levels)
+
+
+@dataclass(frozen=True)
+class Front:
+    """A lens with or without the mask, in a stop of a relative diameter, or with a notch filter."""
+
+    masked: bool
+    diameter: float = 1.0
+    notch: float | None = None  #: m, centre of a notch filter
+    depth: float = 0.0  #: of the notch
+
+    @property
+    def notches(self) -> dict[str, Any]:
+        """Return the parameters of `doe.shade` for the notch filter, if there is one."""
+        return {} if self.notch is None else {"notches": (self.notch,), "depth": self.depth}
+
+
+@dataclass(frozen=True)
+class FrontMeasures:
+    """What is measured of one front under one condition."""
+
+    spectrum: PictureSpectrum
+    energy: Mapping[str, Tensor]  #: by target (channel,)
+    peak: float  #: laser suppression ratio at the worst of all bands of the recipe
+    #: heat of the hottest pixel relative to the clear lens, at the worst of them; NaN if not asked
+    #: for
+    heat: float
+    radius: Tensor  #: (ring,) cycles per pixel
+    square: Tensor  #: (ring,) mean of |OTF|**2
+    glare: Mapping[int, GlareLevels]  #: by the side of the field in pixels
+    colour: Tensor  #: (channel,) response to the laser
+
+
+@dataclass(frozen=True)
+class FrontSettings:
+    """The settings of the protection study that determine what is measured of a front."""
+
+    variance: float  #: of the contrast of the scene
+    up_to: float  #: cycles per pixel, of the mean log NEQ
+    size: float  #: height of the targets in pixels
+    fields: tuple[int, ...]  #: sides of the field in pixels
+    dwell: float | None  #: s; None: the peak alone counts
+
+
+class FrontBench:
+    """Measures fronts of one camera, each only once, because the store keeps the result."""
+
+    def __init__(self, camera: ProtectionCamera, store: Store, settings: FrontSettings) -> None:
+        self.camera, self.store, self.settings = camera, store, settings
+        self._psfs: dict[Front, Psf] = {}
+        self._harms: dict[Front, dict[str, Tensor]] = {}
+        code = Code(store.code_memo)
+        files = [file_digest(Path(inspect.getfile(source))) for source in _SOURCES]
+        files += [file_digest(Path(__file__)), file_digest(Path(inspect.getfile(ProtectionCamera)))]
+        steps = [
+            camera.recipe.steps[name]
+            for name in ("psf[mask]", "pupil[mask]", "index", "responses")
+            if name in camera.recipe.steps
+        ]
+        params = [{name: plain(value) for name, value in step.params.items()} for step in steps]
+        self._key = [
+            camera.keys,
+            [code.of(node) for node in camera.nodes],
+            files,
+            params,
+            camera.bands.centres.tolist(),
+            camera.laser_bands.centres.tolist(),
+            repr(settings),
+        ]
+
+    def measure(self, front: Front, condition: Condition) -> FrontMeasures:
+        """Return what is measured of a front under a condition, from the store if it is there."""
+        key = digest("protection front", self._key, repr(front), condition.plain)
+        measures = compute_once(
+            self.store, key, dict, lambda: self._measure(front, condition), _ABOUT
+        )
+        return _measures(measures)
+
+    def _measure(self, front: Front, condition: Condition) -> dict[str, Tensor]:
+        camera, s = self.camera, self.settings
+        light = camera.illuminant, camera.responses, camera.bands
+        assumed, true = self._known(front), self._psf(front, camera.bands, condition)
+        spectrum = picture_spectrum(true, assumed, *light, s.variance, s.up_to)
+        radius, square = radial_contrast(true, *light)
+        measures: dict[str, Tensor] = {
+            f"spectrum.{name}": x for name, x in spectrum._asdict().items()
+        }
+        measures |= {f"energy.{name}": x for name, x in detail_energy(true, *light, s.size).items()}
+        measures |= {"radius": radius, "square": square, **self._harm(front)}
+        return measures | self._glare(front, condition)
+
+    def _harm(self, front: Front) -> dict[str, Tensor]:
+        """Return peak and heat at the worst of all bands of the recipe; they are computed once.
+
+        A mask may pass a laser in a narrow band that lies between the few bands of the scene.
+        """
+        if front not in self._harms:
+            bands = self.camera.laser_bands
+            columns = (torch.split(values, 1) for values in bands)
+            single = (Bands(*values) for values in zip(*columns, strict=True))
+            peaks, heats = zip(*(self._harm_in(front, band) for band in single), strict=True)
+            self._harms[front] = {
+                "peak": torch.stack(peaks).max(),
+                "heat": torch.stack(heats).max(),
+            }
+        return self._harms[front]
+
+    def _harm_in(self, front: Front, band: Bands) -> tuple[Tensor, Tensor]:
+        """Return peak and heat in one band, both relative to the clear lens."""
+        psf = self._psf(front, band, None)
+        peak = metrics.lsr(psf).max()
+        if self.settings.dwell is None:
+            return peak, torch.tensor(torch.nan, dtype=torch.float64)
+        clear = self._psf(Front(False), band, None)
+        pitch = self.camera.lens["pixel_pitch"]
+        return (
+            peak,
+            metrics.heat_ratio(psf, clear, pixel_pitch=pitch, dwell=self.settings.dwell).max(),
+        )
+
+    def _known(self, front: Front) -> Psf:
+        """Return the PSF that the filter knows, without the unknown conditions; it is computed
+        once.
+        """
+        if front not in self._psfs:
+            self._psfs[front] = self._psf(front, self.camera.bands, None)
+        return self._psfs[front]
+
+    def _psf(self, front: Front, bands: Bands, condition: Condition | None, **options: Any) -> Psf:
+        return self.camera.psf(
+            front.masked, front.diameter, bands, condition, **front.notches, **options
+        )
+
+    def _laser_psf(self, front: Front, line: Bands, condition: Condition, **options: Any) -> Psf:
+        return self.camera.laser_psf(
+            front.masked, front.diameter, line, condition, **front.notches, **options
+        )
+
+    def _glare(self, front: Front, condition: Condition) -> dict[str, Tensor]:
+        """Return the levels of a laser's light over each field, with the light that the lens
+        scatters.
+
+        Wider fields are for a laser on the axis alone, and only as wide as the samples of the pupil
+        carry.
+        """
+        camera = self.camera
+        line = camera.laser_line(condition.wavelength)
+        glare = {"colour": camera.laser_colour(line)}
+        reach = min(self.settings.fields)
+        spot = (condition.direction[0] * reach, condition.direction[1] * reach)
+        scale = camera.lens["pixel_pitch"] / camera.lens["focal_length"]
+        for side in self.settings.fields if condition.direction == (0.0, 0.0) else (reach,):
+            shape, angle = (side, side), (spot[0] * scale, spot[1] * scale)
+            try:
+                light = self._laser_psf(front, line, condition, shape=shape, angle=angle)
+            except ValueError:  # the pupil is too coarse
+                if side == reach:
+                    raise
+                continue
+            levels = glare_levels(light.intensity[0], float(light.clear_peak))
+            glare |= {f"level.{side}": levels.level, f"share.{side}": levels.share}
+        return glare
+
+
+def _measures(stored: Mapping[str, Any]) -> FrontMeasures:
+    sides = [int(name.removeprefix("level.")) for name in stored if name.startswith("level.")]
+    return FrontMeasures(
+        PictureSpectrum(*(stored[f"spectrum.{name}"] for name in PictureSpectrum._fields)),
+        {name: stored[f"energy.{name}"] for name in TARGETS},
+        float(stored["peak"]),
+        float(stored["heat"]),
+        stored["radius"],
+        stored["square"],
+        {side: GlareLevels(stored[f"level.{side}"], stored[f"share.{side}"]) for side in sides},
+        stored["colour"],
+    )

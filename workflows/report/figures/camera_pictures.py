@@ -1,0 +1,314 @@
+"""Pictures of what the camera sees: overview, spectra, restored frame, shading field."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neusee.nodes.spectra import mean_wavelength
+from neusee.nodes.values import Bands, Shading
+from neusee.workflows.report.figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    VERMILION,
+    PointLabel,
+    canvas,
+    drawn,
+    encoded,
+    nanometres,
+    picture,
+    place_labels,
+)
+
+# --- camera overview ------------------------------------------------------------------------------
+
+# Camera overview: the scene, its pictures without and with mask, and the restored picture with its
+# error.
+
+
+@drawn
+def overview(
+    *,
+    truth: Tensor,
+    plain: Tensor,
+    mask: Tensor,
+    restored: Tensor | None = None,
+    spots: Mapping[str, Tensor] | None = None,
+) -> Any:
+    """Draw the scene, its pictures without and with mask, and the restored picture with its
+    error if it is given.
+    """
+    white = high(truth)
+    pictures = {"truth": truth, "plain lens": plain, "with mask": mask}
+    pictures |= {} if restored is None else {"restored": restored}
+    count = len(pictures) + (restored is not None)
+    figure, axes = canvas(2.6 * count, 3.4, 1, count)
+    for ax, (name, image) in zip(axes[0], pictures.items(), strict=False):
+        picture(ax, encoded(centre(image, truth) / white), name)
+        _ring(ax, spots or {}, truth)
+    if restored is not None:
+        _error(figure, axes[0, -1], (centre(restored, truth) - truth).abs().mean(0) / white)
+        _ring(axes[0, -1], spots or {}, truth)
+    return figure
+
+
+def _error(figure: Any, ax: Any, error: Tensor) -> None:
+    shown = picture(
+        ax, error.cpu().numpy(), "|restored − truth|", cmap="viridis", vmin=0.0, vmax=high(error)
+    )
+    bar = figure.colorbar(shown, ax=ax, fraction=0.046, pad=0.03, extend="max")
+    bar.set_label("fraction of white", fontsize=9)
+    bar.ax.tick_params(labelsize=9)
+
+
+def high(values: Tensor) -> float:
+    """Return the 99.5 % quantile of the pixel values of an image as white level, but at least
+    1e-9.
+    """
+    sample = values.detach().flatten()[:: max(1, values.numel() // 200_000)].float()
+    return max(float(torch.quantile(sample, 0.995)), 1e-9)
+
+
+def centre(image: Tensor, like: Tensor) -> Tensor:
+    """Crop the centre of an image to the size of the image ``like``; the optical axis stays at
+    pixel N // 2.
+    """
+    top, left = (image.shape[d] // 2 - like.shape[d] // 2 for d in (-2, -1))
+    if top < 0 or left < 0:
+        raise ValueError(
+            f"a picture of shape {tuple(image.shape)} is smaller than the scene,"
+            f" {tuple(like.shape)}"
+        )
+    return image[..., top : top + like.shape[-2], left : left + like.shape[-1]].float()
+
+
+def _ring(ax: Any, spots: Mapping[str, Tensor], like: Tensor) -> None:
+    """Draw a ring around the brightest pixel of each laser, unless this pixel is on the rim:
+    that laser is outside.
+    """
+    from matplotlib.patches import Circle
+
+    radius = max(like.shape[-1] / 14, 3.0)
+    images = [centre(spot, like) for spot in spots.values()]
+    for y, x in {divmod(int(image.sum(0).argmax()), image.shape[-1]) for image in images}:
+        if not (0 < y < like.shape[-2] - 1 and 0 < x < like.shape[-1] - 1):
+            continue
+        for width, colour in ((3.0, "black"), (1.4, ORANGE)):
+            ax.add_patch(Circle((x, y), radius, fill=False, color=colour, linewidth=width))
+
+
+# --- scene spectra --------------------------------------------------------------------------------
+
+# Figure of the spectra of three scene pixels, and of the RGB values from which these spectra are
+# reconstructed.
+
+
+_POINTS = ("A", "B", "C")
+CHANNELS = ((VERMILION, "channel R"), (GREEN, "channel G"), (BLUE, "channel B"))
+MONO = ((BLUE, "the one channel"),)
+
+
+@drawn
+def spectra(
+    *,
+    scene: Tensor,
+    radiance: Tensor,
+    bands: Bands,
+    illuminant: Tensor,
+    responses: Tensor,
+    lines: Mapping[str, Bands] | None = None,
+) -> Any:
+    """Draw the spectra of three scene pixels, the illuminant, and the spectral responses of the
+    sensor channels.
+    """
+    figure, axes = canvas(13.0, 4.4, 1, 3, width_ratios=(1.0, 1.35, 1.35))
+    points = _points(scene)
+    _scene(axes[0, 0], scene, points)
+    _spectra(axes[0, 1], scene, radiance, bands, points)
+    _channels(axes[0, 2], illuminant, responses, bands)
+    for ax in axes[0, 1:]:
+        _lasers(ax, lines or {})
+        ax.set_xlabel("wavelength (nm)")
+        ax.set_ylim(bottom=0.0)
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
+    labels = [PointLabel(x, y, name, BLACK) for name, (y, x) in zip(_POINTS, points, strict=True)]
+    place_labels(figure, {axes[0, 0]: labels}, framed=True)
+    return figure
+
+
+def _points(scene: Tensor) -> list[tuple[int, int]]:
+    """Return (y, x) of the reddest, the greenest and the bluest pixel of the scene that is
+    neither dark nor clipped.
+    """
+    inner = (
+        torch.nn.functional.avg_pool2d(scene[None].float(), 5, 1, 2)[0]
+        if min(scene.shape[-2:]) >= 5
+        else scene
+    )
+    lit, white = inner.amax(0), high(scene)
+    usable = (lit > 0.2 * white) & (lit < 0.9 * white)
+    share = inner / inner.sum(0).clamp_min(1e-9)
+    return [divmod(int(channel.where(usable, -1.0).argmax()), scene.shape[-1]) for channel in share]
+
+
+def _scene(ax: Any, scene: Tensor, points: list[tuple[int, int]]) -> None:
+    picture(ax, encoded(scene / high(scene)), "three points of the scene")
+    for y, x in points:
+        for colour, width in (("white", 2.5), ("black", 1.0)):
+            ax.plot(x, y, "o", mfc="none", mec=colour, markersize=9, mew=width)
+
+
+def _spectra(
+    ax: Any, scene: Tensor, radiance: Tensor, bands: Bands, points: list[tuple[int, int]]
+) -> None:
+    nm = nanometres(bands.centres)
+    for name, (y, x), style in zip(_POINTS, points, ("-", "--", "-."), strict=True):
+        rgb = scene[:, y, x].tolist()
+        row, column = (
+            p * r // s
+            for p, r, s in zip((y, x), radiance.shape[-2:], scene.shape[-2:], strict=True)
+        )
+        label = f"{name}: RGB {rgb[0]:.2f} {rgb[1]:.2f} {rgb[2]:.2f}"
+        colour = encoded(0.75 * scene[:, y : y + 1, x : x + 1] / max(*rgb, 1e-9))[0, 0]
+        ax.plot(nm, radiance[:, row, column].cpu().numpy(), style, color=colour, label=label)
+    ax.set(title="spectra reconstructed from RGB", ylabel="relative spectral radiance")
+
+
+def _channels(ax: Any, illuminant: Tensor, responses: Tensor, bands: Bands) -> None:
+    nm = nanometres(bands.centres)
+    ax.plot(nm, illuminant.cpu().numpy(), color="black", linestyle="--", label="illuminant")
+    for channel, (colour, name) in zip(
+        responses, CHANNELS if len(responses) > 1 else MONO, strict=True
+    ):
+        ax.plot(nm, channel.cpu().numpy(), color=colour, label=name)
+    ax.set(title="illuminant and channels", ylabel="relative")
+
+
+def _lasers(ax: Any, lines: Mapping[str, Bands]) -> None:
+    """Draw a vertical line at the wavelength of each laser; one label stands for three or more
+    lasers.
+    """
+    for number, (name, line) in enumerate(lines.items()):
+        nm = mean_wavelength(line) * 1e9
+        label = (
+            f"laser {name}, {nm:.0f} nm"
+            if len(lines) < 3
+            else f"{len(lines)} lasers"
+            if number == 0
+            else None
+        )
+        style = "-." if len(lines) == 2 and number == 1 else ":"
+        ax.axvline(nm, color="#555555", linewidth=1.2, linestyle=style, label=label)
+
+
+# --- frame and interval ---------------------------------------------------------------------------
+
+# A frame that somebody took, the restored picture, and what is not known of each of its pixels.
+
+
+BRIGHT = 1.5  #: times white, which nothing that is lit by the light of the scene exceeds by much
+_LEVEL = 0.95  #: of the quantile of Student's t that ends an interval of 90 %
+#: degrees of freedom of a draw, whose errors are averaged over 7 x 7 pixels and alike in a few of
+#: them
+_EACH = 4
+
+
+def half_width(spread: Tensor, draws: int) -> Tensor:
+    """Return half the width of the 90 % interval, from the standard deviation that was estimated
+    from ``draws``.
+    """
+    from scipy.stats import t
+
+    return spread * float(t.ppf(_LEVEL, _EACH * draws))
+
+
+def unexplained(restored: Tensor, half: Tensor, invented: Tensor) -> Tensor:
+    """Return True for pixels (y, x) that no scene explains: darker than black or brighter than
+    `BRIGHT` white.
+
+    The half width of the interval is allowed for, and saturated pixels do not count.
+    """
+    outside = (restored < -half) | (restored > BRIGHT + half)
+    return outside.any(0) & ~invented
+
+
+@drawn
+def restored_frame(
+    *, frame: Tensor, restored: Tensor, spread: Tensor, clipped: Tensor, draws: int
+) -> Any:
+    """Draw a frame, the restored picture, and half the width of the 90 % interval, with marked
+    pixels in colour.
+    """
+    figure, axes = canvas(11.0, 4.1, 1, 3)
+    picture(axes[0, 0], encoded(frame), "frame")
+    picture(axes[0, 1], encoded(restored), "restored")
+    wide, saturated = half_width(spread, draws), clipped.any(0)
+    half, invented = wide.mean(0).cpu().numpy(), saturated.cpu().numpy()
+    top = float(np.quantile(half[~invented], 0.995)) if not invented.all() else float(half.max())
+    shown = picture(
+        axes[0, 2], half, "90 % interval, ±", cmap="viridis", vmin=0.0, vmax=max(top, 1e-9)
+    )
+    bar = figure.colorbar(shown, ax=axes[0, 2], fraction=0.046, pad=0.03, extend="max")
+    bar.set_label("fraction of white", fontsize=9)
+    bar.ax.tick_params(labelsize=9)
+    strange = unexplained(restored, wide, saturated).cpu().numpy()
+    _mark(
+        axes[0, 2],
+        {"saturated: invented": (invented, ORANGE), "no scene explains": (strange, VERMILION)},
+    )
+    return figure
+
+
+def _mark(ax: Any, kinds: Mapping[str, tuple[Any, str]]) -> None:
+    """Colour pixels by kind, and name the kinds that there are, with their share, below the
+    picture.
+    """
+    from matplotlib.colors import to_rgba
+    from matplotlib.patches import Patch
+
+    handles = []
+    for name, (where, colour) in kinds.items():
+        if not where.any():
+            continue
+        over = np.zeros((*where.shape, 4))
+        over[where] = to_rgba(colour)
+        ax.imshow(over)
+        handles.append(Patch(facecolor=colour, label=f"{name} ({where.mean():.2%})"))
+    if handles:
+        ax.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.02), fontsize=9)
+
+
+# --- shading field --------------------------------------------------------------------------------
+
+# The smooth transmission that frames share, and how far it is known.
+
+
+NORMAL = 1.645  #: standard deviations at the ends of an interval of 90 %
+
+
+@drawn
+def transmission(*, shading: Shading) -> Any:
+    """Draw the estimated transmission at each knot, and half the width of its 90 % interval."""
+    figure, axes = canvas(8.0, 4.0, 1, 2)
+    wide = NORMAL * shading.deviation
+    applied = (
+        "frame divided by it"
+        if bool(shading.identifiable)
+        else "not identifiable: frame left as it is"
+    )
+    fields = (
+        (shading.estimate.exp(), f"transmission, {applied}"),
+        (shading.estimate.exp() * wide.sinh(), "90 % interval, ±"),
+    )
+    for ax, (values, title) in zip(axes[0], fields, strict=True):
+        shown = picture(ax, values.cpu().numpy(), title, cmap="viridis")
+        bar = figure.colorbar(shown, ax=ax, fraction=0.046, pad=0.03)
+        bar.set_label("relative to the geometric mean", fontsize=9)
+        bar.ax.tick_params(labelsize=9)
+    return figure

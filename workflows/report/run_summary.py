@@ -1,0 +1,403 @@
+"""The summary of a run in sentences: what the mask buys and costs, what a frame tells."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neusee.nodes.values import Shading
+from neusee.workflows.graph.recipe_graph import Recipe
+from neusee.workflows.report.contents import RIVAL, TABLE, shade_of
+from neusee.workflows.report.figures.camera_pictures import BRIGHT, NORMAL, half_width, unexplained
+from neusee.workflows.report.result_numbers import Value, arms, lines_of, suppressed
+
+# --- mask story -----------------------------------------------------------------------------------
+
+# What a mask, filter or stop buys and costs in a run, in sentences with the numbers of the run, and
+# its rival.
+
+
+SENTENCES = ("buys", "irradiance", "costs", "rival", "frame")
+PLAIN, MASK, RESTORED = "plain lens", "with mask", "restored"
+_PEAK, _QUALITY, _LOST = "peak/I_sat", "PSNR (dB)", "saturated px"
+_EQUAL = 0.01  #: relative difference of two peaks below which the mask changes nothing
+_LEAST = 0.9  #: LSR above which there is nothing to replace
+_TIMES = 2.0  #: ratio of two peaks below which their difference is told in percent
+
+Arm = Mapping[str, float]
+_WHERE = {PLAIN: "behind the plain lens", MASK: "behind the mask"}  #: words of the two arms
+_PREFIXES = {-9: "n", -6: "u", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+
+
+def story(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, Any]:
+    """Return the sentences on what the mask of a run buys and costs, and their numbers; nothing
+    without a pair.
+    """
+    numbers = {name: _known(cells) for name, cells in arms(recipe, keys, value).items()}
+    lsr = suppressed(recipe, keys, value)
+    said = sentences(numbers, lsr, bool(lines_of(recipe, keys)), element(recipe))
+    judged = any(name.partition("[")[0] == "damage" for name in recipe.steps)
+    said |= irradiance(_laser_peaks(keys, value), judged) if said else {}
+    said |= {} if shade_of(recipe) or not said else rival(lsr, numbers)
+    return {
+        **said,
+        "numbers": {name: numbers[name] for name in numbers if said},
+        "lsr": lsr if said else {},
+    }
+
+
+def element(recipe: Recipe) -> str:
+    """Return what stands in the arm of the mask: a mask, a stop, a filter, several of these, or
+    a flat plate.
+    """
+    height, shade = recipe.steps.get("height"), recipe.steps.get(shade_of(recipe) or "")
+    parts = [] if height and height.node.path == "doe.flat" else ["mask"]
+    if shade:
+        kinds = {"smaller stop": "diameter", "grey filter": "transmittance"}
+        parts += [kind for kind, name in kinds.items() if shade.params.get(name, 1.0) < 1]
+        parts += ["notch filter"] * bool(shade.params.get("notches"))
+    return " and ".join(parts) or "flat plate"
+
+
+def sentences(
+    numbers: Mapping[str, Arm], lsr: Mapping[str, float], laser: bool, element: str = "mask"
+) -> dict[str, str]:
+    """Return the sentences ``buys`` and ``costs`` from the numbers of plain lens, mask and restored
+    picture.
+
+    ``lsr`` has the laser suppression ratio of the mask by wavelength of each laser. ``laser`` is
+    False if no laser shines. ``element`` is what stands in place of the mask, such as ``grey
+    filter``. A sentence whose numbers a run does not have for both the plain lens and the mask is
+    left out.
+    """
+    plain, mask = numbers.get(PLAIN, {}), numbers.get(MASK, {})
+    if not plain or not mask:
+        return {}
+    restored = numbers.get(RESTORED, {})
+    texts = _buys(plain, mask, lsr, laser, element), _costs(plain, mask, restored, laser, element)
+    return {name: text for name, text in zip(("buys", "costs"), texts, strict=True) if text}
+
+
+def irradiance(peaks: Mapping[str, float], judged: bool) -> dict[str, str]:
+    """Return the sentence ``irradiance``: the W/cm2 of the lasers in the brightest pixel, which no
+    multiple replaces.
+
+    ``peaks`` are in W/m2, by plain lens and mask. ``judged`` is True for a recipe that compares
+    them with thresholds.
+    """
+    shining = [
+        f"{_density(peaks[name])} {words}"
+        for name, words in _WHERE.items()
+        if peaks.get(name, 0.0) > 0
+    ]
+    if not shining:
+        return {}
+    damage = (
+        "the step `damage` compares them"
+        if judged
+        else "`damage: published` and `neusee safety` compare them"
+    )
+    text = (
+        f"The lasers have {' and '.join(shining)} there: {damage} with the thresholds that are"
+        " known"
+    )
+    return {"irradiance": f"{text}, and a multiple of saturation is not a measure of damage."}
+
+
+def _laser_peaks(keys: Mapping[str, str], value: Value) -> dict[str, float]:
+    """Return the W/m2 of all lasers in the brightest pixel behind the plain lens and behind the
+    mask.
+    """
+    steps = {name: TABLE[name][_PEAK] for name in (PLAIN, MASK)}
+    peaks = {name: value(step) for name, step in steps.items() if step in keys}
+    return {name: float(peak.laser) for name, peak in peaks.items() if hasattr(peak, "laser")}
+
+
+def _density(value: float) -> str:
+    """Return an irradiance in W/m2 as text in W/cm2 with a prefix."""
+    power = min(max(3 * math.floor(math.log10(value * 1e-4) / 3), -9), 9)
+    return f"{value * 1e-4 / 10.0**power:.3g} {_PREFIXES[power]}W/cm2"
+
+
+def rival(lsr: Mapping[str, float], numbers: Mapping[str, Arm]) -> dict[str, str]:
+    """Return the sentence ``rival``: the grey filter that weakens each laser at least as much, if
+    the mask does at all.
+
+    The picture behind this filter has its numbers if the run computed them, and else the command
+    that computes them.
+    """
+    share = max(lsr.values(), default=1.0)
+    if share >= _LEAST:
+        return {}
+    text = f"A grey filter that passes {share:.3g} of the light weakens the laser as much: "
+    command = f"doe=grey_filter doe.transmittance={share:.3g}"
+    grey_filter, restored = numbers.get(RIVAL, {}), numbers.get(RESTORED, {})
+    if _QUALITY not in grey_filter:
+        return {"rival": f"{text}for its picture, restored alike, run this recipe with {command}."}
+    against = (
+        f" against {restored[_QUALITY]:.1f} dB behind the mask" if _QUALITY in restored else ""
+    )
+    picture = (
+        "its picture, restored by a Wiener filter, has a PSNR of"
+        f" {grey_filter[_QUALITY]:.1f} dB{against}"
+    )
+    count = (
+        "no pixel saturates"
+        if not grey_filter.get(_LOST)
+        else f"{grey_filter[_LOST]:,.0f} pixels saturate"
+    )
+    return {"rival": f"{text}{picture}{f'; {count}' if _LOST in grey_filter else ''} ({command})."}
+
+
+def _known(cells: Arm) -> dict[str, float]:
+    return {name: number for name, number in cells.items() if not math.isnan(number)}
+
+
+def _buys(plain: Arm, mask: Arm, lsr: Mapping[str, float], laser: bool, element: str) -> str:
+    """Return a sentence with the irradiance of the brightest pixel without and with the mask,
+    and the LSR.
+    """
+    if not (plain.get(_PEAK, 0.0) > 0 and mask.get(_PEAK, 0.0) > 0):
+        return _suppression(lsr, element)
+    less = plain[_PEAK] / mask[_PEAK]
+    ends = f"{_number(mask[_PEAK])} in place of {_number(plain[_PEAK])} times saturation"
+    if abs(less - 1) < _EQUAL:
+        change = f"the brightest pixel receives as much light as behind the plain lens ({ends}"
+    else:
+        word, ratio = ("less", less) if less > 1 else ("more", 1 / less)
+        much = f"{_number(ratio)} times" if ratio >= _TIMES else f"{100 * abs(1 / less - 1):.0f} %"
+        change = (
+            f"the brightest pixel receives {much} {word} light than behind the plain lens ({ends}"
+        )
+    if not laser:
+        return f"No laser shines here, whose peak the {element} could lower: {change})."
+    return f"{_lowered(less, element)}: {change}{'; ' * bool(lsr)}{_ratios(lsr)})."
+
+
+def _lowered(less: float, element: str) -> str:
+    """Return whether a mask lowers the peak on the sensor, for the peak of the plain lens over
+    that of the mask.
+    """
+    several = _several(element)
+    if abs(less - 1) < _EQUAL:
+        return f"The {element} {'do' if several else 'does'} not change the peak on the sensor"
+    if less < 1:
+        return f"The {element} {'raise' if several else 'raises'} the peak on the sensor"
+    little = "" if less >= _TIMES else " a little"
+    return f"The {element} {'lower' if several else 'lowers'} the peak on the sensor{little}"
+
+
+def _suppression(lsr: Mapping[str, float], element: str) -> str:
+    """Return a sentence with the LSR of the mask alone, for a run that does not compute the
+    irradiance.
+    """
+    if not lsr:
+        return ""
+    bought = "a weaker laser" if max(lsr.values()) < 1 - _EQUAL else "no weaker laser here"
+    verb = "buy" if _several(element) else "buys"
+    return f"The {element} {verb} {bought}: {_ratios(lsr)} of the peak behind the clear lens."
+
+
+def _ratios(lsr: Mapping[str, float]) -> str:
+    """Return the laser suppression ratio of a laser, or the least and the largest of several
+    lasers, as text.
+    """
+    if not lsr:
+        return ""
+    ends = sorted(lsr, key=lsr.__getitem__)
+    first, last = (f"{lsr[name]:.3g} at {name}" for name in (ends[0], ends[-1]))
+    return f"LSR {first}" if len(lsr) == 1 else f"LSR from {first} to {last}"
+
+
+def _costs(plain: Arm, mask: Arm, restored: Arm, laser: bool, element: str) -> str:
+    """Return a sentence with the picture quality and the saturated pixels without and with the
+    mask.
+    """
+    texts = _picture(plain, mask, restored, element), _saturation(plain, mask, laser, element)
+    parts = [sentence for sentence in texts if sentence]
+    return f"{'; '.join(parts)}." if parts else ""
+
+
+def _picture(plain: Arm, mask: Arm, restored: Arm, element: str) -> str:
+    if _QUALITY not in plain or _QUALITY not in mask:
+        return ""
+    before, behind, after = (arm.get(_QUALITY, -math.inf) for arm in (plain, mask, restored))
+    end = f", and {after:.1f} dB after restoration" if _QUALITY in restored else ""
+    text = (
+        f"PSNR {before:.1f} dB with the plain lens{',' if end else ' and'} {behind:.1f} dB with the"
+        f" {element}{end}"
+    )
+    verb = "cost" if _several(element) else "costs"
+    if behind >= before:
+        return f"The {element} {verb} no picture quality here: {text}"
+    return (
+        f"The {element} {verb} picture"
+        f" quality{', which restoration wins back' if after >= before else ''}: {text}"
+    )
+
+
+def _saturation(plain: Arm, mask: Arm, laser: bool, element: str) -> str:
+    """Return how many pixels saturate with the mask and with the plain lens, and that a laser
+    dazzles more of them.
+    """
+    if _LOST not in plain or _LOST not in mask:
+        return ""
+    with_mask, without = (f"{arm[_LOST]:,.0f}" for arm in (mask, plain))
+    if with_mask == without == "0":
+        return "no pixel saturates"
+    same = f"{with_mask} pixels saturate with and without the {element}"
+    text = (
+        same
+        if with_mask == without
+        else f"{with_mask} pixels saturate with the {element}, {without} without"
+    )
+    wider = mask[_LOST] / plain[_LOST] if laser and plain[_LOST] > 0 else 0.0
+    verb = "enlarge" if _several(element) else "enlarges"
+    return (
+        f"{text}: the {element} {verb} the dazzled area {_number(wider)} times"
+        if wider > 1 + _EQUAL
+        else text
+    )
+
+
+def _several(element: str) -> bool:
+    """Return True for a mask with a filter or stop, which takes a verb in the plural."""
+    return " and " in element
+
+
+def _number(value: float) -> str:
+    """Return a positive number as text with three digits or, from 1000 on, as a whole number
+    with commas.
+    """
+    return f"{value:.3g}" if value < 999.5 else f"{value:,.0f}"
+
+
+# --- frame story ----------------------------------------------------------------------------------
+
+# What is known of a restored frame, in sentences with the numbers of the run: invented pixels, and
+# the interval.
+
+
+_NEEDS = ("restored", "restored_spread", "raw[mask]", "clipped[mask]")
+_FRAME = "sensor.frame"
+_WIENER = ("restore.wiener", "restore.wiener_by_field")  #: filters of which the interval is
+_MEASURED = "restore.spread_by_field"
+_SHADING = "shading"
+
+
+def said_of_frame(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, str]:
+    """Return what is known of a restored frame as the paragraph ``frame``; nothing for a run
+    without a frame.
+    """
+    if not keys.keys() >= set(_NEEDS) or recipe.steps["raw[mask]"].node.path != _FRAME:
+        return {}
+    restored, spread, _, clipped = (value(step) for step in _NEEDS)
+    if restored.shape != spread.shape:
+        return {}
+    invented = clipped.any(0)
+    half = half_width(spread, recipe.steps["restored_spread"].params["draws"])
+    name = recipe.steps["raw[mask]"].params["file"].name
+    parts = [
+        _invented(name, invented),
+        _interval(half, invented),
+        _doubtful(restored, half, invented),
+    ]
+    if _SHADING in recipe.steps and _SHADING in keys:
+        parts.append(_shading(value(_SHADING)))
+    parts.append(_limits(recipe))
+    return {"frame": " ".join(sentence for sentence in parts if sentence)}
+
+
+def _invented(name: str, invented: Tensor) -> str:
+    count, share = int(invented.sum()), float(invented.double().mean())
+    if not count:
+        return (
+            f"No pixel of {name} is saturated, so that nothing in the restored picture is invented."
+        )
+    are = "pixel is" if count == 1 else "pixels are"
+    return (
+        f"In {name} {count:,} {are} saturated in at least one channel, {share:.2%} of the picture:"
+        " what stands there is invented from the surroundings and the prior of the filter (orange"
+        " in the figure, white in data/invented.png)."
+    )
+
+
+def _interval(half: Tensor, invented: Tensor) -> str:
+    if bool(invented.all()):
+        return ""
+    widths = half.mean(0)[~invented].flatten()
+    widths = widths[:: max(1, len(widths) // 1_000_000)].double()
+    middle, upper = (float(torch.quantile(widths, q)) for q in (0.5, 0.95))
+    return (
+        f"Elsewhere a restored pixel is known to ±{middle:.2g} of white in half of the pixels and"
+        f" to ±{upper:.2g} in 95 % of them, with a probability of 90 % under the model of the"
+        " interval."
+    )
+
+
+def _doubtful(restored: Tensor, half: Tensor, invented: Tensor) -> str:
+    """Return a sentence on the pixels that no scene can explain, if there are more than chance
+    makes.
+    """
+    wrong = unexplained(restored, half, invented)
+    count = int(wrong.sum())
+    if float(wrong.double().mean()) < 1e-3 and count < 20:
+        return ""
+    return (
+        f"{count:,} other pixels are restored darker than black or brighter than {BRIGHT:g} times"
+        " white, by more than this interval (red in the figure): no scene explains them, and the"
+        " model does not hold there. Either light of a laser or a lamp was taken for scene, or"
+        " white is set too low (frame.white). Do not trust them or their surroundings;"
+        " restore=search finds lasers and removes them."
+    )
+
+
+def _shading(shading: Shading) -> str:
+    """Return what the frames tell of dirt, as a smooth transmission."""
+    count = int(shading.frames)
+    frames = "one frame tells" if count == 1 else f"{count} frames tell"
+    evidence = f"{frames} {float(shading.told):.0%} of the variance of the shading"
+    width = f"±{NORMAL * float(shading.deviation.median()):.2g}"
+    if not bool(shading.identifiable):
+        return (
+            f"Dirt is not identifiable: {evidence}, and the probability that there is none is"
+            f" {float(shading.clean):.0%}. At least 8 different scenes, half of the variance and at"
+            " most 5% are needed. The frame is left as it is. The logarithm of a transmission"
+            f" stays unknown to {width} in half of the field; the interval of the picture includes"
+            " this."
+        )
+    low, high = (float(end) for end in shading.transmission.aminmax())
+    return (
+        f"The frame was divided by a transmission of {low:.2f} to {high:.2f} relative to its"
+        f" geometric mean, whose logarithm is known to {width} in half of the field: {evidence}."
+        " What all scenes have in common cannot be told from dirt, nor a constant factor. Light"
+        " that dirt scatters into the picture is not removed."
+    )
+
+
+def _limits(recipe: Recipe) -> str:
+    step = recipe.steps.get("deconvolved")
+    own = (
+        step is not None
+        and step.node.path in _WIENER
+        and "deconvolved" in recipe.steps["restored"].sources
+    )
+    whose = (
+        ""
+        if own
+        else (
+            "The interval is that of a Wiener filter, not of the method that restored this"
+            " picture. "
+        )
+    )
+    measured = recipe.steps["restored_spread"].node.path == _MEASURED
+    blur = "blur, the error of the measured PSF" if measured else "blur"
+    return (
+        f"{whose}The interval includes noise, {blur} and saturation. It does not include lasers"
+        " that the filter is not told of, errors of the camera's description, and colours that no"
+        " three channels tell apart."
+    )

@@ -1,0 +1,720 @@
+"""The spot of a laser behind lens and mask over the distance: its core, veil and peak."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from neusee.nodes.flare import surface_of, veil_at
+from neusee.nodes.laser import (
+    BrightPixels,
+    beam_radius,
+    curvature_radius,
+    hidden_light,
+    summit_gain,
+    unseen_light,
+    with_frame,
+)
+from neusee.nodes.values import Psf
+from neusee.workflows.engine.execution import RunSeries
+from neusee.workflows.engine.runner import Result, run
+from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
+from neusee.workflows.graph.recipe_graph import Recipe, Step, needed
+from neusee.workflows.graph.run_error import RunError
+from neusee.workflows.recipe.blocks.safety_block import Safety, Scatter
+from neusee.workflows.recipe.distributions.shapes import FloatArray
+from neusee.workflows.safety.damage_pattern import step_of
+from neusee.workflows.safety.exposures import (
+    SettingDraws,
+    far_distance,
+    fill_at,
+    interpolated,
+    miss_between,
+)
+from neusee.workflows.store.remote_store import open_store
+from neusee.workflows.store.result_store import Store
+
+# --- light levels ---------------------------------------------------------------------------------
+
+# Light of the faintest of a number of pixels, over the distance: core and veil of the spot, ranked
+# on the sensor.
+#
+# A level is the share of the light that passes the lens, in the faintest of the N brightest pixels.
+# It is computed at the rungs of a ladder of distances, for some defoci and spots around the nominal
+# ones and some shares of scatter, and interpolated between these in logarithms.
+
+
+#: factor of one standard deviation of a share of scatter that the recipe does not state
+ASSUMED = 1.5
+_CERTAIN = 0.02  #: largest range of a logarithm that is taken as one value
+_ROUNDED = 1e-9  #: rounding of the logarithm of a distance
+_STREAM = 9_001  #: of the random numbers of the assumed share
+#: levels at which pixels with light from elsewhere are counted, of groups and between them
+_STEPS = 600
+_FAINTEST = 1e-12  #: of the brightest level, below which no level stands between those of groups
+#: share of the core in the light of a pixel beyond the window from which the radial law decides it
+_OWN_RIM = 0.1
+
+
+@dataclass(frozen=True)
+class Veil:
+    """The light that the lens scatters: its share, with draws, and its law."""
+
+    share: FloatArray  #: (1 + draw or 1,) of the light that passes the lens
+    assumed: bool  #: whether the recipe states none
+    #: of the distance in pixels, in a pixel, for the nominal share
+    light: Callable[[FloatArray], FloatArray]
+
+
+def veil_of(safety: Safety, draws: SettingDraws) -> Veil | None:
+    """Return the veil of the lens, or None for a lens that scatters nothing."""
+    lens, pitch = safety.settings.lens, safety.settings.sensor.pixel_pitch
+    scatter = lens.scatter
+    if scatter is None:
+        return None
+    assumed_surface = {"lens": surface_of(scatter.share, scatter.l, scatter.s)}
+    surfaces: Mapping[str, Mapping[str, Any]] = scatter.surfaces or assumed_surface
+    camera = {"focal_length": lens.focal_length, "pixel_pitch": pitch, "diameter": lens.diameter}
+
+    computed: dict[bytes, FloatArray] = {}
+
+    def light(radius: FloatArray) -> FloatArray:
+        key = hashlib.sha1(radius.tobytes()).digest()
+        if key not in computed:
+            computed[key] = veil_at(torch.from_numpy(radius), surfaces=surfaces, **camera)[
+                0
+            ].numpy()
+        return computed[key]
+
+    total = float(veil_at(torch.zeros(1, dtype=torch.float64), surfaces=surfaces, **camera)[1])
+    share, assumed = _share(safety, draws, scatter, total)
+    return Veil(share, assumed, light)
+
+
+def _share(
+    safety: Safety, draws: SettingDraws, scatter: Scatter, total: float
+) -> tuple[FloatArray, bool]:
+    """Return the share of the light that is scattered, with draws, and whether it is assumed."""
+    if scatter.surfaces is not None:
+        return np.array([total]), False
+    if "lens.scatter.share" in safety.values:
+        stated = draws.column("lens.scatter.share", scatter.share)
+        return (stated if np.ptp(stated) else stated[:1]), False
+    factor = np.power(ASSUMED, draws.normal(_STREAM))
+    return np.minimum(scatter.share * np.concatenate([[1.0], factor]), 0.99), True
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Points at which levels are computed along one quantity, in its own scale."""
+
+    points: FloatArray
+
+    @classmethod
+    def around(cls, values: FloatArray, per_unit: float) -> Grid:
+        """Return a grid that holds values: one point if they are alike, else ``per_unit`` points
+        a unit, at least 3.
+        """
+        low, high = float(values.min()), float(values.max())
+        if high - low < _CERTAIN:
+            return cls(values.ravel()[:1].astype(np.float64))
+        return cls(np.linspace(low, high, max(3, 1 + int(np.ceil((high - low) * per_unit)))))
+
+    @classmethod
+    def through_zero(cls, values: FloatArray, per_unit: float) -> Grid:
+        """Return such a grid with a point at 0, so that values of 0 are not interpolated."""
+        points = cls.around(np.append(values, 0.0), per_unit).points
+        if len(points) == 1:
+            return cls(np.zeros(1))
+        step = points[1] - points[0]
+        ends = math.floor(points[0] / step + _ROUNDED), math.ceil(points[-1] / step - _ROUNDED)
+        return cls(np.arange(ends[0], ends[1] + 1) * step)
+
+    def weights(self, values: FloatArray) -> list[FloatArray]:
+        """Return the weight of each point in the linear interpolation at values."""
+        if len(self.points) == 1:
+            return [np.ones((1,) * values.ndim)]
+        step = self.points[1] - self.points[0]
+        place = np.clip((values - self.points[0]) / step, 0, len(self.points) - 1)
+        return [np.clip(1 - np.abs(place - i), 0, 1) for i in range(len(self.points))]
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Logarithms of levels at the rungs of a ladder and at points of grids, for several numbers
+    of pixels.
+    """
+
+    rungs: FloatArray  #: (rung,) logarithm of the distance
+    grids: tuple[Grid, ...]
+    values: FloatArray  #: (rung, point of each grid ..., rank)
+    #: of the same shape: share of the pixels whose light is that of the radial law
+    beyond: FloatArray
+    misses: tuple[float, ...] = ()  #: of a logarithm between two rungs, counted upward
+    #: (rank,) logarithm of a bound, which counts nearer than the first rung
+    most: FloatArray | None = None
+
+    def at(self, place: FloatArray, others: Sequence[FloatArray], ranks: slice) -> FloatArray:
+        """Return the logarithms of levels (..., rank); ``place`` is the logarithm of the
+        distance.
+        """
+        weights = [grid.weights(values) for grid, values in zip(self.grids, others, strict=True)]
+        size = np.broadcast_shapes(
+            place.shape, *(weight.shape for weight in itertools.chain(*weights))
+        )
+        clipped = np.broadcast_to(np.clip(place, self.rungs[0], self.rungs[-1]), size)
+        total = np.zeros((*size, len(range(*ranks.indices(self.values.shape[-1])))))
+        for point in itertools.product(*(range(len(grid.points)) for grid in self.grids)):
+            weight = functools.reduce(
+                np.multiply,
+                (grid_weights[index] for grid_weights, index in zip(weights, point, strict=True)),
+            )
+            weight = np.broadcast_to(weight, size)
+            # a draw lies between two points of a grid, and needs no others
+            rows = np.flatnonzero(weight.any(axis=1))
+            cell: Any = (slice(None), *point, ranks)
+            total[rows] += weight[rows, :, None] * interpolated(
+                self.rungs, self.values[cell], clipped[rows]
+            )
+        total += miss_between(self.rungs, self.misses, clipped)[..., None]
+        if self.most is None:
+            return total
+        return np.where(place[..., None] < self.rungs[0] - _ROUNDED, self.most[ranks], total)
+
+
+@dataclass(frozen=True)
+class Counted:
+    """Falling levels of light, and how many pixels have at least each of them."""
+
+    light: FloatArray  #: (level,)
+    count: FloatArray  #: of the pixels that have at least this light
+    alike: FloatArray  #: of those among them that have just this light
+    decided: FloatArray  #: of those whose light is that of the radial law
+
+
+def levels_of(
+    groups: BrightPixels,
+    shape: tuple[int, int],
+    ranks: FloatArray,
+    veil: Veil | None,
+    shares: FloatArray,
+    smooth: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the logarithms of the levels (share, rank) of groups of pixels.
+
+    The second array is the share of the counted pixels that lie beyond the window of a PSF, and
+    whose light the radial law of `with_frame` decides. ``shares`` are those of the scattered light;
+    without a veil there is one row.
+    """
+    framed = with_frame(groups, shape)
+    radius, pixels = framed.radius.numpy(), framed.pixels.numpy()
+    core = (framed.smooth if smooth else framed.light).numpy()
+    scattered = veil.light(radius) / veil.share[0] if veil else np.zeros_like(core)
+    added = np.arange(len(core)) >= len(groups.radius)
+    hidden = hidden_light(groups) if added.any() else 0.0
+    levels, beyond = [], []
+    for share in shares if veil else (0.0,):
+        light = (1 - share) * core + share * scattered
+        if hidden:
+            counted = _with_hidden(light, pixels, added, (1 - share) * hidden)
+        else:
+            counted = _as_they_are(light, pixels, added & ((1 - share) * core > _OWN_RIM * light))
+        levels.append(_at_ranks(ranks, counted))
+        beyond.append(np.interp(ranks, counted.count, counted.decided / counted.count))
+    return np.stack(levels), np.stack(beyond)
+
+
+def _as_they_are(light: FloatArray, pixels: FloatArray, guessed: NDArray[np.bool_]) -> Counted:
+    """Return the counts at the levels of groups of pixels; ``guessed`` marks those of the radial
+    law.
+    """
+    order = np.argsort(-light)
+    return Counted(
+        light=light[order],
+        count=np.maximum(np.cumsum(pixels[order]), 1e-9),
+        alike=pixels[order],
+        decided=np.cumsum(np.where(guessed, pixels, 0.0)[order]),
+    )
+
+
+def _with_hidden(
+    light: FloatArray, pixels: FloatArray, added: NDArray[np.bool_], hidden: float
+) -> Counted:
+    """Return the largest counts when light from elsewhere falls on the pixels that are ``added``
+    to the window.
+    """
+    levels = _steps(np.sort(light)[::-1])
+    own = np.argsort(-light[~added])
+    rising, total = -light[~added][own], np.append(0.0, np.cumsum(pixels[~added][own]))
+    inside = total[np.searchsorted(rising, -levels, side="right")]
+    brighter = total[np.searchsorted(rising, -levels, side="left")]
+    lit = _lit_at_most(light[added], pixels[added], hidden, levels)
+    return Counted(levels, np.maximum(inside + lit, 1e-9), inside - brighter, lit)
+
+
+def _steps(levels: FloatArray) -> FloatArray:
+    """Return falling levels: some of the given ones, and others at equal ratios, for gaps
+    between these.
+    """
+    picked = levels[np.unique(np.linspace(0, len(levels) - 1, _STEPS).astype(int))]
+    top = max(float(levels[0]), 1e-280)
+    between = np.geomspace(max(float(levels[-1]), _FAINTEST * top), top, _STEPS)
+    rising: FloatArray = np.unique(np.concatenate([picked, between]))
+    return rising[::-1]
+
+
+def _at_ranks(ranks: FloatArray, counted: Counted) -> FloatArray:
+    """Return the logarithms of the light at ranks, from the count up to the end of each group; a
+    group is as bright.
+    """
+    first = np.minimum(counted.count - counted.alike + 1, counted.count)
+    place = np.maximum.accumulate(np.stack([first, counted.count], 1).ravel())
+    logarithms: FloatArray = np.interp(
+        np.log(ranks), np.log(place), np.repeat(np.log(counted.light + 1e-300), 2)
+    )
+    return logarithms
+
+
+def _lit_at_most(
+    light: FloatArray, pixels: FloatArray, hidden: float, levels: FloatArray
+) -> FloatArray:
+    """Return how many pixels have at least each level, at most, when light from elsewhere is added
+    to their own.
+
+    It is dealt out where least of it is needed: to the brightest pixels first.
+    """
+    order = np.argsort(-light)
+    own, width = light[order], pixels[order]
+    number = np.append(0.0, np.cumsum(width))
+    needed = np.cumsum(np.maximum(levels[:, None] - own, 0.0) * width, 1)
+    return np.array([np.interp(hidden, np.append(0.0, row), number) for row in needed])
+
+
+# --- spots along ----------------------------------------------------------------------------------
+
+# The spot of a laser behind lens and mask at several distances, from the steps of the recipe.
+#
+# The steps of a spot are run again with another distance in the step of the wavefront: taper and
+# curvature of the beam at that distance, through lens and mask. Results are kept in the store, by
+# their distance.
+
+
+_RANKS = "laser.bright_pixels"
+_FACTOR = 6.0  #: of the distance from one spot to the next at first
+_CLOSE = 0.02  #: error of the interpolation of a peak or a level at which no spot is added
+_MOST_PEAKS = 25  #: peaks behind a mask
+_CLOSE_PEAKS = 0.005  #: error of a peak at which none is added
+_WIDENINGS = 2  #: doublings of the window of a spot that lacks light
+_MOST = 17  #: spots behind one arm
+_FINEST = 1.3  #: factor of the distance between two spots, at least
+_DEFOCUS = 550e-9  #: m; the wavelength in which waves of defocus are counted
+#: largest phase step of the wavefront between two samples of the pupil, in turns; the mask adds its
+#: own
+_TURN = 0.25
+_DIM = 3.0  #: half-widths at 1/e2 of the irradiance beyond which the beam in the pupil is dark
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """The pixels of the sensor behind lens or mask at several distances, in shares of the light
+    through the lens.
+    """
+
+    arm: str  #: ``plain`` or ``mask``
+    distances: tuple[float, ...]  #: m, rising
+    groups: tuple[BrightPixels, ...]  #: at each distance
+    error: float  #: largest error of a level by interpolation between the distances
+    #: of the logarithm of a level, by gap between two distances, counted upward
+    misses: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Peaks:
+    """The peak behind the mask, over that of the clear lens in focus with the same beam, at
+    several distances.
+    """
+
+    here: float  #: at the distance of the recipe, over the peak of the clear lens without taper
+    along: tuple[tuple[float, float], ...]  #: distance in m, and ratio
+    error: float  #: largest error of the ratio by interpolation
+    #: of the logarithm of the ratio, by gap between two distances, counted upward
+    misses: tuple[float, ...] = ()
+    #: distance in m, and share of the light that counts as the peak
+    outside: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class _Runs:
+    """Runs of the steps of a recipe at one distance after the other, which read the code of the
+    steps once.
+    """
+
+    recipe: Recipe
+    safety: Safety
+    store: Store
+    series: RunSeries
+
+    @classmethod
+    def begun(cls, recipe: Recipe, safety: Safety, store: Store | None) -> _Runs:
+        """Return a series without a run."""
+        opened = store or open_store()
+        return cls(recipe, safety, opened, RunSeries.begun(opened))
+
+    def of(self, recipe: Recipe, outputs: Sequence[str]) -> Result:
+        """Return the result of steps of a recipe that differs from that of the series in its
+        parameters.
+        """
+        return run(recipe, self.store, outputs, series=self.series)
+
+
+def ranked_of(recipe: Recipe, safety: Safety, store: Store | None) -> tuple[Ranked, ...]:
+    """Return the pixels of the steps that the settings name; raise `RecipeError` for a step of
+    another kind.
+    """
+    protection = safety.settings.protection
+    named = {
+        arm: step
+        for arm, step in protection.pixels
+        if step is not None and (arm, protection.mask) != ("mask", None)
+    }
+    if safety.settings.dazzle is None or not named:
+        return ()
+    steps = {arm: _step(recipe, safety, arm, step) for arm, step in named.items()}
+    runs = _Runs.begun(recipe, safety, store)
+    return tuple(_ranked(runs, arm, step) for arm, step in steps.items())
+
+
+def peaks_of(recipe: Recipe, safety: Safety, store: Store | None) -> Peaks | None:
+    """Return the peak behind the mask over the distance, or None without a mask."""
+    if safety.settings.protection.mask is None:
+        return None
+    step, runs = _mask_step(recipe, safety), _Runs.begun(recipe, safety, store)
+    plain = step.replace("[mask,", "[plain,")
+    reference = plain if plain != step and plain in recipe.steps else None
+    here = _peak(runs, recipe, step, safety.laser.distance)
+    clear = _peak(runs, recipe, reference, safety.laser.distance).inside if reference else 1.0
+    if _wavefront_of(recipe, step) is None:  # the spot of a plane wave, which a distant laser has
+        far = far_distance(safety.laser.beam(), safety.settings.lens.diameter)
+        bounded = ((safety.laser.distance, here.unseen),) if here.most > here.inside else ()
+        return Peaks(here.most / clear, ((far, here.most / clear),), 0.0, outside=bounded)
+    outside: dict[float, float] = {}
+
+    def log_ratio(distance: float) -> FloatArray:
+        peak = _peak(runs, at_distance(recipe, safety, step, distance), step, distance)
+        if peak.most > peak.inside:
+            outside[distance] = peak.unseen
+        return np.array([math.log(peak.most / peak.focused)])
+
+    spots = _refined(_first(safety, recipe, step), log_ratio, _MOST_PEAKS, _CLOSE_PEAKS)
+    ratios = (math.exp(float(value[0])) for value in spots.values)
+    along = tuple(zip(spots.distances, ratios, strict=True))
+    counted = tuple(sorted(outside.items()))
+    return Peaks(here.most / clear, along, max(spots.misses, default=0.0), spots.misses, counted)
+
+
+@dataclass(frozen=True)
+class _Peak:
+    """The peak of a spot over that of the clear lens without taper, and what may be brighter
+    outside its window.
+    """
+
+    inside: float  #: the window
+    unseen: float  #: share of the light of the beam that may be in one spot outside
+    focused: float  #: peak of the clear lens in focus with the same beam
+
+    @property
+    def most(self) -> float:
+        """Return the highest peak that there may be: unseen light in as sharp a spot as that of
+        the clear lens.
+        """
+        return max(self.inside, self.unseen * self.focused)
+
+
+def _peak(runs: _Runs, recipe: Recipe, step: str, distance: float) -> _Peak:
+    """Return the largest value of a step; of `metrics.lsr` that of the spot between its samples.
+
+    A window that lacks light which may hold a higher peak is doubled, as far as the samples of the
+    pupil carry it.
+    """
+    has_taper = _wavefront_of(recipe, step) is not None
+    beam, diameter = runs.safety.laser.beam(), runs.safety.settings.lens.diameter
+    fill = fill_at(beam, diameter, distance) if has_taper else 0.0
+    psf = _psf_of(recipe, step)
+    if psf is None:
+        return _Peak(float(runs.of(recipe, [step])[step].max()), 0.0, _focused(fill))
+    peak = _peak_of(runs.of(recipe, [psf])[psf], fill)
+    window = next(
+        (source.name for source in _upstream(recipe, psf) if source.node.path == "optics.psf"), None
+    )
+    for _ in range(_WIDENINGS):
+        if window is None or peak.most <= peak.inside:
+            break
+        shape = tuple(2 * size for size in recipe.steps[window].params["shape"])
+        recipe = _with_param(recipe, window, "shape", shape)
+        try:
+            peak = _peak_of(runs.of(recipe, [psf])[psf], fill)
+        except RunError:  # beyond the window that the samples of the pupil carry
+            break
+    return peak
+
+
+def _peak_of(psf: Psf, fill: float) -> _Peak:
+    """Return the peak of a PSF of a beam that fills the lens to (D / (2 w))^2."""
+    passing = _passing(fill)
+    bands = list(zip(psf.intensity, psf.clear_peak.tolist(), strict=True))
+    inside = max(float(band.max() * summit_gain(band)) / clear for band, clear in bands)
+    return _Peak(
+        inside, max(float(unseen_light(band, passing)) for band, _ in bands), _focused(fill)
+    )
+
+
+def _mask_step(recipe: Recipe, safety: Safety) -> str:
+    """Return the name of the step of the peak behind the mask."""
+    named = safety.settings.protection.mask
+    assert named is not None
+    return step_of(recipe, safety, "protection.mask", named, "mask")
+
+
+def _psf_of(recipe: Recipe, step: str) -> str | None:
+    """Return the name of the PSF whose peak a step of `metrics.lsr` is; None for a step of
+    another node.
+    """
+    return (
+        str(recipe.steps[step].wires["psf"])
+        if recipe.steps[step].node.path == "metrics.lsr"
+        else None
+    )
+
+
+def _passing(fill: float) -> float:
+    """Return the light of a Gaussian beam through the lens over that of an even one with the
+    irradiance of its axis.
+    """
+    return 1.0 if fill < 1e-9 else -math.expm1(-2 * fill) / (2 * fill)
+
+
+def _focused(fill: float) -> float:
+    """Return the peak of a Gaussian beam in focus over that of an even one with the irradiance
+    of its axis.
+    """
+    return 1.0 if fill < 1e-9 else (-math.expm1(-fill) / fill) ** 2
+
+
+def _ranked(runs: _Runs, arm: str, step: str) -> Ranked:
+    """Return the pixels behind one arm at the distances between which they change."""
+    recipe, safety = runs.recipe, runs.safety
+    beam, lens = safety.laser.beam(), safety.settings.lens
+    veil = _nominal_veil(safety)
+    groups: dict[float, BrightPixels] = {}
+    beside = _psf_beside(recipe, safety, arm, step)
+
+    def level(distance: float) -> FloatArray:
+        pixels = BrightPixels(
+            *runs.of(at_distance(recipe, safety, step, distance), [step, *beside])[step]
+        )
+        passing = _passing(fill_at(beam, lens.diameter, distance))
+        groups[distance] = pixels._replace(
+            light=pixels.light / passing,
+            smooth=pixels.smooth / passing,
+            rim=pixels.rim * pixels.rim.new_tensor([1.0, 1 / passing, 1 / passing]),
+        )
+        return _log_level(groups[distance], safety, veil)
+
+    if _wavefront_of(recipe, step) is None:
+        level(safety.laser.distance)
+        return Ranked(arm, (safety.laser.distance,), (groups[safety.laser.distance],), math.inf)
+    spots = _refined(_first(safety, recipe, step), level, _MOST)
+    error = max(spots.misses, default=0.0)
+    return Ranked(
+        arm,
+        spots.distances,
+        tuple(groups[distance] for distance in spots.distances),
+        error,
+        spots.misses,
+    )
+
+
+def _psf_beside(recipe: Recipe, safety: Safety, arm: str, step: str) -> list[str]:
+    """Return the PSF of the peak behind the mask, if it needs the pupil of a step of pixels,
+    which one run shares.
+    """
+    if arm != "mask" or safety.settings.protection.mask is None:
+        return []
+    psf = _psf_of(recipe, _mask_step(recipe, safety))
+    shares = (
+        psf is not None and _wavefront_of(recipe, psf) == _wavefront_of(recipe, step) is not None
+    )
+    return [psf] if psf is not None and shares else []
+
+
+def _nominal_veil(safety: Safety) -> Veil | None:
+    """Return the veil of the lens without draws."""
+    return veil_of(safety, SettingDraws(0, {}, {}, 0))
+
+
+def _log_level(groups: BrightPixels, safety: Safety, veil: Veil | None) -> FloatArray:
+    """Return the logarithm of the level of the asked number of pixels, with the nominal veil."""
+    dazzle, shape = safety.settings.dazzle, safety.settings.sensor.shape
+    asked = (dazzle.share if dazzle else 1.0) * shape[0] * shape[1]
+    shares = veil.share[:1] if veil else np.zeros(1)
+    levels, _ = levels_of(groups, shape, np.array([max(asked, 1.0)]), veil, shares, False)
+    nominal: FloatArray = levels[0]
+    return nominal
+
+
+def _first(safety: Safety, recipe: Recipe, step: str) -> list[float]:
+    """Return the first distances of spots: from the nearest one that the samples of the pupil
+    carry to a far one.
+    """
+    beam, lens = safety.laser.beam(), safety.settings.lens
+    far = far_distance(beam, lens.diameter)
+    near = min(max(safety.settings.distances[0], _carried(safety, recipe, step)), far)
+    if far / near < _FINEST:
+        return [near, far] if near < far else [far]
+    count = max(3, 1 + math.ceil(math.log(far / near) / math.log(_FACTOR)))
+    return [float(distance) for distance in np.geomspace(near, far, count)]
+
+
+def _carried(safety: Safety, recipe: Recipe, step: str) -> float:
+    """Return the shortest distance in m at which the samples of the pupil carry the curvature of
+    the beam.
+    """
+    pupil = _pupils(recipe, step)[0]
+    stop = recipe.steps[str(pupil.wires["stop"])].params
+    pitch = safety.settings.lens.diameter / float(stop["samples"])
+    beam, rim = safety.laser.beam(), safety.settings.lens.diameter / 2
+    for distance in np.geomspace(*safety.settings.distances, 400):
+        lit = min(rim, _DIM * beam_radius(beam, distance))
+        if lit * pitch / curvature_radius(beam, distance) <= _TURN * beam.wavelength:
+            return float(distance)
+    return safety.settings.distances[1]
+
+
+@dataclass(frozen=True)
+class _Refined:
+    """Values at rising distances, and how much an interpolation between two of them may miss."""
+
+    distances: tuple[float, ...]  #: m
+    values: tuple[FloatArray, ...]  #: logarithms
+    misses: tuple[float, ...]  #: of the logarithm, by gap
+
+
+def _refined(
+    distances: Sequence[float],
+    value: Callable[[float], FloatArray],
+    limit: int,
+    close: float = _CLOSE,
+) -> _Refined:
+    """Return values (logarithms) at distances, and at the middles of the gaps in which
+    interpolation misses most.
+
+    A middle shows how much its gap missed. Each half is then counted with as much, until its own
+    middle is known: the peak behind a mask has kinks, where another lobe becomes the brightest.
+    Gaps that miss no more than ``close`` stay.
+    """
+    values = {distance: value(distance) for distance in distances}
+    misses = dict.fromkeys(itertools.pairwise(distances), math.inf)
+    while len(values) < limit:
+        wide = [gap for gap in misses if gap[1] / gap[0] > _FINEST and misses[gap] > close]
+        if not wide:
+            break
+        near, far = max(wide, key=lambda gap: misses[gap] * math.log(gap[1] / gap[0]))
+        middle = math.sqrt(near * far)
+        rising = sorted(values)
+        guess = interpolated(
+            np.log(rising), np.stack([values[place] for place in rising]), np.log(middle)
+        )
+        values[middle] = value(middle)
+        miss = float(np.abs(values[middle] - guess).max())
+        del misses[near, far]
+        misses |= {(near, middle): miss, (middle, far): miss}
+    rising = sorted(values)
+    gaps = tuple(misses[gap] for gap in itertools.pairwise(rising))
+    return _Refined(tuple(rising), tuple(values[distance] for distance in rising), gaps)
+
+
+def at_distance(recipe: Recipe, safety: Safety, step: str, distance: float) -> Recipe:
+    """Return the recipe with another distance of the laser in the wavefront on which a step
+    depends.
+
+    A lens that is focused on a distance, or on the laser, has the defocus of its pupil changed with
+    it.
+    """
+    wavefront = _wavefront_of(recipe, step)
+    assert wavefront is not None
+    varied = _with_param(recipe, wavefront, "distance", distance)
+    lens = safety.settings.lens
+    if lens.focus == "infinity":
+        return varied
+    bend = _bend(safety, distance) if lens.focus == "laser" else 1 / float(lens.focus)
+    for pupil in _pupils(recipe, step):
+        waves = pupil.params["defocus"] - bend * lens.diameter**2 / 8 / _DEFOCUS
+        varied = _with_param(varied, pupil.name, "defocus", waves)
+    return varied
+
+
+def _with_param(recipe: Recipe, step: str, name: str, value: Any) -> Recipe:
+    """Return the recipe with another value of one parameter of a step."""
+    changed = recipe.steps[step]
+    changed = replace(changed, params={**changed.params, name: value})
+    return replace(recipe, steps={**recipe.steps, step: changed})
+
+
+def _pupils(recipe: Recipe, step: str) -> list[Step]:
+    """Return the steps of the pupil on which a step depends."""
+    return [above for above in _upstream(recipe, step) if above.node.path == "optics.pupil"]
+
+
+def _bend(safety: Safety, distance: float) -> float:
+    """Return the curvature in 1/m of the wavefront of the laser at a distance."""
+    return float(1 / curvature_radius(safety.laser.beam(), distance))
+
+
+def _wavefront_of(recipe: Recipe, step: str) -> str | None:
+    """Return the name of the step of the wavefront on which a step depends; None without one."""
+    names = (
+        source.name for source in _upstream(recipe, step) if source.node.path == "laser.wavefront"
+    )
+    return next(names, None)
+
+
+def _upstream(recipe: Recipe, step: str) -> Iterator[Step]:
+    """Yield the steps on which a step depends."""
+    yield from (recipe.steps[name] for name in needed(recipe, [step]))
+
+
+def _step(recipe: Recipe, safety: Safety, arm: str, named: str) -> str:
+    """Return the name of a step of ranked pixels; raise `RecipeError` for another node, and for
+    another sensor.
+    """
+    setting, sensor = f"protection.pixels.{arm}", safety.settings.sensor
+    step = step_of(recipe, safety, setting, named, arm)
+    ranking, params = recipe.steps[step], recipe.steps[step].params
+    value, text = safety.values[setting], ""
+    if ranking.node.path != _RANKS:
+        text = f"the step {step} is of the node {ranking.node.path}: name a step of {_RANKS}"
+    elif (
+        not math.isclose(params["pixel_pitch"], sensor.pixel_pitch)
+        or tuple(params["shape"]) != sensor.shape
+    ):
+        text = (
+            f"the step {step} has another sensor: give it safety.sensor.pixel_pitch and"
+            " safety.sensor.shape"
+        )
+    elif any(source.node.path == "flare.stray_light" for source in _upstream(recipe, step)):
+        text = (
+            f"the step {step} has stray light, which the estimate adds itself: rank the PSF before"
+            " flare.stray_light"
+        )
+    if text:
+        raise RecipeError([Diagnostic(value.mark, value.name, text)])
+    return step
