@@ -161,11 +161,11 @@ CUT = {"calibration.emcee_sampler:_FIRST": 80, "calibration.emcee_sampler:_LONGE
 LABORATORY = "calibrate my/lab --sensor lab"
 DRAWN = {"calibration.emcee_sampler:sample": drawn_chains}
 ONE_PLOT = {"calibration.emva_figures:PICTURES": {"photon_transfer": PICTURES["photon_transfer"]}}
-#: one laser of an evaluation's page, as weak as its points: each saturated pixel adds an unknown
+#: two lasers of an evaluation's page, as weak as its points: each saturated pixel adds an unknown
 #: to the filter
 WEAK = {
     "evaluation.evaluation_result:_WEAKEST": 3.0,
-    "evaluation.evaluation_result:CASES": {name: LASERS[name] for name in ("green", NONE)},
+    "evaluation.evaluation_result:CASES": {name: LASERS[name] for name in ("green", "red", NONE)},
 }
 PROTOCOL = (
     "scene.shape=[28,28]",
@@ -179,10 +179,10 @@ PROTOCOL = (
     "--equal-protection",
     "1e-5",
 )
-#: one of the six lasers of the protocol's page, and a weak one
-ONE_OF_SIX = {
+#: two of the six lasers of the protocol's page, and weak ones
+TWO_OF_SIX = {
     "evaluation.evaluation_result:_WEAKEST": 3.0,
-    "evaluation.evaluation_result:SIX": {name: LASERS[name] for name in ("green", NONE)},
+    "evaluation.evaluation_result:SIX": {name: LASERS[name] for name in ("green", "red", NONE)},
 }
 #: settings of an accuracy study, each measured once
 FEW_POINTS = {
@@ -317,7 +317,7 @@ STAND_INS = {
     "study protection axicon doe.waves=5 --light continuous --draws 6": StandIn(
         "minutes", more=PROTECTION, instead={"6": "2"}, constants=FEW_STOPS),
     "evaluate paper_protocol --data photographs": StandIn(
-        "days: the camera of the paper has 2160 x 2160 samples", more=PROTOCOL, constants=ONE_OF_SIX),
+        "days: the camera of the paper has 2160 x 2160 samples", more=PROTOCOL, constants=TWO_OF_SIX),
     f"{EVALUATE} --scenes 3 --strengths 0,1e3,1e6": StandIn(
         "a minute", instead={**FIELD, "3": "1", "0,1e3,1e6": "0,3"}, constants=WEAK),
     f"{EVALUATE} --scenes 3 --strengths 1e4,1e6 "

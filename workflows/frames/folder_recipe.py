@@ -138,8 +138,8 @@ camera:                    # first estimates by least squares; the frames decide
   drift: {drift:.3g}
 {traced}outputs: [measured, least_squares, camera]
 """
-_HOT = """  hot: {{node: calibrate.hot_pixels, with: {{files: [{files}]{divisor}}}}}   # in the
-longest dark exposure
+_HOT = """  # in the longest dark exposure
+  hot: {{node: calibrate.hot_pixels, with: {{files: [{files}]{divisor}}}}}
 """
 _RELATIVE = """traceability:
   photons: {known: relative}   # no radiometry: no quantum efficiency is told

@@ -11,8 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.workflows.forked_commands import Commands
-
 ROOT = Path(__file__).parents[3]
 LIGHT = """
 import sys
@@ -30,13 +28,9 @@ QUICK = ("safety.draws=100", "safety.protection={filter: 1e-2}")
 
 
 class Terminal:
-    """A working folder, a home and a cache, in which commands run in processes of their own.
+    """A working folder, a home and a cache, in which commands run in processes of their own."""
 
-    Those that may import torch are forks of one that has it at hand.
-    """
-
-    def __init__(self, root, forks):
-        self.forks = forks
+    def __init__(self, root):
         self.folder, self.cache, home = root / "work", root / "cache", root / "home"
         # made while a command runs, they would be a change
         for folder in (home, self.cache, self.folder / "runs"):
@@ -51,27 +45,17 @@ class Terminal:
 
     def __call__(self, *words, light=False):
         """Run a command; ``light`` refuses the import of torch and other large packages."""
-        if light:
-            command = [sys.executable, "-c", LIGHT, *words]
-            done = subprocess.run(
-                command, cwd=self.folder, env=self.env, capture_output=True, text=True, check=False
-            )
-        else:
-            code = LIGHT.replace("sys.meta_path", "#")
-            done = self.forks(*words, cwd=self.folder, env=self.env, code=code)
+        code = LIGHT if light else LIGHT.replace("sys.meta_path", "#")
+        command = [sys.executable, "-c", code, *words]
+        done = subprocess.run(
+            command, cwd=self.folder, env=self.env, capture_output=True, text=True, check=False
+        )
         return done.returncode, done.stdout, done.stderr
 
 
-@pytest.fixture(scope="module")
-def forks():
-    found = Commands(variables={"PYTHONPATH": str(ROOT / ".src")})
-    yield found
-    found.close()
-
-
 @pytest.fixture
-def neusee(tmp_path, forks):
-    return Terminal(tmp_path, forks)
+def neusee(tmp_path):
+    return Terminal(tmp_path)
 
 
 RUN = """# A frame that a user took.

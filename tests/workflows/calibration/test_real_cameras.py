@@ -171,7 +171,7 @@ def test_emcee_draws_from_the_same_posterior(store, tmp_path):
         tmp_path / "chain.h5",
         seed=1,
         walkers=32,
-        wanted=500,
+        effective_size=500,
     )
     assert chains.long
     rows = {row.name: row for row in compare_models(problem.recipe, store)}
