@@ -12,8 +12,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
+from importlib.util import find_spec, module_from_spec
 from itertools import chain
+from types import ModuleType
 from typing import Any, get_args, get_origin
 
 import torch
@@ -231,12 +233,26 @@ _here: dict[str, _Here] = {}
 
 
 def _chance_of_its_own() -> None:
-    """Give dask a generator of its own: its threads draw beside a step, which would be taken for
-    draws of the step.
+    """Give dask a module `random` of its own: its threads draw beside a step, which would be taken
+    for draws of the step.
     """
+    own_random = _second_random()
     for name, module in list(sys.modules.items()):
         if name.startswith(("distributed.", "dask.")) and getattr(module, "random", None) is random:
-            module.random = random.Random()  # type: ignore[attr-defined]
+            module.random = own_random  # type: ignore[attr-defined]
+
+
+@cache
+def _second_random() -> ModuleType:
+    """Return the module `random` loaded once more, with the classes and functions of the first one
+    and a generator of its own.
+    """
+    specification = find_spec("random")
+    assert specification is not None
+    assert specification.loader is not None
+    second = module_from_spec(specification)
+    specification.loader.exec_module(second)
+    return second
 
 
 def lane_here(dask_worker: Any) -> tuple[str, float]:

@@ -91,8 +91,7 @@ COMMANDS = {
     "new": "new node mine --in {out}",
     "handbook": "handbook --no-pictures --no-open --quiet --out {out}/book",
     "study accuracy": (
-        f"study accuracy first_light {SMALL} optics.bands=2 ~expect laser=none outputs=[raw]"
-        " --quick --seeds 1"
+        f"study accuracy first_light {SMALL} ~expect laser=none outputs=[raw] --quick --seeds 1"
     ),
     "study stability": "study stability mine.yaml",
     "study leave-out": "study leave-out mine.yaml",

@@ -290,8 +290,8 @@ import sys, time, torch
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 import test_engine_choices as t
-from neusee.workflows.keys import module_owner
-module_owner.PROVEN = ("neusee.", "test_engine_choices.")
+from neusee.workflows.keys import cache_key
+cache_key.PROVEN = ("neusee.", "test_engine_choices.")
 print("ready", flush=True)
 t.run(t.recipe("m", a=(t.slow, {}, {"seconds": 1.0}), m=(t.mean, {"x": "a"}, {})), t.Store(Path(sys.argv[1])))
 print(t.CALLS, flush=True)

@@ -129,3 +129,5 @@ def test_what_dask_draws_beside_a_step_is_no_draw_of_the_step(monkeypatch):
     before = SharedGenerators()
     sizeof.sizeof(many)
     assert before.drawn() == []
+    # a second worker in this process takes a class from what dask holds for the module
+    assert sizeof.random.Random(3).random() == random.Random(3).random()
