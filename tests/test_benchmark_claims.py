@@ -11,6 +11,7 @@ from neusee import recipes
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 from paired_times import Comparison, median_ranks
+from stored_results import FOLDER, page, stored, tables_of
 
 PAGE = Path(recipes.__file__).parent / "guide" / "benchmarks.md"
 RESULTS = Path(__file__).parent / "benchmarks" / "RESULTS.md"
@@ -45,9 +46,22 @@ def test_every_ratio_of_the_page_lies_in_its_interval():
 
 def test_the_results_have_the_tables_of_the_page():
     """One writer makes both, so that neither is edited by hand."""
-    results = RESULTS.read_text(encoding="utf-8")
     part = re.compile(r"^## ([^\n]+)\n\n<!-- claim \w+ -->\n(.*?)<!-- end -->", re.M | re.S)
     sections = part.findall(PAGE.read_text(encoding="utf-8"))
     assert len(sections) >= 2
-    for title, text in sections:
-        assert f"### {title}\n\n{text.strip()}\n" in results
+    of_page = [table for title, text in sections for table in tables_of(text, title)]
+    assert stored("claims")["tables"] == of_page
+
+
+def test_the_measured_page_is_what_the_script_writes_from_the_documents():
+    assert RESULTS.read_text(encoding="utf-8") == page()
+
+
+def test_a_row_of_a_measured_table_has_a_cell_for_each_column():
+    documents = [stored(path.stem) for path in FOLDER.glob("*.json")]
+    assert len(documents) > 40
+    for document in documents:
+        for table in document["tables"]:
+            assert re.fullmatch(r"\d{4}-\d\d-\d\d", table["date"])
+            widths = {len(row) for row in table.get("rows", [])}
+            assert widths <= {len(table.get("columns", []))}, document["heading"]

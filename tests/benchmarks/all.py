@@ -1,7 +1,7 @@
 """The claims of speed, each beside its peers in one run: `python tests/benchmarks/all.py [NAME ...]
 [--turns 10]`.
 
-Writes the page `recipes/guide/benchmarks.md` of the handbook, and the same tables in `RESULTS.md`.
+Writes the page `recipes/guide/benchmarks.md` of the handbook, and stores the same tables for `RESULTS.md`.
 With names, such as `scan`, only these claims are measured again, and the other parts stay; `--page`
 measures none, and writes both files from the page. One thread; processor seconds, so that other
 work on the machine changes little; the load is recorded.
@@ -26,15 +26,10 @@ from pathlib import Path
 import torch
 from claims import CLAIMS
 from paired_times import OURS, Comparison, Figures
+from stored_results import store, stored, tables_of
 
 PAGE = Path(__file__).parents[2] / "recipes" / "guide" / "benchmarks.md"
-RESULTS = Path(__file__).with_name("RESULTS.md")
-TITLE = "## Claims of speed beside peers (`all.py`)"
-HEAD = f"""{TITLE}
-
-Written by `python tests/benchmarks/all.py`; the page `recipes/guide/benchmarks.md` has the same tables, and says how
-to read them.
-"""
+DOCUMENT = "claims"  #: in `results/`
 ABOUT = """# Speed beside peers
 
 Each table is one claim. neusee and its peers do the same work in turns, in one run of
@@ -121,18 +116,19 @@ def main() -> None:
 
 
 def write(new: Mapping[str, str]) -> None:
-    """Write the parts ``new`` of the page anew and keep the others, and write the same parts in
-    `RESULTS.md`.
+    """Write the parts ``new`` of the page anew and keep the others, and store the tables of all
+    parts.
     """
     old = PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""
     parts = {found[1]: found[0] for found in _SECTION.finditer(old)} | new
     peers = ", ".join(f"{peer} {version(peer)}" for peer in _PEERS)
     body = "".join(f"\n## {heading(name)}\n\n{parts[name]}" for name in CLAIMS if name in parts)
     PAGE.write_text(ABOUT.format(peers=peers) + body, encoding="utf-8")
-    before, mark, rest = RESULTS.read_text(encoding="utf-8").partition(TITLE)
-    after = rest[found.start() :] if mark and (found := re.search(r"^## ", rest, re.M)) else ""
-    text = f"{before.rstrip()}\n\n{HEAD}{_SECTION.sub(lambda part: part[2], body).replace('## ', '### ')}\n{after}"
-    RESULTS.write_text(text.replace("\n\n\n", "\n\n"), encoding="utf-8")
+    document = stored(DOCUMENT)
+    document["tables"] = []
+    for name in CLAIMS:
+        document["tables"] += tables_of(parts.get(name, ""), heading(name))
+    store(DOCUMENT, document)
 
 
 def heading(name: str) -> str:

@@ -6,7 +6,7 @@ RESULTS.md.
 Each row is a process of its own, in an empty folder, with a cache that fails as `cache_faults.py`
 says (mounts need root). `run` computes the recipe first_light as shipped, the other commands the
 small recipes of `test_cache_faults.py`. Without arguments, `run` meets every fault and each other
-command those in `SOME`. The section of RESULTS.md is written anew, with the rows of the commands
+command those in `SOME`. The stored table is written anew, with the rows of the commands
 that were not asked for as they were.
 """
 
@@ -15,7 +15,6 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
-import re
 import subprocess
 import sys
 import time
@@ -25,20 +24,20 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from stored_results import store_rows, stored
+
 HERE = Path(__file__).resolve()
 CLI = HERE.parents[1] / "workflows" / "cli"
-RESULTS = HERE.with_name("RESULTS.md")
-HEAD = "## A cache that fails, by command and fault (`bench_cache_faults.py`)"
+DOCUMENT = "cache_faults"  #: in `results/`
 SOME = ("a full disk", "a file in its place", "errors of the device")
 FULL = ["run", "first_light", "--json"]
 MIDDLE = "a disk that fills up in the middle"  #: a fault for results of a full size alone
-COLUMNS = "| command | cache | exit code | s | numbers | message |\n|---|---|---|---|---|---|\n"
 ABOUT = """\
-`run` is `neusee run first_light` as shipped, and computes every step. These runs take more than ten minutes altogether,
-so the other commands run the small recipes of `test_cache_faults.py`, where every fault meets every command. Each row
-is one process; its seconds include the start of the program and the report, and are those of a machine that others
-used too, so that they tell no price of a fault. *numbers* says what a run says of the expected numbers of its recipe.
-"""
+`run` is `neusee run first_light` as shipped, and computes every step. These runs take more than ten minutes \
+altogether, so the other commands run the small recipes of `test_cache_faults.py`, where every fault meets every \
+command. Each row is one process; its seconds include the start of the program and the report, and are those of a \
+machine that others used too, so that they tell no price of a fault. *numbers* says what a run says of the expected \
+numbers of its recipe."""
 
 
 def module(file: Path) -> Any:
@@ -73,7 +72,7 @@ def child(fault: str, words: Sequence[str]) -> None:
         app.main(list(words))
 
 
-def row(command: str, fault: str, words: Sequence[str], recipe: str) -> str:
+def row(command: str, fault: str, words: Sequence[str], recipe: str) -> list[str]:
     """Return the row of the table for a command that was run on a cache with a fault."""
     with TemporaryDirectory(prefix="neusee-") as folder:
         (Path(folder) / "mine.yaml").write_text(recipe, encoding="utf-8")
@@ -97,24 +96,14 @@ def row(command: str, fault: str, words: Sequence[str], recipe: str) -> str:
     verdict = (
         json.loads(done.stdout)["verdict"] if "--json" in words and done.returncode == 0 else ""
     )
-    return f"| {command} | {fault} | {done.returncode} | {seconds:.0f} | {verdict} | {told} |\n"
+    return [command, fault, str(done.returncode), f"{seconds:.0f}", verdict, told]
 
 
-def rows(text: str) -> dict[str, str]:
-    """Return the rows in a section of RESULTS.md by command and fault."""
-    found = re.finditer(r"^\| (\w[^|]*) \| ([^|]+) \| \d+ \|.*\n", text, re.MULTILINE)
-    return {f"{match[1]}: {match[2]}": match[0] for match in found}
-
-
-def write(made: dict[str, str]) -> None:
-    """Write rows to the section of this script in RESULTS.md, and keep its other rows."""
-    text = RESULTS.read_text(encoding="utf-8")
-    before, _, rest = text.partition(HEAD)
-    old, mark, after = rest.partition("\n## ")
-    all_rows = rows(old) | made
-    body = "".join(all_rows[key] for key in sorted(all_rows, key=lambda key: key.partition(":")[0]))
-    section = f"{HEAD}\n\n{ABOUT}\n{COLUMNS}{body}"
-    RESULTS.write_text(f"{before.rstrip()}\n\n{section}{mark}{after}", encoding="utf-8")
+def write(made: list[str]) -> None:
+    """Store a row in the place of the one of the same command and fault, and keep the others."""
+    [table] = stored(DOCUMENT)["tables"]
+    others = [old for old in table["rows"] if old[:2] != made[:2]]
+    store_rows(DOCUMENT, sorted([*others, made], key=lambda cells: cells[0]), ABOUT)
 
 
 def main(words: Sequence[str]) -> None:
@@ -130,8 +119,8 @@ def main(words: Sequence[str]) -> None:
         for fault in names.split(",") if names else plan[command]:
             given = FULL if command == "run" else small.COMMANDS[command]
             made = row(command, fault, given, small.RECIPE)
-            print(made, end="", flush=True)
-            write({f"{command}: {fault}": made})
+            print(*made, sep=" | ", flush=True)
+            write(made)
 
 
 if __name__ == "__main__":

@@ -18,16 +18,14 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from stored_results import store_rows
+
 from neusee.workflows.keys.sealed_files import seal_record
 from neusee.workflows.store.journal import row_of
 
-RESULTS = Path(__file__).with_name("RESULTS.md")
-HEAD = "## A cache of many results"
-ABOUT = """`python tests/benchmarks/bench_cache_size.py`: processor seconds (user and system) and peak resident
-memory of each process, the start of the program included, on a machine that others used too. One result in four has a
-file of 1 kB.
-"""
-COLUMNS = "| results | command | processor s | peak MB |\n|---|---|---|---|\n"
+DOCUMENT = "cache_size"  #: in `results/`
+ABOUT = """Processor seconds (user and system) and peak resident memory of each process, the start of the \
+program included, on a machine that others used too. One result in four has a file of 1 kB."""
 COMMANDS = {
     "cache ls": ["cache", "ls"],
     "cache ls --all": ["cache", "ls", "--all"],
@@ -107,27 +105,19 @@ def measured(root: Path, words: list[str]) -> tuple[float, float, str]:
     return used.ru_utime + used.ru_stime, used.ru_maxrss / 1e3, last
 
 
-def write(lines: list[str]) -> None:
-    """Write the section of this script in RESULTS.md anew."""
-    before, _, rest = RESULTS.read_text(encoding="utf-8").partition(HEAD)
-    _, mark, after = rest.partition("\n## ")
-    section = f"{HEAD}\n\n{ABOUT}\n{COLUMNS}{''.join(lines)}"
-    RESULTS.write_text(f"{before.rstrip()}\n\n{section}{mark}{after}", encoding="utf-8")
-
-
 def main() -> None:
     """Measure every command on caches of each size, and record them."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--results", type=int, nargs="+", default=[0, 100_000])
-    lines = []
+    rows = []
     for count in parser.parse_args().results:
         with tempfile.TemporaryDirectory() as place:
             fill(Path(place) / "cache", count)
             for name, words in COMMANDS.items():
                 seconds, peak, last = measured(Path(place) / "cache", words)
                 print(f"{count} {name}: {seconds:.2f} s, {peak:.0f} MB; {last}", flush=True)
-                lines.append(f"| {count} | `{name}` | {seconds:.1f} | {peak:.0f} |\n")
-    write(lines)
+                rows.append([str(count), f"`{name}`", f"{seconds:.1f}", f"{peak:.0f}"])
+    store_rows(DOCUMENT, rows, ABOUT)
 
 
 if __name__ == "__main__":

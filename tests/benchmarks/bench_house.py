@@ -4,9 +4,9 @@
     pip download --no-deps --dest peers snakemake joblib
     python tests/benchmarks/bench_house.py neusee=.src/neusee joblib=peers/joblib
 
-Each folder is a package, whose tests are left out. A table in Markdown has a row for each folder;
-the line below it counts the imports of private modules (an underscore in front) in the tests of
-neusee. What is counted:
+Each folder is a package, whose tests are left out. The table in RESULTS.md
+has a row for each folder; the line above it counts the imports of private modules (an underscore in
+front) in the tests of neusee. What is counted:
 
 - code: without blank lines, comments and docstrings, and without the spaces in front;
 - decisions a line: branches, loops, conditional expressions, handlers, boolean operators, filters
@@ -18,6 +18,7 @@ neusee. What is counted:
 """
 
 import ast
+import datetime
 import io
 import os
 import sys
@@ -27,8 +28,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from radon.complexity import cc_visit
+from stored_results import store
 
 ROOT = Path(__file__).parents[2]
+TESTS = ROOT / "tests"
 sys.path.insert(0, str(ROOT))
 
 from tests.test_plain_names import EMPTY, bindings  # noqa: E402
@@ -206,15 +209,26 @@ def private_imports(tests: Path) -> int:
 
 
 def main(arguments: list[str]) -> None:
-    """Print the table of the folders."""
+    """Count the folders, print their rows and store them."""
     if not arguments:
         sys.exit(__doc__)
-    print("| source | " + " | ".join(COLUMNS) + " |")
-    print("|---" * (len(COLUMNS) + 1) + "|")
+    rows = []
     for argument in arguments:
         name, _, folder = argument.partition("=")
-        print(f"| {name} | " + " | ".join(counted(Path(folder)).row()) + " |", flush=True)
-    print(f"\nPrivate imports in tests of neusee: {private_imports(ROOT / 'tests')} lines.")
+        rows.append([name, *counted(Path(folder)).row()])
+        print(*rows[-1], sep=" | ", flush=True)
+    tests = f"Lines of the tests of neusee that import a private module: {private_imports(TESTS)}."
+    print(tests)
+    table = {"title": "", "columns": ["source", *COLUMNS]}
+    heading = "How the source reads, beside peers"
+    command = "python tests/benchmarks/bench_house.py NAME=FOLDER ..."
+    document = {"order": 58, "heading": heading, "command": command, "machine": "any"}
+    date = datetime.date.today().isoformat()
+    store(
+        "house",
+        document
+        | {"sampling": "", "tables": [table | {"conditions": tests, "date": date, "rows": rows}]},
+    )
 
 
 if __name__ == "__main__":

@@ -19,9 +19,9 @@ import tempfile
 import time
 from pathlib import Path
 
-RESULTS = Path(__file__).with_name("RESULTS.md")
-HEAD = "## A repeated command (`bench_repeated_command.py`)"
-COLUMNS = "| command | processor, s | wall, s | times `import torch` |\n|---|---|---|---|\n"
+from stored_results import store_rows
+
+DOCUMENT = "repeated_command"  #: in `results/`
 RECIPE = ["-m", "neusee", "safety", "safety_pointer", "--quiet"]
 VALIDATE = ["-m", "neusee", "validate", "first_light"]
 RUN, PLAN = ["-m", "neusee", "run", "first_light"], ["-m", "neusee", "plan", "first_light"]
@@ -63,23 +63,13 @@ def shown(seconds: list[float]) -> str:
     return f"{min(seconds):.2f} ({statistics.median(seconds):.2f})"
 
 
-def line(name: str, rows: list[tuple[float, float]], alone: float) -> str:
+def row(name: str, rows: list[tuple[float, float]], alone: float) -> list[str]:
     """Return the row of a command in the table; ``alone``: processor seconds of an import of
     torch, the median.
     """
     processor, wall = map(list, zip(*rows, strict=True))
-    return (
-        f"| {name} | {shown(processor)} | {shown(wall)} |"
-        f" {statistics.median(processor) / alone:.2f} |\n"
-    )
-
-
-def write(lines: list[str], about: str) -> None:
-    """Write the section of this script in RESULTS.md anew."""
-    before, _, rest = RESULTS.read_text(encoding="utf-8").partition(HEAD)
-    _, mark, after = rest.partition("\n## ")
-    section = f"{HEAD}\n\n{about}\n\n{COLUMNS}{''.join(lines)}"
-    RESULTS.write_text(f"{before.rstrip()}\n\n{section}{mark}{after}", encoding="utf-8")
+    times_torch = f"{statistics.median(processor) / alone:.2f}"
+    return [name, shown(processor), shown(wall), times_torch]
 
 
 def main() -> None:
@@ -100,12 +90,14 @@ def main() -> None:
                 found[name].append(measured(words, place))
             loads.append(os.getloadavg()[0])
     alone = statistics.median(processor for processor, _ in found[TORCH])
-    lines = [line(name, rows, alone) for name, rows in found.items()]
+    rows = [row(name, times_of, alone) for name, times_of in found.items()]
     load = f"load of the machine {min(loads):.1f} to {max(loads):.1f} with {os.cpu_count()} cores"
-    write(
-        lines, f"Whole processes of one thread, {times} of each in turns: least (median); {load}."
+    store_rows(
+        DOCUMENT,
+        rows,
+        f"Whole processes of one thread, {times} of each in turns: least (median); {load}.",
     )
-    print("".join(lines), load)
+    print(*rows, load, sep="\n")
 
 
 if __name__ == "__main__":
