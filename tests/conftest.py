@@ -5,6 +5,8 @@ import threading
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests import grouped_rows
+
 # Most of what is tested is over before a second thread is awake, and where others compute, threads
 # that wait for each other take many times as long. Before torch is imported; processes that a test
 # starts inherit it. Tests of several threads ask for them.
@@ -33,13 +35,31 @@ LONG_FILES = (
 )
 
 
+@pytest.hookimpl(trylast=True)  # after what was asked for by words and marks
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Put the tests of long files first and leave the others in their order."""
+    """Put the tests of long files first, leave the others in their order, and make one test of
+    the rows of each table.
+    """
     assert all((config.rootpath / name).is_file() for name in LONG_FILES), (
         "name the long files as they are"
     )
     order = {name: place for place, name in enumerate(LONG_FILES)}
     items.sort(key=lambda item: order.get(item.nodeid.partition("::")[0], len(order)))
+    if not config.getoption("each_row"):
+        items[:] = grouped_rows.grouped(items)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Offer `--each-row`."""
+    parser.addoption("--each-row", action="store_true", help="report each row of a table apart")
+
+
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
+    """Run a table row by row; leave all other tests to pytest."""
+    if not isinstance(item, grouped_rows.Rows):
+        return None
+    grouped_rows.run(item, nextitem)
+    return True
 
 
 def pytest_collection_finish() -> None:
