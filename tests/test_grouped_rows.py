@@ -37,6 +37,7 @@ import pytest
 from tests.conftest import pytest_runtest_protocol
 from tests import grouped_rows
 
+@pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items):
     items[:] = grouped_rows.grouped(items)
 
