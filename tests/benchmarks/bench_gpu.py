@@ -71,7 +71,7 @@ def scan():
     for length in (4096, 65_536):
         values = [x.detach().cuda().requires_grad_() for x in draw(length)]
         truth = reference(*(x.detach() for x in values))
-        for name, backend in (("Triton", "triton"), ("torch", "torch"), ("mambapy", None)):
+        for name, backend in (("torch", "torch"), ("mambapy", None)):
 
             def once(backend=backend, values=values):
                 y = (

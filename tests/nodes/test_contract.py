@@ -4,7 +4,6 @@ size.
 
 import ast
 import importlib
-import importlib.util
 import inspect
 import pkgutil
 from pathlib import Path
@@ -15,12 +14,9 @@ import neusee.nodes
 from neusee.nodes import Node
 
 ROOT = Path(__file__).parents[2]
-#: what torch brings on CUDA alone; it holds no nodes
-ONLY_WITH = {"neusee.nodes.restore._scan._triton_scan": "triton"}
 MODULES = [
     importlib.import_module(m.name)
     for m in pkgutil.walk_packages(neusee.nodes.__path__, "neusee.nodes.")
-    if importlib.util.find_spec(ONLY_WITH.get(m.name, "torch"))
 ]
 NODES = sorted(
     {

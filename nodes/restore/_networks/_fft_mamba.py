@@ -23,7 +23,6 @@ from neusee.nodes.restore._networks._restorer import (
     restorer_checks,
 )
 from neusee.nodes.restore._scan._selective_scan import selective_scan
-from neusee.nodes.restore._scan._torch_scan import dual_scan
 from neusee.nodes.units import Count, DataFile, Layers
 
 # --- scan layer -----------------------------------------------------------------------------------
@@ -31,8 +30,6 @@ from neusee.nodes.units import Count, DataFile, Layers
 # Trainable layers for selective scans, with the initial values of their time steps and decay rates.
 
 
-Kind = Literal["s6", "ssd"]  #: s6: a decay for each channel and state; ssd: a decay for each head
-HEAD = 16  #: channels that share a decay
 #: range of the first steps of a scan, log-uniform: a memory of ten to a thousand positions
 STEPS = (1e-3, 0.1)
 
@@ -72,41 +69,12 @@ class Scan(nn.Module):
             return selective_scan(u, step, decay, single(into), single(out), self.D).to(u.dtype)
 
 
-class DualScan(nn.Module):
-    """A selective scan with one step and one decay rate for each head of channels, computed by
-    matrix products.
-    """
-
-    def __init__(self, channels: int, states: int, rank: int) -> None:
-        super().__init__()
-        heads = channels // math.gcd(channels, HEAD)
-        self.sizes = [heads, states, states]
-        self.read = nn.Linear(channels, sum(self.sizes), bias=False)
-        self.dt_bias, self.A_log, self.D = (nn.Parameter(torch.empty(heads)) for _ in range(3))
-
-    def start(self, rng: torch.Generator) -> None:
-        """Set random time steps for the start of training, and random decay rates from 1 to 16,
-        the range of `Scan`.
-        """
-        self.dt_bias.copy_(_first_steps(len(self.D), rng))
-        self.A_log.uniform_(1.0, 16.0, generator=rng).log_()
-        self.D.fill_(1.0)
-
-    def forward(self, u: Tensor) -> Tensor:
-        rate, into, out = (single(numbers) for numbers in self.read(u).split(self.sizes, -1))
-        with torch.autocast(u.device.type, enabled=False):
-            return dual_scan(
-                single(u), _step(rate, self.dt_bias), _decay(self.A_log), into, out, self.D
-            )
-
-
 class BothWays(nn.Module):
     """The sum of a forward and a backward selective scan, each with its own weights."""
 
-    def __init__(self, channels: int, states: int, rank: int, kind: Kind = "s6") -> None:
+    def __init__(self, channels: int, states: int, rank: int) -> None:
         super().__init__()
-        make = Scan if kind == "s6" else DualScan
-        self.there, self.back = (make(channels, states, rank) for _ in range(2))
+        self.there, self.back = (Scan(channels, states, rank) for _ in range(2))
 
     def forward(self, u: Tensor) -> Tensor:
         result: Tensor = self.there(u) + self.back(u.flip(1)).flip(1)
@@ -152,15 +120,14 @@ class Spatial(nn.Module):
         width: int,
         states: int,
         by_columns: bool,
-        kind: Kind = "s6",
         directions: Directions = 2,
     ) -> None:
         super().__init__()
         inner, self.by_columns = 2 * width, by_columns
         self.enter = nn.Conv2d(width, 2 * inner, 1)
         self.mix = nn.Conv2d(inner, inner, 3, padding=1, groups=inner)
-        self.scan = BothWays(inner, states, -(-width // 16), kind)
-        self.across = BothWays(inner, states, -(-width // 16), kind) if directions == 4 else None
+        self.scan = BothWays(inner, states, -(-width // 16))
+        self.across = BothWays(inner, states, -(-width // 16)) if directions == 4 else None
         self.norm = nn.LayerNorm(inner)
         self.leave = nn.Conv2d(inner, width, 1)
 
@@ -229,12 +196,12 @@ class Frequency(nn.Module):
     picture passes almost unchanged.
     """
 
-    def __init__(self, width: int, states: int, kind: Kind = "s6", form: Form = "complex") -> None:
+    def __init__(self, width: int, states: int, form: Form = "complex") -> None:
         super().__init__()
         self.form = form
         self.norm = nn.LayerNorm(2 * width)
         self.enter = nn.Linear(2 * width, 2 * width)
-        self.scan = BothWays(width, states, -(-width // 16), kind)
+        self.scan = BothWays(width, states, -(-width // 16))
         self.scanned = nn.LayerNorm(width)
         self.leave = nn.Linear(width, 2 * width)
         self.strength = nn.Parameter(torch.empty(()))
@@ -284,14 +251,13 @@ class Block(nn.Module):
         width: int,
         states: int,
         by_columns: bool,
-        kind: Kind = "s6",
         directions: Directions = 2,
         form: Form = "complex",
     ) -> None:
         super().__init__()
         self.norm, self.second_norm = ChannelNorm(width), ChannelNorm(width)
-        self.spatial = Spatial(width, states, by_columns, kind, directions)
-        self.frequency = Frequency(width, states, kind, form)
+        self.spatial = Spatial(width, states, by_columns, directions)
+        self.frequency = Frequency(width, states, form)
         self.weigh = nn.Conv2d(2 * width, width, 1)
         self.widen = nn.Conv2d(width, 4 * width, 1)
         self.mix = nn.Conv2d(4 * width, 4 * width, 3, padding=1, groups=4 * width)
@@ -331,7 +297,6 @@ class FFTMamba(PictureRestorer):
         blocks: int = 8,
         states: int = 16,
         shuffle: int = 2,
-        ssm: Kind = "s6",
         directions: Directions = 2,
         pyramid: bool = False,
         frequency: Form = "complex",
@@ -339,7 +304,6 @@ class FFTMamba(PictureRestorer):
         super().__init__()
         self.shuffle, self.multiple, self.one_pass = shuffle, 2 * shuffle, pyramid
         self.options = {
-            "ssm": ssm,
             "directions": directions,
             "pyramid": pyramid,
             "frequency": frequency,
@@ -347,7 +311,7 @@ class FFTMamba(PictureRestorer):
         inside = 3 * shuffle**2
         self.enter = nn.Conv2d(2 * inside, width, 3, padding=1)
         self.blocks = nn.Sequential(
-            *(Block(width, states, bool(i % 2), ssm, directions, frequency) for i in range(blocks))
+            *(Block(width, states, bool(i % 2), directions, frequency) for i in range(blocks))
         )
         self.leave = nn.Conv2d(width, width, 3, padding=1)
         self.last = nn.Conv2d(width, inside, 3, padding=1)
@@ -379,7 +343,6 @@ def fft_mamba(
     blocks: Layers = 8,
     states: Layers = 16,
     shuffle: Count = 2,
-    ssm: Kind = "s6",
     directions: Directions = 2,
     pyramid: bool = False,
     frequency: Form = "complex",
@@ -396,8 +359,7 @@ def fft_mamba(
     training pictures, because a network is less accurate on longer scans. ``reduce``: the picture
     is reduced by this factor first and enlarged again afterwards, for an element behind which finer
     detail is lost. ``detail``: the finer detail is added unchanged, for a deconvolved picture, in
-    which finer detail is not lost. ``ssm`` is the scan: s6 has a decay for each channel and state;
-    ssd has a decay for 16 channels, by matrix products. ``directions`` 4: each block scans rows and
+    which finer detail is not lost. ``directions`` 4: each block scans rows and
     columns. ``pyramid``: one pass, at the full size. ``frequency`` amp_phase, for comparison: the
     gate is computed from amplitude and phase, and changes amplitude and phase.
 
@@ -406,10 +368,10 @@ def fft_mamba(
     Error:  float32, 1e-5; of the restoration, the error that the training reached.
     Raises: ParameterError before the run without weights, or where the weights do not fit;
             ValueError for a picture that is not a colour picture or not finite.
-    Source: NeuSee, section Image Restoration; Gu and Dao, Mamba, 2023 (s6), Dao and Gu, Mamba-2,
-            2024 (ssd); sizes and connections are ours.
+    Source: NeuSee, section Image Restoration; Gu and Dao, Mamba, 2023; sizes and connections
+            are ours.
     """
-    kind = partial(FFTMamba, width, blocks, states, shuffle, ssm, directions, pyramid, frequency)
+    kind = partial(FFTMamba, width, blocks, states, shuffle, directions, pyramid, frequency)
     return restored(picture, kind, weights, tile, reduce, detail)
 
 

@@ -1,9 +1,6 @@
 """The selective scan: a linear recurrence whose step, input and output depend on the position."""
 
-import functools
-import importlib.util
 import os
-import warnings
 from typing import Literal, get_args
 
 import torch
@@ -11,9 +8,9 @@ from torch import Tensor
 
 from neusee.nodes.restore._scan import _cpp_scan, _torch_scan
 
-#: the kernels differ only within rounding, but NEUSEE_SCAN chooses one for all
-__depends__ = ("env:NEUSEE_SCAN", "unaffected:triton", "unaffected:mamba_ssm")
-Backend = Literal["torch", "cpp", "triton", "mamba_ssm"]
+#: both backends differ only within rounding, but NEUSEE_SCAN chooses one for all
+__depends__ = ("env:NEUSEE_SCAN",)
+Backend = Literal["torch", "cpp"]
 
 
 def selective_scan(
@@ -24,23 +21,22 @@ def selective_scan(
     C: Tensor,
     D: Tensor | None = None,
     *,
-    backend: Literal["auto", "torch", "cpp", "triton", "mamba_ssm"] = "auto",
+    backend: Literal["auto", "torch", "cpp"] = "auto",
 ) -> Tensor:
     """Run the scan h_t = exp(dt_t A) h_(t-1) + dt_t B_t u_t from h = 0, and return y_t = <C_t, h_t>
     + D u_t.
 
     ``A`` is negative and ``dt`` positive: decays are at most 1 and are only multiplied, so nothing
-    overflows at any length. ``backend`` "auto" is C++ on a CPU with a compiler; on CUDA in float32
-    a Triton kernel, or mamba_ssm where only mamba_ssm is installed; and torch in all other cases.
-    ``NEUSEE_SCAN=torch`` selects torch everywhere. The scan is differentiable once: a gradient of
-    its gradient raises an error.
+    overflows at any length. ``backend`` "auto" is C++ on a CPU with a compiler, and torch in all
+    other cases. ``NEUSEE_SCAN=torch`` selects torch everywhere. The scan is differentiable once: a
+    gradient of its gradient raises an error.
 
     Shapes: u, dt (batch, length, d), A (d, n), B, C (batch, length, n), D (d) -> (batch, length,
             d).
     Units:  none; dt in those of 1 / A.
     Error:  float32, also from half precision and under autocast: of the largest |y|, over 65 536
-            steps and for dt |A| from 1e-6 to 200, 2e-7 in C++ and Triton, 7e-7 in torch. float64 if
-            any input is float64: 1e-12.
+            steps and for dt |A| from 1e-6 to 200, 2e-7 in C++, 7e-7 in torch. float64 if any input
+            is float64: 1e-12.
     Raises: ValueError for shapes that do not fit and for a backend that these tensors, or this
             machine, do not support.
     Source: Gu and Dao, Mamba: Linear-Time Sequence Modeling with Selective State Spaces, 2023,
@@ -48,7 +44,7 @@ def selective_scan(
     """
     _check_shapes(u, dt, A, B, C, D)
     kind = _kind(u, dt, A, B, C)
-    backend_used = _auto(u, kind) if backend == "auto" else backend
+    backend_used = _auto(u) if backend == "auto" else backend
     with torch.autocast(u.device.type, enabled=False):
         y = _run(backend_used, *(x.to(kind) for x in (u, dt, A, B, C)))
         return y if D is None else torch.addcmul(y, D.to(kind), u.to(kind))
@@ -109,91 +105,20 @@ def _kind(*tensors: Tensor) -> torch.dtype:
     return torch.float64 if any(x.dtype == torch.float64 for x in tensors) else torch.float32
 
 
-def _auto(u: Tensor, kind: torch.dtype) -> Backend:
+def _auto(u: Tensor) -> Backend:
     named = os.environ.get("NEUSEE_SCAN") or ""
     if named not in ("", *get_args(Backend)):
-        raise ValueError(
-            f"NEUSEE_SCAN is {named!r}: write torch or cpp, or on CUDA triton or mamba_ssm"
-        )
-    if named == "torch":
+        raise ValueError(f"NEUSEE_SCAN is {named!r}: write torch or cpp")
+    if named == "torch" or u.device.type != "cpu":
         return "torch"
-    if u.device.type == "cpu":
-        return "cpp" if _cpp_scan.compiled() else "torch"
-    if u.device.type == "cuda" and kind == torch.float32:
-        return _kernel(named)
-    return "torch"
-
-
-def _kernel(named: str) -> Backend:
-    """Return the scan backend for CUDA: the named backend if it is installed, else another
-    installed backend, else torch.
-    """
-    if named != "mamba_ssm" and importlib.util.find_spec("triton"):
-        return "triton"
-    if named != "triton" and importlib.util.find_spec("mamba_ssm"):
-        return "mamba_ssm"
-    _say_once(
-        "neither Triton nor mamba_ssm is installed for the selective"
-        f" scan{named and f' ({named} is requested)'}"
-    )
-    return "torch"
-
-
-@functools.cache
-def _say_once(why: str) -> None:
-    warnings.warn(f"{why}: torch computes the scan more slowly", stacklevel=5)
+    return "cpp" if _cpp_scan.compiled() else "torch"
 
 
 def _run(backend: str, u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:
     if backend not in get_args(Backend):
         raise ValueError(f"backend is {backend!r}: write auto, {', '.join(get_args(Backend))}")
-    if backend in ("triton", "mamba_ssm"):
-        if u.device.type != "cuda" or u.dtype != torch.float32:
-            raise ValueError(
-                f"the backend {backend} is for float32 on CUDA, but u is {u.dtype} on {u.device}"
-            )
-        return (by_mamba if backend == "mamba_ssm" else by_triton)(u, dt, A, B, C)
     if backend == "cpp" and u.device.type != "cpu":
         raise ValueError(f"the backend cpp is for the CPU, but u is on {u.device}")
     scan = _cpp_scan.Scan if backend == "cpp" and _cpp_scan.compiled() else _torch_scan.Scan
     y: Tensor = scan.apply(u, dt, A, B, C)  # type: ignore[no-untyped-call]
     return y
-
-
-def by_triton(*tensors: Tensor) -> Tensor:
-    """Run the scan by the Triton kernel; raise ValueError if Triton is not installed."""
-    if not importlib.util.find_spec("triton"):
-        raise ValueError(
-            "the backend triton is not installed: install a CUDA build of torch, which includes"
-            " Triton"
-        )
-    from neusee.nodes.restore._scan import _triton_scan
-
-    y: Tensor = _triton_scan.Scan.apply(*tensors)  # type: ignore[no-untyped-call]
-    return y
-
-
-class _Once(torch.autograd.Function):
-    """An identity that refuses a second derivative, because mamba_ssm silently computes a wrong
-    second derivative.
-    """
-
-    @staticmethod
-    def forward(ctx: object, y: Tensor) -> Tensor:
-        return y.view_as(y)
-
-    @staticmethod
-    def backward(ctx: object, *slopes: Tensor) -> Tensor:
-        _torch_scan.refuse_twice()
-        return slopes[0]
-
-
-def by_mamba(u: Tensor, dt: Tensor, A: Tensor, B: Tensor, C: Tensor) -> Tensor:
-    """Run the scan by the kernel of mamba_ssm; raise ValueError if mamba_ssm is not installed."""
-    try:
-        from mamba_ssm.ops.selective_scan_interface import selective_scan_fn
-    except ImportError as error:
-        raise ValueError(f"the backend mamba_ssm is not installed: {error}") from error
-    u, dt, B, C = (x.transpose(1, 2).contiguous() for x in (u, dt, B, C))
-    y: Tensor = _Once.apply(selective_scan_fn(u, dt, A, B, C))  # type: ignore[no-untyped-call]
-    return y.transpose(1, 2)

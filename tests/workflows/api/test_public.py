@@ -33,7 +33,7 @@ def exceptions():
     found = {}
     for package in (neusee.nodes, neusee.workflows):
         for info in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            if "triton" in info.name or info.name.endswith("__main__"):
+            if info.name.endswith("__main__"):
                 continue
             try:
                 module = importlib.import_module(info.name)

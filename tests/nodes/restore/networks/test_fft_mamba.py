@@ -1,7 +1,6 @@
 """The FFT-Mamba network: its size, the order of its scans, and what each part owes by itself."""
 
 import itertools
-import math
 from fractions import Fraction
 
 import pytest
@@ -17,7 +16,6 @@ from neusee.nodes.restore._networks._fft_mamba import (
     SMALL,
     Block,
     BothWays,
-    DualScan,
     FFTMamba,
     Frequency,
     Scan,
@@ -28,13 +26,8 @@ from neusee.nodes.restore._networks._fft_mamba import (
     radial_order,
 )
 from neusee.nodes.restore._networks._restorer import start_network
-from neusee.nodes.restore._scan._torch_scan import dual_scan
 
 CPU = torch.device("cpu")
-SCANS = [
-    pytest.param(lambda: Scan(6, 4, 2), id="s6"),
-    pytest.param(lambda: DualScan(6, 4, 2), id="ssd"),
-]
 
 
 def seeded(seed=0):
@@ -49,16 +42,11 @@ def begun(make):
     return start_network(make, seeded()).requires_grad_(False)
 
 
-def parameters(
-    width, blocks, states, shuffle, ssm="s6", directions=2, pyramid=False, frequency="complex"
-):
+def parameters(width, blocks, states, shuffle, directions=2, pyramid=False, frequency="complex"):
     """Written out part by part, biases last in each."""
     rank = -(-width // 16)
 
     def both_ways(d):
-        if ssm == "ssd":
-            heads = d // math.gcd(d, 16)
-            return 2 * (d * (heads + 2 * states) + 3 * heads)
         return 2 * (d * (rank + 2 * states) + rank * d + d + d * states + d)
 
     inner = 2 * width
@@ -96,12 +84,9 @@ def parameters(
         (64, 8, 16, 4),
         (48, 8, 16, 4),
         (20, 3, 5, 1),
-        (64, 8, 16, 2, "ssd"),
-        (20, 3, 5, 1, "ssd"),
-        (64, 8, 16, 2, "s6", 4),
-        (20, 3, 5, 1, "ssd", 4),
-        (64, 8, 16, 2, "s6", 2, True),
-        (20, 3, 5, 1, "s6", 4, True, "amp_phase"),
+        (64, 8, 16, 2, 4),
+        (64, 8, 16, 2, 2, True),
+        (20, 3, 5, 1, 4, True, "amp_phase"),
     ],
 )
 def test_has_as_many_parameters_as_its_parts(sizes):
@@ -117,7 +102,7 @@ def test_the_usual_network_has_938_thousand_parameters_in_eight_blocks():
 
 
 def test_four_directions_are_a_ninth_more_parameters():
-    assert parameters(64, 8, 16, 2, "s6", 4) - parameters(64, 8, 16, 2) == 8 * 2 * (
+    assert parameters(64, 8, 16, 2, 4) - parameters(64, 8, 16, 2) == 8 * 2 * (
         128 * 36 + 4 * 128 + 128 + 128 * 17
     )
     with torch.device("meta"):
@@ -172,9 +157,8 @@ def test_steps_at_the_start_remember_ten_to_a_thousand_places():
     assert torch.equal(scan.D, torch.ones(400))
 
 
-@pytest.mark.parametrize("make", SCANS)
-def test_a_scan_remembers_and_does_not_foresee(make):
-    scan, before = begun(make), drawn(1, 40, 6)
+def test_a_scan_remembers_and_does_not_foresee():
+    scan, before = begun(lambda: Scan(6, 4, 2)), drawn(1, 40, 6)
     after = before.clone()
     after[:, 12] += 1
     change = (scan(after) - scan(before)).abs().amax((0, 2))
@@ -198,9 +182,8 @@ def test_a_scan_is_its_recurrence():
     assert_close(scan(u).double(), wanted, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("make", SCANS)
-def test_decays_and_steps_stay_within_bounds_whatever_is_learnt(make):
-    scan, u = start_network(make, seeded()), 100 * drawn(1, 40, 6)
+def test_decays_and_steps_stay_within_bounds_whatever_is_learnt():
+    scan, u = start_network(lambda: Scan(6, 4, 2), seeded()), 100 * drawn(1, 40, 6)
     with torch.no_grad():
         scan.A_log.copy_(torch.linspace(-200, 200, scan.A_log.numel()).view_as(scan.A_log))
         scan.dt_bias.copy_(torch.linspace(-300, 300, scan.dt_bias.numel()))
@@ -243,62 +226,6 @@ def test_a_scan_by_rows_goes_along_rows():
     change = (part(after) - part(before)).abs().amax((0, 1)).flatten()
     assert not change[: 2 * 6 + 3].any()
     assert float(change[2 * 6 + 3 :].min()) > 0
-
-
-@pytest.mark.parametrize("length", [1, 31, 32, 33, 100])
-def test_the_dual_scan_is_its_recurrence(length):
-    heads, states = 3, 5
-    u, dt = drawn(2, length, 6).double(), drawn(2, length, heads).double().exp()
-    into, out = drawn(2, length, states).double(), drawn(2, length, states, seed=6).double()
-    decay, skip = -drawn(heads).double().exp(), drawn(heads, seed=7).double()
-    found = dual_scan(u, dt, decay, into, out, skip)
-    state = torch.zeros(2, heads, 2, states, dtype=torch.float64)
-    for t in range(length):
-        now = u[:, t].view(2, heads, 2)
-        state = torch.exp(dt[:, t] * decay)[..., None, None] * state
-        state = state + (dt[:, t, :, None] * now)[..., None] * into[:, t, None, None]
-        wanted = (state * out[:, t, None, None]).sum(-1) + skip[:, None] * now
-        assert_close(found[:, t], wanted.flatten(1), rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("decays", [1e-6, 1e-3, 50.0, 200.0, "mixed"])
-def test_the_dual_scan_in_single_precision_is_that_in_double(decays):
-    logs = torch.rand(1, 700, 2, generator=seeded(), dtype=torch.float64) * math.log(
-        5e7
-    ) + math.log(1e-6)
-    dt = logs.exp() if decays == "mixed" else torch.full((1, 700, 2), decays, dtype=torch.float64)
-    u, into, out = (drawn(1, 700, n, seed=seed).double() for n, seed in ((4, 4), (3, 5), (3, 6)))
-    decay, skip, weights = (
-        -torch.ones(2).double(),
-        torch.zeros(2).double(),
-        drawn(1, 700, 4, seed=9),
-    )
-    exact = [x.requires_grad_() for x in (u, dt, decay, into, out, skip)]
-    single = [x.detach().float().requires_grad_() for x in exact]
-    results = [dual_scan(*given) for given in (exact, single)]
-    slopes = [
-        torch.autograd.grad((r * weights).sum(), g)
-        for r, g in zip(results, (exact, single), strict=True)
-    ]
-    for one, other in zip((results[0], *slopes[0]), (results[1], *slopes[1]), strict=True):
-        assert (
-            float((one - other).detach().abs().max())
-            <= 2e-5 * float(one.detach().abs().max()) + 1e-30
-        )
-
-
-def test_the_dual_scan_has_true_slopes_of_both_orders():
-    inputs = [
-        drawn(1, 5, 4).double(),
-        drawn(1, 5, 2).double().exp(),
-        -drawn(2).double().exp(),
-        drawn(1, 5, 2, seed=2).double(),
-        drawn(1, 5, 2, seed=3).double(),
-        drawn(2, seed=4).double(),
-    ]
-    inputs = [x.requires_grad_() for x in inputs]
-    assert torch.autograd.gradcheck(lambda *v: dual_scan(*v, chunk=2), inputs, fast_mode=True)
-    assert torch.autograd.gradgradcheck(lambda *v: dual_scan(*v, chunk=2), inputs, fast_mode=True)
 
 
 # --- the spectrum ---------------------------------------------------------------------------------
@@ -479,12 +406,11 @@ def test_a_constant_gate_of_amplitude_scales_the_picture_and_one_of_phase_turns_
         ),
         ("frequency", "amp_phase", "frequency: amp_phase, and this network has frequency: complex"),
         ("directions", 4, "directions: 4, and this network has directions: 2"),
-        ("ssm", "ssd", "ssm: ssd, and this network has ssm: s6"),
     ],
 )
 def test_a_file_of_weights_tells_what_its_tensors_do_not(tmp_path, option, learnt, said):
     sizes = {"width": 4, "blocks": 1, "states": 2, "shuffle": 2}
-    usual = {"ssm": "s6", "directions": 2, "pyramid": False, "frequency": "complex"}
+    usual = {"directions": 2, "pyramid": False, "frequency": "complex"}
     net = begun(lambda: FFTMamba(**sizes, **{option: learnt}))
     save_file(net.state_dict(), file := tmp_path / "net.safetensors", file_metadata(net))
     with pytest.raises(ParameterError, match=f"net.safetensors.*{said}") as caught:

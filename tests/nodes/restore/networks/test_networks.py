@@ -20,21 +20,15 @@ from neusee.nodes.restore._networks._unet_and_nafnet import NAFBlock, NAFNet, UN
 SMALL = {"width": 4, "blocks": 2, "states": 3}
 MAKE = {
     "fft_mamba": partial(FFTMamba, **SMALL),
-    "ssd": partial(FFTMamba, **SMALL, ssm="ssd"),
     "unet": partial(UNet, 4),
     "nafnet": partial(NAFNet, 4),
 }
 PARAMS = {
     "fft_mamba": SMALL,
-    "ssd": SMALL | {"ssm": "ssd"},
     "unet": {"width": 4},
     "nafnet": {"width": 4},
 }
 every_network = pytest.mark.parametrize("name", MAKE)
-
-
-def node_of(name):
-    return getattr(restore, {"ssd": "fft_mamba"}.get(name, name))
 
 
 def seeded(seed=0):
@@ -263,7 +257,7 @@ def test_sizes_of_the_baselines():
 def test_the_node_gives_what_the_network_gives(name, saved):
     net, path = saved(name)
     picture = 3 * drawn(3, 19, 13) - 1  # beside a lamp, and out of gamut
-    node = node_of(name)
+    node = getattr(restore, name)
     assert node.hooks.preflight(**PARAMS[name], weights=path) == []
     with torch.no_grad():
         wanted = net(picture[None])[0]
@@ -280,7 +274,7 @@ def test_the_node_gives_what_the_network_gives(name, saved):
 @every_network
 def test_the_node_computes_in_single_precision_whatever_comes(name, saved):
     _, path = saved(name)
-    node = partial(node_of(name), **PARAMS[name], weights=path)
+    node = partial(getattr(restore, name), **PARAMS[name], weights=path)
     picture = drawn(3, 16, 16).half()
     found = node(picture)
     assert found.dtype == torch.float32
@@ -299,7 +293,9 @@ def test_weights_stored_in_half_precision_compute_in_single(name, saved, tmp_pat
     with torch.no_grad():
         wanted = net.bfloat16().float()(drawn(3, 16, 16)[None])[0]
     assert torch.equal(
-        node_of(name)(drawn(3, 16, 16), **PARAMS[name], weights=tmp_path / "half.safetensors"),
+        getattr(restore, name)(
+            drawn(3, 16, 16), **PARAMS[name], weights=tmp_path / "half.safetensors"
+        ),
         wanted,
     )
 
@@ -308,14 +304,14 @@ def test_weights_stored_in_half_precision_compute_in_single(name, saved, tmp_pat
 def test_slopes_reach_the_picture_through_the_node(name, saved):
     _, path = saved(name)
     picture = drawn(3, 16, 16).requires_grad_()
-    node_of(name)(picture, **PARAMS[name], weights=path).square().sum().backward()
+    getattr(restore, name)(picture, **PARAMS[name], weights=path).square().sum().backward()
     assert bool(picture.grad.isfinite().all())
     assert float(picture.grad.abs().min(0).values.min()) > 0
 
 
 @every_network
 def test_without_weights_it_is_refused_with_what_to_give(name):
-    node = node_of(name)
+    node = getattr(restore, name)
     with pytest.raises(ParameterError, match=r"give the \.safetensors file") as caught:
         node.hooks.preflight(**PARAMS[name])
     assert caught.value.parameter == "weights"
@@ -326,7 +322,7 @@ def test_without_weights_it_is_refused_with_what_to_give(name):
 @every_network
 def test_weights_of_another_network_are_refused_by_their_name(name, saved, tmp_path):
     net, path = saved(name)
-    node = node_of(name)
+    node = getattr(restore, name)
     with pytest.raises(ParameterError, match=r"\(width 8\) has") as caught:
         node.hooks.preflight(**PARAMS[name] | {"width": 8}, weights=path)
     assert caught.value.parameter == "weights"
@@ -363,7 +359,6 @@ def test_a_picture_that_is_not_finite_is_refused(saved):
 def test_the_full_size_works_on_an_odd_picture(name):
     full = {
         "fft_mamba": FFTMamba,
-        "ssd": partial(FFTMamba, ssm="ssd"),
         "unet": UNet,
         "nafnet": NAFNet,
     }

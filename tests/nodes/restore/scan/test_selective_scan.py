@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-import types
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,8 +15,8 @@ import pytest
 import torch
 
 from neusee.nodes import _cpp_library
-from neusee.nodes.restore._scan import _cpp_scan, _selective_scan, _torch_scan
-from neusee.nodes.restore._scan._selective_scan import by_mamba, reference, selective_scan
+from neusee.nodes.restore._scan import _cpp_scan, _torch_scan
+from neusee.nodes.restore._scan._selective_scan import reference, selective_scan
 
 ROOT = Path(__file__).parents[4]
 RATES = [1e-6, 1e-3, 0.1, 1.0, 50.0, 200.0, "mix"]
@@ -277,27 +276,6 @@ def test_what_cannot_be_scanned_is_refused():
         selective_scan(values[0][0], *values[1:])
     with pytest.raises(ValueError, match="backend is 'fast'"):
         selective_scan(*values, backend="fast")
-    for backend in ("mamba_ssm", "triton"):
-        with pytest.raises(ValueError, match=f"the backend {backend} is for float32 on CUDA"):
-            selective_scan(*values, backend=backend)
-
-
-def test_the_kernel_of_mamba_gets_the_length_last_and_one_derivative(monkeypatch):
-    def kernel(u, dt, A, B, C):
-        assert all(x.is_contiguous() for x in (u, dt, B, C))
-        return reference(
-            *(x.transpose(1, 2) for x in (u, dt)), A, *(x.transpose(1, 2) for x in (B, C))
-        ).mT
-
-    name = "mamba_ssm.ops.selective_scan_interface"
-    for part in ("mamba_ssm", "mamba_ssm.ops", name):
-        monkeypatch.setitem(sys.modules, part, types.SimpleNamespace(selective_scan_fn=kernel))
-    leaves = [x.requires_grad_() for x in draw(20, 3, 2)]
-    y = by_mamba(*leaves)
-    assert worst(y, loop(*(x.detach() for x in leaves))) < 1e-13
-    assert len(torch.autograd.grad(y.sum(), leaves, retain_graph=True)) == 5
-    with pytest.raises(RuntimeError, match="no second derivative"):
-        torch.autograd.grad(y.sum(), leaves, create_graph=True)
 
 
 def test_the_environment_chooses(monkeypatch):
@@ -312,36 +290,6 @@ def test_the_environment_chooses(monkeypatch):
     monkeypatch.setenv("NEUSEE_SCAN", "fortran")
     with pytest.raises(ValueError, match="NEUSEE_SCAN is 'fortran'"):
         selective_scan(*values)
-
-
-@pytest.mark.parametrize(
-    ("there", "named", "chosen"),
-    [
-        (("triton", "mamba_ssm"), "", "triton"),
-        (("triton", "mamba_ssm"), "mamba_ssm", "mamba_ssm"),
-        (("mamba_ssm",), "", "mamba_ssm"),
-        (("mamba_ssm",), "triton", "torch"),
-        ((), "", "torch"),
-    ],
-)
-def test_on_a_gpu_what_is_installed_scans(monkeypatch, there, named, chosen):
-    monkeypatch.setenv("NEUSEE_SCAN", named)
-    monkeypatch.setattr(_selective_scan.importlib.util, "find_spec", lambda name: name in there)
-    _selective_scan._say_once.cache_clear()
-    u = types.SimpleNamespace(device=torch.device("cuda"))
-    assert _selective_scan._auto(u, torch.float64) == "torch"
-    if chosen == "torch":
-        with pytest.warns(
-            UserWarning,
-            match=r"^neither Triton nor mamba_ssm is installed.*: torch computes the scan",
-        ) as said:
-            assert [
-                _selective_scan._auto(u, torch.float32),
-                _selective_scan._auto(u, torch.float32),
-            ] == ["torch"] * 2
-        assert len(said) == 1
-    else:
-        assert _selective_scan._auto(u, torch.float32) == chosen
 
 
 def test_without_a_compiler_torch_computes_and_it_is_said_once(monkeypatch, tmp_path):
