@@ -212,23 +212,6 @@ class FoundLasers(NamedTuple):
     straight_spread: Tensor
 
 
-class Shading(NamedTuple):
-    """The smooth transmission that frames of one camera share: dirt on lens and window, and
-    fall-off to the corners.
-    """
-
-    #: (y, x) by which a frame is divided; its geometric mean is 1; 1 where not identifiable
-    transmission: Tensor
-    spread: Tensor  #: (y, x) standard deviation of its logarithm, of what the division leaves
-    estimate: Tensor  #: (knot y, knot x) float64, posterior mean of the logarithm
-    deviation: Tensor  #: (knot y, knot x) float64, posterior standard deviation of the logarithm
-    told: Tensor  #: () float64, share of the variance of the field that the frames tell, 0 to 1
-    clean: Tensor  #: () float64, probability that there is no field
-    identifiable: Tensor  #: () bool: True if the frames tell the field
-    frames: Tensor  #: () int64, how many there were
-    alike: Tensor  #: () float64, correlation of the details of two scenes: 0 for scenes that differ
-
-
 class WienerProblem(NamedTuple):
     """The deconvolution of `restore.wiener`: a linear problem for a scene of mean 0 and variance
     1, and its answer.

@@ -27,7 +27,6 @@ from neusee.nodes.restore._networks._restorer import Restorer, parameter_groups,
 from neusee.nodes.restore._networks._unet_and_nafnet import NAFNet, UNet, nafnet, unet
 from neusee.nodes.restore._networks._wiener_networks import Informed, Unrolled, informed, unrolled
 from neusee.nodes.restore._sensor_likelihood import MeasuringSensor, measuring_sensor
-from neusee.nodes.restore._shading_field import shading
 from neusee.nodes.restore._wiener_by_field import spread_by_field, wiener_by_field
 
 __all__ = [
@@ -63,7 +62,6 @@ __all__ = [
     "parameter_groups",
     "require_exportable",
     "richardson_lucy",
-    "shading",
     "skip_critic_draws",
     "spread_by_field",
     "start_network",

@@ -17,7 +17,7 @@ from neusee.nodes.sensor._exposure import channel_weights
 from neusee.nodes.sensor._saturation import Well, refuse_without_steps
 from neusee.nodes.spectra._cie_tables import paints, to_srgb
 from neusee.nodes.units import Efficiency, Electrons, Exposure, Gain, PixelPitch
-from neusee.nodes.values import Bands, MeasuredPsf, Psf, Shading
+from neusee.nodes.values import Bands, MeasuredPsf, Psf
 
 # --- electrons and colour -------------------------------------------------------------------------
 
@@ -34,7 +34,6 @@ _BRIGHTEST = 0.5
 @node()
 def electrons(
     raw: Tensor,
-    shading: Shading | None = None,
     *,
     gain: Gain,
     offset: Electrons,
@@ -42,16 +41,13 @@ def electrons(
 ) -> Tensor:
     """Convert digital numbers to electrons: undo the gain of the sensor and subtract its offset.
 
-    With ``shading``, of `restore.shading`, the electrons are divided by its transmission.
-
-    Shapes: raw (..., y, x), shading (y, x) -> (..., y, x).
+    Shapes: raw (..., y, x) -> (..., y, x).
     Units:  raw DN; gain K, DN/e-; offset e-; result e-, negative where read noise was negative.
     Error:  the rounding of the converter, 0.29 DN rms; clipped pixels stay clipped. The quotient
             itself is float32, within 1.2e-7 of raw / gain.
     Source: NeuSee, Eq. (SensorImage), inverted.
     """
-    light = single(raw) / gain - (offset if offset_subtracted else 0.0)
-    return light if shading is None else light / shading.transmission.to(light)
+    return single(raw) / gain - (offset if offset_subtracted else 0.0)
 
 
 @electrons.preflight
@@ -65,11 +61,8 @@ def _(*, offset: float, offset_subtracted: bool = True, **params: object) -> lis
 
 
 @electrons.propagate_error
-def _(raw: ErrorBound, shading: ErrorBound | None = None, *, gain: float, **params: Any) -> float:
-    if shading is None:
-        return raw.rms / gain
-    lowest_transmission = shading.stats.min if shading.stats and not shading.rms else 0.0
-    return raw.rms / gain / lowest_transmission if lowest_transmission > 0 else math.inf
+def _(raw: ErrorBound, *, gain: float, **params: Any) -> float:
+    return raw.rms / gain
 
 
 @electrons.expected_range

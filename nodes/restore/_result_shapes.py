@@ -40,7 +40,6 @@ from neusee.nodes.restore._networks._own_network import tried
 from neusee.nodes.restore._networks._unet_and_nafnet import nafnet, unet
 from neusee.nodes.restore._networks._wiener_networks import informed, unrolled
 from neusee.nodes.restore._point_frames import points_in
-from neusee.nodes.restore._shading_field import grid, shading
 from neusee.nodes.restore._wiener_by_field import spread_by_field, wiener_by_field
 from neusee.nodes.shape_rules import (
     at_least_single,
@@ -56,7 +55,6 @@ from neusee.nodes.values import (
     MeasuredPsf,
     Psf,
     Pupil,
-    Shading,
     WienerProblem,
 )
 
@@ -83,8 +81,6 @@ _LINES = 61  #: spectral lines that a search tries, each with five transforms
 #: bytes of inner results of a network that need as much memory as a byte of the usual work of a
 #: node
 _KEPT = 1 / 8
-_LAWS = 400.0  #: bytes, and operations, of the laws of a scene for each element of their matrices
-_FIELD = 60.0  #: products of matrices of the knots
 _LAYER = 1e-3  #: operations of a transform that take as long as one of a layer
 
 for node in (
@@ -115,27 +111,6 @@ def _(channels: Tensor, matrix: Tensor, **params: Any) -> Tensor:
 @colour_matrix.shape
 def _(bands: Any, illuminant: Any, responses: Tensor, *inputs: Any, **params: Any) -> Tensor:
     return double(3, len(responses))
-
-
-@shading.shape
-def _(responses: Any, *, shape: Sequence[int], **params: Any) -> Shading:
-    y, x = shape
-    knots, scalar = grid((y, x)), double()
-    counts = blank(dtype=torch.bool), blank(dtype=torch.int64)
-    return Shading(
-        blank(y, x), blank(y, x), double(*knots), double(*knots), scalar, scalar, *counts, scalar
-    )
-
-
-@shading.work
-def _(
-    result: Shading, *inputs: Any, files: Sequence[Any] = (), **params: Any
-) -> tuple[float, float]:
-    y, x = result.transmission.shape
-    knots = result.estimate.numel()
-    return 100.0 * y * x + _LAWS * knots**2, _FIELD * knots**3 + 10.0 * len(files) * (
-        y * x + _LAWS * knots**2
-    )
 
 
 @nearby_glare.shape

@@ -15,7 +15,7 @@ from neusee.nodes.precision import single
 from neusee.nodes.restore._inverse._glare import Glare, with_light_around, with_smooth
 from neusee.nodes.restore._inverse._hidden_pixels import most_likely
 from neusee.nodes.restore._inverse._masked_blur import edge
-from neusee.nodes.restore._inverse._posterior_spread import Draws, frame_deviation, with_shading
+from neusee.nodes.restore._inverse._posterior_spread import Draws, frame_deviation
 from neusee.nodes.restore._inverse._wiener import (
     PRECISE,
     Doubt,
@@ -28,7 +28,7 @@ from neusee.nodes.restore._inverse._wiener import (
 )
 from neusee.nodes.restore._point_frames import hats
 from neusee.nodes.units import Electrons
-from neusee.nodes.values import Bands, MeasuredPsf, Psf, Shading
+from neusee.nodes.values import Bands, MeasuredPsf, Psf
 
 Balance = Annotated[float, Field(ge=1e-6, le=1e6)]
 
@@ -90,8 +90,6 @@ def spread_by_field(
     matrix: Tensor,
     glare: list[Tensor] | None = None,
     nearby: list[Tensor] | None = None,
-    restored: Tensor | None = None,
-    shading: Shading | None = None,
     *,
     balance: Balance = 1.0,
     doubt: Doubt = 0.0,
@@ -106,8 +104,8 @@ def spread_by_field(
 
     As `restore.wiener_spread` with the law `frame`, around each node. Each drawn scene is blurred
     with a PSF drawn from the measurement, and restored with the mean PSF: noise, the lost detail
-    and the error of the PSF enter together. ``glare``, ``nearby``, ``restored`` and ``shading``
-    count as in `restore.wiener_spread`.
+    and the error of the PSF enter together. ``glare`` and ``nearby`` count as in
+    `restore.wiener_spread`.
 
     Shapes: as `restore.wiener_by_field`, matrix (colour, channel) -> (colour, y, x).
     Units:  those of `restore.colour`.
@@ -131,7 +129,7 @@ def spread_by_field(
             scaled = _problem(electrons, clipped, zone, light, settings)
         deviation = frame_deviation(scaled, matrix, draws, rng, zone.draws)
         total[:, zone.rows, zone.columns] += zone.weight.to(total) * deviation.to(total)
-    return with_shading(total, restored, shading)
+    return total
 
 
 @wiener_by_field.check

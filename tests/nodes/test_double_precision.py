@@ -628,7 +628,7 @@ _ELSEWHERE = {
         "calibrate.stray_light", "calibrate.stray_prior", "calibrate.sufficient", "restore.filter_facts",
         "restore.find_lasers", "restore.found_glare", "restore.found_nearby", "restore.informed",
         "restore.measured_psf", "restore.nearby_glare",
-        "restore.richardson_lucy", "restore.shading", "restore.unrolled", "restore.wiener", "restore.wiener_by_field",
+        "restore.richardson_lucy", "restore.unrolled", "restore.wiener", "restore.wiener_by_field",
         "restore.wiener_problem", "spectra.compress"),
     "copies, counts or states": ("laser.bright_pixels", "laser.damaged_pixels", "laser.dazzle", "laser.dazzle_curve",
         "metrics.saturated", "optics.pupil_of_bands", "optics.stop", "restore.clipped", "sensor.crop", "sensor.limits",

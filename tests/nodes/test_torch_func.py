@@ -39,7 +39,7 @@ def test_the_table_has_a_line_for_every_node(every_case):
 def test_a_node_without_a_tensor_says_why():
     line = dict.fromkeys(TRANSFORMS, "–")
     # a stop only says where the samples lie; four nodes read files
-    readers = ("restore.measured_psf", "restore.shading", "scene.hyperspectral", "sensor.frame")
+    readers = ("restore.measured_psf", "scene.hyperspectral", "sensor.frame")
     for path, why in NOTHING_TO_FOLLOW.items():
         assert TABLE[path] == {"of": "", **line, "why": why}, path
         assert BY_PATH[path].inputs in ((), ("stop",)) or path in readers, path

@@ -465,7 +465,6 @@ NOTHING_TO_FOLLOW = {
     "doe.unet": "draws a network that is to be trained",
     "doe.vortex": "has a whole charge alone",
     "optics.stop": "states the pupil grid, which other nodes read as plain numbers",
-    "restore.shading": "reads files",
     "restore.measured_psf": "reads files",
     "scene.exr": "reads a file",
     "sensor.frame": "reads a file",

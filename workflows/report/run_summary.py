@@ -9,10 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neusee.nodes.values import Shading
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.report.contents import RIVAL, TABLE, shade_of
-from neusee.workflows.report.figures.camera_pictures import BRIGHT, NORMAL, half_width, unexplained
+from neusee.workflows.report.figures.camera_pictures import BRIGHT, half_width, unexplained
 from neusee.workflows.report.result_numbers import Value, arms, lines_of, suppressed
 
 # --- mask story -----------------------------------------------------------------------------------
@@ -286,7 +285,6 @@ _NEEDS = ("restored", "restored_spread", "raw[mask]", "clipped[mask]")
 _FRAME = "sensor.frame"
 _WIENER = ("restore.wiener", "restore.wiener_by_field")  #: filters of which the interval is
 _MEASURED = "restore.spread_by_field"
-_SHADING = "shading"
 
 
 def said_of_frame(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict[str, str]:
@@ -306,8 +304,6 @@ def said_of_frame(recipe: Recipe, keys: Mapping[str, str], value: Value) -> dict
         _interval(half, invented),
         _doubtful(restored, half, invented),
     ]
-    if _SHADING in recipe.steps and _SHADING in keys:
-        parts.append(_shading(value(_SHADING)))
     parts.append(_limits(recipe))
     return {"frame": " ".join(sentence for sentence in parts if sentence)}
 
@@ -353,29 +349,6 @@ def _doubtful(restored: Tensor, half: Tensor, invented: Tensor) -> str:
         " model does not hold there. Either light of a laser or a lamp was taken for scene, or"
         " white is set too low (frame.white). Do not trust them or their surroundings;"
         " restore=search finds lasers and removes them."
-    )
-
-
-def _shading(shading: Shading) -> str:
-    """Return what the frames tell of dirt, as a smooth transmission."""
-    count = int(shading.frames)
-    frames = "one frame tells" if count == 1 else f"{count} frames tell"
-    evidence = f"{frames} {float(shading.told):.0%} of the variance of the shading"
-    width = f"±{NORMAL * float(shading.deviation.median()):.2g}"
-    if not bool(shading.identifiable):
-        return (
-            f"Dirt is not identifiable: {evidence}, and the probability that there is none is"
-            f" {float(shading.clean):.0%}. At least 8 different scenes, half of the variance and at"
-            " most 5% are needed. The frame is left as it is. The logarithm of a transmission"
-            f" stays unknown to {width} in half of the field; the interval of the picture includes"
-            " this."
-        )
-    low, high = (float(end) for end in shading.transmission.aminmax())
-    return (
-        f"The frame was divided by a transmission of {low:.2f} to {high:.2f} relative to its"
-        f" geometric mean, whose logarithm is known to {width} in half of the field: {evidence}."
-        " What all scenes have in common cannot be told from dirt, nor a constant factor. Light"
-        " that dirt scatters into the picture is not removed."
     )
 
 

@@ -65,7 +65,6 @@ OUTPUTS = ("raw[mask]", "developed[mask]", "clipped[mask]", "restored", "restore
 PLAIN_CAMERA = "first_light"  #: recipe around a sensor file, with a plain lens
 _SCENE = ("scene", "cube")  #: steps of the groups `scene` and `lift`, which a frame does not need
 _DROPPED = ("rival", "damage", "safety")  #: groups that compare or judge a simulated laser
-_SHADING = "shading=estimated"  #: an option of which all frames together tell
 #: restorers for a measured PSF
 _WITH_PSF = {"restore=measured": "measured", "restore=search": "measured_search"}
 _STEM = re.compile(r"[^\w-]+")
@@ -90,12 +89,6 @@ def recipes_of(
     name, base, words = _camera(camera, folder)
     words += _mask(mask, folder) + _psf(psf, changes, folder, first)
     frames, recipes, problems = list(frames), list[Recipe](), dict[Diagnostic, None]()
-    if any(change.lstrip("+") == _SHADING for change in changes):
-        quoted = ", ".join(map(_quoted, frames))
-        words = [
-            *words,
-            _said("frames", f"shading.frames=[{quoted}]", folder, shown_as=f"{len(frames)} frames"),
-        ]
     own = [(n, text) for n, text in enumerate(changes, first) if not psf or text not in _WITH_PSF]
     for frame in frames:
         try:

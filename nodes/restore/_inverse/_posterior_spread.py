@@ -35,7 +35,7 @@ from neusee.nodes.restore._inverse._wiener import (
 )
 from neusee.nodes.restore._inverse._wiener_prior import drawn_blotches, fitted_law
 from neusee.nodes.units import Electrons
-from neusee.nodes.values import Bands, Psf, Shading
+from neusee.nodes.values import Bands, Psf
 
 # --- frame deviation ------------------------------------------------------------------------------
 
@@ -256,8 +256,6 @@ def wiener_spread(
     glare: list[Tensor] | None = None,
     nearby: list[Tensor] | None = None,
     ghosts: list[Tensor] | None = None,
-    restored: Tensor | None = None,
-    shading: Shading | None = None,
     *,
     balance: Annotated[float, Field(ge=1e-6, le=1e6)] = 1.0,
     doubt: Doubt = 0.0,
@@ -288,9 +286,6 @@ def wiener_spread(
     three, and that the deviation of a scene is 0.8 of its mean, to a factor of 1.6; and scattered
     light has blotches of 16 pixels, with 0.4 of the deviation of its speckle.
 
-    With ``restored``, the picture in colour, and ``shading``, by which the frame was divided, what
-    is not known of the shading counts too: its relative deviation times the picture.
-
     Shapes: as `restore.wiener`, matrix (colour, channel) -> (colour, y, x).
     Units:  those of `restore.colour`; with the unit matrix e-.
     Error:  with `law` filter a relative standard deviation of 1 / sqrt(2 draws) in each pixel,
@@ -315,16 +310,7 @@ def wiener_spread(
         settings = Settings(balance, read_noise, doubt, least_doubt, scatter, border)
         scaled = posed(fine, unclipped, kernels, shapes, settings, white)
     drawn = drawn_deviation if law == "filter" else frame_deviation
-    return with_shading(drawn(scaled, matrix, draws, rng).to(single(electrons)), restored, shading)
-
-
-def with_shading(deviation: Tensor, restored: Tensor | None, shading: Shading | None) -> Tensor:
-    """Return the deviation of a picture (colour, y, x) that includes what is not known of its
-    shading.
-    """
-    if restored is None or shading is None:
-        return deviation
-    return torch.hypot(deviation, (restored * shading.spread).to(deviation).abs())
+    return drawn(scaled, matrix, draws, rng).to(single(electrons))
 
 
 def drawn_deviation(scaled: Scaled, matrix: Tensor, draws: int, rng: Generator) -> Tensor:

@@ -107,22 +107,6 @@ def test_a_folder_gives_a_folder_of_results_for_each_frame_and_the_second_time_f
 
 
 @pytest.mark.slow
-def test_the_shading_comes_from_all_frames_that_are_named_and_the_page_says_what_they_tell(
-    neusee, tmp_path
-):
-    for number in range(2):
-        save(tmp_path / "frames" / f"f{number}.npy", shot(seed=number))
-    code, out, err = neusee("frames", "+shading=estimated", "--camera", "plain_lens", "--json")
-    assert (code, err) == (0, "")
-    for line in out.splitlines():
-        document = json.loads(line)
-        assert "Dirt is not identifiable: 2 frames tell " in document["story"]["frame"]
-        assert "shading" in {step["step"] for step in document["steps"]}
-        page = (tmp_path / document["report"]).read_text(encoding="utf-8")
-        assert "The shading field" in page
-
-
-@pytest.mark.slow
 def test_a_camera_may_be_a_sensor_file_and_a_laser_may_be_told(neusee, tmp_path):
     sensor = tmp_path / "lab" / "sensor" / "mine.yaml"
     sensor.parent.mkdir(parents=True)
@@ -250,17 +234,9 @@ BAD = {
         "more: not a change of a value",
     ),
     "a step that a frame lacks": ([GOOD, "--camera", "half_ring", "outputs=[truht]"], "truht"),
-    "bad frame of the shading": (
-        [GOOD, "+shading=estimated", "shading.frames=[small.npy]", "--camera", "half_ring"],
-        "small.npy has 12 x 12 pixels (y, x), but sensor.shape is [20, 20]",
-    ),
-    "no frames of the shading": (
-        [GOOD, "+shading=estimated", "shading.frames=others", "--camera", "half_ring"],
-        "no such file, and no folder or pattern",
-    ),
-    "unknown shading": (
-        [GOOD, "+shading=estimate", "--camera", "half_ring"],
-        "did you mean estimated?",
+    "a field of dirt": (
+        [GOOD, "+shading=estimated", "--camera", "half_ring"],
+        "dirt is not estimated from frames",
     ),
     "absent points": (
         [GOOD, "--camera", "half_ring", "--psf", "points"],

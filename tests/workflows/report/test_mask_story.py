@@ -337,7 +337,7 @@ def test_the_page_leads_with_the_pictures_and_the_story(document):
 
 
 @pytest.mark.parametrize(
-    "why", ["`neusee study accuracy first_light` measures it", "the recipe has no step shading"]
+    "why", ["`neusee study accuracy first_light` measures it", "the recipe has no step dirt"]
 )
 def test_the_page_shows_no_backtick(document, why):
     """Words between backticks are code, in the story and in the reasons of what is not drawn."""

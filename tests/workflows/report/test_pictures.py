@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from neusee.nodes import node
-from neusee.nodes.values import Bands, Psf, Pupil, Shading
+from neusee.nodes.values import Bands, Psf, Pupil
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
@@ -21,7 +21,6 @@ from neusee.workflows.report import contents, run_pictures
 from neusee.workflows.report.figures import camera_pictures as camera_overview
 from neusee.workflows.report.figures import camera_pictures as frame_and_interval
 from neusee.workflows.report.figures import camera_pictures as scene_spectra
-from neusee.workflows.report.figures import camera_pictures as shading_field
 from neusee.workflows.report.figures import graph_and_timeline as recipe_graph
 from neusee.workflows.report.figures import optics
 from neusee.workflows.report.figures import optics as own_tables
@@ -77,14 +76,6 @@ def psf_of(p: Pupil, *, shape: tuple[int, int] = (N, N), precision: str = "doubl
 def scene() -> torch.Tensor:
     ramp = torch.linspace(0.05, 0.9, N)
     return torch.stack([ramp.expand(N, N), ramp[:, None].expand(N, N), 0.9 - ramp.expand(N, N)])
-
-
-def shading() -> Shading:
-    log = torch.linspace(-0.3, 0.3, 12).double()[:, None] * torch.linspace(0.5, 1, 9).double()
-    smooth, one = torch.ones(N, N), torch.tensor(0.8).double()
-    return Shading(
-        smooth, smooth, log, 0.1 + log.abs(), one, 1 - one, one > 0, torch.tensor(20), one
-    )
 
 
 def spot() -> torch.Tensor:
@@ -160,7 +151,6 @@ def drawings(light: SimpleNamespace, table_arguments: dict) -> dict[str, tuple]:
             optics.psf,
             dict(plain=light.plain, mask=light.mask, bands=bands(), pixel_pitch=PIXEL),
         ),
-        "shading": (shading_field.transmission, dict(shading=shading())),
         "suppression": (
             optics.suppression,
             dict(lsr=light.lsr, bands=bands(), psf=light.mask, bsr=torch.full((B,), 0.9)),

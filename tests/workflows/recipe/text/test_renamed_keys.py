@@ -63,6 +63,7 @@ def test_every_old_name_is_of_one_kind_and_is_one_no_more():
         *GRID,
         *ELEMENT,
         *LIFT,
+        "shading",
     )
     assert sorted(kinds) == sorted(old_names())
     assert sorted(ELEMENT) == [
@@ -107,6 +108,12 @@ def test_an_old_key_that_a_reference_names(old):
     assert len(found) == 1
     assert found[0][0] == "argument 1"
     assert instead(old) in found[0][2]
+
+
+def test_the_group_of_the_field_of_dirt_in_an_argument():
+    assert refused("first_light", "+shading=estimated") == [
+        ("argument 1", "shading", instead("shading"))
+    ]
 
 
 @pytest.mark.parametrize("old", NODES)
