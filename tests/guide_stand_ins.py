@@ -63,7 +63,7 @@ class StandIn(NamedTuple):
     instead: Mapping[str, str] = {}  #: words in the place of words of the page
     #: ``module:name`` of a number of the program that is made small
     constants: Mapping[str, Any] = {}
-    processes: int = 1  #: of a mesh
+    processes: int = 1  #: of `torchrun`
     code: int = 0  #: the exit code
 
 
@@ -231,11 +231,10 @@ STAND_INS = {
     "train train_small": StandIn("a training of an hour", more=(*TRAINING, *ONE)),
     "train train_small train=as_printed": StandIn("a training of an hour", more=(*TRAINING, *ONE)),
     f"{SIX}": StandIn("a training of 20 s", more=TRAINING, instead=SHORT),
-    f"{SIX} --mesh 1x2": StandIn("a training of 20 s", more=TRAINING, instead=SHORT, processes=2),
+    f"{SIX} --out runs/two": StandIn("a training of 20 s", more=TRAINING, instead=SHORT, processes=2),
     "train train --device cuda": StandIn("days on a GPU", more=PAPER_TRAINING, instead={"cuda": "cpu"}),
-    "train train train.photographs=my_photographs --device cuda --mesh 4x2": StandIn(
-        "days on eight GPUs: two processes, and gloo", more=PAPER_TRAINING, instead={"cuda": "cpu", "4x2": "2x1"},
-        processes=2),
+    "train train train.photographs=my_photographs --device cuda": StandIn(
+        "days on eight GPUs: two processes, and gloo", more=PAPER_TRAINING, instead={"cuda": "cpu"}, processes=2),
     f'train train_small doe=shaded "{LIMITED}" --stage mask': StandIn(
         "an hour", more=TRAINING, instead={LIMITED: LIMITED.replace("{kind", "{iterations: 2, kind")}),
     "train train_small train.photographs=my_photographs": StandIn("ten minutes", more=(*TRAINING, *ONE)),

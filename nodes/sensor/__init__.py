@@ -2,7 +2,7 @@
 
 from neusee.nodes.sensor import _expected_ranges, _result_shapes  # noqa: F401  attach ranges and shape rules
 from neusee.nodes.sensor._digitization import Bits, crop, digitize, electrons_to_clip, full_well
-from neusee.nodes.sensor._exposure import add_photons, channel_sums, expose, level
+from neusee.nodes.sensor._exposure import add_photons, expose, level
 from neusee.nodes.sensor._frame_file import FRAME_SUFFIXES, frame
 from neusee.nodes.sensor._noise import dark_current, photon_noise, read_noise
 from neusee.nodes.sensor._photon_transfer import photon_transfer
@@ -21,7 +21,6 @@ __all__ = [
     "Bits",
     "Limits",
     "add_photons",
-    "channel_sums",
     "crop",
     "dark_current",
     "digitize",

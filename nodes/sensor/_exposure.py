@@ -39,18 +39,6 @@ def weighted(image: Tensor | Channels, weights: Tensor) -> Tensor:
     return flat.reshape(*flat.shape[:-1], *image.shape[-2:])
 
 
-def channel_sums(image: Tensor, rows: Tensor) -> Channels:
-    """Return weighted sums of the spectral bands of an image, one sum for each row of the matrix
-    ``rows``.
-
-    Shapes: image (..., band, y, x), rows (row, band). The sums carry no approximation error. The
-            sums of a part of the
-    bands are the contribution of these bands to the whole.
-    """
-    exact = torch.zeros((), dtype=torch.float64)
-    return Channels(weighted(image, rows), rows.detach().double(), exact, largest=exact)
-
-
 def _of_rows(weights: Tensor, rows: Tensor) -> Tensor:
     """Solve ``weights = M rows`` for the matrix M by least squares in float64.
 

@@ -29,7 +29,6 @@ from neusee.nodes.restore._inverse import _masked_blur as _fft_grid
 from neusee.workflows.engine.runner import run
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.run_training import _photographs
 from neusee.workflows.training.training_pictures import TrainingStream
 
@@ -201,7 +200,7 @@ def pictures(count=3):
         with numbers({(_wiener, "most_likely"): timed}):
             for number in range(count + 1):
                 began = time.process_time()
-                stream._alone(Shared.of({}).seen, 2, number)
+                stream._alone({}, 2, number)
                 whole = time.process_time() - began
                 print(
                     f"{solve.__name__} {number}: {whole:.2f} s, deconvolution {spent[-1]:.2f} s",

@@ -1,7 +1,7 @@
 """Learning in several processes: how far their gradients are from those of one, and seconds an
 iteration.
 
-    python tests/benchmarks/bench_mesh.py [1x1 2x1 1x2 2x2 ...]
+    python tests/benchmarks/bench_mesh.py [1 2 4 ...]
 
 Errors: one iteration in float64, of each part |difference| / |gradient|. Seconds: `train_small`
         with pictures of all
@@ -58,14 +58,14 @@ def timed(job: dict[str, Any], mesh: Mesh) -> None:
         torch.save({"seconds": statistics.median(seconds[1:])}, Path(job["folder"], "timed.pt"))
 
 
-def done(place: Path, mesh: str, case: str, do: str, words: list[str]) -> dict[str, Any]:
+def done(place: Path, count: int, case: str, do: str, words: list[str]) -> dict[str, Any]:
     """What a job in processes of its own left."""
-    folder = place / f"{do} {case} {mesh}"
+    folder = place / f"{do} {case} {count}"
     start(
         {
             "folder": str(folder),
             "store": str(place / "store"),
-            "mesh": mesh,
+            "processes": count,
             "do": do,
             "words": words,
         }
@@ -87,28 +87,28 @@ def error(found: dict[str, Any], one: dict[str, Any], part: str) -> float:
     return float(off / whole)
 
 
-def main(meshes: list[str]) -> None:
-    """One line for each case and mesh."""
+def main(counts: list[int]) -> None:
+    """One line for each case and number of processes."""
     mesh_processes.LONGEST = 600.0
     DO["timed"] = timed
     print(
-        "| imaged | mesh | element | network | critics | s an iteration"
+        "| imaged | processes | element | network | critics | s an iteration"
         " |\n|---|---|---|---|---|---|",
         flush=True,
     )
     with tempfile.TemporaryDirectory() as folder:
         for case, words in CASES.items():
             one = None
-            for mesh in meshes:
-                found = done(Path(folder), mesh, case, "step", [*PLAIN, *words, *DOUBLE])
+            for count in counts:
+                found = done(Path(folder), count, case, "step", [*PLAIN, *words, *DOUBLE])
                 one = one or found
                 errors = " | ".join(
                     f"{error(found, one, part):.1e}" for part in ("mask", "net", "critics")
                 )
-                seconds = done(Path(folder), mesh, case, "timed", [*PLAIN, *words])["seconds"]
-                print(f"| {case} | {mesh} | {errors} | {seconds:.2f} |", flush=True)
+                seconds = done(Path(folder), count, case, "timed", [*PLAIN, *words])["seconds"]
+                print(f"| {case} | {count} | {errors} | {seconds:.2f} |", flush=True)
 
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    main(sys.argv[1:] or ["1x1", "2x1", "1x2", "2x2"])
+    main([int(count) for count in sys.argv[1:]] or [1, 2, 4])

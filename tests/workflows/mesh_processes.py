@@ -3,7 +3,7 @@ afford many.
 
     python mesh_processes.py JOBS.json
 
-A job: ``mesh`` (such as 2x1), ``words`` that change the recipe, a ``folder`` of its own, and what
+A job: the number of ``processes``, ``words`` that change the recipe, a ``folder`` of its own, and what
 to ``do``: ``step``, the gradients of one iteration; ``train``, a training; ``fail``, a training in
 which one process raises. Beside each job's folder a list of exit codes is left, one a process.
 """
@@ -23,11 +23,10 @@ from typing import Any
 import torch
 
 from neusee.workflows import Store, load
-from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.process_mesh import Mesh, joined
 from neusee.workflows.training.run_training import _photographs, train
 from neusee.workflows.training.training_iteration import Learner
-from neusee.workflows.training.training_pictures import TrainingStream
+from neusee.workflows.training.training_pictures import Shared, TrainingStream
 
 LONGEST = 120.0  #: s, after which a process counts as hanging
 
@@ -45,14 +44,7 @@ def step(job: dict[str, Any], mesh: Mesh) -> None:
     if mesh.first:
         parts = {n: getattr(learner, n).named_parameters() for n in ("mask", "net", "critics")}
         grads = {f"{n}.{k}": p.grad for n, named in parts.items() for k, p in named}
-        shared = {
-            "steps": sorted(samples.shards.steps),
-            "sums": sorted(samples.shards.rows),
-            "cut": samples._each._cut,
-        }
-        torch.save(
-            {"grads": grads, "losses": losses, "shared": shared}, Path(job["folder"], "step.pt")
-        )
+        torch.save({"grads": grads, "losses": losses}, Path(job["folder"], "step.pt"))
 
 
 def pooled(job: dict[str, Any], mesh: Mesh) -> None:
@@ -72,7 +64,7 @@ def pooled(job: dict[str, Any], mesh: Mesh) -> None:
         for i, sample in samples.batch(Shared.of({}), 2, first, 2)
     ]
     torch.save(
-        {"pictures": found, "drawn": len(drawn), "by band": samples._each.by_band},
+        {"pictures": found, "drawn": len(drawn)},
         Path(job["folder"], f"pool_{mesh.rank}.pt"),
     )
 
@@ -107,7 +99,7 @@ def work(job: dict[str, Any], rank: int, world: int, port: int) -> None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            with joined(job["mesh"], "cpu") as mesh:
+            with joined("", "cpu") as mesh:
                 DO[job["do"]](job, mesh)
         code = 0
     except BaseException:
@@ -117,15 +109,15 @@ def work(job: dict[str, Any], rank: int, world: int, port: int) -> None:
 
 def start(job: dict[str, Any]) -> None:
     """All processes of a job, until they have ended."""
-    data, band = map(int, job["mesh"].split("x"))
+    world = job["processes"]
     Path(job["folder"]).mkdir(parents=True)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    running, codes, end = {}, [-1] * (data * band), time.monotonic() + LONGEST
-    for rank in range(data * band):
+    running, codes, end = {}, [-1] * world, time.monotonic() + LONGEST
+    for rank in range(world):
         if (pid := os.fork()) == 0:
-            work(job, rank, data * band, port)
+            work(job, rank, world, port)
         running[pid] = rank
     while running and time.monotonic() < end:
         pid, status = os.waitpid(-1, os.WNOHANG)

@@ -52,10 +52,6 @@ class Stages(StrEnum):
 _STAGES = (
     "1: mask and network; 2: network alone; both: 1, then 2; mask: mask alone, without images."
 )
-_MESH = (
-    "DATAxBAND processes of torchrun: 4x2, four groups that share the bands by two; else all share"
-    " the data."
-)
 _LINES = 10  #: lines of progress for a stage, outside a terminal
 #: the `stages` that `verbs.train` takes
 _NUMBERS = {Stages.FIRST: (1,), Stages.SECOND: (2,), Stages.MASK: (0,)}
@@ -65,7 +61,7 @@ def train(
     words: Words = None,
     stage: Annotated[Stages, typer.Option("--stage", help=_STAGES)] = Stages.BOTH,
     device: Annotated[str, typer.Option("--device", help="Where to train: cpu or cuda.")] = "cpu",
-    mesh: Annotated[str, typer.Option("--mesh", help=_MESH)] = "",
+    mesh: Annotated[str, typer.Option("--mesh", hidden=True)] = "",
     as_json: AsJson = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -80,7 +76,7 @@ def train(
     was stopped.
 
     Several processes share one training: torchrun --nproc-per-node 8 --no-python neusee train
-    RECIPE --device cuda --mesh 4x2.
+    RECIPE --device cuda.
     """
     recipe, command = load(words or ["train_small"], "train")
     if recipe.lifting is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from math import ceil
 from typing import Any
@@ -258,17 +258,12 @@ def _has(x: Tensor, axis: int) -> bool:
     return -x.dim() <= axis < x.dim()
 
 
-def taken(
-    step: Step, inputs: Sequence[Any], which: list[int], of: Collection[str] | None = None
-) -> list[Any]:
-    """Return the inputs of a step, reduced to the wavelength bands with the indices ``which``.
-
-    If ``of`` names inputs, only these inputs are reduced.
-    """
+def taken(step: Step, inputs: Sequence[Any], which: list[int]) -> list[Any]:
+    """Return the inputs of a step, reduced to the wavelength bands with the indices ``which``."""
     reduced = list(inputs)
     for i, (name, value) in enumerate(zip(step.node.inputs, inputs, strict=False)):
         axis = _axis(step, name, value)
-        if axis is not None and (of is None or name in of):
+        if axis is not None:
             reduced[i] = with_band_tensors(
                 value, [_slices(x, axis, which) for x in band_tensors(value)]
             )

@@ -148,28 +148,6 @@ def _readers(recipe: Recipe, order: Iterable[str]) -> dict[str, list[str]]:
     return readers
 
 
-@dataclass(frozen=True)
-class Asked:
-    """Sums over the wavelength bands of an image that later steps need, with the steps that read
-    these sums.
-    """
-
-    bands: str
-    responses: str
-    readers: tuple[str, ...]
-    well: bool
-
-
-def asked_of(recipe: Recipe, image: str, outputs: Iterable[str]) -> Asked | None:
-    """Return the sums over wavelength bands of ``image`` that outputs need, or None if an output
-    needs single bands.
-    """
-    names = _readers(recipe, needed(recipe, outputs)).get(image, [])
-    readers = [recipe.steps[name] for name in names]
-    weights = _Draft(recipe, frozenset(outputs), {}).spectral(image, readers)
-    return weights and Asked(*weights, tuple(names), _well(readers))
-
-
 @dataclass
 class _Draft:
     """A recipe in which some steps are being replaced by cheaper steps."""

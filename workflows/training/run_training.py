@@ -181,12 +181,12 @@ def train(
 
     Stage 0 designs the mask without images and replaces stage 1.
 
-    Every process of a mesh calls this function with the same arguments and a folder that all
+    Every process of `torchrun` calls this function with the same arguments and a folder that all
     processes see; only the first process writes, and an error in one process ends all processes.
-    The mesh changes results by rounding only.
+    Their number changes results by rounding only.
 
     Raises ValueError for a recipe without the block ``train``, a folder without photographs, stage
-    2 without a mask, stage 1 after the mask was designed, or a mesh that does not fit;
+    2 without a mask, stage 1 after the mask was designed, or processes that cannot share it;
     ArithmeticError for a loss that is NaN or infinite, after the weights and picture numbers that
     led to the loss are written to a file.
     """
@@ -253,13 +253,13 @@ def _require_fitting_mesh(
 
 def _require_equal_shares(recipe: Recipe, settings: Training, mesh: Mesh) -> None:
     for number, stage in settings.stages.items():
-        if stage.batch % mesh.data:
+        if stage.batch % mesh.size:
             path = f"{KEY}.stages.{number}.batch"
             setting = recipe.config.settings.get(path)
             raise MeshError(
                 f"{setting.source if setting else recipe.name}   {path}   {stage.batch} pictures"
-                f" cannot be divided equally among {mesh.data} processes: --mesh {mesh} needs a"
-                f" multiple of {mesh.data}"
+                f" cannot be divided equally among {mesh.size} processes: write a multiple of"
+                f" {mesh.size}"
             )
 
 

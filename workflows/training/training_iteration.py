@@ -42,10 +42,9 @@ from neusee.workflows.graph.diagnostics import nearest
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import device_kind, stream_seed
 from neusee.workflows.recipe.blocks.train_block import KEY, Network, Stage, Training
-from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.loop.resumable_loop import Losses, averaged, require_finite
 from neusee.workflows.training.process_mesh import ALONE, Mesh
-from neusee.workflows.training.training_pictures import Sample, Samples
+from neusee.workflows.training.training_pictures import Sample, Samples, Shared
 
 # --- picture batches ------------------------------------------------------------------------------
 
@@ -376,11 +375,10 @@ class Learner:
         """Backpropagate the laser suppression loss band by band to save memory, and return the mean
         suppression ratio.
 
-        Processes have different bands, or the same bands with smaller weights, so that each band
-        counts once.
+        Every process has all bands, with smaller weights, so that each band counts once.
         """
         psf: Psf = shared.values[samples.psf]
-        count, times = samples.counted(samples.psf, len(psf.clear_peak))
+        times = self.mesh.size
         with torch.no_grad():
             peaks: Tensor = metrics.lsr(psf)
         if self.stage.lsr:
@@ -389,7 +387,7 @@ class Learner:
                     self._suppression, psf.intensity, psf.clear_peak, band, use_reentrant=False
                 )
                 (self.stage.lsr / times * loss).backward()
-        return {"LSR": float(peaks.mean()) * (len(peaks) / count) / times}
+        return {"LSR": float(peaks.mean()) / times}
 
     def _suppression(self, intensity: Tensor, clear: Tensor, band: int) -> Tensor:
         psf = Psf(intensity[band : band + 1], clear[band : band + 1])

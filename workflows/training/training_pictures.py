@@ -26,8 +26,8 @@ from neusee.workflows.keys.code_digest import Code, engine
 from neusee.workflows.recipe.blocks.train_block import KEY, POSED, Training
 from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store, compute_once
+from neusee.workflows.store.serialization import each_tensor, tensors_in
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
-from neusee.workflows.training.band_shards import Pictures, Shards, Shared
 from neusee.workflows.training.camera_mismatch import CameraMismatch
 from neusee.workflows.training.process_mesh import ALONE, Mesh, MeshError
 
@@ -310,8 +310,31 @@ class Sample:
         return cls(tensors["picture"], tensors["truth"], tensors["light"], drawn, given_of(tensors))
 
 
-#: of a process without a picture in a round
-_NOTHING = Sample(torch.zeros(0), torch.zeros(0), torch.zeros(0), {})
+@dataclass(frozen=True)
+class Shared:
+    """Results that depend on the mask but on no picture, with detached copies that add up
+    gradients of all pictures.
+    """
+
+    made: Mapping[str, Any]  #: results with their autograd graph
+    values: Mapping[str, Any]  #: detached copies, which later steps read
+
+    @classmethod
+    def of(cls, made: Mapping[str, Any]) -> Shared:
+        """Detach results from the autograd graph."""
+        return cls(made, each_tensor(_leaf, dict(made)))  # two results may be one tensor
+
+    def back(self) -> None:
+        """Propagate the accumulated gradients from the detached copies to the mask."""
+        pairs = zip(tensors_in(dict(self.made)), tensors_in(dict(self.values)), strict=True)
+        roots = [(x, leaf.grad) for x, leaf in pairs if x.requires_grad and leaf.grad is not None]
+        if roots:
+            torch.autograd.backward([x for x, _ in roots], [grad for _, grad in roots])
+
+
+def _leaf(x: Tensor) -> Tensor:
+    """Return a detached copy of a tensor, with the same ``requires_grad``."""
+    return x.detach().requires_grad_(x.requires_grad)
 
 
 class TrainingStream:
@@ -338,8 +361,6 @@ class TrainingStream:
         self.seed, self.mesh, self.held_out = recipe.seed, mesh, held_out
         self._pool = settings.pool if frozen else None
         self._kept: dict[tuple[int, int], Sample] = {}
-        #: by stage and numbers, of processes that divide the bands
-        self._rounds: dict[tuple[int, ...], Sample] = {}
         outputs: tuple[str, ...] = (settings.picture, settings.truth, settings.light, settings.psf)
         require_steps(recipe, "train", (*outputs, settings.scene, *learns))
         self._inputs = _uncertain_inputs(recipe, outputs)
@@ -359,11 +380,9 @@ class TrainingStream:
         self._readers = self._read(believed, order)
         noise, drawn = self._changing(recipe, order)
         learnt = dependents(recipe, learns, order)
-        self.shards = Shards.of(recipe, self.psf, outputs, drawn | learnt, store, mesh)
-        drawn |= self.shards.behind
         read = _sources(recipe, drawn) | {self.psf}
         border = [name for name in order if name in (learnt - drawn) & read]
-        self._divide(recipe, learn, border, drawn, noise, store)
+        self._divide(recipe, learn, border, noise, store)
 
     def _stored_pool(self, recipe: Recipe, store: Store) -> StoredPool | None:
         """Return the pictures of a pool in the store, or None if there is no pool to keep."""
@@ -417,25 +436,16 @@ class TrainingStream:
         recipe: Recipe,
         learn: str | None,
         border: list[str],
-        drawn: set[str],
         noise: set[str],
         store: Store,
     ) -> None:
         """Divide the recipe into steps that depend on the mask alone, up to ``border``, and
         steps for each picture.
         """
-        settings = self.settings
         ways: dict[str, Any] = {"store": store, "device": self.device}
-        read = self.shards.steps & _sources(recipe, drawn - self.shards.steps)
-        self._whole = [name for name in border if name in read]
-        caller = self.shards.call
-        self.shared = (
-            as_function(recipe, learn, outputs=border, caller=caller, **ways) if learn else None
-        )
-        free = [*border, settings.scene, *self._readers]
-        self._each = Pictures(recipe, free, self._made, noise, self.shards, ways)
-        if self._each.by_band:
-            self._stored = None  # a picture that several processes compute stays in memory
+        self.shared = as_function(recipe, learn, outputs=border, **ways) if learn else None
+        free = [*border, self.settings.scene, *self._readers]
+        self._simulate = as_function(recipe, *free, outputs=self._made, redraw=noise, **ways)
 
     @property
     def pool_counts(self) -> dict[str, int]:
@@ -453,54 +463,18 @@ class TrainingStream:
         iteration.
         """
         results = self.shared({str(self.settings.learn): height}) if self.shared else {}
-        return Shared.of(results, self.shards, self._whole)
-
-    def counted(self, name: str, here: int) -> tuple[int, int]:
-        """Return the total number of spectral bands of a result, and the number of processes
-        that compute each band.
-        """
-        by_band = name in self.shards.steps
-        return (self.shards.count, self.mesh.data) if by_band else (here, self.mesh.size)
+        return Shared.of(results)
 
     def batch(
         self, shared: Shared, stage: int, first: int, count: int
     ) -> Iterator[tuple[int, Sample]]:
-        """Yield index and picture for each picture of a training batch that this process completes.
+        """Yield index and picture for each picture of a training batch that this process simulates.
 
         The batch has ``count`` pictures and begins with the picture number ``first``.
-
-        The caller must exhaust the iterator, because gradients return to all processes that
-        computed a part.
         """
-        group = range(self.mesh.row, count, self.mesh.data)
-        for begin in range(0, len(group), self.mesh.band):
-            together = group[begin : begin + self.mesh.band]
-            mine = together[self.mesh.column] if self.mesh.column < len(together) else None
-            if self._each.by_band:
-                yield from self._round(shared, stage, first, together, mine)
-            elif mine is not None:
-                sample = self(shared.seen, stage, first + mine)
-                yield mine, self.turned(sample, stage, first + mine)
-
-    def _round(
-        self, shared: Shared, stage: int, first: int, together: Sequence[int], mine: int | None
-    ) -> Iterator[tuple[int, Sample]]:
-        """Compute the pictures ``together`` with the processes that divide the bands, and yield the
-        picture of this process.
-        """
-        key = (stage, *(self._number(stage, first + i) for i in together))
-        if key in self._rounds:  # in the memory of all processes, or of none
-            if mine is not None:
-                yield mine, self.turned(self._rounds[key], stage, first + mine)
-            return
-        begun = {i: self._drawn(stage, number) for i, number in zip(together, key[1:], strict=True)}
-        parts = {i: (theta, noise) for i, (theta, noise, _) in begun.items()}
-        with self._each.together(shared, parts, mine) as values:
-            sample = _NOTHING if mine is None else self._sample(values, begun[mine][2])
-            if mine is not None:
-                yield mine, self.turned(sample, stage, first + mine)
-        if self._pool is not None and stage != HELD_OUT:
-            self._rounds[key] = sample
+        for i in range(self.mesh.rank, count, self.mesh.size):
+            sample = self(shared.values, stage, first + i)
+            yield i, self.turned(sample, stage, first + i)
 
     def __call__(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
         """Return the training picture with the given number, which does not depend on order or
@@ -547,9 +521,11 @@ class TrainingStream:
 
     def _alone(self, shared: Mapping[str, Any], stage: int, number: int) -> Sample:
         theta, noise, drawn = self._drawn(stage, number)
+        values = {**shared, **theta}
+        free = {name: values[name] for name in self._simulate.free}
 
         def simulated() -> Sample:
-            return self._sample(self._each.alone({**shared, **theta}, noise), drawn)
+            return self._sample(self._simulate(free, noise), drawn)
 
         if self._stored is None or stage == HELD_OUT:
             return simulated()
@@ -694,12 +670,6 @@ class SeveralCameras:
         """Return no results: none depends on a mask that is trained."""
         return Shared.of({})
 
-    def counted(self, name: str, here: int) -> tuple[int, int]:
-        """Return the total number of spectral bands of a result, and how many processes compute
-        each: one.
-        """
-        return here, 1
-
     def batch(
         self, shared: Shared, stage: int, first: int, count: int
     ) -> Iterator[tuple[int, Sample]]:
@@ -710,7 +680,7 @@ class SeveralCameras:
             number = first + i
             within = number % self._pool if self._pool and stage != HELD_OUT else number
             stream = self._streams[within % self.repeats]
-            yield i, stream.turned(stream(shared.seen, stage, number), stage, number)
+            yield i, stream.turned(stream(shared.values, stage, number), stage, number)
 
 
 Samples = TrainingStream | SeveralCameras

@@ -10,9 +10,8 @@ import torch
 
 from neusee.nodes.scene import Change, Photographs, symmetry
 from neusee.workflows import RecipeError, Store, load
-from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.process_mesh import ALONE
-from neusee.workflows.training.training_pictures import TrainingStream
+from neusee.workflows.training.training_pictures import Shared, TrainingStream
 from tests.workflows.training.noise_photographs import noise_photograph
 from tests.workflows.training.test_warm_start import TINY, trained
 

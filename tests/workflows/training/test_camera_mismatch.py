@@ -12,10 +12,9 @@ from neusee.workflows import RecipeError, Store, load
 from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import TOLD
-from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.held_out import HELD_OUT
 from neusee.workflows.training.run_training import train
-from neusee.workflows.training.training_pictures import TrainingStream
+from neusee.workflows.training.training_pictures import Shared, TrainingStream
 from tests.workflows.training.noise_photographs import noise_photograph
 from tests.workflows.training.test_warm_start import TINY
 
@@ -315,6 +314,6 @@ def test_a_design_that_is_told_unchanged_shares_one_gradient_with_the_camera():
     height = torch.tensor([1.0, 2.0], requires_grad=True)
     design = 3 * height
     shared = Shared.of({"fabricated": design, f"{TOLD}made": design})
-    (shared.seen["fabricated"].sum() + 10 * shared.seen[f"{TOLD}made"].sum()).backward()
+    (shared.values["fabricated"].sum() + 10 * shared.values[f"{TOLD}made"].sum()).backward()
     shared.back()
     assert height.grad.tolist() == [33.0, 33.0]

@@ -16,11 +16,10 @@ from scipy import stats
 from neusee.nodes.scene import Photographs
 from neusee.nodes.scene import _photograph as _photograph_folder
 from neusee.workflows import RecipeError, Store, load
-from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.held_out import COLUMNS, Validation, interval, split
 from neusee.workflows.training.process_mesh import ALONE
 from neusee.workflows.training.run_training import train
-from neusee.workflows.training.training_pictures import TrainingStream
+from neusee.workflows.training.training_pictures import Shared, TrainingStream
 
 TINY = [
     "optics.samples=48", "optics.pitch=168.27 um", "optics.bands=3", "optics.window=[32, 32]", "scene.shape=[32, 32]",

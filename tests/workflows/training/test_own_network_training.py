@@ -273,6 +273,6 @@ def test_all_processes_have_the_running_means_of_the_first(monkeypatch):
     )
     ALONE.share_buffers(net)
     assert not sent
-    Mesh(data=2, rank=1).share_buffers(net)
+    Mesh(2, rank=1).share_buffers(net)
     assert [source for _, source in sent] == [0, 0, 0]
     assert all(x is y for (x, _), y in zip(sent, net.buffers(), strict=True))

@@ -25,10 +25,9 @@ from neusee.nodes.scene import Photographs
 from neusee.workflows import RecipeError, Store, as_function, load
 from neusee.workflows.cli import app
 from neusee.workflows.recipe.blocks.train_block import MaskSettings, Rates
-from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.mask_design import design_page
 from neusee.workflows.training.run_training import frozen, train
-from neusee.workflows.training.training_pictures import TrainingStream
+from neusee.workflows.training.training_pictures import Shared, TrainingStream
 from tests.workflows.crate_rules import faults
 
 ROOT = Path(__file__).parents[3]

@@ -12,13 +12,13 @@ from neusee import recipes
 from neusee.nodes.scene import Photographs
 from neusee.workflows import RecipeError, Store, load
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.training.band_shards import Shared
 from neusee.workflows.training.held_out import Split, _by_photograph
 from neusee.workflows.training.process_mesh import Mesh, MeshError
 from neusee.workflows.training.training_inputs import inputs_of
 from neusee.workflows.training.training_pictures import (
     HELD_OUT,
     SeveralCameras,
+    Shared,
     TrainingStream,
     require_alone,
 )
@@ -132,7 +132,7 @@ def test_a_file_of_a_camera_is_sought_beside_the_recipe_and_counts_by_its_conten
 def test_several_processes_are_refused():
     recipe = load("train_small", [*POSED, "train.cameras=[[doe=flat]]"])
     with pytest.raises(MeshError, match="runs in a single process"):
-        require_alone(recipe, Mesh(data=2))
+        require_alone(recipe, Mesh(2))
 
 
 @pytest.mark.slow

@@ -7,19 +7,15 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file
 
-from neusee.nodes import doe
 from neusee.workflows import Store, load
-from neusee.workflows.training.band_shards import Shards
-from neusee.workflows.training.process_mesh import Mesh, MeshError, shape_of
-from neusee.workflows.training.run_training import _photographs, train
-from neusee.workflows.training.training_pictures import TrainingStream
+from neusee.workflows.training.process_mesh import Mesh, MeshError, require_mesh
+from neusee.workflows.training.run_training import train
 from tests.workflows.training.noise_photographs import noise_photograph
 
 ROOT = Path(__file__).parents[4]
@@ -40,25 +36,26 @@ SHORT = [
     "train.show=2",
 ]
 JOBS = [
-    ("every", "1x1", "step", EVERY), ("every", "2x1", "step", EVERY), ("every", "1x2", "step", EVERY),
-    ("broken", "2x1", "fail", SHORT),
-]  # fmt: skip
+    ("every", 1, "step", EVERY),
+    ("every", 2, "step", EVERY),
+    ("broken", 2, "fail", SHORT),
+]
 
 
 def processes(folder, jobs):
-    """Do the jobs, one after another, each in processes of its own; by what it is called and its
-    mesh, its folder.
+    """Do the jobs, one after another, each in processes of its own; by what it is called and
+    their number, its folder.
     """
     made = [
         {
-            "folder": str(folder / f"{name} {mesh}"),
+            "folder": str(folder / f"{name} {count}"),
             "store": str(folder / "store"),
             "runs": str(folder / name),
-            "mesh": mesh,
+            "processes": count,
             "do": do,
             "words": words,
         }
-        for name, mesh, do, words in jobs
+        for name, count, do, words in jobs
     ]
     (folder / "jobs.json").write_text(json.dumps(made))
     script = Path(__file__).parents[2] / "mesh_processes.py"
@@ -72,7 +69,8 @@ def processes(folder, jobs):
     )
     assert done.returncode == 0, done.stderr
     return {
-        (name, mesh): Path(job["folder"]) for (name, mesh, *_), job in zip(jobs, made, strict=True)
+        (name, count): Path(job["folder"])
+        for (name, count, *_), job in zip(jobs, made, strict=True)
     }
 
 
@@ -122,36 +120,12 @@ def same(found, expected):
 
 @pytest.mark.slow
 def test_two_processes_find_the_gradients_of_one(done):
-    one, data, band = (stepped(done["every", mesh]) for mesh in ("1x1", "2x1", "1x2"))
-    same(data, one)
-    same(band, one)
-    assert not data["shared"]["steps"]
-    assert band["shared"]["steps"] == [
-        "bsr[mask]",
-        "image[mask]",
-        "image[plain]",
-        "psf[mask]",
-        "radiance",
-    ]
-    assert band["shared"]["cut"] == ["bsr[mask]", "image[mask]", "image[plain]"]
-    assert band["shared"]["sums"] == ["image[mask]", "image[plain]"]
+    one, two = (stepped(done["every", count]) for count in (1, 2))
+    same(two, one)
 
 
 @pytest.mark.slow
-def test_what_is_imaged_in_a_few_planes_needs_the_gathered_psf(tmp_path):
-    read = [*FEW, "train.stages.1.bsr=0.1"]  # a loss that reads the light behind the mask
-    done = processes(tmp_path, [("few", mesh, "step", read) for mesh in ("1x1", "1x2")])
-    one, band = (stepped(done["few", mesh]) for mesh in ("1x1", "1x2"))
-    same(band, one)
-    assert band["shared"] == {
-        "steps": ["bsr[mask]", "psf[mask]", "radiance"],
-        "cut": ["bsr[mask]"],
-        "sums": [],
-    }
-
-
-@pytest.mark.slow
-def test_a_pool_is_simulated_once_under_every_mesh_and_with_a_camera_that_is_not_known(tmp_path):
+def test_a_pool_is_simulated_once_by_two_processes_and_with_a_camera_that_is_not_known(tmp_path):
     """Each process has the pictures of one process, of which it draws the values in the first
     round alone.
     """
@@ -165,32 +139,26 @@ def test_a_pool_is_simulated_once_under_every_mesh_and_with_a_camera_that_is_not
         defocus,
         "train.picture=restored",
     ]
-    done = processes(tmp_path, [("pool", mesh, "pool", words) for mesh in ("1x1", "1x2", "2x1")])
+    done = processes(tmp_path, [("pool", count, "pool", words) for count in (1, 2)])
     assert not any(code for folder in done.values() for code in codes(folder)), [
         errors(f) for f in done.values()
     ]
-    (one,), band, data = (
-        [torch.load(file, weights_only=True) for file in sorted(done["pool", mesh].glob("pool_*"))]
-        for mesh in ("1x1", "1x2", "2x1")
+    (one,), two = (
+        [torch.load(file, weights_only=True) for file in sorted(done["pool", count].glob("pool_*"))]
+        for count in (1, 2)
     )
-    assert [each["by band"] for each in band] == [True, True]
-    assert (one["drawn"], [each["drawn"] for each in band], [each["drawn"] for each in data]) == (
-        4,
-        [4, 4],
-        [2, 2],
-    )
-    for each in (band, data):
-        for rank in range(2):
-            mine = [tensors for i, tensors in one["pictures"] if i == rank]
-            assert [i for i, _ in each[rank]["pictures"]] == [rank] * 4
-            for (_, found), expected in zip(each[rank]["pictures"], mine, strict=True):
-                assert float((found["picture"] - expected["picture"]).abs().max()) <= 1e-9
-                assert torch.equal(found["truth"], expected["truth"])
+    assert (one["drawn"], [each["drawn"] for each in two]) == (4, [2, 2])
+    for rank in range(2):
+        mine = [tensors for i, tensors in one["pictures"] if i == rank]
+        assert [i for i, _ in two[rank]["pictures"]] == [rank] * 4
+        for (_, found), expected in zip(two[rank]["pictures"], mine, strict=True):
+            assert float((found["picture"] - expected["picture"]).abs().max()) <= 1e-9
+            assert torch.equal(found["truth"], expected["truth"])
 
 
 @pytest.mark.slow
 def test_one_that_fails_ends_all(done):
-    broken = done["broken", "2x1"]
+    broken = done["broken", 2]
     assert codes(broken) == [1, 1], "each ends by itself, and with an error"
     assert "this one cannot go on" in (broken / "error_1.txt").read_text()
     (folder,) = (broken.parent / "broken").iterdir()
@@ -200,10 +168,10 @@ def test_one_that_fails_ends_all(done):
 
 
 @pytest.mark.slow
-def test_another_mesh_goes_on_to_the_same_weights(tmp_path):
-    jobs = [("whole", "1x1", "train"), ("broken", "2x1", "fail"), ("broken", "1x2", "train")]
+def test_one_process_goes_on_to_the_same_weights(tmp_path):
+    jobs = [("whole", 1, "train"), ("broken", 2, "fail"), ("broken", 1, "train")]
     found = processes(tmp_path, [(*job, SHORT) for job in jobs])
-    assert not any(codes(found["broken", "1x2"])), errors(found["broken", "1x2"])
+    assert not any(codes(found["broken", 1])), errors(found["broken", 1])
     (one,), (two,) = ((tmp_path / name).iterdir() for name in ("whole", "broken"))
     assert one.name == two.name
     for file in ("mask", "network"):
@@ -216,21 +184,16 @@ def test_another_mesh_goes_on_to_the_same_weights(tmp_path):
     ]
     assert rows[0] == rows[1]
     assert len(rows[0]) == 1 + 4
-    assert json.loads((two / "training.json").read_text())["mesh"] == "1x2"
+    assert json.loads((two / "training.json").read_text())["mesh"] == "1x1"
 
 
 @pytest.mark.slow
 def test_four_processes_find_the_gradients_of_one(tmp_path):
-    each = {"every": EVERY, "few": FEW, "by band": [*EVERY, "reading.level=per_band"]}
-    meshes = {"every": ["2x2", "1x4"], "few": ["2x2", "1x3"], "by band": ["2x2"]}
-    jobs = [(name, mesh, "step", each[name]) for name in each for mesh in ("1x1", *meshes[name])]
+    each = {"every": EVERY, "few": FEW}
+    jobs = [(name, count, "step", words) for name, words in each.items() for count in (1, 4)]
     found = processes(tmp_path, jobs)
-    for name, among in meshes.items():
-        for mesh in among:
-            same(stepped(found[name, mesh]), stepped(found[name, "1x1"]))
-    shared = stepped(found["by band", "2x2"])["shared"]
-    assert shared["cut"] == ["bsr[mask]", "image[mask]", "image[plain]"]
-    assert shared["sums"] == [], "the peak of each band is asked for"
+    for name in each:
+        same(stepped(found[name, 4]), stepped(found[name, 1]))
 
 
 @pytest.mark.slow
@@ -257,18 +220,16 @@ def test_torchrun_starts_it_and_stops_all_where_one_fails(tmp_path):
         "--out",
         str(tmp_path / "runs"),
     ]
-    once = subprocess.run(
-        [*start, "--mesh", "1x2"], env=environment, capture_output=True, text=True, check=False
-    )
+    once = subprocess.run(start, env=environment, capture_output=True, text=True, check=False)
     assert once.returncode == 0, once.stderr
     (folder,) = (tmp_path / "runs").iterdir()
     assert once.stdout.splitlines().count(str(folder)) == 1
-    assert json.loads((folder / "training.json").read_text())["command"][-2:] == ["--mesh", "1x2"]
+    assert json.loads((folder / "training.json").read_text())["mesh"] == "2x1"
     wrong = subprocess.run(
-        [*start, "--mesh", "2x2"], env=environment, capture_output=True, text=True, check=False
+        [*start, "--mesh", "1x2"], env=environment, capture_output=True, text=True, check=False
     )
     assert wrong.returncode != 0
-    assert "--mesh 2x2 is for 4 processes and there are 2" in wrong.stderr
+    assert "--mesh 1x2: processes do not share the bands of a picture" in wrong.stderr
 
 
 LEAVES = """
@@ -281,8 +242,8 @@ from neusee.workflows.training.process_mesh import joined
 def threads():
     return [path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm")]
 
-with joined("1x2", "cpu") as mesh:
-    dist.all_reduce(torch.ones(3), group=mesh.group)
+with joined("2x1", "cpu") as mesh:
+    dist.all_reduce(torch.ones(3))
     assert "pt_gloo_runloop" in threads()
 Path(sys.argv[1], str(mesh.rank)).write_text(" ".join(threads()))  # the mesh is held
 """
@@ -307,24 +268,24 @@ def test_no_thread_of_a_mesh_runs_on_after_it(tmp_path):
         assert "gloo" not in (tmp_path / rank).read_text()
 
 
-@pytest.mark.parametrize(
-    ("text", "world", "shape"), [("", 1, (1, 1)), ("", 4, (4, 1)), ("2x4", 8, (2, 4))]
-)
-def test_a_mesh_is_read(text, world, shape):
-    assert shape_of(text, world) == shape
+@pytest.mark.parametrize(("text", "world"), [("", 1), ("", 4), ("4x1", 4)])
+def test_a_mesh_that_fits_is_accepted(text, world):
+    require_mesh(text, world)
 
 
 @pytest.mark.parametrize(
     ("text", "world", "said"),
     [
-        ("2x2", 1, "there is 1: start torchrun --nproc-per-node 4"),
-        ("3", 3, "write DATAxBAND"),
-        ("0x2", 2, "write DATA"),
+        ("4x1", 1, "there is 1: start torchrun --nproc-per-node 4"),
+        ("3", 3, "write PROCESSESx1"),
+        ("0x2", 2, "write PROCESSES"),
+        ("4x2", 8, "--mesh 4x2: processes do not share the bands of a picture, each has pictures of"
+         " its own: write --mesh 8x1, or leave --mesh out"),
     ],
-)
+)  # fmt: skip
 def test_a_mesh_that_does_not_fit_is_refused(text, world, said):
     with pytest.raises(MeshError, match=re.escape(said)):
-        shape_of(text, world)
+        require_mesh(text, world)
 
 
 def test_a_batch_that_cannot_be_shared_is_refused_where_it_stands(tmp_path):
@@ -332,34 +293,7 @@ def test_a_batch_that_cannot_be_shared_is_refused_where_it_stands(tmp_path):
     with pytest.raises(
         MeshError, match=r"argument \d+   train\.stages\.1\.batch   3 pictures .* multiple of 2"
     ):
-        train(recipe, Store(tmp_path), tmp_path, [], print, mesh=Mesh(2, 1))
-
-
-def test_more_processes_than_bands_are_refused_where_the_bands_stand(tmp_path):
-    recipe = load("train_small", EVERY)
-    with pytest.raises(
-        MeshError, match=r"neusee\.yaml:\d+:\d+: bands has only 5 bands for 6 processes"
-    ):
-        samples(recipe, tmp_path, Mesh(1, 6))
-
-
-def test_a_psf_that_couples_its_bands_is_named(tmp_path):
-    recipe = load("train_small", EVERY)
-    coupled = replace(
-        recipe,
-        steps={**recipe.steps, "psf[mask]": replace(recipe.steps["psf[mask]"], node=doe.flat)},
-    )
-    with pytest.raises(
-        MeshError, match=r"psf\[mask\] \(doe.flat\) computes all bands together.* write --mesh 2x1"
-    ):
-        Shards.of(coupled, "psf[mask]", ["psf[mask]"], {"psf[mask]"}, Store(tmp_path), Mesh(1, 2))
-
-
-def samples(recipe, folder, mesh):
-    how = recipe.training
-    return TrainingStream(
-        recipe, how, _photographs(recipe, how, True), Store(folder), "cpu", None, mesh
-    )
+        train(recipe, Store(tmp_path), tmp_path, [], print, mesh=Mesh(2))
 
 
 @pytest.mark.slow
@@ -374,10 +308,10 @@ def test_all_processes_hold_out_the_same_photographs(tmp_path):
         "train.validate_every=2",
         f"train.photographs={tmp_path / 'photographs'}",
     ]
-    found = processes(tmp_path, [(mesh, mesh, "train", words) for mesh in ("1x1", "2x1", "1x2")])
+    found = processes(tmp_path, [(f"{count}", count, "train", words) for count in (1, 2)])
     rows = {}
-    for name, mesh in found:
-        assert not any(codes(found[name, mesh])), errors(found[name, mesh])
+    for name, count in found:
+        assert not any(codes(found[name, count])), errors(found[name, count])
         (folder,) = (tmp_path / name).iterdir()
         table = [line.split(",")[:-1] for line in (folder / "losses.csv").read_text().splitlines()]
         rows[name] = table
@@ -387,10 +321,10 @@ def test_all_processes_hold_out_the_same_photographs(tmp_path):
             2,
             2,
         )
-    assert rows["2x1"] == rows["1x2"] == rows["1x1"]
+    assert rows["2"] == rows["1"]
     # one process has no picture to restore
     one = [*words, "train.held_out_pictures=1", "train.validate_every=1"]
-    again = processes(tmp_path, [("alone", "1x2", "train", one)])["alone", "1x2"]
+    again = processes(tmp_path, [("alone", 2, "train", one)])["alone", 2]
     assert not any(codes(again)), errors(again)
-    place = rows["1x1"][0].index("held_out_PSNR")
-    assert [bool(row[place]) for row in rows["1x1"][1:]] == [False, True, True, False, True]
+    place = rows["1"][0].index("held_out_PSNR")
+    assert [bool(row[place]) for row in rows["1"][1:]] == [False, True, True, False, True]
