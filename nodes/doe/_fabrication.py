@@ -125,9 +125,8 @@ def _(
     top = wave or max_height
     if levels is None or top is None:
         return x
-    allowed = [
-        top * k / (levels if wave else levels - 1) for k in range(levels + 1 if wave else levels)
-    ]
+    steps = levels if wave else levels - 1
+    allowed = [top * k / steps for k in range(steps + 1)]
     table = torch.tensor(allowed, dtype=torch.float64, device=x.device)
     nearest = table[(x[..., None] - table).abs().argmin(-1)]
     return nearest if wave is None else torch.where(nearest == wave, 0.0, nearest)

@@ -221,6 +221,24 @@ def _refuse_gap(index_curve: Curves) -> None:
 
 
 def _coefficients(file: Path, rows: Rows) -> Sellmeier:
+    """Return the glass of a table of Sellmeier coefficients, one term a row."""
+    area, low, high = _units(file, rows)
+    values = rows.values
+    if len({tuple(row) for row in values[:, 2:]}) > 1:
+        raise ValueError(
+            f"{file.name}: from and to differ between the rows: repeat the one range in each row"
+        )
+    glass = Sellmeier(
+        B=tuple(map(float, values[:, 0])),
+        C=tuple(float(x) * area for x in values[:, 1]),
+        range=(float(values[0, 2]) * low, float(values[0, 3]) * high),
+    )
+    _refuse_coefficients(glass, f"{file.name}: the coefficients")
+    return glass
+
+
+def _units(file: Path, rows: Rows) -> tuple[float, float, float]:
+    """Return the units of C in m^2, and of from and to in m; raise ValueError for other columns."""
     names = [column.quantity.lower() for column in rows.columns]
     if names != ["b", "c", "from", "to"]:
         raise ValueError(
@@ -231,16 +249,4 @@ def _coefficients(file: Path, rows: Rows) -> Sellmeier:
         raise ValueError(
             f"{file.name}: C needs a unit such as um^2, and from and to need a unit such as nm"
         )
-    values = rows.values
-    if len({tuple(row) for row in values[:, 2:]}) > 1:
-        raise ValueError(
-            f"{file.name}: from and to differ between the rows: repeat the one range in each row"
-        )
-    ends = float(values[0, 2]) * LENGTHS[low], float(values[0, 3]) * LENGTHS[high]
-    glass = Sellmeier(
-        B=tuple(map(float, values[:, 0])),
-        C=tuple(float(x) * _AREAS[c] for x in values[:, 1]),
-        range=ends,
-    )
-    _refuse_coefficients(glass, f"{file.name}: the coefficients")
-    return glass
+    return _AREAS[c], LENGTHS[low], LENGTHS[high]
