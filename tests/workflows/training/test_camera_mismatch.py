@@ -141,7 +141,7 @@ def test_the_truth_is_drawn_by_its_law_and_belief_is_not(photograph, store):
     angles = np.array([theta["laser_psf[mask,drawn].angle"] for theta in drawn])
     assert angles.std(0) == pytest.approx([13e-6, 13e-6], rel=0.15)
     assert abs(np.corrcoef(angles.T)[0, 1]) < 0.2
-    recipe = samples._each._end.recipe
+    recipe = samples._simulate.recipe
     assert recipe.steps[f"{TOLD}pupil[mask]"].params["defocus"] == 0
     assert recipe.steps[f"{TOLD}laser_psf[mask,drawn]"].params["angle"] == (0.0, 0.0)
     assert not any(
@@ -179,12 +179,12 @@ def test_dirt_that_nobody_knows_is_another_in_every_picture_and_is_told_clean(ph
     samples = stream(
         [*CAMERA, *DUSTY, *differing("dirt.grease=uniform(0 waves, 0.1 waves)")], photograph, store
     )
-    recipe = samples._each._end.recipe
+    recipe = samples._simulate.recipe
     assert recipe.steps["pupil[mask]"].wires["dirt"] == "dirt"
     assert recipe.steps[f"{TOLD}pupil[mask]"].wires["dirt"] is None, (
         "a told window that is clean has no effect"
     )
-    assert "dirt" in samples._each._end.live, "it is computed for each picture"
+    assert "dirt" in samples._simulate.live, "it is computed for each picture"
 
 
 def test_the_height_error_is_drawn_for_the_camera_alone(photograph, store):
@@ -192,9 +192,9 @@ def test_the_height_error_is_drawn_for_the_camera_alone(photograph, store):
     plain = stream(words, photograph, store)
     law = differing("height_error.rms=uniform(0 nm, 40 nm)", "height_error.depth=normal(0, 0.02)")
     rough = stream([*words, *law], photograph, store)
-    assert {"made", f"{TOLD}made"} <= rough._each._end.recipe.steps.keys()
-    assert rough._each._end.recipe.steps[f"{TOLD}made"].params["rms"] == 0
-    assert ("made" in rough._each._end.live, f"{TOLD}made" in rough._each._end.live) == (
+    assert {"made", f"{TOLD}made"} <= rough._simulate.recipe.steps.keys()
+    assert rough._simulate.recipe.steps[f"{TOLD}made"].params["rms"] == 0
+    assert ("made" in rough._simulate.live, f"{TOLD}made" in rough._simulate.live) == (
         True,
         False,
     )

@@ -37,4 +37,4 @@ def test_the_light_behind_the_mask_is_computed_where_a_loss_reads_it(tmp_path, w
     photographs = Photographs((recipe.steps["scene"].params["file"],))
     samples = TrainingStream(recipe, recipe.training, photographs, Store(tmp_path), "cpu", recipe)
     assert len(samples({}, 2, 0).light) == bands
-    assert ("bsr[mask]" in samples._each._end.live) == bool(bands)
+    assert ("bsr[mask]" in samples._simulate.live) == bool(bands)
