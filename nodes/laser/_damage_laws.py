@@ -92,14 +92,16 @@ def matching_laws(
     laws: Iterable[DamageLaw], device: str, wavelength: float, duration: float, quantity: Quantity
 ) -> tuple[DamageLaw, ...]:
     """Return the laws that hold for a class of sensors, a wavelength in m and a duration in s."""
-    return tuple(
-        law
-        for law in laws
-        if law.quantity == quantity
-        and law.device.casefold() == device.casefold()
-        and law.wavelengths[0] <= wavelength <= law.wavelengths[1]
-        and law.durations[0] <= duration <= law.durations[1]
-    )
+    of_device = [law for law in laws if law.device.casefold() == device.casefold()]
+    of_quantity = [law for law in of_device if law.quantity == quantity]
+    return tuple(law for law in of_quantity if _reaches(law, wavelength, duration))
+
+
+def _reaches(law: DamageLaw, wavelength: float, duration: float) -> bool:
+    """Return True if a law holds at a wavelength in m and for a duration in s."""
+    shortest, longest = law.wavelengths
+    briefest, slowest = law.durations
+    return shortest <= wavelength <= longest and briefest <= duration <= slowest
 
 
 def spot_reach(diameter: Number, duration: Number) -> Tensor:

@@ -104,12 +104,16 @@ def _refuse(wavelength: float, duration: float) -> None:
 
 def _near_infrared(nm: float) -> tuple[float, float]:
     """Return the factors C_A and C_C, which let more of the infrared pass than of visible light."""
-    absorbed = 1.0 if nm < 700 else math.pow(10, 0.002 * (nm - 700)) if nm < 1050 else 5.0
+    absorbed = 5.0
+    if nm < 700:
+        absorbed = 1.0
+    elif nm < 1050:
+        absorbed = math.pow(10, 0.002 * (nm - 700))
     if nm < 1150:
         return absorbed, 1.0
-    return absorbed, (
-        math.pow(10, 0.018 * (nm - 1150)) if nm < 1200 else 8 + math.pow(10, 0.04 * (nm - 1250))
-    )
+    if nm < 1200:
+        return absorbed, math.pow(10, 0.018 * (nm - 1150))
+    return absorbed, 8 + math.pow(10, 0.04 * (nm - 1250))
 
 
 def _retina(nm: float, duration: float) -> _Law:
@@ -148,7 +152,11 @@ def _cornea(nm: float, duration: float) -> _Law:
     """Return the limit in J/m2 from 1400 nm on."""
     if duration >= 10:
         return _power_law(1000, 1, duration, 1)
-    flat, until = (1e4, 10.0) if 1500 <= nm < 1800 else (100.0, 1e-7) if nm >= 2600 else (1e3, 1e-3)
+    flat, until = 1e3, 1e-3
+    if 1500 <= nm < 1800:
+        flat, until = 1e4, 10.0
+    elif nm >= 2600:
+        flat, until = 100.0, 1e-7
     if duration <= until:
         return _constant(flat, 1, duration, 1e-9)
     return _power_law(5600, 1, duration, 0.25)
