@@ -262,12 +262,12 @@ def spectral_channels(names: Sequence[str]) -> dict[float, str]:
 
     Reflectance channels are used only if the file has no emission channels.
     """
+    matches = [match for match in map(_NAME.fullmatch, names) if match]
+    spectral = [match for match in matches if match[2] not in ("", ",")]
     for kind in ("S0", "T"):
-        matches = [
-            m for m in map(_NAME.fullmatch, names) if m and m[1] == kind and m[2] not in ("", ",")
-        ]
-        if matches:
-            return dict(sorted((_wavelength(m), m[0]) for m in matches))
+        of_kind = [match for match in spectral if match[1] == kind]
+        if of_kind:
+            return dict(sorted((_wavelength(match), match[0]) for match in of_kind))
     return {}
 
 
