@@ -245,12 +245,14 @@ def _found(
             max(y - window[0] // 2, 0) : y + window[0] // 2 + 1,
             max(x - window[1] // 2, 0) : x + window[1] // 2 + 1,
         ] = 0
-    inner = [
-        p
-        for p in points
-        if all(_RIM <= c < n - _RIM for c, n in zip(p[0], above.shape, strict=True))
-    ]
-    return inner
+    height, width = above.shape
+    return [point for point in points if _is_inner(point[0], height, width)]
+
+
+def _is_inner(place: tuple[int, int], height: int, width: int) -> bool:
+    """Return True if a pixel (y, x) does not lie in the rim of a picture."""
+    y, x = place
+    return _RIM <= y < height - _RIM and _RIM <= x < width - _RIM
 
 
 def _median(picture: Tensor) -> Tensor:
