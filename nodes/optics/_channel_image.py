@@ -332,8 +332,9 @@ def _fitted(
     """Return the basis images of the scene, and the part of the PSF that reaches the scene, in
     the same precision.
     """
-    count = len(psf.intensity)
-    psf_bands = count if share is None else len(share) if share.shape[1] == count else -1
+    psf_bands = len(psf.intensity)
+    if share is not None:
+        psf_bands = len(share) if share.shape[1] == psf_bands else -1
     bands = {len(radiance.basis), psf_bands, rows.shape[-1]}
     if len(bands) > 1 or radiance.planes.ndim != 3 or psf.intensity.ndim != 3 or rows.ndim != 2:
         raise ValueError(

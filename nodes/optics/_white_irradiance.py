@@ -53,9 +53,9 @@ def white_irradiance(
     """
     if illuminance is None and luminance is None:
         return torch.zeros((), dtype=torch.float64)
-    candela = (
-        (0.0 if luminance is None else luminance) if illuminance is None else illuminance / math.pi
-    )
+    candela = 0.0 if luminance is None else luminance
+    if illuminance is not None:
+        candela = illuminance / math.pi
     widths = bands.widths.detach().cpu().double()
     radiance = candela * luminous_share(bands, kind, temperature)
     if float(widths.max() / widths.min()) > 1 + _EQUAL:
