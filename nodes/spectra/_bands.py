@@ -173,9 +173,11 @@ def _(
 ) -> list[str]:
     _refuse_many(count)
     points = params.get("sampling") == "point"
-    reach = _GRID * count / 2 if points else (3 * fwhm if span is None else span) / 2
+    name, width = ("fwhm", 3 * fwhm) if span is None else ("span", span)
+    if points:
+        name, width = "count", _GRID * count
+    reach = width / 2
     if wavelength - reach < 100e-9:
-        name = "count" if points else "fwhm" if span is None else "span"
         text = (
             f"the bands of the laser reach down to {(wavelength - reach) * 1e9:.3g} nm: keep all"
             " bands above 100 nm"
