@@ -55,15 +55,7 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
     Source: EMVA Standard 1288, release 4.0 Linear, sections 6.6 to 6.8.
     """
     dark = levels.photons == 0
-    if not bool(dark.any()):
-        raise ValueError(
-            "the offset of the camera is unknown without dark frames: give frames without light"
-        )
-    if int((~dark).sum()) < 2:
-        raise ValueError(
-            f"{int((~dark).sum())} lit level(s) cannot define a line: give two or more different"
-            " light levels"
-        )
+    _refuse_too_few(dark)
     nearest = (levels.exposure[~dark, None] - levels.exposure[dark]).abs().argmin(1)
     lit = without_histograms(levels, ~dark)
     below = without_histograms(levels, dark.nonzero().squeeze(1)[nearest])
@@ -76,15 +68,9 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
             " above the dark level) cannot define a line: give two or more different light levels"
             " there"
         )
-    gain, response = (
-        _slope(mean[fitted], variance[fitted]),
-        _slope(lit.photons[fitted], mean[fitted]),
-    )
-    if not (float(gain) > 0 and float(response) > 0):
-        raise ValueError(
-            f"slopes {float(gain):.3g} DN/e- and {float(response):.3g} DN/photon are not positive:"
-            " more light must raise mean and variance; check `photons` of each level"
-        )
+    gain = _slope(mean[fitted], variance[fitted])
+    response = _slope(lit.photons[fitted], mean[fitted])
+    _refuse_falling(gain, response)
     of_lit, of_dark = (
         (2 * x.variance.square() / x.degrees_of_freedom)[fitted] for x in (lit, below)
     )
@@ -94,17 +80,39 @@ def least_squares(levels: Levels, *, share: Share = 0.7) -> LeastSquares:
     noise, noise_error = _dark_noise(levels, dark)
     efficiency = response / gain
     return LeastSquares(
-        gain,
-        efficiency,
-        noise / gain,
-        levels.mean[_shortest_dark(levels, dark)],
-        _dark_current(levels, dark) / gain,
-        full / gain,
-        gain_error * gain,
-        efficiency * torch.hypot(gain_error, response_error),
-        torch.hypot(noise_error, gain_error * noise) / gain,
-        torch.tensor(float(len(fitted)), dtype=torch.float64),
+        gain=gain,
+        efficiency=efficiency,
+        temporal_dark_noise=noise / gain,
+        dark_signal=levels.mean[_shortest_dark(levels, dark)],
+        dark_current=_dark_current(levels, dark) / gain,
+        saturation=full / gain,
+        gain_error=gain_error * gain,
+        efficiency_error=efficiency * torch.hypot(gain_error, response_error),
+        temporal_dark_noise_error=torch.hypot(noise_error, gain_error * noise) / gain,
+        fitted=torch.tensor(float(len(fitted)), dtype=torch.float64),
     )
+
+
+def _refuse_too_few(dark: Tensor) -> None:
+    """Raise ValueError unless one level is ``dark``, (level,) bool, and two are lit."""
+    if not bool(dark.any()):
+        raise ValueError(
+            "the offset of the camera is unknown without dark frames: give frames without light"
+        )
+    lit = int((~dark).sum())
+    if lit < 2:
+        raise ValueError(
+            f"{lit} lit level(s) cannot define a line: give two or more different light levels"
+        )
+
+
+def _refuse_falling(gain: Tensor, response: Tensor) -> None:
+    """Raise ValueError unless both slopes of a camera are positive."""
+    if not (float(gain) > 0 and float(response) > 0):
+        raise ValueError(
+            f"slopes {float(gain):.3g} DN/e- and {float(response):.3g} DN/photon are not positive:"
+            " more light must raise mean and variance; check `photons` of each level"
+        )
 
 
 @least_squares.check

@@ -404,14 +404,15 @@ def _header_of_picture(file: Path) -> _Found:
         for tags in (exif, exif.get_ifd(_EXIF)):
             if _EXPOSURE in tags:
                 said["exposuretime"] = float(tags[_EXPOSURE])
-        bits = (
-            8
-            if image.mode == "L"
-            else 16
-            if image.mode.startswith("I;16") or image.format == "PNG"
-            else 32
-        )
-        return int(getattr(image, "n_frames", 1)), (image.height, image.width), bits, said
+        frames = int(getattr(image, "n_frames", 1))
+        return frames, (image.height, image.width), _bits_of(image.mode, image.format), said
+
+
+def _bits_of(mode: str, kind: str | None) -> int:
+    """Return the bits of a pixel in a picture of a mode and a format of Pillow."""
+    if mode == "L":
+        return 8
+    return 16 if mode.startswith("I;16") or kind == "PNG" else 32
 
 
 def _texts(info: Mapping[Any, Any]) -> dict[str, Any]:

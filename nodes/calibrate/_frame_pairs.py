@@ -271,18 +271,17 @@ def saturated(levels: Sequence[Level]) -> list[Level]:
     """
     lit = [level for level in levels if not level.dark and level.paired]
     peak = max(lit, key=lambda level: level.variance, default=None)
-    return [level for level in levels if level.high or (peak is not None and _is_flat(level, peak))]
+    if peak is None:
+        return [level for level in levels if level.high]
+    return [level for level in levels if level.high or _is_flat(level, peak)]
 
 
 def tested(levels: Sequence[Level]) -> list[Level]:
     """Return the paired levels whose noise is tested: those that the fit uses, without a pile at
     an end.
     """
-    return [
-        level
-        for level in levels
-        if level.paired and level.fitted and not level.high and not level.low
-    ]
+    fitted = [level for level in levels if level.paired and level.fitted]
+    return [level for level in fitted if not level.high and not level.low]
 
 
 def _is_flat(level: Level, peak: Level) -> bool:
@@ -443,10 +442,13 @@ def bounded(
         return FrameTest(
             name, evidence.strength, evidence.limit, "passed", text, hidden=tuple(hidden)
         )
-    verdict: Verdict = "refused" if worst > REFUSED else "modelled" if modelled else "widened"
+    verdict: Verdict = "modelled" if modelled else "widened"
+    if worst > REFUSED:
+        verdict = "refused"
     text = (
         f"{sentence}: an error of {100 * worst:.2g} % may follow, and nothing is"
         f" corrected{_remedy(name, verdict)}"
     )
-    text = f"{sentence}: {modelled}" if verdict == "modelled" else text
+    if verdict == "modelled":
+        text = f"{sentence}: {modelled}"
     return FrameTest(name, evidence.strength, evidence.limit, verdict, text, hidden=tuple(hidden))

@@ -76,7 +76,11 @@ def products(x: Tensor, lag: tuple[int, int]) -> Tensor:
     height, width = x.shape[1:]
     first = x[:, : height - down, max(0, -right) : width - max(0, right)]
     other = x[:, down:, max(0, right) : width - max(0, -right)]
-    length = width if down == 0 else height if right == 0 else math.inf
+    length = math.inf  # of the line that holds both pixels, if one does
+    if down == 0:
+        length = width
+    elif right == 0:
+        length = height
     return first * other + x.square().mean() / length
 
 
@@ -184,10 +188,9 @@ def _whiteness(levels: Sequence[Level], white: Sequence[Tensor]) -> FrameTest:
         for lags in (_NEAR, _CORNERS, _FAR)
     )
     evidence = strongest([near, corners, far], sides=2)
-    darks, lit = (
-        [x for x, level in zip(white, levels, strict=True) if level.dark == dark]
-        for dark in (True, False)
-    )
+    pairs = list(zip(white, levels, strict=True))
+    darks = [x for x, level in pairs if level.dark]
+    lit = [x for x, level in pairs if not level.dark]
     of_readout = _from_readout(darks, lit)
     text = f"{_NOISE} {_correlates(white)}"
     sentence = f"{text}, as in frames that are mixed, denoised, interpolated or compressed"
@@ -399,7 +402,8 @@ def _drift(levels: Sequence[Level]) -> FrameTest:
     """Test if the mean moves between the frames of a pair."""
     drifts = list(chain.from_iterable(_drift_over_chance(level) for level in levels))
     evidence = strongest([[z] for z in drifts], sides=2)
-    dark, lit = ([level for level in levels if level.dark == is_dark] for is_dark in (True, False))
+    dark = [level for level in levels if level.dark]
+    lit = [level for level in levels if not level.dark]
     uneven = sum(level.flicker / (level.variance + _TINY) for level in lit) / max(1, len(lit))
     moved = _farthest_drift(levels)
     sentence = (

@@ -345,7 +345,8 @@ def _uneven(levels: Sequence[Level], full: Sequence[Level]) -> Iterator[FrameTes
     variance of each pixel grow alike. It does not where the brightest part of the frame is full
     before the mean is, which ``full`` levels show.
     """
-    lit, dark = ([level for level in levels if level.dark == is_dark] for is_dark in (False, True))
+    lit = [level for level in levels if not level.dark]
+    dark = [level for level in levels if level.dark]
     bright = max(lit, key=lambda level: level.mean, default=None)
     if bright is None or not dark or min(bright.first.shape[1:]) < 2 * _BLOCKS:
         return

@@ -122,7 +122,9 @@ def _reference_inner(
     and counts, and this middle; zeros and nothing if the middle is too narrow.
     """
     low, high = own[0][0] + _EDGE, own[-1][0] - _EDGE
-    inside = [(v, n) for v, n in own if low < v < high and variance**0.5 >= _COARSE]
+    if not variance**0.5 >= _COARSE:  # or not a number
+        return [0.0, 0.0, 0.0, 0.0], []
+    inside = [(v, n) for v, n in own if low < v < high]
     count = math.fsum(n for _, n in inside)
     if count < 2:
         return [0.0, 0.0, 0.0, 0.0], []
