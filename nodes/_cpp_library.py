@@ -65,11 +65,13 @@ def _processor() -> str:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         lines = []
-    facts = [
-        next((x for x in lines if x.startswith(word)), "")
-        for word in ("model name", "flags", "Features")
-    ]
+    facts = [_first(lines, word) for word in ("model name", "flags", "Features")]
     return "\n".join([platform.platform(), platform.machine(), platform.processor(), *facts])
+
+
+def _first(lines: list[str], word: str) -> str:
+    """Return the first line that begins with a word, or an empty text."""
+    return next((line for line in lines if line.startswith(word)), "")
 
 
 def _compiler() -> str:

@@ -162,7 +162,9 @@ class ErrorBound:
         """Return the bound of the relative error of the largest element of a node input, or inf
         if unknown.
         """
-        return 0.0 if self.rms == 0.0 else math.inf if self.peak is None else self.peak
+        if self.rms == 0.0:
+            return 0.0
+        return math.inf if self.peak is None else self.peak
 
 
 # --- hooks ----------------------------------------------------------------------------------------

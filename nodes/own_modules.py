@@ -279,16 +279,17 @@ def network_classes(module: ModuleType) -> dict[str, type[nn.Module]]:
     """Return the classes of `torch.nn.Module` that a module or package of a user defines, by
     name.
     """
+    values = vars(module).items()
+    return {name: value for name, value in values if _is_network_of(module, value)}
+
+
+def _is_network_of(module: ModuleType, value: object) -> bool:
     from torch import nn
 
-    return {
-        name: value
-        for name, value in vars(module).items()
-        if isinstance(value, type)
-        and issubclass(value, nn.Module)
-        and not inspect.isabstract(value)
-        and f"{value.__module__}.".startswith(f"{module.__name__}.")
-    }
+    if not isinstance(value, type) or not issubclass(value, nn.Module):
+        return False
+    defined_here = f"{value.__module__}.".startswith(f"{module.__name__}.")
+    return defined_here and not inspect.isabstract(value)
 
 
 def _nearest(name: str, candidates: Any) -> str:

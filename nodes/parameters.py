@@ -58,14 +58,11 @@ def _first_truth(value: Any) -> bool | None:
     """Return the first true or false in a value or in its lists and mappings, or None."""
     if isinstance(value, bool):
         return value
-    parts = (
-        value.values()
-        if isinstance(value, dict)
-        else value
-        if isinstance(value, list | tuple)
-        else ()
-    )
-    return next((truth for truth in map(_first_truth, parts) if truth is not None), None)
+    if isinstance(value, dict):
+        value = list(value.values())
+    if not isinstance(value, list | tuple):
+        return None
+    return next((truth for truth in map(_first_truth, value) if truth is not None), None)
 
 
 # --- file parameters ------------------------------------------------------------------------------

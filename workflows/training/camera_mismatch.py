@@ -195,12 +195,8 @@ def _towards(recipe: Recipe, mismatch: Mapping[str, Difference], path: str) -> l
     """
     laser = path.removeprefix("lasers.").removesuffix(f".{ANGLE}")
     source, order = f"direction[{laser}]", needed(recipe, [FRAME])
-    readers = [
-        f"{name}.{ANGLE}"
-        for name in order
-        if recipe.steps[name].wires.get("direction") == source
-        and ANGLE in recipe.steps[name].params
-    ]
+    turned = [name for name in order if recipe.steps[name].wires.get("direction") == source]
+    readers = [f"{name}.{ANGLE}" for name in turned if ANGLE in recipe.steps[name].params]
     if not readers:
         raise _mistake(mismatch, path, "no step before the frame reads this direction")
     return readers

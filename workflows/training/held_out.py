@@ -275,7 +275,8 @@ def facts(parts: Split, rows: Sequence[Mapping[str, str]], patience: int | None)
     best = Best.of(rows, 2)
     if not best.iterations:
         return names
-    row = next(r for r in rows if r["stage"] == "2" and int(r["iteration"]) + 1 == best.iterations)
+    rows_of_stage = [row for row in rows if row["stage"] == "2"]
+    row = next(row for row in rows_of_stage if int(row["iteration"]) + 1 == best.iterations)
     numbers = {name: float(row[name]) for name in COLUMNS if row.get(name)}
     early = patience is not None and best.since >= patience
     return {**names, "best": {"iterations": best.iterations, **numbers}, "stopped_early": early}
