@@ -612,10 +612,6 @@ MUTANTS = (
         within("nodes", "propagated_errors.py"),
         ("matrix.stats.shape[-1] * (", "("),
         ("(matrix.stats.largest_rms + matrix.rms)", "abs(matrix.stats.sum / 12)"),
-        (
-            "    return raw.rms / gain / lowest_transmission",
-            "    return raw.rms / gain * lowest_transmission",
-        ),
     ),
     *faults(
         "nodes/doe/_shade.py",

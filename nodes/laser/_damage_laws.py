@@ -99,9 +99,8 @@ def matching_laws(
 
 def _reaches(law: DamageLaw, wavelength: float, duration: float) -> bool:
     """Return True if a law holds at a wavelength in m and for a duration in s."""
-    shortest, longest = law.wavelengths
-    briefest, slowest = law.durations
-    return shortest <= wavelength <= longest and briefest <= duration <= slowest
+    of_light = law.wavelengths[0] <= wavelength <= law.wavelengths[1]
+    return of_light and law.durations[0] <= duration <= law.durations[1]
 
 
 def spot_reach(diameter: Number, duration: Number) -> Tensor:

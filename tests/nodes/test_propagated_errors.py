@@ -205,11 +205,3 @@ def test_errors_of_electrons_count_in_digital_numbers_and_back():
         )
         == 7.0
     )
-
-
-def test_what_a_shaded_pixel_lacks_is_divided_by_its_transmission():
-    darkest = ErrorBound(0.0, TensorStats((4, 4), "float32", 0.5, 1.0, 12.0, 16, True))
-    hook = restore.electrons.hooks.propagate_error
-    assert hook(ErrorBound(3.0), darkest, gain=0.25) == 24.0
-    for unknown in (ErrorBound(0.0), ErrorBound(1e-3, darkest.stats)):
-        assert hook(ErrorBound(3.0), unknown, gain=0.25) == math.inf
