@@ -262,6 +262,13 @@ def fitted_levels(levels: Sequence[Level], share: float | None) -> list[Level]:
     ]
 
 
+def dark_and_lit(levels: Sequence[Level]) -> tuple[list[Level], list[Level]]:
+    """Return the levels without light, and those with light."""
+    dark = [level for level in levels if level.dark]
+    lit = [level for level in levels if not level.dark]
+    return dark, lit
+
+
 def saturated(levels: Sequence[Level]) -> list[Level]:
     """Return the levels whose numbers pile up at the highest number, or whose variance has fallen
     above its maximum.

@@ -15,6 +15,7 @@ from neusee.nodes.calibrate._frame_pairs import (
     Hidden,
     Level,
     bounded,
+    dark_and_lit,
     normal_limit,
     outcome,
     probably_sound,
@@ -402,8 +403,7 @@ def _drift(levels: Sequence[Level]) -> FrameTest:
     """Test if the mean moves between the frames of a pair."""
     drifts = list(chain.from_iterable(_drift_over_chance(level) for level in levels))
     evidence = strongest([[z] for z in drifts], sides=2)
-    dark = [level for level in levels if level.dark]
-    lit = [level for level in levels if not level.dark]
+    dark, lit = dark_and_lit(levels)
     uneven = sum(level.flicker / (level.variance + _TINY) for level in lit) / max(1, len(lit))
     moved = _farthest_drift(levels)
     sentence = (

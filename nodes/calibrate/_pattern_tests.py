@@ -15,6 +15,7 @@ from neusee.nodes.calibrate._frame_pairs import (
     Hidden,
     Level,
     bounded,
+    dark_and_lit,
     outcome,
     probably_sound,
     saturated,
@@ -345,8 +346,7 @@ def _uneven(levels: Sequence[Level], full: Sequence[Level]) -> Iterator[FrameTes
     variance of each pixel grow alike. It does not where the brightest part of the frame is full
     before the mean is, which ``full`` levels show.
     """
-    lit = [level for level in levels if not level.dark]
-    dark = [level for level in levels if level.dark]
+    dark, lit = dark_and_lit(levels)
     bright = max(lit, key=lambda level: level.mean, default=None)
     if bright is None or not dark or min(bright.first.shape[1:]) < 2 * _BLOCKS:
         return
