@@ -22,9 +22,7 @@ class Rows(pytest.Item):
     def __init__(self, *, rows: list[pytest.Function], **names: object) -> None:
         super().__init__(**names)  # type: ignore[arg-type]
         self.rows = rows
-        for mark in rows[0].own_markers:
-            if mark.name != "parametrize":
-                self.add_marker(mark)
+        self.own_markers += [mark for mark in rows[0].own_markers if mark.name != "parametrize"]
 
     def runtest(self) -> None:
         """Not called: the rows are run by `pytest_runtest_protocol`."""

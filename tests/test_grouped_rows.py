@@ -18,6 +18,7 @@ def test_is_odd(number, counter, tmp_path):
     (tmp_path / "made").touch()
     assert number % 2 == 1
 
+@pytest.mark.usefixtures("counter")
 @pytest.mark.parametrize("number", [1, 2])
 def test_is_skipped(number):
     if number == 2:
