@@ -30,8 +30,7 @@ from neusee.workflows.calibration.laboratory import RELATIVE, stated
 from neusee.workflows.calibration.log_posterior import LaplaceFit, SensorPosterior
 from neusee.workflows.calibration.posterior_checks import Check, Mark, count_failures, is_camera
 from neusee.workflows.calibration.uncertainty_budget import budget_picture, budget_sections
-from neusee.workflows.report.study_page import Mark as StudyPageMark
-from neusee.workflows.report.study_page import Section, with_uncertainty
+from neusee.workflows.report.study_page import Marked, Section, with_uncertainty
 
 if TYPE_CHECKING:
     from neusee.nodes.values import Levels
@@ -429,7 +428,6 @@ def _parameters(result: CalibrationResult) -> Section:
         "draws below it",
         "width / prior",
     )
-    estimates = result.rows()
     rows = [
         (
             words(r.name),
@@ -438,23 +436,24 @@ def _parameters(result: CalibrationResult) -> Section:
             r.end("high"),
             r.unit,
             f"{r.nominal:.6g}",
-            r.share,
+            _judged_share(r),
             r.narrower,
         )
-        for r in estimates
+        for r in result.rows()
     ]
-    marks: dict[tuple[int, int], StudyPageMark] = {
-        (i, 6): "pass" if 0.005 <= r.share <= 0.995 else "warn"
-        for i, r in enumerate(estimates)
-        if r.kind == "estimate"
-    }
     return Section(
         "The lens" if isinstance(result.problem.levels, Rings) else "The sensor",
         text,
         columns,
         rows,
-        marks=marks,
     )
+
+
+def _judged_share(r: ParameterEstimate) -> Marked:
+    """Return the share of the draws below the recipe's value, marked if the frames estimate it."""
+    if r.kind != "estimate":
+        return Marked(r.share)
+    return Marked(r.share, "pass" if 0.005 <= r.share <= 0.995 else "warn")
 
 
 def _models(result: CalibrationResult) -> Section:
@@ -480,13 +479,13 @@ def _between(interval: IntervalEstimate) -> str:
 
 
 def _checks(result: CalibrationResult) -> Section:
-    rows = [(check.name, check.found, check.bar, check.mark) for check in result.checks]
-    marks: dict[tuple[int, int], StudyPageMark] = {
-        (i, 3): check.mark for i, check in enumerate(result.checks)
-    }
+    rows = [
+        (check.name, check.found, check.bar, Marked(check.mark, check.mark))
+        for check in result.checks
+    ]
     count = count_failures(result.checks)
     text = f"{count} fail: the posterior is not fit for use." if count else "No check fails."
-    return Section("Checks", text, ("check", "found", "bar", "holds"), rows, marks=marks)
+    return Section("Checks", text, ("check", "found", "bar", "holds"), rows)
 
 
 def _not_determined(result: CalibrationResult) -> Section:
@@ -495,12 +494,9 @@ def _not_determined(result: CalibrationResult) -> Section:
         more than the frames do."""
     strengths = result.identifiability.strengths
     directions = [line for line in result.identifiability.directions if line != RELATIVE]
-    rows = list(
-        zip(strengths, [""] * (len(strengths) - len(directions)) + [*directions], strict=True)
-    )
-    marks: dict[tuple[int, int], StudyPageMark] = {
-        (i, 0): "warn" if text else "pass" for i, (_, text) in enumerate(rows)
-    }
-    return Section(
-        "What the levels determine", text, ("strength", "not determined"), rows, marks=marks
-    )
+    named = [""] * (len(strengths) - len(directions)) + directions
+    rows = [
+        (Marked(strength, "warn" if direction else "pass"), direction)
+        for strength, direction in zip(strengths, named, strict=True)
+    ]
+    return Section("What the levels determine", text, ("strength", "not determined"), rows)

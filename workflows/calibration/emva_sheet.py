@@ -45,7 +45,7 @@ from neusee.workflows.frames.folder_recipe import quoted
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.report.study_folder import CsvTable
-from neusee.workflows.report.study_page import Mark, Section
+from neusee.workflows.report.study_page import Mark, Marked, Section
 from neusee.workflows.store.result_store import Store
 
 # --- emva frames ----------------------------------------------------------------------------------
@@ -590,23 +590,24 @@ def group_of(quantity: Quantity, sheet: EmvaSheet) -> str:
 
 def _section(sheet: EmvaSheet, heading: str, text: str, picture: bytes | None) -> Section:
     rows: list[Sequence[Any]] = []
-    marks: dict[tuple[int, int], Mark] = {}
     columns: Sequence[str] = ("symbol", "quantity", "value", "why not, or why a limit")
-    for quantity in (
+    quantities = [
         q for q in sheet.quantities if heading in _TABLES and group_of(q, sheet) == heading
-    ):
-        if quantity.reason:
-            marks[len(rows), 2] = "warn"
-        rows.append((quantity.symbol, quantity.name, quantity.text, quantity.reason))
-    if not marks:
+    ]
+    for quantity in quantities:
+        text_of_value = Marked(quantity.text, "warn" if quantity.reason else None)
+        rows.append((quantity.symbol, quantity.name, text_of_value, quantity.reason))
+    if not any(quantity.reason for quantity in quantities):
         columns, rows = columns[:-1], [row[:-1] for row in rows]
-    return Section(heading, text, columns if rows else (), rows, picture, marks)
+    return Section(heading, text, columns if rows else (), rows, picture)
 
 
 def _compliance(sheet: EmvaSheet, frames: EmvaFrames, statements: Mapping[str, Any]) -> Section:
     demands = requirements(sheet, frames, statements)
-    marks: dict[tuple[int, int], Mark] = {(i, 2): row.mark for i, row in enumerate(demands)}
-    rows = [(row.demand, row.found, "yes" if row.mark == "pass" else "no") for row in demands]
+    rows = [
+        (row.demand, row.found, Marked("yes" if row.mark == "pass" else "no", row.mark))
+        for row in demands
+    ]
     open_ones = sum(row.mark != "pass" for row in demands)
     text = f"""The quantities are computed as EMVA 1288, release 4.0 Linear, says. This is a
         computation from frames and no certificate: geometry, homogeneity and calibration of the
@@ -619,7 +620,6 @@ def _compliance(sheet: EmvaSheet, frames: EmvaFrames, statements: Mapping[str, A
         text,
         ("demand", "found", "met"),
         rows,
-        marks=marks,
     )
 
 

@@ -32,7 +32,7 @@ from neusee.workflows.calibration.posterior_checks import Check
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.recipe.distributions.joint_distribution import Z_90
-from neusee.workflows.report.study_page import Mark, Section
+from neusee.workflows.report.study_page import Mark, Marked, Section
 from neusee.workflows.store.result_store import Store
 
 if TYPE_CHECKING:
@@ -342,15 +342,12 @@ def frame_section(tests: Sequence[FrameTest]) -> Section:
             "Only moments are given, so that noise, patterns and numbers of the frames are not"
             " tested."
         )
-    rows = [(t.name, abs(t.number), abs(t.limit), t.verdict, t.sentence) for t in tests]
-    marks: dict[tuple[int, int], Mark] = {(i, 3): _MARKS[t.verdict] for i, t in enumerate(tests)}
-    return Section(
-        "The frames",
-        text,
-        ("test", "number", "limit", "verdict", "what it says"),
-        rows,
-        marks=marks,
-    )
+    rows = [
+        (t.name, abs(t.number), abs(t.limit), Marked(t.verdict, _MARKS[t.verdict]), t.sentence)
+        for t in tests
+    ]
+    columns = ("test", "number", "limit", "verdict", "what it says")
+    return Section("The frames", text, columns, rows)
 
 
 def as_rows(tests: Iterable[FrameTest]) -> list[dict[str, Any]]:

@@ -39,7 +39,7 @@ from neusee.workflows.report.figures.style import (
     canvas,
     drawn,
 )
-from neusee.workflows.report.study_page import Mark, Section, with_uncertainty
+from neusee.workflows.report.study_page import Marked, Section, with_uncertainty
 
 if TYPE_CHECKING:
     from neusee.workflows.calibration.calibration_page import CalibrationResult, ParameterEstimate
@@ -129,11 +129,8 @@ def budget_sections(
         "not stated",
     )
     rows = [_row(budget) for budget in budgets]
-    marks: dict[tuple[int, int], Mark] = {
-        (i, 8): "warn" for i, budget in enumerate(budgets) if budget.missing
-    }
     return [
-        Section("Uncertainty budget", _TEXT + note, columns, rows, picture, marks),
+        Section("Uncertainty budget", _TEXT + note, columns, rows, picture),
         Section(
             "Sources of uncertainty",
             _LINES,
@@ -170,7 +167,7 @@ def _row(budget: Budget) -> tuple[Any, ...]:
         _freedom(budget.freedom),
         f"{budget.factor:.2f}",
         budget.expanded,
-        ", ".join(budget.missing) or "–",
+        Marked(", ".join(budget.missing), "warn") if budget.missing else "–",
     )
 
 
@@ -208,13 +205,12 @@ def _freedom(freedom: float) -> str:
 def _traced(traceability: Traceability) -> list[Section]:
     text = """What the block `traceability` of the recipe states of the light and of the
         temperature, so that a value can be traced to a standard."""
+    unstated = Marked("not stated", "warn")
     rows = [
-        (name, "not stated" if value is None else value) for name, value in statements(traceability)
+        (name, unstated if value in (None, "not stated") else value)
+        for name, value in statements(traceability)
     ]
-    marks: dict[tuple[int, int], Mark] = {
-        (i, 1): "warn" for i, (_, value) in enumerate(rows) if value == "not stated"
-    }
-    return [Section("Traceability", text, ("statement", "value"), rows, marks=marks)]
+    return [Section("Traceability", text, ("statement", "value"), rows)]
 
 
 def statements(traceability: Traceability) -> list[tuple[str, str | None]]:

@@ -63,15 +63,11 @@ def summary(comparison: RunComparison) -> list[str]:
         [file for file in files if file.state != "same"]
         for files in (comparison.figures, comparison.data)
     )
-    code = (
-        "The left or the right folder records no digests of code."
-        if comparison.code is None
-        else (
-            f"{_counted(len(comparison.code), 'difference')} in the code."
-            if comparison.code
-            else "The code is the same."
-        )
-    )
+    code = "The code is the same."
+    if comparison.code is None:
+        code = "The left or the right folder records no digests of code."
+    elif comparison.code:
+        code = f"{_counted(len(comparison.code), 'difference')} in the code."
     return [
         *_compared(comparison.numbers),
         f"{len(drawn)} of {_counted(len(comparison.figures), 'picture')} differ.",
@@ -183,21 +179,23 @@ def _files(comparison: RunComparison) -> Section:
     return Section("Files", f"{text}\n\n{lines}" if lines else text, columns if rows else (), rows)
 
 
+def _text_of_code(comparison: RunComparison) -> str:
+    if comparison.code is None:
+        return (
+            "The folder of a run of an earlier version records no digests of code, so that the"
+            " code is not compared."
+        )
+    if comparison.code:
+        return "What differs in the code of the nodes, by module and definition."
+    return "The code of every common node is the same."
+
+
 def _causes(comparison: RunComparison) -> list[Section]:
     return [
         _table("Recipe", "The final values of both recipes", comparison.recipe, sources=True),
         Section(
             "Code",
-            (
-                "The folder of a run of an earlier version records no digests of code, so that the"
-                " code is not compared."
-                if comparison.code is None
-                else (
-                    "What differs in the code of the nodes, by module and definition."
-                    if comparison.code
-                    else "The code of every common node is the same."
-                )
-            ),
+            _text_of_code(comparison),
             ("difference",) if comparison.code else (),
             [[line] for line in comparison.code or ()],
         ),

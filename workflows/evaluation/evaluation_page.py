@@ -36,7 +36,7 @@ from neusee.workflows.report.figures.style import (
     encoded,
     picture,
 )
-from neusee.workflows.report.study_page import Mark, Section
+from neusee.workflows.report.study_page import Marked, Section
 
 if TYPE_CHECKING:
     from neusee.workflows.evaluation.evaluation_result import (
@@ -165,7 +165,8 @@ def _places(values: Sequence[float]) -> list[float]:
     below the others.
     """
     logs = [float(np.log10(k)) for k in values if k > 0]
-    return [float(np.log10(k)) if k > 0 else (min(logs) - 1 if logs else 0.0) for k in values]
+    below = min(logs) - 1 if logs else 0.0
+    return [float(np.log10(k)) if k > 0 else below for k in values]
 
 
 @drawn
@@ -471,15 +472,19 @@ def _gained(result: EvaluationResult, reference: str) -> Section:
         the same pictures, at each laser strength, with 95 % intervals as below. A colour marks an
         interval without zero."""
     listed: list[Sequence[Any]] = []
-    marks: dict[tuple[int, int], Mark] = {}
     for name in (name for name, other in result.references.items() if other == reference != name):
         gains = gains_by_strength(result.tables[name], result.tables[reference], result.recipe.seed)
-        for i, x in enumerate(gains, 1):
-            if x.excludes_zero:
-                marks[len(listed), i] = "pass" if x.mean > 0 else "fail"
-        listed.append((name, *(_between(x, ".1%") for x in gains)))
+        listed.append((name, *(_judged(x, ".1%") for x in gains)))
     columns = ("pipeline", *_strength_names(result))
-    return Section(f"Gain by strength over {reference}", text, columns, listed, marks=marks)
+    return Section(f"Gain by strength over {reference}", text, columns, listed)
+
+
+def _judged(x: Interval, digits: str) -> Marked:
+    """Return an interval as a cell, which is marked if the interval excludes zero."""
+    text = _between(x, digits)
+    if not x.excludes_zero:
+        return Marked(text)
+    return Marked(text, "pass" if x.mean > 0 else "fail")
 
 
 def _with_interval(x: Interval, metric: str) -> str:
@@ -556,19 +561,13 @@ def _compared(result: EvaluationResult, reference: str) -> Section:
         colour marks an interval without zero. If many pipelines are compared with one reference,
         about one in twenty is marked by chance."""
     listed: list[Sequence[Any]] = []
-    marks: dict[tuple[int, int], Mark] = {}
     for p in result.pipelines:
         if p.name == reference or result.references[p.name] != reference:
             continue
         less, share, small = result.against[p.name].values()
-        for column, interval in ((1, less), (2, share), (3, small)):
-            if interval.excludes_zero:
-                marks[len(listed), column] = "pass" if interval.mean > 0 else "fail"
-        listed.append(
-            (p.name, _between(less, ".4f"), _between(share, ".1%"), _between(small, ".1%"))
-        )
+        listed.append((p.name, _judged(less, ".4f"), _judged(share, ".1%"), _judged(small, ".1%")))
     columns = ("pipeline", "L1 less", "gain", "gain, small")
-    return Section(f"Against {reference}", text, columns, listed, marks=marks)
+    return Section(f"Against {reference}", text, columns, listed)
 
 
 def _between(x: Interval, digits: str) -> str:
@@ -603,12 +602,12 @@ def _plane(result: EvaluationResult, picture: bytes) -> Section:
         contrast is that of the remaining light, and the bound of the mask, in the table, is
         higher."""
     listed: list[Sequence[Any]] = []
-    marks: dict[tuple[int, int], Mark] = {}
     for name, m in result.masks.items():
-        marks[len(listed), 4] = "pass" if (m.rms <= _COARSE * m.most).all() else "fail"
-        listed.append((name, *(float(x.mean()) for x in (m.lsr, m.median, m.rms, m.most))))
+        bound_holds = bool((m.rms <= _COARSE * m.most).all())
+        bound = Marked(float(m.most.mean()), "pass" if bound_holds else "fail")
+        listed.append((name, *(float(x.mean()) for x in (m.lsr, m.median, m.rms)), bound))
     columns = ("mask", "mean LSR", "median", "rms", "rms at most")
-    return Section("Suppression and contrast", text, columns, listed, picture, marks)
+    return Section("Suppression and contrast", text, columns, listed, picture)
 
 
 def _commands(result: EvaluationResult) -> list[Section]:

@@ -92,7 +92,9 @@ def mode_for(silent: bool) -> Mode:
     """Return how a table is printed: ``silent`` on request, ``live`` (updated) on a terminal,
     else ``plain`` lines.
     """
-    return "silent" if silent else "live" if sys.stdout.isatty() else "plain"
+    if silent:
+        return "silent"
+    return "live" if sys.stdout.isatty() else "plain"
 
 
 class ProgressTable(ABC):

@@ -12,8 +12,8 @@ import functools
 import math
 import numbers
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any, Literal
@@ -23,6 +23,14 @@ _SHORT = 16  #: characters of the longest text that a table does not break at a 
 _BREAK = re.compile(r"(?<=[_,/.])(?=[a-z])|(?=\[)")  #: where a long word may go on in a new line
 
 Mark = Literal["pass", "warn", "fail"]
+
+
+@dataclass(frozen=True, slots=True)
+class Marked:
+    """A value of a table cell that passes, warns or fails; without a mark, the plain value."""
+
+    value: Any
+    mark: Mark | None = None
 
 
 @dataclass(frozen=True)
@@ -35,9 +43,9 @@ class Section:
     heading: str
     text: str
     columns: Sequence[str] = ()
-    rows: Sequence[Sequence[Any]] = ()  #: a real number is shown with three digits, None as a dash
+    #: a real number is shown with three digits, None as a dash, a `Marked` value with its colour
+    rows: Sequence[Sequence[Any]] = ()
     picture: bytes | None = None  #: PNG
-    marks: Mapping[tuple[int, int], Mark] = field(default_factory=dict)  #: (row, column), from 0
 
 
 def page(
@@ -94,6 +102,16 @@ def _with_breaks(text: str) -> str:
     )
 
 
+def marked_column(
+    rows: Iterable[Sequence[Any]], column: int, marks: Iterable[Mark | None]
+) -> list[Sequence[Any]]:
+    """Return the rows of a table with a mark, or None, for the cell of each row in a column."""
+    return [
+        (*row[:column], Marked(row[column], mark), *row[column + 1 :])
+        for row, mark in zip(rows, marks, strict=True)
+    ]
+
+
 def said(value: Any) -> str:
     """Return the value of a table cell as text, with three digits of a real number and a dash
     for None.
@@ -122,9 +140,9 @@ def with_uncertainty(mean: float, sd: float) -> str:
 
 
 def _section(anchor: str, section: Section) -> dict[str, Any]:
-    _refuse_stray_marks(section)
+    rows = [[_with_mark(value) for value in row] for row in section.rows]
     numeric = {
-        i for i in range(len(section.columns)) if _holds_numbers([row[i] for row in section.rows])
+        i for i in range(len(section.columns)) if _holds_numbers([row[i].value for row in rows])
     }
     return {
         "anchor": anchor,
@@ -134,10 +152,7 @@ def _section(anchor: str, section: Section) -> dict[str, Any]:
         "picture": base64.b64encode(section.picture).decode() if section.picture else "",
         "columns": section.columns,
         "numeric": numeric,
-        "rows": [
-            [_cell(v, section.marks.get((r, c)), c in numeric) for c, v in enumerate(row)]
-            for r, row in enumerate(section.rows)
-        ],
+        "rows": [[_cell(value, i in numeric) for i, value in enumerate(row)] for row in rows],
     }
 
 
@@ -151,22 +166,18 @@ def _alternative(section: Section) -> str:
     return " ".join([f"Figure: {section.heading}.", *sentences])
 
 
-def _refuse_stray_marks(section: Section) -> None:
-    """Raise ValueError if a pass, warn or fail mark belongs to a cell outside the table of its
-    section.
-    """
-    for row, column in section.marks:
-        if not (0 <= row < len(section.rows) and 0 <= column < len(section.rows[row])):
-            raise ValueError(
-                f"{section.heading}: the pass, warn or fail mark at row {row}, column {column} is"
-                " outside the table: mark a cell of the table"
-            )
+def _with_mark(value: Any) -> Marked:
+    return value if isinstance(value, Marked) else Marked(value)
 
 
-def _cell(value: Any, mark: Mark | None, numeric: bool) -> dict[str, str]:
-    text = said(value)
-    align = "n" if numeric or _is_number(value) else "one" if _is_short_word(text) else ""
-    return {"text": text, "kind": " ".join(filter(None, (align, mark)))}
+def _cell(cell: Marked, numeric: bool) -> dict[str, str]:
+    text = said(cell.value)
+    align = ""
+    if numeric or _is_number(cell.value):
+        align = "n"
+    elif _is_short_word(text):
+        align = "one"
+    return {"text": text, "kind": " ".join(filter(None, (align, cell.mark)))}
 
 
 def _is_short_word(text: str) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code, engine
 from neusee.workflows.report.study_folder import StudyReport, StudyRun
-from neusee.workflows.report.study_page import Section
+from neusee.workflows.report.study_page import Marked, Section
 from neusee.workflows.safety.damage_pattern import DeadPixels
 from neusee.workflows.safety.exposures import Spread
 from neusee.workflows.safety.laser_spots import Veil
@@ -43,7 +43,7 @@ class Assessment:
     paragraphs: list[list[str]]
     title: str
     lead: str
-    #: as `Section`, with the marks as a list of row, column and mark
+    #: as `Section`, with a `Marked` cell as its value and its mark
     sections: list[dict[str, Any]]
     pictures: dict[str, bytes]
     rows: list[list[Any]]  #: of limits.csv, the header first
@@ -52,23 +52,35 @@ class Assessment:
     @property
     def report(self) -> StudyReport:
         """Return the page of the estimate with its files."""
-        sections = [
-            Section(
-                **{
-                    **section,
-                    "marks": {(row, column): mark for row, column, mark in section["marks"]},
-                }
-            )
-            for section in self.sections
-        ]
         return StudyReport(
             self.title,
             self.lead,
-            sections,
+            [_section(plain) for plain in self.sections],
             self.pictures,
             {"limits.csv": (self.rows[0], self.rows[1:])},
             {"worksheet.html": self.worksheet},
         )
+
+
+def _section(plain: Mapping[str, Any]) -> Section:
+    """Return a section from how the store keeps it."""
+    rows = [
+        [Marked(**cell) if isinstance(cell, dict) else cell for cell in row]
+        for row in plain["rows"]
+    ]
+    return Section(**{**plain, "rows": rows})
+
+
+def _plain_section(section: Section) -> dict[str, Any]:
+    """Return a section as the store keeps it."""
+    rows = [
+        [
+            {"value": cell.value, "mark": cell.mark} if isinstance(cell, Marked) else cell
+            for cell in row
+        ]
+        for row in section.rows
+    ]
+    return {**vars(section), "rows": rows}
 
 
 def assess(
@@ -141,17 +153,13 @@ def _assessed(estimate: Estimate) -> Assessment:
     page = report(estimate)
     pictures = {name: picture for name, picture in page.pictures.items() if picture}
     header, rows = page.tables["limits.csv"]
-    sections = [
-        {**vars(section), "marks": [[*place, mark] for place, mark in section.marks.items()]}
-        for section in page.sections
-    ]
     plain = [list(header), *(list(row) for row in rows)]
     return Assessment(
         document=document(estimate),
         paragraphs=paragraphs(estimate),
         title=page.title,
         lead=page.lead,
-        sections=sections,
+        sections=[_plain_section(section) for section in page.sections],
         pictures=pictures,
         rows=plain,
         worksheet=worksheet_page(estimate),

@@ -17,7 +17,7 @@ from neusee.workflows.report.figures.style import (
     drawn,
 )
 from neusee.workflows.report.study_folder import StudyReport
-from neusee.workflows.report.study_page import Mark, Section
+from neusee.workflows.report.study_page import Mark, Section, marked_column
 from neusee.workflows.safety import safety_estimate, safety_text
 from neusee.workflows.safety.damage_pattern import DamagePattern, DeadPixels
 from neusee.workflows.safety.exposures import QUANTILES
@@ -303,11 +303,10 @@ def _limits(estimate: Estimate) -> Section | None:
         incubation of many pulses. A probability is stated for a law with data of devices alone, and
         is that of a device drawn from all devices. {safety_text.intervals_text(estimate)}
         {CERTIFICATE}"""
-    marks: dict[tuple[int, int], Mark] = {
-        (i, 3): "warn" for i in range(len(estimate.findings), len(rows))
-    }
-    marks |= {(i, 3): _mark(finding) for i, finding in enumerate(estimate.findings)}
-    return Section("Limits", text, safety_text.LIMIT_COLUMNS, rows, marks=marks)
+    judged = list(map(_mark, estimate.findings))
+    others: list[Mark] = ["warn"] * (len(rows) - len(judged))
+    marked = marked_column(rows, 3, [*judged, *others])
+    return Section("Limits", text, safety_text.LIMIT_COLUMNS, marked)
 
 
 def _mark(finding: Finding) -> Mark:

@@ -109,7 +109,9 @@ def _open(remedy: Remedy) -> Remedy:
 def problem_of(limit: str) -> Problem:
     """Return the problem that a limit belongs to, by its name."""
     word = limit.partition(":")[0]
-    return "saturation" if word == "saturated" else "contrast" if word == "veiled" else "damage"
+    if word == "saturated":
+        return "saturation"
+    return "contrast" if word == "veiled" else "damage"
 
 
 # --- the question: how often is each limit exceeded behind another protection? --------------------

@@ -6,7 +6,14 @@ from html.parser import HTMLParser
 
 import pytest
 
-from neusee.workflows.report.study_page import Section, page, said, with_uncertainty
+from neusee.workflows.report.study_page import (
+    Marked,
+    Section,
+    marked_column,
+    page,
+    said,
+    with_uncertainty,
+)
 
 PNG = b"\x89PNG\r\n\x1a\n and what follows"
 
@@ -34,29 +41,27 @@ class Cells(HTMLParser):
             self._class = None
 
 
-def made(**how):
-    section = Section(
-        "Cases",
-        "One.\n\nTwo <b>.",
-        ("case", "error"),
-        [["dark", 1.23456e-4], ["<one>", None]],
-        **how,
-    )
+ROWS = (("dark", 1.23456e-4), ("<one>", None))
+
+
+def made(rows=ROWS, **options):
+    section = Section("Cases", "One.\n\nTwo <b>.", ("case", "error"), rows, **options)
     return page("Study of x", "It holds.", [section], {"neusee": "0.1", "seeds": [1, 2]})
 
 
 def test_cells_hold_numbers_to_three_digits_and_marks_as_classes():
-    found = Cells(made(marks={(0, 1): "fail", (1, 0): "pass"})).cells
+    rows = [("dark", Marked(1.23456e-4, "fail")), (Marked("<one>", "pass"), None)]
+    found = Cells(made(rows)).cells
     assert found[:4] == [("dark", ""), ("0.000123", "n fail"), ("<one>", "pass"), ("–", "n")]
     assert ("1, 2", "key") in found
 
 
-def test_a_mark_where_there_is_no_cell_is_refused():
-    with pytest.raises(
-        ValueError,
-        match=r"Cases: the pass, warn or fail mark at row 2, column 0 is outside the table",
-    ):
-        made(marks={(2, 0): "fail"})
+def test_a_column_is_marked_row_by_row_and_an_unmarked_cell_looks_as_before():
+    assert made(marked_column(ROWS, 1, [None, None])) == made()
+    found = Cells(made(marked_column(ROWS, 1, ["warn", None]))).cells
+    assert found[:4] == [("dark", ""), ("0.000123", "n warn"), ("<one>", ""), ("–", "n")]
+    with pytest.raises(ValueError, match="shorter"):
+        marked_column(ROWS, 1, ["warn"])
 
 
 def test_the_page_carries_its_picture_and_fetches_nothing():
@@ -103,9 +108,7 @@ def test_what_a_cell_says(value, text):
 
 
 def test_words_between_backticks_are_code_and_a_sign_stays_beside_its_word():
-    text = page(
-        "t", "of `a` and `<b>`", [Section("s", "", ("c",), [("yes",)], marks={(0, 0): "pass"})], {}
-    )
+    text = page("t", "of `a` and `<b>`", [Section("s", "", ("c",), [(Marked("yes", "pass"),)])], {})
     assert "<p>of <code>a</code> and <code>&lt;b&gt;</code></p>" in text
     assert 'td.pass::before { content: "✓\\a0"; }' in text
 

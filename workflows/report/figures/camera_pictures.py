@@ -196,13 +196,11 @@ def _lasers(ax: Any, lines: Mapping[str, Bands]) -> None:
     """
     for number, (name, line) in enumerate(lines.items()):
         nm = mean_wavelength(line) * 1e9
-        label = (
-            f"laser {name}, {nm:.0f} nm"
-            if len(lines) < 3
-            else f"{len(lines)} lasers"
-            if number == 0
-            else None
-        )
+        label = None
+        if len(lines) < 3:
+            label = f"laser {name}, {nm:.0f} nm"
+        elif number == 0:
+            label = f"{len(lines)} lasers"
         style = "-." if len(lines) == 2 and number == 1 else ":"
         ax.axvline(nm, color="#555555", linewidth=1.2, linestyle=style, label=label)
 

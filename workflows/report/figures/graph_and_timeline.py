@@ -128,7 +128,9 @@ def _mean(values: list[float], other: float) -> float:
 def _edge(ax: Any, start: tuple[float, int], end: tuple[float, int]) -> None:
     from matplotlib.patches import FancyArrowPatch
 
-    bend = 0.0 if end[1] - start[1] == 1 else 0.12 if end[0] <= start[0] else -0.12
+    bend = 0.12 if end[0] <= start[0] else -0.12
+    if end[1] - start[1] == 1:
+        bend = 0.0
     path: dict[str, Any] = {
         "connectionstyle": f"arc3,rad={bend}",
         "arrowstyle": "-|>",
@@ -360,7 +362,9 @@ def _unit(seconds: float) -> tuple[float, str]:
     """Return the unit (s, ms or µs) that suits the size of a time, as the factor from seconds
     and the name.
     """
-    return (1.0, "s") if seconds >= 1.0 else (1e3, "ms") if seconds >= 1e-3 else (1e6, "µs")
+    if seconds >= 1.0:
+        return 1.0, "s"
+    return (1e3, "ms") if seconds >= 1e-3 else (1e6, "µs")
 
 
 def _time(seconds: float) -> str:

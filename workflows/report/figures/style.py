@@ -64,6 +64,22 @@ def canvas(
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
+def panels(
+    count: int, across: int, width: float, height: float, below: float = 0.0, **options: Any
+) -> tuple[Any, list[Any]]:
+    """Return a figure of ``count`` panels of ``width`` by ``height`` inches, at most ``across`` in
+    a row, and their axes.
+
+    ``below`` is the height (inches) of what stands below or beside the panels, such as a legend.
+    """
+    columns = min(across, count)
+    rows = -(-count // columns)
+    figure, axes = canvas(width * columns, height * rows + below, rows, columns, **options)
+    for unused in axes.flat[count:]:
+        unused.set_axis_off()
+    return figure, list(axes.flat[:count])
+
+
 def drawn(draw: Callable[P, Any]) -> Callable[P, bytes]:
     """Decorate a drawing function, so that the function uses the common style and returns the
     bytes of a PNG file.
@@ -237,7 +253,9 @@ def _place(ax: Any, point: PointLabel, taken: list[Any], renderer: Any, framed: 
     }
     style |= {"bbox": _FRAME} if framed else {}
     for x, y in _OFFSETS:
-        side = "left" if x > 0 else "right" if x < 0 else "center"
+        side = "center"
+        if x:
+            side = "left" if x > 0 else "right"
         placement = {"xytext": (x, y), "textcoords": "offset points", "ha": side}
         text = ax.annotate(point.text, (point.x, point.y), **placement, fontsize=9, **style)
         text.set_in_layout(False)

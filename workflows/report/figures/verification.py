@@ -104,13 +104,9 @@ def stability(*, step: Callable[..., Any], psf: Psf) -> Any:
 
 
 def _verdict(error: float) -> tuple[str, str]:
-    return (
-        ("sound", "#9AD6C1")
-        if error < 1e-5
-        else ("watch", "#F6D58A")
-        if error < 1e-3
-        else ("wrong", "#F2B08A")
-    )
+    if error < 1e-5:
+        return "sound", "#9AD6C1"
+    return ("watch", "#F6D58A") if error < 1e-3 else ("wrong", "#F2B08A")
 
 
 def laser_trial(step: Callable[..., Any], psf: Psf, size: int = 192) -> Tensor:

@@ -26,7 +26,7 @@ from neusee.workflows.report.figures.style import (
     place_labels,
     plain_ticks,
 )
-from neusee.workflows.report.study_page import Mark, Section
+from neusee.workflows.report.study_page import Mark, Marked, Section
 from neusee.workflows.studies.accuracy.single_steps import USED, StepTried
 from neusee.workflows.studies.accuracy.work_precision_points import (
     Points,
@@ -484,30 +484,19 @@ def _all_points(points: Points, text: str, picture: bytes | None) -> Section:
     columns += ["error", "least", "most", "stated", "worst output"]
     sound = [p for p in points if p.sound]
     best = {id(p) for p in pareto_front(sound)}
-    rows, marks = [], {}
+    rows = []
     for p in sound:
-        row = (
-            p.seconds,
-            p.found.computing,
-            p.error,
-            min(p.by_seed),
-            p.most,
-            p.found.bound,
-            _worst_output(p),
-        )
-        rows.append(
-            (
-                p.trial.line,
-                f"{p.trial.label}{' (the recipe)' * p.trial.own}{' *' * (id(p) in best)}",
-                *row,
-            )
-        )
+        setting = f"{p.trial.label}{' (the recipe)' * p.trial.own}{' *' * (id(p) in best)}"
+        largest = Marked(p.most)
         if p.trial.value is not None:
-            marks[len(rows) - 1, 6] = _mark(ToleranceChoice(p.trial.value, p, None), points)
+            largest = Marked(p.most, _mark(ToleranceChoice(p.trial.value, p, None), points))
+        times = (p.seconds, p.found.computing)
+        errors = (p.error, min(p.by_seed), largest, p.found.bound, _worst_output(p))
+        rows.append((p.trial.line, setting, *times, *errors))
     text += """\n\nA star marks the Pareto front: no other point is both quicker and more accurate.
         The marks show whether a tolerance was held with every seed; an exclamation mark, that only
         rounding exceeds it."""
-    return Section("Error against run time", text, columns, rows, picture, marks)
+    return Section("Error against run time", text, columns, rows, picture)
 
 
 def _chosen(points: Points) -> Section:
@@ -521,21 +510,19 @@ def _chosen(points: Points) -> Section:
         "chosen over cheapest",
     )
     rows: list[tuple[Any, ...]] = []
-    marks: dict[tuple[int, int], Mark] = {}
-    for i, c in enumerate(choices(points)):
-        best = (
-            (c.cheapest.trial.name, c.cheapest.most, c.cheapest.seconds)
-            if c.cheapest
-            else (None, None, None)
-        )
-        rows.append((power_of_ten(c.tolerance), c.chosen.most, c.chosen.seconds, *best, c.ratio))
-        marks[i, 1] = _mark(c, points)
+    for c in choices(points):
+        chosen = (Marked(c.chosen.most, _mark(c, points)), c.chosen.seconds)
+        best: tuple[Any, ...] = (None, None, None)
+        if c.cheapest:
+            best = (c.cheapest.trial.name, c.cheapest.most, c.cheapest.seconds)
+        ratio = None
         if c.ratio is not None:
-            marks[i, 6] = "pass" if c.ratio <= _FACTOR else "warn"
+            ratio = Marked(c.ratio, "pass" if c.ratio <= _FACTOR else "warn")
+        rows.append((power_of_ten(c.tolerance), *chosen, *best, ratio))
     text = f"""For each tolerance, the engine's choice and the quickest of all points above whose
         error is within the tolerance. A choice passes if it takes at most {_FACTOR:g} times as long
         as the quickest point."""
-    return Section("Chosen against cheapest", text, columns, rows, None, marks)
+    return Section("Chosen against cheapest", text, columns, rows)
 
 
 def _outputs(points: Points, picture: bytes | None) -> list[Section]:
@@ -669,4 +656,6 @@ def _worst_output(p: WorkPrecisionPoint) -> str:
 
 
 def _mark(choice: ToleranceChoice, points: Points) -> Mark:
-    return "pass" if choice.held else "warn" if _beyond_rounding(choice, points) else "fail"
+    if choice.held:
+        return "pass"
+    return "warn" if _beyond_rounding(choice, points) else "fail"

@@ -18,7 +18,7 @@ from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport, StudyRun
-from neusee.workflows.report.study_page import Mark, Section
+from neusee.workflows.report.study_page import Marked, Section
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.calibration.posterior_tests import (
     DRAWS,
@@ -236,24 +236,14 @@ def _intervals(result: CalibrationStudyResult) -> Section:
         posterior z has mean 0 and standard deviation 1; for a posterior cut off by a limit, only
         about. Told: in how many simulations the frames estimate the parameter, or only limit it."""
     columns = ("parameter", "p", "at least", "coverage", "bar", "z mean", "z sd", "told")
-    rows, marks = [], dict[tuple[int, int], Mark]()
-    for i, v in enumerate(result.rank_tests):
+    rows = []
+    for v in result.rank_tests:
+        p = Marked(v.p, "pass" if v.uniform else "fail")
+        coverage = Marked(v.coverage, "pass" if v.covered else "fail")
         bar = f"{v.bar[0]:.3f} to {v.bar[1]:.3f}"
-        rows.append(
-            (
-                _plain(v.name),
-                v.p,
-                v.least_p,
-                v.coverage,
-                bar,
-                v.z_mean,
-                v.z_sd,
-                _count_kinds(result, v.name),
-            )
-        )
-        marks[i, 1] = "pass" if v.uniform else "fail"
-        marks[i, 3] = "pass" if v.covered else "fail"
-    return Section("Coverage", text, columns, rows, marks=marks)
+        judged = (p, v.least_p, coverage, bar)
+        rows.append((_plain(v.name), *judged, v.z_mean, v.z_sd, _count_kinds(result, v.name)))
+    return Section("Coverage", text, columns, rows)
 
 
 def _count_kinds(result: CalibrationStudyResult, name: str) -> str:
@@ -285,11 +275,9 @@ def _weighed(result: CalibrationStudyResult) -> Section:
     for f in result.sensitivity.findings:
         moved = [None if x is None else (x - f.value) / f.sd for x in f.doubled.values()]
         rows.append([_plain(f.name), KINDS[f.kind] or "estimate", f.value, f.sd, *moved])
-    marks: dict[tuple[int, int], Mark] = {
-        (len(rows), 4 + i): "warn" for i, share in enumerate(left.values()) if share < ENOUGH
-    }
-    rows.append(["draws left", "", None, None, *left.values()])
-    return Section(heading, text, columns, rows, marks=marks)
+    shares = [Marked(share, "warn" if share < ENOUGH else None) for share in left.values()]
+    rows.append(["draws left", "", None, None, *shares])
+    return Section(heading, text, columns, rows)
 
 
 def _refusals(result: CalibrationStudyResult) -> list[Section]:

@@ -31,7 +31,7 @@ from neusee.workflows.engine.provenance import versions
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import digest, stream_seed
 from neusee.workflows.keys.code_digest import engine
-from neusee.workflows.report.figures.style import BLUE, VERMILION, canvas, drawn
+from neusee.workflows.report.figures.style import BLUE, VERMILION, drawn, panels
 from neusee.workflows.store.result_store import Store, compute_once
 
 # --- independent draws ----------------------------------------------------------------------------
@@ -393,13 +393,9 @@ def ranks(rank_tests: Sequence[RankTest]) -> Any:
     """Draw a histogram of the ranks of each parameter's true values, with the 99 % band of
     uniform ranks.
     """
-    columns = min(3, len(rank_tests))
-    rows = -(-len(rank_tests) // columns)
-    figure, axes = canvas(3.4 * columns, 2.4 * rows + 0.4, rows, columns, sharex=True)
-    for ax, test in zip(axes.flat, rank_tests, strict=False):
+    figure, axes = panels(len(rank_tests), 3, 3.4, 2.4, below=0.4, sharex=True)
+    for ax, test in zip(axes, rank_tests, strict=True):
         _histogram(ax, test)
-    for ax in list(axes.flat)[len(rank_tests) :]:
-        ax.set_axis_off()
     figure.supxlabel(f"draws below the truth, of {DRAWS}", fontsize=10)
     figure.supylabel("simulations", fontsize=10)
     return figure

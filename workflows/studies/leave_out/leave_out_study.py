@@ -18,7 +18,7 @@ from neusee.workflows.keys.code_digest import Code, engine
 from neusee.workflows.recipe.loading import changed
 from neusee.workflows.report.figures.style import BLUE, canvas, drawn
 from neusee.workflows.report.study_folder import SHOWN, CsvTable, Progress, StudyReport, StudyRun
-from neusee.workflows.report.study_page import Mark, Section
+from neusee.workflows.report.study_page import Marked, Section
 from neusee.workflows.store.result_store import Store, compute_once
 from neusee.workflows.studies.cold_run import key_parts, run_cold
 from neusee.workflows.studies.leave_out.left_out_steps import (
@@ -195,7 +195,7 @@ _COLUMNS = (
     "holds",
 )
 _HOW = {"handed on": "left out", "not added": "not added", "stands in": "summed"}
-_HELD = {True: "holds", False: "fails"}
+_HELD = {True: Marked("holds", "pass"), False: Marked("fails", "fail")}
 
 
 @dataclass(frozen=True)
@@ -324,9 +324,7 @@ def _outputs(recipe: Recipe, result: LeaveOutResult) -> Section:
         "tolerance",
         "holds",
     )
-    return Section(
-        "The outputs", text, columns, rows, marks=_marks(result.output_errors, len(columns) - 1)
-    )
+    return Section("The outputs", text, columns, rows)
 
 
 def _omissions(result: LeaveOutResult) -> Section:
@@ -356,9 +354,7 @@ def _omissions(result: LeaveOutResult) -> Section:
     )
     cells = [(_cells(row), row) for row in result.rows]
     rows = [(name, _HOW[kind], *numbers, _HELD[row.holds]) for (name, kind, *numbers), row in cells]
-    return Section(
-        "Each omission", text, columns, rows, marks=_marks(result.rows, len(columns) - 1)
-    )
+    return Section("Each omission", text, columns, rows)
 
 
 def _scenes(result: LeaveOutResult) -> Section:
@@ -395,7 +391,3 @@ def _bars(costs: Sequence[SceneCost]) -> Any:
     # no bar and no note is there, whatever the times
     figure.legend(loc="outside upper center", ncols=2)
     return figure
-
-
-def _marks(rows: Sequence[OutputError | OmissionRow], column: int) -> dict[tuple[int, int], Mark]:
-    return {(i, column): "pass" if row.holds else "fail" for i, row in enumerate(rows)}

@@ -416,7 +416,9 @@ def _marked(error: float, bound: float, slope: float | None, steeper: float) -> 
     shares = [error / bound] if slope is None else [error / bound, slope / steeper]
     within = all(share <= 1.0 for share in shares)  # NaN is not within its bound
     near = within and max(shares) > _NEAR
-    mark: Mark = "warn" if near else "pass" if within else "fail"
+    mark: Mark = "pass" if within else "fail"
+    if near:
+        mark = "warn"
     return Cell(
         mark, "near its bound" * near, error, bound, slope, None if slope is None else steeper
     )

@@ -19,7 +19,7 @@ from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code, engine
 from neusee.workflows.report.figures.style import BLACK, canvas, drawn
 from neusee.workflows.report.study_folder import Progress, StudyReport, StudyRun
-from neusee.workflows.report.study_page import Mark, Section
+from neusee.workflows.report.study_page import Mark, Section, marked_column
 from neusee.workflows.store.result_store import Store, compute_once
 from neusee.workflows.studies.stability.case_result import Cell, judge_step
 from neusee.workflows.studies.stability.extreme_cases import (
@@ -107,8 +107,9 @@ def cell_text(cell: Cell) -> str:
     """
     sign = {"pass": "", "warn": "!", "fail": "×"}[cell.mark]
     if cell.error is None:
-        short = "r" if cell.note.startswith("refused") else "s" if "seen" in cell.note else "–"
-        return sign + short
+        if cell.note.startswith("refused"):
+            return f"{sign}r"
+        return f"{sign}s" if "seen" in cell.note else f"{sign}–"
     steep = cell.slope is not None and _share(cell.slope, cell.slope_bound) > _share(
         cell.error, cell.bound
     )
@@ -304,10 +305,8 @@ def _tables(rows: Sequence[GridCell]) -> Iterator[Section]:
     }
     for mark, heading in headings.items():
         lines = [_line(row) for row in rows if row.cell.mark == mark]
-        marks = {(i, _COLUMNS.index("mark")): mark for i in range(len(lines))}
-        yield Section(
-            heading, "" if lines else "No cell.", _COLUMNS if lines else (), lines, marks=marks
-        )
+        marked = marked_column(lines, _COLUMNS.index("mark"), [mark] * len(lines))
+        yield Section(heading, "" if lines else "No cell.", _COLUMNS if lines else (), marked)
     cases = {row.case.name: row.case for row in rows}.values()
     yield Section(
         "The cases", "", ("case", "group", "what"), [(c.name, c.group, c.what) for c in cases]

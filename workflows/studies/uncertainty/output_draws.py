@@ -73,13 +73,9 @@ def scatter(values: FloatArray, sequences: int = 0) -> Scatter:
         low, high = np.quantile(values, [0.05, 0.95], axis=0)
     sd = np.where(sd > _CONSTANT * np.abs(values).max(0), sd, 0.0)
     worst = values[:, int(sd.argmax())]
-    error = (
-        0.0
-        if not sd.max() > 0
-        else _of_sequences(worst, sequences)
-        if sequences
-        else _jackknife(worst)
-    )
+    error = 0.0
+    if sd.max() > 0:
+        error = _of_sequences(worst, sequences) if sequences else _jackknife(worst)
     return Scatter(mean, sd, low, high, error)
 
 

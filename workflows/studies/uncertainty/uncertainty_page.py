@@ -23,10 +23,16 @@ from neusee.workflows.report.figures.style import (
     canvas,
     drawn,
     encoded,
+    panels,
     picture,
     plain_ticks,
 )
-from neusee.workflows.report.study_page import Mark, Section, with_uncertainty
+from neusee.workflows.report.study_page import (
+    Mark,
+    Marked,
+    Section,
+    with_uncertainty,
+)
 from neusee.workflows.studies.uncertainty.output_draws import FloatArray, Scatter, worst_known
 from neusee.workflows.studies.uncertainty.sobol_indices import IndexInterval, SobolIndices
 
@@ -57,17 +63,13 @@ def tornado(
     """Draw a tornado diagram of each output number: the values with one input at its 5 % and its
     95 % quantile.
     """
-    columns = min(2, len(swings))
-    rows = -(-len(swings) // columns)
     longest = max(map(len, swings.values()))
-    figure, axes = canvas(6.6 * columns, (0.34 * longest + 1.3) * rows, rows, columns)
+    figure, axes = panels(len(swings), 2, 6.6, 0.34 * longest + 1.3)
     figure.get_layout_engine().set(h_pad=_APART)
-    for ax, (name, bars) in zip(axes.flat, swings.items(), strict=False):
+    for ax, (name, bars) in zip(axes, swings.items(), strict=True):
         _bars(ax, sorted(bars, key=lambda bar: abs(bar[2] - bar[1])), middles[name])
         ax.set_title(name)
-    for ax in list(axes.flat)[len(swings) :]:
-        ax.set_axis_off()
-    handles, labels = axes.flat[0].get_legend_handles_labels()
+    handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles[:2], labels[:2], loc="outside lower center", ncols=2)
     return figure
 
@@ -192,11 +194,9 @@ def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) ->
     """Draw a histogram of each output number over all draws, and a line at the value for median
     inputs.
     """
-    columns = min(3, len(draws))
-    rows = -(-len(draws) // columns)
-    figure, axes = canvas(3.6 * columns, 2.6 * rows + 0.3, rows, columns)
+    figure, axes = panels(len(draws), 3, 3.6, 2.6, below=0.3)
     figure.get_layout_engine().set(h_pad=_APART)
-    for ax, (name, values) in zip(axes.flat, draws.items(), strict=False):
+    for ax, (name, values) in zip(axes, draws.items(), strict=True):
         ax.hist(values, _BINS, color=BLUE, alpha=0.8)
         ax.axvline(
             middles[name],
@@ -208,11 +208,9 @@ def histograms(draws: Mapping[str, FloatArray], middles: Mapping[str, float]) ->
         _few_numbers(ax)
         ax.locator_params(axis="y", integer=True)
         ax.grid(False)
-    for ax in list(axes.flat)[len(draws) :]:
-        ax.set_axis_off()
     figure.supylabel("draws", fontsize=10)
     figure.legend(
-        *(legend[:1] for legend in axes.flat[0].get_legend_handles_labels()),
+        *(legend[:1] for legend in axes[0].get_legend_handles_labels()),
         loc="outside lower center",
     )
     return figure
@@ -488,17 +486,17 @@ def _posterior(result: UncertaintyResult) -> list[Section]:
         return []
     text = """The position of the recipe's own value in the posterior. A value that the frames only
         limit, or do not determine, is drawn mostly from the prior of the calibration."""
-    rows, marks = [], dict[tuple[int, int], Mark]()
-    for i, s in enumerate(standings):
-        rows.append(
-            (s.path, s.own, f"{s.mean:.6g}", s.sd, s.below, _CONSTRAINT.get(s.kind, "estimate"))
-        )
-        if s.kind == "estimate":
-            marks[i, 4] = "warn" if s.far else "pass"
-        else:
-            marks[i, 5] = "warn"
+    rows = []
+    for s in standings:
+        is_estimate = s.kind == "estimate"
+        below = Marked(s.below)
+        if is_estimate:
+            below = Marked(s.below, "warn" if s.far else "pass")
+        limit = _CONSTRAINT.get(s.kind, "estimate")
+        constraint = Marked(limit, None if is_estimate else "warn")
+        rows.append((s.path, s.own, f"{s.mean:.6g}", s.sd, below, constraint))
     columns = ("value", "recipe", "posterior mean", "sd", "posterior below it", "told")
-    return [Section("The recipe beside its posterior", text, columns, rows, marks=marks)]
+    return [Section("The recipe beside its posterior", text, columns, rows)]
 
 
 def _numbers(result: UncertaintyResult, picture: bytes | None) -> Section:
@@ -512,17 +510,16 @@ def _numbers(result: UncertaintyResult, picture: bytes | None) -> Section:
         " element counts."
     )
     columns = ("quantity", "at the medians", "mean", "sd", "error", "5 %", "95 %")
-    rows, marks = list[Sequence[Any]](), dict[tuple[int, int], Mark]()
+    rows = list[Sequence[Any]]()
     for name, s in result.scatter.items():
         i = int(s.sd.argmax())
         label = name if len(s.sd) == 1 else f"{name}, element {i}"
         numbers = (f"{result.middle[name][i]:.6g}", f"{s.mean[i]:.6g}", float(s.sd[i]))
-        marks[len(rows), 4] = (
-            "pass" if s.error <= result.wanted and name not in result.strange else "fail"
-        )
-        error = "does not vary" if s.is_constant else f"{s.error:.1%}"
+        holds = s.error <= result.wanted and name not in result.strange
+        text_of_error = "does not vary" if s.is_constant else f"{s.error:.1%}"
+        error = Marked(text_of_error, "pass" if holds else "fail")
         rows.append((label, *numbers, error, f"{s.low[i]:.6g}", f"{s.high[i]:.6g}"))
-    return Section("Numbers", text, columns, rows, picture, marks)
+    return Section("Numbers", text, columns, rows, picture)
 
 
 def _moves(result: UncertaintyResult, picture: bytes | None) -> list[Section]:
@@ -538,30 +535,26 @@ def _moves(result: UncertaintyResult, picture: bytes | None) -> list[Section]:
         all."""
     columns = ("quantity", "input", "first", "interval", "total", "interval", "explained")
     rows: list[Sequence[Any]] = []
-    marks: dict[tuple[int, int], Mark] = {}
     for name, shares in result.shares.items():
-        if not shares.explains_enough:
-            marks[len(rows), 6] = "warn"
-        if shares.explained < _TOO_LITTLE:
-            rows.append((name, "not judged", None, None, None, None, f"{shares.explained:.0%}"))
-            continue
-        for label, first, total in zip(
-            result.inputs.labels, shares.first, shares.total, strict=True
-        ):
-            if total.value > _LITTLE:
-                explained = f"{shares.explained:.1%}"
-                rows.append(
-                    (
-                        name,
-                        label,
-                        first.value,
-                        _between(first),
-                        total.value,
-                        _between(total),
-                        explained,
-                    )
-                )
-    return [Section("Influence of the inputs", text, columns, rows, picture, marks)]
+        rows += _influence(name, result.inputs.labels, shares)
+    return [Section("Influence of the inputs", text, columns, rows, picture)]
+
+
+def _influence(name: str, labels: Sequence[str], shares: SobolIndices) -> list[Sequence[Any]]:
+    """Return a row for each input that moves a quantity; the first row has the mark of the
+    polynomial.
+    """
+    mark: Mark | None = None if shares.explains_enough else "warn"
+    if shares.explained < _TOO_LITTLE:
+        explained = Marked(f"{shares.explained:.0%}", mark)
+        return [(name, "not judged", None, None, None, None, explained)]
+    rows: list[Sequence[Any]] = []
+    for label, first, total in zip(labels, shares.first, shares.total, strict=True):
+        if total.value > _LITTLE:
+            explained = Marked(f"{shares.explained:.1%}", None if rows else mark)
+            effects = (first.value, _between(first), total.value, _between(total))
+            rows.append((name, label, *effects, explained))
+    return rows
 
 
 def _between(index: IndexInterval) -> str:

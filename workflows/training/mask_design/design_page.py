@@ -21,7 +21,7 @@ from neusee.workflows.report.figures.style import (
     canvas,
     drawn,
 )
-from neusee.workflows.report.study_page import Mark, Section
+from neusee.workflows.report.study_page import Marked, Section
 from neusee.workflows.training.mask_design.design_terms import Fabrication, Terms
 from neusee.workflows.training.mask_design.mask_optimisers import LearntMask
 
@@ -104,18 +104,18 @@ def section(facts: dict[str, Any]) -> Section:
         and a grey filter of {facts["filter"]:.3g}. The rival is the round stop, as a share of the
         aperture, with the grey filter that has the least error at the same limit. A gain above 0 is
         in favour of the mask. Unknown glare and clipping are neglected."""
-    listed, marks = [], dict[tuple[int, int], Mark]()
-    for number, row in enumerate(facts["rows"]):
+    listed = []
+    for row in facts["rows"]:
         mask, stop = (
             _DECIBELS * row["filtered_error"],
             _DECIBELS * row["filtered_error of the stop"],
         )
         bits, stop_bits = -row["information"], -row["information of the stop"]
-        marks[number, 3] = "pass" if mask < stop else "fail"
-        marks[number, 8] = "pass" if bits > stop_bits else "fail"
-        own = (row["stop"], row["filter of the stop"], bits, stop_bits, bits - stop_bits)
-        listed.append((row["light"], mask, stop, stop - mask, *own))
-    return Section("Behind a peak limit", text, _COLUMNS, listed, marks=marks)
+        gain = Marked(stop - mask, "pass" if mask < stop else "fail")
+        more_bits = Marked(bits - stop_bits, "pass" if bits > stop_bits else "fail")
+        own = (row["stop"], row["filter of the stop"], bits, stop_bits, more_bits)
+        listed.append((row["light"], mask, stop, gain, *own))
+    return Section("Behind a peak limit", text, _COLUMNS, listed)
 
 
 def line(facts: dict[str, Any]) -> str:
