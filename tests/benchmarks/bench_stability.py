@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from neusee.workflows import Store, load
-from neusee.workflows.studies.stability.stability_study import study
+from neusee.workflows.studies.run_study import study_recipe
 
 RECIPES = sorted(path.stem for path in (Path(__file__).parents[2] / "recipes").glob("*.yaml"))
 
@@ -51,7 +51,9 @@ def main() -> None:
             " |\n|---|---|---|---|---|---|"
         )
         for recipe in given.recipes:
-            folder = study(load(recipe), store, Path(place) / "runs", ["neusee"], lambda line: None)
+            folder = study_recipe(
+                "stability", load(recipe), store, Path(place) / "runs", ["neusee"]
+            )
             found = json.loads((folder / "provenance.json").read_text())
             count, spent = seconds(Store(store.root)).get(load(recipe).name, (0, 0.0))
             cells = f"{found['cells']} | {found['failed']} | {found['warned']}"

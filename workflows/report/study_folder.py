@@ -48,7 +48,8 @@ class StudyReport:
     pictures: Mapping[str, bytes | None] = field(default_factory=dict)
     tables: Mapping[str, CsvTable] = field(default_factory=dict)  #: by file name
     files: Mapping[str, Content] = field(default_factory=dict)  #: by file name
-    shown: Sequence[str] = SHOWN  #: the values of the document that the page shows
+    #: the values of the document that the page shows; None for all but the recipe
+    shown: Sequence[str] | None = SHOWN
     banner: str = ""  #: reason why the result must not be used
 
     def write(self, folder: RunFolder, document: Mapping[str, Any]) -> None:
@@ -63,9 +64,21 @@ class StudyReport:
         for name, content in self.files.items():
             content(folder.path / name) if callable(content) else folder.write(name, content)
         folder.write("provenance.json", as_json(document))
-        shown = {name: document[name] for name in self.shown}
+        names = self.shown
+        if names is None:
+            names = [name for name in document if name != "config"]
+        shown = {name: document[name] for name in names}
         shown |= {"warnings": "; ".join(document["warnings"])} if document.get("warnings") else {}
         folder.write("report.html", page(self.title, self.lead, self.sections, shown, self.banner))
+
+
+@dataclass(frozen=True)
+class StudyOutcome:
+    """What a study has found, before its folder is written."""
+
+    key: str  #: of all that decides the results; the name of the folder ends with it
+    content: Mapping[str, Any]  #: of ``provenance.json``, beside what each study states
+    report: StudyReport
 
 
 class StudyRun:

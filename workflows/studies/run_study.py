@@ -22,6 +22,7 @@ from typing import Any
 
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.sealed_files import text_of
+from neusee.workflows.report.study_folder import StudyOutcome, StudyRun
 from neusee.workflows.store.remote_store import open_store
 from neusee.workflows.store.result_store import Store
 
@@ -63,10 +64,10 @@ def study_recipe(
     """
     room = kind.replace("-", "_")
     module = import_module(f"neusee.workflows.studies.{room}.{room}_study")
-    folder: Path = module.study(
-        recipe, store or open_store(), runs, list(command), progress, **options
-    )
-    return folder
+    study_run = StudyRun(kind, recipe, command)
+    outcome: StudyOutcome = module.study(recipe, store or open_store(), progress, **options)
+    document = study_run.document(outcome.content)
+    return study_run.write(runs, outcome.key, document, outcome.report)
 
 
 def count_failures(folder: Path) -> int:

@@ -6,9 +6,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from neusee.workflows.graph.diagnostics import RecipeError
@@ -16,7 +15,7 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import engine
 from neusee.workflows.recipe.loading import changed
-from neusee.workflows.report.study_folder import Progress, StudyReport, StudyRun
+from neusee.workflows.report.study_folder import Progress, StudyOutcome, StudyReport
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.accuracy import accuracy_page
 from neusee.workflows.studies.accuracy.accuracy_page import (
@@ -45,17 +44,14 @@ _LEFT = "not measured within the budget: run the study again to continue"
 def study(
     recipe: Recipe,
     store: Store,
-    runs: Path,
-    command: Sequence[str],
     progress: Progress,
     *,
     seeds: int = 3,
     quick: bool = False,
     budget: float | None = None,
     device: str = "cpu",
-) -> Path:
-    """Measure error against run time, write ``runs/<date>_<recipe>_accuracy_<key>/`` and return
-    that folder.
+) -> StudyOutcome:
+    """Measure error against run time.
 
     Args: seeds: number of seeds of the noise, which give the range of each error. quick: measures
             fewer settings.
@@ -67,7 +63,6 @@ def study(
         raise ValueError(
             f"seeds={seeds}: the accuracy study needs at least one random seed, such as seeds=3"
         )
-    study_run = StudyRun("accuracy", recipe, command)
     cache = PointCache(finest(recipe), store, seeds, device)
     result = _measure(
         recipe, cache, progress, quick, math.inf if budget is None else time.monotonic() + budget
@@ -75,8 +70,7 @@ def study(
     key = digest(
         "accuracy", cache.key(recipe), [[p.trial.line, p.trial.label] for p in result.points], quick
     )
-    document = study_run.document(_document(result, cache, quick))
-    return study_run.write(runs, key, document, _report(result, document))
+    return StudyOutcome(key, _document(result, cache, quick), _report(result))
 
 
 def trials(recipe: Recipe, turned: Knobs, quick: bool) -> Iterator[Trial]:
@@ -169,7 +163,7 @@ def _document(result: AccuracyResult, cache: PointCache, quick: bool) -> dict[st
     }
 
 
-def _report(result: AccuracyResult, document: Mapping[str, Any]) -> StudyReport:
+def _report(result: AccuracyResult) -> StudyReport:
     pictures = accuracy_page.pictures(result)
     return StudyReport(
         f"Accuracy of {result.recipe.name}",
@@ -177,6 +171,5 @@ def _report(result: AccuracyResult, document: Mapping[str, Any]) -> StudyReport:
         accuracy_page.sections(result, pictures),
         pictures,
         tables={"table.csv": (accuracy_page.HEADER, accuracy_page.table(result))},
-        files={"recipe.yaml": result.recipe.config.to_yaml()},
-        shown=[name for name in document if name != "config"],
+        shown=None,
     )

@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -17,7 +16,7 @@ from neusee.workflows.calibration.log_posterior import SensorPosterior, find_mod
 from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.report.study_folder import CsvTable, Progress, StudyReport, StudyRun
+from neusee.workflows.report.study_folder import CsvTable, Progress, StudyOutcome, StudyReport
 from neusee.workflows.report.study_page import Marked, Section
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.calibration.posterior_tests import (
@@ -97,20 +96,17 @@ class CalibrationStudyResult:
 def study(
     recipe: Recipe,
     store: Store,
-    runs: Path,
-    command: Sequence[str],
     progress: Progress,
     simulations: int = 200,
     move: str = "de",
     pixels: int = PIXELS,
     sampler: Sampler | None = None,
-) -> Path:
-    """Simulate and calibrate sensors, and return the folder with the results.
+) -> StudyOutcome:
+    """Simulate and calibrate sensors.
 
     The posterior is sampled by ``sampler``, or by walkers with the move ``move`` if there is no
     ``sampler``.
     """
-    study_run = StudyRun("calibration", recipe, command)
     with one_thread():
         simulator = SensorSimulator(
             recipe, store, pixels, sampler or partial(walk_draws, move_name=move), move
@@ -120,10 +116,8 @@ def study(
     result = CalibrationStudyResult(
         simulated, rank_tests(simulated), simulator.prior_widths(), sensitive, reason
     )
-    document = study_run.document(_document(result))
-    return study_run.write(
-        runs, digest(document["verdicts"]), document, _report(recipe, result, pixels)
-    )
+    content = _document(result)
+    return StudyOutcome(digest(content["verdicts"]), content, _report(recipe, result, pixels))
 
 
 def _simulate_all(

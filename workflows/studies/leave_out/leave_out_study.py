@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from neusee.workflows.engine.provenance import machine
@@ -17,7 +16,13 @@ from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code, engine
 from neusee.workflows.recipe.loading import changed
 from neusee.workflows.report.figures.style import BLUE, canvas, drawn
-from neusee.workflows.report.study_folder import SHOWN, CsvTable, Progress, StudyReport, StudyRun
+from neusee.workflows.report.study_folder import (
+    SHOWN,
+    CsvTable,
+    Progress,
+    StudyOutcome,
+    StudyReport,
+)
 from neusee.workflows.report.study_page import Marked, Section
 from neusee.workflows.store.result_store import Store, compute_once
 from neusee.workflows.studies.cold_run import key_parts, run_cold
@@ -219,15 +224,12 @@ class LeaveOutResult:
 def study(
     recipe: Recipe,
     store: Store,
-    runs: Path,
-    command: Sequence[str],
     progress: Progress,
     contents: bool = True,
-) -> Path:
+) -> StudyOutcome:
     """Measure the errors of a recipe with steps left out, and with ``contents`` the run times
     for simpler scenes.
     """
-    study_run = StudyRun("leave-out", recipe, command)
     comparison = OmissionComparison(recipe, store)
     output_errors, rows = comparison.output_errors(), []
     failure = {True: "", False: ": does not hold"}
@@ -242,10 +244,9 @@ def study(
     result = LeaveOutResult(
         output_errors, rows, list(measure_scenes(recipe, store, progress)) if contents else []
     )
-    document = study_run.document(
-        {"tolerance": recipe.tolerance, "failed": result.failed, **_document(result)}
-    )
-    return study_run.write(runs, digest(document["rows"]), document, _report(recipe, result))
+    rows_and_costs = _document(result)
+    content = {"tolerance": recipe.tolerance, "failed": result.failed, **rows_and_costs}
+    return StudyOutcome(digest(content["rows"]), content, _report(recipe, result))
 
 
 def _document(result: LeaveOutResult) -> dict[str, Any]:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,7 +38,7 @@ from neusee.workflows.report.figures.style import (
     canvas,
     drawn,
 )
-from neusee.workflows.report.study_folder import SHOWN, Progress, StudyReport, StudyRun
+from neusee.workflows.report.study_folder import SHOWN, Progress, StudyOutcome, StudyReport
 from neusee.workflows.report.study_page import Section
 from neusee.workflows.store.result_store import Store
 
@@ -407,8 +406,6 @@ _LAWS = UnknownLaws()
 def study(
     recipe: Recipe,
     store: Store,
-    runs: Path,
-    command: Sequence[str],
     progress: Progress,
     draws: int = 12,
     bands: int = 7,
@@ -416,9 +413,8 @@ def study(
     size: float = 14.0,
     prnu: float = 0.01,
     residual: float = 0.02,
-) -> Path:
-    """Compare the mask of a recipe with filters and stops of equal protection, and return the
-    folder with the results.
+) -> StudyOutcome:
+    """Compare the mask of a recipe with filters and stops of equal protection.
 
     Args: draws: of the unknown conditions. bands: wavelengths of the scene; the laser may have each
             of the recipe.
@@ -426,7 +422,6 @@ def study(
     targets in pixels. prnu: relative spread of the sensitivity of pixels. residual: share of the
     glare that is subtracted wrongly.
     """
-    study_run = StudyRun("protection", recipe, command)
     camera = ProtectionCamera.of(recipe, store, bands)
     side = min(int(n) for n in camera.lens["shape"])
     if 4 * size > side:
@@ -440,14 +435,10 @@ def study(
     conditions = draw_conditions(draws, recipe.seed, _LAWS)
     result = measure_protection(bench, conditions, camera.pixel(prnu, residual), progress)
     said = quotable(result, recipe.name, light)
-    document = study_run.document(
-        {"light": light, "paragraph": said, **_document(result, conditions)}
-    )
+    content = {"light": light, "paragraph": said, **_document(result, conditions)}
     options = {"light": light, "size": size, "prnu": prnu, "residual": residual}
     report = _report(recipe, result, said, _notes(camera, options))
-    return study_run.write(
-        runs, digest(document["gain"], document["lost"], options), document, report
-    )
+    return StudyOutcome(digest(content["gain"], content["lost"], options), content, report)
 
 
 def _document(result: ProtectionResult, conditions: Sequence[Condition]) -> dict[str, Any]:

@@ -9,7 +9,6 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from neusee.workflows.engine.local_executor import one_thread
@@ -18,7 +17,7 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.keys.code_digest import Code, engine
 from neusee.workflows.report.figures.style import BLACK, canvas, drawn
-from neusee.workflows.report.study_folder import Progress, StudyReport, StudyRun
+from neusee.workflows.report.study_folder import Progress, StudyOutcome, StudyReport
 from neusee.workflows.report.study_page import Mark, Section, marked_column
 from neusee.workflows.store.result_store import Store, compute_once
 from neusee.workflows.studies.stability.case_result import Cell, judge_step
@@ -194,21 +193,15 @@ class GridCell:
 def study(
     recipe: Recipe,
     store: Store,
-    runs: Path,
-    command: Sequence[str],
     progress: Progress,
     cases: Sequence[Case] = CASES,
-) -> Path:
-    """Test every step of ``recipe`` and its losses in every extreme case, and return the folder
-    with the results.
-    """
-    study_run = StudyRun("stability", recipe, command)
+) -> StudyOutcome:
+    """Test every step of ``recipe`` and its losses in every extreme case."""
     with one_thread():
         rows = list(_rows(recipe, store, cases, progress))
-    document = study_run.document(_document(rows))
-    return study_run.write(
-        runs, digest([repr(_line(row)) for row in rows]), document, _report(recipe, rows, document)
-    )
+    content = _document(rows)
+    key = digest([repr(_line(row)) for row in rows])
+    return StudyOutcome(key, content, _report(recipe, rows, content))
 
 
 def _rows(
@@ -274,13 +267,13 @@ def _document(rows: Sequence[GridCell]) -> dict[str, Any]:
     }
 
 
-def _report(recipe: Recipe, rows: Sequence[GridCell], document: Mapping[str, Any]) -> StudyReport:
+def _report(recipe: Recipe, rows: Sequence[GridCell], content: Mapping[str, Any]) -> StudyReport:
     worst = _worst_by_case_and_node(rows)
     picture = grid_picture([(row.case.group, row.case.name, row.node, row.cell) for row in worst])
     lead = (
-        f"{document['cells']} cells, {len({r.case.name for r in rows})} cases by"
-        f" {len({r.node for r in rows})} nodes: {document['failed']} fail, {document['warned']}"
-        f" warn, {document['passed']} pass."
+        f"{content['cells']} cells, {len({r.case.name for r in rows})} cases by"
+        f" {len({r.node for r in rows})} nodes: {content['failed']} fail, {content['warned']}"
+        f" warn, {content['passed']} pass."
     )
     return StudyReport(
         f"Stability of {recipe.name}",
@@ -288,7 +281,7 @@ def _report(recipe: Recipe, rows: Sequence[GridCell], document: Mapping[str, Any
         [Section("How to read it", _HOW, picture=picture), *_tables(rows)],
         {"stability": picture},
         tables={"table.csv": (_COLUMNS, map(_line, rows))},
-        shown=[name for name in document if name != "config"],
+        shown=None,
     )
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from neusee.workflows.recipe.distributions.uncertain_inputs import (
     InputDraws,
     Inputs,
 )
-from neusee.workflows.report.study_folder import Content, Progress, StudyReport, StudyRun
+from neusee.workflows.report.study_folder import Content, Progress, StudyOutcome, StudyReport
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.run_study import StudyRefused
 from neusee.workflows.studies.uncertainty.output_draws import (
@@ -56,8 +55,6 @@ _COLUMNS = ("quantity", "element", "at the medians", "mean", "sd", "5 %", "95 %"
 def study(
     recipe: Recipe,
     store: Store,
-    runs: Path,
-    command: Sequence[str],
     progress: Progress,
     error: float = 0.05,
     most: int = 1000,
@@ -65,15 +62,13 @@ def study(
     workers: int = 0,
     device: str = "cpu",
     until: Sequence[str] = (),
-) -> Path:
+) -> StudyOutcome:
     """Sample inputs, up to ``most`` times, until all output standard deviations are known to the
     relative ``error``.
 
     With ``until``, names of outputs or of single quantities, only their deviations decide. On the
-    CPU, ``workers`` processes compute draws; 0 means one for each free processor. Returns the
-    folder with the results.
+    CPU, ``workers`` processes compute draws; 0 means one for each free processor.
     """
-    study_run = StudyRun("uncertainty", recipe, command)
     inputs = _inputs(recipe)
     _chosen([name.partition(".")[0] for name in until], inputs.recipe.outputs)
     sequences = SCRAMBLES if points == "sobol" else 0
@@ -82,8 +77,8 @@ def study(
     refuse_combinations(inputs, _ends(inputs), allowed)
     draws = OutputDraws(inputs, store, device, workers)
     result = _measure(inputs, draws, allowed, progress, StopRule(error, sequences, tuple(until)))
-    document = study_run.document(_document(result, draws))
-    return study_run.write(runs, digest(document["quantities"]), document, _report(result))
+    content = _document(result, draws)
+    return StudyOutcome(digest(content["quantities"]), content, _report(result))
 
 
 @dataclass(frozen=True)

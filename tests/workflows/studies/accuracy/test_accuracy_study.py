@@ -28,7 +28,7 @@ from neusee.workflows.studies.accuracy.accuracy_page import (
     steps,
     work_precision,
 )
-from neusee.workflows.studies.accuracy.accuracy_study import study, trials
+from neusee.workflows.studies.accuracy.accuracy_study import trials
 from neusee.workflows.studies.accuracy.recipe_knobs import finest, knobs
 from neusee.workflows.studies.accuracy.single_steps import cut_inputs, steps_that_matter, try_step
 from neusee.workflows.studies.accuracy.work_precision_points import (
@@ -41,7 +41,7 @@ from neusee.workflows.studies.accuracy.work_precision_points import (
     median_ratio,
     pareto_front,
 )
-from neusee.workflows.studies.run_study import count_failures
+from neusee.workflows.studies.run_study import count_failures, study_recipe
 
 RECIPE = """\
 # A camera whose errors are known
@@ -311,13 +311,16 @@ def test_a_study_that_was_stopped_goes_on_and_writes_its_folder(nodes, recipe, s
     nodes.STOP_AT.add(17)
     lines = []
     with pytest.raises(KeyboardInterrupt):
-        study(recipe, store, tmp_path / "runs", [], lines.append, seeds=1, quick=True)
+        study_recipe(
+            "accuracy", recipe, store, tmp_path / "runs", [], lines.append, seeds=1, quick=True
+        )
     assert not list(tmp_path.glob("runs/*"))
     assert "bands 4" in nodes.CALLS
     nodes.CALLS.clear()
     lines.clear()
-    folder = study(
-        recipe, store, tmp_path / "runs", ["neusee", "study"], lines.append, seeds=1, quick=True
+    command = ["neusee", "study"]
+    folder = study_recipe(
+        "accuracy", recipe, store, tmp_path / "runs", command, lines.append, seeds=1, quick=True
     )
     assert "bands 17" in nodes.CALLS
     assert nodes.CALLS.count("bands 4") == TIMES - 1  # known from before, and only timed again
@@ -362,11 +365,15 @@ def _look_at(folder):
 
 @pytest.mark.slow
 def test_what_the_budget_leaves_is_said_and_measured_the_next_time(nodes, recipe, store, tmp_path):
-    folder = study(recipe, store, tmp_path / "runs", [], print, seeds=1, quick=True, budget=0.0)
+    folder = study_recipe(
+        "accuracy", recipe, store, tmp_path / "runs", [], print, seeds=1, quick=True, budget=0.0
+    )
     left = [r for r in rows_of(folder) if r["refused"].startswith("not measured within the budget")]
     assert {r["setting"] for r in left} == {"4", "17", "6", "12", "4×6", "9×12", "double"}
     assert "not measured within the budget" in (folder / "report.html").read_text()
-    again = study(recipe, store, tmp_path / "runs", [], print, seeds=1, quick=True)
+    again = study_recipe(
+        "accuracy", recipe, store, tmp_path / "runs", [], print, seeds=1, quick=True
+    )
     assert not [r for r in rows_of(again) if r["refused"].startswith("left")]
 
 
@@ -420,7 +427,7 @@ def test_many_outputs_can_be_told_apart():
 
 def test_a_study_without_seeds_is_refused(recipe, store, tmp_path):
     with pytest.raises(ValueError, match="seeds=0"):
-        study(recipe, store, tmp_path, [], print, seeds=0)
+        study_recipe("accuracy", recipe, store, tmp_path, [], print, seeds=0)
 
 
 def test_a_diagram_is_drawn_of_errors_that_are_zero(tmp_path):
@@ -441,8 +448,9 @@ def test_first_light_in_small(tmp_path):
     ]
     small += ["scene.shape=[32, 32]", "sensor.shape=[24, 24]", "laser=none", "outputs=[raw, lsr]"]
     recipe = load("first_light", small)
-    folder = study(
-        recipe, Store(tmp_path / "store"), tmp_path / "runs", [], print, seeds=1, quick=True
+    store = Store(tmp_path / "store")
+    folder = study_recipe(
+        "accuracy", recipe, store, tmp_path / "runs", [], print, seeds=1, quick=True
     )
     asked = [r for r in rows_of(folder) if r["line"] == "tolerance"]
     assert asked

@@ -18,10 +18,10 @@ from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.store.result_store import Store
-from neusee.workflows.studies.leave_out import leave_out_study
 from neusee.workflows.studies.leave_out import leave_out_study as scene_costs
 from neusee.workflows.studies.leave_out import left_out_steps as omission_rows
 from neusee.workflows.studies.leave_out.left_out_steps import OmissionComparison, least_error
+from neusee.workflows.studies.run_study import study_recipe
 
 MARK = Location("recipe.yaml", 1, 1)
 SMALL = (
@@ -109,8 +109,8 @@ def study(store, tmp_path):
 
     def study(recipe, **options):
         told = []
-        folder = leave_out_study.study(
-            recipe, store, tmp_path / "runs", ["neusee"], told.append, **options
+        folder = study_recipe(
+            "leave-out", recipe, store, tmp_path / "runs", ["neusee"], told.append, **options
         )
         return json.loads((folder / "provenance.json").read_text()), told, folder
 
@@ -243,9 +243,7 @@ def windshield(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         # one process, as in every test: seconds of several together exceed those that pass
         patch.setattr(worker_processes, "free_processors", lambda: 1)
-        folder = leave_out_study.study(
-            recipe, Store(here / "store"), here / "runs", ["neusee"], lambda line: None
-        )
+        folder = study_recipe("leave-out", recipe, Store(here / "store"), here / "runs", ["neusee"])
     return json.loads((folder / "provenance.json").read_text()), folder
 
 

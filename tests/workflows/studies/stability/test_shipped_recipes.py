@@ -7,9 +7,9 @@ import pytest
 
 from neusee.workflows import Store, load
 from neusee.workflows.keys.code_digest import Code
+from neusee.workflows.studies.run_study import study_recipe
 from neusee.workflows.studies.stability.case_result import judge_step
 from neusee.workflows.studies.stability.extreme_cases import CASES, CaseRecipe
-from neusee.workflows.studies.stability.stability_study import study
 
 RECIPES = sorted(path.stem for path in (Path(__file__).parents[4] / "recipes").glob("*.yaml"))
 #: with steps that no recipe has
@@ -25,7 +25,7 @@ def store(tmp_path_factory):
 def failing(recipe, store, folder, **cases):
     """Return case, step, node and errors of each cell that fails."""
     name, *changes = recipe.split()
-    found = study(load(name, changes), store, folder, ["neusee"], lambda line: None, **cases)
+    found = study_recipe("stability", load(name, changes), store, folder, ["neusee"], **cases)
     with (found / "table.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) > 5

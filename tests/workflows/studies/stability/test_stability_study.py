@@ -18,6 +18,7 @@ from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.node_families import find_node
 from neusee.workflows.store.result_store import Store
+from neusee.workflows.studies.run_study import study_recipe
 from neusee.workflows.studies.stability import case_result, extreme_cases, stability_study
 from neusee.workflows.studies.stability.case_result import judge_step
 from neusee.workflows.studies.stability.extreme_cases import (
@@ -28,7 +29,7 @@ from neusee.workflows.studies.stability.extreme_cases import (
     Size,
     unchanged_steps,
 )
-from neusee.workflows.studies.stability.stability_study import cell_text, short_number, study
+from neusee.workflows.studies.stability.stability_study import cell_text, short_number
 
 BY_NAME = {case.name: case for case in CASES}
 
@@ -170,7 +171,8 @@ def test_the_study_writes_its_folder_and_counts_what_fails(tmp_path, monkeypatch
         [],
     )
     cases = [Case("usual", "as it is", "usual", size=Size(16, 16, 3)), BY_NAME["NaN"]]
-    folder = study(recipe, store, tmp_path / "runs", ["neusee"], told.append, cases=cases)
+    runs = tmp_path / "runs"
+    folder = study_recipe("stability", recipe, store, runs, ["neusee"], told.append, cases=cases)
     assert {p.name for p in folder.iterdir()} >= {
         "report.html",
         "table.csv",
@@ -187,9 +189,8 @@ def test_the_study_writes_its_folder_and_counts_what_fails(tmp_path, monkeypatch
     assert len(told) == 2
     before = {row["step"]: row["error"] for row in rows}
     monkeypatch.setattr(stability_study, "judge_step", None)  # what is stored is not judged again
-    again = study(
-        recipe, Store(tmp_path / "store"), tmp_path / "runs", ["neusee"], told.append, cases=cases
-    )
+    store = Store(tmp_path / "store")
+    again = study_recipe("stability", recipe, store, runs, ["neusee"], told.append, cases=cases)
     with (again / "table.csv").open() as file:
         assert {row["step"]: row["error"] for row in csv.DictReader(file)} == before
 
