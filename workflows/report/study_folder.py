@@ -64,12 +64,18 @@ class StudyReport:
         for name, content in self.files.items():
             content(folder.path / name) if callable(content) else folder.write(name, content)
         folder.write("provenance.json", as_json(document))
+        shown = self._shown_of(document)
+        folder.write("report.html", page(self.title, self.lead, self.sections, shown, self.banner))
+
+    def _shown_of(self, document: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the values of a document that the page shows, and its warnings if it has any."""
         names = self.shown
         if names is None:
             names = [name for name in document if name != "config"]
         shown = {name: document[name] for name in names}
-        shown |= {"warnings": "; ".join(document["warnings"])} if document.get("warnings") else {}
-        folder.write("report.html", page(self.title, self.lead, self.sections, shown, self.banner))
+        if document.get("warnings"):
+            shown["warnings"] = "; ".join(document["warnings"])
+        return shown
 
 
 @dataclass(frozen=True)
