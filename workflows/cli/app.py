@@ -23,6 +23,7 @@ from neusee.workflows.cli.commands_and_exit_codes import (
 )
 from neusee.workflows.cli.interrupt_signal import Interrupts, said, say_stopped
 from neusee.workflows.engine.machine_resources import free_processors
+from neusee.workflows.recipe.text.hydra_habits import ADVICE_ON_MULTIRUN
 
 if TYPE_CHECKING:
     import typer
@@ -156,7 +157,9 @@ def _explained(error: Exception) -> int:
     """Print an error as one line; return the exit code for a wrong argument or for a failed run."""
     message = getattr(error, "format_message", None)
     if message is not None:
-        print(f"{message()} (try `neusee --help`)", file=sys.stderr)
+        is_multirun = getattr(error, "option_name", None) in ("-m", "--multirun")
+        advice = ADVICE_ON_MULTIRUN if is_multirun else "try `neusee --help`"
+        print(f"{message()} ({advice})", file=sys.stderr)
         return BAD
     from neusee.workflows.graph.diagnostics import visible
 

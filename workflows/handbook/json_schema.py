@@ -36,7 +36,7 @@ _ANY: Schema = {}
 _FAMILY: Schema = {"type": "object", "additionalProperties": {"type": "string"}, "maxProperties": 1}
 _NODES: Schema = {"anyOf": [{"type": "string"}, _FAMILY]}
 _MEANINGS = {
-    "defaults": "Groups that come first, in order.",
+    "defaults": "Recipes that this one extends, and options of groups, in order.",
     "nodes": "Files and modules with your own nodes.",
     "steps": (
         "The graph: under each name a node, its inputs and its parameters; null removes a step."
@@ -127,14 +127,14 @@ def _defaults() -> Schema:
     """Return the JSON schema of an entry in ``defaults``, which suggests packaged options and
     allows other names.
 
-    In the file of an option an entry is the name of another option of the same group.
+    A name alone is that of a recipe, or, in the file of an option, that of another option of the
+    same group.
     """
     offered = {
         group: {"enum": [option.name for option in options]} for group, options in groups().items()
     }
-    options = {
-        group: {"anyOf": [names, {"type": ["string", "null"]}]} for group, names in offered.items()
-    }
+    other: Schema = {"type": ["string", "null", "array"], "items": {"type": "string"}}
+    options = {group: {"anyOf": [names, other]} for group, names in offered.items()}
     group_choice: Schema = {
         "type": "object",
         "properties": options,

@@ -228,11 +228,21 @@ def load(
         recipe = with_cameras(
             recipe, composed, lambda words: check(compose(name, [*changes, *words], beside, first))
         )
+    for extended in composed.extended if recipe.expect else ():
+        recipe = _without_changed_numbers(recipe, extended, beside)
     if recipe.expect and changes:
         recipe = unaffected_expectations(recipe, _as_written(name, beside))
     if recipe.expect and (problems := list(refuse_indices(recipe))):
         raise RecipeError(problems)
     return recipe
+
+
+def _without_changed_numbers(recipe: Recipe, extended: Path, folder: Path) -> Recipe:
+    """Return a recipe without those expected numbers of a recipe that it extends which its changes
+    affect. One that is no recipe by itself has no numbers of its own.
+    """
+    below = _as_written(str(extended), folder)
+    return recipe if below is None else unaffected_expectations(recipe, below)
 
 
 def _as_written(name: str, folder: Path) -> Recipe | None:

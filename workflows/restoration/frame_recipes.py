@@ -12,7 +12,7 @@ from neusee.nodes.sensor import FRAME_SUFFIXES
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.recipe.text.composition import choices_of, compose, locate, shown
+from neusee.workflows.recipe.text.composition import compose
 from neusee.workflows.recipe.text.overrides import Override, read_override
 from neusee.workflows.recipe.text.yaml_values import Value, read
 
@@ -197,14 +197,12 @@ def _prepared(name: str, base: Path, own: Sequence[Override]) -> list[Override]:
     """Return the words that turn a recipe of a camera into one that restores: no scene, no
     laser, other outputs.
     """
-    path = locate(name, base)
-    document = read(path, shown(path, base)).root
-    groups = {choice.group for choice in choices_of(document, [])}
-    root = compose(name, (), base).root
+    composed = compose(name, (), base)
+    root, groups = composed.root, set(composed.groups)
     overridden = {override.path[0] for override in own}
     words = _without_scene(groups)
     if not overridden & {"laser", "lasers"}:
-        words += _no_laser(groups, document.items)
+        words += _no_laser(groups, composed.own_blocks)
     if "restore" not in overridden:
         words.append("restore=wiener_blind" if "restore" in groups else "+restore=wiener_blind")
     words += _simulated_steps(root)

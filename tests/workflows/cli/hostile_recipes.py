@@ -237,6 +237,10 @@ HOSTILE: dict[str, Hostile] = {
     "an option by a link": Hostile(
         "defaults: [{spill: g}]\n" + valued("'${password}'"), _link("spill/g.yaml", "secret/secret.yaml")
     ),
+    "a recipe above": Hostile("defaults: [../secret/secret.yaml]\n" + valued("'${password}'")),
+    "a recipe by a link": Hostile(
+        "defaults: [g]\n" + valued("'${password}'"), _link("g.yaml", "secret/secret.yaml")
+    ),
     "an option above": Hostile("defaults: [{spill: ../../secret/secret}]\n" + valued("'${password}'")),
     "a group above": Hostile("defaults: [{../secret: secret}]\n" + valued("'${password}'")),
     "options in a circle": Hostile(

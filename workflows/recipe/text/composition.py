@@ -12,8 +12,17 @@ from importlib.resources import files
 from pathlib import Path
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError, nearest
+from neusee.workflows.recipe.text.defaults_list import (
+    Choice,
+    Extended,
+    Option,
+    OwnValues,
+    choice,
+    entries_of,
+)
+from neusee.workflows.recipe.text.hydra_habits import advice_on_recipe
 from neusee.workflows.recipe.text.overrides import Override, apply, read_override
-from neusee.workflows.recipe.text.yaml_values import Value, Where, kind, read
+from neusee.workflows.recipe.text.yaml_values import Document, Value, Where, read
 
 # --- no code --------------------------------------------------------------------------------------
 
@@ -46,18 +55,8 @@ def is_inside(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> b
 
 NAME = re.compile(r"[\w-]+")
 RECIPES_VARIABLE = "NEUSEE_RECIPES"  #: folders with recipes and groups, separated as in ``PATH``
-_FORM = "must be one `group: option`, such as `doe: axicon`"
-_INNER = "must be an option of this group, such as `- small`, or one `group: option`"
-
-
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """Entry of ``defaults``: a group and its option, or None for no option."""
-
-    group: str
-    option: str | None
-    mark: Location
-    shown: str  #: the entry as the user wrote it, for a message
+_MOST_FILES_DEEP = 50  #: longest chain of recipes that extend each other
+_SUFFIXES = (".yaml", ".yml")
 
 
 @functools.cache
@@ -92,12 +91,13 @@ def shared_folders() -> tuple[Path, ...]:
     return tuple(dict.fromkeys((*named, user_folder(), packaged())))
 
 
-def search_folders(recipe: Path, folder: Path) -> tuple[Path, ...]:
-    """Return the folders in which the groups of a recipe are searched; beside a packaged recipe
-    is ``folder``.
+def search_folders(recipe: Path, extended: Iterable[Path], folder: Path) -> tuple[Path, ...]:
+    """Return the folders in which the groups of a recipe are searched: beside it, beside the
+    recipes that it extends, and those of all recipes. Beside a packaged recipe is ``folder``.
     """
     beside = folder if recipe.parent == packaged() else recipe.parent
-    return tuple(dict.fromkeys((beside, *shared_folders())))
+    below = [file.parent for file in extended if file.parent != packaged()]
+    return tuple(dict.fromkeys((beside, *below, *shared_folders())))
 
 
 def shown(path: Path, folder: Path) -> str:
@@ -136,7 +136,7 @@ class Groups:
 
     folders: tuple[Path, ...]  #: in the order of the search
     folder: Path  #: to which paths in messages are relative
-    merge: Callable[[tuple[Value, ...]], Value]
+    merge: Callable[[tuple[Value, ...], Location], Value]
     diagnostics: list[Diagnostic] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)  #: on options that hide others of the same name
 
@@ -144,35 +144,44 @@ class Groups:
         """Return the names of the options of each group."""
         return groups_of(*self.folders)
 
-    def option(self, choice: Choice, open_: tuple[Path, ...] = ()) -> Value | None:
-        """Return the values of an option with those of the options that it extends, or None for a
-        mistake.
+    def values(self, choice: Choice, open_: tuple[Path, ...] = ()) -> list[Value | None]:
+        """Return the values of each option of a choice; None stands for a mistake."""
+        values: list[Value | None] = []
+        for option in choice.options:
+            file = self._file(option, open_)
+            if file is None and option.is_optional:
+                note = f"{option.group}: {option.name} is optional, and there is no such option"
+                self.notes.append(note)
+            elif file is None:
+                self._report(option, self._absent(option, open_))
+                values.append(None)
+            else:
+                values.append(self._option(option, file, open_))
+        return values
 
-        ``open_``: the files of options that are being read. An option that extends its own name
-        extends that of the next folder.
+    def _file(self, option: Option, open_: tuple[Path, ...]) -> Path | None:
+        """Return the file of an option; one that extends its own name extends that of the next
+        folder.
+
+        ``open_``: the files of options that are being read.
         """
-        group, name = choice.group, str(choice.option)
         folders = self.folders
         for path in open_:
-            if (path.parent.name, path.stem) == (group, name) and path.parent.parent in folders:
+            same = (path.parent.name, path.stem) == (option.group, option.name)
+            if same and path.parent.parent in folders:
                 folders = folders[folders.index(path.parent.parent) + 1 :]
-        file = option_file(group, name, folders)
-        if file is None:
-            self._report(choice, self._absent(choice, open_))
+        return option_file(option.group, option.name, folders)
+
+    def _option(self, option: Option, file: Path, open_: tuple[Path, ...]) -> Value | None:
+        """Return the values in the file of an option with those of the options that it extends, or
+        None for a mistake.
+        """
+        above = file.parent.parent
+        if is_strange() and above not in shared_folders() and not is_inside(file, above):
+            self._report(option, _is_link(file, self.folder))
             return None
-        if (
-            is_strange()
-            and file.parent.parent not in shared_folders()
-            and not is_inside(file, file.parent.parent)
-        ):
-            message = (
-                f"{shown(file, self.folder)} is a link to another folder, which "
-                f"{NO_CODE_VARIABLE} or --no-code refuses"
-            )
-            self._report(choice, message)
-            return None
-        if not open_ and file.parent.parent != packaged():
-            self._say_hidden(group, name, file)
+        if not open_ and above != packaged():
+            self._say_hidden(option.group, option.name, file)
         return self._read(file, open_)
 
     def _read(self, file: Path, open_: tuple[Path, ...]) -> Value | None:
@@ -182,29 +191,34 @@ class Groups:
             self.diagnostics += error.diagnostics
             return None
         before = len(self.diagnostics)
-        choices = [
-            choice
-            for choice in choices_of(root, self.diagnostics, file.parent.name)
-            if choice.option
-        ]
-        below = [self.option(choice, (*open_, file)) for choice in choices]
-        if None in below or len(self.diagnostics) > before:
+        levels: list[Value | None] = []
+        for entry in entries_of(root, self.diagnostics, file.parent.name):
+            if isinstance(entry, Choice):
+                levels += self.values(entry, (*open_, file))
+            else:
+                levels.append(root)
+        if len(self.diagnostics) > before:
             return None
-        parts = tuple(level for level in (*below, root) if level is not None)
-        return self.merge(parts) if len(parts) > 1 else root
+        parts = tuple(level for level in levels if level is not None)
+        return self.merge(parts, root.mark) if len(parts) > 1 else root
 
-    def _absent(self, choice: Choice, open_: tuple[Path, ...]) -> str:
+    def _absent(self, option: Option, open_: tuple[Path, ...]) -> str:
         """Return the message for an option without a file, or with the files of all folders in
         use.
         """
-        group, name = choice.group, str(choice.option)
         options = self.names()
-        if group not in options:
-            return f"no group {group}; {nearest(group, options)}"
-        if name in options[group] and open_:
+        if option.group not in options:
+            return f"no group {option.group}; {nearest(option.group, options)}"
+        names = options[option.group]
+        if option.name in names and open_:
             chain = " -> ".join(shown(path, self.folder) for path in (*open_, open_[0]))
             return f"options extend each other in a circle: {chain}"
-        return f"no option {name} in {group}; {nearest(name, options[group])}"
+        if "," in option.name:
+            return (
+                f"no option {option.name} in {option.group}: several options are a list,"
+                f" [{option.name}], and several runs are `neusee sweep`"
+            )
+        return f"no option {option.name} in {option.group}; {nearest(option.name, names)}"
 
     def _say_hidden(self, group: str, name: str, file: Path) -> None:
         later_folders = self.folders[self.folders.index(file.parent.parent) + 1 :]
@@ -213,54 +227,17 @@ class Groups:
             ours = "the packaged option" if hidden.parent.parent == packaged() else str(hidden)
             self.notes.append(f"{group}: {name} is {shown(file, self.folder)}, which hides {ours}")
 
-    def _report(self, choice: Choice, message: str) -> None:
-        problem = Diagnostic(choice.mark, choice.shown, message)
+    def _report(self, option: Option, message: str) -> None:
+        problem = Diagnostic(option.mark, option.shown, message)
         if problem not in self.diagnostics:
             self.diagnostics.append(problem)
 
 
-def choices_of(root: Value, diagnostics: list[Diagnostic], group: str = "") -> Iterator[Choice]:
-    """Yield the entries in the list ``defaults`` of a recipe, or of an option of ``group``;
-    report wrong entries.
-    """
-    block = root.items.get("defaults")
-    if block is None:
-        return
-    if not isinstance(block.data, list):
-        form = "options of this group, such as `[small]`" if group else "`group: option`"
-        diagnostics.append(
-            Diagnostic(block.mark, "defaults", f"must be a list of {form}, not {kind(block)}")
-        )
-        return
-    lines: dict[tuple[str, str], int] = {}
-    for entry in block.data:
-        pair = _pair(entry, group)
-        if pair is None:
-            diagnostics.append(Diagnostic(entry.mark, entry.name, _INNER if group else _FORM))
-            continue
-        name, option = pair
-        again = (name, str(option.data) if group else "")
-        if again in lines:
-            message = f"given twice, first in line {lines[again]}"
-            diagnostics.append(Diagnostic(entry.mark, f"defaults.{name}", message))
-            continue
-        lines[again] = entry.mark.line
-        yield Choice(
-            name,
-            None if option.data is None else str(option.data),
-            option.mark,
-            f"{name}: {option.data}",
-        )
-
-
-def _pair(entry: Value, group: str) -> tuple[str, Value] | None:
-    """Return group and option of an entry in ``defaults``, or None if it has another form."""
-    pair = list(entry.items.items()) if isinstance(entry.data, dict) else []
-    if len(pair) == 1 and not isinstance(pair[0][1].data, dict | list):
-        return str(pair[0][0]), pair[0][1]
-    if group and isinstance(entry.data, str):
-        return group, entry
-    return None
+def _is_link(file: Path, folder: Path) -> str:
+    return (
+        f"{shown(file, folder)} is a link to another folder, which {NO_CODE_VARIABLE} or --no-code"
+        " refuses"
+    )
 
 
 # --- named files ----------------------------------------------------------------------------------
@@ -316,6 +293,9 @@ class Composed:
     #: ``scene=siemens``
     replaced: tuple[tuple[Where, str], ...] = ()
     notes: tuple[str, ...] = ()  #: on options that hide others of the same name
+    groups: tuple[str, ...] = ()  #: names of the groups of which it has an option
+    own_blocks: frozenset[str] = frozenset()  #: blocks that the recipes write, beside the options
+    extended: tuple[Path, ...] = ()  #: files of the recipes that it extends, at any depth
 
     def without(self, key: str) -> Composed:
         """Return the recipe without the block ``key``."""
@@ -330,37 +310,38 @@ def locate(recipe: str | Path, folder: Path) -> Path:
     """Return the path of a recipe file from a name, such as that of a packaged recipe, or from a
     path to ``.yaml``.
     """
-    if str(recipe).endswith((".yaml", ".yml")):
+    shared = shared_folders()
+    if str(recipe).endswith(_SUFFIXES):
         path = folder / Path(recipe).expanduser()
         if path.exists() and not path.is_dir():
             return path
-        similar_files = [
-            str(p.relative_to(folder))
-            for p in path.parent.glob("*.yaml")
-            if p.is_relative_to(folder)
-        ]
-        raise RecipeError(
-            [
-                Diagnostic(
-                    Location("recipe"),
-                    str(recipe),
-                    f"no such file; {nearest(str(recipe), similar_files)}",
-                )
-            ]
-        )
-    shared = shared_folders()
-    if NAME.fullmatch(str(recipe)):
-        for above in shared:
-            if (path := above / f"{recipe}.yaml").is_file():
-                return path
-    names = [p.stem for above in shared for p in above.glob("*.yaml")]
-    raise RecipeError(
-        [
-            Diagnostic(
-                Location("recipe"), str(recipe), f"no such recipe; {nearest(str(recipe), names)}"
-            )
-        ]
-    )
+        message = f"no such file; {_similar_file(str(recipe), path, folder)}"
+    else:
+        named = next(_files_named(str(recipe), shared), None)
+        if named is not None:
+            return named
+        message = f"no such recipe; {nearest(str(recipe), _names_in(shared))}"
+    raise RecipeError([Diagnostic(Location("recipe"), str(recipe), message)])
+
+
+def _files_named(name: str, folders: Iterable[Path]) -> Iterator[Path]:
+    """Yield the files of the recipes with a name, in the order of the folders."""
+    if NAME.fullmatch(name):
+        paths = (folder / f"{name}.yaml" for folder in folders)
+        yield from (path for path in paths if path.is_file())
+
+
+def _names_in(folders: Iterable[Path]) -> list[str]:
+    names: list[str] = []
+    for folder in folders:
+        names += [path.stem for path in folder.glob("*.yaml")]
+    return names
+
+
+def _similar_file(name: str, path: Path, folder: Path) -> str:
+    """Return a hint with the recipe files in the folder of a ``path`` that does not exist."""
+    similar = path.parent.glob("*.yaml")
+    return nearest(name, [str(p.relative_to(folder)) for p in similar if p.is_relative_to(folder)])
 
 
 def compose(
@@ -379,7 +360,8 @@ class Composer:
 
     def __init__(self, recipe: str | Path, folder: Path) -> None:
         self._path, self._folder = locate(recipe, folder), folder
-        self._document = read(self._path, shown(self._path, folder))
+        document = read(self._path, shown(self._path, folder))
+        self._written = _Extension(folder).written(self._path, document)
         self._hides = _hiding(self._path, recipe)
         # before the arguments that set single values
         self._known: dict[tuple[Choice, ...], Composed] = {}
@@ -396,28 +378,40 @@ class Composer:
                 )
             except RecipeError as error:
                 diagnostics += error.diagnostics
-        choices, values = _choose(self._document.root, overrides, self._groups(diagnostics))
-        selection = tuple(choices)
-        if selection not in self._known:
-            self._known[selection] = self._with_options(selection)
-        below = self._known[selection]
+        if not self._written.is_complete:  # what lacks a recipe lacks what arguments change
+            overrides = []
+        choices, values = _choose(self._written, overrides, self._groups(diagnostics))
+        if choices not in self._known:
+            self._known[choices] = self._with_options(choices)
+        below = self._known[choices]
         root, diagnostics = below.root, [*diagnostics, *below.diagnostics]
         for override in values:
-            root = apply(root, override, diagnostics, [choice.group for choice in choices])
+            root = apply(root, override, diagnostics, below.groups)
         return replace(below, root=root, diagnostics=tuple(diagnostics))
 
     def _groups(self, diagnostics: list[Diagnostic]) -> Groups:
-        return Groups(search_folders(self._path, self._folder), self._folder, _merged, diagnostics)
+        folders = search_folders(self._path, self._written.extended, self._folder)
+        return Groups(folders, self._folder, _merged, diagnostics)
 
     def _with_options(self, choices: tuple[Choice, ...]) -> Composed:
         """Return the recipe with the chosen option of each group."""
-        document, groups = self._document, self._groups([])
-        options = [groups.option(choice) for choice in choices if choice.option is not None]
-        root = _merged((*(option for option in options if option is not None), document.root))
-        replaced = tuple(_replaced(document.root, choices, groups))
-        diagnostics, notes = tuple(groups.diagnostics), (*self._hides, *groups.notes)
+        written, groups = self._written, self._groups([])
+        levels: list[Value | None] = []
+        for layer in written.layers_with(choices):
+            levels += groups.values(layer) if isinstance(layer, Choice) else [layer]
+        parts = tuple(level for level in levels if level is not None)
+        replaced = tuple(_replaced(written, choices, groups))
         return Composed(
-            self._path.stem, document.title, root, diagnostics, None not in options, replaced, notes
+            name=self._path.stem,
+            title=written.title,
+            root=_merged(parts, written.root.mark),
+            diagnostics=(*written.diagnostics, *groups.diagnostics),
+            whole=written.is_complete and None not in levels,
+            replaced=replaced,
+            notes=(*self._hides, *written.notes, *groups.notes),
+            groups=tuple(entry.group for entry in choices),
+            own_blocks=written.own_blocks,
+            extended=written.extended,
         )
 
 
@@ -453,11 +447,10 @@ def merge(below: Value, above: Value) -> Value:
 
 
 @functools.lru_cache(maxsize=16)
-def _merged(parts: tuple[Value, ...]) -> Value:
-    """Merge the options of the groups and the recipe in order; return the cached object if the
-    parts are the same.
+def _merged(parts: tuple[Value, ...], mark: Location) -> Value:
+    """Merge the options of the groups and the recipes in order; return the cached object if the
+    parts are the same. ``mark`` is the place of the recipe.
     """
-    mark = parts[-1].mark
     return functools.reduce(
         merge, (level.without("defaults") for level in parts), Value({}, mark, mark, ())
     )
@@ -467,56 +460,277 @@ def _new_step(value: Value) -> bool:
     return len(value.path) == 2 and value.path[0] == "steps" and "node" in value.items
 
 
+# --- extended recipes -----------------------------------------------------------------------------
+
+# A recipe with those that it extends, as one list of layers: the options of a group, or the values
+# that a file itself writes. A later layer wins.
+
+
+Layer = Choice | Value
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """A recipe as its files write it, before the arguments of the user."""
+
+    root: Value  #: of its own file
+    title: str
+    layers: tuple[Layer, ...]
+    replaced: tuple[Choice, ...]  #: choices of extended recipes in whose place is another one
+    extended: tuple[Path, ...]  #: files of the recipes that it extends, at any depth
+    diagnostics: tuple[Diagnostic, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def is_complete(self) -> bool:
+        """Return True if every entry of ``defaults`` could be read."""
+        return not self.diagnostics
+
+    @property
+    def choices(self) -> dict[str, Choice]:
+        """Return the choice of each group."""
+        return {layer.group: layer for layer in self.layers if isinstance(layer, Choice)}
+
+    @property
+    def own_blocks(self) -> frozenset[str]:
+        """Return the keys that the recipes write themselves, beside the options of their groups."""
+        keys = set[str]()
+        for layer in self.layers:
+            if isinstance(layer, Value):
+                keys.update(map(str, layer.items))
+        return frozenset(keys - {"defaults"})
+
+    def layers_with(self, choices: Iterable[Choice]) -> list[Layer]:
+        """Return the layers with other choices: each in the place of the former one of its group,
+        and a new one before the values of the recipe itself.
+        """
+        chosen_groups = {entry.group: entry for entry in choices}
+        layers: list[Layer] = []
+        for layer in self.layers:
+            if isinstance(layer, Value):
+                layers.append(layer)
+            elif layer.group in chosen_groups:
+                layers.append(chosen_groups.pop(layer.group))
+        place = len(layers) - 1 if isinstance(layers[-1], Value) else len(layers)
+        return [*layers[:place], *chosen_groups.values(), *layers[place:]]
+
+
+class _Extension:
+    """Reader of a recipe with the recipes that it extends, and of the mistakes in them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder  # to which paths in messages are relative
+        self.diagnostics: list[Diagnostic] = []
+        self.notes: list[str] = []
+        self.replaced: list[Choice] = []
+        self.extended: dict[Path, Location] = {}  # each file, with the entry that names it
+
+    def written(self, path: Path, document: Document) -> Written:
+        """Return the recipe in a file, with the layers of those that it extends."""
+        layers = self._layers(document.root, (path,))
+        return Written(
+            root=document.root,
+            title=document.title,
+            layers=tuple(layers),
+            replaced=tuple(self.replaced),
+            extended=tuple(self.extended),
+            diagnostics=tuple(self.diagnostics),
+            notes=tuple(self.notes),
+        )
+
+    def _layers(self, root: Value, open_: tuple[Path, ...]) -> list[Layer]:
+        """Return the layers of the recipe in the last file of ``open_``, which extend each other in
+        this order.
+        """
+        layers: list[Layer] = []
+        for entry in entries_of(root, self.diagnostics):
+            if isinstance(entry, OwnValues):
+                layers.append(root)
+            elif isinstance(entry, Choice):
+                self._add_choice(entry, layers)
+            else:
+                layers += self._layers_of(entry, open_, layers)
+        return layers
+
+    def _add_choice(self, entry: Choice, layers: list[Layer]) -> None:
+        """Add a choice to the layers, in the place of that which an extended recipe has."""
+        for place, layer in enumerate(layers):
+            if isinstance(layer, Choice) and layer.group == entry.group:
+                if entry.is_optional:
+                    fix = entry.shown.removeprefix("optional ")
+                    message = f"takes the place of {layer.shown} ({layer.mark}): write `{fix}`"
+                    self._refuse(entry.mark, entry.shown, message)
+                    return
+                self.replaced.append(layer)
+                layers[place] = entry
+                return
+        layers.append(entry)
+
+    def _layers_of(
+        self, entry: Extended, open_: tuple[Path, ...], before: Sequence[Layer]
+    ) -> list[Layer]:
+        """Return the layers of an extended recipe; ``before`` are those of earlier entries."""
+        file = self._file(entry, open_)
+        if file is None:
+            return []
+        self.extended[file] = entry.mark
+        try:
+            root = read(file, shown(file, self.folder)).root
+        except RecipeError as error:
+            self.diagnostics += error.diagnostics
+            return []
+        layers = self._layers(root, (*open_, file))
+        if message := _chosen_before(entry, layers, before):
+            self._refuse(entry.mark, entry.name, message)
+        return layers
+
+    def _file(self, entry: Extended, open_: tuple[Path, ...]) -> Path | None:
+        """Return the file of an extended recipe, or None after a report of the mistake."""
+        found = (
+            self._file_at_path(entry)
+            if entry.name.endswith(_SUFFIXES)
+            else self._file_of_name(entry, open_)
+        )
+        message = found if isinstance(found, str) else self._refusal(found, entry, open_)
+        if message:
+            self._refuse(entry.mark, entry.name, message)
+            return None
+        assert isinstance(found, Path)
+        return found
+
+    def _file_at_path(self, entry: Extended) -> Path | str:
+        folder = Path(entry.mark.folder)
+        path = Path(os.path.abspath(folder / Path(entry.name).expanduser()))
+        if path.exists() and not path.is_dir():
+            return path
+        return f"no such file; {_similar_file(entry.name, path, folder)}"
+
+    def _file_of_name(self, entry: Extended, open_: tuple[Path, ...]) -> Path | str:
+        """Return the file of a recipe by its name, or a message: beside the file that names it, and
+        then where every recipe is found.
+
+        A recipe that extends its own name extends that of the next folder.
+        """
+        folders = tuple(dict.fromkeys((open_[-1].parent, *shared_folders())))
+        later_folders = folders
+        for path in open_:
+            if path.stem == entry.name and path.parent in later_folders:
+                later_folders = later_folders[later_folders.index(path.parent) + 1 :]
+        file = next(_files_named(entry.name, later_folders), None)
+        if file is not None:
+            self.notes += _hiding(file, entry.name)
+            return file
+        circular = next(_files_named(entry.name, folders), None)
+        if circular is not None:
+            return self._circle((*open_, circular))
+        groups = groups_of(*folders)
+        if advice := advice_on_recipe(entry.name, groups):
+            return advice
+        if entry.name in groups:
+            return f"is a group: write `{entry.name}: OPTION`; {nearest('', groups[entry.name])}"
+        return f"no such recipe; {nearest(entry.name, _names_in(folders))}"
+
+    def _refusal(self, file: Path, entry: Extended, open_: tuple[Path, ...]) -> str:
+        """Return why a file is not read as an extended recipe, or an empty text."""
+        real = os.path.realpath(file)
+        if any(os.path.realpath(path) == real for path in open_):
+            return self._circle((*open_, file))
+        if file in self.extended:
+            return f"is extended already, by {self.extended[file]}: remove this entry"
+        if len(open_) > _MOST_FILES_DEEP:
+            return f"more than {_MOST_FILES_DEEP} recipes extend each other: write them as one"
+        shared = shared_folders()
+        folder = Path(entry.mark.folder)
+        is_own = file.parent in shared or any(folder.is_relative_to(own) for own in shared)
+        if is_strange() and not is_own and not is_inside(file, folder):
+            return (
+                f"is not in the folder of {Path(entry.mark.file).name}, which {NO_CODE_VARIABLE} or"
+                " --no-code refuses"
+            )
+        return ""
+
+    def _circle(self, files: Sequence[Path]) -> str:
+        chain = " -> ".join(shown(path, self.folder) for path in files)
+        return f"recipes extend each other in a circle: {chain}"
+
+    def _refuse(self, mark: Location, name: str, message: str) -> None:
+        self.diagnostics.append(Diagnostic(mark, name, message))
+
+
+def _chosen_before(entry: Extended, layers: Sequence[Layer], before: Sequence[Layer]) -> str:
+    """Return what to do about groups of which an extended recipe has an option, and an earlier
+    entry too; or an empty text.
+    """
+    groups = {layer.group for layer in layers if isinstance(layer, Choice)}
+    earlier = [layer for layer in before if isinstance(layer, Choice) and layer.group in groups]
+    if not earlier:
+        return ""
+    ours = [layer for layer in earlier if layer.mark.file == entry.mark.file]
+    if ours:
+        return f"has the group {ours[0].group} too: write `{ours[0].shown}` after {entry.name}"
+    names = ", ".join(layer.group for layer in earlier[:6])
+    more = f" and {len(earlier) - 6} more" if len(earlier) > 6 else ""
+    return f"has the groups of an earlier recipe ({names}{more}): extend only one of the two"
+
+
 # --- groups ---------------------------------------------------------------------------------------
 
 
 def _choose(
-    root: Value, overrides: list[Override], groups: Groups
-) -> tuple[list[Choice], list[Override]]:
-    """Return the option of each group after overrides such as ``laser=six``, and the overrides
+    written: Written, overrides: list[Override], groups: Groups
+) -> tuple[tuple[Choice, ...], list[Override]]:
+    """Return the options of each group after overrides such as ``laser=six``, and the overrides
     of single values.
     """
-    choices = {choice.group: choice for choice in choices_of(root, groups.diagnostics)}
+    choices = written.choices
     names, value_overrides = functools.cache(groups.names), []
-    for o in overrides:
-        group, data = o.path[0], o.value.data if o.value else None
-        values = len(o.path) > 1 or isinstance(data, dict | list)
-        if values or (group not in choices and (group in root.items or group not in names())):
-            value_overrides.append(o)
-        elif message := _group_fault(o, choices):
-            groups.diagnostics.append(Diagnostic(o.mark, o.text, message))
-        elif o.sign == "~":
+    for override in overrides:
+        group = override.path[0]
+        is_other = group not in choices and (group in written.own_blocks or group not in names())
+        if is_other or not _names_options(override):
+            value_overrides.append(override)
+        elif message := _group_fault(override, choices):
+            groups.diagnostics.append(Diagnostic(override.mark, override.text, message))
+        elif override.value is None:
             del choices[group]
         else:
-            choices[group] = Choice(group, None if data is None else str(data), o.mark, o.text)
-    return list(choices.values()), value_overrides
+            listed = override.value.data
+            values = listed if isinstance(listed, list) else [override.value]
+            choices[group] = choice(group, values, override.mark, override.text)
+    return tuple(choices.values()), value_overrides
+
+
+def _names_options(override: Override) -> bool:
+    """Return True if the value of an override can be an option of a group, or a list of options."""
+    data = override.value.data if override.value else None
+    if len(override.path) > 1 or isinstance(data, dict):
+        return False
+    return not isinstance(data, list) or all(isinstance(value.data, str) for value in data)
 
 
 def _replaced(
-    root: Value, choices: Iterable[Choice], groups: Groups
+    written: Written, choices: Iterable[Choice], groups: Groups
 ) -> Iterator[tuple[Where, str]]:
-    """Yield the path of each value in an option that the recipe names and an argument replaces
-    or removes.
+    """Yield the path of each value in an option that a recipe names and an argument, or a recipe
+    that extends it, replaces or removes.
     """
-    final_choices = {choice.group: choice for choice in choices}
+    final_choices = {entry.group: entry for entry in choices}
     silent = replace(groups, diagnostics=[], notes=[])
-    for written in choices_of(root, []):
-        now = final_choices.get(written.group)
-        if written.option is None or (now and now.option == written.option):
+    for former in (*written.replaced, *written.choices.values()):
+        now = final_choices.get(former.group)
+        if now and now.names == former.names:
             continue
-        option = silent.option(written)
-        shown = now.shown if now else f"~{written.group}"
-        yield from ((leaf.path, shown) for leaf in (option.leaves() if option else ()))
+        text = now.shown if now else f"~{former.group}"
+        for option in silent.values(former):
+            yield from ((leaf.path, text) for leaf in (option.leaves() if option else ()))
 
 
 def _group_fault(o: Override, choices: Mapping[str, Choice]) -> str:
     group = o.path[0]
     if group in choices:
-        return (
-            f"{group} is already set to {choices[group].option}: remove the +"
-            if o.sign == "+"
-            else ""
-        )
+        names = choices[group].names or ["null"]
+        shown_names = names[0] if len(names) == 1 else f"[{', '.join(names)}]"
+        return f"{group} is already set to {shown_names}: remove the +" if o.sign == "+" else ""
     if o.sign == "~":
         return f"is not a group of this recipe; {nearest(group, choices)}"
     return "" if o.sign else f"this recipe has no group {group}; to add the group, write +{o.text}"

@@ -12,6 +12,7 @@ from typing import Any
 
 from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.final_values import flow
+from neusee.workflows.recipe.text.hydra_habits import advice_on_argument
 from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted, parse
 
@@ -62,7 +63,7 @@ def read_override(text: str, mark: Location) -> Override:
     """
     match = _SYNTAX.fullmatch(text)
     if match is None:
-        raise RecipeError([Diagnostic(mark, text, _HELP)])
+        raise RecipeError([Diagnostic(mark, text, advice_on_argument(text, "") or _HELP)])
     sign, path, value = match["sign"], tuple(match["path"].split(".")), match["value"]
     if sign == "~":
         if value is not None:
@@ -131,16 +132,16 @@ def _fault(
     here = trail[-1][0]
     if not missing:
         return "exists already: remove the + to change the value" if o.sign == "+" else None
+    if advice := advice_on_argument(o.text, ".".join(o.path)):
+        return advice
     if isinstance(here.data, list):
-        if o.sign == "+" and len(missing) == 1 and missing[0] == str(len(here.data)):
+        is_next = len(missing) == 1 and missing[0] == str(len(here.data))
+        if o.sign == "+" and is_next:
             return None
         return f"{here.name} has {len(here.data)} values: 0 to {len(here.data) - 1}"
     if o.sign == "+" or (o.sign == "" and _implied(root, o.path)):
-        return (
-            None
-            if isinstance(here.data, dict | None)
-            else f"{here.name} is a single value, not a mapping"
-        )
+        is_open = isinstance(here.data, dict | None)
+        return None if is_open else f"{here.name} is a single value, not a mapping"
     return instead(".".join(o.path)) or f"unknown; {_suggest(root, o.path, groups)}"
 
 
@@ -158,25 +159,42 @@ def _suggest(root: Value, path: tuple[str, ...], groups: Iterable[str]) -> str:
     """Return a hint with the most similar path in the recipe, because an unknown path is often a
     typing error.
     """
+    here, similar = _followed_similar(root, path, groups)
+    if len(similar) == len(path):
+        return f"did you mean {'.'.join(similar)}?"
+    if same := _paths_ending_alike(root, path[-1]):
+        return f"did you mean {' or '.join(sorted(same)[:3])}?"
+    return f"{here.name or 'the recipe'} has {', '.join(map(str, here.items)) or 'no such value'}"
+
+
+def _followed_similar(
+    root: Value, path: tuple[str, ...], groups: Iterable[str]
+) -> tuple[Value, list[str]]:
+    """Return the value at which a path of similar names ends, with these names."""
     here, similar = root, list[str]()
     for name in path:
-        names = {*map(str, here.items), *((*RESERVED, *groups) if here is root else ())}
+        names = set(map(str, here.items))
+        if here is root:
+            names |= {*RESERVED, *groups}
         close = difflib.get_close_matches(name, names, 1)
         if not close:
             break
         similar += close
         here = here.child(close[0]) or Value(None, here.mark, here.key, ())
-    if len(similar) == len(path):
-        return f"did you mean {'.'.join(similar)}?"
-    leaves = [leaf for leaf in root.leaves() if leaf.path[0] not in RESERVED]
-    same = {
+    return here, similar
+
+
+def _paths_ending_alike(root: Value, name: str) -> set[str]:
+    """Return the paths of the values in the blocks of a recipe whose last name is similar."""
+    return {
         leaf.name
-        for leaf in leaves
-        if difflib.get_close_matches(path[-1], [str(leaf.path[-1])], 1, 0.75)
+        for leaf in root.leaves()
+        if _is_in_block(leaf) and difflib.get_close_matches(name, [str(leaf.path[-1])], 1, 0.75)
     }
-    if same:
-        return f"did you mean {' or '.join(sorted(same)[:3])}?"
-    return f"{here.name or 'the recipe'} has {', '.join(map(str, here.items)) or 'no such value'}"
+
+
+def _is_in_block(leaf: Value) -> bool:
+    return bool(leaf.path) and leaf.path[0] not in RESERVED
 
 
 def _rebuild(trail: Trail, missing: tuple[str, ...], o: Override) -> Value:

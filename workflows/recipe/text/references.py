@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from neusee.workflows.graph.diagnostics import UNREAD, Diagnostic
 from neusee.workflows.recipe.text.composition import packaged
+from neusee.workflows.recipe.text.hydra_habits import advice_on_reference
 from neusee.workflows.recipe.text.overrides import RESERVED
 from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
@@ -133,6 +134,9 @@ class References:
         return replace(value, data=text)
 
     def _target(self, text: str, origin: Value, scope: Scope) -> Value | None:
+        if advice := advice_on_reference(text.strip()):
+            self._fail(origin, advice)
+            return None
         optional = text.rstrip().endswith("?")
         parts, start = text.strip().removesuffix("?").split("."), self.root
         if parts[0] in ("item", "each") and parts[0] not in self.root.items:

@@ -18,6 +18,11 @@ from ruamel.yaml.tokens import ScalarToken
 
 from neusee.workflows.graph.diagnostics import CONTROL, Diagnostic, Location, RecipeError, visible
 from neusee.workflows.keys.sealed_files import NotRegular, opened
+from neusee.workflows.recipe.text.hydra_habits import (
+    ADVICE_ON_HEADER,
+    advice_on_key,
+    package_line,
+)
 
 # --- yaml mistakes --------------------------------------------------------------------------------
 
@@ -377,6 +382,9 @@ def _document(text: str, shown: str, folder: str) -> Document:
         raise RecipeError(
             [Diagnostic(Location(shown, 1, 1), "", f"{problem}: write a mapping, `key: value`")]
         )
+    line = package_line(text)
+    if line is not None:
+        raise RecipeError([Diagnostic(Location(shown, line + 1, 1), "", ADVICE_ON_HEADER)])
     first = text.lstrip().partition("\n")[0].strip()
     return Document(root, visible(first.lstrip("# ")) if first.startswith("#") else "")
 
@@ -467,35 +475,37 @@ class _Builder:
 
     def _mapping(self, node: MappingNode, path: Where) -> dict[str | int, Value]:
         data: dict[str | int, Value] = {}
+        is_advised = False  # one message for the keys of one object
         for key_node, value_node in node.value:
-            mark = self._mark(key_node)
-            if isinstance(key_node, ScalarNode) and (fault := _fault(str(key_node.value))):
-                self._refuse(mark, path, f"a key {fault}")
-                continue
-            key = _key(key_node)
-            if key == "<<":
-                self._refuse(
-                    mark,
-                    path,
-                    "merge keys (<<) are not part of YAML 1.2: refer to values with ${…}",
-                )
-            elif key is None:
-                self._refuse(mark, path, "the key of a mapping must be a name or a whole number")
-            elif isinstance(key, str) and _LACKS_SPACE.fullmatch(key) and _is_empty(value_node):
-                name, _, text = key.partition(":")
-                self._refuse(
-                    mark, (*path, name), f"needs a space after the colon: write `{name}: {text}`"
-                )
+            mark, key = self._mark(key_node), _key(key_node)
+            advice = advice_on_key(key, not path) if key is not None else ""
+            if advice:
+                if not is_advised:
+                    self._refuse(mark, (*path, str(key)), advice)
+                is_advised = True
+            elif fault := self._key_fault(key_node, key):
+                self._refuse(mark, path, fault)
+            elif _lacks_space(key, value_node):
+                name, _, text = str(key).partition(":")
+                message = f"needs a space after the colon: write `{name}: {text}`"
+                self._refuse(mark, (*path, name), message)
             elif key in data:
                 line = data[key].key.line
-                self._refuse(
-                    mark,
-                    (*path, key),
-                    f"given twice, first in line {line}" if line else "given twice",
-                )
-            else:
+                message = f"given twice, first in line {line}" if line else "given twice"
+                self._refuse(mark, (*path, key), message)
+            elif key is not None:
                 data[key] = self.value(value_node, (*path, key), mark)
         return data
+
+    @staticmethod
+    def _key_fault(node: Node, key: str | int | None) -> str:
+        """Return what is wrong with the key of a mapping, or an empty text."""
+        fault = _fault(str(node.value)) if isinstance(node, ScalarNode) else ""
+        if fault:
+            return f"a key {fault}"
+        if key == "<<":
+            return "merge keys (<<) are not part of YAML 1.2: refer to values with ${…}"
+        return "the key of a mapping must be a name or a whole number" if key is None else ""
 
     def _list(self, node: Node, path: Where) -> list[Value]:
         return [
@@ -586,9 +596,10 @@ def number(text: str) -> int | float | str:
     return text
 
 
-def _is_empty(node: Node) -> bool:
-    """Return True for the value of a key behind which nothing is written."""
-    return isinstance(node, ScalarNode) and node.style is None and str(node.value) == ""
+def _lacks_space(key: str | int | None, value: Node) -> bool:
+    """Return True for a key such as ``seed:7``, behind which nothing is written."""
+    is_empty = isinstance(value, ScalarNode) and value.style is None and str(value.value) == ""
+    return is_empty and isinstance(key, str) and _LACKS_SPACE.fullmatch(key) is not None
 
 
 def _key(node: Node) -> str | int | None:

@@ -205,10 +205,7 @@ def test_a_step_that_is_null_is_absent(composed):
         ),
         (
             "++lens.f=1",
-            (
-                "argument 1 | ++lens.f=1 | is not an override: write path=value, +path=value, ~path"
-                " or group=option"
-            ),
+            "argument 1 | ++lens.f=1 | write lens.f=1 to change a value, or +lens.f=1 to add one",
         ),
         (
             "lens..f=1",
@@ -232,8 +229,11 @@ def test_a_wrong_argument_is_shown_with_its_fix(composed, argument, problem):
             "mine.yaml:1:11 | defaults | must be a list of `group: option`, not a mapping",
         ),
         (
-            "defaults: [lens]\n",
-            "mine.yaml:1:12 | defaults.0 | must be one `group: option`, such as `doe: axicon`",
+            "defaults: [3]\n",
+            (
+                "mine.yaml:1:12 | defaults.0 | must be one `group: option`, such as `doe: axicon`,"
+                " or the name of a recipe, such as `first_light`"
+            ),
         ),
         (
             "defaults: [lens: wide, lens: tele]\n",
