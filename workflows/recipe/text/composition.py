@@ -489,7 +489,7 @@ class Written:
     @property
     def choices(self) -> dict[str, Choice]:
         """Return the choice of each group."""
-        return {layer.group: layer for layer in self.layers if isinstance(layer, Choice)}
+        return {layer.group: layer for layer in _choices_in(self.layers)}
 
     @property
     def own_blocks(self) -> frozenset[str]:
@@ -661,16 +661,20 @@ def _chosen_before(entry: Extended, layers: Sequence[Layer], before: Sequence[La
     """Return what to do about groups of which an extended recipe has an option, and an earlier
     entry too; or an empty text.
     """
-    groups = {layer.group for layer in layers if isinstance(layer, Choice)}
-    earlier = [layer for layer in before if isinstance(layer, Choice) and layer.group in groups]
-    if not earlier:
-        return ""
+    groups = {layer.group for layer in _choices_in(layers)}
+    earlier = [layer for layer in _choices_in(before) if layer.group in groups]
     ours = [layer for layer in earlier if layer.mark.file == entry.mark.file]
     if ours:
         return f"has the group {ours[0].group} too: write `{ours[0].shown}` after {entry.name}"
+    if not earlier:
+        return ""
     names = ", ".join(layer.group for layer in earlier[:6])
     more = f" and {len(earlier) - 6} more" if len(earlier) > 6 else ""
     return f"has the groups of an earlier recipe ({names}{more}): extend only one of the two"
+
+
+def _choices_in(layers: Iterable[Layer]) -> list[Choice]:
+    return [layer for layer in layers if isinstance(layer, Choice)]
 
 
 # --- groups ---------------------------------------------------------------------------------------

@@ -129,20 +129,22 @@ def _fault(
     root: Value, o: Override, trail: Trail, missing: tuple[str, ...], groups: Iterable[str]
 ) -> str | None:
     """Return the message for an invalid override of a recipe, or None for a valid override."""
-    here = trail[-1][0]
+    here, is_added = trail[-1][0], o.sign == "+"
     if not missing:
-        return "exists already: remove the + to change the value" if o.sign == "+" else None
+        return "exists already: remove the + to change the value" if is_added else None
     if advice := advice_on_argument(o.text, ".".join(o.path)):
         return advice
     if isinstance(here.data, list):
-        is_next = len(missing) == 1 and missing[0] == str(len(here.data))
-        if o.sign == "+" and is_next:
-            return None
-        return f"{here.name} has {len(here.data)} values: 0 to {len(here.data) - 1}"
-    if o.sign == "+" or (o.sign == "" and _implied(root, o.path)):
+        is_next = is_added and missing == (str(len(here.data)),)
+        return None if is_next else f"{here.name} has {_indices(here.data)}"
+    if is_added or (not o.sign and _implied(root, o.path)):
         is_open = isinstance(here.data, dict | None)
         return None if is_open else f"{here.name} is a single value, not a mapping"
     return instead(".".join(o.path)) or f"unknown; {_suggest(root, o.path, groups)}"
+
+
+def _indices(values: list[Value]) -> str:
+    return f"{len(values)} values: 0 to {len(values) - 1}"
 
 
 def _implied(root: Value, path: tuple[str, ...]) -> bool:

@@ -13,7 +13,7 @@ from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError, YAMLStreamError
-from ruamel.yaml.nodes import MappingNode, Node, ScalarNode
+from ruamel.yaml.nodes import CollectionNode, MappingNode, Node, ScalarNode
 from ruamel.yaml.tokens import ScalarToken
 
 from neusee.workflows.graph.diagnostics import CONTROL, Diagnostic, Location, RecipeError, visible
@@ -247,6 +247,9 @@ _TAG = "tag:yaml.org,2002:"
 _INT = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
 _LACKS_SPACE = re.compile(r"[\w.-]+:\S.*")
+_PROPERTIES = re.compile(r"(?:[&!]\S*\s+)*(?:[&!]\S*)?")  #: anchor and tag before a value
+_NULLS = ("", "~", "null", "Null", "NULL")
+_BOOLEANS = ("true", "True", "TRUE", "false", "False", "FALSE")
 _MOST = 1_000_000  #: largest number of values in one file
 _LARGEST = 4_000_000  #: bytes of one file; 20 000 steps take about half of them
 _DIGITS = 400  #: of a whole number, at most
@@ -393,7 +396,9 @@ def parse(text: str, start: Location, path: Where = ()) -> Value:
     """Return the values in a YAML text; ``start`` is the location of the text in a file, or an
     argument.
     """
-    builder = _Builder(start)
+    if text.rpartition("\n")[2].isspace():
+        text += "\n"  # or the parser reads a last line of spaces as text of a block scalar
+    builder = _Builder(start, text)
     if mistake := directive_mistake(text):
         raise RecipeError([_diagnostic(mistake, start, path)])
     try:
@@ -439,39 +444,90 @@ class _Builder:
     refers.
     """
 
-    def __init__(self, start: Location) -> None:
-        self.start = start
+    def __init__(self, start: Location, text: str) -> None:
+        self.start, self.text = start, text
         self.diagnostics: list[Diagnostic] = []
         self.built: dict[int, Value] = {}
         self.open: set[int] = set()
         self.size: dict[int, int] = {}
         self.aliased = 0  # number of values that come from aliases
+        # of the block in which a value stands: -1 at the top, None within brackets
+        self.column: int | None = -1
 
     def value(self, node: Node, path: Where, key: Location) -> Value:
         mark, tag = self._mark(node), (node.tag or "").replace(_TAG, "!!")
         if tag not in _KNOWN:
             return self._refuse(mark, path, f"unknown YAML tag {tag}: remove the tag")
-        if isinstance(node, ScalarNode):
-            fault = _fault(str(node.value))
-            return (
-                self._refuse(mark, path, fault) if fault else Value(_scalar(node), mark, key, path)
-            )
         if id(node) in self.built:
             self.aliased += self.size[id(node)]
             self._refuse_many(self.aliased, _MOST_ALIASED, mark, path)
             return replace(_moved(self.built[id(node)], path), key=key)
         if id(node) in self.open:
-            return self._refuse(
-                mark, path, "a YAML alias refers to the value that contains the alias"
-            )
+            message = "a YAML alias refers to the value that contains the alias"
+            return self._refuse(mark, path, message)
+        if fault := self._fault(node, tag):
+            return self._refuse(mark, path, fault)
+        if isinstance(node, ScalarNode):
+            return Value(_scalar(node), mark, key, path)
+        return self._collection(node, mark, key, path)
+
+    def _collection(self, node: Node, mark: Location, key: Location, path: Where) -> Value:
+        """Return the list or the mapping of a node."""
+        outer_column = self.column
+        self.column = None if _is_enclosed(node) else self._column(node)
         self.open.add(id(node))
-        data = (
-            self._mapping(node, path) if isinstance(node, MappingNode) else self._list(node, path)
-        )
+        data: dict[str | int, Value] | list[Value]
+        if isinstance(node, MappingNode):
+            data = self._mapping(node, path)
+        else:
+            data = self._list(node, path)
         self.open.discard(id(node))
+        self.column = outer_column
         value = self.built[id(node)] = Value(data, mark, key, path)
         self._weigh(node, value)
         return value
+
+    def _column(self, node: Node) -> int:
+        """Return the column of a block; -1, as of the top, where an anchor or a tag hides it."""
+        hidden = self.text[node.start_mark.index] in "&!"
+        return -1 if hidden else int(node.start_mark.column)
+
+    def _fault(self, node: Node, tag: str) -> str:
+        """Return what is wrong with a value that the parser reads otherwise than YAML 1.2 has it,
+        or that would harm a reader; or an empty text.
+        """
+        fault = _fault(str(node.value)) if isinstance(node, ScalarNode) else ""
+        return fault or self._tag_fault(node, tag) or self._end_fault(node)
+
+    def _tag_fault(self, node: Node, tag: str) -> str:
+        """Return what is wrong with the tag that a text writes before a value."""
+        words = _PROPERTIES.match(self.text, node.start_mark.index)
+        written = [word for word in (words[0].split() if words else ()) if word.startswith("!")]
+        if not written:
+            return ""
+        if written == ["!"]:
+            return "a ! alone: remove it, and quote a text that looks like a number"
+        return "" if _fits(node, tag) else f"the tag {tag} does not fit this value: remove the tag"
+
+    def _end_fault(self, node: Node) -> str:
+        """Return what is wrong with the lines of a value in quotes or brackets, and with what
+        follows it.
+        """
+        if not _is_enclosed(node):
+            return ""
+        end = node.end_mark.index
+        if self.text[end : end + 1] == "#":
+            return "a comment needs a space before its #, after this value"
+        # many write a closing bracket, or a comment, under the key
+        free_starts = "]}#" if isinstance(node, CollectionNode) else ""
+        lines = self.text[node.start_mark.index : end].split("\n")
+        for number, line in enumerate(lines[1:], node.start_mark.line + 2):
+            text = line.strip()
+            indent = len(line) - len(line.lstrip(" "))
+            is_shallow = self.column is not None and indent <= self.column
+            if is_shallow and text and text[0] not in free_starts:
+                return f"indent line {number}, which is part of this value, with more spaces"
+        return ""
 
     def _mapping(self, node: MappingNode, path: Where) -> dict[str | int, Value]:
         data: dict[str | int, Value] = {}
@@ -497,9 +553,11 @@ class _Builder:
                 data[key] = self.value(value_node, (*path, key), mark)
         return data
 
-    @staticmethod
-    def _key_fault(node: Node, key: str | int | None) -> str:
+    def _key_fault(self, node: Node, key: str | int | None) -> str:
         """Return what is wrong with the key of a mapping, or an empty text."""
+        start = node.start_mark.index
+        if self.text[max(0, start - 1) : start] == "?":
+            return "quote a name that begins with ? within brackets"
         fault = _fault(str(node.value)) if isinstance(node, ScalarNode) else ""
         if fault:
             return f"a key {fault}"
@@ -582,6 +640,26 @@ def _scalar(node: ScalarNode) -> Any:
     return number(text) if tag in ("int", "float") and node.style is None else text
 
 
+def _fits(node: Node, tag: str) -> bool:
+    """Return True if a tag that a text writes says what the value is without it, or a text."""
+    if isinstance(node, MappingNode):
+        return tag == "!!map"
+    if not isinstance(node, ScalarNode):
+        return tag == "!!seq"
+    return tag == "!!str" or (node.style is None and _has_type(str(node.value), tag))
+
+
+def _has_type(text: str, tag: str) -> bool:
+    """Return True if an unquoted text has the type of a tag."""
+    types = {
+        "!!int": lambda: _INT.fullmatch(text) is not None,
+        "!!float": lambda: not isinstance(number(text), str),
+        "!!bool": lambda: text in _BOOLEANS,
+        "!!null": lambda: text in _NULLS,
+    }
+    return tag in types and types[tag]()
+
+
 def number(text: str) -> int | float | str:
     """Return the number that a text represents in YAML 1.2, or the text itself if it is not a
     number.
@@ -594,6 +672,13 @@ def number(text: str) -> int | float | str:
     if bare in (".inf", ".nan"):
         return -math.inf if text[0] == "-" and bare == ".inf" else float(bare[1:])
     return text
+
+
+def _is_enclosed(node: Node) -> bool:
+    """Return True for a value in quotes or in brackets."""
+    if isinstance(node, ScalarNode):
+        return node.style in ("'", '"')
+    return isinstance(node, CollectionNode) and bool(node.flow_style)
 
 
 def _lacks_space(key: str | int | None, value: Node) -> bool:

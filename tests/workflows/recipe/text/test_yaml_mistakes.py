@@ -4,7 +4,8 @@ import pytest
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError, YAMLStreamError
 
-from neusee.workflows.recipe.text.yaml_values import directive_mistake, explained
+from neusee.workflows.graph.diagnostics import Location, RecipeError
+from neusee.workflows.recipe.text.yaml_values import directive_mistake, explained, parse
 
 MISTAKES = [
     # a quote or a bracket that never closes, or closes lines later
@@ -86,3 +87,56 @@ def test_a_directive_of_another_kind_is_refused_at_its_line(text, line, message)
 @pytest.mark.parametrize("text", ["a: 1\n", "%YAML 1.2\n---\na: 1\n", "\ufeffa: 1\n%b: 2\n", ""])
 def test_a_text_of_yaml_1_2_has_no_mistake(text):
     assert directive_mistake(text) is None
+
+
+#: texts that the parser reads otherwise than YAML 1.2 has them, or though they are none
+READ_OTHERWISE = {
+    "a: {?b: 1}": (1, 6, "quote a name that begins with ? within brackets"),
+    "a: [?b]": (1, 6, "quote a name that begins with ? within brackets"),
+    "a: ! 12": (1, 4, "a ! alone: remove it, and quote a text that looks like a number"),
+    'a: !!int "3"': (1, 4, "the tag !!int does not fit this value: remove the tag"),
+    "a: !!int 3.5": (1, 4, "the tag !!int does not fit"),
+    "a: !!float b": (1, 4, "the tag !!float does not fit"),
+    "a: !!bool yes": (1, 4, "the tag !!bool does not fit"),
+    "a: !!null x": (1, 4, "the tag !!null does not fit"),
+    "a: !!timestamp 2001-01-01": (1, 4, "the tag !!timestamp does not fit"),
+    "a: !!seq {b: 1}": (1, 4, "the tag !!seq does not fit"),
+    'a: "b"# c': (1, 4, "a comment needs a space before its #"),
+    "a: [b]# c": (1, 4, "a comment needs a space before its #"),
+    "a: [b,\nc]": (1, 4, "indent line 2, which is part of this value, with more spaces"),
+    'a: "b\nc"': (1, 4, "indent line 2, which is part of this value"),
+    'a: "b\n\tc"': (1, 4, "indent line 2, which is part of this value"),
+    "a:\n  b: {c: [1,\n  2]}": (2, 6, "indent line 3, which is part of this value"),
+    "- a: 'b\n  c'": (1, 6, "indent line 2, which is part of this value"),
+}
+READ_ALIKE = {
+    "a: {? b : 1}": {"a": {"b": 1}},
+    "a: &b !!str 12 # c": {"a": "12"},
+    "a: !!int 3": {"a": 3},
+    "a: !!float 3.5": {"a": 3.5},
+    "a: !!bool true": {"a": True},
+    "a: !!null ~": {"a": None},
+    "!!map\na: !!seq [1]": {"a": [1]},
+    'a: "b" # c': {"a": "b"},
+    "a: [\n  b, # c\n# d\n]": {"a": ["b"]},
+    "{a:\n1}": {"a": 1},
+    "a: &b\n  c: 'd\n    e'\nf: *b": {"a": {"c": "d e"}, "f": {"c": "d e"}},
+    "a: |\n  x\n   ": {"a": "x\n \n"},
+    "a: |+\n   ": {"a": "\n"},
+}
+
+
+def test_a_text_is_read_as_yaml_1_2_has_it_or_refused_with_its_place():
+    wrong = {}
+    for text, (line, column, message) in READ_OTHERWISE.items():
+        with pytest.raises(RecipeError) as caught:
+            parse(text, Location("a.yaml", 1, 1))
+        [problem] = caught.value.diagnostics
+        place = (problem.mark.line, problem.mark.column)
+        if place != (line, column) or not problem.message.startswith(message):
+            wrong[text] = place, problem.message
+    for text, expected in READ_ALIKE.items():
+        value = parse(text, Location("a.yaml", 1, 1)).plain
+        if repr(value) != repr(expected):
+            wrong[text] = value
+    assert not wrong
