@@ -160,24 +160,28 @@ def outputs_of(root: Value, wiring: Wiring) -> tuple[str, ...]:
     """Return the names of all copies, such as ``psf[mask]``, of the steps in the recipe key
     ``outputs``.
     """
-    block = root.items.get("outputs")
-    if block is None or block.data in (None, "", [], {}):
-        # else reported as unknown
-        if block is not None or not get_close_matches("outputs", map(str, root.items)):
-            wiring.refuse(
-                block or root, "outputs", "no output is requested: write outputs: [STEP, …]"
-            )
-        return ()
-    if isinstance(block.data, dict):
-        wiring.refuse(block, "outputs", "must be a list of steps, not a mapping")
-        return ()
-    values = block.data if isinstance(block.data, list) else [block]
+    values = _requested(root, wiring)
     resolved = [wiring.references.resolve(value, Scope({}, "outputs")) for value in values]
     names: list[str] = []
     for value in resolved:
         if value.data is not BROKEN:
             names += wiring.outputs(value, value.name)
     return tuple(dict.fromkeys(names))
+
+
+def _requested(root: Value, wiring: Wiring) -> list[Value]:
+    """Return the values in the recipe key ``outputs``; report a recipe that requests no output."""
+    block = root.items.get("outputs")
+    if block is None or block.data in (None, "", [], {}):
+        # else reported as unknown
+        if block is not None or not get_close_matches("outputs", map(str, root.items)):
+            message = "no output is requested: write outputs: [STEP, …]"
+            wiring.refuse(block or root, "outputs", message)
+        return []
+    if isinstance(block.data, dict):
+        wiring.refuse(block, "outputs", "must be a list of steps, not a mapping")
+        return []
+    return block.data if isinstance(block.data, list) else [block]
 
 
 def expectations(root: Value, wiring: Wiring) -> tuple[Expectation, ...]:

@@ -268,13 +268,15 @@ def _checked(composed: Composed, graph: CachedGraph) -> Recipe:
 
 
 def _settings_blocks(
-    composed: Composed, modules: Mapping[str, ModuleType]
+    composed: Composed, blocks: Sequence[Value], modules: Mapping[str, ModuleType]
 ) -> tuple[
     Composed, Training | None, LiftTraining | None, EvaluateSettings | None, Traceability | None
 ]:
     """Return a recipe without its blocks of settings, and these; few recipes need the import of
     their models.
     """
+    if not blocks:
+        return composed, None, None, None, None
     from neusee.workflows.recipe.blocks.evaluate_block import read_evaluate
     from neusee.workflows.recipe.blocks.train_block import read_lift_training, read_training
 
@@ -300,7 +302,7 @@ def check(composed: Composed) -> Recipe:
     mistakes: list[Diagnostic] = []
     own = read_own_families(composed.root, mistakes)
     composed = composed.with_problems(mistakes)
-    read = _settings_blocks(composed, own.modules) if blocks else (composed, None, None, None, None)
+    read = _settings_blocks(composed, blocks, own.modules)
     composed, training, lifting, evaluation, traceability = read
     composed, uncertain = settle(composed)
     diagnostics = list(composed.diagnostics)
@@ -311,9 +313,7 @@ def check(composed: Composed) -> Recipe:
     checker.files[(KEY,)] = own.places
     graph = cached_graph(root, own.modules)
     memory = graph.memory if graph else None
-    steps, absent = (
-        (graph.steps, graph.absent) if graph else declare(root, references, diagnostics, own)
-    )
+    steps, absent = _declared(graph, root, references, diagnostics, own)
     wiring, checked = Wiring(root, steps, absent, references, diagnostics), list[CheckedStep]()
     bound = {step.name: step for step in _bind(wiring, checker, graph, checked)}
     loops = _cycles(bound, steps, graph)
@@ -350,6 +350,19 @@ def check(composed: Composed) -> Recipe:
         traceability=traceability,
         exports=exports,
     )
+
+
+def _declared(
+    graph: CachedGraph | None,
+    root: Value,
+    references: References,
+    diagnostics: list[Diagnostic],
+    own: OwnFamilies,
+) -> tuple[dict[str, Declared], dict[str, Value]]:
+    """Return the declared steps of a recipe and those that are null, which a cached graph has."""
+    if graph is not None:
+        return graph.steps, graph.absent
+    return declare(root, references, diagnostics, own)
 
 
 def _refuse_mistakes(

@@ -182,6 +182,15 @@ def own_nodes(family: str, module: ModuleType) -> dict[str, Node]:
     return nodes
 
 
+_FOLDERS = (".", "..")
+
+
+def _names_path(where: str) -> bool:
+    """Return True for the path of a file or a folder, and not for the name of a module."""
+    has_separator = "/" in where or "\\" in where
+    return where.endswith(".py") or has_separator or where in _FOLDERS
+
+
 def import_own(where: str, folder: Path) -> ModuleType:
     """Import a module that a recipe names: a file or folder relative to ``folder``, or the name of
     a module.
@@ -190,13 +199,12 @@ def import_own(where: str, folder: Path) -> ModuleType:
     """
     from neusee.workflows.observation.observed_call import import_observed  # imports torch
 
-    is_path = where.endswith(".py") or "/" in where or "\\" in where or where in (".", "..")
+    is_path = _names_path(where)
     path = Path(folder, where).expanduser()
     try:
         if is_path:
-            return import_file(
-                path.absolute() if where not in (".", "..") else path.resolve(), import_observed
-            )
+            full_path = path.resolve() if where in _FOLDERS else path.absolute()
+            return import_file(full_path, import_observed)
         module = import_observed(where)
         note_module(where)
         return module
@@ -242,22 +250,23 @@ def unannotated(node: Node) -> list[str]:
 
 def _failure(where: str, error: BaseException) -> str:
     """Return why the import of a module failed, with the last line of the user's code that ran."""
-    lines = [
-        frame
-        for frame in traceback.extract_tb(error.__traceback__)
-        if "importlib" not in frame.filename
-    ]
-    inner = [
-        frame
-        for frame in lines
-        if not frame.filename.startswith(str(Path(neusee.nodes.__file__).parents[1]))
-    ]
+    inner = _own_frames(error)
     line = f"{Path(inner[-1].filename).name}:{inner[-1].lineno}: " if inner else ""
     if isinstance(error, SyntaxError) and error.filename:
         line = f"{Path(error.filename).name}:{error.lineno}: "
     kind = "" if type(error) is ImportError and not inner else f"{type(error).__name__}: "
     text = error.msg if isinstance(error, SyntaxError) else str(error)
     return f"{where} cannot be imported: {line}{kind}{text}".rstrip()
+
+
+def _own_frames(error: BaseException) -> list[traceback.FrameSummary]:
+    """Return the lines of an error that are neither of the import nor of neusee."""
+    ours = str(Path(neusee.nodes.__file__).parents[1])
+    return [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if "importlib" not in frame.filename and not frame.filename.startswith(ours)
+    ]
 
 
 def _exists(family: str, own: Own) -> bool:

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence, Sized
+from collections.abc import (
+    Callable,
+    Collection,
+    Container,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+    Sized,
+)
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -297,10 +306,7 @@ def check_steps(
     to date.
     """
     by_name = {candidate.step.name: candidate for candidate in checked}
-    sources = {
-        name: tuple(s for s in candidate.step.sources if s in by_name)
-        for name, candidate in by_name.items()
-    }
+    sources = {name: _sources_among(by_name, candidate.step) for name, candidate in by_name.items()}
     computed = set(ordered(sources, [name for name in outputs or () if name in by_name]))
     checks = _FormChecks(
         by_name=by_name,
@@ -310,11 +316,14 @@ def check_steps(
         before={} if before is None else before,
         memory=machine_memory(),
     )
-    notes: dict[str, Iterable[str]] = {}
-    for name in by_name if outputs is None else ordered(sources, by_name):
-        notes[name] = checks.notes_of(name)
+    order = by_name if outputs is None else ordered(sources, by_name)
+    notes = {name: checks.notes_of(name) for name in order}
     for name in by_name:
         checker.notes.update(dict.fromkeys(notes.get(name, ())))
+
+
+def _sources_among(names: Container[str], step: Step) -> tuple[str, ...]:
+    return tuple(name for name in step.sources if name in names)
 
 
 @dataclass

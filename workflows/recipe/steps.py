@@ -93,12 +93,17 @@ def declare(
             continue
         node = _node(value, find, references, diagnostics, own)
         dims = _dims(value, root, diagnostics)
-        copies = math.prod(len(root.items[dim].items) for dim in dims or ())
+        copies = _number_of_copies(dims, root)
         total += copies
         if total > _MOST:
             raise RecipeError([_too_many(value, dims or (), root, copies, total)])
         steps[name] = Declared(name, value, node, dims or (), _items_of(dims, root))
     return steps, absent
+
+
+def _number_of_copies(dims: tuple[str, ...] | None, root: Value) -> int:
+    """Return the number of copies of a step; 1 where the lists of items are wrong."""
+    return math.prod(len(root.items[dim].items) for dim in dims or ())
 
 
 def _written_steps(root: Value, diagnostics: list[Diagnostic]) -> list[tuple[str, Value]]:
@@ -391,32 +396,56 @@ class Wiring:
         """Return the steps that feed an input, from its value in the step's key ``from``, or
         None for a mistake.
         """
-        many, path, parsed = takes_many(node, name), f"{step.value.name}.from.{name}", _parse(value)
-        null = self.absent.get(parsed[0]) if parsed else None
-        if value.data is None or null:
-            if many:
-                return ()
-            if name not in node.optional:
-                instead = f"{parsed[0]}, which is null ({null.mark})" if parsed and null else "null"
-                self.refuse(value, path, f"{node.path} needs {name}, but the input is {instead}")
-            return None
+        is_many, path = takes_many(node, name), f"{step.value.name}.from.{name}"
+        if self._is_null(value):
+            if not is_many and name not in node.optional:
+                self._refuse_null(node, name, value, path)
+            return () if is_many else None
         here = dict(zip(step.dims, items, strict=True))
         names = self._producers(value, path, here, self._makers(needs(node, name)))
-        if names is None or parsed is None:
+        if names is None:
             return None
-        producer, chosen_items = self.steps[parsed[0]], parsed[1]
-        self._agree(node, name, producer, value, path)
-        if many:
-            return names
-        if set(producer.dims) <= set(here) or len(chosen_items or ()) == len(producer.dims):
-            return names[0]
+        self._agree(node, name, self._named(value), value, path)
+        if not is_many and not self._is_single(value, here):
+            self._refuse_copies(node, name, value, path, here)
+            return None
+        return names if is_many else names[0]
+
+    def _named(self, value: Value) -> Declared:
+        """Return the step that a value names, which exists."""
+        parsed = _parse(value)
+        assert parsed is not None
+        return self.steps[parsed[0]]
+
+    def _is_single(self, value: Value, here: Mapping[str, str]) -> bool:
+        """Return True if a value names one copy of a step; ``here`` contains the items of the step
+        that reads it.
+        """
+        parsed, producer = _parse(value), self._named(value)
+        chosen_items = parsed[1] if parsed else None
+        return set(producer.dims) <= set(here) or len(chosen_items or ()) == len(producer.dims)
+
+    def _refuse_copies(
+        self, node: Node, name: str, value: Value, path: str, here: Mapping[str, str]
+    ) -> None:
+        producer = self._named(value)
         left = ", ".join(dim for dim in producer.dims if dim not in here)
         message = (
-            f"{node.path} takes one step as {name}; {parsed[0]} is a step for each of {left}: write"
-            f" {_example_of(producer)}"
+            f"{node.path} takes one step as {name}; {producer.name} is a step for each of {left}:"
+            f" write {_example_of(producer)}"
         )
         self.refuse(value, path, message)
-        return None
+
+    def _is_null(self, value: Value) -> bool:
+        """Return True for an input that is null, or that names a step that is null."""
+        parsed = _parse(value)
+        return value.data is None or (parsed is not None and parsed[0] in self.absent)
+
+    def _refuse_null(self, node: Node, name: str, value: Value, path: str) -> None:
+        parsed = _parse(value)
+        null = self.absent.get(parsed[0]) if parsed else None
+        instead = f"{parsed[0]}, which is null ({null.mark})" if parsed and null else "null"
+        self.refuse(value, path, f"{node.path} needs {name}, but the input is {instead}")
 
     def _producers(
         self, value: Value, path: str, here: Mapping[str, str], makers: str = ""
@@ -539,7 +568,10 @@ def needs(node: Node, name: str) -> tuple[type, ...]:
     without classes.
     """
     hints = _options(node.hints.get(name))
-    return tuple(k for h in hints for k in _kinds(get_args(h)[0] if get_origin(h) in _LISTS else h))
+    kinds: list[type] = []
+    for hint in hints:
+        kinds += _kinds(get_args(hint)[0] if get_origin(hint) in _LISTS else hint)
+    return tuple(kinds)
 
 
 def _returned(step: Declared) -> list[type]:
@@ -555,7 +587,7 @@ def _options(hint: Any) -> list[Any]:
     if get_origin(hint) is Annotated:
         return _options(get_args(hint)[0])
     if get_origin(hint) in (Union, types.UnionType):
-        return [option for member in get_args(hint) for option in _options(member)]
+        return list(itertools.chain.from_iterable(map(_options, get_args(hint))))
     return [] if hint is None or hint is type(None) else [hint]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
@@ -383,15 +384,8 @@ def read_safety(
 
     The full path of a file is added to ``files``, by the path of the value in the recipe.
     """
-    lasers = root.items[LASERS].items if LASERS in root.items else {}
-    references.used |= {(LASERS, name, field) for name in lasers for field in Laser.model_fields}
-    block = references.resolve(root.items[KEY], Scope({}, KEY))
-    if broken(block) or block.data is None:
-        return None
-    if not isinstance(block.data, dict):
-        diagnostics.append(
-            Diagnostic(block.mark, KEY, f"must be a mapping of settings, not {kind(block)}")
-        )
+    block = _settings_of(root, references, diagnostics)
+    if block is None:
         return None
     before = len(diagnostics)
     block = _located_in(block, root.mark.file)
@@ -404,6 +398,22 @@ def read_safety(
     values = {dotted(path): value for path, value in _leaves(block, ())}
     values |= {dotted(path): value for path, value in _leaves(item, ("laser",))}
     return Safety(laser, settings, str(item.path[-1]), values, laws)
+
+
+def _settings_of(
+    root: Value, references: References, diagnostics: list[Diagnostic]
+) -> Value | None:
+    """Return the block ``safety`` with its references resolved, or None for null or a mistake."""
+    lasers = root.items[LASERS].items if LASERS in root.items else {}
+    references.used |= {(LASERS, *pair) for pair in product(lasers, Laser.model_fields)}
+    block = references.resolve(root.items[KEY], Scope({}, KEY))
+    if broken(block) or block.data is None:
+        return None
+    if isinstance(block.data, dict):
+        return block
+    message = f"must be a mapping of settings, not {kind(block)}"
+    diagnostics.append(Diagnostic(block.mark, KEY, message))
+    return None
 
 
 def _laws(

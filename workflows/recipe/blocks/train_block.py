@@ -565,22 +565,9 @@ def _wrong_network(block: Value, training: Training) -> Iterator[Diagnostic]:
 
     network = training.network
     if network.architecture is None:
-        if alone := next(
-            (value for name in _OF_CLASS[1:] if (value := block.child(name)) and value.plain), None
-        ):
-            yield Diagnostic(
-                alone.mark,
-                alone.name,
-                "is of a class of your own: name it by architecture: mynet.MyClass",
-            )
+        yield from _without_class(block)
         return
-    for name, value in block.items.items():
-        if name not in _OF_CLASS and not Path(value.mark.folder).is_relative_to(packaged()):
-            text = (
-                f"{name} is of the networks of neusee: write parameters: {{{name}: {value.plain}}}"
-                " for your class"
-            )
-            yield Diagnostic(value.mark, value.name, text)
+    yield from _of_packaged_networks(block)
     try:
         net = own_network(network.architecture, network.parameters, network.multiple)
         if not any(parameter.requires_grad for parameter in net.parameters()):
@@ -591,6 +578,27 @@ def _wrong_network(block: Value, training: Training) -> Iterator[Diagnostic]:
     except ParameterError as error:
         value = block.child(error.parameter) or block.items["architecture"]
         yield Diagnostic(value.mark, value.name, str(error))
+
+
+def _without_class(block: Value) -> Iterator[Diagnostic]:
+    """Yield a diagnostic for the first setting of a class of the user, where none is named."""
+    for name in _OF_CLASS[1:]:
+        value = block.child(name)
+        if value and value.plain:
+            message = "is of a class of your own: name it by architecture: mynet.MyClass"
+            yield Diagnostic(value.mark, value.name, message)
+            return
+
+
+def _of_packaged_networks(block: Value) -> Iterator[Diagnostic]:
+    """Yield a diagnostic for each setting of the packaged networks beside a class of the user."""
+    for name, value in block.items.items():
+        if name not in _OF_CLASS and not Path(value.mark.folder).is_relative_to(packaged()):
+            text = (
+                f"{name} is of the networks of neusee: write parameters: {{{name}: {value.plain}}}"
+                " for your class"
+            )
+            yield Diagnostic(value.mark, value.name, text)
 
 
 def _plain(block: Value) -> Any:

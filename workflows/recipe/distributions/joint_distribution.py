@@ -386,10 +386,7 @@ def _document(path: Path, mark: Location | None) -> Posterior:
 
 def _calibrated(doc: Mapping[str, Any], path: Path, mark: Location | None) -> Posterior:
     """Return the posterior of a calibration, whose draws stand in a file beside it."""
-    if doc.get("failed"):
-        failed = [check["name"] for check in doc.get("checks", ()) if check["mark"] == "fail"]
-        checks = "1 check fails" if doc["failed"] == 1 else f"{doc['failed']} checks fail"
-        raise ValueError(f"the calibration cannot be used: {checks} ({'; '.join(failed)})")
+    _refuse_failed(doc)
     joint = read_posterior(path.with_name("draws.npz"), mark).joint
     assert joint.draws is not None
     rows = {POSTERIOR_NAMES.get(name, name): row for name, row in doc["parameters"].items()}
@@ -401,6 +398,15 @@ def _calibrated(doc: Mapping[str, Any], path: Path, mark: Location | None) -> Po
     untold = tuple(name for name in rows if name not in columns)
     kinds = {name: str(row["kind"]) for name, row in rows.items()}
     return replace(posterior, kinds=kinds, untold=untold)
+
+
+def _refuse_failed(doc: Mapping[str, Any]) -> None:
+    """Raise ValueError for a calibration of which a check fails."""
+    if not doc.get("failed"):
+        return
+    failed = [check["name"] for check in doc.get("checks", ()) if check["mark"] == "fail"]
+    checks = "1 check fails" if doc["failed"] == 1 else f"{doc['failed']} checks fail"
+    raise ValueError(f"the calibration cannot be used: {checks} ({'; '.join(failed)})")
 
 
 def _drawn(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Posterior:
@@ -437,14 +443,7 @@ def _normal(moments: Mapping[str, Any]) -> Joint:
     names = [str(name) for name in moments["mean"]]
     mean = np.array([_si(x) for x in moments["mean"].values()])
     if "covariance" in moments:
-        covariance = _matrix(moments["covariance"])
-        sd = np.sqrt(np.diag(covariance).clip(0)) if covariance.ndim == 2 else np.zeros(0)
-        if sd.shape != mean.shape or not (sd > 0).all():
-            raise ValueError(
-                f"the covariance must be a matrix of {len(names)} x {len(names)} with positive"
-                " variances"
-            )
-        return Joint.of_normal(names, mean, sd, covariance / sd / sd[:, None])
+        return _of_covariance(names, mean, _matrix(moments["covariance"]))
     if not isinstance(moments["sd"], dict) or set(map(str, moments["sd"])) != set(names):
         raise ValueError("sd must have a value for each name in mean, and no other names")
     sd = np.array([_si(moments["sd"][name]) for name in moments["mean"]])
@@ -452,6 +451,16 @@ def _normal(moments: Mapping[str, Any]) -> Joint:
         _matrix(moments["correlation"]) if "correlation" in moments else np.eye(len(names))
     )
     return Joint.of_normal(names, mean, sd, correlation)
+
+
+def _of_covariance(names: list[str], mean: FloatArray, covariance: FloatArray) -> Joint:
+    sd = np.sqrt(np.diag(covariance).clip(0)) if covariance.ndim == 2 else np.zeros(0)
+    if sd.shape != mean.shape or not (sd > 0).all():
+        raise ValueError(
+            f"the covariance must be a matrix of {len(names)} x {len(names)} with positive"
+            " variances"
+        )
+    return Joint.of_normal(names, mean, sd, covariance / sd / sd[:, None])
 
 
 def _refuse_other_moments(moments: Mapping[str, Any]) -> None:

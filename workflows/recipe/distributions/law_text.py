@@ -280,12 +280,7 @@ def _bound(argument: str, law: Law) -> float:
 
 def _empirical(text: str, arguments: Sequence[str], folder: Path, mark: Location | None) -> Law:
     """Return the distribution of the samples in a file, each with the same probability."""
-    options = {}
-    for argument in arguments[1:]:
-        match = _OPTION.fullmatch(argument)
-        if match is None or match[1] in options:
-            raise ValueError(_form("empirical"))
-        options[match[1]] = match[2].strip().strip("\"'")
+    options = _options_of(arguments[1:])
     path = folder / Path(arguments[0].strip("\"'")).expanduser()
     if mark is not None:
         refuse_outside(path, mark)
@@ -311,6 +306,17 @@ def _empirical(text: str, arguments: Sequence[str], folder: Path, mark: Location
         file=path,
         written_path=arguments[0],
     )
+
+
+def _options_of(arguments: Sequence[str]) -> dict[str, str]:
+    """Return the values of the options ``column`` and ``unit`` of samples in a file."""
+    options: dict[str, str] = {}
+    for argument in arguments:
+        match = _OPTION.fullmatch(argument)
+        if match is None or match[1] in options:
+            raise ValueError(_form("empirical"))
+        options[match[1]] = match[2].strip().strip("\"'")
+    return options
 
 
 def _column(path: Path, names: Sequence[str], name: str | None) -> str:
@@ -425,18 +431,23 @@ def _difference(path: str, leaf: Value, root: Value) -> Difference:
             f" {law.text}"
         )
     if law.multiplies:
-        if law.unit:
-            raise ValueError(f"{law.kind} multiplies {path}: write it without the unit {law.unit}")
-        if not value:
-            raise ValueError(
-                f"{path} is 0, which {law.text} would multiply: write normal(…, …) or uniform(…, …)"
-            )
+        _refuse_factor(law, path, value)
     elif law.unit != unit:
         raise ValueError(
             f"{law.text} is added to {path}, whose unit is {unit or 'none'}, not"
             f" {law.unit or 'none'}"
         )
     return Difference(replace(law, unit=unit), value, leaf.mark)
+
+
+def _refuse_factor(law: Law, path: str, value: float) -> None:
+    """Raise ValueError for a factor with a unit, and for a value that no factor changes."""
+    if law.unit:
+        raise ValueError(f"{law.kind} multiplies {path}: write it without the unit {law.unit}")
+    if not value:
+        raise ValueError(
+            f"{path} is 0, which {law.text} would multiply: write normal(…, …) or uniform(…, …)"
+        )
 
 
 def _own(path: str, own: Value) -> tuple[float, str]:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -355,7 +356,7 @@ class Inputs:
             (uncertain, {}) if negligible is None else within_allowed(uncertain, negligible)
         )
         readers = _all_readers(recipe, uncertain, outputs)
-        with_effect = {name for inputs in readers.values() for _, name in inputs}
+        with_effect = {name for _, name in chain.from_iterable(readers.values())}
         if not with_effect:
             raise NothingDrawn(f"no output depends on {', '.join(uncertain.names)}")
         idle = tuple(name for name in uncertain.names if name not in with_effect)
@@ -536,20 +537,25 @@ def _changed(before: Any, after: Any) -> Iterator[tuple[Index, Any]]:
     """Yield the index of each element in which two values of a parameter differ, and the new
     element.
     """
-    if (
-        isinstance(after, list | tuple)
-        and isinstance(before, list | tuple)
-        and len(after) == len(before)
-    ):
-        for i, (a, b) in enumerate(zip(before, after, strict=True)):
-            yield from (((i, *inner), new) for inner, new in _changed(a, b))
-    elif (
-        isinstance(after, Mapping) and isinstance(before, Mapping) and after.keys() == before.keys()
-    ):
-        for key, b in after.items():
-            yield from (((key, *inner), new) for inner, new in _changed(before[key], b))
+    pairs = _paired(before, after)
+    if pairs is not None:
+        for index, (earlier, later) in pairs.items():
+            yield from (((index, *inner), new) for inner, new in _changed(earlier, later))
     elif before != after:
         yield (), after
+
+
+def _paired(before: Any, after: Any) -> dict[Any, tuple[Any, Any]] | None:
+    """Return the elements of two lists or mappings by index, or None if they have no common
+    indices.
+    """
+    lists = isinstance(before, list | tuple) and isinstance(after, list | tuple)
+    if lists and len(after) == len(before):
+        return dict(enumerate(zip(before, after, strict=True)))
+    mappings = isinstance(before, Mapping) and isinstance(after, Mapping)
+    if mappings and after.keys() == before.keys():
+        return {key: (before[key], value) for key, value in after.items()}
+    return None
 
 
 def put_at(value: Any, index: Index, new: float) -> Any:

@@ -64,7 +64,7 @@ def _limit_in_unit(error: ErrorDetails, value: Value) -> str:
     """Return the sentence for a limit of a quantity in a unit that a reader would use, or "" for
     any other error.
     """
-    name = next((name for name in _LIMITS if name in error.get("ctx", {})), None)
+    name = _limit_name(error)
     if name is None:
         return ""
     limit = error["ctx"][name]
@@ -77,6 +77,11 @@ def _limit_in_unit(error: ErrorDetails, value: Value) -> str:
     if name == "ge" and limit > 0 and _is_at_most_zero(error["input"]):
         return "must be greater than 0"
     return f"must be {_LIMITS[name]} {in_words(limit, si)}" if si and limit else ""
+
+
+def _limit_name(error: ErrorDetails) -> str | None:
+    """Return the name that a model gives to the limit of an error, or None for another error."""
+    return next((name for name in _LIMITS if name in error.get("ctx", {})), None)
 
 
 def _is_at_most_zero(number: object) -> bool:

@@ -135,16 +135,18 @@ def _fault(
     if advice := advice_on_argument(o.text, ".".join(o.path)):
         return advice
     if isinstance(here.data, list):
-        is_next = is_added and missing == (str(len(here.data)),)
-        return None if is_next else f"{here.name} has {_indices(here.data)}"
+        return _index_fault(here, missing, is_added)
     if is_added or (not o.sign and _implied(root, o.path)):
         is_open = isinstance(here.data, dict | None)
         return None if is_open else f"{here.name} is a single value, not a mapping"
     return instead(".".join(o.path)) or f"unknown; {_suggest(root, o.path, groups)}"
 
 
-def _indices(values: list[Value]) -> str:
-    return f"{len(values)} values: 0 to {len(values) - 1}"
+def _index_fault(values: Value, missing: tuple[str, ...], is_added: bool) -> str | None:
+    """Return the message for an index that a list does not have, unless it adds the next value."""
+    count = len(values.data)
+    is_next = is_added and missing == (str(count),)
+    return None if is_next else f"{values.name} has {count} values: 0 to {count - 1}"
 
 
 def _implied(root: Value, path: tuple[str, ...]) -> bool:

@@ -6,8 +6,9 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -49,8 +50,13 @@ class Scope:
             return self.items[parts[1]], parts[2:], ""
         if not dims:
             return None, [], f"${{{'.'.join(parts)}}} needs `each` in steps.{self.step}"
-        below = "".join(f".{name}" for name in parts[1 if parts[0] == "item" else 2 :])
+        below = "".join(f".{name}" for name in _below_item(parts))
         return None, [], f"write {' or '.join(f'${{each.{dim}{below}}}' for dim in dims)}"
+
+
+def _below_item(parts: list[str]) -> list[str]:
+    """Return the path below the item to which a reference such as ``${each.lasers.x}`` refers."""
+    return parts[1:] if parts[0] == "item" else parts[2:]
 
 
 class References:
@@ -163,16 +169,8 @@ class References:
         if target.path in self.known:
             self.trace += self._traces[target.path]
             return self.known[target.path]
-        if target.path in self.open:
-            loop = [*self.open[self.open.index(target.path) :], target.path]
-            self._fail(origin, f"the value refers to itself: {' -> '.join(map(dotted, loop))}")
-            return None
-        if len(self.open) > _DEEPEST:
-            self._fail(origin, f"the value begins a chain of more than {_DEEPEST} references")
-            return None
-        self.followed = self.followed + 1 if self.open else 0
-        if self.followed > _MOST_VALUES:
-            self._fail(origin, f"references expand this value to more than {_MOST_VALUES} values")
+        if fault := self._chain_fault(target):
+            self._fail(origin, fault)
             return None
         self.open.append(target.path)
         first = len(self.trace)
@@ -191,6 +189,18 @@ class References:
             self.trace[first:] = dict(self.trace[first:]).items()
             self.known[target.path], self._traces[target.path] = value, self.trace[first:]
         return value
+
+    def _chain_fault(self, target: Value) -> str:
+        """Return what is wrong with one more reference behind those that are being resolved."""
+        if target.path in self.open:
+            loop = [*self.open[self.open.index(target.path) :], target.path]
+            return f"the value refers to itself: {' -> '.join(map(dotted, loop))}"
+        if len(self.open) > _DEEPEST:
+            return f"the value begins a chain of more than {_DEEPEST} references"
+        self.followed = self.followed + 1 if self.open else 0
+        if self.followed > _MOST_VALUES:
+            return f"references expand this value to more than {_MOST_VALUES} values"
+        return ""
 
     def _weight(self, value: Value) -> int:
         """Return the number of values in a resolved value, in which references may repeat the
@@ -239,9 +249,9 @@ class References:
                 if parts[0] not in ("item", "each"):
                     self._target(match[1], text, Scope({}, ""))
                     continue
-                below = parts[1 if parts[0] == "item" else 2 :]
-                blocks = ((dim, self.root.items[dim].items) for dim in dims or self.root.items)
-                self.used |= {(dim, name, *below) for dim, block in blocks for name in block}
+                below = _below_item(parts)
+                for dim in dims or self.root.items:
+                    self.used |= {(dim, name, *below) for name in self.root.items[dim].items}
 
     def finish(self) -> None:
         """Report values of the recipe that no step uses, and references to values that do not
@@ -251,7 +261,7 @@ class References:
         may set more values than a recipe uses: a camera needs the pixel pitch, a bench does not.
         """
         targets = dict(self.lacking)
-        misspelt = set()
+        misspelt = set[Where]()
         for leaf in self._unused():
             meant = self._meant(leaf) or ()
             if meant not in targets and self._may_be_unused(leaf):
@@ -259,6 +269,10 @@ class References:
                 continue
             misspelt.add(meant)
             self.diagnostics.append(_unknown(leaf, meant, targets.get(meant)))
+        self._report_lacking(misspelt)
+
+    def _report_lacking(self, misspelt: Container[Where]) -> None:
+        """Report the references to values that do not exist, but for those in ``misspelt``."""
         lacking = [(path, problem) for path, problem in self.lacking if path not in misspelt]
         incomplete = dict(self._incomplete({path for path, _ in lacking}))
         self.diagnostics += incomplete.values()
@@ -283,27 +297,18 @@ class References:
         """
         for key in dict.fromkeys(path[0] for path in sorted(lacking, key=str)):
             block = self.root.items.get(str(key))
-            paths = sorted(
-                dotted(path[1:]) for path in lacking if path[0] == key and len(path) == 2
-            )
-            if block is None or not block.mark.line or not isinstance(block.data, dict):
-                continue
-            place = _place(block)
-            if place == "packaged" or len(paths) < (3 if place == "recipe" else 1):
-                continue
-            names = ", ".join(paths[:6]) + (f" and {len(paths) - 6} more" if len(paths) > 6 else "")
-            advice = _ADVICE_IN_RECIPE if place == "recipe" else _ADVICE_IN_OPTION
-            yield (
-                key,
-                Diagnostic(block.key, str(key), f"lacks {names}, which steps need: {advice}"),
-            )
+            paths = [path for path in lacking if path[0] == key and len(path) == 2]
+            if block is not None and (message := _lacking_message(block, paths)):
+                yield key, Diagnostic(block.key, str(key), message)
 
     def _unused(self) -> list[Value]:
         blocks = (block for key, block in self.root.items.items() if key not in RESERVED)
-        leaves = (leaf for block in blocks for leaf in block.leaves() if leaf.data != {})
-        return [
-            v for v in leaves if not any(v.path[:n] in self.used for n in range(1, len(v.path) + 1))
-        ]
+        leaves = chain.from_iterable(block.leaves() for block in blocks)
+        return [leaf for leaf in leaves if leaf.data != {} and not self._is_used(leaf)]
+
+    def _is_used(self, leaf: Value) -> bool:
+        """Return True if a step uses a value, or a block that has the value."""
+        return any(leaf.path[:n] in self.used for n in range(1, len(leaf.path) + 1))
 
     def _meant(self, leaf: Value) -> Where | None:
         """Return the path that a user probably meant by an unused path: its new name, or a
@@ -316,6 +321,20 @@ class References:
             {(name,) for name in (*RESERVED, "defaults")} if len(leaf.path) == 1 else set()
         )
         return _nearest(leaf.path, candidates)
+
+
+def _lacking_message(block: Value, paths: Iterable[Where]) -> str:
+    """Return the message for a block of the user that lacks the values at ``paths``, or an empty
+    text where each step says so itself.
+    """
+    if not block.mark.line or not isinstance(block.data, dict):
+        return ""
+    names, place = sorted(dotted(path[1:]) for path in paths), _place(block)
+    if place == "packaged" or len(names) < (3 if place == "recipe" else 1):
+        return ""
+    listed = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+    advice = _ADVICE_IN_RECIPE if place == "recipe" else _ADVICE_IN_OPTION
+    return f"lacks {listed}, which steps need: {advice}"
 
 
 def _unknown(leaf: Value, meant: Where, needed: Diagnostic | None) -> Diagnostic:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterable
 from importlib import resources
+from itertools import product
 
 _TABLE = tomllib.loads(
     resources.files(__package__).joinpath("renamed_keys.toml").read_text(encoding="utf-8")
@@ -14,7 +15,10 @@ _TABLE = tomllib.loads(
 _CALLED: dict[str, str] = _TABLE["called"]
 _GRID, _ON_A_GRID = _TABLE["pupil_grid"]["parameters"], _TABLE["pupil_grid"]["nodes"]
 _REMOVED: dict[str, str] = {
-    **{f"{node}.{name}": _TABLE["pupil_grid"]["instead"] for node in _ON_A_GRID for name in _GRID},
+    **dict.fromkeys(
+        (f"{node}.{name}" for node, name in product(_ON_A_GRID, _GRID)),
+        _TABLE["pupil_grid"]["instead"],
+    ),
     **_TABLE["removed"],
 }
 #: present name by that of version 0.1, of a parameter

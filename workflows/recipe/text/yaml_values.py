@@ -8,6 +8,7 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -188,27 +189,41 @@ def _open_bracket(error: MarkedYAMLError, text: str) -> YamlMistake | None:
     )
 
 
+#: what to do, by a phrase in the problem of the parser
+_SENTENCES = {
+    "mapping values are not allowed": (
+        "a second ':' on this line, or a wrong indent: quote the text, or begin a new line"
+    ),
+    "but found another document": "a second document (---): a recipe must be a single document",
+    "expected '<document start>'": "a line --- must follow %YAML: write it, or remove %YAML",
+}
+
+
 def _sentence(problem: str, here: str, column: int) -> str:
     """Return what to do about a problem of the parser in the line ``here``."""
     if "\\t" in problem or "\t" in here[: column + 1]:
         return "a tab: indent YAML with spaces"
-    if re.search(r"[^\"']\$\{", here) and "expected" in problem:
-        return 'inside { } or [ ], quote a reference: "${…}"'
-    if re.search(r"\[[^\]]*\w\[", here) and "'['" in problem:
-        return 'inside [ ], quote a name with brackets: "psf[mask]"'
-    if "mapping values are not allowed" in problem:
-        return "a second ':' on this line, or a wrong indent: quote the text, or begin a new line"
-    if "but found another document" in problem:
-        return "a second document (---): a recipe must be a single document"
+    if advice := _advice_on_brackets(problem, here):
+        return advice
+    for phrase, sentence in _SENTENCES.items():
+        if phrase in problem:
+            return sentence
     if "cannot start any token" in problem:
         return f"a text cannot begin with {here[column : column + 1]}: quote the text"
-    if "expected '<document start>'" in problem:
-        return "a line --- must follow %YAML: write it, or remove %YAML"
     if alias := re.search(r"found undefined alias '(.*)'", problem):
         return f"no value above has the anchor &{alias[1]}: refer to values with ${{…}}"
     if "expected <block end>" in problem:
         return _wrong_indent(problem, here)
     return f"is not YAML: {problem}"
+
+
+def _advice_on_brackets(problem: str, here: str) -> str:
+    """Return what to quote within brackets in the line ``here``, or an empty text."""
+    if re.search(r"[^\"']\$\{", here) and "expected" in problem:
+        return 'inside { } or [ ], quote a reference: "${…}"'
+    if re.search(r"\[[^\]]*\w\[", here) and "'['" in problem:
+        return 'inside [ ], quote a name with brackets: "psf[mask]"'
+    return ""
 
 
 def _wrong_indent(problem: str, here: str) -> str:
@@ -574,11 +589,8 @@ class _Builder:
         """Count the values in a YAML list or mapping; raise `RecipeError` if aliases produce too
         many values.
         """
-        children = (
-            [v for pair in node.value for v in pair]
-            if isinstance(node, MappingNode)
-            else node.value
-        )
+        is_mapping = isinstance(node, MappingNode)
+        children = list(chain.from_iterable(node.value)) if is_mapping else node.value
         self.size[id(node)] = 1 + sum(self.size.get(id(child), 1) for child in children)
         self._refuse_many(self.size[id(node)], _MOST, value.mark, value.path)
 

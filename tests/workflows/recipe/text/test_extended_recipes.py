@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from neusee.workflows.cli.app import main
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.keys.cache_key import key_of
@@ -178,6 +179,14 @@ def test_a_wrong_argument_is_one_mistake_with_what_to_write(files, write):
         if len(messages) != 1 or f" | {argument} | {expected}" not in messages[0]:
             wrong[argument] = messages
     assert not wrong
+
+
+@pytest.mark.parametrize("word", ["-m", "--multirun"])
+def test_several_runs_are_a_sweep(word, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["run", word, "first_light", "laser=green,red"])
+    assert stopped.value.code == 2
+    assert "several values are a sweep: write `neusee sweep RECIPE" in capsys.readouterr().err
 
 
 def test_an_argument_replaces_the_option_of_an_extended_recipe(files, write):
