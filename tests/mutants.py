@@ -113,6 +113,74 @@ def faults(file: str, tests: str, *changes: tuple[str, str]) -> list[Mutant]:
 
 
 MUTANTS = (
+    # Recipes that extend recipes, and values that YAML 1.2 has otherwise than the parser.
+    *faults(
+        "workflows/recipe/text/composition.py",
+        within(
+            "workflows/recipe/text",
+            "extended_recipes.py::test_a_recipe_is_composed_of_what_its_defaults_say",
+        ),
+        ("                layers[place] = entry\n                return", "                return"),
+    ),
+    Mutant(
+        "workflows/recipe/text/composition.py",
+        "                self.replaced.append(layer)\n",
+        "",
+        within(
+            "workflows/recipe/text",
+            "extended_recipes.py::test_a_value_of_an_extended_recipe_for_an_option_that_is_replaced_is_noted",
+        ),
+    ),
+    *faults(
+        "workflows/recipe/text/composition.py",
+        within(
+            "workflows/recipe/text",
+            "extended_recipes.py::test_a_wrong_entry_is_one_located_mistake",
+        ),
+        ("if any(os.path.realpath(path) == real for path in open_):", "if False:"),
+        ("        if file in self.extended:", "        if False:"),
+        ("if message := _chosen_before(entry, layers, before):", "if message := '':"),
+        ("        if not self._written.is_complete:", "        if False:"),
+    ),
+    *faults(
+        "workflows/recipe/text/defaults_list.py",
+        within(
+            "workflows/recipe/text",
+            "extended_recipes.py::test_a_recipe_is_composed_of_what_its_defaults_say",
+        ),
+        ("    if value.data == SELF:", "    if value.data == '':"),
+        ("is_optional = name.startswith(_OPTIONAL)", "is_optional = False"),
+    ),
+    Mutant(
+        "workflows/recipe/loading.py",
+        "    for extended in composed.extended if recipe.expect else ():",
+        "    for extended in ():",
+        within(
+            "workflows/recipe/text",
+            "extended_recipes.py::test_expected_numbers_that_an_extending_recipe_changes_are_not_compared",
+        ),
+    ),
+    Mutant(
+        "workflows/answers/repeated_command.py",
+        "_recipe_folders(self._words) | beside",
+        "_recipe_folders(self._words)",
+        within("workflows/answers", "repeated_command.py::test_what_has_changed_is_computed_anew"),
+    ),
+    *faults(
+        "workflows/recipe/text/yaml_values.py",
+        within(
+            "workflows/recipe/text",
+            "yaml_mistakes.py::test_a_text_is_read_as_yaml_1_2_has_it_or_refused_with_its_place",
+        ),
+        ("is_shallow = self.column is not None and indent <= self.column", "is_shallow = False"),
+        ('if self.text[end : end + 1] == "#":', "if False:"),
+        ('    if text.rpartition("\\n")[2].isspace():', "    if False:"),
+        ('        if written == ["!"]:', "        if False:"),
+        (
+            'free_starts = "]}#" if isinstance(node, CollectionNode)',
+            'free_starts = "" if isinstance(node, CollectionNode)',
+        ),
+    ),
     # Faults that no test found once.
     Mutant(
         "nodes/sensor/_exposure.py",

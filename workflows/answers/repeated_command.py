@@ -410,13 +410,15 @@ class Command:
 
     def _witnesses(self, out: Path | None, inputs: Iterable[str]) -> Witnesses:
         """Return the witnesses of the answer; folders of results in ``out`` are no witnesses."""
-        recipes = _recipe_folders(self._words)
         ignored = Folders(
             [*_installed(), *_SYSTEM, self._disk.folder, *(ROOT / name for name in SOURCES)]
         )
         cache, written = Folders([self._disk.folder]), os.path.abspath(out) if out else None
         opened = [path for path in self._opened.files if not _DERIVED.search(path)]
         files = [path for path in opened if path.endswith(_RECIPES) or path not in ignored]
+        # a recipe that another one extends may lie anywhere, with options beside it
+        beside = {os.path.dirname(path) for path in files if path.endswith(_RECIPES)}
+        recipes = _recipe_folders(self._words) | beside
         if any(path in cache for path in (os.getcwd(), *files)) or written in recipes:
             raise Unsettled("a recipe is in the folder of the cache or of results")
         folders = [

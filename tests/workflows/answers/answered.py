@@ -52,6 +52,7 @@ class Place:
             "work/mine.yaml": "title: mine\n",
             "work/laser/green.yaml": "wavelength: 532 nm\n",
             "work/table.csv": "1,2\n",
+            "other/base.yaml": "seed: 1\n",
             "home/.config/neusee/recipes/laser/red.yaml": "wavelength: 638 nm\n",
         }.items():
             (root / name).parent.mkdir(parents=True, exist_ok=True)
@@ -89,10 +90,13 @@ class Place:
         return Disk(self.root / "cache")
 
     def recipe(self) -> SimpleNamespace:
-        """Read the recipe, its option and a file that is not there, as a command does."""
+        """Read the recipe, one that it extends, its option and a file that is not there, as a
+        command does.
+        """
         text = (self.work / "mine.yaml").read_text() + (
             self.work / "laser" / "green.yaml"
         ).read_text()
+        text += (self.root / "other" / "base.yaml").read_text()
         try:
             text += (self.work / "wanted.txt").read_text()
         except FileNotFoundError:

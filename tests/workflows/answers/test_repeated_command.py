@@ -69,6 +69,7 @@ CHANGES = {
     "an option": lambda p, m: rewrite(p.work / "laser" / "green.yaml", "wavelength: 533 nm\n"),
     "an option is gone": lambda p, m: (p.work / "laser" / "red.yaml").symlink_to("green.yaml"),
     "a new option beside the recipe": lambda p, m: hide(p, "work/sensor/neusee.yaml"),
+    "a new option beside an extended recipe": lambda p, m: hide(p, "other/laser/green.yaml"),
     "a new recipe beside the recipe": lambda p, m: hide(p, "work/safety_pointer.yaml"),
     "a new option of the user": lambda p, m: hide(
         p, "home/.config/neusee/recipes/laser/green.yaml"

@@ -311,3 +311,10 @@ def test_expected_numbers_that_an_extending_recipe_changes_are_not_compared(writ
     assert {e.step for e in axicon.expect} == {"psf[plain]", "lsr[plain]"}
     [note] = [note for note in axicon.notes if note.startswith("not compared")]
     assert "LSR of the mask at 400 nm" in note
+
+
+def test_a_value_of_an_extended_recipe_for_an_option_that_is_replaced_is_noted(write, tmp_path):
+    write("defaults: [first_light]\ndoe: {orientation: 10 deg}\n", "base.yaml")
+    write("defaults: [base.yaml, {doe: axicon}]\n", "mine.yaml")
+    notes = load("mine.yaml", (), tmp_path).notes
+    assert "doe.orientation (base.yaml:2:20) is not used with doe: axicon" in notes
