@@ -115,7 +115,7 @@ def faults(file: str, tests: str, *changes: tuple[str, str]) -> list[Mutant]:
 MUTANTS = (
     # Recipes that extend recipes, and values that YAML 1.2 has otherwise than the parser.
     *faults(
-        "workflows/recipe/text/composition.py",
+        "workflows/recipe/text/extended_recipes.py",
         within(
             "workflows/recipe/text",
             "extended_recipes.py::test_a_recipe_is_composed_of_what_its_defaults_say",
@@ -123,7 +123,7 @@ MUTANTS = (
         ("                layers[place] = entry\n                return", "                return"),
     ),
     Mutant(
-        "workflows/recipe/text/composition.py",
+        "workflows/recipe/text/extended_recipes.py",
         "                self.replaced.append(layer)\n",
         "",
         within(
@@ -132,7 +132,7 @@ MUTANTS = (
         ),
     ),
     *faults(
-        "workflows/recipe/text/composition.py",
+        "workflows/recipe/text/extended_recipes.py",
         within(
             "workflows/recipe/text",
             "extended_recipes.py::test_a_wrong_entry_is_one_located_mistake",
@@ -140,7 +140,15 @@ MUTANTS = (
         ("if any(os.path.realpath(path) == real for path in open_):", "if False:"),
         ("        if file in self.extended:", "        if False:"),
         ("if message := _chosen_before(entry, layers, before):", "if message := '':"),
-        ("        if not self._written.is_complete:", "        if False:"),
+    ),
+    Mutant(
+        "workflows/recipe/text/composition.py",
+        "        if not self._written.is_complete:",
+        "        if False:",
+        within(
+            "workflows/recipe/text",
+            "extended_recipes.py::test_a_wrong_entry_is_one_located_mistake",
+        ),
     ),
     *faults(
         "workflows/recipe/text/defaults_list.py",

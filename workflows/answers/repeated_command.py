@@ -465,7 +465,7 @@ def _parts(folder: str) -> tuple[str, str]:
 
 def _recipe_folders(words: Sequence[str]) -> set[str]:
     """Return the folders in which the recipe and its options are looked for."""
-    from neusee.workflows.recipe.text.composition import shared_folders
+    from neusee.workflows.recipe.text.recipe_files import shared_folders
 
     beside = (
         os.path.dirname(os.path.expanduser(word)) for word in words if word.endswith(_RECIPES)

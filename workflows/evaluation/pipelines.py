@@ -17,8 +17,9 @@ from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.protection.equal_rivals import EqualShade
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.recipe.text.composition import compose, refuse_outside
+from neusee.workflows.recipe.text.composition import compose
 from neusee.workflows.recipe.text.overrides import Override
+from neusee.workflows.recipe.text.recipe_files import refuse_outside
 
 NONE = "none"  #: name of the restorer that restores nothing, and of the case without a laser
 FLAT = "flat"  #: option of `doe` without a mask

@@ -45,13 +45,14 @@ from neusee.workflows.recipe.step_checks import (
     refuse_indices,
 )
 from neusee.workflows.recipe.steps import Declared, Wiring, cached_of, cycles, declare, device_of
-from neusee.workflows.recipe.text.composition import Composed, compose, groups_of, shared_folders
+from neusee.workflows.recipe.text.composition import Composed, compose
 from neusee.workflows.recipe.text.overrides import (
     Override,
     arguments_in,
     overrides_of,
     read_override,
 )
+from neusee.workflows.recipe.text.recipe_files import groups_of, shared_folders
 from neusee.workflows.recipe.text.references import References
 from neusee.workflows.recipe.text.yaml_values import Value, Where
 

@@ -22,7 +22,7 @@ import neusee.nodes
 from neusee.nodes import Node
 from neusee.nodes.own_modules import FAMILY, import_file, network_classes, note_module
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
-from neusee.workflows.recipe.text.composition import NO_CODE_VARIABLE, is_strange
+from neusee.workflows.recipe.text.recipe_files import NO_CODE_VARIABLE, is_strange
 from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value, kind
 

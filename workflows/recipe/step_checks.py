@@ -38,8 +38,8 @@ from neusee.workflows.graph.step_shapes import (
 from neusee.workflows.keys.cache_key import files_in, is_own
 from neusee.workflows.recipe.node_families import Own, class_context, nodes_of
 from neusee.workflows.recipe.steps import Declared
-from neusee.workflows.recipe.text.composition import NO_CODE_VARIABLE, is_strange, refuse_outside
 from neusee.workflows.recipe.text.field_errors import message_of
+from neusee.workflows.recipe.text.recipe_files import NO_CODE_VARIABLE, is_strange, refuse_outside
 from neusee.workflows.recipe.text.references import References, broken
 from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, Where, kind

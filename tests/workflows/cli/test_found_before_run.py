@@ -674,7 +674,7 @@ def test_the_guide_states_each_limit_as_the_program_has_it():
     from neusee.nodes.spectra import _bands
     from neusee.workflows.recipe import steps as step_declarations
     from neusee.workflows.recipe.text import references, yaml_values
-    from neusee.workflows.recipe.text.composition import packaged
+    from neusee.workflows.recipe.text.recipe_files import packaged
 
     text = (packaged() / "guide" / "recipes.md").read_text(encoding="utf-8")
     stated = [

@@ -4,7 +4,7 @@ from ruamel.yaml import YAML
 
 from neusee.workflows.keys import cache_key as module_owner
 from neusee.workflows.recipe.node_families import all_nodes
-from neusee.workflows.recipe.text.composition import packaged
+from neusee.workflows.recipe.text.recipe_files import packaged
 
 
 def test_no_node_that_ships_is_one_of_the_user(monkeypatch):

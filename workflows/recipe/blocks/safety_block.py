@@ -40,7 +40,7 @@ from neusee.nodes.units import (
 )
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
 from neusee.workflows.recipe.blocks.settings_block import SettingsBlock, located
-from neusee.workflows.recipe.text.composition import refuse_outside
+from neusee.workflows.recipe.text.recipe_files import refuse_outside
 from neusee.workflows.recipe.text.references import References, Scope, broken
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted, kind
 

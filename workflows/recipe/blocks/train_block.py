@@ -46,7 +46,8 @@ from neusee.workflows.recipe.blocks.settings_block import (
     Weight,
     read_block,
 )
-from neusee.workflows.recipe.text.composition import Composed, is_strange, packaged, refuse_outside
+from neusee.workflows.recipe.text.composition import Composed
+from neusee.workflows.recipe.text.recipe_files import is_strange, packaged, refuse_outside
 from neusee.workflows.recipe.text.yaml_values import Value
 
 # --- mask design block ----------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from neusee.workflows.keys.sealed_files import (
     refuse_other_than_file as refuse_other_than_file_regular_file,
 )
 from neusee.workflows.recipe.distributions.shapes import FloatArray, scores_between
-from neusee.workflows.recipe.text.composition import refuse_outside
+from neusee.workflows.recipe.text.recipe_files import refuse_outside
 from neusee.workflows.recipe.text.renamed_keys import POSTERIOR_NAMES
 
 # --- sample table ---------------------------------------------------------------------------------

@@ -31,7 +31,7 @@ from neusee.workflows.recipe.distributions.shapes import (
     Triangular,
     Uniform,
 )
-from neusee.workflows.recipe.text.composition import refuse_outside
+from neusee.workflows.recipe.text.recipe_files import refuse_outside
 from neusee.workflows.recipe.text.yaml_values import Value
 
 # --- law text -------------------------------------------------------------------------------------

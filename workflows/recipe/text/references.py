@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from neusee.workflows.graph.diagnostics import UNREAD, Diagnostic
-from neusee.workflows.recipe.text.composition import packaged
 from neusee.workflows.recipe.text.hydra_habits import advice_on_reference
 from neusee.workflows.recipe.text.overrides import RESERVED
+from neusee.workflows.recipe.text.recipe_files import packaged
 from neusee.workflows.recipe.text.renamed_keys import instead, new_name
 from neusee.workflows.recipe.text.yaml_values import Value, Where, dotted
 
