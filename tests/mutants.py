@@ -180,7 +180,10 @@ MUTANTS = (
             "workflows/recipe/text",
             "yaml_mistakes.py::test_a_text_is_read_as_yaml_1_2_has_it_or_refused_with_its_place",
         ),
-        ("is_shallow = self.column is not None and indent <= self.column", "is_shallow = False"),
+        (
+            "if text and indent <= self.column and text[0]",
+            "if text and indent < self.column and text[0]",
+        ),
         ('if self.text[end : end + 1] == "#":', "if False:"),
         ('    if text.rpartition("\\n")[2].isspace():', "    if False:"),
         ('        if written == ["!"]:', "        if False:"),

@@ -126,37 +126,47 @@ def _refused(case: Case, error: RecipeError) -> Outcome:
 
 def alike(ours: Any, reference: Any) -> bool:
     """Return True for equal values of the same kind; the keys of JSON are texts."""
-    if isinstance(ours, dict) and isinstance(reference, dict):
-        ours = {str(key): value for key, value in ours.items()}
-        return ours.keys() == reference.keys() and all(
-            alike(value, reference[key]) for key, value in ours.items()
-        )
-    if isinstance(ours, list) and isinstance(reference, list):
-        return len(ours) == len(reference) and all(map(alike, ours, reference))
-    if isinstance(ours, bool) or isinstance(reference, bool):
-        return ours is reference
-    if isinstance(ours, int | float) and isinstance(reference, int | float):
+    if isinstance(reference, dict):
+        return isinstance(ours, dict) and _mappings_alike(ours, reference)
+    if isinstance(reference, list):
+        is_list = isinstance(ours, list) and len(ours) == len(reference)
+        return is_list and all(map(alike, ours, reference))
+    if type(reference) in (int, float) and type(ours) in (int, float):
         return math.isclose(ours, reference, rel_tol=1e-12)
     return type(ours) is type(reference) and bool(ours == reference)
 
 
+def _mappings_alike(ours: dict[Any, Any], reference: dict[str, Any]) -> bool:
+    values = {str(key): value for key, value in ours.items()}
+    if values.keys() != reference.keys():
+        return False
+    return all(alike(value, reference[key]) for key, value in values.items())
+
+
 def report(outcomes: list[Outcome]) -> Iterator[str]:
     """Yield the lines of the tables in `RESULTS.md`."""
-    counts = Counter((result.case.kind, result.state) for result in outcomes)
-    states = [state for state in (ALIKE, REFUSED, INVALID_REFUSED, *LISTED)]
-    states = [state for state in states if any(counts[kind, state] for kind in KINDS)]
     yield f"{len(outcomes)} cases; ruamel.yaml {version('ruamel.yaml')}.\n"
+    yield from _table(outcomes)
+    for state in LISTED:
+        listed = [result for result in outcomes if result.state == state]
+        if listed:
+            yield f"\n{state}:\n"
+        yield from map(_row, listed)
+
+
+def _table(outcomes: list[Outcome]) -> Iterator[str]:
+    counts = Counter((result.case.kind, result.state) for result in outcomes)
+    occurring = {result.state for result in outcomes}
+    states = [state for state in (ALIKE, REFUSED, INVALID_REFUSED, *LISTED) if state in occurring]
     yield f"| the reference is | cases | {' | '.join(states)} |"
     yield "|---" * (len(states) + 2) + "|"
     for kind in KINDS:
         numbers = [counts[kind, state] for state in states]
         yield f"| {kind} | {sum(numbers)} | {' | '.join(map(str, numbers))} |"
-    for state in LISTED:
-        listed = [result for result in outcomes if result.state == state]
-        if listed:
-            yield f"\n{state}:\n"
-        for result in listed:
-            yield f"- `{result.case.name}` {result.case.title}: {result.detail}"
+
+
+def _row(result: Outcome) -> str:
+    return f"- `{result.case.name}` {result.case.title}: {result.detail}"
 
 
 def main() -> None:
@@ -175,7 +185,7 @@ def main() -> None:
     if options.refused:
         for result in outcomes:
             if result.state == REFUSED and result.case.kind == "a mapping":
-                print(f"- `{result.case.name}` {result.case.title}: {result.detail}")
+                print(_row(result))
 
 
 if __name__ == "__main__":

@@ -150,28 +150,27 @@ class Extension:
 
     def _file(self, entry: Extended, open_: tuple[Path, ...]) -> Path | None:
         """Return the file of an extended recipe, or None after a report of the mistake."""
-        found = (
-            self._file_at_path(entry)
-            if entry.name.endswith(SUFFIXES)
-            else self._file_of_name(entry, open_)
-        )
-        message = found if isinstance(found, str) else self._refusal(found, entry, open_)
-        if message:
-            self._refuse(entry.mark, entry.name, message)
+        try:
+            is_path = entry.name.endswith(SUFFIXES)
+            file = self._file_at_path(entry) if is_path else self._file_of_name(entry, open_)
+            self._refuse_again(file, entry, open_)
+            _refuse_strange(file, entry)
+        except ValueError as error:
+            self._refuse(entry.mark, entry.name, str(error))
             return None
-        assert isinstance(found, Path)
-        return found
+        return file
 
-    def _file_at_path(self, entry: Extended) -> Path | str:
+    def _file_at_path(self, entry: Extended) -> Path:
+        """Return the file at a path; raise ValueError if there is none."""
         folder = Path(entry.mark.folder)
         path = Path(os.path.abspath(folder / Path(entry.name).expanduser()))
         if path.exists() and not path.is_dir():
             return path
-        return f"no such file; {similar_file(entry.name, path, folder)}"
+        raise ValueError(f"no such file; {similar_file(entry.name, path, folder)}")
 
-    def _file_of_name(self, entry: Extended, open_: tuple[Path, ...]) -> Path | str:
-        """Return the file of a recipe by its name, or a message: beside the file that names it, and
-        then where every recipe is found.
+    def _file_of_name(self, entry: Extended, open_: tuple[Path, ...]) -> Path:
+        """Return the file of a recipe by its name: beside the file that names it, or where the
+        recipes of all are; raise ValueError if there is none.
 
         A recipe that extends its own name extends that of the next folder.
         """
@@ -186,32 +185,20 @@ class Extension:
             return file
         circular = next(files_named(entry.name, folders), None)
         if circular is not None:
-            return self._circle((*open_, circular))
-        groups = groups_of(*folders)
-        if advice := advice_on_recipe(entry.name, groups):
-            return advice
-        if entry.name in groups:
-            return f"is a group: write `{entry.name}: OPTION`; {nearest('', groups[entry.name])}"
-        return f"no such recipe; {nearest(entry.name, names_in(folders))}"
+            raise ValueError(self._circle((*open_, circular)))
+        raise ValueError(_absent(entry.name, folders))
 
-    def _refusal(self, file: Path, entry: Extended, open_: tuple[Path, ...]) -> str:
-        """Return why a file is not read as an extended recipe, or an empty text."""
+    def _refuse_again(self, file: Path, entry: Extended, open_: tuple[Path, ...]) -> None:
+        """Raise ValueError for a file that is being read, or was read already."""
         real = os.path.realpath(file)
         if any(os.path.realpath(path) == real for path in open_):
-            return self._circle((*open_, file))
+            raise ValueError(self._circle((*open_, file)))
         if file in self.extended:
-            return f"is extended already, by {self.extended[file]}: remove this entry"
+            raise ValueError(f"is extended already, by {self.extended[file]}: remove this entry")
         if len(open_) > _MOST_FILES_DEEP:
-            return f"more than {_MOST_FILES_DEEP} recipes extend each other: write them as one"
-        shared = shared_folders()
-        folder = Path(entry.mark.folder)
-        is_own = file.parent in shared or any(folder.is_relative_to(own) for own in shared)
-        if is_strange() and not is_own and not is_inside(file, folder):
-            return (
-                f"is not in the folder of {Path(entry.mark.file).name}, which {NO_CODE_VARIABLE} or"
-                " --no-code refuses"
+            raise ValueError(
+                f"more than {_MOST_FILES_DEEP} recipes extend each other: write them as one"
             )
-        return ""
 
     def _circle(self, files: Sequence[Path]) -> str:
         chain = " -> ".join(shown(path, self.folder) for path in files)
@@ -219,6 +206,27 @@ class Extension:
 
     def _refuse(self, mark: Location, name: str, message: str) -> None:
         self.diagnostics.append(Diagnostic(mark, name, message))
+
+
+def _absent(name: str, folders: tuple[Path, ...]) -> str:
+    """Return the message for a recipe that is in none of the folders."""
+    groups = groups_of(*folders)
+    if advice := advice_on_recipe(name, groups):
+        return advice
+    if name in groups:
+        return f"is a group: write `{name}: OPTION`; {nearest('', groups[name])}"
+    return f"no such recipe; {nearest(name, names_in(folders))}"
+
+
+def _refuse_strange(file: Path, entry: Extended) -> None:
+    """Raise ValueError for a file outside of the folder of a stranger's recipe that extends it."""
+    shared, folder = shared_folders(), Path(entry.mark.folder)
+    is_own = file.parent in shared or any(folder.is_relative_to(own) for own in shared)
+    if is_strange() and not is_own and not is_inside(file, folder):
+        raise ValueError(
+            f"is not in the folder of {Path(entry.mark.file).name}, which {NO_CODE_VARIABLE} or"
+            " --no-code refuses"
+        )
 
 
 def _chosen_before(entry: Extended, layers: Sequence[Layer], before: Sequence[Layer]) -> str:

@@ -533,14 +533,15 @@ class _Builder:
         end = node.end_mark.index
         if self.text[end : end + 1] == "#":
             return "a comment needs a space before its #, after this value"
+        if self.column is None:  # the brackets around it have been looked at, with all their lines
+            return ""
         # many write a closing bracket, or a comment, under the key
         free_starts = "]}#" if isinstance(node, CollectionNode) else ""
         lines = self.text[node.start_mark.index : end].split("\n")
         for number, line in enumerate(lines[1:], node.start_mark.line + 2):
             text = line.strip()
             indent = len(line) - len(line.lstrip(" "))
-            is_shallow = self.column is not None and indent <= self.column
-            if is_shallow and text and text[0] not in free_starts:
+            if text and indent <= self.column and text[0] not in free_starts:
                 return f"indent line {number}, which is part of this value, with more spaces"
         return ""
 
