@@ -119,14 +119,15 @@ def _name(path: Path, folders: list[str]) -> list[str]:
     links lead to.
     """
     full = os.path.abspath(path)
+    real = os.path.realpath(full)
+    name = full
+    target, target_without_links = os.path.basename(real), os.path.basename(full)
     folder = next((candidate for candidate in folders if _is_in(full, candidate)), None)
-    real, top = os.path.realpath(full), folder and os.path.realpath(folder)
-    name = Path(os.path.relpath(full, folder) if folder else full).as_posix()
-    target = Path(
-        os.path.relpath(real, top) if top and _is_in(real, top) else os.path.basename(real)
-    ).as_posix()
-    plain = target == (name if top and _is_in(real, top) else os.path.basename(full))
-    return [name] if plain else [name, target]
+    if folder is not None:
+        name, top = os.path.relpath(full, folder), os.path.realpath(folder)
+        if _is_in(real, top):
+            target, target_without_links = os.path.relpath(real, top), name
+    return [name] if target == target_without_links else [name, target]
 
 
 def _is_in(path: str, folder: str) -> bool:
@@ -187,9 +188,9 @@ def files_in(value: Any) -> Iterable[Path]:
         return [value]
     if isinstance(value, Mapping):
         return list(chain.from_iterable(map(files_in, value.values())))
-    return (
-        list(chain.from_iterable(map(files_in, value))) if isinstance(value, tuple | list) else []
-    )
+    if isinstance(value, tuple | list):
+        return list(chain.from_iterable(map(files_in, value)))
+    return []
 
 
 def _stamp(path: Path) -> Stamp:
@@ -249,14 +250,8 @@ def code_of(step: Step, code: Code) -> str:
     """Return the digest of the code of a step: of its node, and of the network classes that its
     parameters name.
     """
-    return code.of(
-        step.node,
-        tuple(
-            dict.fromkeys(
-                (network.__module__, network.__qualname__) for network in networks_of(step)
-            )
-        ),
-    )
+    networks = [(network.__module__, network.__qualname__) for network in networks_of(step)]
+    return code.of(step.node, tuple(dict.fromkeys(networks)))
 
 
 def networks_of(step: Step) -> list[type[Any]]:
@@ -302,7 +297,7 @@ def plain(value: Any) -> Any:
     """Return a step's parameter as JSON that is the same in every process; a file becomes the
     digest of its content.
     """
-    if value is None or isinstance(value, bool | int | str):
+    if isinstance(value, bool | int | str | None):
         return value
     if isinstance(value, float):
         return float(value)

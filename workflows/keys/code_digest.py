@@ -6,6 +6,7 @@ import functools
 import os
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -536,11 +537,8 @@ class Code:
         root: bool,
     ) -> tuple[LoadedState, str]:
         """Return the state of a loaded module, and its digest."""
-        loaded = LoadedState(
-            sys.modules[module],
-            summary.functions if compiled_as_written(module) else (),
-            follows,
-        )
+        functions = summary.functions if compiled_as_written(module) else ()
+        loaded = LoadedState(sys.modules[module], functions, follows)
         values = counted_values(sys.modules[module], summary, free, root)
         if (only := self._loaded) is not None:
             values = without_modules(
@@ -616,7 +614,8 @@ def _refuse_changing(
     """Raise `LookupError` for an object that changes while a process runs, is read and is not
     declared.
     """
-    read = read_names(summary.statements, set() if used_names & {"", "*"} else used_names)
+    names = set[str]() if used_names & {"", "*"} else used_names
+    read = read_names(summary.statements, names)
     for held, kind_of_object in changing.items():
         if held in read and f"{FREE}{held}" not in free:
             raise UnfollowedCode(changing_refusal(held, kind_of_object, path))
@@ -626,8 +625,9 @@ def _refuse_constructs(
     summary: Summary, path: Path, used_names: set[str], free: Sequence[str]
 ) -> None:
     """Raise `LookupError` for the first construct that the used names reach and no entry covers."""
-    lines = [*reached(summary.statements, None if "" in used_names else used_names)]
-    met = [item for item in summary.constructs if any(item.line in span for span in lines)]
+    names = None if "" in used_names else used_names
+    lines = frozenset(chain.from_iterable(reached(summary.statements, names)))
+    met = [item for item in summary.constructs if item.line in lines]
     left = uncovered(met, free)
     if left is not None:
         raise UnfollowedCode(refusal(left, path))
@@ -687,9 +687,7 @@ class KnownKeys:
             return newest.key, newest.origin
         key, origin = key_of(step, keys, seed, self.code, device)
         if newest is not None and newest.key == key:
-            key = (
-                newest.key
-            )  # the same object, which saves memory where many points keep their keys
+            key = newest.key  # the same object: many points of a sweep keep their keys
         if not has_path(step.params):
             self._newest[step.name] = _Known(step, beside, key, origin)
         return key, origin

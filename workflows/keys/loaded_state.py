@@ -299,19 +299,22 @@ class LoadedState:
         if code is _DISPATCH:
             return "singledispatch", self._pairs(_implementations(function))
         own = self._noted_function(function, home)
-        local = own or not _found(home, function)
-        held = (
-            (function.__defaults__, function.__kwdefaults__, function.__closure__) if local else ()
-        )
-        exact = function_code(code) if local and not own and self._followed(home) else ""
+        if not own and _found(home, function):
+            return "function", home, code.co_qualname, "", []
+        exact = function_code(code) if not own and self._followed(home) else ""
+        held = (function.__defaults__, function.__kwdefaults__, function.__closure__)
         described = [item and self._of(item) for item in held]
-        if own and is_own(home):  # an attribute of a function may hold what a call left in it
-            described += [
-                (name, self._of(attribute))
-                for name, attribute in vars(function).items()
-                if name != "__wrapped__"
-            ]
+        if own and is_own(home):
+            described += self._left_in(function)
         return "function", home, code.co_qualname, exact, described
+
+    def _left_in(self, function: FunctionType) -> list[tuple[str, Any]]:
+        """Return the attributes of a function, which may hold what a call left in it."""
+        return [
+            (name, self._of(attribute))
+            for name, attribute in vars(function).items()
+            if name != "__wrapped__"
+        ]
 
     def _noted_function(self, function: FunctionType, home: str) -> bool:
         """Note a function of another module, or one whose loaded code is not that of the file;
@@ -362,7 +365,7 @@ _NOTHING = ("NoneType", "None")
 _ATOMS = frozenset({"plain", "text", "builtin", "module"})
 #: the method that describes a value, by the kind of its type
 _DESCRIBED: dict[str, Callable[[LoadedState, Any], Any]] = {
-    kind: getattr(LoadedState, f"_{kind}") for kind in ("object", *(kind for kind, _ in _KINDS))
+    kind: getattr(LoadedState, f"_{kind}") for kind, _ in _KINDS
 }
 
 
@@ -373,13 +376,17 @@ def counted_values(
     nodes reach.
     """
     values = {name: value for name, value in vars(module).items() if name not in free}
-    nodes = [name for name, value in values.items() if root and issubclass(type(value), Node)]
+    nodes = _names_of_nodes(values) if root else []
     if nodes:
         classes = [name for name, value in values.items() if _is_network(value)]
         counted = values.keys() & read_names(summary.statements, [*nodes, *classes, "_"])
     else:
         counted = values.keys() - written_only(summary.statements)
     return {name: value for name, value in values.items() if name in counted}
+
+
+def _names_of_nodes(values: Mapping[str, Any]) -> list[str]:
+    return [name for name, value in values.items() if issubclass(type(value), Node)]
 
 
 def without_modules(
@@ -411,11 +418,9 @@ def _array(value: Any) -> tuple[Any, ...]:
         if value.device.type == "meta" or value.layout != torch.strided:
             return str(value.dtype), tuple(value.shape)
         flat = value.detach().cpu().contiguous().reshape(-1)
-        raw: Any = (
-            flat.resolve_conj().resolve_neg().view(torch.uint8).numpy().data
-            if flat.numel()
-            else b""
-        )
+        raw: Any = b""
+        if flat.numel():
+            raw = flat.resolve_conj().resolve_neg().view(torch.uint8).numpy().data
     elif value.flags.c_contiguous and value.dtype.kind in "biufc":
         raw = value.data  # without a copy
     else:
@@ -425,9 +430,9 @@ def _array(value: Any) -> tuple[Any, ...]:
 
 def _attributes(value: Any) -> list[tuple[str, Any]]:
     """Return the attributes of an object, from its ``__dict__`` and its slots."""
-    slots = {
-        slot for base in type(value).__mro__ for slot in _named(vars(base).get("__slots__", ()))
-    }
+    slots = set[str]()
+    for base in type(value).__mro__:
+        slots.update(_slot_names(vars(base).get("__slots__", ())))
     in_slots = {
         slot: getattr(value, slot)
         for slot in sorted(slots)
@@ -450,8 +455,8 @@ def _is_lazy(kind: type, name: str) -> bool:
     return isinstance(getattr(kind, name, None), functools.cached_property)
 
 
-def _named(slots: Any) -> Iterator[str]:
-    return iter((slots,) if isinstance(slots, str) else tuple(slots))
+def _slot_names(slots: Any) -> tuple[str, ...]:
+    return (slots,) if isinstance(slots, str) else tuple(slots)
 
 
 def _content(cell: CellType) -> Any:

@@ -275,15 +275,14 @@ def _counted(top: str, version: str) -> Counted:
     own = [module_origin.plain(name) for name in module_origin.distributions_with(top)]
     contents = {name: _content(name, top) for name in own}
     parts = {f"package {top}": {"version": version, "content": _joined(contents.values())}}
-    edited = top in sys.modules and max(
-        content.changed for content in contents.values()
-    ) > import_time(top)
+    newest = max(content.changed for content in contents.values())
+    edited = top if top in sys.modules and newest > import_time(top) else ""
     for name in sorted(_required(own)):
         about = {"version": module_origin.released(name)}
         if name not in BY_VERSION:
             about["content"] = _content(name, name).digest
         parts.setdefault(f"package {name}", about)
-    return Counted(parts, top if edited else "")
+    return Counted(parts, edited)
 
 
 def _joined(contents: Iterable[Content]) -> str:
@@ -315,7 +314,8 @@ def _required(names: Iterable[str]) -> set[str]:
             ):
                 continue
             distributions.add(requirement)
-            todo += [] if requirement in BY_VERSION else [requirement]
+            if requirement not in BY_VERSION:
+                todo.append(requirement)
     return distributions - first
 
 
@@ -347,21 +347,22 @@ def _files(name: str, top: str) -> dict[str, str]:
     without a record.
     """
     site = os.path.dirname(module_origin.metadata_folder(name))
-    recorded = [*_recorded(module_origin.metadata_text(name, "RECORD").decode(errors="replace"))]
+    record = module_origin.metadata_text(name, "RECORD").decode(errors="replace")
+    recorded = list(_recorded(record))
     if recorded:
-        folders = {path.rpartition("/")[0] for path in recorded if path.endswith("/__init__.py")}
-        for package in sorted(
-            folder for folder in folders if folder.rpartition("/")[0] not in folders
-        ):
-            recorded += filter(_is_module, _below(site, package))
+        paths = [*recorded, *_modules_in_packages(site, recorded)]
     else:
-        recorded += [
-            entry
-            for entry in os.listdir(site)
-            if entry.partition(".")[0] == top and _is_module(entry)
-        ]
-        recorded += _below(site, top)
-    return {path: os.path.join(site, path) for path in recorded}
+        modules = [entry for entry in os.listdir(site) if entry.partition(".")[0] == top]
+        paths = [*filter(_is_module, modules), *_below(site, top)]
+    return {path: os.path.join(site, path) for path in paths}
+
+
+def _modules_in_packages(site: str, recorded: Iterable[str]) -> Iterator[str]:
+    """Yield the modules that stand in the recorded packages, with those without a record."""
+    folders = {path.rpartition("/")[0] for path in recorded if path.endswith("/__init__.py")}
+    outermost = [folder for folder in folders if folder.rpartition("/")[0] not in folders]
+    for package in sorted(outermost):
+        yield from filter(_is_module, _below(site, package))
 
 
 def _recorded(record: str) -> Iterator[str]:
@@ -525,7 +526,10 @@ class Whole(NamedTuple):
 
 
 def parts_of(looks: dict[str, Look]) -> Parts:
-    return {name: content for look in looks.values() for name, content in look.parts.items()}
+    parts: Parts = {}
+    for look in looks.values():
+        parts.update(look.parts)
+    return parts
 
 
 def digest_of(look: Look, documents: bool) -> list[Any]:

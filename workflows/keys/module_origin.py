@@ -44,25 +44,46 @@ def origin_of(module: str, packages: frozenset[str]) -> Origin:
     counts if installed.
     """
     top = module.partition(".")[0]
-    if top in _fixed and top not in packages:
+    counts_by_source = top in packages
+    if top in _fixed and not counts_by_source:
         return _fixed[top]
-    if top in ("builtins", "__future__") or (top in sys.stdlib_module_names and not _shadowed(top)):
+    if _is_of_python(top):
         return _fixed.setdefault(top, Origin("python"))
-    if (
-        module != top
-        and top not in packages
-        and (above := origin_of(top, packages)).kind == "distribution"
-    ):
-        return above
-    file = getattr(sys.modules.get(module), "__file__", None) if module == top else None
-    if file is None or not _is_installed(file):
-        file = module_path(module)
+    if module != top and not counts_by_source:
+        package = origin_of(top, packages)
+        if package.kind == "distribution":
+            return package
+    file = _stated_or_searched(module, top)
     if file is None:
-        return _without_file(module, top, packages)
-    if top not in packages and _is_installed(file) and (version := version_of(top)):
+        return _without_file(module, top, counts_by_source)
+    version = "" if counts_by_source else _version_at(file, top)
+    if version:
         return _fixed.setdefault(top, Origin("distribution", None, version))
-    path = Path(file)
-    return Origin("source" if path.suffix == ".py" else "binary", path)
+    return _of_file(Path(file))
+
+
+def _is_of_python(top: str) -> bool:
+    if top in ("builtins", "__future__"):
+        return True
+    return top in sys.stdlib_module_names and not _shadowed(top)
+
+
+def _stated_or_searched(module: str, top: str) -> str | None:
+    """Return the file of a module; an installed package is believed where it says that it is."""
+    if module == top:
+        file: str | None = getattr(sys.modules.get(module), "__file__", None)
+        if file is not None and _is_installed(file):
+            return file
+    return module_path(module)
+
+
+def _version_at(file: str, top: str) -> str:
+    """Return name and version of the distribution that a file is of, or an empty text."""
+    return version_of(top) if _is_installed(file) else ""
+
+
+def _of_file(path: Path) -> Origin:
+    return Origin("source", path) if path.suffix == ".py" else Origin("binary", path)
 
 
 def _is_installed(file: str) -> bool:
@@ -93,11 +114,9 @@ def module_path(module: str) -> str | None:
     parent, _, name = module.rpartition(".")
     if not parent:
         spec = _spec(module)
-        return (
-            spec.origin
-            if spec is not None and spec.has_location and os.path.isfile(spec.origin or "")
-            else None
-        )
+        if spec is None or not spec.has_location or not os.path.isfile(spec.origin or ""):
+            return None
+        return spec.origin
     return next(filter(None, (_file_in(folder, name) for folder in _folders_above(module))), None)
 
 
@@ -139,9 +158,9 @@ def distributions_with(top: str) -> list[str]:
 def released(name: str) -> str:
     """Return name and version of an installed distribution, or an empty text."""
     version = _releases().get(plain(name), ("", ""))[0]
-    return (
-        version and f"{name} {version.partition('+')[0] if name in _BUILD_IN_VERSION else version}"
-    )
+    if name in _BUILD_IN_VERSION:
+        version = version.partition("+")[0]
+    return version and f"{name} {version}"
 
 
 def metadata_folder(name: str) -> str:
@@ -220,21 +239,27 @@ def contents(module: str) -> Mapping[str, Any]:
     return getattr(sys.modules[module], "__dict__", {})
 
 
-def _without_file(module: str, top: str, packages: frozenset[str]) -> Origin:
+def _without_file(module: str, top: str, counts_by_source: bool) -> Origin:
     """Return the origin of a module without a file: a folder of modules, a built-in part, or a
     missing module.
     """
     if module in sys.modules:
-        inside = contents(module)
-        if inside.get("__path__") is not None and not inside.get("__file__"):
-            return Origin("folder")
-        installed = "" if top in packages or module == top else version_of(top)
-        return Origin("distribution", None, installed) if installed else Origin("nowhere")
-    if "." not in module:
+        return _loaded_without_file(module, top, counts_by_source)
+    if module == top:
         spec = _spec(module)
-        return Origin("absent" if spec is None else "nowhere" if spec.has_location else "folder")
-    not_a_folder = any(not os.path.isdir(folder) for folder in _folders_above(module))
-    return Origin("nowhere" if not_a_folder else "absent")
+        if spec is None:
+            return Origin("absent")
+        return Origin("nowhere") if spec.has_location else Origin("folder")
+    above_are_folders = all(map(os.path.isdir, _folders_above(module)))
+    return Origin("absent") if above_are_folders else Origin("nowhere")
+
+
+def _loaded_without_file(module: str, top: str, counts_by_source: bool) -> Origin:
+    inside = contents(module)
+    if inside.get("__path__") is not None and not inside.get("__file__"):
+        return Origin("folder")
+    version = "" if counts_by_source or module == top else version_of(top)
+    return Origin("distribution", None, version) if version else Origin("nowhere")
 
 
 def _folders_above(module: str) -> list[str]:
@@ -249,11 +274,8 @@ def _folders(package: str) -> list[str]:
     if not parent:
         spec = _spec(package)
         return list(spec.submodule_search_locations or ()) if spec is not None else []
-    return [
-        path
-        for folder in _folders_above(package)
-        if os.path.isdir(path := os.path.join(folder, name))
-    ]
+    paths = [os.path.join(folder, name) for folder in _folders_above(package)]
+    return list(filter(os.path.isdir, paths))
 
 
 def _spec(top: str) -> importlib.machinery.ModuleSpec | None:
@@ -266,7 +288,8 @@ def _spec(top: str) -> importlib.machinery.ModuleSpec | None:
 def _file_in(folder: str, name: str) -> str | None:
     """Return the file of a module in a folder, or None."""
     if folder not in _listed:
-        _listed[folder] = frozenset(os.listdir(folder) if os.path.isdir(folder) else ())
+        names = os.listdir(folder) if os.path.isdir(folder) else []
+        _listed[folder] = frozenset(names)
     if name in _listed[folder]:
         file = module_file(folder, [name])
         if file is not None:

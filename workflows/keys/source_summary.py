@@ -10,7 +10,7 @@ import sys
 import threading
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from itertools import chain
+from itertools import chain, filterfalse
 from types import CodeType
 from typing import NamedTuple
 
@@ -118,40 +118,41 @@ def statements(blocks: Iterable[Block]) -> list[Statement]:
     return [_statement(block.item, block.kinds) for block in blocks]
 
 
-def reached(parts: Sequence[Statement], names: Collection[str] | None) -> Iterator[range]:
-    """Yield the lines of the statements that the use of some names, or None for all names, may
+def reached(parts: Sequence[Statement], names: Collection[str] | None) -> list[range]:
+    """Return the lines of the statements that the use of some names, or None for all names, may
     run.
     """
-    if names is None or "*" in names:
-        yield from (range(statement.first, statement.last + 1) for statement in parts)
-        return
-    wanted_names, reached_already = set(names), set[int]()
-    while True:
-        new = [
-            n
-            for n, statement in enumerate(parts)
-            if n not in reached_already
-            and (not statement.binds or wanted_names & {*statement.binds})
-        ]
-        if not new:
-            return
-        for n in new:
-            reached_already.add(n)
-            wanted_names |= {*parts[n].refers}
-            yield range(parts[n].first, parts[n].last + 1)
+    run = parts
+    if names is not None and "*" not in names:
+        run = _run_by(parts, _led_to(parts, set(names)))
+    return [range(statement.first, statement.last + 1) for statement in run]
 
 
 def read_names(parts: Sequence[Statement], names: Collection[str]) -> set[str]:
     """Return the names that the statements read which the use of some names, or of all if none
     is given, may run.
     """
-    read = set(names) or set(chain.from_iterable(statement.binds for statement in parts))
+    first = set(names) or set(chain.from_iterable(statement.binds for statement in parts))
+    return _led_to(parts, first)
+
+
+def _led_to(parts: Sequence[Statement], names: set[str]) -> set[str]:
+    """Return some names with all that is read by the statements that their use may run."""
     while True:
-        run = [statement for statement in parts if not statement.binds or read & {*statement.binds}]
-        longer = read.union(*(statement.refers for statement in run))
-        if longer == read:
-            return read
-        read = longer
+        run = _run_by(parts, names)
+        longer = names.union(*(statement.refers for statement in run))
+        if longer == names:
+            return names
+        names = longer
+
+
+def _run_by(parts: Sequence[Statement], names: set[str]) -> list[Statement]:
+    """Return the statements that bind one of the names, and those that are run for their effect."""
+    return [
+        statement
+        for statement in parts
+        if not statement.binds or not names.isdisjoint(statement.binds)
+    ]
 
 
 def written_only(parts: Sequence[Statement]) -> set[str]:
@@ -163,7 +164,7 @@ def written_only(parts: Sequence[Statement]) -> set[str]:
 
 
 def _statement(item: ast.stmt, kinds: Kinds) -> Statement:
-    marks = item.decorator_list if isinstance(item, _DEFINITION) else []
+    marks = getattr(item, "decorator_list", ())
     first = min([item.lineno, *(mark.lineno for mark in marks)])
     written = {id(name) for name in _noted(kinds)}
     loads = [name for name in each(kinds, ast.Name) if isinstance(name.ctx, ast.Load)]
@@ -191,9 +192,17 @@ def _binds(item: ast.stmt) -> Iterable[str]:
     if isinstance(item, _DEFINITION):
         quiet = all(ast.unparse(mark).startswith(_QUIET) for mark in item.decorator_list)
         return {item.name} if quiet else set()
-    targets = item.targets if isinstance(item, ast.Assign) else [getattr(item, "target", None)]
+    targets = _targets(item)
     names = {target.id for target in targets if isinstance(target, ast.Name)}
     return names if len(names) == len(targets) else set()
+
+
+def _targets(item: ast.stmt) -> list[ast.expr]:
+    """Return what a statement gives a value, such as the names on the left side."""
+    if isinstance(item, ast.Assign):
+        return item.targets
+    target = getattr(item, "target", None)
+    return [] if target is None else [target]
 
 
 # --- outward code ---------------------------------------------------------------------------------
@@ -441,15 +450,13 @@ class _Pass:
         passed_names = self._given(call, scope)
         if _is_quiet(name, call):
             return
-        if not is_calm(full):
+        if is_calm(full):
+            if bare or last.endswith("_"):
+                self.outward.update(filterfalse(is_calm, passed_names))
+        else:
             self.passed |= passed_names
-            if bare or _changes(last):
-                self.outward.add(name)
-            return
-        if name.startswith("torch.library.") or (bare and _is_setter(last)):
+        if _changes_package(name, last, bare):
             self.outward.add(name)
-        if bare or last.endswith("_"):
-            self.outward |= {held_name for held_name in passed_names if not is_calm(held_name)}
 
     def _given(self, call: ast.Call, scope: NameScope) -> set[str]:
         """Return the names of what other modules hold and a call is given, not of what their
@@ -471,16 +478,13 @@ class _Pass:
         is defined.
         """
         for mark in getattr(item, "decorator_list", ()):
-            imports = self._imports(mark.func if isinstance(mark, ast.Call) else mark, scope)
-            self.outward |= {name for name in imports if not _is_quiet_decorator(name)}
+            decorator = mark.func if isinstance(mark, ast.Call) else mark
+            imports = self._imports(decorator, scope)
+            self.outward.update(filterfalse(_is_quiet_decorator, imports))
         if isinstance(item, ast.ClassDef):
             for base in [*item.bases, *(word.value for word in item.keywords)]:
                 imports = self._imports(base, scope)
-                self.outward |= {
-                    name
-                    for name in imports
-                    if not is_calm(name) and not _starts(name, _QUIET_CALLS)
-                }
+                self.outward.update(filterfalse(_is_quiet_base, imports))
 
 
 def is_calm(name: str) -> bool:
@@ -488,6 +492,13 @@ def is_calm(name: str) -> bool:
     given.
     """
     return name.partition(".")[0] in CALM
+
+
+def _changes_package(name: str, method: str, bare: bool) -> bool:
+    """Return True for a call that may change the package of its function, by its full name."""
+    if not is_calm(name):
+        return bare or _changes(method)
+    return name.startswith("torch.library.") or (bare and _is_setter(method))
 
 
 def _is_setter(method: str) -> bool:
@@ -506,6 +517,11 @@ def _is_quiet_decorator(name: str) -> bool:
     if name.startswith("neusee."):
         return not _HOOK.fullmatch(name.rpartition(".")[2])
     return _starts(name, _QUIET_DECORATORS)
+
+
+def _is_quiet_base(name: str) -> bool:
+    """Return True for a class that registers none of the classes that are derived from it."""
+    return is_calm(name) or _starts(name, _QUIET_CALLS)
 
 
 def _is_quiet(name: str, call: ast.Call) -> bool:
@@ -573,21 +589,29 @@ def summarise(source: bytes, own: bool = False) -> Summary:
     text = _digest_of_syntax(tree)
     imports, bound = _imports(tree.all)
     names = _full_names(bound)
-    by_literal = [_by_literal(call, names) for call in each(tree.all, ast.Call)]
+    unfollowed, reach = constructs(tree, names), NOWHERE
+    if own:
+        unfollowed = _with_constructs_of_users(unfollowed, parsed, tree, names)
+        reach = reach_of(parsed, {name: _full(ways) for name, ways in bound.items()})
     return Summary(
-        text,
-        digest(text, tree.documents),
-        any(_reads_docstrings(kinds, own) for kinds in (tree.all, tree.not_run)),
-        [*imports, *(way for way in by_literal if way is not None)],
-        sorted(name for name, ways in bound.items() if any(way[2] for way in ways)),
-        _uses(tree.all, {name: set(filter(_chained, ways)) for name, ways in bound.items()}),
-        _definitions(tree.texts),
-        functions,
-        _all_constructs(parsed, tree, names) if own else constructs(tree, names),
-        statements(tree.blocks),
-        [*chain.from_iterable(_declared(item) for item, _ in tree.texts)],
-        reach_of(parsed, {name: _full(ways) for name, ways in bound.items()}) if own else NOWHERE,
+        tree=text,
+        whole=digest(text, tree.documents),
+        documents=_reads_docstrings(tree.all, own) or _reads_docstrings(tree.not_run, own),
+        imports=[*imports, *_literal_imports(tree.all, names)],
+        binds=_names_from_modules(bound),
+        uses=_uses(tree.all, bound),
+        definitions=_definitions(tree.texts),
+        functions=functions,
+        constructs=unfollowed,
+        statements=statements(tree.blocks),
+        depends=[*chain.from_iterable(_declared(item) for item, _ in tree.texts)],
+        reach=reach,
     )
+
+
+def _names_from_modules(bound: Mapping[str, set[Import]]) -> list[str]:
+    """Return the names that statements such as ``from module import name`` bind."""
+    return sorted(name for name, ways in bound.items() if any(way[2] for way in ways))
 
 
 def _full_names(bound: Mapping[str, set[Import]]) -> dict[str, str]:
@@ -609,13 +633,11 @@ def syntax_outline(source: bytes) -> tuple[str, list[tuple[str, list[str]]]]:
     """
     with _parsing:
         tree = ast.parse(source)
-    import_statements = [
-        item for item in tree.body if isinstance(item, ast.Import | ast.ImportFrom)
-    ]
-    imports = [
-        (getattr(item, "module", "") or "", [alias.name for alias in item.names])
-        for item in import_statements
-    ]
+    imports: list[tuple[str, list[str]]] = []
+    for item in tree.body:
+        if isinstance(item, ast.Import | ast.ImportFrom):
+            module = getattr(item, "module", "") or ""
+            imports.append((module, [alias.name for alias in item.names]))
     return _digest_of_syntax(Syntax(tree)), imports
 
 
@@ -628,28 +650,31 @@ def _imports(kinds: Kinds) -> tuple[list[Import], dict[str, set[Import]]]:
     imports: list[Import] = []
     bound: dict[str, set[Import]] = defaultdict(set)
     for item in each(kinds, ast.Import):
-        imports += [(0, alias.name, "") for alias in item.names]
         for alias in item.names:
-            bound[alias.asname or _top(alias.name)].add(
-                (0, alias.name if alias.asname else _top(alias.name), "")
-            )
+            imports.append((0, alias.name, ""))
+            named = alias.name if alias.asname else _top(alias.name)
+            bound[alias.asname or named].add((0, named, ""))
     for item in each(kinds, ast.ImportFrom):
-        ways = [(item.level, item.module or "", alias.name) for alias in item.names]
-        imports += ways
-        for alias, way in zip(item.names, ways, strict=True):
+        for alias in item.names:
+            way = (item.level, item.module or "", alias.name)
+            imports.append(way)
             bound[alias.asname or alias.name].add(way)
     return list(dict.fromkeys(imports)), bound
 
 
-def _by_literal(call: ast.Call, names: Mapping[str, str]) -> Import | None:
-    """Return the import in a call such as ``import_module("a.b")``, or None for any other call."""
-    module = literal_import(call, names)
-    return (module and (len(module) - len(module.lstrip(".")), module.lstrip("."), "")) or None
+def _literal_imports(kinds: Kinds, names: Mapping[str, str]) -> Iterator[Import]:
+    """Yield the imports in calls such as ``import_module("a.b")``."""
+    for call in each(kinds, ast.Call):
+        module = literal_import(call, names)
+        if module:
+            absolute = module.lstrip(".")
+            yield len(module) - len(absolute), absolute, ""
 
 
-def _all_constructs(parsed: ast.Module, tree: Syntax, names: Mapping[str, str]) -> list[Construct]:
+def _with_constructs_of_users(
+    usual: list[Construct], parsed: ast.Module, tree: Syntax, names: Mapping[str, str]
+) -> list[Construct]:
     """Return what is not followed, with what only matters in code of a user."""
-    usual = constructs(tree, names)
     usual_places = {(item.line, item.text.rpartition(".")[2]) for item in usual}
     by_user = [*facts(tree.all, names), *moments(tree.all, names)]
     beside = [
@@ -662,9 +687,7 @@ def _reads_docstrings(kinds: Kinds, own: bool) -> bool:
     """Return True for code that reads a docstring as data, or attributes that it does not name
     in code of a user.
     """
-    if own and (
-        reads_attributes_unnamed(kinds) or any("__doc__" in text for text, _ in texts(kinds))
-    ):
+    if own and (reads_attributes_unnamed(kinds) or _spells_docstring(kinds)):
         return True
     by_attribute = any(item.attr in _READS for item in each(kinds, ast.Attribute))
     by_name = any(
@@ -675,6 +698,10 @@ def _reads_docstrings(kinds: Kinds, own: bool) -> bool:
         or by_name
         or any(item.value == "__doc__" for item in each(kinds, ast.Constant))
     )
+
+
+def _spells_docstring(kinds: Kinds) -> bool:
+    return any("__doc__" in text for text, _ in texts(kinds))
 
 
 def _declared(item: ast.stmt) -> list[str]:
@@ -718,9 +745,10 @@ def _uses(kinds: Kinds, bound: dict[str, set[Import]]) -> list[Use]:
     """Return each use of an imported name in an expression such as ``a.b.c``, and each use of a
     whole package.
     """
+    followed = {name: set(filter(_chained, ways)) for name, ways in bound.items()}
     lines: dict[tuple[int, str, str, str], int] = {}
     for name, attributes, line in _chains(kinds):
-        for way in bound.get(name, ()):
+        for way in followed.get(name, ()):
             if attributes or ".".join(filter(None, way[1:])) in ("neusee", ROOT, "nodes"):
                 use = (*way, ".".join(attributes))
                 lines[use] = min(line, lines.get(use, line))
@@ -769,10 +797,7 @@ def _labels(item: ast.stmt) -> Iterable[str]:
         return [f"class {item.name}"]
     if isinstance(item, ast.Import | ast.ImportFrom):
         return ["imports"]
-    targets = (
-        item.targets if isinstance(item, ast.Assign) else [getattr(item, "target", None) or item]
-    )
-    inside = chain.from_iterable(ast.walk(t) for t in targets if not isinstance(t, ast.stmt))
+    inside = chain.from_iterable(map(ast.walk, _targets(item)))
     names = [part.id for part in inside if isinstance(part, ast.Name)]
     return [f"constant {name}" for name in names] or ["other statements"]
 
@@ -781,11 +806,8 @@ def _owner(function: ast.FunctionDef | ast.AsyncFunctionDef) -> str:
     """Return the name of a function, or ``psf.check`` for a function ``_`` with the decorator
     ``@psf.check``.
     """
-    for mark in function.decorator_list:
-        if (
-            function.name == "_"
-            and isinstance(mark, ast.Attribute)
-            and isinstance(mark.value, ast.Name)
-        ):
+    marks = function.decorator_list if function.name == "_" else []
+    for mark in marks:
+        if isinstance(mark, ast.Attribute) and isinstance(mark.value, ast.Name):
             return f"{mark.value.id}.{mark.attr}"
     return function.name

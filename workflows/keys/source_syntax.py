@@ -86,35 +86,35 @@ class Syntax:
         """Add a part of the tree, and then its own parts."""
         kind = type(item)
         name, fields = _SHAPES.get(kind) or _shape(kind)
-        words = self._words
-        words.append(name)
+        self._words.append(name)
         self._kinds[kind].append(item)
+        if kind is ast.If and _is_not_run(item.test):  # type: ignore[attr-defined]
+            return self._visit_else(item, scope)  # type: ignore[arg-type]
+        scope = self._scope_inside(item, scope)
+        for field in fields:
+            value = getattr(item, field)
+            children = self._listed(item, field, value) if type(value) is list else [value]
+            for child in children:
+                if isinstance(child, ast.AST) and child._fields:
+                    self._visit(child, scope)
+                else:
+                    self._words.append(_word(child))
+
+    def _scope_inside(self, item: ast.AST, scope: Scope) -> Scope:
+        """Note a call or a join with the functions around it, and return those around its parts."""
+        kind = type(item)
         if kind is ast.Call:
             self.calls.append((scope, item))  # type: ignore[arg-type]
         elif kind is ast.BinOp:
             self.joins.append((scope, item))  # type: ignore[arg-type]
-        elif kind in _FUNCTIONS:
-            scope = (*scope, item)
-        elif kind is ast.If and _is_not_run(item.test):  # type: ignore[attr-defined]
-            return self._visit_else(item, scope)  # type: ignore[arg-type]
-        for field in fields:
-            value = getattr(item, field)
-            if isinstance(value, ast.AST):
-                if value._fields:
-                    self._visit(value, scope)
-                else:
-                    words.append(type(value).__name__)
-            elif type(value) is list:
-                if field == "body" and kind in _DOCUMENTED:
-                    value = self._without_docstring(item)
-                words.append(f"[{len(value)}")
-                for child in value:
-                    if isinstance(child, ast.AST):
-                        self._visit(child, scope)
-                    else:
-                        words.append(repr(child))
-            else:
-                words.append(repr(value))
+        return (*scope, item) if kind in _FUNCTIONS else scope
+
+    def _listed(self, item: ast.AST, field: str, values: list[Any]) -> list[Any]:
+        """Add the number of values in a field, and return them without a docstring."""
+        if field == "body" and type(item) in _DOCUMENTED:
+            values = self._without_docstring(item)
+        self._words.append(f"[{len(values)}")
+        return values
 
     def _visit_else(self, item: ast.If, scope: Scope) -> None:
         """Add a branch that no process runs by its text alone, and the other branch with its
@@ -153,6 +153,11 @@ class Syntax:
         return body
 
 
+def _word(value: Any) -> str:
+    """Return the word of a constant, or of a part of the tree that has no parts of its own."""
+    return type(value).__name__ if isinstance(value, ast.AST) else repr(value)
+
+
 def each(kinds: Kinds, *types: type) -> Iterator[Any]:
     """Yield the parts of the given types, those of the first type first."""
     for kind in types:
@@ -163,13 +168,11 @@ def _is_not_run(test: ast.expr) -> bool:
     """Return True for the test of a block for type checkers, or of a file that is run as a
     program.
     """
-    first = (
-        test.left
-        if isinstance(test, ast.Compare)
-        else test.value
-        if isinstance(test, ast.Attribute)
-        else test
-    )
+    first = test
+    if isinstance(test, ast.Compare):
+        first = test.left
+    elif isinstance(test, ast.Attribute):
+        first = test.value
     return (
         isinstance(first, ast.Name)
         and first.id in _NOT_RUN
@@ -229,15 +232,11 @@ class NameScope:
     def __init__(self, item: ast.AST, above: NameScope | None) -> None:
         self.above = above
         self.is_module = above is None
-        inner = getattr(item, "args", None) if isinstance(item, _FUNCTIONS) else None
-        self.arguments = (
-            {argument.arg for argument in ast.walk(inner) if isinstance(argument, ast.arg)}
-            if inner
-            else set[str]()
-        )
+        self.arguments = arguments(item)
         self.values: dict[str, list[ast.expr | None]] = defaultdict(list)
         body = getattr(item, "body", [])
-        for statement in _inside(body if isinstance(body, list) else [body]):
+        statements = body if isinstance(body, list) else [body]
+        for statement in _inside(statements):
             for target, value in _bindings(statement):
                 self.values[target].append(value)
 
@@ -289,13 +288,9 @@ def _of_all(
 
 def last_name(item: ast.expr) -> str:
     """Return the last word of an expression such as ``a.b.c``."""
-    return (
-        item.attr
-        if isinstance(item, ast.Attribute)
-        else item.id
-        if isinstance(item, ast.Name)
-        else ""
-    )
+    if isinstance(item, ast.Attribute):
+        return item.attr
+    return item.id if isinstance(item, ast.Name) else ""
 
 
 def _of_name(
@@ -306,13 +301,18 @@ def _of_name(
     if holder is None or (holder.is_module and name in bound):
         return imported
     if name in holder.arguments:
-        kind: Literal["class", "argument"] = "class" if name in _CLASS else "argument"
-        return [] if name in _SELF else [Root(kind, name)]
+        return _of_argument(name)
     values = [value for value in holder.values[name] if value is not None]
     origins = _of_all(values, holder, bound, visited)
     if None in holder.values[name]:  # an import inside of a function
         origins += imported
     return [*origins, Root("own", name)] if holder.is_module else origins
+
+
+def _of_argument(name: str) -> list[Root]:
+    if name in _SELF:
+        return []
+    return [Root("class", name)] if name in _CLASS else [Root("argument", name)]
 
 
 def _of_call(
@@ -322,17 +322,20 @@ def _of_call(
     it is a new object.
     """
     name = last_name(call.func)
-    if isinstance(call.func, ast.Name) and name in _THROUGH:
-        return _of_all(call.args, scope, bound, visited)
-    if isinstance(call.func, ast.Name) and name in ("globals", "type"):
-        return [Root("own" if name == "globals" else "class", name)]
+    if isinstance(call.func, ast.Name):
+        if name in _THROUGH:
+            return _of_all(call.args, scope, bound, visited)
+        if name in _GIVEN:
+            return [_GIVEN[name]]
     origins = roots(call.func, scope, bound, visited)
     if name[:1].isupper() or name in _COPYING:
         return []
-    old = [root.name for root in origins if _is_of_library(root)]
-    return [Root("import", name if name.endswith("()") else f"{name}()") for name in old]
+    called = [root.name.removesuffix("()") for root in origins if _is_of_library(root)]
+    return [Root("import", f"{name}()") for name in called]
 
 
+#: what builtin functions give a part of
+_GIVEN = {"globals": Root("own", "globals"), "type": Root("class", "type")}
 #: functions and methods whose result is a new object
 _COPYING = ("copy", "clone", "deepcopy", "detach", "tolist", "item")
 
@@ -377,9 +380,13 @@ def _bindings(item: ast.AST) -> Iterator[tuple[str, ast.expr | None]]:
     for target, value in _assigned(item):
         if isinstance(item, _LOOPS) and value is not None:
             value = ast.Starred(value)  # one of its parts
-        for child in ast.walk(target):
-            if isinstance(child, ast.Name) and isinstance(child.ctx, ast.Store):
-                yield child.id, value
+        for name in _stored_names(target):
+            yield name, value
+
+
+def _stored_names(target: ast.expr) -> list[str]:
+    names = [child for child in ast.walk(target) if isinstance(child, ast.Name)]
+    return [name.id for name in names if isinstance(name.ctx, ast.Store)]
 
 
 _LOOPS = (ast.For, ast.AsyncFor, ast.comprehension)
@@ -417,11 +424,9 @@ def dotted(item: ast.expr, bound: Mapping[str, str]) -> str:
 
 def arguments(function: ast.AST) -> set[str]:
     inner = getattr(function, "args", None)
-    return (
-        {argument.arg for argument in ast.walk(inner) if isinstance(argument, ast.arg)}
-        if inner is not None
-        else set()
-    )
+    if inner is None:
+        return set()
+    return {argument.arg for argument in ast.walk(inner) if isinstance(argument, ast.arg)}
 
 
 def assigned(function: ast.AST) -> Iterator[tuple[str, ast.expr]]:
@@ -569,12 +574,11 @@ class Scratch:
         """Return the ids of the texts that name a file in a temporary folder, or in an archive
         in memory.
         """
-        joins = [item.right for scope, item in tree.joins if self.holds(item.left, scope)]
-        calls = [(scope, call) for scope, call in tree.calls if self._is_below_made(call, scope)]
-        return {
-            id(argument)
-            for argument in [*joins, *(argument for _, call in calls for argument in call.args)]
-        }
+        below = [item.right for scope, item in tree.joins if self.holds(item.left, scope)]
+        for scope, call in tree.calls:
+            if self._is_below_made(call, scope):
+                below += call.args
+        return set(map(id, below))
 
     def _is_below_made(self, call: ast.Call, scope: Scope) -> bool:
         """Return True for a call that joins words to a temporary path, and for a method of an

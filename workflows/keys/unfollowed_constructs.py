@@ -57,6 +57,7 @@ _DRAWING = (
     *("torch.random.get_rng_state", "numpy.random.get_state"),
 )
 _TIMES = ("time", "perf_counter", "monotonic", "process_time", "thread_time")
+_CALENDAR = ("localtime", "gmtime", "strftime", "ctime", "asctime")
 
 #: What the names of Python and of libraries do, by their first parts.
 _NAMES: Mapping[str, tuple[str, str]] = {
@@ -110,11 +111,8 @@ _NAMES: Mapping[str, tuple[str, str]] = {
     **dict.fromkeys(
         ("os.cpu_count", "os.getpid", "os.uname", "platform", "getpass", "uuid"), ("state", _CLOCK)
     ),
-    **{f"time.{name}{unit}": ("state", _CLOCK) for name in _TIMES for unit in ("", "_ns")},
-    **{
-        f"time.{name}": ("state", _CLOCK)
-        for name in ("localtime", "gmtime", "strftime", "ctime", "asctime")
-    },
+    **{f"time.{name}": ("state", _CLOCK) for name in (*_TIMES, *_CALENDAR)},
+    **{f"time.{name}_ns": ("state", _CLOCK) for name in _TIMES},
     **{f"datetime.datetime.{name}": ("state", _CLOCK) for name in ("now", "utcnow", "today")},
     **dict.fromkeys(
         ("datetime.date.today", "threading.get_ident", "resource", "tracemalloc"), ("state", _CLOCK)
@@ -187,7 +185,8 @@ def constructs(tree: Syntax, bound: Mapping[str, str]) -> list[Construct]:
     own = _bound_here(tree.all)
     scratch = Scratch(bound, lambda full: _READERS.fullmatch(full) is not None)
     unfollowed = [*_named(tree.all, bound, own), *_read(tree.calls, bound, own, scratch)]
-    unfollowed += _file_names(tree.all, scratch.texts(tree) if scratch else set())
+    scratch_texts = scratch.texts(tree) if scratch else set[int]()
+    unfollowed += _file_names(tree.all, scratch_texts)
     return sorted(set(unfollowed), key=lambda item: (item.line, item))
 
 
@@ -195,11 +194,9 @@ def literal_import(call: ast.expr, bound: Mapping[str, str]) -> str | None:
     """Return the module in a call such as ``import_module("a.b")``, or None for any other
     expression.
     """
-    if (
-        not isinstance(call, ast.Call)
-        or not call.args
-        or dotted(call.func, bound) not in _IMPORTERS
-    ):
+    if not isinstance(call, ast.Call) or not call.args:
+        return None
+    if dotted(call.func, bound) not in _IMPORTERS:
         return None
     first = call.args[0]
     return first.value if isinstance(first, ast.Constant) and isinstance(first.value, str) else None
@@ -245,11 +242,12 @@ def _is_imported_or_builtin(base: str, bound: Mapping[str, str], own: set[str]) 
 
 def entry_of(full: str) -> tuple[str, str] | None:
     """Return what a full name such as ``os.environ.get`` does, or None for any other name."""
-    parts = full.split(".")
-    return next(
-        (_NAMES[name] for n in range(len(parts), 0, -1) if (name := ".".join(parts[:n])) in _NAMES),
-        None,
-    )
+    name = full
+    while name:
+        if name in _NAMES:
+            return _NAMES[name]
+        name = name.rpartition(".")[0]
+    return None
 
 
 def _first_name(item: ast.expr) -> str:
@@ -259,11 +257,9 @@ def _first_name(item: ast.expr) -> str:
 
 
 def _environ(item: ast.expr) -> ast.expr:
-    return (
-        item.value
-        if isinstance(item, ast.Attribute) and item.attr in ("get", "__getitem__", "pop")
-        else item
-    )
+    if isinstance(item, ast.Attribute) and item.attr in ("get", "__getitem__", "pop"):
+        return item.value
+    return item
 
 
 def _variables(kinds: Kinds, bound: Mapping[str, str]) -> Iterator[tuple[ast.expr, str]]:
@@ -397,18 +393,19 @@ def orders(tree: ast.Module) -> list[Construct]:
     """Return each place where a module takes the order of a set, or a hash, that differs between
     processes.
     """
-    expressions = _found(tree, NameScope(tree, None))
+    expressions = _hash_ordered(tree, NameScope(tree, None))
     return [
         Construct("hash", "", ast.unparse(item)[:60], _WHY, item.lineno) for item in expressions
     ]
 
 
-def _found(item: ast.AST, scope: NameScope) -> Iterator[ast.expr]:
+def _hash_ordered(item: ast.AST, scope: NameScope) -> Iterator[ast.expr]:
+    """Yield each expression in a part of the tree whose order or value the hash seed decides."""
     if isinstance(item, _SCOPES):
         scope = NameScope(item, scope)
-    yield from (taken for taken in _taken(item, scope) if _is_set(taken, scope))
+    yield from (taken for taken in _taken(item) if _is_set(taken, scope))
     if isinstance(item, ast.Call):
-        if _is_hash(item, scope) or _pops_of_set(item, scope):
+        if _hashes(item, scope):
             yield item
         if last_name(item.func) in _UNORDERED:
             for argument in item.args:
@@ -416,11 +413,16 @@ def _found(item: ast.AST, scope: NameScope) -> Iterator[ast.expr]:
             return
     if not _defines_hash(item):
         for child in ast.iter_child_nodes(item):
-            yield from _found(child, scope)
+            yield from _hash_ordered(child, scope)
 
 
 def _defines_hash(item: ast.AST) -> bool:
     return isinstance(item, ast.FunctionDef) and item.name == "__hash__"
+
+
+def _hashes(call: ast.Call, scope: NameScope) -> bool:
+    """Return True for a call whose value the hash seed decides."""
+    return _is_hash(call, scope) or _pops_of_set(call, scope)
 
 
 def _pops_of_set(call: ast.Call, scope: NameScope) -> bool:
@@ -437,10 +439,10 @@ def _below(argument: ast.expr, scope: NameScope) -> Iterator[ast.expr]:
             yield from _below(value, scope)
     elif isinstance(argument, _LISTED):
         for operand in _behind_first(argument):
-            yield from _found(operand, scope)
+            yield from _hash_ordered(operand, scope)
     else:
         for child in ast.iter_child_nodes(argument):
-            yield from _found(child, scope)
+            yield from _hash_ordered(child, scope)
 
 
 def _behind_first(listed: ast.ListComp | ast.DictComp | ast.GeneratorExp) -> list[ast.expr]:
@@ -453,7 +455,7 @@ def _behind_first(listed: ast.ListComp | ast.DictComp | ast.GeneratorExp) -> lis
     return [*operands, *values]
 
 
-def _taken(item: ast.AST, scope: NameScope) -> list[ast.expr]:
+def _taken(item: ast.AST) -> list[ast.expr]:
     """Return the expressions whose order a statement or an expression takes."""
     if isinstance(item, ast.For | ast.AsyncFor):
         return [item.iter]
@@ -531,8 +533,8 @@ _TIMES_OF_FILES = ("mtime", "ctime", "atime", "birthtime")
 _FIELDS = ("mode", "uid", "gid", "ino", "dev", "nlink")
 _STAMPS = frozenset(
     {
-        *(f"st_{name}{unit}" for name in _TIMES_OF_FILES for unit in ("", "_ns")),
-        *(f"st_{name}" for name in _FIELDS),
+        *(f"st_{name}_ns" for name in _TIMES_OF_FILES),
+        *(f"st_{name}" for name in (*_TIMES_OF_FILES, *_FIELDS)),
         *(f"ST_{name.upper()}" for name in (*_TIMES_OF_FILES, *_FIELDS)),
         *(
             "getmtime",
@@ -611,24 +613,16 @@ _Found = Iterator[tuple[str, tuple[str, str], int]]
 
 def _by_name(kinds: Kinds, bound: Mapping[str, str]) -> _Found:
     for item in each(kinds, ast.Attribute, ast.Name):
-        if isinstance(item.ctx, ast.Load):
-            full = dotted(item, bound)
-            last = (
-                item.attr
-                if isinstance(item, ast.Attribute)
-                else full.rpartition(".")[2]
-                if item.id in bound
-                else ""
-            )
-            why = _WHY_BESIDE.get(last) or (_FULL.get(full) if _is_imported(item, bound) else None)
-            if why is not None:
-                yield last if last in _WHY_BESIDE else full, why, item.lineno
-
-
-def _is_imported(item: ast.expr, bound: Mapping[str, str]) -> bool:
-    while isinstance(item, ast.Attribute):
-        item = item.value
-    return isinstance(item, ast.Name) and item.id in bound
+        if not isinstance(item.ctx, ast.Load):
+            continue
+        full, is_imported = dotted(item, bound), _first_name(item) in bound
+        last = full.rpartition(".")[2] if is_imported else ""
+        if isinstance(item, ast.Attribute):
+            last = item.attr
+        if last in _WHY_BESIDE:
+            yield last, _WHY_BESIDE[last], item.lineno
+        elif is_imported and full in _FULL:
+            yield full, _FULL[full], item.lineno
 
 
 def _by_text(kinds: Kinds) -> _Found:
@@ -682,18 +676,16 @@ def _of_paths(kinds: Kinds) -> _Found:
     pattern has groups too.
     """
     annotated = [item for item in each(kinds, ast.arg) if item.annotation is not None]
-    paths = {
-        item.arg
-        for item in annotated
-        if any(word in ast.unparse(item.annotation) for word in ("Path", "DataFile"))
-    }
-    for item in each(kinds, ast.Attribute):
-        if (
-            item.attr in ("owner", "group")
-            and isinstance(item.value, ast.Name)
-            and item.value.id in paths
-        ):
+    paths = {item.arg for item in annotated if _names_path(item.annotation)}
+    owners = [item for item in each(kinds, ast.Attribute) if item.attr in ("owner", "group")]
+    for item in owners:
+        if isinstance(item.value, ast.Name) and item.value.id in paths:
             yield item.attr, ("stamp", _STAMP), item.lineno
+
+
+def _names_path(annotation: ast.expr) -> bool:
+    text = ast.unparse(annotation)
+    return "Path" in text or "DataFile" in text
 
 
 # --- facts of the moment --------------------------------------------------------------------------
@@ -804,8 +796,5 @@ def _looked_up(kinds: Kinds, bound: Mapping[str, str]) -> _MomentFact:
             continue
         entry = entry_of(f"{base}.{name}") if name else ("state", _LOOKED_UP)
         if entry or name in _LAST:
-            yield (
-                ast.unparse(call)[:60],
-                entry[1] if entry else _WHY_OF_MOMENT,
-                call.lineno,
-            )
+            why = entry[1] if entry else _WHY_OF_MOMENT
+            yield ast.unparse(call)[:60], why, call.lineno

@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, starmap
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -89,7 +89,8 @@ def resolve(
             path = source.parent / entry
             if path.exists():
                 declared.parts[f"file {entry}"] = {"content": _content(path)}
-                declared.changed.extend([entry] if _changed(path, import_time(module)) else [])
+                if _changed(path, import_time(module)):
+                    declared.changed.append(entry)
             elif all(word.isidentifier() for word in entry.split(".")) and exists(entry):
                 declared.modules.append(entry)
             else:
@@ -103,16 +104,17 @@ def resolve(
 
 def uncovered(met: Iterable[Construct], entries: Sequence[str]) -> Construct | None:
     """Return the first construct that no entry covers, or None."""
-    return next((item for item in met if not any(_covers(entry, item) for entry in entries)), None)
+    for item in met:
+        if not any(_covers(entry, item) for entry in entries):
+            return item
+    return None
 
 
 def refusal(item: Construct, source: Path) -> str:
     """Return the message that refuses a construct: its place, its text, the reason and the fix."""
     fix = _FIX[item.kind].format(name=item.name or _NAME.get(item.kind, ""))
-    free = (
-        "or, if no result depends on it,"
-        f' depends=["{FREE}{item.text if item.text.isidentifier() else item.kind}"]'
-    )
+    name = item.text if item.text.isidentifier() else item.kind
+    free = f'or, if no result depends on it, depends=["{FREE}{name}"]'
     return (
         f"{source}:{item.line}: {item.text}: {item.why}, and a cache key cannot see it: {fix};"
         f" {free}"
@@ -246,12 +248,10 @@ class Siblings:
         others = own_modules()
         if not others:
             return []
-        followed: dict[str, Look] = {}
-        for root in roots:
-            followed.update(self._whole_of(root).looks)
-        mine = _own(followed)
+        followed = _looks_of(roots, lambda root: self._whole_of(root).looks)
+        mine, own = _own(followed), any(map(is_own, roots))
         beside = [name for name in others if name not in followed]
-        return [name for name in beside if self._joins(name, mine, any(map(is_own, roots)))]
+        return [name for name in beside if self._joins(name, mine, own)]
 
     def _joins(self, module: str, mine: Mapping[str, Reach], own: bool) -> bool:
         scope = self._scope_of(module)
@@ -309,9 +309,8 @@ def _is_shared(name: str) -> bool:
 
 
 def _kind(name: str) -> str:
-    return (
-        origin_of(name.partition(".")[0], frozenset()).kind if name.partition(".")[0] else "nowhere"
-    )
+    top = name.partition(".")[0]
+    return origin_of(top, frozenset()).kind if top else "nowhere"
 
 
 # --- user code ------------------------------------------------------------------------------------
@@ -355,28 +354,35 @@ def own_code_of(
     roots = [node.fn.__module__, *networks]
     if not any(map(is_own, roots)):
         return None
-    looks: dict[str, Look] = {}
-    for root in roots:
-        looks.update(code.looks(root))
+    looks = _looks_of(roots, code.looks)
     summaries = {name: look.summary for name, look in looks.items() if look.summary is not None}
     own = {name: summary for name, summary in summaries.items() if is_own(name)}
     declared = [(looks[name].path, summary.depends) for name, summary in summaries.items()]
     declared.append((looks[roots[0]].path, [*node.depends]))
     entries = [*chain.from_iterable(depends for _, depends in declared)]
-    files = {os.path.realpath(file) for file in files_in(params)}
-    for source, depends in declared:
-        files |= _declared_files(source, depends)
+    files = map(os.path.realpath, files_in(params))
+    declared_files = chain.from_iterable(starmap(_declared_files, declared))
     changed = outward_names([summary.reach for summary in own.values()])
     return OwnCode(
         modules=frozenset(own),
         followed=frozenset(looks),
-        files=frozenset(files),
+        files=frozenset(chain(files, declared_files)),
         free=_after(FREE, entries),
         changed=frozenset(changed),
         unread=_unread_logs(own),
         may_change=bool(changed) or _may_change_others(own),
         variables=_after(VARIABLE, entries),
     )
+
+
+def _looks_of(
+    roots: Iterable[str], looks_of: Callable[[str], Mapping[str, Look]]
+) -> dict[str, Look]:
+    """Return what each module adds that some modules lead to."""
+    looks: dict[str, Look] = {}
+    for root in roots:
+        looks.update(looks_of(root))
+    return looks
 
 
 def _declared_files(source: Path | None, entries: Sequence[str]) -> set[str]:
