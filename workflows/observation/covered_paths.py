@@ -7,6 +7,7 @@ The key holds versions of packages, and the system is not an input: every entry 
 from __future__ import annotations
 
 import functools
+import itertools
 import os
 import site
 import sys
@@ -86,7 +87,7 @@ def program() -> tuple[str, ...]:
     whole folder.
     """
     prefixes = {sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix}
-    python = [os.path.join(prefix, folder) for prefix in prefixes for folder in _OF_PYTHON]
+    python = itertools.starmap(os.path.join, itertools.product(prefixes, _OF_PYTHON))
     paths = sysconfig.get_paths()
     installed = [paths[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")]
     zipped = os.path.join(

@@ -163,12 +163,12 @@ def is_of_library(left: Taint, own: OwnCode) -> bool:
 
 def _of_modules(own: OwnCode) -> dict[str, dict[str, str]]:
     """Return a digest of each value of the user's modules, by module and name; empty for None."""
-    modules = {
-        name: module
-        for name in own.modules
-        if isinstance(module := sys.modules.get(name), ModuleType)
+    modules = {name: sys.modules.get(name) for name in own.modules}
+    return {
+        name: _digests(module, own)
+        for name, module in modules.items()
+        if isinstance(module, ModuleType)
     }
-    return {name: _digests(module, own) for name, module in modules.items()}
 
 
 def _digests(module: ModuleType, own: OwnCode) -> dict[str, str]:
@@ -244,11 +244,13 @@ def _of_others(own: OwnCode) -> dict[str, dict[str, Any]]:
     change.
     """
     names = [name for name in own.changed if "()" not in name and not name.startswith(".")]
-    attributes = {name: _attributes(value) for name in names if (value := _found(name)) is not None}
+    values = {name: _found(name) for name in names}
+    attributes = {name: _attributes(value) for name, value in values.items() if value is not None}
     for name in names:
         place, _, last = name.rpartition(".")
         parts = getattr(_found(place), "__dict__", {}) if place else {}
-        attributes.setdefault(place, {last: parts[last]} if last in parts else {})
+        attribute = {last: parts[last]} if last in parts else {}
+        attributes.setdefault(place, attribute)
     return attributes
 
 

@@ -170,7 +170,7 @@ def _run(
 
 def _judged(watch: Watch, covered: Covered, records: list[Record]) -> tuple[Taint, ...]:
     chance = watch.chance()
-    if not (records or watch.bodies or watch.settings or chance):
+    if not any((records, watch.bodies, watch.settings, chance)):
         return ()
     quiet = {path for path, is_quiet in watch.quiet.items() if is_quiet}
     judgement = Judgement(covered, watch.bodies, quiet, watch.temporary)
@@ -231,11 +231,9 @@ def tainted_modules(own: OwnCode, taints: Iterable[Taint]) -> frozenset[str]:
     """Return the modules of the user that may have what a step reached: all, if a library or a
     setting has it.
     """
-    return (
-        own.modules.union(own_modules())
-        if any(is_of_library(reached, own) for reached in taints)
-        else own.modules
-    )
+    if any(is_of_library(reached, own) for reached in taints):
+        return own.modules.union(own_modules())
+    return own.modules
 
 
 def undeclared(own: OwnCode, asked: Asked) -> list[Taint]:

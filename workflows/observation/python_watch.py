@@ -87,9 +87,9 @@ class KeptGenerators:
 
 
 def _state(generator: Any) -> bytes:
-    return pickle.dumps(
-        generator.getstate() if isinstance(generator, random.Random) else generator.state
-    )
+    is_of_python = isinstance(generator, random.Random)
+    state = generator.getstate() if is_of_python else generator.state
+    return pickle.dumps(state)
 
 
 # --- python watch ---------------------------------------------------------------------------------
@@ -144,12 +144,17 @@ class Watch:
         """
         return bool(getattr(self._local, "trusted", False))
 
+    def needs_record(self) -> bool:
+        """Return True if no kernel sees what the current thread does, and it is not trusted."""
+        return not self.kernel and not self.trusted()
+
     def trust(self, trusted: bool) -> bool:
         """Trust the current thread, or no longer, and return what held before."""
         before = self.trusted()
         if before != trusted:
             self._local.trusted = trusted
-            self._mark(TRUSTED if trusted else UNTRUSTED)
+            mark = TRUSTED if trusted else UNTRUSTED
+            self._mark(mark)
         return before
 
     def heard(self, path: str, quiet: bool) -> None:
@@ -285,11 +290,9 @@ class WatchedThreads:
 
     def __enter__(self) -> None:
         for place, name, function in self._before:
-            setattr(
-                place,
-                name,
-                _starting(function) if place is threading.Thread else _starting_nameless(function),
-            )
+            has_thread = place is threading.Thread
+            wrapped = _starting(function) if has_thread else _starting_nameless(function)
+            setattr(place, name, wrapped)
 
     def __exit__(self, *_: object) -> None:
         for place, name, function in self._before:
@@ -396,7 +399,7 @@ def _heard(event: str, arguments: tuple[Any, ...]) -> None:
         _settings(watch, arguments)
     if event == "subprocess.Popen":
         _program(watch, arguments)
-    elif event in _HANDLERS and not watch.kernel and not watch.trusted():
+    elif event in _HANDLERS and watch.needs_record():
         _HANDLERS[event](watch, arguments)
 
 
@@ -404,12 +407,11 @@ def _program(watch: Watch, arguments: tuple[Any, ...]) -> None:
     """Take note of a child process; the program itself compiles its C++ when it is first used."""
     if _called_by_program():
         watch.trust_child()
-    elif not watch.kernel and not watch.trusted():
+    elif watch.needs_record():
         command = arguments[0] or arguments[1]
-        words = (
-            command if isinstance(command, str | bytes | os.PathLike) else next(iter(command), "")
-        )
-        watch.records.append(Record("exec", os.fsdecode(words)))
+        is_text = isinstance(command, str | bytes | os.PathLike)
+        first_word = command if is_text else next(iter(command), "")
+        watch.records.append(Record("exec", os.fsdecode(first_word)))
 
 
 def _called_by_program() -> bool:
@@ -547,9 +549,11 @@ def _of_address(does: Does) -> Callable[[Watch, tuple[Any, ...]], None]:
 
     def note(watch: Watch, arguments: tuple[Any, ...]) -> None:
         address = arguments[1]
-        unix = isinstance(address, str | bytes)
-        where = os.path.realpath(os.fsdecode(address)) if unix else ":".join(map(str, address))
-        watch.records.append(Record(does, where, "unix" if unix else "internet"))
+        if isinstance(address, str | bytes):
+            where, family = os.path.realpath(os.fsdecode(address)), "unix"
+        else:
+            where, family = ":".join(map(str, address)), "internet"
+        watch.records.append(Record(does, where, family))
 
     return note
 

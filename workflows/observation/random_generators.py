@@ -77,7 +77,8 @@ class WatchedChance:
 
     def __enter__(self) -> None:
         for place, name, function in self._before:
-            setattr(place, name, _seeding(function) if name == "seed" else _asking(function))
+            wrapped = _seeding(function) if name == "seed" else _asking(function)
+            setattr(place, name, wrapped)
 
     def __exit__(self, *_: object) -> None:
         for place, name, function in self._before:
@@ -324,8 +325,9 @@ def _setting(function: Callable[..., Any], shared: Shared, by: _By) -> Callable[
     """
 
     def set_generator(*arguments: Any, **named: Any) -> Any:
-        without = next(iter((*arguments, *named.values())), None) is None
-        return shared.set(lambda: function(*arguments, **named), "system" if without else by)
+        without_value = next(iter((*arguments, *named.values())), None) is None
+        source: _By = "system" if without_value else by
+        return shared.set(lambda: function(*arguments, **named), source)
 
     return set_generator
 

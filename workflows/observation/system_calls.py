@@ -253,7 +253,9 @@ def program(name: str) -> list[Step]:
     """Return the instructions of the filter for a processor."""
     of_32_bits = _calls_of_32_bits() if name == "x86_64" else []
     x32 = [Step(BPF_JGE, 0, 1, _X32), _STOP] if name == "x86_64" else []
-    calls = [step for number, call in numbers(name).items() for step in _call(number, call.when)]
+    calls: list[Step] = []
+    for number, call in numbers(name).items():
+        calls += _call(number, call.when)
     usual = [_load(_NUMBER), *x32, *calls, _PASS]
     return [
         _load(_ARCH),
@@ -265,11 +267,9 @@ def program(name: str) -> list[Step]:
 
 
 def _calls_of_32_bits() -> list[Step]:
-    stops = [
-        step
-        for number in CALLS_OF_32_BITS.values()
-        for step in (Step(BPF_JEQ, 0, 1, number), _STOP)
-    ]
+    stops: list[Step] = []
+    for number in CALLS_OF_32_BITS.values():
+        stops += [Step(BPF_JEQ, 0, 1, number), _STOP]
     return [Step(BPF_JEQ, 0, len(stops) + 1, AUDIT_ARCH_I386), _load(_NUMBER), *stops]
 
 
@@ -378,7 +378,8 @@ class Task:
         Without ``follow``, a link at the end of the path stays.
         """
         if not text.startswith("/"):
-            text = os.path.join(self.link("cwd" if folder == AT_FDCWD else f"fd/{folder}"), text)
+            start = "cwd" if folder == AT_FDCWD else f"fd/{folder}"
+            text = os.path.join(self.link(start), text)
         # of the thread, not of the process that reads this
         for own in ("/proc/self", "/proc/thread-self"):
             if f"{text}/".startswith(f"{own}/"):
@@ -475,19 +476,16 @@ def _address(task: Task, call: Call, arguments: Sequence[int]) -> Record:
     family = struct.unpack_from("H", data)[0] if len(data) > 1 else socket.AF_UNSPEC
     if family == socket.AF_UNIX:
         name = os.fsdecode(data[2:].partition(b"\0")[0])
-        return Record(
-            call.does, task.path(name, AT_FDCWD) if name else f"@{os.fsdecode(data[3:])}", "unix"
-        )
+        path = task.path(name, AT_FDCWD) if name else f"@{os.fsdecode(data[3:])}"
+        return Record(call.does, path, "unix")
     if family in (socket.AF_INET, socket.AF_INET6):
         start, length = (4, 4) if family == socket.AF_INET else (8, 16)
         host = socket.inet_ntop(family, data[start : start + length])
         return Record(call.does, f"{host}:{struct.unpack_from('!H', data, 2)[0]}", "internet")
     # the kernel itself answers a netlink socket, and a socket without a family is only let go
-    return Record(
-        call.does,
-        f"family {family}",
-        "" if family in (socket.AF_UNSPEC, socket.AF_NETLINK) else "other",
-    )
+    reaches_nothing = family in (socket.AF_UNSPEC, socket.AF_NETLINK)
+    kind = "" if reaches_nothing else "other"
+    return Record(call.does, f"family {family}", kind)
 
 
 def _named(task: Task, call: Call, arguments: Sequence[int]) -> Record:

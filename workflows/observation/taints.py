@@ -106,11 +106,9 @@ _OF_CHANCE = {
 def taint(kind: Kind, name: str) -> Taint:
     """Return a taint with what to write against it."""
     fix = _FIX[kind].format(name=_short(kind, name))
-    return Taint(
-        kind,
-        name,
-        f"{_OF_CHANCE[name]}; or {fix}" if kind == "random" and name in _OF_CHANCE else fix,
-    )
+    if kind == "random" and name in _OF_CHANCE:
+        fix = f"{_OF_CHANCE[name]}; or {fix}"
+    return Taint(kind, name, fix)
 
 
 def _short(kind: Kind, name: str) -> str:
@@ -170,11 +168,8 @@ class Judgement:
 
     def taints(self) -> tuple[Taint, ...]:
         """Return the taints, each once; a look at a folder on the way to another one is none."""
-        reached = [
-            reached_item.what
-            for reached_item in self._taints
-            if reached_item.kind in ("file", "folder", "write")
-        ]
+        kinds = ("file", "folder", "write")
+        reached = [reached_item.what for reached_item in self._taints if reached_item.kind in kinds]
         on_the_way = set[str]()
         for path in (*reached, *self._looks):
             on_the_way.update(_with_parents(path)[1:])
@@ -192,7 +187,7 @@ class Judgement:
         flags = record.flags
         if _TMPFILE and flags & _TMPFILE == _TMPFILE:
             return  # a new file without a name
-        if flags & os.O_CREAT and (flags & os.O_EXCL or not (record.there or flags & os.O_TRUNC)):
+        if _creates(record):
             self._make(record)
         elif flags & os.O_TRUNC and flags & _ACCESS != os.O_RDONLY:
             self._add_made(record.path)
@@ -218,10 +213,8 @@ class Judgement:
 
     def _meet(self, record: Record) -> None:
         """Judge a path where the success of a call depends on what was there before."""
-        path, named_by_chance = (
-            record.path,
-            any(above in self._temporary for above in _with_parents(record.path)),
-        )
+        path = record.path
+        named_by_chance = not self._temporary.isdisjoint(_with_parents(path))
         free = record.trusted or named_by_chance or path in self._folders
         if not (free or self._is_covered(path) or is_searched_program(path)):
             self.add("write", path)
@@ -297,7 +290,8 @@ class Judgement:
         if is_chance(path):
             self.add("random", path)
         elif not self._is_covered(path):
-            self.add("folder" if os.path.isdir(path) else "file", path)
+            kind: Kind = "folder" if os.path.isdir(path) else "file"
+            self.add(kind, path)
 
     def _read_source(self, path: str) -> None:
         """Judge source of a module that the key follows, which has neither its comments nor its
@@ -358,6 +352,13 @@ class Judgement:
     def _add_made(self, path: str) -> None:
         self._made.add(path)
         self._folders.update(_with_parents(path))
+
+
+def _creates(record: Record) -> bool:
+    """Return True for a call that makes a file, or that one which is there stops."""
+    if not record.flags & os.O_CREAT:
+        return False
+    return bool(record.flags & os.O_EXCL) or not (record.there or record.flags & os.O_TRUNC)
 
 
 def _with_parents(path: str) -> list[str]:
