@@ -228,11 +228,8 @@ def _check_docstring(network: type[nn.Module]) -> Iterator[Finding]:
     """Find whether the class has a docstring of its own that begins with a sentence."""
     first = (vars(network).get("__doc__") or "").strip().partition("\n")[0]
     ok = first[:1].isupper() and first.endswith(".")
-    yield Finding(
-        "docstring",
-        ok,
-        "one sentence" if ok else "begin the class with one sentence that ends with a stop",
-    )
+    wrong = "begin the class with one sentence that ends with a stop"
+    yield Finding.of("docstring", ok, "one sentence", wrong)
 
 
 def _check_network_key(network: type[nn.Module]) -> Iterator[Finding]:
@@ -282,7 +279,7 @@ def _check_weights(make: Make) -> Iterator[Finding]:
         "two networks with the same weights differ: register each drawn tensor as a parameter or a"
         " buffer"
     )
-    yield Finding("weights", same, text if same else wrong)
+    yield Finding.of("weights", same, text, wrong)
 
 
 def _check_gradient(make: Make) -> Iterator[Finding]:

@@ -41,6 +41,12 @@ class Finding:
     ok: bool | None  #: None if the node leaves out what would be good to have
     text: str
 
+    @classmethod
+    def of(cls, rule: str, ok: bool, kept_text: str, broken_text: str) -> Finding:
+        """Return the outcome of a rule, with the text for a rule that is kept or that is broken."""
+        text = kept_text if ok else broken_text
+        return cls(rule, ok, text)
+
 
 # --- document rules -------------------------------------------------------------------------------
 
@@ -140,7 +146,8 @@ class Call:
     def result(self, inputs: Sequence[Any] | None = None) -> Any:
         """Return the result of the node, with the same random numbers each time."""
         rng = {"rng": torch.Generator().manual_seed(_SEED)} if self.node.random else {}
-        return self.node(*(self.inputs if inputs is None else inputs), **self.params, **rng)
+        values = self.inputs if inputs is None else inputs
+        return self.node(*values, **self.params, **rng)
 
 
 def check_result(call: Call) -> Iterator[Finding]:
@@ -151,25 +158,19 @@ def check_result(call: Call) -> Iterator[Finding]:
     first, second = call.result(), call.result()
     after = tensors_in(list(call.inputs))
     same = all(torch.equal(x, y) for x, y in zip(before, after, strict=True))
-    yield Finding(
-        "inputs",
-        same,
-        "left as they were" if same else "changed in place: let the node clone the input",
+    yield Finding.of(
+        "inputs", same, "left as they were", "changed in place: let the node clone the input"
     )
     finite = all(bool(x.isfinite().all()) for x in _floating(first))
-    yield Finding(
-        "finite",
-        finite,
-        "no NaN, no infinity" if finite else "the result has NaN or infinite values",
+    yield Finding.of(
+        "finite", finite, "no NaN, no infinity", "the result has NaN or infinite values"
     )
     again = all(
         torch.allclose(x, y, 0.0, 0.0, True)
         for x, y in zip(tensors_in(first), tensors_in(second), strict=True)
     )
-    yield Finding(
-        "same twice",
-        again,
-        "the same bits" if again else "two calls differ: draw from the argument rng",
+    yield Finding.of(
+        "same twice", again, "the same bits", "two calls differ: draw from the argument rng"
     )
     kind = call.node.hints.get("return", Any)
     is_kind = fits(first, kind)
@@ -331,7 +332,8 @@ def check_skip_bound(call: Call) -> Iterator[Finding]:
 def _size(change: Tensor, is_random: bool) -> float:
     """Return the largest element of a change, or the root mean square of a random one."""
     double = change.double()
-    return float(double.square().mean().sqrt() if is_random else double.abs().max())
+    size = double.square().mean().sqrt() if is_random else double.abs().max()
+    return float(size)
 
 
 def check_shape(call: Call) -> Iterator[Finding]:
@@ -440,6 +442,10 @@ class Outcome:
     place: str = ""  #: file and line of the failure in the code of the user
     is_end: bool = False  #: True if the call ended its process, or had no end
 
+    def names(self) -> list[str]:
+        """Return the places of the parts in the result."""
+        return [name for name, _ in self.parts]
+
 
 @dataclass(frozen=True, slots=True)
 class Difference:
@@ -471,8 +477,7 @@ def difference(actual: Outcome, expected: Outcome, rtol: float) -> Difference | 
     """Return how an outcome differs; None if all bits are the same. NaN is the same as NaN."""
     if actual.failure or expected.failure:
         return _of_failures(actual, expected)
-    names = [[name for name, _ in outcome.parts] for outcome in (actual, expected)]
-    if names[0] != names[1]:
+    if actual.names() != expected.names():
         return Difference("the result has other parts, or in another order")
     pairs = zip(actual.parts, expected.parts, strict=True)
     deviations = [_of_part(name, own, other, rtol) for (name, own), (_, other) in pairs]
@@ -484,9 +489,8 @@ def _of_failures(actual: Outcome, expected: Outcome) -> Difference | None:
     """Return how an outcome differs, where one of both is a failure."""
     if actual.failure == expected.failure:
         return None
-    return Difference(
-        f"it {actual.failure}" if actual.failure else "it gives a result", actual.place
-    )
+    text = f"it {actual.failure}" if actual.failure else "it gives a result"
+    return Difference(text, actual.place)
 
 
 def _of_part(name: str, actual: Any, expected: Any, rtol: float) -> Difference | None:

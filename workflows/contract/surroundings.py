@@ -152,15 +152,14 @@ class Others:
         """Return in which surrounding a result differs; ``variables`` of the environment decide
         it.
         """
+        names = "variables"
+        if variables:
+            names = f"variable{'s' * (len(variables) > 1)} {', '.join(variables)}"
         return surrounding.differs.format(
             locale=self.locale,
             threads=self.in_threads(),
             threads_here=self.threads_here,
-            names=(
-                f"variable{'s' * (len(variables) > 1)} {', '.join(variables)}"
-                if variables
-                else "variables"
-            ),
+            names=names,
         )
 
     def in_threads(self) -> str:
@@ -191,10 +190,8 @@ class Others:
         """Return the environment of a new process of Python with those of ``changes`` that only
         a new one can have.
         """
-        variables = {
-            **environ,
-            "PYTHONHASHSEED": str(self.hash_seed + 1 if HASH in changes else self.hash_seed),
-        }
+        hash_seed = self.hash_seed + 1 if HASH in changes else self.hash_seed
+        variables = {**environ, "PYTHONHASHSEED": str(hash_seed)}
         # of compiled programs
         variables.setdefault("XDG_CACHE_HOME", os.path.join(os.path.expanduser("~"), ".cache"))
         if LOCALE in changes:
@@ -224,10 +221,12 @@ class Others:
                 "HOME": str(folder),
                 **dict.fromkeys(("USER", "LOGNAME", "USERNAME"), "somebody"),
             }
+        working_folder = str(folder) if FOLDER in changes else ""
+        threads = self.threads if THREADS in changes else 0
         return Settings(
-            folder=str(folder) if FOLDER in changes else "",
+            folder=working_folder,
             variables={name: value for name, value in variables.items() if name not in declared},
-            threads=self.threads if THREADS in changes else 0,
+            threads=threads,
             has_locale=LOCALE in changes,
             has_other_states=RANDOM in changes,
             has_other_work=WORK in changes,
@@ -235,13 +234,9 @@ class Others:
         )
 
     def _can_change(self, surrounding: Surrounding) -> bool:
-        return (
-            bool(self.locale)
-            if surrounding is LOCALE
-            else bool(self.variables)
-            if surrounding is VARIABLES
-            else True
-        )
+        if surrounding is LOCALE:
+            return bool(self.locale)
+        return surrounding is not VARIABLES or bool(self.variables)
 
 
 def others(environ: Mapping[str, str]) -> Others:
@@ -249,10 +244,12 @@ def others(environ: Mapping[str, str]) -> Others:
     seed = environ.get("PYTHONHASHSEED", "")
     threads = environ.get("OMP_NUM_THREADS", "")
     here = int(threads) if threads.isdecimal() else _processors()
+    hash_seed = int(seed) if seed.isdecimal() else 0
+    other_threads = 3 if here == 1 else 1
     now = next((environ[name] for name in ("LC_ALL", "LC_CTYPE", "LANG") if environ.get(name)), "C")
     return Others(
-        hash_seed=int(seed) if seed.isdecimal() else 0,
-        threads=3 if here == 1 else 1,
+        hash_seed=hash_seed,
+        threads=other_threads,
         threads_here=here,
         locale=other_locale(now, installed_locales(environ), environ),
         variables=tuple(sorted(name for name in environ if not is_known(name))),
