@@ -66,7 +66,7 @@ NO_SIZE = {
     "nodes/restore/_networks/_network_files.py:exported_network": CHECKED,
     "workflows/answers/repeated_command.py:_devices": SYSTEM,
     "workflows/answers/repeated_command.py:program_state": SOURCE,
-    "workflows/answers/witnesses.py:_digest_by": DIGEST,
+    "workflows/answers/witnesses.py:_digest_of_results": DIGEST,
     "workflows/answers/witnesses.py:file_digest": DIGEST,
     "workflows/calibration/emcee_sampler.py:_write": OWN,
     "workflows/engine/step_process.py:_called": (

@@ -23,6 +23,7 @@ from neusee.workflows.answers.stored_answer import (
 )
 from neusee.workflows.answers.witnesses import (
     Folders,
+    Listing,
     Opened,
     Unsettled,
     Witnesses,
@@ -353,28 +354,39 @@ class Command:
         """
         self._opened.end()
         with suppress(OSError, ValueError, KeyError, TypeError):
-            inputs = [
-                *_input_files(recipe),
-                *(self._of_cache() if isinstance(results, Said) else ()),
-            ]
-            witnesses = self._witnesses(results.out if results else None, inputs)
-            written = results if results and results.out else None
-            if self._is_doubtful() or not (written or os.path.isdir(self._disk.folder)):
+            inputs = [*_input_files(recipe)]
+            if isinstance(results, Said):
+                inputs += self._of_cache()
+            out = results.out if results else None
+            witnesses = self._witnesses(out, inputs)
+            if self._is_doubtful() or not (out or os.path.isdir(self._disk.folder)):
                 return
-            label, key = _parts(written.folder.name) if written else ("", "")
-            fields = results.fields() if results else {"files": {}}
-            answer = Answer(
-                self._state.digest,
-                witnesses,
-                text,
-                as_json,
-                out=str(written.out) if written else "",
-                label=label,
-                key=key,
-                **fields,
-            )
+            answer = self._answer(witnesses, text, as_json, results)
             if write_answer(self._disk, self.name, answer):
                 make_room(self._disk, budget_bytes(None))
+
+    def _answer(
+        self,
+        witnesses: Witnesses,
+        text: str,
+        as_json: bool,
+        results: Results | RunResults | Said | None,
+    ) -> Answer:
+        """Return the answer to keep: the text, what decided it, and the folder if there is one."""
+        written = results if results and results.out else None
+        out = str(written.out) if written else ""
+        label, key = _parts(written.folder.name) if written else ("", "")
+        fields = results.fields() if results else {"files": {}}
+        return Answer(
+            self._state.digest,
+            witnesses,
+            text,
+            as_json,
+            out=out,
+            label=label,
+            key=key,
+            **fields,
+        )
 
     def _fits(self, answer: Answer) -> bool:
         """Return True if the folder of an answer is the one that the command names, and if it can
@@ -410,22 +422,36 @@ class Command:
 
     def _witnesses(self, out: Path | None, inputs: Iterable[str]) -> Witnesses:
         """Return the witnesses of the answer; folders of results in ``out`` are no witnesses."""
-        ignored = Folders(
-            [*_installed(), *_SYSTEM, self._disk.folder, *(ROOT / name for name in SOURCES)]
-        )
-        cache, written = Folders([self._disk.folder]), os.path.abspath(out) if out else None
-        opened = [path for path in self._opened.files if not _DERIVED.search(path)]
-        files = [path for path in opened if path.endswith(_RECIPES) or path not in ignored]
+        cache = Folders([self._disk.folder])
+        written = os.path.abspath(out) if out else None
+        ignored = self._ignored()
+        files = self._files_opened(ignored)
         # a recipe that another one extends may lie anywhere, with options beside it
         beside = {os.path.dirname(path) for path in files if path.endswith(_RECIPES)}
         recipes = _recipe_folders(self._words) | beside
         if any(path in cache for path in (os.getcwd(), *files)) or written in recipes:
             raise Unsettled("a recipe is in the folder of the cache or of results")
-        folders = [
-            path for path in self._opened.folders if path not in ignored and not _PART.search(path)
-        ]
-        listed = {path: self._opened.folders[path] for path in folders if path != written}
+        folders = self._folders_listed(ignored)
+        listed = {path: listing for path, listing in folders.items() if path != written}
         return witnesses_of([*files, *inputs], recipes, listed, self._started() - _TICK, written)
+
+    def _ignored(self) -> Folders:
+        """Return the folders of what is installed and of the cache, which have other witnesses."""
+        sources = [ROOT / name for name in SOURCES]
+        return Folders([*_installed(), *_SYSTEM, self._disk.folder, *sources])
+
+    def _files_opened(self, ignored: Folders) -> list[str]:
+        """Return the files that were opened and are neither ignored nor made from other ones."""
+        opened = [path for path in self._opened.files if not _DERIVED.search(path)]
+        return [path for path in opened if path.endswith(_RECIPES) or path not in ignored]
+
+    def _folders_listed(self, ignored: Folders) -> dict[str, Listing]:
+        """Return what was in the folders that were listed, but for ignored and unfinished ones."""
+        return {
+            path: listing
+            for path, listing in self._opened.folders.items()
+            if path not in ignored and not _PART.search(path)
+        }
 
     def _of_cache(self) -> list[str]:
         """Return the files of the cache that were read and decide what a forecast or an

@@ -133,13 +133,12 @@ class RunResults(NamedTuple):
             or document["missed"]
         ):
             raise NotRepeatable("a run that computed a step, warned or missed a number")
-        files = {
-            name: bytes_of(path, _ANY)
-            for path in sorted(folder.rglob("*"))
-            if path.is_file()
-            and (name := path.relative_to(folder).as_posix())
-            not in (CRATE, REPORT_PAGE, *self.taken)
-        }
+        made_again = {CRATE, REPORT_PAGE, *self.taken}
+        files: dict[str, bytes] = {}
+        for path in sorted(filter(Path.is_file, folder.rglob("*"))):
+            name = path.relative_to(folder).as_posix()
+            if name not in made_again:
+                files[name] = bytes_of(path, _ANY)
         said = json.loads(files[DOCUMENT])
         made = page(said, _pictures(folder, self.taken))
         if (

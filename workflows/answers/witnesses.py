@@ -292,9 +292,10 @@ def taken_from(store: Store, taken: Mapping[str, Path]) -> StoredResults:
     """
     asked, loaded = store.asked(), sorted(store.loaded())
     paths = {name: os.path.relpath(path, store.root) for name, path in taken.items()}
-    bands = (
-        f"bands/{name[:2]}/{name}" for key in loaded for name in metadata.bands(asked[key] or {})
-    )
+    bands: list[str] = []
+    for key in loaded:
+        names = metadata.bands(asked[key] or {})
+        bands += [f"bands/{name[:2]}/{name}" for name in names]
     read_files = sorted({*paths.values(), *bands})
     if outside := [path for path in read_files if not _FILE.fullmatch(path)]:
         raise Unsettled(f"{outside[0]} is not in the folders of a store")
@@ -338,11 +339,8 @@ def checked(fields: Mapping[str, Any]) -> StoredResults:
         isinstance(field, dict) for field in (results.results, results.files, results.taken)
     ):
         raise ValueError("a field of the answer is not of its type")
-    names = [
-        (_KEY, [*results.results, *results.loaded]),
-        (_FILE, [*results.files, *results.taken.values()]),
-    ]
-    if any(not form.fullmatch(name) for form, many in names for name in many):
+    keys, paths = [*results.results, *results.loaded], [*results.files, *results.taken.values()]
+    if not (all(map(_KEY.fullmatch, keys)) and all(map(_FILE.fullmatch, paths))):
         raise ValueError("the answer names what is no result and no file of a cache")
     digests = [*results.results.values(), *results.files.values()]
     if not all(isinstance(text, str) for text in digests) or not {*results.taken.values()} <= {
@@ -377,16 +375,14 @@ def _is_whole(disk: Disk, about: Metadata | None) -> bool:
     payload = about.get("payload")
     if not payload:
         return True
-    algorithm, name = (hashlib.sha256, "sha256") if secrets() else (xxhash.xxh3_128, "xxh3")
-    return bool(_digest_by(disk.path(about["key"], "safetensors"), algorithm) == payload.get(name))
+    name = "sha256" if secrets() else "xxh3"
+    content_digest = _digest_of_results(disk.path(about["key"], "safetensors"))
+    return bool(content_digest == payload.get(name))
 
 
 def _digest_of_results(path: str) -> str:
     """Return a digest of a file, of the kind that the store uses for its files."""
-    return _digest_by(path, hashlib.sha256 if secrets() else xxhash.xxh3_128)
-
-
-def _digest_by(path: str, algorithm: Any) -> str:
+    algorithm: Any = hashlib.sha256 if secrets() else xxhash.xxh3_128
     with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise Unsettled(f"{path} is not a file")
