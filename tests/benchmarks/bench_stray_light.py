@@ -18,9 +18,10 @@ import numpy as np
 import torch
 
 from neusee.workflows.calibration.identifiability import identify
-from neusee.workflows.calibration.importance_sampling import draw_samples, weights
+from neusee.workflows.calibration.importance_sampling import draw_samples
 from neusee.workflows.calibration.log_posterior import find_mode, initial_theta
 from neusee.workflows.calibration.posterior_checks import _SMOOTH, _SURPRISE, slow_waves
+from neusee.workflows.calibration.posterior_mixture import normalised
 from tests.workflows.calibration.simulated_lenses import (
     PRIOR,
     drawn_camera,
@@ -41,7 +42,7 @@ def fitted(seed, prior):
         samples, log = draw_samples(problem, mode, np.random.default_rng(seed))
     except ValueError as error:
         return {"seed": seed, "truth": truth, "refused": str(error)}
-    weight = weights(log)
+    weight = normalised(log)
     samples, weight = samples[weight > 0], weight[weight > 0]
     found = problem.parameters(samples)
     below = {name: float(weight @ (found[name].numpy() < truth[name])) for name in SHAPE}

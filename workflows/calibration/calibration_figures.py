@@ -10,6 +10,7 @@ import numpy as np
 
 from neusee.nodes.calibrate import Rings, Sufficient
 from neusee.nodes.values import Levels
+from neusee.workflows.calibration.identifiability import words_of
 from neusee.workflows.calibration.posterior_checks import is_camera
 from neusee.workflows.report.figures.style import BLACK, BLUE, ORANGE, VERMILION, canvas, drawn
 from neusee.workflows.report.study_page import Section
@@ -212,12 +213,9 @@ def corners(draws: FloatArray, names: Sequence[str], nominal: Sequence[float]) -
                 [ranges[column], ranges[row]],
                 (nominal[column], nominal[row]),
             )
-            _labelled(
-                ax,
-                names[column] if row == count - 1 else "",
-                names[row] if column == 0 < row else "",
-                text,
-            )
+            below = names[column] if row == count - 1 else ""
+            beside = names[row] if column == 0 < row else ""
+            _labelled(ax, below, beside, text)
     return figure
 
 
@@ -315,11 +313,6 @@ _EXCLUDED = """The measured variance of each level against its mean, and the pre
 _CORNER = 20_000  #: draws for the picture of pairs
 
 
-def words(name: str) -> str:
-    """Return the name of a parameter as words."""
-    return name.replace("_", " ")
-
-
 def curve_section(result: CalibrationResult) -> Section:
     """Return the section with the photon-transfer curve, or with the rings about a point source."""
     if isinstance(result.problem.levels, Rings):
@@ -407,7 +400,9 @@ def corner_section(result: CalibrationResult) -> Section:
     text = """Every pair of parameters of which the frames tell a value or a limit; the recipe's own
         values are orange. Gain, offset, noise and efficiency correlate."""
     picture = corners(
-        shown, [f"{words(r.name)}\n{r.unit}" for r in determined], [r.nominal for r in determined]
+        shown,
+        [f"{words_of(r.name)}\n{r.unit}" for r in determined],
+        [r.nominal for r in determined],
     )
     return Section("Parameters in pairs", text, picture=picture)
 

@@ -22,10 +22,9 @@ from neusee.workflows.calibration.calibration_figures import (
     chains_section,
     corner_section,
     curve_section,
-    words,
 )
 from neusee.workflows.calibration.frame_validity import IntervalEstimate, ModelSpread, frame_section
-from neusee.workflows.calibration.identifiability import KINDS, Identifiability
+from neusee.workflows.calibration.identifiability import KINDS, Identifiability, words_of
 from neusee.workflows.calibration.laboratory import RELATIVE, stated
 from neusee.workflows.calibration.log_posterior import LaplaceFit, SensorPosterior
 from neusee.workflows.calibration.posterior_checks import Check, Mark, count_failures, is_camera
@@ -360,8 +359,8 @@ def lead(result: CalibrationResult) -> str:
     """Return the opening of a calibration's page: estimates, values to report, and undetermined
     parameters.
     """
-    values = [f"{words(row.name)} {row.text}" for row in result.rows()]
-    stated = [f"{words(m.name)} {_between(m.stated)}" for m in estimated_models(result)]
+    values = [f"{words_of(row.name)} {row.text}" for row in result.rows()]
+    stated = [f"{words_of(m.name)} {_between(m.stated)}" for m in estimated_models(result)]
     return "\n\n".join(
         f"{opening}{'; '.join(parts)}."
         for opening, parts in (
@@ -430,7 +429,7 @@ def _parameters(result: CalibrationResult) -> Section:
     )
     rows = [
         (
-            words(r.name),
+            words_of(r.name),
             r.text,
             r.end("low"),
             r.end("high"),
@@ -441,12 +440,8 @@ def _parameters(result: CalibrationResult) -> Section:
         )
         for r in result.rows()
     ]
-    return Section(
-        "The lens" if isinstance(result.problem.levels, Rings) else "The sensor",
-        text,
-        columns,
-        rows,
-    )
+    heading = "The lens" if isinstance(result.problem.levels, Rings) else "The sensor"
+    return Section(heading, text, columns, rows)
 
 
 def _judged_share(r: ParameterEstimate) -> Marked:
@@ -468,7 +463,7 @@ def _models(result: CalibrationResult) -> Section:
         "unit",
     )
     rows = [
-        (words(m.name), *map(_between, (*m.models, m.stated)), unit_of(m.name, result.params))
+        (words_of(m.name), *map(_between, (*m.models, m.stated)), unit_of(m.name, result.params))
         for m in estimated_models(result)
     ]
     return Section("How models of the response differ", text, columns, rows)

@@ -21,11 +21,10 @@ from neusee.workflows.calibration.posterior_mixture import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from neusee.workflows.calibration.log_posterior import FloatArray
+    from neusee.workflows.calibration.log_posterior import FloatArray, LaplaceFit, SensorPosterior
 
     #: the numbers of a distribution, each for every set of widths (draw, ...)
     Law = tuple[FloatArray, ...]
-    from neusee.workflows.calibration.log_posterior import FloatArray, LaplaceFit, SensorPosterior
 
 
 # --- camera density -------------------------------------------------------------------------------
@@ -363,7 +362,7 @@ _SHARE, _TAIL_REACH, _TAIL_SHARE = 0.05, 2.5, 6.0
 
 
 @dataclass(frozen=True)
-class TailDensity:
+class TailDensity(Density):
     """A density of which a fixed share comes from a mixture for the tails; both are normalised
     alike.
     """
@@ -383,13 +382,6 @@ class TailDensity:
         """Return the logarithm of the density at samples (draw, free), up to a constant."""
         body, tails = self.body.log_density(samples), self.tails.log_density(samples)
         return log_sum(np.stack([body + np.log1p(-_SHARE), tails + np.log(_SHARE)], -1))
-
-    def propose(self, own: FloatArray, rng: Random) -> tuple[FloatArray, FloatArray]:
-        """Return new samples like ``own`` (draw, free), and the logarithm of the density at
-        ``own`` over that there.
-        """
-        drawn = self.draw(len(own), rng)
-        return drawn, self.log_density(own) - self.log_density(drawn)
 
 
 def hardly_told(problem: SensorPosterior, mode: LaplaceFit, doubt: float = _DOUBT) -> list[int]:

@@ -254,7 +254,8 @@ def sample(
     tau_before, stored = _longest_time(runs, before) if before else np.inf, True
     while True:
         walk_until(runs, steps, problem.log_posterior)
-        stored = _keep(file, [run.backend for run in runs], progress if stored else silent)
+        warn = progress if stored else silent
+        stored = _keep(file, [run.backend for run in runs], warn)
         tau = _longest_time(runs)
         chains = _gathered(runs, tau, steps, _are_long(steps, tau, tau_before))
         size = chains.flat.shape[0] / tau

@@ -86,28 +86,7 @@ def signal_to_noise(sheet: EmvaSheet) -> Any:
         label="measured",
         **_DOTS,
     )
-    eta, k, threshold, saturation = (
-        sheet[key].value for key in ("eta", "K", "mu_p_min", "mu_p_sat")
-    )
-    if eta is not None and k is not None and threshold is not None and saturation is not None:
-        light = np.geomspace(threshold, saturation, _BINS)
-        electrons = eta / 100 * light
-        noise = (sheet["sigma_y_dark"].value or 0.0) ** 2 / k**2 + electrons
-        ax.plot(light, electrons / np.sqrt(noise), color=BLUE, label="linear model")
-        ax.plot(light, np.sqrt(light), color=GREEN, linestyle="-.", label="ideal sensor")
-        dsnu, prnu = sheet["DSNU1288"].value, sheet["PRNU1288"].value
-        if dsnu is not None and prnu is not None:
-            total = noise + dsnu**2 + (prnu / 100 * electrons) ** 2
-            ax.plot(
-                light,
-                electrons / np.sqrt(total),
-                color=ORANGE,
-                linestyle="--",
-                label="total SNR, with DSNU and PRNU",
-            )
-        ax.axvline(
-            threshold, color=VERMILION, linestyle=":", label=f"μ_p.min: {sheet['mu_p_min'].text}"
-        )
+    _modelled_ratio(ax, sheet)
     _saturation(ax, sheet, float(transfer.photons[transfer.saturation]))
     ax.set(
         xscale="log",
@@ -119,6 +98,33 @@ def signal_to_noise(sheet: EmvaSheet) -> Any:
     ax.set_ylim(bottom=min(1.0, *ax.get_ylim()))
     ax.legend(loc="upper left")
     return figure
+
+
+def _modelled_ratio(ax: Any, sheet: EmvaSheet) -> None:
+    """Draw the ratio of the linear model from threshold to saturation, if the frames tell both."""
+    eta, k, threshold, saturation = (
+        sheet[key].value for key in ("eta", "K", "mu_p_min", "mu_p_sat")
+    )
+    if eta is None or k is None or threshold is None or saturation is None:
+        return
+    light = np.geomspace(threshold, saturation, _BINS)
+    electrons = eta / 100 * light
+    noise = (sheet["sigma_y_dark"].value or 0.0) ** 2 / k**2 + electrons
+    ax.plot(light, electrons / np.sqrt(noise), color=BLUE, label="linear model")
+    ax.plot(light, np.sqrt(light), color=GREEN, linestyle="-.", label="ideal sensor")
+    dsnu, prnu = sheet["DSNU1288"].value, sheet["PRNU1288"].value
+    if dsnu is not None and prnu is not None:
+        total = noise + dsnu**2 + (prnu / 100 * electrons) ** 2
+        ax.plot(
+            light,
+            electrons / np.sqrt(total),
+            color=ORANGE,
+            linestyle="--",
+            label="total SNR, with DSNU and PRNU",
+        )
+    ax.axvline(
+        threshold, color=VERMILION, linestyle=":", label=f"μ_p.min: {sheet['mu_p_min'].text}"
+    )
 
 
 def general(sheet: EmvaSheet) -> Any:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -47,6 +47,8 @@ from neusee.workflows.recipe.loading import load
 from neusee.workflows.report.study_folder import CsvTable
 from neusee.workflows.report.study_page import Mark, Marked, Section
 from neusee.workflows.store.result_store import Store
+
+T = TypeVar("T")
 
 # --- emva frames ----------------------------------------------------------------------------------
 
@@ -188,9 +190,8 @@ def _frames(recipe: Recipe, store: Store, step: Step) -> Any:
 
 
 def _nearest_half(series: Sequence[SpatialSeries], measured: Levels) -> Nonuniformity:
-    return _pair(
-        series[i] for i in _dark_and_half([(s.photons, s.exposure) for s in series], measured)
-    )
+    light = [(averaged.photons, averaged.exposure) for averaged in series]
+    return _pair(series[i] for i in _dark_and_half(light, measured))
 
 
 def _pair(series: Iterator[SpatialSeries]) -> Nonuniformity:
@@ -254,24 +255,23 @@ def spectrograms(sheet: EmvaSheet) -> dict[tuple[str, str], dict[str, Spectrogra
         images["DSNU", "DN"] = dark.average
     if dark is not None and lit is not None and (signal := signal_of(dark, lit)) > 0:
         images["PRNU", "%"] = (lit.average - dark.average) * (100 / signal)
-    return {
-        key: {name: spectrogram(image, way) for name, way in _DIRECTIONS.items()}
-        for key, image in images.items()
-    }
+    return {key: _by_direction(spectrogram, image) for key, image in images.items()}
 
 
 def line_profiles(sheet: EmvaSheet) -> dict[str, dict[str, Profiles]]:
     """Return the profiles in DN by the name of the averaged frame and by direction."""
     dark, lit = sheet.spatial
     images = {} if dark is None else {"dark": dark.average}
-    if lit is not None:
-        images["lit" if dark is None else "lit, less the dark"] = lit.average - (
-            0.0 if dark is None else dark.average
-        )
-    return {
-        key: {name: profiles(image, way) for name, way in _DIRECTIONS.items()}
-        for key, image in images.items()
-    }
+    if lit is not None and dark is not None:
+        images["lit, less the dark"] = lit.average - dark.average
+    elif lit is not None:
+        images["lit"] = lit.average
+    return {key: _by_direction(profiles, image) for key, image in images.items()}
+
+
+def _by_direction(measure: Callable[[Any, bool], T], image: Any) -> dict[str, T]:
+    """Return what a function measures along the rows and along the columns of an image."""
+    return {name: measure(image, is_vertical) for name, is_vertical in _DIRECTIONS.items()}
 
 
 def defect_histograms(sheet: EmvaSheet) -> dict[tuple[str, str], DefectHistogram]:
@@ -473,13 +473,11 @@ def banner(sheet: EmvaSheet, tests: Sequence[FrameTest] = ()) -> str:
     text.
     """
     coarse = sheet["sigma_y_dark"].bound != ""
-    reasons = (
-        [_COARSE]
-        if coarse
-        else [f"K is not told: {sheet['K'].reason}"]
-        if sheet["K"].value is None
-        else []
-    )
+    reasons: list[str] = []
+    if coarse:
+        reasons.append(_COARSE)
+    elif sheet["K"].value is None:
+        reasons.append(f"K is not told: {sheet['K'].reason}")
     wrong = (
         test
         for test in tests
@@ -541,9 +539,8 @@ def sections(
         _section(sheet, heading, text, pictures.get(name)) for heading, name, text in _SECTIONS
     )
     filled = (s for s in candidates if s.rows or s.picture)
-    tested = replace(
-        frame_section(frames.tests), text=_TESTED if len(frames.tests) > 1 else _MOMENTS
-    )
+    text_of_tests = _TESTED if len(frames.tests) > 1 else _MOMENTS
+    tested = replace(frame_section(frames.tests), text=text_of_tests)
     return [*filled, *budget, tested, _compliance(sheet, frames, statements)]
 
 
@@ -591,15 +588,16 @@ def group_of(quantity: Quantity, sheet: EmvaSheet) -> str:
 def _section(sheet: EmvaSheet, heading: str, text: str, picture: bytes | None) -> Section:
     rows: list[Sequence[Any]] = []
     columns: Sequence[str] = ("symbol", "quantity", "value", "why not, or why a limit")
-    quantities = [
-        q for q in sheet.quantities if heading in _TABLES and group_of(q, sheet) == heading
-    ]
+    candidates = sheet.quantities if heading in _TABLES else ()
+    quantities = [quantity for quantity in candidates if group_of(quantity, sheet) == heading]
     for quantity in quantities:
-        text_of_value = Marked(quantity.text, "warn" if quantity.reason else None)
-        rows.append((quantity.symbol, quantity.name, text_of_value, quantity.reason))
+        value = Marked(quantity.text, "warn" if quantity.reason else None)
+        rows.append((quantity.symbol, quantity.name, value, quantity.reason))
     if not any(quantity.reason for quantity in quantities):
         columns, rows = columns[:-1], [row[:-1] for row in rows]
-    return Section(heading, text, columns if rows else (), rows, picture)
+    if not rows:
+        columns = ()
+    return Section(heading, text, columns, rows, picture)
 
 
 def _compliance(sheet: EmvaSheet, frames: EmvaFrames, statements: Mapping[str, Any]) -> Section:
@@ -630,15 +628,11 @@ def _of_transfer(sheet: EmvaSheet, frames: EmvaFrames) -> Iterator[Requirement]:
     top = "reached" if transfer.saturated else "not reached"
     yield _asked(f"{_LEVELS} or more lit levels", f"{count}", count >= _LEVELS)
     yield _asked("two frames or more at each level", f"{frames.frames}", frames.frames >= 2)
-    yield _asked(
-        "dark frames at the exposure of each lit level",
-        "yes" if pairs else "of the nearest exposure",
-        pairs,
-    )
+    text = "yes" if pairs else "of the nearest exposure"
+    yield _asked("dark frames at the exposure of each lit level", text, pairs)
     yield _asked("levels from dark to saturation", f"saturation {top}", transfer.saturated)
-    yield Requirement(
-        "temporal dark noise of 0.49 DN or more", noise.text, "fail" if noise.bound else "pass"
-    )
+    mark: Mark = "fail" if noise.bound else "pass"
+    yield Requirement("temporal dark noise of 0.49 DN or more", noise.text, mark)
     text = f"{times} exposure{'s' * (times != 1)}"
     yield _asked(f"dark current from {_EXPOSURES} or more exposures", text, times >= _EXPOSURES)
 
@@ -648,7 +642,8 @@ def _of_series(sheet: EmvaSheet) -> Iterator[Requirement]:
     for name, series in (("dark", dark), ("lit", lit)):
         demand = f"series of {_SERIES} or more {name} frames for spatial quantities"
         count = 0 if series is None else series.count
-        yield _asked(demand, f"{count} frames" if count else "no series", count >= _SERIES)
+        text = f"{count} frames" if count else "no series"
+        yield _asked(demand, text, count >= _SERIES)
     if dark is not None and lit is not None:
         yield _asked(
             "both series at one exposure", _exposures(dark, lit), dark.exposure == lit.exposure
@@ -665,9 +660,8 @@ def _of_series(sheet: EmvaSheet) -> Iterator[Requirement]:
 def _of_told(statements: Mapping[str, Any]) -> Iterator[Requirement]:
     for key, name in OPERATING_POINT.items():
         value = statements.get(key)
-        yield _asked(
-            f"stated: {name}", "not stated" if value is None else str(value), value is not None
-        )
+        text = "not stated" if value is None else str(value)
+        yield _asked(f"stated: {name}", text, value is not None)
 
 
 def _elsewhere() -> Iterator[Requirement]:
@@ -684,7 +678,8 @@ def _elsewhere() -> Iterator[Requirement]:
 
 
 def _asked(demand: str, text: str, met: bool) -> Requirement:
-    return Requirement(demand, text, "pass" if met else "warn")
+    mark: Mark = "pass" if met else "warn"
+    return Requirement(demand, text, mark)
 
 
 def _exposures(dark: SpatialSeries, lit: SpatialSeries) -> str:

@@ -21,7 +21,7 @@ from neusee.nodes.calibrate import (
     open_errors,
 )
 from neusee.nodes.values import Levels
-from neusee.workflows.calibration.importance_sampling import draw_samples, weights
+from neusee.workflows.calibration.importance_sampling import draw_samples
 from neusee.workflows.calibration.log_posterior import (
     SensorPosterior,
     initial_theta,
@@ -29,6 +29,7 @@ from neusee.workflows.calibration.log_posterior import (
     search_mode,
 )
 from neusee.workflows.calibration.posterior_checks import Check
+from neusee.workflows.calibration.posterior_mixture import normalised
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.recipe.distributions.joint_distribution import Z_90
@@ -148,7 +149,7 @@ def _posterior(problem: SensorPosterior, rng: np.random.Generator) -> _Posterior
             f"no posterior mode of {', '.join(problem.names)} was found: give narrower priors"
         )
     samples, log = draw_samples(problem, mode, rng)
-    weight = weights(log)
+    weight = normalised(log)
     centre = weight @ samples
     width = np.sqrt(weight @ (samples - centre) ** 2)
     return dict(zip(problem.names, zip(centre.tolist(), width.tolist(), strict=True), strict=True))
@@ -181,8 +182,10 @@ def width_of_mean(fewer: float, richer: float) -> float:
 
 
 def _interval(centre: float, width: float, linear: bool) -> IntervalEstimate:
-    ends = [centre, centre - Z_90 * width, centre + Z_90 * width]
-    return IntervalEstimate(*(ends if linear else [float(np.exp(x)) for x in ends]))
+    low, high = centre - Z_90 * width, centre + Z_90 * width
+    if linear:
+        return IntervalEstimate(centre, low, high)
+    return IntervalEstimate(float(np.exp(centre)), float(np.exp(low)), float(np.exp(high)))
 
 
 # --- frame validity -------------------------------------------------------------------------------
@@ -260,7 +263,8 @@ def frames_and_mask(
     pixels if it has one.
     """
     source, mask = str(step.wires["frames"]), step.wires.get("mask")
-    values = run(recipe, store, (source, str(mask)) if mask else (source,)).values
+    outputs = (source, str(mask)) if mask else (source,)
+    values = run(recipe, store, outputs).values
     return values[source], values[str(mask)] if mask else None
 
 
@@ -319,7 +323,8 @@ def data_check(pairs: float) -> Check:
             ": intervals are wider than by statistics alone, because so few may hide mixing and lag"
         )
     bar = f"at least {CLEAN_PAIRS:.2g}, such as 10 levels of 2 frames of {side} x {side} pixels"
-    return Check("the frames are numerous enough", text, bar, "pass" if enough else "warn")
+    mark: Mark = "pass" if enough else "warn"
+    return Check("the frames are numerous enough", text, bar, mark)
 
 
 def _bar(test: FrameTest) -> str:

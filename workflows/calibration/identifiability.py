@@ -104,7 +104,7 @@ def _weak_direction(
     name = max(parts, key=lambda pair: abs(pair[1]))[0]
     kinds[name] = _limit(problem, mode, name)
     reason = _REASONS.get((name, kinds[name]), "")
-    return f"{_plain(name)}: {KINDS[kinds[name]]}{reason}"
+    return f"{words_of(name)}: {KINDS[kinds[name]]}{reason}"
 
 
 def identify_from_draws(
@@ -137,7 +137,7 @@ def identify_from_draws(
     undetermined = [
         name for name, kind in kinds.items() if kind != "estimate" and name not in named
     ]
-    sentences += [f"{_plain(name)}: {KINDS[kinds[name]]}" for name in undetermined]
+    sentences += [f"{words_of(name)}: {KINDS[kinds[name]]}" for name in undetermined]
     sentences = withheld_electrons(kinds, sentences)
     return replace(about_mode, kinds=kinds, directions=sentences)
 
@@ -168,14 +168,11 @@ def withheld_electrons(kinds: dict[str, str], sentences: Sequence[str]) -> list[
         if kinds.get("gain") == "none" and kinds.get(name, "none") != "none"
     ]
     kinds |= dict.fromkeys(withheld, "none")
-    others = [
-        text
-        for text in sentences
-        if not text.startswith(tuple(f"{_plain(name)}: " for name in withheld))
-    ]
+    subjects = tuple(f"{words_of(name)}: " for name in withheld)
+    others = [text for text in sentences if not text.startswith(subjects)]
     return [
         *(
-            f"{_plain(name)}: {KINDS['none']}: no value in electrons without the gain"
+            f"{words_of(name)}: {KINDS['none']}: no value in electrons without the gain"
             for name in withheld
         ),
         *others,
@@ -259,19 +256,23 @@ def _together(parts: Sequence[tuple[str, float]]) -> str:
     """
     first = max(parts, key=lambda pair: abs(pair[1]))
     others = [(name, bool(x * first[1] > 0)) for name, x in parts if name != first[0]]
-    raised, lowered = (
-        [_plain(name) for name, same in others if same is up] for up in (True, False)
-    )
-    changes = [f"more {_listed(raised)}"] * bool(raised) + [f"less {_listed(lowered)}"] * bool(
-        lowered
-    )
-    names = _listed([_plain(name) for name, _ in parts])
-    return f"{names} only together: more {_plain(first[0])} with {_listed(changes)}"
+    raised = [words_of(name) for name, rises in others if rises]
+    lowered = [words_of(name) for name, rises in others if not rises]
+    changes: list[str] = []
+    if raised:
+        changes.append(f"more {_listed(raised)}")
+    if lowered:
+        changes.append(f"less {_listed(lowered)}")
+    names = _listed([words_of(name) for name, _ in parts])
+    return f"{names} only together: more {words_of(first[0])} with {_listed(changes)}"
 
 
-def _plain(name: str) -> str:
+def words_of(name: str) -> str:
+    """Return the name of a parameter as words."""
     return name.replace("_", " ")
 
 
 def _listed(words: Sequence[str]) -> str:
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+    if len(words) < 2:
+        return "".join(words)
+    return f"{', '.join(words[:-1])} and {words[-1]}"

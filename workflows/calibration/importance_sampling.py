@@ -89,9 +89,8 @@ def fit_about_mode(
     logs: list[FloatArray] = []
     best, best_mixture = -1.0, mixture
     for number in range(1, _ROUNDS + 1):
-        drawn, log = weighed(
-            problem, CameraDensity(mixture, others) if others else mixture, _TRIED, rng
-        )
+        proposal: Density = CameraDensity(mixture, others) if others else mixture
+        drawn, log = weighed(problem, proposal, _TRIED, rng)
         mixtures.append(mixture)
         samples.append(drawn[:, in_mixture])
         logs.append(log + mixture.log_density(drawn[:, in_mixture]))
@@ -195,7 +194,7 @@ class Guide(NamedTuple):
         """Return ``count`` different samples, drawn by their weights, at which walkers can
         start.
         """
-        weight = weights(self.log)
+        weight = normalised(self.log)
         numbers = rng.choice(
             len(weight), size=count, p=weight, replace=int((weight > 0).sum()) < count
         )
@@ -224,7 +223,7 @@ def draw_guide(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Genera
     """
     fit = fit_mixture if problem.coordinates.bent else fit_about_mode
     guide = Guide(*fit(problem, mode, DRAWS, rng))
-    _refuse_few(problem, _effective_sample_fraction(weights(guide.log)))
+    _refuse_few(problem, effective(guide.log))
     return guide
 
 
@@ -235,15 +234,3 @@ def _refuse_few(problem: SensorPosterior, fraction: float) -> None:
             f" {fraction * DRAWS:.0f}: hold the parameters that the levels do not determine at"
             " fixed values"
         )
-
-
-def weights(log: FloatArray) -> FloatArray:
-    """Return importance weights with a sum of 1 from the logarithms of unnormalised weights."""
-    weight = np.exp(log - log.max())
-    normalized: FloatArray = weight / weight.sum()
-    return normalized
-
-
-def _effective_sample_fraction(weight: FloatArray) -> float:
-    """Return the effective sample size divided by the number of samples."""
-    return float(1.0 / (weight**2).sum() / len(weight))

@@ -54,20 +54,21 @@ def laboratory_of(recipe: Recipe) -> Laboratory:
     unknown quantity.
     """
     statements = stated(recipe)
-    if wrong := [
-        name for name in statements.temperature.coefficients if name not in WITH_COEFFICIENT
-    ]:
+    stated_names = statements.temperature.coefficients
+    wrong = [name for name in stated_names if name not in WITH_COEFFICIENT]
+    if wrong:
         hint = nearest(wrong[0], WITH_COEFFICIENT)
         raise ValueError(
             f"traceability.temperature.coefficients: {wrong[0]} has no coefficient; {hint}"
         )
     width = statements.lamp.centroid_uncertainty
+    width_in_nm = None if width is None else 1e9 * width
     return Laboratory(
         photons=statements.photons.relative_uncertainty,
         photons_distribution=statements.photons.distribution,
         photons_freedom=statements.photons.degrees_of_freedom,
         drift=statements.lamp.drift,
-        wavelength=None if width is None else 1e9 * width,
+        wavelength=width_in_nm,
         slope=statements.lamp.efficiency_per_nm,
         temperature=statements.temperature.uncertainty,
         coefficients=statements.temperature.coefficients,

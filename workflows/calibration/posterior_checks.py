@@ -13,14 +13,15 @@ import numpy as np
 from neusee.nodes.calibrate import Likelihood, Rings
 from neusee.nodes.values import Levels
 from neusee.workflows.calibration.identifiability import Identifiability
-from neusee.workflows.calibration.importance_sampling import Guide, draw_guide, weights
+from neusee.workflows.calibration.importance_sampling import Guide, draw_guide
 from neusee.workflows.calibration.log_posterior import LaplaceFit, SensorPosterior
+from neusee.workflows.calibration.posterior_mixture import normalised
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from neusee.workflows.calibration.emcee_sampler import Chains
-    from neusee.workflows.calibration.log_posterior import FloatArray, SensorPosterior
+    from neusee.workflows.calibration.log_posterior import FloatArray
 
 
 # --- level misfit ---------------------------------------------------------------------------------
@@ -306,7 +307,7 @@ def importance_samples(problem: SensorPosterior, mode: LaplaceFit, seed: int) ->
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         smooth, tail = arviz().psislw(np.where(np.isfinite(log), log - log.max(), _NEVER))
-    return ImportanceSamples(guide.samples, weights(smooth), float(tail), guide)
+    return ImportanceSamples(guide.samples, normalised(smooth), float(tail), guide)
 
 
 def checks(
@@ -343,12 +344,11 @@ def _of_chains(chains: Chains) -> Iterator[Check]:
         min(_effective_sample_size(draws, method) for draws in coordinates)
         for method in ("bulk", "tail")
     )
-    size, enough = (
-        f"effective sample size {bulk:.0f}, {tail:.0f} in the tails",
-        min(bulk, tail) >= _INDEPENDENT,
-    )
     yield Check(
-        "draws are numerous enough", size, f"each at least {_INDEPENDENT:.0f} draws", _mark(enough)
+        "draws are numerous enough",
+        f"effective sample size {bulk:.0f}, {tail:.0f} in the tails",
+        f"each at least {_INDEPENDENT:.0f} draws",
+        _mark(min(bulk, tail) >= _INDEPENDENT),
     )
     low, high = _ACCEPTED
     well = low <= chains.accepted <= high
@@ -393,17 +393,23 @@ def _of_peak(
     if not columns:
         return
     if bent:
-        size = 1 / float((law.weights**2).sum())
-        text, enough = (
-            f"effective sample size {size:.0f} of {len(law.weights)}",
-            _WEIGHTED * len(law.weights),
-        )
-        yield Check(
-            "weighted draws are numerous enough",
-            text,
-            f"at least {enough:.0f}",
-            _mark(size >= enough, "warn"),
-        )
+        yield _of_weights(law)
+    yield _of_agreement(chains, law, columns)
+
+
+def _of_weights(law: ImportanceSamples) -> Check:
+    count = len(law.weights)
+    size = 1 / float((law.weights**2).sum())
+    return Check(
+        "weighted draws are numerous enough",
+        f"effective sample size {size:.0f} of {count}",
+        f"at least {_WEIGHTED * count:.0f}",
+        _mark(size >= _WEIGHTED * count, "warn"),
+    )
+
+
+def _of_agreement(chains: Chains, law: ImportanceSamples, columns: list[int]) -> Check:
+    """Return if the chains and importance sampling have the same widths and means."""
     sd, mean = law.sd()[columns], law.mean()[columns]
     flat = chains.flat[:, columns]
     apart, off = np.abs(flat.std(0) / sd - 1), np.max(np.abs(flat.mean(0) - mean) / sd)
@@ -412,12 +418,8 @@ def _of_peak(
     text = f"widths within {apart[worst]:.1%}, means {off:.2f} sd; k-hat {law.tail:.2f}"
     bar = f"{allowed[worst]:.0%} and {_MEAN} sd, where k-hat is below {_TAIL}"
     agrees = bool((apart <= allowed).all()) and off <= _MEAN
-    yield Check(
-        "importance sampling agrees with the chains",
-        text,
-        bar,
-        _mark(agrees, "fail" if law.tail < _TAIL else "warn"),
-    )
+    failure: Mark = "fail" if law.tail < _TAIL else "warn"
+    return Check("importance sampling agrees with the chains", text, bar, _mark(agrees, failure))
 
 
 def _of_data(

@@ -181,10 +181,12 @@ class Density(Protocol):
         """Return new samples like ``own`` (draw, free), and the logarithm of the density at
         ``own`` over that there.
         """
+        drawn = self.draw(len(own), rng)
+        return drawn, self.log_density(own) - self.log_density(drawn)
 
 
 @dataclass(frozen=True)
-class Mixture:
+class Mixture(Density):
     """A mixture of Student's t distributions of several coordinates."""
 
     shares: FloatArray  #: (component,) sum 1
@@ -209,13 +211,6 @@ class Mixture:
         return log_sum(
             self._levels + self._constants - power * np.log1p(self._squares(samples) / self.tails)
         )
-
-    def propose(self, own: FloatArray, rng: Random) -> tuple[FloatArray, FloatArray]:
-        """Return new samples like ``own`` (draw, free), and the logarithm of the density at
-        ``own`` over that there.
-        """
-        drawn = self.draw(len(own), rng)
-        return drawn, self.log_density(own) - self.log_density(drawn)
 
     def normal_shares(self, samples: FloatArray) -> FloatArray:
         """Return the share (draw, component) of each component in the density of normal
@@ -342,7 +337,8 @@ def _apart(places: FloatArray, weight: FloatArray, rng: np.random.Generator) -> 
     starts, away = [int(pool[0])], ((places[pool] - places[pool[0]]) ** 2).sum(1)
     for number in range(1, _PARTS):
         far = number % 2 and away.sum() > 0
-        starts.append(int(rng.choice(pool, p=away / away.sum()) if far else rng.choice(pool)))
+        chances = away / away.sum() if far else None
+        starts.append(int(rng.choice(pool, p=chances)))
         away = np.minimum(away, ((places[pool] - places[starts[-1]]) ** 2).sum(1))
     return starts
 

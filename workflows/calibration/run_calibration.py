@@ -27,6 +27,7 @@ from neusee.workflows.calibration.calibration_page import (
     sections,
 )
 from neusee.workflows.calibration.frame_validity import (
+    ModelSpread,
     as_rows,
     compare_models,
     data_check,
@@ -148,10 +149,6 @@ def find_posterior(
     identifiability = identify(problem, mode)
     if identifiability.refused:
         raise CalibrationRefused(identifiability.refused)
-    key = digest(
-        "posterior", engine("calibration.emcee_sampler"), problem.key, walkers, move, recipe.seed
-    )
-    file = store.root / "posterior" / f"{key}.h5"
     law = importance_samples(problem, mode, recipe.seed)
     if problem.coordinates.bent:
         identifiability = identify_from_draws(
@@ -162,7 +159,7 @@ def find_posterior(
     chains = emcee_sampler.sample(
         problem,
         mode,
-        file,
+        _draws_file(store, problem, walkers, move),
         seed=recipe.seed,
         walkers=walkers,
         move_name=move,
@@ -170,22 +167,27 @@ def find_posterior(
         progress=progress,
         guide=law.guide,
     )
-    models = (
-        compare_models(recipe, store, recipe.seed) if isinstance(problem.levels, Levels) else []
-    )
+    models: list[ModelSpread] = []
+    if isinstance(problem.levels, Levels):
+        models = compare_models(recipe, store, recipe.seed)
     tested = [
         *frame_checks(tests, not isinstance(problem.levels, Rings)),
         *_data_checks(problem, mode, tests),
         *checks(problem, mode, identifiability, chains, law),
     ]
-    result = _widened(
-        CalibrationResult(problem, mode, identifiability, chains, tested, models, tests), laboratory
-    )
-    return (
-        replace(result, checks=[*tested, *agreement(result.beside)])
-        if is_camera(problem)
-        else result
-    )
+    result = CalibrationResult(problem, mode, identifiability, chains, tested, models, tests)
+    result = _widened(result, laboratory)
+    if not is_camera(problem):
+        return result
+    return replace(result, checks=[*tested, *agreement(result.beside)])
+
+
+def _draws_file(store: Store, problem: SensorPosterior, walkers: int, move: str) -> Path:
+    """Return the file of the store that keeps the chains of a posterior."""
+    seed = problem.recipe.seed
+    code = engine("calibration.emcee_sampler")
+    key = digest("posterior", code, problem.key, walkers, move, seed)
+    return store.root / "posterior" / f"{key}.h5"
 
 
 def _data_checks(
@@ -213,11 +215,11 @@ def _widened(result: CalibrationResult, laboratory: Laboratory) -> CalibrationRe
     identifiability = result.identifiability
     chains = widened(problem, result.chains, tests, problem.recipe.seed)
     models = widened_models(result.models, tests, problem.coordinates.prior.may_hide)
+    if is_relative(problem.recipe):
+        identifiability = without_efficiency(identifiability)
     result = replace(
         result,
-        identifiability=without_efficiency(identifiability)
-        if is_relative(problem.recipe)
-        else identifiability,
+        identifiability=identifiability,
         chains=with_laboratory(problem, chains, laboratory, problem.recipe.seed),
         models=with_laboratory_models(models, laboratory),
         walk=result.chains,

@@ -199,7 +199,9 @@ def _named(budget: Budget) -> str:
 
 
 def _freedom(freedom: float) -> str:
-    return f"{freedom:.3g}" if freedom < 1e4 else "∞" if math.isinf(freedom) else f"{freedom:.0e}"
+    if freedom < 1e4:
+        return f"{freedom:.3g}"
+    return "∞" if math.isinf(freedom) else f"{freedom:.0e}"
 
 
 def _traced(traceability: Traceability) -> list[Section]:
@@ -491,13 +493,13 @@ def _shares(result: CalibrationResult) -> dict[str, dict[str, float]]:
         values = {name: float(x) for name, x in problem.parameters(mode.theta).items()}
         sources = camera_sources(problem.levels, {**result.params, **values})
     z = torch.from_numpy(problem.whitened(mode.theta))
-    return {
-        name: {
-            (_PRIOR if source == "prior" else source): share
-            for source, share in variance_shares(slopes, sources, torch.from_numpy(along)).items()
+    shares: dict[str, dict[str, float]] = {}
+    for name, along in _derivatives(result, z.numpy()).items():
+        of_sources = variance_shares(slopes, sources, torch.from_numpy(along))
+        shares[name] = {
+            _PRIOR if source == "prior" else source: share for source, share in of_sources.items()
         }
-        for name, along in _derivatives(result, z.numpy()).items()
-    }
+    return shares
 
 
 def _derivatives(result: CalibrationResult, z: FloatArray) -> dict[str, FloatArray]:

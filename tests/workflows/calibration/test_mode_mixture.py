@@ -10,8 +10,8 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_t
 
 from neusee.workflows.calibration.camera_density import TailDensity, with_prior_tails
-from neusee.workflows.calibration.importance_sampling import fit_about_mode, weights
-from neusee.workflows.calibration.posterior_mixture import Mixture
+from neusee.workflows.calibration.importance_sampling import fit_about_mode
+from neusee.workflows.calibration.posterior_mixture import Mixture, normalised
 
 #: a dark current and its standard error; the width of its prior, a logarithm
 FOUND, ERROR, WIDTH = 0.7, 0.25, 2.3
@@ -43,7 +43,7 @@ def drawn():
         names=("dark_current", "offset"), coordinates=coordinates, log_posterior=log_posterior
     )
     _, samples, log = fit_about_mode(problem, mode, 4000, np.random.default_rng(5))
-    return samples, weights(log)
+    return samples, normalised(log)
 
 
 @pytest.mark.parametrize("share", [0.005, 0.02, 0.1, 0.5, 0.9])

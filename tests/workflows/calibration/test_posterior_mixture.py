@@ -9,9 +9,9 @@ import torch
 from scipy.stats import multivariate_t
 
 from neusee.workflows.calibration.emcee_sampler import GuidedMove, Walk, walk_until
-from neusee.workflows.calibration.importance_sampling import draw_samples, weights
+from neusee.workflows.calibration.importance_sampling import draw_samples
 from neusee.workflows.calibration.log_posterior import find_mode, initial_theta
-from neusee.workflows.calibration.posterior_mixture import Mixture
+from neusee.workflows.calibration.posterior_mixture import Mixture, normalised
 from tests.workflows.calibration.simulated_lenses import (
     TRUTH,
     picture,
@@ -117,7 +117,7 @@ def on_a_grid(problem, prior, sine, *ends, steps=(110, 48, 48)):
     middle = [np.log(prior["b0"][0]), np.log(prior["l"][0]), prior["s"][0]]
     width = [np.log(prior["b0"][1]), np.log(prior["l"][1]), prior["s"][1]]
     log = np.where(np.isfinite(log), log, -np.inf) - 0.5 * (((places - middle) / width) ** 2).sum(1)
-    weight = weights(log)
+    weight = normalised(log)
     mean = weight @ places
     return mean, np.sqrt(weight @ (places - mean) ** 2), 1 / (weight**2).sum()
 
@@ -131,7 +131,7 @@ def test_weighted_draws_are_those_of_a_grid_along_a_ridge(ridge):
     samples, log = draw_samples(
         problem, find_mode(problem, initial_theta(problem)), np.random.default_rng(1)
     )
-    weight = weights(log)
+    weight = normalised(log)
     found = problem.parameters(samples)
     drawn = np.stack([found["b0"].log(), found["l"].log(), found["s"]], -1)
     mean, sd, cells = on_a_grid(problem, SHAPE_ONLY, *grid)

@@ -18,9 +18,10 @@ from neusee.workflows.calibration import (
 from neusee.workflows.calibration.calibration_figures import ring_radii
 from neusee.workflows.calibration.calibration_page import unit_of
 from neusee.workflows.calibration.identifiability import identify, identify_from_draws
-from neusee.workflows.calibration.importance_sampling import draw_guide, draw_samples, weights
+from neusee.workflows.calibration.importance_sampling import draw_guide, draw_samples
 from neusee.workflows.calibration.log_posterior import find_mode, initial_theta
 from neusee.workflows.calibration.posterior_checks import importance_samples
+from neusee.workflows.calibration.posterior_mixture import normalised
 from tests.workflows.calibration.simulated_lenses import (
     CAMERA,
     LENS,
@@ -50,13 +51,13 @@ def shape_of(problem, samples):
 
 def weighted(problem, mode, seed):
     samples, log = draw_samples(problem, mode, np.random.default_rng(seed))
-    return shape_of(problem, samples), weights(log)
+    return shape_of(problem, samples), normalised(log)
 
 
 def told(problem, mode):
     """Return what `neusee calibrate` says that the picture tells."""
     samples, log = draw_samples(problem, mode, np.random.default_rng(1))
-    return identify_from_draws(problem, mode, identify(problem, mode), samples, weights(log))
+    return identify_from_draws(problem, mode, identify(problem, mode), samples, normalised(log))
 
 
 def test_the_mean_of_a_ring_is_wing_and_scatter():

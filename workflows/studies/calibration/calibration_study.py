@@ -11,7 +11,7 @@ from functools import partial
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from neusee.workflows.calibration.identifiability import KINDS, identify
+from neusee.workflows.calibration.identifiability import KINDS, identify, words_of
 from neusee.workflows.calibration.log_posterior import SensorPosterior, find_mode, initial_theta
 from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.graph.recipe_graph import Recipe
@@ -218,7 +218,7 @@ def _ranks(result: CalibrationStudyResult, picture: bytes, pixels: int) -> Secti
         sensor that is drawn. The search for the mode starts near the truth: this study tests the
         posterior and the draws, not the search. A walker is stranded if its median log posterior
         lies 20 nats below that of the others."""
-    rows = [(_plain(name), width) for name, width in result.prior_widths.items()]
+    rows = [(words_of(name), width) for name, width in result.prior_widths.items()]
     return Section("Ranks of the truth", text, ("parameter", "width of the prior"), rows, picture)
 
 
@@ -236,7 +236,7 @@ def _intervals(result: CalibrationStudyResult) -> Section:
         coverage = Marked(v.coverage, "pass" if v.covered else "fail")
         bar = f"{v.bar[0]:.3f} to {v.bar[1]:.3f}"
         judged = (p, v.least_p, coverage, bar)
-        rows.append((_plain(v.name), *judged, v.z_mean, v.z_sd, _count_kinds(result, v.name)))
+        rows.append((words_of(v.name), *judged, v.z_mean, v.z_sd, _count_kinds(result, v.name)))
     return Section("Coverage", text, columns, rows)
 
 
@@ -263,12 +263,12 @@ def _weighed(result: CalibrationStudyResult) -> Section:
         "from these frames",
         "value",
         "sd",
-        *(f"{_plain(name)} x 2" for name in names),
+        *(f"{words_of(name)} x 2" for name in names),
     )
     rows: list[list[Any]] = []
     for f in result.sensitivity.findings:
         moved = [None if x is None else (x - f.value) / f.sd for x in f.doubled.values()]
-        rows.append([_plain(f.name), KINDS[f.kind] or "estimate", f.value, f.sd, *moved])
+        rows.append([words_of(f.name), KINDS[f.kind] or "estimate", f.value, f.sd, *moved])
     shares = [Marked(share, "warn" if share < ENOUGH else None) for share in left.values()]
     rows.append(["draws left", "", None, None, *shares])
     return Section(heading, text, columns, rows)
@@ -286,7 +286,3 @@ def _refusals(result: CalibrationStudyResult) -> list[Section]:
             rows,
         )
     ]
-
-
-def _plain(name: str) -> str:
-    return name.replace("_", " ")
