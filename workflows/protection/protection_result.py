@@ -88,7 +88,8 @@ def measure_protection(
 
     def candidate(front: Front, condition: Condition = usual) -> Candidate:
         measures, harm = bench.measure(front, condition), bench.measure(front, usual)
-        return Candidate(front, measures, harm.peak if bench.settings.dwell is None else harm.heat)
+        protection = harm.peak if bench.settings.dwell is None else harm.heat
+        return Candidate(front, measures, protection)
 
     mask = candidate(Front(True))
     own = mask.protection
@@ -102,15 +103,12 @@ def measure_protection(
     rivals = _rivals(clear, masked, own, pixel, stops)
     rivals["notch"] = Rival("notch", Front(False, 1.0, usual.wavelength, 1 - own), 1.0)
     measured = {name: candidate(rival.front) for name, rival in rivals.items()}
-    quiet = {
-        name: _quiet(measured[name].found, rival.transmittance, pixel)
-        for name, rival in rivals.items()
-    }
+    quiet = _quiet_frames(rivals, measured, pixel)
     quiet["best stop and filter"] = _best_quiet(clear, own, pixel)
     pairs = {n: (best(masked, own, n, pixel), best(clear, own, n, pixel)) for n in LIGHTS}
     drawn = _drawn_gains(conditions, candidate, pairs, pixel, progress)
     attack, lost = _attacks(conditions, candidate, rivals, pixel, progress)
-    bound, forbidden = _bounds(bench, pixel, own)
+    bound, forbidden = _bounds(bench, pixel)
     return ProtectionResult(
         own=own,
         rivals=rivals,
@@ -127,6 +125,16 @@ def measure_protection(
         lost=lost,
         tint={name: colour_shift(judged.found) for name, judged in measured.items()},
     )
+
+
+def _quiet_frames(
+    rivals: Mapping[str, Rival], measured: Mapping[str, Candidate], pixel: PixelNoise
+) -> dict[str, dict[float, dict[str, float]]]:
+    """Return what each rival does to frames without a laser."""
+    return {
+        name: _quiet(measured[name].found, rival.transmittance, pixel)
+        for name, rival in rivals.items()
+    }
 
 
 def _curves(
@@ -308,7 +316,7 @@ def _fields(
 
 
 def _bounds(
-    bench: FrontBench, pixel: PixelNoise, own: float
+    bench: FrontBench, pixel: PixelNoise
 ) -> tuple[dict[float, tuple[float, float]], dict[float, float]]:
     """Return gain and bound of the mean NEQ over the lens band at the middle wavelength, and the
     forbidding glare.
