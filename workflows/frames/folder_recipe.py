@@ -257,13 +257,17 @@ def _loaded(name: str, text: str, changes: Sequence[str] = ()) -> Recipe:
 def _read(folder: Path, folder_levels: FolderLevels, scale: float, needs: _Corrections) -> str:
     levels = "\n".join(_level(level, scale) for level in folder_levels.levels)
     divisor = f", divisor: {needs.divisor}" if needs.divisor > 1 else ""
+    hot, source_of_level = "", "frames"
+    if needs.hot:
+        hot = _HOT.format(files=_listed(needs.hot), divisor=divisor)
+        source_of_level = "{frames: frames, mask: hot}"
     return _READ.format(
         folder=" ".join(folder.name.split()) or ".",
         source=folder_levels.source,
         levels=levels,
         divisor=divisor,
-        hot=_HOT.format(files=_listed(needs.hot), divisor=divisor) if needs.hot else "",
-        source_of_level="{frames: frames, mask: hot}" if needs.hot else "frames",
+        hot=hot,
+        source_of_level=source_of_level,
     )
 
 
@@ -285,17 +289,19 @@ def _rest(fit: LeastSquares, efficiency: float, times: int, relative: bool) -> s
     """
     gain, noise = float(fit.gain), max(float(fit.temporal_dark_noise), 0.1)
     dark = float(fit.dark_current)
+    if not dark > 0:  # NaN where all darks have one exposure
+        dark = float(times > 1)
+    current = "null   # all darks have one exposure"
+    if times > 1:
+        current = '["${camera.dark_current}", 10]'
+    traced = _RELATIVE if relative else ""
     return _REST.format(
         gain=gain,
         efficiency=min(max(efficiency, 0.02), 0.98),
         signal=float(fit.dark_signal),
         noise=noise,
-        dark=dark if dark > 0 else float(times > 1),  # NaN where all darks have one exposure
-        current=(
-            '["${camera.dark_current}", 10]'
-            if times > 1
-            else "null   # all darks have one exposure"
-        ),
+        dark=dark,
+        current=current,
         drift=max(0.01 * noise * gain, 0.003),
-        traced=_RELATIVE if relative else "",
+        traced=traced,
     )

@@ -69,7 +69,11 @@ def read_name(file: Path, folder: Path) -> NamedFrame:
     text = "/".join(parts).lower()
     exposure, light = _exposure(text), _last(_AFTER, text) or _last(_BEFORE, text)
     dark = _DARK.search(text) is not None
-    photons = 0.0 if dark else None if light is None else _float(light[1])
+    photons: float | None = None
+    if dark:
+        photons = 0.0
+    elif light is not None:
+        photons = _float(light[1])
     left = text.replace(exposure.written, "") if exposure else text
     left = left.replace(light[0], "") if light else left
     level = _INDEX.sub("", left).strip(" /._-")
@@ -329,7 +333,6 @@ _LOSSY = (".jpg", ".jpeg", ".jpe", ".jp2", ".heic", ".heif", ".webp")
 _SHOWN = 3  #: files that a message names
 #: lit levels: a gain, a bend, a twist and the lamp are told from fewer only by their priors
 _LIT = 4
-_SAME = 1e-6  #: relative difference of two exposures that are one
 _HOW = """name files such as dark_10ms_1.png and lit_10ms_5000ph_1.png (exposure, photons of a
 pixel, number of the frame), or write a table frames.csv with the columns file, exposure and
 photons, or light for light that is known up to a factor""".replace("\n", " ")
@@ -488,15 +491,21 @@ def _frame(
     photons, exposure = (row.photons, row.exposure) if row else (name.photons, name.exposure)
     light = row.light if row else None
     dark = 0.0 in (photons, light, header.photons) or (name.dark and not photons and not light)
+    table_of_row = table if row else None
+    told = _source(exposure, name, table_of_row)
+    if exposure is None:
+        exposure = header.exposure
+    if photons is None:
+        photons = header.photons
     return Frame(
         file=file,
         header=header,
         level=name.level,
         dark=dark,
-        exposure=header.exposure if exposure is None else exposure,
-        photons=header.photons if photons is None else photons,
+        exposure=exposure,
+        photons=photons,
         light=light,
-        told=_source(exposure, name, table if row else None),
+        told=told,
     )
 
 
@@ -537,11 +546,9 @@ def _doubt(frame: Frame, name: NamedFrame, files: Sequence[Path], folder: Path) 
 
 
 def _short(file: Path, folder: Path) -> str:
-    return (
-        str(file.resolve().relative_to(folder.resolve()))
-        if file.is_relative_to(folder)
-        else str(file)
-    )
+    if file.is_relative_to(folder):
+        return str(file.resolve().relative_to(folder.resolve()))
+    return str(file)
 
 
 def _some(files: Sequence[Path], folder: Path) -> str:
@@ -638,7 +645,7 @@ def _numbers(
     groups: dict[_Key, list[Frame]], levels: Sequence[FolderLevel], folder: Path
 ) -> Iterator[str]:
     """Yield a problem for levels of one frame, and for too few lit levels."""
-    single = [f[0].file for f in groups.values() if sum(frame.header.frames for frame in f) < 2]
+    single = [frames[0].file for frames in groups.values() if _count(frames) < 2]
     if single:
         yield (
             f"{_some(single, folder)}: one frame of its level: take two or more frames of each "
@@ -651,6 +658,11 @@ def _numbers(
             f"{folder}: {lit} lit level{'s' * (lit != 1)}: take {_LIT} or more of different light,"
             " up to saturation"
         )
+
+
+def _count(frames: Sequence[Frame]) -> int:
+    """Return the number of frames in the files of a level."""
+    return sum(frame.header.frames for frame in frames)
 
 
 def _light_problems(levels: Sequence[FolderLevel], light: Light) -> Iterator[str]:

@@ -77,9 +77,8 @@ def frames_of_sensor(recipe: Recipe, store: Store) -> SensorFrames:
         files += _files(step)
     header = frame_header(files[0])
     levels: Levels = run(recipe, store, ("measured",)).values["measured"]
-    brightest = max(
-        float(levels.mean.max()), float(levels.cell_value.max()) if len(levels.cell_value) else 0.0
-    )
+    largest_value = float(levels.cell_value.max()) if len(levels.cell_value) else 0.0
+    brightest = max(float(levels.mean.max()), largest_value)
     bits = next((b for b in _BITS if brightest < 2**b), header.bits)
     dark = levels.exposure[levels.photons == 0]
     return SensorFrames(header.shape, bits, saturation_signal(levels), float(dark.min()))
