@@ -186,6 +186,7 @@ def recipe_page() -> str:
         for name, entry in recipe_schema["properties"].items()
     ]
     step = recipe_schema["$defs"]["step"]["properties"]
+    titles = [[f"`{recipe.name}`", escaped(recipe.title)] for recipe in recipes()]
     lines = [
         "# Recipe language",
         "",
@@ -215,10 +216,7 @@ def recipe_page() -> str:
         *("", "## Groups", ""),
         *_groups(),
         *("", "## Recipes", ""),
-        *table(
-            ["recipe", "what it shows"],
-            [[f"`{recipe.name}`", escaped(recipe.title)] for recipe in recipes()],
-        ),
+        *table(["recipe", "what it shows"], titles),
     ]
     return "\n".join(lines) + "\n"
 
