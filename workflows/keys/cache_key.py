@@ -157,12 +157,12 @@ def file_digest(path: Path) -> str:
     show a second change. Raises `OSError` if the file changes each time while it is read.
     """
     for _ in range(_TRIES):
-        stamp = _stamp(path)
+        stamp = file_stamp(path)
         if stamp in _files:
             return _files[stamp]
         with opened(path) as file:
             digits = hashlib.file_digest(file, xxhash.xxh3_128).hexdigest()
-        if _stamp(path) == stamp:
+        if file_stamp(path) == stamp:
             if time.time_ns() - max(stamp[-2:]) > _SETTLED:
                 _files[stamp] = digits
             return digits
@@ -176,7 +176,7 @@ def file_stamps(value: Any) -> list[Stamp]:
     by a file that was taken away again. A file that changed in this moment is waited for, because
     its next change could have its stamp.
     """
-    stamps = [_stamp(path) for path in files_in(value)]
+    stamps = [file_stamp(path) for path in files_in(value)]
     if stamps and time.time_ns() - max(max(stamp[-2:]) for stamp in stamps) < _TICK:
         time.sleep(_TICK / 1e9)
     return stamps
@@ -193,7 +193,8 @@ def files_in(value: Any) -> Iterable[Path]:
     return []
 
 
-def _stamp(path: Path) -> Stamp:
+def file_stamp(path: Path | str) -> Stamp:
+    """Return what changes whenever a file is changed; raise `OSError` if it is missing."""
     stat = os.stat(path)
     return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
 

@@ -57,6 +57,7 @@ from neusee.workflows.keys.module_origin import (
     Origin,
     contents,
     look_again,
+    module_file,
     module_path,
     origin_of,
 )
@@ -66,7 +67,6 @@ from neusee.workflows.keys.source_summary import (
     Import,
     Summary,
     Use,
-    module_file,
     reached,
     read_names,
     summarise,
@@ -400,10 +400,7 @@ class Code:
             return self._wholes[module]
         looks, names = self._led_to(module)
         if module not in looks or looks[module].summary is None:
-            raise UnfollowedCode(
-                f"{module} has no source file, so its nodes have no cache key: save the module as a"
-                " file"
-            )
+            raise UnfollowedCode(_NO_FILE.format(module))
         documents = any(look.summary.documents for look in looks.values() if look.summary)
         state = {name: digest_of(look, documents) for name, look in looks.items()}
         now = settings() | (own_settings(reads_time(looks)) if is_own(module) else {})
@@ -472,10 +469,7 @@ class Code:
         if origin.kind in ("distribution", "absent"):
             return installed_look(module, origin.version, packages)
         if origin.path is None:
-            raise UnfollowedCode(
-                f"{module} has no source file, so its nodes have no cache key: save the module as a"
-                " file"
-            )
+            raise UnfollowedCode(_NO_FILE.format(module))
         if origin.kind == "binary":
             return Look(
                 {f"file {origin.path.name}": {"content": source_of(module, origin.path)[1]}}, {}

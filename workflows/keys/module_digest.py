@@ -23,6 +23,7 @@ from pydantic import TypeAdapter
 
 from neusee.nodes.import_times import import_time
 from neusee.workflows.keys import module_origin
+from neusee.workflows.keys.cache_key import Stamp, file_stamp
 from neusee.workflows.keys.module_origin import distributions_of
 from neusee.workflows.keys.sealed_files import (
     bytes_of,
@@ -54,7 +55,7 @@ EDITION = xxhash.xxh3_64_hexdigest(
 )
 _KEPT = 1000  #: number of summaries in the file
 #: stamps of files of digests that this process has read or written
-_right: dict[Path, tuple[int, ...]] = {}
+_right: dict[Path, Stamp] = {}
 
 #: digests of definitions, versions or contents, by module or other dependency
 Parts = dict[str, dict[str, str]]
@@ -155,16 +156,11 @@ def write_parts(root: Path, code: str, parts: Parts) -> None:
     """
     path = root / "code" / f"{code}.json"
     with suppress(OSError):
-        stamp = _stamp(path)
+        stamp = file_stamp(path)
         if _right.get(path) == stamp or read_parts(root, code):
             _right[path] = stamp
             return
     _write(path, seal_record("definitions", {**parts, "key": f"code/{code}"}), root / "tmp")
-
-
-def _stamp(path: Path) -> tuple[int, ...]:
-    stat = os.stat(path)
-    return stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
 
 
 def _write(path: Path, content: bytes, folder: Path) -> None:
@@ -390,15 +386,14 @@ def _is_module(file: str) -> bool:
     return file.endswith((".py", ".so", ".pyd"))
 
 
-def _content_stamp(file: str) -> tuple[int, ...]:
+def _content_stamp(file: str) -> Stamp:
     """Return what changes whenever a file is changed, last the times of its content and entry;
     nothing if missing.
     """
     try:
-        stat = os.stat(file)
+        return file_stamp(file)
     except OSError:
         return ()
-    return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns
 
 
 def _digest_of(file: str) -> bytes:

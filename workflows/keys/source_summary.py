@@ -17,7 +17,6 @@ from typing import NamedTuple
 import xxhash
 
 from neusee.workflows.keys.cache_key import digest
-from neusee.workflows.keys.module_origin import module_file
 from neusee.workflows.keys.source_syntax import (
     Block,
     Kinds,
@@ -541,8 +540,6 @@ def _starts(name: str, entries: tuple[str, ...]) -> bool:
 # Summary of a source file: the digests of the file and of its definitions, its imports, and what is
 # not followed.
 
-
-__all__ = ["ROOT", "Import", "Summary", "Use", "module_file", "summarise", "syntax_outline"]
 
 ROOT = "neusee.nodes"
 #: lock of the parser of Python 3.11, which miscounts the depth in two threads

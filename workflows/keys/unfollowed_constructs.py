@@ -383,7 +383,6 @@ _UNORDERED = frozenset(
         "isdisjoint",
     }
 )
-_SETS = ("set", "frozenset", "AbstractSet", "Set", "MutableSet")
 _OF_SETS = ("union", "intersection", "difference", "symmetric_difference", "copy")
 _SCOPES = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.Lambda)
 _LISTED = (ast.ListComp, ast.DictComp, ast.GeneratorExp)

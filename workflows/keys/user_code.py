@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from neusee.nodes import Node
     from neusee.workflows.graph.recipe_graph import Step
     from neusee.workflows.keys.code_digest import Code
-    from neusee.workflows.keys.module_digest import Look
 
 
 # --- declared dependencies ------------------------------------------------------------------------
