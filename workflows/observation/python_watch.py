@@ -12,15 +12,51 @@ import pickle
 import random
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 
 from neusee.workflows.observation.covered_paths import is_installed
 from neusee.workflows.observation.system_calls import CHILD, TRUSTED, UNTRUSTED, Does, Record
+
+# --- replaced functions ---------------------------------------------------------------------------
+
+# Functions of modules and classes, in whose place others stand while a call is observed.
+
+
+#: the place of a function, its name there, and what wraps it
+Wrapping = tuple[Any, str, Callable[[Any], Any]]
+
+
+def wrapped(wrappings: Iterable[Wrapping]) -> list[tuple[Any, str, Any]]:
+    """Return place, name and wrapped function, without those that this Python does not have."""
+    return [
+        (place, name, wrap(getattr(place, name)))
+        for place, name, wrap in wrappings
+        if hasattr(place, name)
+    ]
+
+
+class ReplacedFunctions:
+    """Functions that are replaced inside of a ``with`` block."""
+
+    def __init__(self, replacements: Sequence[tuple[Any, str, Any]]) -> None:
+        """Take the place and the name of each function, and what stands there meanwhile."""
+        self._meanwhile = replacements
+        self._before = [(place, name, getattr(place, name)) for place, name, _ in replacements]
+
+    def __enter__(self) -> Self:
+        for place, name, function in self._meanwhile:
+            setattr(place, name, function)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for place, name, function in self._before:
+            setattr(place, name, function)
+
 
 # --- kept generators ------------------------------------------------------------------------------
 
@@ -204,22 +240,12 @@ _SEARCH, _EXECUTE = "_find_and_load", "_call_with_frames_removed"
 _NATIVE = {getattr(_imp, name, None) for name in ("create_dynamic", "exec_dynamic")} - {None}
 
 
-class WatchedImports:
+class WatchedImports(ReplacedFunctions):
     """The two functions of importlib, wrapped while a call is observed."""
 
     def __init__(self) -> None:
-        self._before = {name: getattr(_BOOTSTRAP, name, None) for name in (_SEARCH, _EXECUTE)}
-
-    def __enter__(self) -> None:
-        for name, wrap in ((_SEARCH, _searching), (_EXECUTE, _executing)):
-            function = self._before[name]
-            if function is not None:
-                setattr(_BOOTSTRAP, name, wrap(function))
-
-    def __exit__(self, *_: object) -> None:
-        for name, function in self._before.items():
-            if function is not None:
-                setattr(_BOOTSTRAP, name, function)
+        places = [(_BOOTSTRAP, _SEARCH, _searching), (_BOOTSTRAP, _EXECUTE, _executing)]
+        super().__init__(wrapped(places))
 
 
 def _searching(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -279,24 +305,17 @@ def _module(called: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[str
 # not.
 
 
-class WatchedThreads:
+class WatchedThreads(ReplacedFunctions):
     """The two functions that start a thread, wrapped while a call is observed; audit events tell
     from Python 3.12.
     """
 
     def __init__(self) -> None:
-        places: list[tuple[Any, str]] = [(threading.Thread, "start"), (_thread, "start_new_thread")]
-        self._before = [(place, name, getattr(place, name)) for place, name in places]
-
-    def __enter__(self) -> None:
-        for place, name, function in self._before:
-            has_thread = place is threading.Thread
-            wrapped = _starting(function) if has_thread else _starting_nameless(function)
-            setattr(place, name, wrapped)
-
-    def __exit__(self, *_: object) -> None:
-        for place, name, function in self._before:
-            setattr(place, name, function)
+        places: list[Wrapping] = [
+            (threading.Thread, "start", _starting),
+            (_thread, "start_new_thread", _starting_nameless),
+        ]
+        super().__init__(wrapped(places))
 
 
 def _starting(function: Callable[[threading.Thread], None]) -> Callable[[threading.Thread], None]:

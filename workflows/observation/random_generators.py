@@ -14,7 +14,12 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from neusee.workflows.observation.python_watch import watch_here
+from neusee.workflows.observation.python_watch import (
+    ReplacedFunctions,
+    Wrapping,
+    watch_here,
+    wrapped,
+)
 
 # --- drawn names ----------------------------------------------------------------------------------
 
@@ -57,7 +62,7 @@ def _module(frame: object) -> str:
 # The sources of chance that a call asks, such as the system, a process or a device.
 
 
-class WatchedChance:
+class WatchedChance(ReplacedFunctions):
     """The functions through which Python code asks for chance, wrapped while a call is observed.
 
     The kernel sees most of it too, but not where the library of C draws without a system call.
@@ -66,23 +71,12 @@ class WatchedChance:
     def __init__(self) -> None:
         # temporary files have drawn names, which no result has: their generator is made before
         next(tempfile._get_candidate_names())  # type: ignore[attr-defined]
-        places: list[tuple[Any, str]] = [
-            (os, "urandom"),
-            (random, "_urandom"),
-            (random.Random, "seed"),
+        places: list[Wrapping] = [
+            (os, "urandom", _asking),
+            (random, "_urandom", _asking),
+            (random.Random, "seed", _seeding),
         ]
-        self._before = [
-            (place, name, getattr(place, name)) for place, name in places if hasattr(place, name)
-        ]
-
-    def __enter__(self) -> None:
-        for place, name, function in self._before:
-            wrapped = _seeding(function) if name == "seed" else _asking(function)
-            setattr(place, name, wrapped)
-
-    def __exit__(self, *_: object) -> None:
-        for place, name, function in self._before:
-            setattr(place, name, function)
+        super().__init__(wrapped(places))
 
 
 def _note(source: str) -> None:
@@ -247,7 +241,7 @@ class Shared:
         return value
 
 
-class SharedGenerators:
+class SharedGenerators(ReplacedFunctions):
     """The shared generators during an observed call, with the functions that set their seeds and
     states wrapped.
     """
@@ -259,18 +253,8 @@ class SharedGenerators:
             "numpy.random": Shared(_of_numpy),
             "random": Shared(random.getstate),
         }
-        replaced = [function for function in self._replaced() if hasattr(function[0], function[1])]
-        self._after = replaced
-        self._before = [(place, name, getattr(place, name)) for place, name, _ in replaced]
-
-    def __enter__(self) -> SharedGenerators:
-        for place, name, function in self._after:
-            setattr(place, name, function)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for place, name, function in self._before:
-            setattr(place, name, function)
+        replaced = self._replaced()
+        super().__init__([item for item in replaced if hasattr(item[0], item[1])])
 
     def drawn(self) -> list[str]:
         """Return the names of the generators that drew what no seed decides."""
@@ -294,10 +278,10 @@ class SharedGenerators:
             (torch.cuda, of_cuda),
             (torch.cuda.random, of_cuda),
         )
-        wrapped: list[tuple[Any, str, Any]] = []
+        replaced: list[tuple[Any, str, Any]] = [(_TORCH, _GENERATOR, generator)]
         for place, functions in places:
-            wrapped += [(place, name, function) for name, function in functions.items()]
-        return [(_TORCH, _GENERATOR, generator), *wrapped]
+            replaced += [(place, name, function) for name, function in functions.items()]
+        return replaced
 
 
 class _Seeded:
