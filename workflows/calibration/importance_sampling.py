@@ -32,7 +32,7 @@ from neusee.workflows.calibration.posterior_mixture import (
 )
 
 if TYPE_CHECKING:
-    from neusee.workflows.calibration.log_posterior import FloatArray, LaplaceFit, SensorPosterior
+    from neusee.workflows.calibration.log_posterior import FloatArray
 
 
 # --- mode mixture ---------------------------------------------------------------------------------

@@ -167,9 +167,7 @@ def find_posterior(
         progress=progress,
         guide=law.guide,
     )
-    models: list[ModelSpread] = []
-    if isinstance(problem.levels, Levels):
-        models = compare_models(recipe, store, recipe.seed)
+    models = _models_of_response(recipe, store, problem)
     tested = [
         *frame_checks(tests, not isinstance(problem.levels, Rings)),
         *_data_checks(problem, mode, tests),
@@ -180,6 +178,15 @@ def find_posterior(
     if not is_camera(problem):
         return result
     return replace(result, checks=[*tested, *agreement(result.beside)])
+
+
+def _models_of_response(
+    recipe: Recipe, store: Store, problem: SensorPosterior
+) -> list[ModelSpread]:
+    """Return the posteriors with several models of the response; none for rings about a source."""
+    if not isinstance(problem.levels, Levels):
+        return []
+    return compare_models(recipe, store, recipe.seed)
 
 
 def _draws_file(store: Store, problem: SensorPosterior, walkers: int, move: str) -> Path:
