@@ -147,7 +147,8 @@ def _run(arguments: list[str]) -> int:
     from neusee.workflows.cli.command_frame import print_warning
     from neusee.workflows.cli.program_options import run_program
 
-    settle_threads(arguments[0] if arguments else "")
+    command = arguments[0] if arguments else ""
+    settle_threads(command)
     with warnings.catch_warnings():
         warnings.showwarning = print_warning
         return run_program(arguments, completes)

@@ -213,8 +213,9 @@ def gc_lines(store: Store, budget: str | None = None, dry: bool = False) -> list
 
     Raises `ValueError` for a budget that is not a size.
     """
-    swept = store.gc(None if budget is None else parse_size(budget), dry)
-    full = budget is not None and _is_beyond(store, swept.left, parse_size(budget))
+    limit = None if budget is None else parse_size(budget)
+    swept = store.gc(limit, dry)
+    full = limit is not None and _is_beyond(store, swept.left, limit)
     old = stored_answer.sweep(store.disk, dry, everything=full)
     abouts = ((key, store.about(key)) for key in swept.evicted)  # the receipts of what went
     rows = [[*_row(key, about, False)[1:4], key[:8]] for key, about in abouts if about is not None]
@@ -282,11 +283,11 @@ def _picture_problem(files: DerivedFiles, key: str, about: dict[str, Any]) -> st
 
 
 def _row(key: str, about: dict[str, Any], pinned: bool) -> list[str]:
-    took, date = (
-        f"{about.get('seconds') or 0.0:.3f}",
-        str(about.get("date") or "")[:19].replace("T", " "),
-    )
-    mark = "pinned" if pinned else "" if is_kept(about) else "receipt"
+    took = f"{about.get('seconds') or 0.0:.3f}"
+    date = str(about.get("date") or "")[:19].replace("T", " ")
+    mark = "" if is_kept(about) else "receipt"
+    if pinned:
+        mark = "pinned"
     return [
         date,
         format_size(_size(about)),

@@ -84,7 +84,8 @@ def nodes(
     """
     own = _own(recipe)
     with failing(LookupError):
-        say(node_lines(name, own) if name else nodes_lines(own))
+        lines = node_lines(name, own) if name else nodes_lines(own)
+        say(lines)
 
 
 def schema(
@@ -118,10 +119,10 @@ def recipe_lines() -> list[str]:
     from neusee.workflows.recipe import loading
 
     titles = columns([[recipe.name, recipe.title] for recipe in loading.recipes()])
-    groups = (
-        f"  {name}: {', '.join(o.name for o in options)}"
-        for name, options in loading.groups().items()
-    )
+    groups: list[str] = []
+    for name, options in loading.groups().items():
+        names = ", ".join(option.name for option in options)
+        groups.append(f"  {name}: {names}")
     return [*titles, "", "groups, as in `neusee run laser=six`", *groups]
 
 

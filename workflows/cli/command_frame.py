@@ -57,8 +57,6 @@ def split_frames(words: list[str]) -> tuple[list[str], list[str], int]:
 
     A file may have the sign = in its name if it exists.
     """
-    from pathlib import Path
-
     count = next(
         (n for n, word in enumerate(words) if _is_change(word) and not Path(word).exists()),
         len(words),
@@ -126,11 +124,8 @@ def refusing() -> Iterator[None]:
         yield
     except RecipeError as error:
         count = len(error.diagnostics)
-        fail(
-            "\n".join(
-                [*_first_lines(str(error)), f"{count} problem{'s' * (count > 1)}, nothing was run"]
-            )
-        )
+        verdict = f"{count} problem{'s' * (count > 1)}, nothing was run"
+        fail("\n".join([*_first_lines(str(error)), verdict]))
 
 
 def _first_lines(text: str) -> list[str]:
@@ -172,12 +167,8 @@ def keep_for_result(context: typer.Context) -> None:
 def say(lines: list[str]) -> None:
     """Print lines to stdout."""
     stream = sys.stdout
-    print(
-        *lines,
-        sep="\n",
-        file=stream.result if isinstance(stream, _ForResult) else stream,
-        flush=True,
-    )
+    result = stream.result if isinstance(stream, _ForResult) else stream
+    print(*lines, sep="\n", file=result, flush=True)
 
 
 def say_line(line: str) -> None:

@@ -62,7 +62,8 @@ class Interrupts:
         now = time.monotonic()
         if self.came and not self._was_swallowed:
             if now - self._first > _ONE_PRESS:
-                os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, b"stopped at once\n")
+                stderr = sys.__stderr__.fileno() if sys.__stderr__ else 2
+                os.write(stderr, b"stopped at once\n")
                 os._exit(INTERRUPTED)
             return  # the second signal of the same press would interrupt what ends the command
         self._first, self._was_swallowed = now, False

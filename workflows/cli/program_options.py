@@ -74,12 +74,8 @@ def run_program(arguments: list[str], completes: bool) -> int:
     if NO_CODE in arguments:
         os.environ["NEUSEE_NO_CODE"] = "1"
         arguments = [argument for argument in arguments if argument != NO_CODE]
+    names: Collection[str] = COMMANDS if completes else arguments
     try:
-        return (
-            program(COMMANDS if completes else arguments)(
-                arguments, standalone_mode=False, prog_name="neusee"
-            )
-            or 0
-        )
+        return program(names)(arguments, standalone_mode=False, prog_name="neusee") or 0
     except typer.Abort:
         raise KeyboardInterrupt from None

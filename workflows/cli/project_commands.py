@@ -97,8 +97,10 @@ def _is_taken(path: Path) -> bool:
 def _write_start(path: Path, start: str, name: str) -> None:
     """Write a start with a name in place of NAME; without a name, as it is."""
     text = (files("neusee.workflows.cli") / "starts" / start).read_text(encoding="utf-8")
+    if name:
+        text = text.replace("NAME", name)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text.replace("NAME", name) if name else text, encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
 
 
 def _say_written(paths: Iterable[Path], folder: Path, commands: Iterable[str]) -> None:
@@ -232,12 +234,13 @@ def check(
         by_name = check_all(nodes, networks, process)
     failed = sum(f.ok is False for f in chain.from_iterable(by_name.values()))
     if as_json:
-        document = {name: [asdict(f) for f in findings] for name, findings in by_name.items()}
+        document = {name: list(map(asdict, findings)) for name, findings in by_name.items()}
         say([json.dumps(document, indent=1)])
     else:
         _say_findings(by_name)
         say([f"{_count(len(nodes), len(networks))}: {_verdict(failed)}"])
-    raise typer.Exit(MISSED if failed else DONE)
+    code = MISSED if failed else DONE
+    raise typer.Exit(code)
 
 
 def _say_findings(by_name: Mapping[str, Sequence[Finding]]) -> None:

@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
     from neusee.workflows.simulation.simulate_recipe import Simulation
     from neusee.workflows.store.result_store import Store
+    from neusee.workflows.sweeps.sweep_points import OnError
 
 
 # --- recipe commands ------------------------------------------------------------------------------
@@ -129,10 +130,13 @@ def run(
         table,
     ):
         done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit, again)
-    hints = [] if silent else commands_to_try(recipe, command[2 : -1 if exact else None], _loads)
-    _say_briefly(done, as_json) if silent else say(
-        console.closing(done.document, str(done.page), hints)
-    )
+    if silent:
+        hints = []
+        _say_briefly(done, as_json)
+    else:
+        recipe_words = command[2:-1] if exact else command[2:]
+        hints = commands_to_try(recipe, recipe_words, _loads)
+        say(console.closing(done.document, str(done.page), hints))
     if done.document["missed"]:
         raise typer.Exit(MISSED)
     if executor == "local" and not again:
@@ -439,6 +443,7 @@ def sweep(
     store = the_store()
     from neusee.workflows.cli.sweep_screen import run_sweep
 
+    policy: OnError = "continue" if on_error == "continue" else "stop"
     with refusing(), resumable(lambda: kept_in(store, "the points that are finished are")):
         search_for_garbage()
         code = run_sweep(
@@ -446,7 +451,7 @@ def sweep(
             words,
             first=first,
             zip=paired,
-            on_error="continue" if on_error == "continue" else "stop",
+            on_error=policy,
             netcdf=netcdf,
             device=device,
             out=out,
@@ -606,8 +611,10 @@ def compare(
     page = comparison_report.write_comparison(comparison, out, ["neusee", *TYPED]) / "report.html"
     if as_json:
         say_json({"report": str(page), **comparison_report.document(comparison)})
+    elif quiet:
+        say([str(page)])
     else:
-        say([str(page)] if quiet else [*comparison_report.lines(comparison), "", f"page   {page}"])
+        say([*comparison_report.lines(comparison), "", f"page   {page}"])
     if comparison.largest > fail_above:
         worst = max(comparison.numbers, key=lambda number: number.relative)
         fail(

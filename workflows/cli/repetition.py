@@ -51,7 +51,8 @@ def say_and_keep(
 
     say_line(text)
     for command in repeated_command.running:
-        command.keep(text, False, recipe, Said(store, memory) if store else None)
+        results = Said(store, memory) if store else None
+        command.keep(text, False, recipe, results)
 
 
 def keep_answer(

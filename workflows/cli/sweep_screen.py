@@ -7,12 +7,13 @@ from __future__ import annotations
 import shlex
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neusee.workflows.cli.command_frame import say_json, say_line
+from neusee.workflows.cli.command_options import option_words
 from neusee.workflows.cli.commands_and_exit_codes import DONE, FAILED, INTERRUPTED
 from neusee.workflows.report.console import Mode, ProgressTable, mode_for
 from neusee.workflows.report.terminal_text import lasts
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 
 _NUMBERS = 4  #: results in the row of a point
 _LAST = 25  #: points in a live table
+#: options that the command of a sweep does not name
+_USUAL = {"on-error": "stop", "device": "cpu", "out": Path("runs")}
 
 
 def run_sweep(
@@ -65,7 +68,8 @@ def run_sweep(
     work = Sweeping(
         recipe, read_words(words, place, first), place, store or open_store(), zip, device
     )
-    again = _command(recipe, words, zip, on_error, netcdf, device, out)
+    options = {"zip": zip, "netcdf": netcdf, "on-error": on_error, "device": device, "out": out}
+    again = ["neusee", "sweep", recipe, *words, *_words_of(options)]
     silent = quiet or as_json
     if not silent:
         print(*_opening(work), sep="\n", flush=True)
@@ -95,7 +99,8 @@ def _say_briefly(result: Sweep, path: Path, again: Sequence[str], as_json: bool)
     """Print the path of the table of a sweep, or its document as JSON, and the failures on
     stderr.
     """
-    print(*_failures(result), sep="\n", end="\n" if result.failed else "", file=sys.stderr)
+    for line in _failures(result):
+        print(line, file=sys.stderr)
     if as_json:
         say_json(_document(result, path, again))
     else:
@@ -157,21 +162,9 @@ def _run_points(
     return table.outcomes, "complete", None
 
 
-def _command(
-    recipe: str,
-    words: Sequence[str],
-    paired: bool,
-    on_error: str,
-    netcdf: bool,
-    device: str,
-    out: Path,
-) -> list[str]:
-    """Return the words of the command that runs a sweep again."""
-    options = ["--zip"] * paired + ["--netcdf"] * netcdf
-    options += ["--on-error", on_error] if on_error != "stop" else []
-    options += ["--device", device] if device != "cpu" else []
-    options += ["--out", str(out)] if out != Path("runs") else []
-    return ["neusee", "sweep", recipe, *words, *options]
+def _words_of(options: Mapping[str, Any]) -> list[str]:
+    """Return the words of the options that are not as usual."""
+    return option_words({name: x for name, x in options.items() if x != _USUAL.get(name)})
 
 
 def _closing(
@@ -249,10 +242,8 @@ class SweepTable(ProgressTable):
         values = map(cell_text, point_cells(outcome.point, self.columns))
         numbers = list(headline(outcome.numbers).items())[:_NUMBERS]
         results = "  ".join(f"{name} {value}" for name, value in numbers)
-        done, left = (
-            f"{len(self.outcomes)}/{self.points}",
-            lasts(outcome.left) if outcome.left else "",
-        )
+        done = f"{len(self.outcomes)}/{self.points}"
+        left = lasts(outcome.left) if outcome.left else ""
         return [
             done,
             str(outcome.point.number),

@@ -89,9 +89,13 @@ def train(
 
     device, (rank, world) = device_here(device), processes()
     check_device(device)
-    silent, who = quiet or as_json or rank > 0, f"process {rank}: " if world > 1 else ""
-    stages = _NUMBERS.get(stage, recipe.training.learnt if recipe.training else ())
-    command += ["--stage", stage.value, *(["--mesh", mesh] if mesh else [])]
+    silent = quiet or as_json or rank > 0
+    who = f"process {rank}: " if world > 1 else ""
+    learnt = recipe.training.learnt if recipe.training else ()
+    stages = _NUMBERS.get(stage, learnt)
+    command += ["--stage", stage.value]
+    if mesh:
+        command += ["--mesh", mesh]
     lengths = _lengths(recipe, stages)
     with (
         resumable(lambda: kept_training(out, recipe.name)),
@@ -113,7 +117,8 @@ def train(
             mesh=processes_here,
         )
     if rank == 0:
-        _say_results(folder, as_json, [] if silent else _next(folder, stage))
+        lines = [] if silent else _next(folder, stage)
+        _say_results(folder, as_json, lines)
 
 
 def _refuse_stage_and_mesh(recipe: Recipe, stage: Stages, mesh: str) -> None:
@@ -166,15 +171,16 @@ def _lift(
             watch=watch,
         )
     weights = folder / "mst_plus_plus.safetensors"
-    again = shlex.join(
-        ["neusee", "run", "first_light", "lift=mst_plus_plus", f"lift.weights={weights}"]
-    )
+    again = ["neusee", "run", "first_light", "lift=mst_plus_plus", f"lift.weights={weights}"]
     lines = [
         f"weights: {weights}",
         f"curves:  {folder / 'curves.png'}",
         f"judged:  {folder / 'training.json'}",
+        f"next:    {shlex.join(again)}",
     ]
-    _say_results(folder, as_json, [] if silent else [*lines, f"next:    {again}"])
+    if silent:
+        lines = []
+    _say_results(folder, as_json, lines)
 
 
 def _next(folder: Path, stage: Stages) -> list[str]:
@@ -215,9 +221,10 @@ def _loss_bar(
     hidden = quiet or not console.is_terminal
     bar = Progress(*columns, TextColumn("{task.fields[losses]}"), console=console, disable=hidden)
     lines = ProgressLines(quiet)
+    titles = {stage: f"stage {stage}" if stage else "lift" for stage in lengths}
     tasks = {
-        s: bar.add_task(f"stage {s}" if s else "lift", total=n, losses="")
-        for s, n in lengths.items()
+        stage: bar.add_task(titles[stage], total=iterations, losses="")
+        for stage, iterations in lengths.items()
     }
 
     def watch(stage: int, done: int, losses: Mapping[str, float]) -> None:
@@ -225,9 +232,8 @@ def _loss_bar(
         text = " ".join(f"{name} {losses[name]:.3g}" for name in names)
         bar.update(tasks[stage], completed=done, losses=text)
         if bar.disable and not quiet and done % max(1, lengths[stage] // _LINES) == 0:
-            lines(
-                f"{f'stage {stage}, ' if stage else ''}iteration {done} of {lengths[stage]}: {text}"
-            )
+            where = f"stage {stage}, " if stage else ""
+            lines(f"{where}iteration {done} of {lengths[stage]}: {text}")
 
     with bar:
         yield watch
