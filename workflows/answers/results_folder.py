@@ -155,11 +155,8 @@ def write_run_again(answer: Answer, disk: Disk, seconds: float) -> tuple[Path, d
 
     Raises `OSError` if the folder cannot be written; no part of it is left then.
     """
-    began, document = (
-        datetime.now(UTC).isoformat(timespec="seconds"),
-        json.loads(answer.files[DOCUMENT]),
-    )
-    document = _of_now(document, seconds)
+    began = datetime.now(UTC).isoformat(timespec="seconds")
+    document = _of_now(json.loads(answer.files[DOCUMENT]), seconds)
     with new_run(Path(answer.out), answer.label, answer.key) as folder:
         folder.said = {"began": began} | document
         for name, path in answer.stored.taken.items():

@@ -57,10 +57,8 @@ def transfer(
     )
     above = axes[0, 0]
     order = np.flatnonzero(unclipped)[np.argsort(predicted[0].mean(0)[unclipped])]
-    mean, (low, middle, high) = (
-        predicted[0].mean(0)[order],
-        np.percentile(predicted[1], _BAND, axis=0)[:, order],
-    )
+    mean = predicted[0].mean(0)[order]
+    low, middle, high = np.percentile(predicted[1], _BAND, axis=0)[:, order]
     above.fill_between(
         mean, low, high, color=BLUE, alpha=0.25, linewidth=0, label="predicted, 90 %"
     )
@@ -284,10 +282,8 @@ def _ranges(draws: FloatArray, nominal: Sequence[float]) -> list[tuple[float, fl
     )
     own = np.asarray(nominal)
     inside = (own >= draws.min(0)) & (own <= draws.max(0))
-    low, high = (
-        np.where(inside, which(shown[:, i], own), shown[:, i])
-        for i, which in ((0, np.minimum), (1, np.maximum))
-    )
+    low = np.where(inside, np.minimum(shown[:, 0], own), shown[:, 0])
+    high = np.where(inside, np.maximum(shown[:, 1], own), shown[:, 1])
     return [
         (float(a), float(b)) if b > a else (float(a) - 0.5, float(a) + 0.5)
         for a, b in zip(low, high, strict=True)
@@ -347,7 +343,8 @@ def _repeated(result: CalibrationResult) -> tuple[FloatArray, FloatArray, FloatA
     values = {**result.params, **result.problem.parameters(drawn)}
     scatter = np.broadcast_to(np.asarray(values.get("scatter", 0.0)), len(drawn))
     width = np.sqrt(2 / freedom + scatter[:, None] ** 2)
-    variance, away = look.variance.numpy() * (1 + width * rng.standard_normal(width.shape)), None
+    variance = look.variance.numpy() * (1 + width * rng.standard_normal(width.shape))
+    away = None
     if is_camera(result.problem):
         away = np.full(len(freedom), np.nan)
         away[look.degrees_of_freedom.numpy() > 0] = np.split(look.scaled.numpy(), 4, axis=-1)[

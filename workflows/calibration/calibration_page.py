@@ -190,10 +190,8 @@ def _reason(measured: Levels) -> str:
 
 
 def _row(row: ParameterEstimate, comparison: Comparison) -> tuple[str, str, str, str, str, float]:
-    value, posterior = (
-        with_uncertainty(comparison.value, comparison.error),
-        with_uncertainty(row.mean, row.sd),
-    )
+    value = with_uncertainty(comparison.value, comparison.error)
+    posterior = with_uncertainty(row.mean, row.sd)
     return (
         QUANTITIES[row.name][1],
         value,

@@ -257,14 +257,10 @@ class NearZero:
         slope, precision = self._others.information(widths)
         own, others = self._own, ~self._own
         # the prior of the parameter is that of its logarithm and joins on the grid
-        slope_own, own_own = (
-            slope[:, own][:, 0] + self._middle,
-            precision[:, own][:, :, own][:, 0, 0] - 1,
-        )
-        across, root = (
-            precision[:, others][:, :, own],
-            np.linalg.cholesky(precision[:, others][:, :, others]),
-        )
+        slope_own = slope[:, own][:, 0] + self._middle
+        own_own = precision[:, own][:, :, own][:, 0, 0] - 1
+        across = precision[:, others][:, :, own]
+        root = np.linalg.cholesky(precision[:, others][:, :, others])
         both = np.concatenate([slope[:, others][..., None], across], -1)
         solved = np.linalg.solve(root, both)
         steps, pull = np.moveaxis(np.linalg.solve(np.swapaxes(root, 1, 2), solved), -1, 0)

@@ -159,7 +159,8 @@ def _spread(name: str, problem: SensorPosterior, posteriors: list[_Posterior]) -
     linear = name in problem.coordinates.linear
     models = [posterior[name] for posterior in posteriors]
     (low, narrow), (high, wide) = models[-2:] if len(models) > 1 else models * 2
-    middle, width = 0.5 * (low + high), math.hypot(width_of_mean(narrow, wide), 0.5 * (high - low))
+    middle = 0.5 * (low + high)
+    width = math.hypot(width_of_mean(narrow, wide), 0.5 * (high - low))
     return ModelSpread(
         name, tuple(_interval(*model, linear) for model in models), _interval(middle, width, linear)
     )
@@ -395,9 +396,8 @@ def widened(
         return chains
     generator = torch.Generator().manual_seed(seed)
     normal = torch.randn(2, chains.log.size, generator=generator, dtype=torch.float64)
-    gain, noise = (
-        errors[n] * x.view(chains.log.shape) for n, x in zip(("gain", "noise"), normal, strict=True)
-    )
+    gain = errors["gain"] * normal[0].view(chains.log.shape)
+    noise = errors["noise"] * normal[1].view(chains.log.shape)
     values = problem.parameters(chains.draws)
     if "gain" in values:
         values["gain"] = values["gain"] * gain.exp()

@@ -320,11 +320,11 @@ def checks(
     """Run all checks of a posterior and return the results; if a check fails, the posterior is
     not fit for use.
     """
-    peak, data = (
-        _of_peak(problem, mode, identifiability, chains, law),
-        _of_data(problem, mode, identifiability, law),
-    )
-    return [*_of_chains(chains), *peak, *data]
+    return [
+        *_of_chains(chains),
+        *_of_peak(problem, mode, identifiability, chains, law),
+        *_of_data(problem, mode, identifiability, law),
+    ]
 
 
 def _of_chains(chains: Chains) -> Iterator[Check]:
@@ -412,7 +412,8 @@ def _of_agreement(chains: Chains, law: ImportanceSamples, columns: list[int]) ->
     """Return if the chains and importance sampling have the same widths and means."""
     sd, mean = law.sd()[columns], law.mean()[columns]
     flat = chains.flat[:, columns]
-    apart, off = np.abs(flat.std(0) / sd - 1), np.max(np.abs(flat.mean(0) - mean) / sd)
+    apart = np.abs(flat.std(0) / sd - 1)
+    off = np.max(np.abs(flat.mean(0) - mean) / sd)
     allowed = np.maximum(_SD, _LUCK * law.doubt(flat))
     worst = int(np.argmax(apart / allowed))
     text = f"widths within {apart[worst]:.1%}, means {off:.2f} sd; k-hat {law.tail:.2f}"
@@ -512,10 +513,8 @@ def goodness_of_fit(likelihood: Likelihood, free: int = 0) -> GoodnessOfFit:
             f"deviances of shape {shape} belong to several sensors: compute the likelihood of one"
             " sensor"
         )
-    deviance, freedom = (
-        float(likelihood.deviance.sum()),
-        float(likelihood.degrees_of_freedom.sum()) - free,
-    )
+    deviance = float(likelihood.deviance.sum())
+    freedom = float(likelihood.degrees_of_freedom.sum()) - free
     if freedom <= 0:
         raise ValueError(
             f"{freedom + free:.0f} measured numbers cannot test {free} free parameters: give more"

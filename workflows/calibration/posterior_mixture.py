@@ -281,10 +281,8 @@ def fit_mixture(
 def _joined(first: Mixture, second: Mixture) -> Mixture:
     """Return the mixture of two mixtures in equal parts."""
     shares = 0.5 * np.concatenate([first.shares, second.shares])
-    centres, roots = (
-        np.concatenate([a, b])
-        for a, b in ((first.centres, second.centres), (first.roots, second.roots))
-    )
+    centres = np.concatenate([first.centres, second.centres])
+    roots = np.concatenate([first.roots, second.roots])
     return Mixture(shares, centres, roots)
 
 
@@ -302,10 +300,8 @@ def _start(problem: SensorPosterior, mode: LaplaceFit, rng: np.random.Generator)
     """
     places, logs = follow_posterior(problem, _PARTICLES, rng)
     beside = mode.draw(_BESIDE, rng)
-    places, logs = (
-        np.concatenate([places, beside]),
-        np.concatenate([logs, problem.log_posterior(beside)]),
-    )
+    places = np.concatenate([places, beside])
+    logs = np.concatenate([logs, problem.log_posterior(beside)])
     return places[logs > max(float(logs.max()), mode.log) - _FAR]
 
 

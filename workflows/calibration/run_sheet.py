@@ -69,11 +69,10 @@ def write_sheet(
             and for a wrong
     statement.
     """
-    study_run, statements = (
-        StudyRun("sheet", recipe, command),
-        operating_point(state, stated(recipe)),
-    )
-    laboratory, photons_told = laboratory_of(recipe), not (relative or is_relative(recipe))
+    study_run = StudyRun("sheet", recipe, command)
+    statements = operating_point(state, stated(recipe))
+    laboratory = laboratory_of(recipe)
+    photons_told = not (relative or is_relative(recipe))
     frames = frames_of_recipe(recipe, store, release)
     sheet = emva_sheet(frames.levels, frames.spatial, photons_told=photons_told)
     budgets = sheet_budgets(frames.levels, sheet, laboratory, photons_told)

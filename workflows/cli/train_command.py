@@ -186,11 +186,14 @@ def _lift(
 def _next(folder: Path, stage: Stages) -> list[str]:
     if stage is Stages.MASK:
         return [f"mask:    {folder / 'mask.safetensors'}", f"report:  {folder / 'report.html'}"]
-    mask, network = folder / "mask.safetensors", folder / "network.safetensors"
-    lines = [f"mask:    {mask}"] if mask.is_file() else []
-    best = folder / "best.safetensors"
-    lines += [f"best:    {best}"] if best.is_file() else []
-    return [*lines, f"network: {network}", f"report:  {folder / 'training.html'}"]
+    lines: list[str] = []
+    mask, best = folder / "mask.safetensors", folder / "best.safetensors"
+    if mask.is_file():
+        lines.append(f"mask:    {mask}")
+    if best.is_file():
+        lines.append(f"best:    {best}")
+    network, page = folder / "network.safetensors", folder / "training.html"
+    return [*lines, f"network: {network}", f"report:  {page}"]
 
 
 @contextmanager

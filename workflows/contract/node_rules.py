@@ -198,10 +198,8 @@ def check_reference(call: Call) -> Iterator[Finding]:
     if node.hooks.approximation_error is not None:
         return  # factors of a cheaper form, of which many have the same product
     rng = {"rng": torch.Generator().manual_seed(_SEED)} if node.random else {}
-    results, slow = (
-        tensors_in(call.result()),
-        tensors_in(node.hooks.reference(*call.inputs, **call.params, **rng)),
-    )
+    results = tensors_in(call.result())
+    slow = tensors_in(node.hooks.reference(*call.inputs, **call.params, **rng))
     if [x.shape for x in results] != [x.shape for x in slow]:
         shapes = [_shapes(tensors) or "no tensor" for tensors in (results, slow)]
         yield Finding("reference", False, f"the result is {shapes[0]}, the reference {shapes[1]}")
@@ -296,10 +294,8 @@ def check_bands(call: Call) -> Iterator[Finding]:
         _first_band(value, axes[name]) if name in axes else value
         for name, value in zip(call.node.inputs, call.inputs, strict=True)
     ]
-    of_stack, alone = (
-        tensors_in(_first_band(call.result(), axes["return"])),
-        tensors_in(call.result(first_bands)),
-    )
+    of_stack = tensors_in(_first_band(call.result(), axes["return"]))
+    alone = tensors_in(call.result(first_bands))
     same = all(torch.equal(x, y) for x, y in zip(of_stack, alone, strict=True))
     yield Finding("bands", same, f"the first band alone has {'the same' if same else 'other'} bits")
 
@@ -345,9 +341,8 @@ def check_shape(call: Call) -> Iterator[Finding]:
         each_tensor(lambda x: x.to("meta") if x.numel() > _FEW else x, value)
         for value in call.inputs
     ]
-    stated, actual = (
-        _every_tensor(value) for value in (hook(*inputs, **call.params), call.result())
-    )
+    stated = _every_tensor(hook(*inputs, **call.params))
+    actual = _every_tensor(call.result())
     same = [tuple(x.shape) for x in stated] == [tuple(x.shape) for x in actual]
     yield Finding("shape", same, f"told {_shapes(stated)}, is {_shapes(actual)}")
 

@@ -248,7 +248,8 @@ def misplaced_frames(levels: Sequence[Files], folder: Path) -> Iterator[str]:
     """
     means = [_means(files) for _, _, files in levels]
     middles = [float(np.median([mean for _, mean, _ in of_level])) for of_level in means]
-    darks, lit = _of_kind(middles, levels, dark=True), _of_kind(middles, levels, dark=False)
+    darks = _of_kind(middles, levels, dark=True)
+    lit = _of_kind(middles, levels, dark=False)
     half_of_lit = float(np.median(lit))
     if half_of_lit <= max(darks):
         yield (

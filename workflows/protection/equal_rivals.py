@@ -81,8 +81,10 @@ class Rival:
         parts = ["mask"] if self.front.masked else []
         if self.front.notch is not None:
             parts.append(f"notch at {self.front.notch * 1e9:.0f} nm")
-        parts += [f"stop {self.front.diameter:.3g}"] if self.front.diameter < 1 else []
-        parts += [f"filter {self.transmittance:.2g}"] if self.transmittance < 1 else []
+        if self.front.diameter < 1:
+            parts.append(f"stop {self.front.diameter:.3g}")
+        if self.transmittance < 1:
+            parts.append(f"filter {self.transmittance:.2g}")
         return ", ".join(parts) or "open lens"
 
 

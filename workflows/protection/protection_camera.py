@@ -128,10 +128,8 @@ class ProtectionCamera:
         lens scatters.
         """
         notches = {name: options.pop(name) for name in ("notches", "depth") if name in options}
-        front, lens = (
-            self._front(masked, diameter, line, condition, **notches),
-            {**self.lens, **options},
-        )
+        front = self._front(masked, diameter, line, condition, **notches)
+        lens = {**self.lens, **options}
         sizes = {name: lens[name] for name in ("focal_length", "pixel_pitch", "angle")}
         aperture = float(self.stop.diameter)
         psf: Psf = stray_light(
