@@ -2148,12 +2148,6 @@ MUTANTS = (
         within("workflows/engine", "cost_model.py::test_only_the_newest_count"),
     ),
     Mutant(
-        "workflows/engine/load_or_recompute.py",
-        "load > compute + _GAIN",
-        "load > compute - _GAIN",
-        within("workflows/engine", "load_or_recompute.py::test_a_millisecond_is_not_worth_a_look"),
-    ),
-    Mutant(
         "workflows/placement/heft_schedule.py",
         "[-1]) + 1",
         "[-1])",

@@ -6,19 +6,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 from neusee.nodes import TensorStats
 from neusee.workflows.engine.cost_model import Costs, Estimate, sizes_of
 from neusee.workflows.engine.dispatch import Loop, chains_of
-from neusee.workflows.engine.load_or_recompute import (
-    Upstream,
-    cheaper_to_recompute,
-    uses_of,
-    worth_solving,
-)
 from neusee.workflows.engine.local_executor import Local
+from neusee.workflows.engine.missing_values import Upstream, uses_of
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import (
     joined,
@@ -178,7 +172,7 @@ def refuse_taints(outcome: Outcome) -> None:
 
 # --- execution ------------------------------------------------------------------------------------
 
-# Execution of one run: the keys of the steps, the choice to load or compute each value, and the
+# Execution of one run: the keys of the steps, the values that are loaded or computed, and the
 # records.
 #
 # No function is recursive over the graph. Values are kept by key: two steps with one key are
@@ -186,7 +180,6 @@ def refuse_taints(outcome: Outcome) -> None:
 
 
 _QUICK = 1e-3  #: s below which two processes may both compute a step without a lease
-_UNKNOWN = 100.0  #: s of a step without measurement, when loading is compared with computing
 
 
 class Execution:
@@ -288,7 +281,7 @@ class Execution:
         self._finish(ran(outcome, "not stored", self._bound(name), self.began, None))
 
     def make(self, targets: list[Key], keep: bool, later: Sequence[Key] = ()) -> None:
-        """Load or compute the values with the cache keys ``targets``.
+        """Load the values with the cache keys ``targets`` that are stored, and compute the others.
 
         Values that the keys ``later`` need stay in memory, and with ``keep`` also each value that
         is not stored.
@@ -296,14 +289,10 @@ class Execution:
         while True:
             below = Upstream(self.known, self.sources)
             order = in_order(below, targets)
-            if again := self._dear(below, targets):
-                below = Upstream(partial(self._known_but, again), self.sources)
-                order = in_order(below, targets)
             try:
                 plan = [key for key in order if key in below.missing]
-                is_known = self.known if again else below.knows
-                uses = uses_of(plan, [*targets, *later], is_known, self.sources)
-                return self._execute(plan, again, targets, keep, uses, asked=not (keep or later))
+                uses = uses_of(plan, [*targets, *later], below.knows, self.sources)
+                return self._execute(plan, targets, keep, uses, asked=not (keep or later))
             except InputMissing:
                 continue
 
@@ -374,31 +363,6 @@ class Execution:
         self.receipts[key] = about
         return False
 
-    def _known_but(self, again: Collection[Key], key: Key) -> bool:
-        """Return True for a stored value that is not to be computed again."""
-        return key not in again and self.known(key)
-
-    def _dear(self, below: Upstream, targets: list[Key]) -> frozenset[Key]:
-        """Return the keys of the stored values that are cheaper to compute than to read."""
-
-        def compute(key: Key) -> float:
-            about = self.receipts.get(key) or self.store.about(key)
-            return float(about.get("seconds") or 0.0) if about else _UNKNOWN
-
-        def load(key: Key) -> float:
-            return (
-                0.0
-                if key in self.values
-                else self._reading(key)
-                if self.known(key)
-                else float("inf")
-            )
-
-        read = [key for key in below if key not in below.missing and key not in self.values]
-        if not any(worth_solving(self._reading(key), compute(key)) for key in read):
-            return frozenset()
-        return frozenset(cheaper_to_recompute(targets, self.sources, load, compute))
-
     def _reading(self, key: Key) -> float:
         """Return the predicted time (s) for reading a stored value, or infinity if the value is
         not stored.
@@ -409,7 +373,6 @@ class Execution:
     def _execute(
         self,
         plan: list[Key],
-        again: frozenset[Key],
         targets: list[Key],
         keep: bool,
         uses: Counter[Key],
@@ -419,7 +382,7 @@ class Execution:
         for keys, executor in self._by_executor(plan):
             elsewhere = [key for key in plan if key not in keys]
             read = set[Key]().union(*map(self.sources, elsewhere))
-            for outcome in self._outcomes(keys, again, {*targets, *read}, asked, executor):
+            for outcome in self._outcomes(keys, {*targets, *read}, asked, executor):
                 key, sources = outcome.work.key, outcome.work.sources
                 if outcome.value is not None or not outcome.kept:
                     self.values.add(outcome)
@@ -440,7 +403,6 @@ class Execution:
     def _outcomes(
         self,
         plan: list[Key],
-        again: frozenset[Key],
         targets: Collection[Key],
         asked: bool,
         executor: Executor,
@@ -456,7 +418,7 @@ class Execution:
         large_targets = {
             key for key in targets if self.costs.size_of(self.makers[key].name) >= threshold
         }
-        works = [self._work(key, key in again, key in large_targets, executor) for key in plan]
+        works = [self._work(key, key in large_targets, executor) for key in plan]
         try:
             prepared = prepare(
                 works, self.costs, self.receipts, executor.lanes, targets, self.values
@@ -477,7 +439,7 @@ class Execution:
             executor.cancel()
             raise
 
-    def _work(self, key: Key, recompute: bool, target: bool, executor: Executor) -> StepJob:
+    def _work(self, key: Key, target: bool, executor: Executor) -> StepJob:
         step = self.makers[key]
         reads = tuple(self._read(step.wires.get(name)) for name in step.node.inputs)
         device, lanes = places(step, self.devices)[0], executor.lanes
@@ -487,7 +449,6 @@ class Execution:
             self.recipe.name,
             self.recipe.seed,
         )
-        recompute = recompute or key in self._anew
         work = StepJob(
             step,
             key,
@@ -498,7 +459,7 @@ class Execution:
             device,
             lane,
             is_requested,
-            recompute=recompute,
+            recompute=key in self._anew,
         )
         return replace(work, own=own_code(step, self.code))
 
