@@ -37,18 +37,11 @@ ROOMS = (
 )  # fmt: skip
 DOOR = ""  #: neusee.workflows itself, which offers names of all rooms: no room imports it
 
-#: From a room to a later one, in a function or for types alone.
+#: From a room to a later one, for types alone: nothing is imported when the program runs. These
+#: are the only cycles of rooms.
 UPWARD = {
-    ("graph", "engine"): "type-only, and lazy: Recipe.run runs the recipe",
-    ("graph", "store"): "type-only: the store that Recipe.run takes",
-    ("graph", "recipe.blocks"): "type-only: what a recipe says of its training",
-    ("graph", "recipe.distributions"): "type-only: what a recipe is not sure of",
-    ("graph", "report"): "lazy representation: what a notebook shows of a recipe",
-    ("engine", "report"): "lazy representation: what a notebook shows of a result, and its numbers",
-    (
-        "recipe.distributions",
-        "recipe",
-    ): "lazy: a recipe with drawn values is checked again as a whole",
+    ("graph", "recipe.blocks"): "a field of Recipe: what it says of training, safety, evaluation",
+    ("graph", "recipe.distributions"): "a field of Recipe: what it is not sure of",
 }
 
 #: Rooms that answer a command each, and do not import one another.
@@ -215,7 +208,7 @@ def is_later(room, other):
 
 
 def direction(files):
-    """Imports of a later room, but for those in a function, or for types alone, that are
+    """Imports of a later room, in a function as well, but for those for types alone that are
     allowed.
     """
     allowed = {(source, target) for source, target in UPWARD}
@@ -223,12 +216,32 @@ def direction(files):
         if (
             source != DOOR
             and is_later(source, target)
-            and (when == "top" or (source, target) not in allowed)
+            and (when != "type" or (source, target) not in allowed)
         ):
             yield (
                 f"{where} ({when}): {source} imports {target or 'the whole of workflows'}, which"
                 " comes later"
             )
+
+
+def cycles(files):
+    """Rooms that need each other, whether a file, a function or a type imports, but for
+    `UPWARD`.
+    """
+    needs = defaultdict(set)
+    for source, target, _, _ in edges(files):
+        if DOOR not in (source, target) and (source, target) not in UPWARD:
+            needs[source].add(target)
+    yield from circles(needs)
+
+
+def circles(needs):
+    """What needs itself through others, from a name to the names that it needs."""
+    left = dict(needs)
+    while free := [name for name, below in left.items() if left.keys().isdisjoint(below)]:
+        left = {name: below for name, below in left.items() if name not in free}
+    for name in sorted(left):
+        yield f"{name} and {', '.join(sorted(left[name] & left.keys()))} need each other"
 
 
 def siblings(files):
@@ -239,6 +252,21 @@ def siblings(files):
             yield f"{where}: {one} imports {other}"
         if one == other == "studies" and "." in source and "." in target:
             yield f"{where}: {source} imports {target}"
+
+
+def pure(files):
+    """Imports of other rooms in graph when the program runs, and functions there that run or
+    draw.
+    """
+    for file, tree in files.items():
+        if home(file) != "graph":
+            continue
+        for item in items_of(tree):
+            if isinstance(item, ast.FunctionDef) and re.search("^run$|html", item.name):
+                yield f"{file}:{item.lineno}: {item.name}"
+        for source, target, when, where in edges({file: tree}):
+            if when != "type":
+                yield f"{where}: {source} imports {target}"
 
 
 def exits(files):
@@ -426,8 +454,8 @@ def offers(files):
                 yield f"{file}: offers {module}.{name}, which is not there"
 
 
-FILE_RULES = (direction, siblings, exits, terminal, samplers, private, dynamic, formulas)
-HOUSE_RULES = (classes, names, places, offers)
+FILE_RULES = (direction, pure, siblings, exits, terminal, samplers, private, dynamic, formulas)
+HOUSE_RULES = (classes, names, places, offers, cycles)
 
 # --- the tests ------------------------------------------------------------------------------------
 
@@ -470,6 +498,19 @@ def test_units_below_node_below_the_families():
             if e.module.startswith("neusee.nodes")
         }
         assert names <= allowed, name
+
+
+def test_no_two_families_of_nodes_need_each_other():
+    needs = defaultdict(set)
+    families = {path.parent.name for path in ROOT.glob("nodes/*/__init__.py")}
+    for path in NODES:
+        family = path.relative_to(ROOT / "nodes").parts[0]
+        for each in imports(parsed(path)):
+            needed = each.full.removeprefix("neusee.nodes.").partition(".")[0]
+            if family in families and needed in families - {family}:
+                needs[family].add(needed)
+    assert needs, "the families are found"
+    assert not list(circles(needs))
 
 
 def test_heavy_imports_wait_until_they_are_needed():
@@ -533,10 +574,11 @@ def first_file(room):
     return f"{room.replace('.', '/')}/__init__.py"
 
 
-def test_what_is_allowed_in_a_function_is_forbidden_at_the_top():
+def test_what_is_allowed_for_types_is_forbidden_when_the_program_runs():
     for source, target in UPWARD:
         file, code = f"{source.replace('.', '/')}/__init__.py", f"import neusee.workflows.{target}"
-        assert not list(direction(alone(file, f"def _():\n    {code}")))
+        assert not list(direction(alone(file, f"if TYPE_CHECKING:\n    {code}")))
+        assert len(list(direction(alone(file, f"def _():\n    {code}")))) == 1
         assert len(list(direction(alone(file, code)))) == 1
 
 
@@ -595,6 +637,9 @@ OFFENCES = [
     (places, "helpers.py", "x = 1"),
     (places, "engine/loops/__init__.py", "x = 1"),
     (offers, "graph/__init__.py", "import torch"),
+    (pure, "graph/step_shapes.py", "def run(self):\n    pass"),
+    (pure, "graph/recipe_graph.py", "def _repr_html_(self):\n    pass"),
+    (pure, "graph/recipe_graph.py", "def _():\n    import neusee.workflows.keys.cache_key"),
 ]
 
 
@@ -623,6 +668,14 @@ def test_a_room_that_does_not_say_what_it_offers_is_found(words):
 def test_a_room_that_is_gone_is_missed():
     files = {file: tree for file, tree in house().items() if not file.startswith("placement/")}
     assert list(places(files)) == ["placement is no room"]
+
+
+@pytest.mark.parametrize("form", ["{}", "def _():\n    {}", "if TYPE_CHECKING:\n    {}"])
+def test_a_planted_circle_of_rooms_is_found(form):
+    code = form.format("import neusee.workflows.report.notebook")
+    circle = list(cycles({**house(), **alone("engine/runner.py", code)}))
+    assert any(line.startswith("engine and") for line in circle)
+    assert any(line.startswith("report and") for line in circle)
 
 
 def test_nanometres_are_no_formula():

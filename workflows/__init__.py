@@ -1,8 +1,8 @@
 """The machinery that reads a recipe, runs its steps in order, stores their results and reports on
 the run.
 
-    from neusee.workflows import load
-    result = load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}).run()
+    from neusee.workflows import load, run
+    result = run(load("first_light", doe="axicon", sensor={"read_noise": "20 e-"}))
     result["restored"], result.numpy("restored"), result.metrics()
 
 Names are imported when they are first used, so that ``neusee --help`` answers without torch.

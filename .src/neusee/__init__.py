@@ -76,5 +76,35 @@ def __getattr__(name: str) -> "Any":
     return found
 
 
+def _tell_notebooks() -> None:
+    """Tell IPython, where it runs, how a notebook shows a recipe and a result of a run.
+
+    The pages are imported when the first of them is shown.
+    """
+    import sys
+
+    running = getattr(sys.modules.get("IPython"), "get_ipython", None)
+    shell = running() if running else None
+    if shell is not None:
+        html = shell.display_formatter.formatters["text/html"]
+        html.for_type_by_name("neusee.workflows.graph.recipe_graph", "Recipe", _recipe_html)
+        html.for_type_by_name("neusee.workflows.engine.runner", "Result", _result_html)
+
+
+def _recipe_html(recipe: "Recipe") -> str:
+    from neusee.workflows.report.notebook import recipe_html
+
+    return recipe_html(recipe)
+
+
+def _result_html(result: "Result") -> str:
+    from neusee.workflows.report.notebook import result_html
+
+    return result_html(result)
+
+
+_tell_notebooks()
+
+
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})

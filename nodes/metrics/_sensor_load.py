@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, node
-from neusee.nodes.sensor._digitization import Bits, clipping_number
+from neusee.nodes.sensor._digitization import Bits, is_clipped
 from neusee.nodes.sensor._exposure import weighted
 from neusee.nodes.sensor._saturation import Well, refuse_without_steps, saturation
 from neusee.nodes.units import Efficiency, Exposure, Gain, PixelPitch, Time
@@ -38,7 +38,7 @@ def saturated(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> S
             NaN.
     Source: NeuSee, Eq. (SensorImage).
     """
-    full = clipped(raw, full_well=full_well, gain=gain, bits=bits).any(-3)
+    full = is_clipped(raw, full_well=full_well, gain=gain, bits=bits).any(-3)
     pixels = full.sum().double()
     return Saturated(pixels, pixels / full.numel())
 
@@ -54,14 +54,6 @@ def _(result: Saturated, *inputs: Tensor, **params: Any) -> list[Check]:
     return [
         Check(f"{int(result.pixels)} saturated pixels, {float(result.share):.2%} of all pixels")
     ]
-
-
-def clipped(raw: Tensor, *, full_well: float, gain: float, bits: int) -> Tensor:
-    """Return True for raw values in DN at the full well or at the largest output of the
-    converter, and for NaN.
-    """
-    marked: Tensor = ~(raw < clipping_number(full_well, gain, bits))  # NaN counts as clipped
-    return marked
 
 
 # --- peak irradiance ------------------------------------------------------------------------------

@@ -8,11 +8,10 @@ from pydantic import Field
 from torch import Tensor
 
 from neusee.nodes import Check, ErrorBound, TensorStats, node
-from neusee.nodes.metrics._sensor_load import clipped as at_the_end
 from neusee.nodes.precision import single
 from neusee.nodes.restore._inverse._masked_blur import effective_psf
 from neusee.nodes.scene._grey import luminance
-from neusee.nodes.sensor._digitization import Bits
+from neusee.nodes.sensor._digitization import Bits, is_clipped
 from neusee.nodes.sensor._exposure import channel_weights
 from neusee.nodes.sensor._saturation import Well, refuse_without_steps
 from neusee.nodes.spectra._cie_tables import paints, to_srgb
@@ -84,7 +83,7 @@ def clipped(raw: Tensor, *, full_well: Well, gain: Gain, bits: Bits = 16) -> Ten
             (NaN).
     Source: NeuSee, Eq. (SensorImage).
     """
-    return at_the_end(raw, full_well=full_well, gain=gain, bits=bits)
+    return is_clipped(raw, full_well=full_well, gain=gain, bits=bits)
 
 
 @clipped.preflight

@@ -15,7 +15,7 @@ from torch.nn.functional import max_pool2d, pad
 
 from neusee.nodes import ParameterError
 from neusee.nodes.input_files import once_per_version
-from neusee.nodes.metrics._sensor_load import clipped
+from neusee.nodes.sensor._digitization import is_clipped
 from neusee.nodes.sensor._frame_file import Curve, frame_problem, read_frame
 
 # --- point frames ---------------------------------------------------------------------------------
@@ -131,7 +131,7 @@ def read_points(files: Sequence[Path], window: tuple[int, int], camera: Camera) 
     parts, first = [], 0
     for number, file in enumerate(lit):
         raw = torch.from_numpy(np.ascontiguousarray(read_frame(file).values, dtype=np.float64))
-        ends = clipped(raw, full_well=full_well, gain=gain, bits=bits)
+        ends = is_clipped(raw, full_well=full_well, gain=gain, bits=bits)
         light = raw / gain - torch.as_tensor(base)
         places = [place for place, _ in _found(file, window, camera)]
         parts.append(_kept(light, ends, places, window, number, first))
@@ -226,7 +226,7 @@ def _found(
     """
     gain, _, full_well, bits, read_noise = camera
     raw = torch.from_numpy(np.ascontiguousarray(read_frame(file).values, dtype=np.float64))
-    ends = clipped(raw, full_well=full_well, gain=gain, bits=bits).any(0)
+    ends = is_clipped(raw, full_well=full_well, gain=gain, bits=bits).any(0)
     light = (raw / gain).sum(0)
     calm = _median(light)
     ground = calm.median()

@@ -31,6 +31,14 @@ def clipping_number(full_well: float, gain: float, bits: int) -> int:
     return max(1, min((1 << bits) - 1, int(full_well * gain - 0.5)))
 
 
+def is_clipped(raw: Tensor, *, full_well: float, gain: float, bits: int) -> Tensor:
+    """Return True for raw values in DN at the full well or at the largest output of the
+    converter, and for NaN.
+    """
+    marked: Tensor = ~(raw < clipping_number(full_well, gain, bits))  # NaN counts as clipped
+    return marked
+
+
 def electrons_to_clip(full_well: float, gain: float, bits: int, offset: float = 0.0) -> float:
     """Return the electrons of light that fill a pixel: its digital number, rounded to the nearest,
     counts as clipped.

@@ -85,11 +85,11 @@ def again(recipe: str, place: Path, repeats: int = 7) -> None:
 
 ENGINE = """
 import sys, time
-from neusee.workflows import load
+from neusee.workflows import load, run
 recipe = load("paper_table1", sys.argv[1:])
 outputs = [n for n in recipe.steps if n.partition("[")[0] in ("raw", "lsr", "bsr", "peak", "saturated", "developed")]
 began = time.perf_counter()
-done = recipe.run(outputs=outputs).done.values()
+done = run(recipe, outputs=outputs).done.values()
 ran = sum(d.state == "run" for d in done)
 print(f"{time.perf_counter() - began:.2f} {ran} {len(done)}")
 """

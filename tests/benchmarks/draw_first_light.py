@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 
+import neusee
 from neusee.nodes.sensor import saturation
 from neusee.workflows import load
 
@@ -83,7 +84,7 @@ def main():
     from PIL import Image
 
     recipe = load("first_light", [f"outputs=[{WANTED}]"])
-    draw(recipe.run(), recipe.steps["peak[plain]"]).savefig(PICTURE)
+    draw(neusee.run(recipe), recipe.steps["peak[plain]"]).savefig(PICTURE)
     with Image.open(PICTURE) as drawn:
         picture = drawn.convert("RGB")
     palette = picture.quantize(COLOURS, method=Image.Quantize.FASTOCTREE, kmeans=2)

@@ -25,8 +25,8 @@ from scipy.optimize import nnls
 
 from neusee.nodes import registered_nodes
 from neusee.workflows.engine import cost_model as cost_laws
+from neusee.workflows.engine.wanted_steps import steps_of, wanted
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.report.contents import steps_of, wanted
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
 TARGET = Path(__file__).parents[2] / "workflows" / "engine" / "node_costs.json"

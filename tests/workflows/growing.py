@@ -18,7 +18,9 @@ from pathlib import Path
 
 import torch
 
+import neusee
 from neusee.workflows import Store, load, run
+from neusee.workflows.report.notebook import recipe_html, result_html
 from neusee.workflows.simulation.simulate_recipe import simulate
 
 
@@ -33,10 +35,10 @@ def several(path: Path, folder: Path, count: int) -> None:
         if i % 10 == 0:
             simulate(recipe, store, folder / "runs", ["neusee", "run"])
         elif i % 10 == 5:
-            recipe.run(store)._repr_html_()
-            recipe._repr_html_()
+            result_html(neusee.run(recipe, store=store))
+            recipe_html(recipe)
         elif i % 2:
-            recipe.run(store)
+            neusee.run(recipe, store=store)
         else:
             run(recipe, store, ["made"])
 

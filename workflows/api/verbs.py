@@ -15,6 +15,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from neusee.workflows.engine.runner import Result
+from neusee.workflows.engine.runner import run as run_recipe
 from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.overrides import Override, overrides_of
@@ -23,7 +25,6 @@ from neusee.workflows.report.study_folder import Progress, silent
 from neusee.workflows.store.remote_store import open_store
 
 if TYPE_CHECKING:
-    from neusee.workflows.engine.runner import Result
     from neusee.workflows.engine.step_job import Executor
     from neusee.workflows.evaluation.pipelines import Pipeline
     from neusee.workflows.graph.recipe_graph import Event
@@ -60,7 +61,9 @@ def run(
             unknown output.
     """
     names = (outputs,) if isinstance(outputs, str) else outputs
-    return _read(recipe, changes).run(store, names, watch, device, executor, memory)
+    return run_recipe(
+        _read(recipe, changes), store, names, watch, device=device, executor=executor, memory=memory
+    )
 
 
 def sweep(

@@ -107,7 +107,8 @@ def run(
     with within_memory(memory) as limit:
         recipe, command = load(words, "run", exact=exact)
     _check_rerun(recipe, again)
-    from neusee.workflows.report import console, contents
+    from neusee.workflows.engine.wanted_steps import steps_of, wanted
+    from neusee.workflows.report import console
     from neusee.workflows.simulation.simulate_recipe import simulate
     from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
@@ -116,10 +117,8 @@ def run(
     before = _opening(recipe, command, silent)
     store = the_store()
     predicted = _predicted(recipe, store, device, limit, executor == "local", silent)
-    cheaper = with_substitutions(recipe, contents.wanted(recipe))
-    table = console.RunTable(
-        cheaper, contents.steps_of(cheaper), console.mode_for(silent), predicted
-    )
+    cheaper = with_substitutions(recipe, wanted(recipe))
+    table = console.RunTable(cheaper, steps_of(cheaper), console.mode_for(silent), predicted)
     with (
         resumable(
             lambda: kept_in(
@@ -534,8 +533,9 @@ def _restored(
     silent: bool,
 ) -> Simulation:
     """Run the recipe of a frame, with the lines of its steps unless the command is silent."""
+    from neusee.workflows.engine.wanted_steps import steps_of, wanted
     from neusee.workflows.explain.run_forecast import lanes_for, planned
-    from neusee.workflows.report import console, contents
+    from neusee.workflows.report import console
     from neusee.workflows.simulation.simulate_recipe import simulate
     from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
@@ -543,10 +543,8 @@ def _restored(
     _refuse_beyond_memory(planned(recipe, store, lanes_for(recipe, device, limit)), limit)
     if not silent:
         say(console.opening(recipe, shlex.join(command[1:])))
-    cheaper = with_substitutions(recipe, contents.wanted(recipe))
-    with console.RunTable(
-        cheaper, contents.steps_of(cheaper), console.mode_for(silent), {}
-    ) as table:
+    cheaper = with_substitutions(recipe, wanted(recipe))
+    with console.RunTable(cheaper, steps_of(cheaper), console.mode_for(silent), {}) as table:
         return simulate(cheaper, store, out, command, device, table.watch, None, limit)
 
 

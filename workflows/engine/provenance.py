@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import platform
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
@@ -147,4 +148,20 @@ def ran(
         outcome.deviation,
         expected.peak if expected and expected.known else None,
         outcome.kept,
+    )
+
+
+def state_counts(records: Iterable[StepRecord]) -> str:
+    """Return the number of steps in each state as text, such as ``12 run, 3 cached``.
+
+    A step whose result no other step had to load counts as cached.
+    """
+    counts = Counter(
+        "cached" if done.state == "not needed" else str(done.state) for done in records
+    )
+    return (
+        ", ".join(
+            f"{counts[state]} {state}" for state in ("run", "cached", "left out") if counts[state]
+        )
+        or "nothing to do"
     )

@@ -17,11 +17,15 @@ from neusee.workflows.engine.machine_resources import give_back, process_peak
 from neusee.workflows.engine.memory_limits import limited
 from neusee.workflows.engine.node_call import to_device
 from neusee.workflows.engine.placement_inputs import past_costs, running_peak
+from neusee.workflows.engine.provenance import state_counts
+from neusee.workflows.engine.result_values import arrays_of, figures_of_merit, metrics_of
 from neusee.workflows.engine.step_job import Executor, Outcome, Show
+from neusee.workflows.engine.wanted_steps import wanted
 from neusee.workflows.graph.recipe_graph import (
     Event,
     Recipe,
     StepRecord,
+    by_family,
     copies_of,
     needed,
     unknown_step,
@@ -117,8 +121,6 @@ class Result:
 
     def numpy(self, step: str) -> Any:
         """Return the value of a step with a NumPy array in place of every tensor."""
-        from neusee.workflows.report.notebook import arrays_of
-
         return arrays_of(self.value(step))
 
     def metrics(self) -> dict[str, float | list[float]]:
@@ -128,19 +130,27 @@ class Result:
         A figure with a value for each band is a list. A figure that this run did not need is read
         from the store or computed.
         """
-        from neusee.workflows.report.notebook import numbers_of
+        recipe = self.recipe.unsubstituted or self.recipe
+        names = metrics_of(recipe, {*self.keys, *wanted(recipe)})
+        values = values_of(self, recipe, names)
+        return figures_of_merit({name: values[name] for name in names})
 
-        return numbers_of(self)
+    def counts(self) -> str:
+        """Return the number of steps in each state and the time, such as ``12 run, 3 cached in
+        0.31 s``.
+        """
+        return f"{state_counts(self.done.values())} in {self.seconds:.3g} s"
 
     def __repr__(self) -> str:
-        from neusee.workflows.report.notebook import result_line
+        outputs = ", ".join(by_family(self.values))
+        return f"<result of {self.recipe.name}: {outputs}; {self.counts()}>"
 
-        return result_line(self)
 
-    def _repr_html_(self) -> str:
-        from neusee.workflows.report.notebook import result_html
-
-        return result_html(self)
+def values_of(result: Result, recipe: Recipe, steps: Iterable[str]) -> Mapping[str, Any]:
+    """Return the values of a run, and those of other ``steps``, which ``recipe`` computes."""
+    absent = [name for name in steps if name not in result.values]
+    again = run(recipe, result.store, absent, device=result.device).values if absent else {}
+    return {**again, **result.values}
 
 
 def run(

@@ -42,9 +42,9 @@ from neusee.workflows.keys.cache_key import device_kind, digest, key_of
 from neusee.workflows.keys.code_digest import Code, engine
 from neusee.workflows.recipe.blocks.evaluate_block import Mismatch
 from neusee.workflows.recipe.distributions.shapes import written
-from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs, NothingDrawn
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.recipe.text.overrides import Override
+from neusee.workflows.recipe.uncertain_inputs import Inputs, NothingDrawn
 from neusee.workflows.store.result_store import Store, compute_once
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 

@@ -27,7 +27,7 @@ from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import Recipe, Step
 from neusee.workflows.keys.cache_key import digest, file_digest, key_of, stream_seed
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs, NothingDrawn
+from neusee.workflows.recipe.uncertain_inputs import Inputs, NothingDrawn
 from neusee.workflows.store.result_store import Store
 
 PHOTOGRAPH = "scene.photograph"

@@ -16,11 +16,12 @@ from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import past_costs, prepare, running_peak
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.step_job import Lane, StepJob
+from neusee.workflows.engine.wanted_steps import steps_of, wanted
 from neusee.workflows.graph.recipe_graph import Recipe, needed, nodes_of
 from neusee.workflows.keys.cache_key import Key, device_kind
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
-from neusee.workflows.report.contents import FIGURES, files_of, steps_of, wanted
+from neusee.workflows.report.contents import FIGURES, files_of
 from neusee.workflows.report.files_beside import LARGE, ROOM
 from neusee.workflows.report.terminal_text import columns
 from neusee.workflows.store.cache_settings import UNITS, format_size

@@ -13,13 +13,10 @@ from neusee.workflows.graph.final_values import Config, Setting
 
 if TYPE_CHECKING:
     from neusee.nodes.calibrate import Traceability
-    from neusee.workflows.engine.runner import Result
-    from neusee.workflows.engine.step_job import Executor
     from neusee.workflows.recipe.blocks.evaluate_block import EvaluateSettings
     from neusee.workflows.recipe.blocks.safety_block import Safety
     from neusee.workflows.recipe.blocks.train_block import LiftTraining, Training
     from neusee.workflows.recipe.distributions.nominal_values import Uncertain
-    from neusee.workflows.store.result_store import Store
 
 
 # --- step record ----------------------------------------------------------------------------------
@@ -199,30 +196,8 @@ class Recipe:
         """
         return self.limit(step) * self.tolerance_scale
 
-    def run(
-        self,
-        store: Store | None = None,
-        outputs: Iterable[str] | None = None,
-        watch: Callable[[Event], None] | None = None,
-        device: str = "cpu",
-        executor: Executor | None = None,
-        memory: int | None = None,
-    ) -> Result:
-        """Run the recipe and return the results of its steps, like `neusee.workflows.run`.
-
-        Several threads may run recipes with the same store at the same time.
-        """
-        from neusee.workflows.engine.runner import run
-
-        return run(self, store, outputs, watch, device, executor, memory)
-
     def __repr__(self) -> str:
         return f"<recipe {self.name}: {len(self.steps)} steps -> {', '.join(self.outputs)}>"
-
-    def _repr_html_(self) -> str:
-        from neusee.workflows.report.notebook import recipe_html
-
-        return recipe_html(self)
 
 
 def copies_of(recipe: Recipe, names: Iterable[str]) -> set[str]:
@@ -237,6 +212,16 @@ def copies_of(recipe: Recipe, names: Iterable[str]) -> set[str]:
             raise ValueError(unknown_step(name, recipe.steps))
         copies |= own
     return copies
+
+
+def by_family(names: Iterable[str]) -> dict[str, list[str]]:
+    """Group names of steps by the part before the bracket: ``psf[plain]`` and ``psf[mask]``
+    belong to ``psf``.
+    """
+    groups: dict[str, list[str]] = {}
+    for name in names:
+        groups.setdefault(name.partition("[")[0], []).append(name)
+    return groups
 
 
 def needed(recipe: Recipe, outputs: Iterable[str]) -> list[str]:

@@ -572,3 +572,11 @@ def changed(recipe: Recipe, overrides: Sequence[str]) -> Recipe:
         exact=recipe.exact,
         estimates=recipe.estimates and loaded.estimates,
     )
+
+
+def recipe_at(uncertain: Uncertain, values: Mapping[str, float]) -> Recipe:
+    """Return the recipe with the given numbers in SI units in place of its uncertain values.
+
+    Raises `RecipeError` for an invalid value.
+    """
+    return check(uncertain.composed_at(values))

@@ -4,5 +4,5 @@ Pages, pictures, tables, exported files, what a notebook shows and what the cons
 Nothing here decides what is computed, beyond the steps that a page reads.
 Offers: `run_folder.new_run`, `run_page.document`, `run_pictures.pictures`, `data_exports.exports`,
         `study_page.page`, `study_folder.StudyRun`, `study_folder.StudyReport`,
-        `console.ProgressTable`, `contents.wanted`.
+        `console.ProgressTable`, `notebook.result_html`.
 """

@@ -16,11 +16,11 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from neusee.workflows.graph.recipe_graph import Event, StepRecord
+from neusee.workflows.graph.recipe_graph import Event, StepRecord, by_family
 from neusee.workflows.report.paper_readings import consequences
 from neusee.workflows.report.run_page import shape_of, unchecked_lines, unit_of
 from neusee.workflows.report.run_summary import SENTENCES
-from neusee.workflows.report.terminal_text import by_family, indented, lasts, wrapped
+from neusee.workflows.report.terminal_text import indented, lasts, wrapped
 from neusee.workflows.report.tolerance_spent import said_of_economies, said_of_errors
 
 if TYPE_CHECKING:

@@ -23,11 +23,12 @@ import torch
 
 from neusee.workflows.engine.machine_resources import process_memory
 from neusee.workflows.engine.memory_limits import MemoryLimit
+from neusee.workflows.engine.wanted_steps import wanted
 from neusee.workflows.engine.worker_processes import deaf_fork, ignore_interrupts
 from neusee.workflows.graph.recipe_graph import Recipe, StepRecord, needed
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.keys.code_digest import Code
-from neusee.workflows.report.contents import Missing, wanted
+from neusee.workflows.report.contents import Missing
 from neusee.workflows.report.figures import style
 from neusee.workflows.report.run_pictures import (
     GRAPH_DRAWING,

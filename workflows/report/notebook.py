@@ -11,18 +11,19 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from neusee.nodes import TensorStats
+from neusee.workflows.engine.runner import Result, values_of
+from neusee.workflows.engine.wanted_steps import BANDS, LINES, TABLE
 from neusee.workflows.graph.final_values import Setting, flow
-from neusee.workflows.graph.recipe_graph import Recipe, in_order
-from neusee.workflows.report import result_numbers
-from neusee.workflows.report.contents import BANDS, FIGURES, LINES, TABLE, wanted
-from neusee.workflows.report.result_numbers import metrics_of, table
+from neusee.workflows.graph.recipe_graph import Recipe, by_family, in_order
+from neusee.workflows.report.contents import FIGURES
+from neusee.workflows.report.figures.camera_pictures import centre, high
+from neusee.workflows.report.figures.style import encoded
+from neusee.workflows.report.result_numbers import table
 from neusee.workflows.report.study_page import filled
-from neusee.workflows.report.terminal_text import by_family
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-    from neusee.workflows.engine.runner import Result
 
 _LONGEST_WAIT = 2.0  #: s, limit for computing values that the store does not hold
 _WEIGHT = 800_000  #: bytes of base64, limit for all pictures together
@@ -30,50 +31,6 @@ _WEIGHT = 800_000  #: bytes of base64, limit for all pictures together
 _EDGES = {1: 640, 2: 400}
 _NAMES = {"plain": "plain lens", "mask": "with mask"}
 _LONGEST = 100  #: characters of a value in a table, at most
-
-
-def numbers_of(result: Result) -> dict[str, float | list[float]]:
-    """Return the figures of merit of a run by name, as a number or as a list with one number for
-    each band.
-    """
-    recipe = result.recipe.unsubstituted or result.recipe
-    names = metrics_of(recipe, {*result.keys, *wanted(recipe)})
-    values = _values_of(result, recipe, names)
-    lists: dict[str, list[float]] = {}
-    for name in names:
-        for step, field, _, number in result_numbers.numbers_of(name, values[name]):
-            lists.setdefault(f"{step}.{field}".rstrip("."), []).append(number)
-    return {name: numbers[0] if len(numbers) == 1 else numbers for name, numbers in lists.items()}
-
-
-def arrays_of(value: Any) -> Any:
-    """Replace every tensor in a nested value by a NumPy array; bfloat16 becomes float32."""
-    import torch
-    from torch import Tensor
-
-    if isinstance(value, Tensor):
-        here = value.detach().cpu()
-        return (here.float() if here.dtype == torch.bfloat16 else here).numpy()
-    if isinstance(value, tuple):
-        items = [arrays_of(item) for item in value]
-        return value._make(items) if hasattr(value, "_make") else tuple(items)
-    if isinstance(value, list):
-        return [arrays_of(item) for item in value]
-    return (
-        {name: arrays_of(item) for name, item in value.items()}
-        if isinstance(value, dict)
-        else value
-    )
-
-
-def result_line(result: Result) -> str:
-    """Return a run result as a line such as ``<result of first_light: restored, raw; 12 run, 3
-    cached in 0.31 s>``.
-    """
-    return (
-        f"<result of {result.recipe.name}: {', '.join(by_family(result.values))};"
-        f" {_counts(result)}>"
-    )
 
 
 def result_html(result: Result) -> str:
@@ -85,7 +42,7 @@ def result_html(result: Result) -> str:
         "notebook.html.j2",
         title=result.recipe.name,
         lines=[
-            line for line in (result.recipe.title, f"{_counts(result)}, on {result.device}") if line
+            line for line in (result.recipe.title, f"{result.counts()}, on {result.device}") if line
         ],
         look=_failed_checks(result),
         pictures=_pictures({**result.values, **values}),
@@ -98,12 +55,6 @@ def _failed_checks(result: Result) -> list[str]:
     for done in result.done.values():
         texts += [f"{done.step}: {check.text}" for check in done.checks if not check.ok]
     return texts
-
-
-def _counts(result: Result) -> str:
-    from neusee.workflows.report.run_page import state_counts
-
-    return f"{state_counts(result.done.values())} in {result.seconds:.3g} s"
 
 
 def _of_table(result: Result) -> list[str]:
@@ -122,7 +73,7 @@ def _at_hand(result: Result, steps: Iterable[str]) -> dict[str, Any]:
     within 2 s.
     """
     affordable = _affordable(result, dict.fromkeys(steps))
-    values = _values_of(result, result.recipe, affordable)
+    values = values_of(result, result.recipe, affordable)
     return {name: values[name] for name in affordable}
 
 
@@ -147,13 +98,6 @@ def _held(result: Result) -> set[str]:
     return {
         name for name, key in result.keys.items() if name in result.values or result.store.has(key)
     }
-
-
-def _values_of(result: Result, recipe: Recipe, steps: Iterable[str]) -> Mapping[str, Any]:
-    """Return the values of a run, and those of other ``steps``, which ``recipe`` computes."""
-    absent = [name for name in steps if name not in result.values]
-    again = recipe.run(result.store, absent, device=result.device).values if absent else {}
-    return {**again, **result.values}
 
 
 def _took(result: Result, step: str) -> float:
@@ -201,8 +145,6 @@ def _looks(value: Any) -> tuple[str, str, str]:
     """Return shape, type and range of a result as text; for a named tuple, its numbers replace
     the range.
     """
-    from neusee.nodes import TensorStats
-
     facts = TensorStats.of(value)
     if facts is None:
         return "", type(value).__name__, ""
@@ -249,8 +191,6 @@ def _shown_pictures(values: Mapping[str, Any]) -> dict[str, Tensor]:
     """Return linear pictures of which the brightest has the value 1: of the overview, or four
     others.
     """
-    from neusee.workflows.report.figures.camera_pictures import centre, high
-
     if all(need in values for need in FIGURES[0].needs.values() if not need.startswith("?")):
         needs = _of_overview()
         truth = values[needs["truth"]]
@@ -276,8 +216,6 @@ def _picture(name: str, linear: Tensor, edge: int) -> dict[str, Any]:
     """Encode a linear image as an sRGB PNG file, reduced to at most ``edge`` pixels on a side."""
     from kornia.geometry.transform import resize
     from PIL import Image
-
-    from neusee.workflows.report.figures.style import encoded
 
     image = linear.detach().cpu().float()
     image = image.expand(3, *image.shape[-2:])

@@ -10,8 +10,9 @@ from typing import Any
 from torch import Tensor
 
 from neusee.nodes.spectra import mean_wavelength
+from neusee.workflows.engine.result_values import metrics_of, numbers_of, tensor_fields
+from neusee.workflows.engine.wanted_steps import BANDS, LINES, TABLE, compared
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.report.contents import BANDS, LINES, TABLE, compared
 from neusee.workflows.report.figures.style import nearest
 
 Value = Callable[[str], Any]  #: a function from the name of a step to the value of the step
@@ -35,7 +36,6 @@ _LEGEND = {
     ),
 }
 _DESIGN_WAVELENGTH = 550e-9  #: m, for the LSR in the result table of a recipe without a laser
-_MOST = 4096  #: elements, at most, of a result whose numbers become rows
 
 
 def expected(recipe: Recipe, value: Value) -> list[dict[str, Any]]:
@@ -127,7 +127,7 @@ def _field(result: Any, field: str) -> Tensor | None:
     """Return the field ``field`` of a result, or its first field for an empty name, or None if
     the field is missing.
     """
-    fields = {} if result is None else dict(_fields(result))
+    fields = {} if result is None else dict(tensor_fields(result))
     return fields.get(field) if field else next(iter(fields.values()), None)
 
 
@@ -167,32 +167,3 @@ def metrics(recipe: Recipe, keys: Mapping[str, str], value: Value) -> list[list[
     for name in metrics_of(recipe, keys):
         rows += numbers_of(name, value(name))
     return rows
-
-
-def metrics_of(recipe: Recipe, among: Container[str]) -> list[str]:
-    """Return the steps in ``among`` whose nodes are metrics, in the order of the recipe."""
-    return [
-        name
-        for name, step in recipe.steps.items()
-        if name in among and step.node.path.startswith("metrics.")
-    ]
-
-
-def numbers_of(step: str, result: Any) -> list[list[Any]]:
-    """Return a row (step, field, index, value) for each number in a result of at most 4096
-    elements.
-    """
-    rows: list[list[Any]] = []
-    for field, tensor in _fields(result):
-        if tensor.numel() <= _MOST and not tensor.is_complex():
-            numbers = tensor.detach().double().flatten().tolist()
-            rows += [[step, field, i if len(numbers) > 1 else "", n] for i, n in enumerate(numbers)]
-    return rows
-
-
-def _fields(result: Any) -> list[tuple[str, Tensor]]:
-    if isinstance(result, Tensor):
-        return [("", result)]
-    if hasattr(result, "_asdict"):
-        return [(k, v) for k, v in result._asdict().items() if isinstance(v, Tensor)]
-    return []

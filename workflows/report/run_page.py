@@ -7,19 +7,19 @@ import os
 import platform
 import re
 import shlex
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from neusee.nodes import Check
-from neusee.workflows.engine.provenance import facts_in, version_of
+from neusee.workflows.engine.provenance import facts_in, state_counts, version_of
 from neusee.workflows.engine.runner import Result
+from neusee.workflows.engine.wanted_steps import compared
 from neusee.workflows.graph.recipe_graph import Recipe, StepRecord
 from neusee.workflows.keys.cache_key import file_digest
 from neusee.workflows.recipe.distributions.nominal_values import told
-from neusee.workflows.report.contents import FIGURES, compared
+from neusee.workflows.report.contents import FIGURES
 from neusee.workflows.report.paper_readings import consequences, in_force
 from neusee.workflows.report.result_numbers import expected, metrics, table
 from neusee.workflows.report.run_folder import present_time
@@ -309,22 +309,6 @@ def verdict(
         else f"{len(failed)} check{'s' * (len(failed) > 1)} to look at"
     )
     return f"{numbers}; {checks}."
-
-
-def state_counts(records: Iterable[StepRecord]) -> str:
-    """Return the number of steps in each state as text, such as ``12 run, 3 cached``.
-
-    A step whose result no other step had to load counts as cached.
-    """
-    counts = Counter(
-        "cached" if done.state == "not needed" else str(done.state) for done in records
-    )
-    return (
-        ", ".join(
-            f"{counts[state]} {state}" for state in ("run", "cached", "left out") if counts[state]
-        )
-        or "nothing to do"
-    )
 
 
 def shape_of(done: StepRecord) -> str:

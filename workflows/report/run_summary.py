@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neusee.workflows.engine.wanted_steps import RIVAL, TABLE, shade_of
 from neusee.workflows.graph.recipe_graph import Recipe
-from neusee.workflows.report.contents import RIVAL, TABLE, shade_of
 from neusee.workflows.report.figures.camera_pictures import BRIGHT, half_width, unexplained
 from neusee.workflows.report.result_numbers import Value, arms, lines_of, suppressed
 

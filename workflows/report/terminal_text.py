@@ -7,7 +7,7 @@ import math
 import re
 import shlex
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Any
 
@@ -49,16 +49,6 @@ def wrapped(text: str) -> list[str]:
     return textwrap.wrap(
         text, get_terminal_size().columns, initial_indent="  ", subsequent_indent="  "
     )
-
-
-def by_family(names: Iterable[str]) -> dict[str, list[str]]:
-    """Group names of steps by the part before the bracket: ``psf[plain]`` and ``psf[mask]``
-    belong to ``psf``.
-    """
-    groups: dict[str, list[str]] = {}
-    for name in names:
-        groups.setdefault(name.partition("[")[0], []).append(name)
-    return groups
 
 
 def lasts(seconds: float) -> str:

@@ -32,7 +32,7 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.recipe.blocks.safety_block import BEAM, Lens, Safety
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain
 from neusee.workflows.recipe.distributions.shapes import FloatArray
-from neusee.workflows.recipe.distributions.uncertain_inputs import (
+from neusee.workflows.recipe.uncertain_inputs import (
     NEGLIGIBLE,
     only_values,
     within_allowed,

@@ -16,12 +16,12 @@ from neusee.workflows.engine.memory_limits import MemoryLimit, guarded, limited
 from neusee.workflows.engine.provenance import timestamp
 from neusee.workflows.engine.runner import Result, run
 from neusee.workflows.engine.step_job import Executor
+from neusee.workflows.engine.wanted_steps import wanted
 from neusee.workflows.explain.why_rerun import explained
 from neusee.workflows.graph.recipe_graph import Event, Recipe, StepRecord
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report import run_folder, run_page
 from neusee.workflows.report import run_page as run_timing
-from neusee.workflows.report.contents import wanted
 from neusee.workflows.report.data_exports import data_files, exports
 from neusee.workflows.report.files_beside import FilesBeside, GraphAhead
 from neusee.workflows.report.run_folder import NotWritten, RunFolder, code_text, new_run

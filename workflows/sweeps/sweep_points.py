@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 from neusee.workflows.engine.execution import RunSeries
 from neusee.workflows.engine.local_executor import memory_limit
 from neusee.workflows.engine.node_call import place
+from neusee.workflows.engine.result_values import numbers_of
 from neusee.workflows.engine.runner import run
 from neusee.workflows.engine.worker_processes import shared
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
@@ -24,7 +25,6 @@ from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key
 from neusee.workflows.recipe.loading import check
 from neusee.workflows.recipe.text.composition import Composer
-from neusee.workflows.report.result_numbers import numbers_of
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.sweeps.axes import Point
 from neusee.workflows.sweeps.point_order import PointJob, best_order, work_left

@@ -29,7 +29,7 @@ from neusee.workflows.graph.recipe_graph import (
 from neusee.workflows.recipe.blocks.train_block import KEY, Training
 from neusee.workflows.recipe.distributions.law_text import ANGLE, Difference
 from neusee.workflows.recipe.distributions.shapes import draw_laws
-from neusee.workflows.recipe.distributions.uncertain_inputs import Index, Inputs, put_at
+from neusee.workflows.recipe.uncertain_inputs import Index, Inputs, put_at
 
 _FAR = 4.5  #: standard deviations up to which the drawn values must be valid
 _AXES = ("y", "x")

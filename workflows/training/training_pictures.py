@@ -24,7 +24,7 @@ from neusee.workflows.graph.recipe_graph import TOLD, Recipe, Step, dependents, 
 from neusee.workflows.keys.cache_key import device_kind, digest, is_private, key_of
 from neusee.workflows.keys.code_digest import Code, engine
 from neusee.workflows.recipe.blocks.train_block import KEY, POSED, Training
-from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
+from neusee.workflows.recipe.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store, compute_once
 from neusee.workflows.store.serialization import each_tensor, tensors_in
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions

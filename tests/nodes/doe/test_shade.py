@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+import neusee
 from neusee.nodes import ParameterError
 from neusee.nodes.doe import shade
 from neusee.nodes.metrics import light_outside, lsr
@@ -80,7 +81,8 @@ def test_the_fast_transform_of_a_shaded_pupil_agrees_with_the_definition(samplin
 def test_only_the_arm_of_the_mask_is_shaded(tmp_path):
     store, outputs = Store(tmp_path), ["outputs=[lsr, bsr]", *SMALL]
     plain, grey = (
-        load("plain_lens", [f"doe={name}", *outputs]).run(store) for name in ("flat", "grey_filter")
+        neusee.run(load("plain_lens", [f"doe={name}", *outputs]), store=store)
+        for name in ("flat", "grey_filter")
     )
     assert torch.equal(grey["bsr[plain]"], plain["bsr[plain]"])
     assert torch.allclose(grey["lsr[mask]"], 0.01 * plain["lsr[mask]"], rtol=1e-5)
@@ -90,7 +92,9 @@ def test_only_the_arm_of_the_mask_is_shaded(tmp_path):
 def test_a_mask_and_a_shade_compose_in_one_group(tmp_path):
     store = Store(tmp_path)
     both, alone = (
-        load("axicon", [f"doe={n}", "doe.waves=5", "outputs=[lsr]", *SMALL]).run(store)["lsr[mask]"]
+        neusee.run(
+            load("axicon", [f"doe={n}", "doe.waves=5", "outputs=[lsr]", *SMALL]), store=store
+        )["lsr[mask]"]
         for n in ("axicon_and_filter", "axicon")
     )
     assert torch.allclose(both, 0.1 * alone, rtol=1e-5)
@@ -98,7 +102,7 @@ def test_a_mask_and_a_shade_compose_in_one_group(tmp_path):
 
 def test_a_notch_in_the_laser_dims_the_laser_and_tints_the_scene(tmp_path):
     outputs = ["outputs=[peak, image, spot]", *SMALL, "optics.bands=16", "lasers.green.fwhm=1 nm"]
-    found = load("plain_lens", ["doe=notch", *outputs]).run(Store(tmp_path))
+    found = neusee.run(load("plain_lens", ["doe=notch", *outputs]), store=Store(tmp_path))
     ratio = found["spot[mask,green]"].max() / found["spot[plain,green]"].max()
     assert float(ratio) == pytest.approx(0.01, rel=0.2)
     scene = found["image[mask]"].sum((-2, -1)) / found["image[plain]"].sum((-2, -1))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+import neusee
 from neusee.nodes import ParameterError
 from neusee.nodes.spectra import responses
 from neusee.nodes.values import Bands
@@ -62,7 +63,7 @@ def test_a_recipe_takes_the_file_and_a_changed_file_is_another_result(tmp_path):
     found = []
     for factor in (1, 1, 2):
         write(tmp_path, [(w, r, factor * g, b) for w, r, g, b in ROWS])
-        result = load("first_light", words, tmp_path).run(Store(tmp_path / "store"))
+        result = neusee.run(load("first_light", words, tmp_path), store=Store(tmp_path / "store"))
         found.append((result["responses"], result.done["responses"].state))
     assert [state for _, state in found] == ["run", "cached", "run"]
     assert float(found[0][0][0].max()) < 1

@@ -7,6 +7,7 @@ import os
 import pytest
 import torch
 
+import neusee
 from neusee.nodes import Node
 from neusee.nodes.optics import image, psf
 from neusee.nodes.spectra import illuminate
@@ -312,8 +313,11 @@ def test_a_run_shares_the_bands_that_stayed(write, tmp_path):
         Store(tmp_path / "cache"),
         "filters.centres=[450 nm, 500 nm, 552 nm, 600 nm, 650 nm]",
     )
-    first, found = load(path).run(store), load(path, (moved,)).run(store)
-    expected = load(path, (moved,)).run(Store(tmp_path / "other"))
+    first, found = (
+        neusee.run(load(path), store=store),
+        neusee.run(load(path, (moved,)), store=store),
+    )
+    expected = neusee.run(load(path, (moved,)), store=Store(tmp_path / "other"))
     for name, written in (("psf", len(Psf._fields)), ("image", 1)):
         assert found.done[name].state == "run"
         before, after = (
@@ -328,14 +332,14 @@ def test_a_run_shares_the_bands_that_stayed(write, tmp_path):
 
 def test_a_damaged_band_of_a_stored_result_is_mended(write, tmp_path):
     recipe, root = load(write(CAMERA)), tmp_path / "cache"
-    first = recipe.run(Store(root))
+    first = neusee.run(recipe, store=Store(root))
     for path in sorted(files(Store(root).blobs))[::4]:
         damage(path) if path.stat().st_size > 200 else path.unlink()
     with pytest.warns(UserWarning, match="counts as missing"):
-        again = recipe.run(Store(root))
+        again = neusee.run(recipe, store=Store(root))
     assert all(same(again.values[name], first.values[name]) for name in first.values)
     assert all(
         done.state == "cached"
-        for done in recipe.run(Store(root)).done.values()
+        for done in neusee.run(recipe, store=Store(root)).done.values()
         if done.state != "not needed"
     )

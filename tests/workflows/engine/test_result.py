@@ -10,8 +10,9 @@ import sys
 import pytest
 import torch
 
+import neusee
 from neusee.workflows import as_function, load
-from neusee.workflows.report.contents import wanted
+from neusee.workflows.engine.wanted_steps import wanted
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.remote_store import RemoteStore
 from neusee.workflows.store.result_store import Store
@@ -32,7 +33,7 @@ def store(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def result(store):
-    return load("first_light", SMALL).run(store)
+    return neusee.run(load("first_light", SMALL), store=store)
 
 
 def same(one, other):
@@ -98,7 +99,7 @@ def test_a_fresh_process_reads_a_result(result, tmp_path):
         lambda result: result["raw"],
         lambda result: result.value("raw"),
         lambda result: result.numpy("raw"),
-        lambda result: result.recipe.run(result.store, ["raw"]),
+        lambda result: neusee.run(result.recipe, store=result.store, outputs=["raw"]),
         lambda result: as_function(result.recipe, "raw", store=result.store),
     ],
     ids=["item", "value", "numpy", "run", "as_function"],
@@ -117,14 +118,14 @@ def test_many_arms_are_counted(store):
         ValueError,
         match=rf"^no output spot: this recipe has spot\[.*, spot\[.* and {count - 8} more$",
     ):
-        recipe.run(store, ["spot"])
+        neusee.run(recipe, store=store, outputs=["spot"])
 
 
 @pytest.mark.parametrize("outputs", [None, ["raw[mask]"]])
 def test_metrics_are_the_numbers_that_the_program_prints(outputs, store, tmp_path):
     recipe = load("first_light", SMALL)
     document = simulate(recipe, store, tmp_path / "runs", ["neusee", "run"]).document
-    found = recipe.run(store, outputs).metrics()
+    found = neusee.run(recipe, store=store, outputs=outputs).metrics()
     printed = {}
     for step, field, _, number in document["metrics"]:
         printed.setdefault(f"{step}.{field}".rstrip("."), []).append(number)

@@ -9,10 +9,10 @@ from neusee.nodes import node
 from neusee.nodes.values import Bands
 from neusee.workflows.engine.cost_model import measured_size, shipped, sizes_of
 from neusee.workflows.engine.runner import run
+from neusee.workflows.engine.wanted_steps import steps_of, wanted
 from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.graph.step_shapes import bytes_of, form_of, forms_of
 from neusee.workflows.recipe.loading import load
-from neusee.workflows.report.contents import steps_of, wanted
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 

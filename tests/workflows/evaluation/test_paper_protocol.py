@@ -32,7 +32,7 @@ from neusee.workflows.evaluation.pipelines import (
     refuse_fixed_laser,
 )
 from neusee.workflows.evaluation.run_evaluation import read_settings
-from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
+from neusee.workflows.recipe.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
 
 SMALL = ["optics.samples=96", "optics.pitch=84.15 um", "optics.bands=3", "optics.window=[24, 24]"]
@@ -178,7 +178,7 @@ from pathlib import Path
 import neusee
 from neusee.workflows.evaluation import evaluation_scenes
 from neusee.workflows.evaluation.evaluation_points import EvaluationPoints
-from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
+from neusee.workflows.recipe.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
 
 import colour, matplotlib.figure

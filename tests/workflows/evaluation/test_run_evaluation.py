@@ -30,7 +30,7 @@ from neusee.workflows.evaluation.pipelines import (
     read_pipelines,
 )
 from neusee.workflows.evaluation.run_evaluation import evaluate
-from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
+from neusee.workflows.recipe.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
 
 SMALL = ["optics.samples=96", "optics.pitch=84.15 um", "optics.bands=5", "optics.window=[24, 24]"]

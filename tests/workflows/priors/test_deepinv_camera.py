@@ -14,6 +14,7 @@ import pytest
 import torch
 from scipy import stats
 
+import neusee
 from neusee.nodes.metrics import quality
 from neusee.workflows import as_physics, load
 from neusee.workflows.store.result_store import Store
@@ -121,8 +122,10 @@ def test_the_blur_is_that_of_the_recipe(double, recipe, store):
     """A frame of the recipe without noise, from an independent sum over the scene of one
     channel's PSF.
     """
-    result = recipe.run(
-        store, [f"{name}" for name in ("psf[mask]", "illuminant", "responses", "bands")]
+    result = neusee.run(
+        recipe,
+        store=store,
+        outputs=[f"{name}" for name in ("psf[mask]", "illuminant", "responses", "bands")],
     )
     share = np.array(
         result["responses"] * result["illuminant"] * result["bands"].centres, dtype=float
@@ -142,7 +145,8 @@ def test_the_blur_is_that_of_the_recipe(double, recipe, store):
 
 def test_a_frame_in_electrons_is_the_signal_where_it_did_not_clip(physics, recipe, store):
     signal, clipped = (
-        recipe.run(store, [name])[name] for name in ("signal[mask]", "clipped[mask]")
+        neusee.run(recipe, store=store, outputs=[name])[name]
+        for name in ("signal[mask]", "clipped[mask]")
     )
     found = physics.electrons(physics.frame)[0]
     torch.testing.assert_close(found[~clipped], signal[~clipped], rtol=1e-5, atol=0.01)
@@ -262,8 +266,8 @@ def test_eight_lines_restore_a_picture_better_than_the_raw_frame(store):
     )
     with torch.no_grad():
         picture = camera.colour(restore(camera.frame, camera, init=camera.even()))[0]
-    truth = recipe.run(store, ["truth"])["truth"]
-    raw = recipe.run(store, ["developed[mask]"])["developed[mask]"]
+    truth = neusee.run(recipe, store=store, outputs=["truth"])["truth"]
+    raw = neusee.run(recipe, store=store, outputs=["developed[mask]"])["developed[mask]"]
     assert float(quality(picture, truth).psnr) > float(quality(raw, truth).psnr) + 1.0
 
 

@@ -5,6 +5,7 @@ import importlib
 import pytest
 from typer.testing import CliRunner
 
+import neusee
 from neusee.workflows import Store, load
 from neusee.workflows.cli.app import app
 from neusee.workflows.graph.diagnostics import RecipeError
@@ -56,7 +57,9 @@ GOOD += 'def double(x: Tensor) -> Tensor:\n    """Double."""\n    return 2 * x\n
 def test_an_installed_family_needs_no_entry_in_the_recipe(install, write, tmp_path):
     install("labkit", "gauge", GOOD)
     write(USES.format("gauge.double"))
-    result = load("mine.yaml", (), tmp_path).run(Store(tmp_path / "cache"), outputs=["a", "b"])
+    result = neusee.run(
+        load("mine.yaml", (), tmp_path), store=Store(tmp_path / "cache"), outputs=["a", "b"]
+    )
     assert (result["b"] == 2 * result["a"]).all()
     assert "gauge.double" in dict(node_families.all_nodes())
 

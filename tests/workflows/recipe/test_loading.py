@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import neusee
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.recipe import loading
@@ -231,9 +232,9 @@ def test_a_preflight_without_its_input_leaves_the_question_to_the_run(read, tmp_
     recipe = read(text)
     assert recipe.notes == ()
     with pytest.raises(RunError, match=r"mask .*mask.npy is \(8, 8\), not the pupil grid \(4, 4\)"):
-        recipe.run(store)
+        neusee.run(recipe, store=store)
     _heights(tmp_path, 4)
-    assert recipe.run(store)["written"].shape == (4, 4)
+    assert neusee.run(recipe, store=store)["written"].shape == (4, 4)
 
 
 def test_an_input_with_wrong_parameters_is_one_mistake(mistakes, tmp_path):

@@ -9,6 +9,7 @@ import jsonschema
 import pytest
 from typer.testing import CliRunner
 
+import neusee
 from neusee.workflows import Store, load, run
 from neusee.workflows.cli.app import app
 from neusee.workflows.graph.diagnostics import RecipeError
@@ -87,7 +88,7 @@ def test_a_file_beside_the_recipe_is_a_family(mine, tmp_path):
     assert recipe.steps["bloomed"].node.path == "bloom_a.bloom"
     assert f"reading this recipe ran code: {tmp_path / 'bloom_a.py'}" in recipe.notes
     result = run(recipe, store=Store(tmp_path / "cache"))
-    scene = load(mine(), ["outputs=[scene]"], tmp_path).run()["scene"]
+    scene = neusee.run(load(mine(), ["outputs=[scene]"], tmp_path))["scene"]
     assert (result["bloomed"] != scene).any()
     assert float(result["total"]) == pytest.approx(float(scene.sum()), rel=1e-6)
 

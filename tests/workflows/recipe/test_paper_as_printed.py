@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import neusee
 from neusee.workflows import Store, load
 
 N_PUPIL, N_SCENE, N_SENSOR, N_PSF = 64, 48, 40, 40
@@ -34,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("printed")
-    return replace(load("first_light", SMALL), exact=True).run(Store(folder))
+    return neusee.run(replace(load("first_light", SMALL), exact=True), store=Store(folder))
 
 
 def data(run, name):
@@ -138,7 +139,7 @@ def test_the_digital_numbers_are_those_of_the_printed_formulas(run, arm):
 
 def test_without_a_share_of_the_mean_no_light_is_left(tmp_path):
     words = [*SMALL[:-1], "outputs=[photons, charge]", "sensor.c1=0", "lasers.green.strength=0"]
-    run = replace(load("first_light", words), exact=True).run(Store(tmp_path))
+    run = neusee.run(replace(load("first_light", words), exact=True), store=Store(tmp_path))
     p, charge = data(run, "photons[plain]"), data(run, "charge[plain]")
     # the positive half of N(0, sqrt(p)) in photons: its mean is sqrt(p / 2 pi)
     expected = EFFICIENCY * np.sqrt(p / (2 * np.pi))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+import neusee
 from neusee.nodes import losses, metrics, sensor, spectra
 from neusee.nodes.values import Psf
 from neusee.workflows import Store, load
@@ -112,7 +113,9 @@ def test_a_longer_exposure_collects_more_light_unless_as_printed(tmp_path, readi
         *(["reading.saturating_exposure=${sensor.exposure}"] if reading == "as_printed" else []),
     ]
     usual, longer = (
-        load("first_light", [*words, f"sensor.exposure={seconds} s"]).run(Store(tmp_path))
+        neusee.run(
+            load("first_light", [*words, f"sensor.exposure={seconds} s"]), store=Store(tmp_path)
+        )
         for seconds in (0.1, 0.2)
     )
     for arm in ("plain", "mask"):

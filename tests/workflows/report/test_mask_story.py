@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from neusee.nodes.values import Bands
+from neusee.workflows.engine.wanted_steps import wanted
 from neusee.workflows.recipe.loading import load
 from neusee.workflows.report import console
 from neusee.workflows.report import run_folder as run_html
 from neusee.workflows.report import run_summary as mask_story
-from neusee.workflows.report.contents import wanted
 from neusee.workflows.report.run_summary import sentences
 
 PLAIN = {"peak/I_sat": 912.3, "LSR": 1.0, "PSNR (dB)": 27.07, "saturated px": 244.0}

@@ -5,20 +5,25 @@ notebook shows.
 from __future__ import annotations
 
 import base64
+import importlib
 import io
 import re
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy
 import pytest
 import torch
 
+import neusee
 from neusee.nodes import Check, node
 from neusee.nodes.metrics import Quality
 from neusee.workflows import Recipe, RecipeError, Step, Store, load
+from neusee.workflows.engine.result_values import arrays_of
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.report import notebook, result_numbers
 
@@ -299,8 +304,8 @@ def store(tmp_path):
     return Store(tmp_path / "cache")
 
 
-def test_a_recipe_runs_itself_and_gives_arrays(store):
-    result = small(2.0).run(store)
+def test_a_result_gives_arrays_and_figures_of_merit(store):
+    result = neusee.run(small(2.0), store=store)
     assert torch.equal(result["half"], result.values["half"])
     assert isinstance(result["ramp"], torch.Tensor)
     array = result.numpy("half")
@@ -311,12 +316,12 @@ def test_a_recipe_runs_itself_and_gives_arrays(store):
     assert isinstance(found.psnr, numpy.ndarray)
     mean = float(result["half"].double().mean())
     assert result.metrics() == {"score.l1": mean, "score.psnr": 2 * mean, "score.ssim": mean / 2}
-    assert list(small(2.0).run(store, ["ramp"]).values) == ["ramp"]
+    assert list(neusee.run(small(2.0), store=store, outputs=["ramp"]).values) == ["ramp"]
 
 
 def test_numbers_that_numpy_has_no_type_for_become_larger():
-    assert notebook.arrays_of([torch.ones(2, dtype=torch.bfloat16)])[0].dtype == numpy.float32
-    assert notebook.arrays_of({"a": (torch.ones(1), None)}) == {"a": (numpy.ones(1), None)}
+    assert arrays_of([torch.ones(2, dtype=torch.bfloat16)])[0].dtype == numpy.float32
+    assert arrays_of({"a": (torch.ones(1), None)}) == {"a": (numpy.ones(1), None)}
 
 
 def test_a_number_a_band_is_a_list(store, monkeypatch):
@@ -334,14 +339,14 @@ def test_a_number_a_band_is_a_list(store, monkeypatch):
         ("lsr",),
         {**recipe.steps, "lsr": Step("lsr", lsr, {}, {"picture": "ramp"}, Location("x"), {})},
     )
-    assert recipe.run(store).metrics()["lsr"] == pytest.approx([0, 1 / 960, 2 / 960])
+    assert neusee.run(recipe, store=store).metrics()["lsr"] == pytest.approx([0, 1 / 960, 2 / 960])
 
 
 @pytest.mark.slow
 def test_several_threads_run_several_recipes_on_one_store(store):
     scales = [float(i % 7) for i in range(28)]
     with ThreadPoolExecutor(8) as pool:
-        results = list(pool.map(lambda scale: small(scale).run(store), scales))
+        results = list(pool.map(lambda scale: neusee.run(small(scale), store=store), scales))
     for scale, result in zip(scales, results, strict=True):
         assert torch.equal(result["half"], half(ramp(scale=scale)))
         assert result.recipe.steps["ramp"].params["scale"] == scale
@@ -350,7 +355,9 @@ def test_several_threads_run_several_recipes_on_one_store(store):
 
 def test_several_threads_read_the_code_of_nodes_at_once(tmp_path):
     with ThreadPoolExecutor(8) as pool:
-        results = list(pool.map(lambda i: small(1.0).run(Store(tmp_path / str(i))), range(12)))
+        results = list(
+            pool.map(lambda i: neusee.run(small(1.0), store=Store(tmp_path / str(i))), range(12))
+        )
     assert len({result.done["half"].key for result in results}) == 1
 
 
@@ -400,9 +407,44 @@ def sizes(page: Page) -> list[tuple[int, int]]:
     return [Image.open(io.BytesIO(picture)).size for picture in page.pictures]
 
 
+class Formatter:
+    """Formatter of IPython, as far as a package tells it how to show its types."""
+
+    def __init__(self):
+        self.shown = {}
+
+    def for_type_by_name(self, module, name, show):
+        self.shown[module, name] = show
+
+
+def told(shell, monkeypatch):
+    """What the package tells IPython when it is imported while ``shell`` runs."""
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    importlib.reload(neusee)
+
+
+def test_a_notebook_is_told_how_to_show_a_recipe_and_a_result(store, monkeypatch):
+    html = Formatter()
+    display = SimpleNamespace(formatters={"text/html": html})
+    told(SimpleNamespace(display_formatter=display), monkeypatch)
+    result = neusee.run(small(), store=store)
+    recipe = result.recipe
+    assert len(html.shown) == 2
+    show_result = html.shown[type(result).__module__, type(result).__name__]
+    assert show_result(result) == notebook.result_html(result)
+    show_recipe = html.shown[type(recipe).__module__, type(recipe).__name__]
+    assert show_recipe(recipe) == notebook.recipe_html(recipe)
+
+
+def test_where_no_notebook_runs_nothing_is_told(monkeypatch):
+    told(None, monkeypatch)
+    monkeypatch.delitem(sys.modules, "IPython")
+    importlib.reload(neusee)
+
+
 def test_a_result_shows_its_picture_its_values_and_its_steps(store):
-    result = small().run(store)
-    text = result._repr_html_()
+    result = neusee.run(small(), store=store)
+    text = notebook.result_html(result)
     page = Page(text)
     assert sizes(page) == [(40, 24)]
     assert not page.tags & {"script", "link", "iframe", "object"}
@@ -416,15 +458,15 @@ def test_a_result_shows_its_picture_its_values_and_its_steps(store):
         "not in the store",
     } <= {"3 run in" if w.startswith("3 run in") else w for w in page.words}
     assert any(w.startswith("l1 0.24974, psnr 0.49948") for w in page.words)
-    again = small().run(store)
+    again = neusee.run(small(), store=store)
     assert "2 cached" not in repr(again)
     assert repr(again).startswith("<result of small: half, score; 3 cached in ")
-    assert "cached" in Page(again._repr_html_()).words
+    assert "cached" in Page(notebook.result_html(again)).words
 
 
 def test_a_recipe_shows_its_changes_its_steps_and_where_values_stand(given):
     recipe = given(sensor={"gain": 2})
-    page = Page(recipe._repr_html_())
+    page = Page(notebook.recipe_html(recipe))
     assert {
         "spot ×2",
         "toy.spot",
@@ -435,7 +477,7 @@ def test_a_recipe_shows_its_changes_its_steps_and_where_values_stand(given):
     } <= set(page.words)
     assert page.pictures == []
     assert repr(recipe) == "<recipe mine: 8 steps -> raw>"
-    assert "Changes" not in Page(given()._repr_html_()).words
+    assert "Changes" not in Page(notebook.recipe_html(given())).words
     assert "where" in page.words  # the steps that ask for a device
 
 
@@ -478,14 +520,14 @@ def test_the_overview_is_shown_by_one_stretch():
 def test_showing_a_result_computes_nothing_that_took_long(store, monkeypatch):
     for module in (notebook, result_numbers):
         monkeypatch.setattr(module, "TABLE", {"row": {"peak/I_sat": "ramp"}})
-    result = small().run(store, ["half"])
+    result = neusee.run(small(), store=store, outputs=["half"])
     known = {"peak/I_sat", "row"}
-    assert known <= set(Page(result._repr_html_()).words)
+    assert known <= set(Page(notebook.result_html(result)).words)
     monkeypatch.setattr(Store, "about", lambda self, key: None)
     slow = {name: replace(done, seconds=60.0) for name, done in result.done.items()}
     CALLS.clear()
-    words = Page(replace(result, done=slow)._repr_html_()).words
+    words = Page(notebook.result_html(replace(result, done=slow))).words
     assert not known & set(words)
     assert CALLS == []
-    assert known <= set(Page(result._repr_html_()).words)  # cheap: had again
+    assert known <= set(Page(notebook.result_html(result)).words)  # cheap: had again
     assert CALLS == [1.0]

@@ -11,6 +11,7 @@ from html.parser import HTMLParser
 import pytest
 import torch
 
+import neusee
 from neusee.nodes import Check, node
 from neusee.workflows.graph.diagnostics import Location
 from neusee.workflows.graph.recipe_graph import Expectation, Recipe, Step
@@ -409,7 +410,7 @@ def test_the_page_says_what_the_cache_saved(done, tmp_path):
 
 
 def test_the_plan_is_compared_where_all_that_ran_was_known(tmp_path):
-    result = recipe().run(Store(tmp_path / "cache"))
+    result = neusee.run(recipe(), store=Store(tmp_path / "cache"))
     slots = (Slot("number", "cpu", 0.0, 1.0), Slot("truth", "cpu", 1.0, 3.0))
     known = {name: replace(done, predicted=1.5) for name, done in result.done.items()}
 
@@ -468,7 +469,7 @@ def test_the_run_is_drawn_over_time_unless_nothing_ran(done, tmp_path):
 
 
 def test_only_what_was_known_is_drawn_as_the_plan(tmp_path):
-    result = recipe().run(Store(tmp_path / "cache"))
+    result = neusee.run(recipe(), store=Store(tmp_path / "cache"))
     told = {
         "number": replace(
             result.done["number"], predicted=1.0, began=5.0, seconds=2.0, lane="cpu:1"
@@ -499,7 +500,7 @@ def test_only_what_was_known_is_drawn_as_the_plan(tmp_path):
 
 
 def test_a_guess_leaves_no_gap_in_the_plan_that_is_drawn(tmp_path):
-    result = recipe().run(Store(tmp_path / "cache"))
+    result = neusee.run(recipe(), store=Store(tmp_path / "cache"))
     told = {
         "number": replace(
             result.done["number"], predicted=None, began=5.0, seconds=2.0, lane="cpu"

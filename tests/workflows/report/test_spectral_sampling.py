@@ -6,8 +6,9 @@ import pytest
 
 from neusee.workflows import load
 from neusee.workflows.engine.runner import run
-from neusee.workflows.report import contents, run_page
+from neusee.workflows.engine.wanted_steps import wanted
 from neusee.workflows.report import run_folder as run_html
+from neusee.workflows.report import run_page
 from neusee.workflows.report.console import closing
 from neusee.workflows.report.tolerance_spent import spectral_error
 from neusee.workflows.store.result_store import Store
@@ -32,7 +33,7 @@ def store(tmp_path_factory):
 
 def document(store, *changes):
     recipe = load("first_light", [*SMALL, *changes])
-    return run_page.document(run(recipe, store, contents.wanted(recipe)), ["neusee", "run"])
+    return run_page.document(run(recipe, store, wanted(recipe)), ["neusee", "run"])
 
 
 def test_an_error_larger_than_the_tolerance_is_a_warning(store):

@@ -7,6 +7,7 @@ import functools
 import numpy as np
 import pytest
 
+import neusee
 from neusee.workflows import Store, load
 from neusee.workflows.safety.run_safety import document
 from neusee.workflows.safety.safety_estimate import estimate
@@ -57,7 +58,7 @@ def expected_point(found, joules):
     m.
     """
     step = "laser_psf[plain,reflection]"
-    spot = found.recipe.run(outputs=[step])[step]
+    spot = neusee.run(found.recipe, outputs=[step])[step]
     light = spot.intensity[0].double().numpy()
     peak = next(each for each in found.findings if each.option == "plain lens").exposure.value
     y, x = np.nonzero(light / light.max() * peak >= joules * 1e4)

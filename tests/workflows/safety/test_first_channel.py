@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+import neusee
 from neusee.workflows import RecipeError, Store, load
 from neusee.workflows.safety.exposure_limits import saturating, with_channels
 from neusee.workflows.safety.exposures import draw_settings
@@ -54,7 +55,7 @@ def counted(folder, store, changes):
     found = estimate(recipe, store)
     (plain,) = [each for each in found.dazzled if each.option == "plain lens"]
     return float(
-        recipe.run(store, outputs=["saturated[plain]"])["saturated[plain]"].pixels
+        neusee.run(recipe, store=store, outputs=["saturated[plain]"])["saturated[plain]"].pixels
     ), plain.pixels.value
 
 

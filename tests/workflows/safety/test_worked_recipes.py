@@ -13,6 +13,7 @@ from scipy.integrate import dblquad, quad
 from scipy.optimize import brentq
 from scipy.special import j1, ndtr
 
+import neusee
 from neusee.workflows import load
 from neusee.workflows.safety.run_safety import document
 from neusee.workflows.safety.safety_estimate import estimate
@@ -418,7 +419,7 @@ def test_the_mask_divides_the_peak_by_its_ratio():
         "safety_pointer", ["safety.draws=100", "optics.samples=512", "safety.dazzle=null"]
     )
     found = estimate(recipe)
-    result = recipe.run(outputs=[f"laser_lsr[{arm},pointer]" for arm in ("plain", "mask")])
+    result = neusee.run(recipe, outputs=[f"laser_lsr[{arm},pointer]" for arm in ("plain", "mask")])
     ratio = float(
         result["laser_lsr[mask,pointer]"].max() / result["laser_lsr[plain,pointer]"].max()
     )

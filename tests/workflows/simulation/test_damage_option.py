@@ -5,6 +5,7 @@ camera, and dead pixels.
 import pytest
 import torch
 
+import neusee
 from neusee.workflows import Store, load
 from neusee.workflows.graph.diagnostics import RecipeError
 
@@ -55,8 +56,8 @@ def compute(tmp_path_factory):
     (folder / "own.csv").write_text(OWN)
     (folder / "mono.csv").write_text("wavelength (nm),QE (%)\n350,20\n525,69\n1100,0.2\n")
     store = Store(folder / "store")
-    return lambda name, outputs, *changes: load(f"{name}.yaml", list(changes), folder).run(
-        store, outputs=outputs
+    return lambda name, outputs, *changes: neusee.run(
+        load(f"{name}.yaml", list(changes), folder), store=store, outputs=outputs
     )
 
 

@@ -4,6 +4,7 @@ restoration.
 
 import pytest
 
+import neusee
 from neusee.workflows import Store, load
 
 SMALL = [
@@ -18,7 +19,7 @@ SMALL = [
 
 
 def gains(words, folder):
-    result = load("hdr_night", words).run(Store(folder))
+    result = neusee.run(load("hdr_night", words), store=Store(folder))
     before, after = result["developed_quality[mask]"], result["restored_quality"]
     return float(after.psnr - before.psnr), float(after.ssim / before.ssim)
 

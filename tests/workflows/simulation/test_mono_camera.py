@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from safetensors.torch import save_file
 
+import neusee
 from neusee.nodes.restore._networks._restorer import start_network
 from neusee.nodes.restore._networks._unet_and_nafnet import NAFNet
 from neusee.nodes.scene import grey
@@ -72,7 +73,7 @@ def mono(tmp_path):
         recipe = load(
             "first_light", [*SMALL, "sensor=mine", *words, f"outputs=[{outputs}]"], tmp_path
         )
-        return recipe, recipe.run(Store(tmp_path / "store"))
+        return recipe, neusee.run(recipe, store=Store(tmp_path / "store"))
 
     return compute
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+import neusee
 from neusee.workflows import Store, load
 from tests.workflows.simulation import radiometry
 
@@ -106,7 +107,7 @@ def compute(tmp_path_factory):
             ["laser=twelve", *QUIET, *words, f"outputs=[{outputs}]", "tolerance=0"],
             folder,
         )
-        return recipe.run(store)
+        return neusee.run(recipe, store=store)
 
     return compute
 

@@ -4,6 +4,7 @@ said.
 
 import pytest
 
+import neusee
 from neusee.workflows import Store, load
 
 SMALL = [
@@ -25,9 +26,9 @@ BY_STRENGTH = ["lasers.green.angle=[0 mrad, 0 mrad]"]
 def test_the_peak_of_the_same_light_grows_with_the_exposure(tmp_path, laser):
     """1, 10 and 100 ms gave one number; the W/m2 of the laser do not change."""
     found = [
-        load("first_light", [*SMALL, *laser, f"sensor.exposure={ms} ms"]).run(Store(tmp_path))[
-            "peak[plain]"
-        ]
+        neusee.run(
+            load("first_light", [*SMALL, *laser, f"sensor.exposure={ms} ms"]), store=Store(tmp_path)
+        )["peak[plain]"]
         for ms in (1, 10, 100)
     ]
     first = float(found[0].irradiance)

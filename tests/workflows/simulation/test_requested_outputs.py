@@ -6,10 +6,11 @@ import json
 
 import pytest
 
+from neusee.workflows.engine.wanted_steps import TABLE, compared, wanted
 from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.recipe.loading import load, recipes
 from neusee.workflows.report.console import closing
-from neusee.workflows.report.contents import FIGURES, TABLE, compared, wanted
+from neusee.workflows.report.contents import FIGURES
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
 

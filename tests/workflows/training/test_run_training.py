@@ -19,6 +19,7 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
+import neusee
 from neusee.nodes import optics
 from neusee.nodes.doe._parametrisations import PARAMETRISATIONS
 from neusee.nodes.scene import Photographs
@@ -113,7 +114,7 @@ def test_both_stages_at_64_pixels_and_31_bands(tmp_path, photographs):
         *files,
         "outputs=[restored, lsr]",
     ]
-    made = load("train_small", own).run(Store(tmp_path / "store"))
+    made = neusee.run(load("train_small", own), store=Store(tmp_path / "store"))
     assert made["restored"].shape == (3, 64, 64)
     assert (folder / "curves.png").stat().st_size > 10_000
     assert sorted(path.name for path in (folder / "pictures").iterdir()) == [
@@ -286,7 +287,7 @@ def test_a_network_is_learnt_behind_the_recipes_own_restorer(tmp_path, photograp
     ]
     recipe = load("train_small", [*words, *alone, "train.picture=restored"])
     folder = trained(recipe, tmp_path, [1])
-    start = recipe.run(Store(tmp_path / "store"), outputs=["height"])["height"]
+    start = neusee.run(recipe, store=Store(tmp_path / "store"), outputs=["height"])["height"]
     learnt = load_file(folder / "mask.safetensors")["height"]
     moved = learnt - start - (learnt - start).mean()
     assert float(moved.abs().max()) > 1e-10  # a step of 2e-4 in a logit; rounding: 1e-13
@@ -573,9 +574,9 @@ def test_a_mask_is_designed_and_stage_2_learns_behind_it(command, tmp_path, phot
 def _element_of(words, folder):
     """The relief that stage 2 sees."""
     recipe = load(words[0], words[1:])
-    return frozen(recipe, recipe.training, folder).run(Store(folder / "own"), outputs=["height"])[
-        "height"
-    ]
+    return neusee.run(
+        frozen(recipe, recipe.training, folder), store=Store(folder / "own"), outputs=["height"]
+    )["height"]
 
 
 def test_a_mask_is_designed_where_nothing_else_could_learn(command, tmp_path, photographs):

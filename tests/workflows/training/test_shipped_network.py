@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import neusee
 from neusee.nodes.scene import Photographs
 from neusee.workflows import Store, load
 from neusee.workflows.training.training_pictures import HELD_OUT
@@ -77,8 +78,9 @@ def test_the_demonstration_is_better_than_its_filter_behind_a_mask_that_suppress
     """Its photograph was one of the training; the filter is told the laser exactly, the network
     roughly.
     """
-    found = load("demonstration").run(
-        Store(tmp_path),
+    found = neusee.run(
+        load("demonstration"),
+        store=Store(tmp_path),
         outputs=["restored_quality", "wiener_quality", "developed_quality[mask]", "lsr[mask]"],
     )
     restored, wiener = found["restored_quality"], found["wiener_quality"]

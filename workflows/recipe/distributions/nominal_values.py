@@ -90,19 +90,15 @@ class Uncertain:
         """
         return self.laws[name].text if name in self.laws else f"posterior {self.source}"
 
-    def at(self, values: Mapping[str, float]) -> Any:
-        """Return the recipe with the given numbers in SI units in place of its uncertain values,
-        after a check.
-
-        Raises `RecipeError` for an invalid value.
+    def composed_at(self, values: Mapping[str, float]) -> Composed:
+        """Return the recipe, not yet checked, with the given numbers in SI units in place of its
+        uncertain values.
         """
-        from neusee.workflows.recipe.loading import check
-
         root = self.composed.root
         for path, value in values.items():
             unit = self.laws[path].unit if path in self.laws else self.units[path]
             root = put(root, tuple(path.split(".")), written(value, unit))
-        return check(replace(self.composed, root=root))
+        return replace(self.composed, root=root)
 
 
 def settle(composed: Composed) -> tuple[Composed, Uncertain | None]:

@@ -21,14 +21,14 @@ from neusee.workflows.engine.differentiable_function import as_function
 from neusee.workflows.engine.local_executor import one_thread
 from neusee.workflows.engine.node_call import place
 from neusee.workflows.engine.provenance import timestamp
+from neusee.workflows.engine.result_values import numbers_of
 from neusee.workflows.engine.worker_processes import shared_in_order, workers_for
 from neusee.workflows.graph.diagnostics import Diagnostic, RecipeError
 from neusee.workflows.graph.recipe_graph import needed
 from neusee.workflows.keys.cache_key import device_kind, digest, key_of
 from neusee.workflows.keys.code_digest import Code, engine
 from neusee.workflows.recipe.distributions.shapes import FloatArray as ShapesFloatArray
-from neusee.workflows.recipe.distributions.uncertain_inputs import InputDraws, Inputs
-from neusee.workflows.report.result_numbers import numbers_of
+from neusee.workflows.recipe.uncertain_inputs import InputDraws, Inputs
 from neusee.workflows.store.result_store import Store, compute_once
 
 # --- scatter estimate -----------------------------------------------------------------------------

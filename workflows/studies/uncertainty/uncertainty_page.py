@@ -11,8 +11,8 @@ import numpy as np
 from torch import Tensor
 
 from neusee.workflows.engine.runner import run
-from neusee.workflows.recipe.distributions.uncertain_inputs import InputDraws, Inputs
-from neusee.workflows.report.contents import BANDS
+from neusee.workflows.engine.wanted_steps import BANDS
+from neusee.workflows.recipe.uncertain_inputs import InputDraws, Inputs
 from neusee.workflows.report.figures.camera_pictures import high
 from neusee.workflows.report.figures.style import (
     BLACK,

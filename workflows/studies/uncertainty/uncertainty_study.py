@@ -16,7 +16,7 @@ from neusee.workflows.graph.recipe_graph import Recipe
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.recipe.distributions.joint_distribution import Z_90
 from neusee.workflows.recipe.distributions.nominal_values import told
-from neusee.workflows.recipe.distributions.uncertain_inputs import (
+from neusee.workflows.recipe.uncertain_inputs import (
     NEGLIGIBLE,
     SCRAMBLES,
     InputDraws,

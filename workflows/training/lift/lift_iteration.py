@@ -21,6 +21,7 @@ from neusee.nodes.spectra import (
 )
 from neusee.nodes.values import Bands
 from neusee.workflows.engine.differentiable_function import as_function
+from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.recipe_graph import Recipe, needed
 from neusee.workflows.keys.cache_key import stream_seed
 from neusee.workflows.recipe.blocks.train_block import LiftTraining
@@ -50,7 +51,7 @@ class Pairs:
                 f"train_lift: step {settings.picture} gives no random pictures: use a"
                 " spectra.leaves step"
             )
-        results = recipe.run(store, [bands, settings.measured], device=device)
+        results = run(recipe, store, [bands, settings.measured], device=device)
         self.bands: Bands = results[bands]
         self.measured: Tensor = results[settings.measured]
         need_mst_plus_plus_bands(self.bands)

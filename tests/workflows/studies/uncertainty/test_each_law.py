@@ -11,7 +11,7 @@ from scipy import stats
 
 from neusee.workflows import load
 from neusee.workflows.graph.diagnostics import RecipeError
-from neusee.workflows.recipe.distributions.uncertain_inputs import Inputs
+from neusee.workflows.recipe.uncertain_inputs import Inputs
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.run_study import StudyRefused, study_recipe
 from neusee.workflows.studies.uncertainty.output_draws import OutputDraws

@@ -18,7 +18,8 @@ from neusee.workflows.cli.app import app
 from neusee.workflows.engine.runner import run
 from neusee.workflows.graph.diagnostics import RecipeError
 from neusee.workflows.graph.recipe_graph import needed
-from neusee.workflows.recipe.distributions.uncertain_inputs import SCRAMBLES, Inputs
+from neusee.workflows.recipe.loading import recipe_at
+from neusee.workflows.recipe.uncertain_inputs import SCRAMBLES, Inputs
 from neusee.workflows.simulation.simulate_recipe import simulate
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.studies.run_study import StudyRefused, count_failures, study_recipe
@@ -57,7 +58,7 @@ def test_what_a_draw_changes_is_what_a_recipe_with_its_values_says():
     assert set(inputs.names) == {"sensor.read_noise", "sensor.gain", "lasers.green.angle.0"}
     for row in inputs.independent(5, 1).values:
         values = dict(zip(inputs.names, map(float, row), strict=True))
-        said = inputs.uncertain.at(values)
+        said = recipe_at(inputs.uncertain, values)
         for reader, value in inputs.theta(values).items():
             step, _, param = reader.rpartition(".")
             assert value == said.steps[step].params[param], reader
@@ -155,7 +156,7 @@ def test_a_draw_is_a_run_with_its_values_to_the_last_bit(store):
     draws = OutputDraws(inputs, store)
     row = inputs.independent(3, 1).values[2]
     found = draws.numbers(row[None])[0]
-    said = inputs.uncertain.at(dict(zip(inputs.names, map(float, row), strict=True)))
+    said = recipe_at(inputs.uncertain, dict(zip(inputs.names, map(float, row), strict=True)))
     assert found == quantities(run(said, store).values)
     assert found["saturated[mask].pixels"][0] > 0
 
@@ -190,7 +191,9 @@ def test_pictures_have_the_mean_and_deviation_of_all_draws(store):
     mean, sd = OutputDraws(inputs, store).pictures(values)["raw[mask]"]
     names = inputs.names
     each = [
-        run(inputs.uncertain.at(dict(zip(names, map(float, v), strict=True))), store)["raw[mask]"]
+        run(recipe_at(inputs.uncertain, dict(zip(names, map(float, v), strict=True))), store)[
+            "raw[mask]"
+        ]
         for v in values
     ]
     whole = torch.stack(each).double()

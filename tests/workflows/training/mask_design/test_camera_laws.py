@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+import neusee
 from neusee.nodes import losses, metrics
 from neusee.workflows import load
 from neusee.workflows.recipe.blocks.train_block import DesignError, MaskTraining
@@ -72,13 +73,13 @@ def test_draws_are_those_of_a_normal_law_and_of_the_seed():
 
 def test_a_direction_moves_the_peak_and_not_the_picture_and_a_wavelength_both(recipe, store):
     terms = Terms(recipe, how(direction_spread=f"{HALF} rad", wavelength_spread="5 nm"), store)
-    height = recipe.run(store, outputs=["height"])["height"]
+    height = neusee.run(recipe, store=store, outputs=["height"])["height"]
     with torch.no_grad():
         here, beside, longer = (
             terms.psf(height, None, s) for s in (NOMINAL, (0, 0, 1.0, 1.0), (0, 1.0, 0, 0))
         )
         by_hand = load("first_light", [*SMALL, f"steps.psf.with.angle=[{HALF} rad, {HALF} rad]"])
-        expected = by_hand.run(store, outputs=["psf[mask]"])["psf[mask]"]
+        expected = neusee.run(by_hand, store=store, outputs=["psf[mask]"])["psf[mask]"]
         assert float((beside.intensity - expected.intensity).abs().max()) < 1e-6 * float(
             expected.intensity.max()
         )
@@ -109,7 +110,7 @@ def test_a_direction_moves_the_peak_and_not_the_picture_and_a_wavelength_both(re
 
 def test_the_filter_holds_the_worst_peak_of_the_laws(recipe, store):
     terms = Terms(recipe, how(direction_spread=f"{HALF} rad"), store)
-    height = recipe.run(store, outputs=["height"])["height"]
+    height = neusee.run(recipe, store=store, outputs=["height"])["height"]
     found = against_stops(terms, height)
     with torch.no_grad():
         worst = max(

@@ -9,6 +9,7 @@ import torch
 from pydantic import ValidationError
 from safetensors.torch import load_file
 
+import neusee
 from neusee.nodes import losses
 from neusee.workflows import load
 from neusee.workflows.recipe.blocks.train_block import MaskTraining
@@ -78,7 +79,7 @@ def test_the_light_that_a_stop_takes_lowers_signal_and_noise(recipe, store):
     passed = float(terms.passed()["transmittance"])
     assert passed == pytest.approx(0.8 * 0.25, rel=0.05)
     expected = losses.filtered_error(
-        half.run(store, outputs=["psf[mask]"])["psf[mask]"],
+        neusee.run(half, store=store, outputs=["psf[mask]"])["psf[mask]"],
         *terms.seen(),
         light=30,
         read_noise=10.5,

@@ -11,6 +11,7 @@ import torch
 from pydantic import ValidationError
 from safetensors.torch import load_file
 
+import neusee
 from neusee.nodes.doe import half_rings
 from neusee.workflows import load
 from neusee.workflows.report.figures import optics
@@ -98,7 +99,7 @@ def test_the_file_is_the_mask_and_the_bounds_hold_on_it(recipe, store, tmp_path,
     again = load(
         "first_light", [*SMALL, "doe=pixelwise", f"doe.file={folder / 'mask.safetensors'}"]
     )
-    lsr = again.run(store, outputs=["lsr[mask]"])["lsr[mask]"]
+    lsr = neusee.run(again, store=store, outputs=["lsr[mask]"])["lsr[mask]"]
     assert lsr.tolist() == pytest.approx(found["bands"]["lsr"], rel=1e-5)
     bands = {name: torch.tensor(values) for name, values in found["bands"].items()}
     assert bool((bands["lsr"] >= bands["energy_floor"]).all())
@@ -223,7 +224,7 @@ def test_the_recipes_own_relief_is_learnt_sample_by_sample_until_it_is_enough(st
         learning_rate=0.02,
     )
     terms = Terms(ring, given, store)
-    start = ring.run(store, outputs=["height"])["height"]
+    start = neusee.run(ring, store=store, outputs=["height"])["height"]
     before, after = (
         terms.parts(height)
         for height in (
@@ -241,7 +242,7 @@ def test_the_recipes_own_relief_is_learnt_sample_by_sample_until_it_is_enough(st
 def test_a_filter_leaves_the_same_wrong_of_all_bands_chosen_or_not(recipe, store):
     given = how(bands=None, weights={"wiener": 1.0})
     terms = Terms(recipe, given, store)
-    height = recipe.run(store, outputs=["height"])["height"]
+    height = neusee.run(recipe, store=store, outputs=["height"])["height"]
     whole, chosen = (float(terms.parts(height, bands)["wiener"]) for bands in (None, range(5)))
     assert whole == pytest.approx(chosen, rel=1e-6)
     assert float(terms.parts(height, [1, 3])["wiener"]) != pytest.approx(whole, rel=1e-3)

@@ -25,6 +25,7 @@ from neusee.workflows.recipe.distributions.shapes import (
     share_between,
     written,
 )
+from neusee.workflows.recipe.loading import recipe_at
 
 # --- allowed range --------------------------------------------------------------------------------
 
@@ -122,7 +123,7 @@ def _reason(uncertain: Uncertain, name: str, value: float) -> Reason:
     if not math.isfinite(value):
         return "must be finite"
     try:
-        uncertain.at({name: value})
+        recipe_at(uncertain, {name: value})
     except RecipeError as error:
         return error.diagnostics[0].message
     return ""
@@ -450,7 +451,7 @@ class Inputs:
         for name, column in zip(self.names, values.T, strict=True):
             for value in (float(column.min()), float(column.max())):
                 try:
-                    self.uncertain.at({name: value})
+                    recipe_at(self.uncertain, {name: value})
                 except RecipeError as error:
                     drawn = [
                         replace(d, message=f"the value is sampled, but {d.message}")
@@ -461,7 +462,7 @@ class Inputs:
     def problem(self, row: FloatArray) -> Diagnostic | None:
         """Return why the recipe does not allow the values of a draw together, or None."""
         try:
-            self.uncertain.at(dict(zip(self.names, map(float, row), strict=True)))
+            recipe_at(self.uncertain, dict(zip(self.names, map(float, row), strict=True)))
         except RecipeError as error:
             return error.diagnostics[0]
         return None
@@ -497,7 +498,7 @@ def _readers(
     in the parameter.
     """
     probe = _probe(uncertain, name)
-    changed: Recipe = uncertain.at({name: probe})
+    changed = recipe_at(uncertain, {name: probe})
     if changed.steps.keys() != recipe.steps.keys() or changed.outputs != recipe.outputs:
         raise ValueError(
             f"the value {name} changes the list of steps and therefore cannot be sampled"
