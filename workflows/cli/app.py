@@ -11,6 +11,7 @@ from io import TextIOWrapper
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Any
 
+from neusee.workflows.cli import lazy_imports as lazy
 from neusee.workflows.cli.commands_and_exit_codes import (
     BAD,
     COLUMNS,
@@ -23,6 +24,7 @@ from neusee.workflows.cli.commands_and_exit_codes import (
 )
 from neusee.workflows.cli.interrupt_signal import Interrupts, said, say_stopped
 from neusee.workflows.engine.machine_resources import free_processors
+from neusee.workflows.graph.diagnostics import visible
 from neusee.workflows.recipe.text.hydra_habits import ADVICE_ON_MULTIRUN
 
 if TYPE_CHECKING:
@@ -80,9 +82,8 @@ app: typer.Typer
 def __getattr__(name: str) -> Any:
     if name != "app":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from neusee.workflows.cli.program_options import program
 
-    return globals().setdefault("app", program())
+    return globals().setdefault("app", lazy.program_options.program())
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -139,19 +140,15 @@ def _run(arguments: list[str]) -> int:
     ):
         print(help_page())
         return DONE
-    if not completes and arguments[:1] and arguments[0] in REPEATED:
-        from neusee.workflows.cli.repetition import say_stored_answer
-
-        if say_stored_answer(arguments):
-            return DONE
-    from neusee.workflows.cli.command_frame import print_warning
-    from neusee.workflows.cli.program_options import run_program
+    repeatable = not completes and arguments[:1] and arguments[0] in REPEATED
+    if repeatable and lazy.repetition.say_stored_answer(arguments):
+        return DONE
 
     command = arguments[0] if arguments else ""
     settle_threads(command)
     with warnings.catch_warnings():
-        warnings.showwarning = print_warning
-        return run_program(arguments, completes)
+        warnings.showwarning = lazy.command_frame.print_warning
+        return lazy.program_options.run_program(arguments, completes)
 
 
 def _explained(error: Exception) -> int:
@@ -162,7 +159,6 @@ def _explained(error: Exception) -> int:
         advice = ADVICE_ON_MULTIRUN if is_multirun else "try `neusee --help`"
         print(f"{message()} ({advice})", file=sys.stderr)
         return BAD
-    from neusee.workflows.graph.diagnostics import visible
 
     cause = type(error).__name__
     text = str(error) if cause in ("RunError", "UnfollowedCode") else f"{cause}: {error}"

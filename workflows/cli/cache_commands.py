@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from neusee.workflows.answers import stored_answer
+from neusee.workflows.cli import lazy_imports as lazy
 from neusee.workflows.cli.command_frame import failing, say, the_store
 from neusee.workflows.cli.commands_and_exit_codes import MISSED
 from neusee.workflows.report.terminal_text import columns
 from neusee.workflows.store.cache_settings import format_size, parse_size
+from neusee.workflows.store.derived_files import DerivedFiles
 from neusee.workflows.store.metadata import is_kept
 
 if TYPE_CHECKING:
@@ -100,10 +102,8 @@ def why(key: Key) -> None:
 
     Also print the differences from the nearest earlier result.
     """
-    from neusee.workflows.explain.stored_origin import why_key_lines
-
     with failing(LookupError):
-        say(why_key_lines(the_store(), key))
+        say(lazy.stored_origin.why_key_lines(the_store(), key))
 
 
 # --- what the commands print ----------------------------------------------------------------------
@@ -179,8 +179,6 @@ def verify_lines(store: Store) -> tuple[list[str], int]:
     """Read every result in the cache; return a line for each damaged result, and the number of
     damaged results.
     """
-    from neusee.workflows.store.derived_files import DerivedFiles
-
     files = DerivedFiles(store)
     sizes, damaged = list[int](), list[str]()
     for entry in store.check():

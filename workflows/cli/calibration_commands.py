@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from neusee.workflows.cli import lazy_imports as lazy
 from neusee.workflows.cli.command_frame import (
     fail,
     failing,
@@ -84,9 +85,6 @@ def calibrate(
     """
     store, target = the_store(), _target(sensor)
     recipe, command, is_folder = _loaded(words, store, quiet or as_json)
-    from neusee.workflows.api import verbs
-    from neusee.workflows.calibration.run_calibration import CalibrationRefused
-    from neusee.workflows.graph.run_error import RunError
 
     options: dict[str, Any] = {"walkers": walkers, "move": move, "draws": draws}
     command += option_words({**options, "sensor": sensor})
@@ -94,10 +92,14 @@ def calibrate(
         fail("--sensor needs a folder of frames, such as `neusee calibrate lab --sensor mine`")
     with (
         resumable(lambda: kept_in(store, "the draws up to the last line above are")),
-        failing(RunError, ValueError, ImportError, code=FAILED),
-        failing(CalibrationRefused, code=FAILED, before="refused, nothing was drawn: "),
+        failing(lazy.run_error.RunError, ValueError, ImportError, code=FAILED),
+        failing(
+            lazy.run_calibration.CalibrationRefused,
+            code=FAILED,
+            before="refused, nothing was drawn: ",
+        ),
     ):
-        folder = verbs.calibrate(
+        folder = lazy.verbs.calibrate(
             recipe,
             store=store,
             out=out,
@@ -129,10 +131,9 @@ def _say_results(folder: Path, quiet: bool, as_json: bool) -> None:
 def _target(sensor: str) -> Path | None:
     if not sensor:
         return None
-    from neusee.workflows.frames.sensor_group import sensor_target
 
     with failing(ValueError):
-        return sensor_target(sensor, Path.cwd())
+        return lazy.sensor_group.sensor_target(sensor, Path.cwd())
 
 
 def _loaded(words: list[str] | None, store: Store, quiet: bool) -> tuple[Recipe, list[str], bool]:
@@ -142,20 +143,16 @@ def _loaded(words: list[str] | None, store: Store, quiet: bool) -> tuple[Recipe,
     name, changes, _ = split(words)
     if not Path(name).is_dir() or _is_recipe(name):
         return *load(words, "calibrate"), False
-    from neusee.workflows.frames.folder_recipe import recipe_of_folder
-    from neusee.workflows.report.study_folder import silent
 
     with failing(ValueError, before="nothing was drawn: "), refusing():
-        report = silent if quiet else say_line
-        recipe = recipe_of_folder(Path(name), store, changes, report)
+        report = lazy.study_folder.silent if quiet else say_line
+        recipe = lazy.folder_recipe.recipe_of_folder(Path(name), store, changes, report)
         return recipe, ["neusee", "calibrate", name, *changes], True
 
 
 def _is_recipe(name: str) -> bool:
     """Return True for the name of a recipe, which counts before a folder of the same name."""
-    from neusee.workflows.recipe.loading import recipes
-
-    return name in {recipe.name for recipe in recipes()}
+    return name in {recipe.name for recipe in lazy.loading.recipes()}
 
 
 def _write_sensor(
@@ -164,10 +161,10 @@ def _write_sensor(
     """Write the sensor group of a calibration into its folder, and to ``target`` if that is
     given.
     """
-    from neusee.workflows.frames.sensor_group import frames_of_sensor, sensor_text
-
     with failing(ValueError, code=FAILED):
-        text = sensor_text(results, frames_of_sensor(recipe, store))
+        text = lazy.sensor_group.sensor_text(
+            results, lazy.sensor_group.frames_of_sensor(recipe, store)
+        )
     for file in filter(None, (results / "sensor" / "mine.yaml", target)):
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text, encoding="utf-8")
@@ -176,11 +173,10 @@ def _write_sensor(
 
 
 def _lines(parameters: dict[str, dict[str, object]]) -> list[str]:
-    from neusee.workflows.calibration.calibration_page import ParameterEstimate
-
     # what the frames do not tell is not in the file
     unknown = dict.fromkeys(("mean", "sd", "low", "high"), math.nan)
-    rows = [ParameterEstimate(**{**unknown, **row}) for row in parameters.values()]  # type: ignore[arg-type]
+    estimate = lazy.calibration_page.ParameterEstimate
+    rows = [estimate(**{**unknown, **row}) for row in parameters.values()]  # type: ignore[arg-type]
     return [f"{row.name.replace('_', ' '):20s} {row.text}" for row in rows]
 
 
@@ -236,16 +232,13 @@ def sheet(
     or the reason why the frames do not tell it. Where rounding hides the dark noise, the page has a
     red banner and the exit code is 3.
     """
-    from neusee.workflows.calibration.run_sheet import write_sheet
-    from neusee.workflows.graph.run_error import RunError
-
     recipe, command = _loaded_camera(words, quiet or as_json)
     facts, edition = state or (), _edition(release)
     command += option_words({"release": edition, "relative": relative})
     for fact in facts:
         command += ["--state", fact]
-    with failing(RunError, code=FAILED), failing(ValueError):
-        folder = write_sheet(
+    with failing(lazy.run_error.RunError, code=FAILED), failing(ValueError):
+        folder = lazy.run_sheet.write_sheet(
             recipe, the_store(), out, command, release=edition, relative=relative, state=facts
         )
     document = json.loads(text_of(folder / "emva1288.json"))
@@ -273,20 +266,16 @@ def _loaded_camera(words: list[str] | None, quiet: bool) -> tuple[Recipe, list[s
     name, changes, _ = split(words)
     if Path(name).suffix.lower() != ".txt" and not Path(name).is_dir():
         return load(words, "sheet")
-    from neusee.workflows.calibration.emva_sheet import descriptor_recipe
-    from neusee.workflows.frames.folder_recipe import (
-        descriptor_of,
-        descriptors_in,
-        recipe_of_folder,
-    )
-    from neusee.workflows.report.study_folder import silent
 
     with failing(ValueError, before="nothing was computed: "), refusing():
-        if Path(name).is_dir() and not descriptors_in(Path(name)):
-            report = silent if quiet else say_line
-            recipe = recipe_of_folder(Path(name), the_store(), changes, report, every_pixel=True)
+        if Path(name).is_dir() and not lazy.folder_recipe.descriptors_in(Path(name)):
+            report = lazy.study_folder.silent if quiet else say_line
+            recipe = lazy.folder_recipe.recipe_of_folder(
+                Path(name), the_store(), changes, report, every_pixel=True
+            )
             return recipe, ["neusee", "sheet", name, *changes]
-        return descriptor_recipe(descriptor_of(Path(name)), changes), [
+        descriptor = lazy.folder_recipe.descriptor_of(Path(name))
+        return lazy.emva_sheet.descriptor_recipe(descriptor, changes), [
             "neusee",
             "sheet",
             name,
@@ -295,9 +284,8 @@ def _loaded_camera(words: list[str] | None, quiet: bool) -> tuple[Recipe, list[s
 
 
 def _line(quantity: dict[str, object]) -> str:
-    from neusee.nodes.calibrate import Quantity
-
-    stated = Quantity(**{name: value for name, value in quantity.items() if name != "section"})  # type: ignore[arg-type]
+    fields = {name: value for name, value in quantity.items() if name != "section"}
+    stated = lazy.calibrate.Quantity(**fields)  # type: ignore[arg-type]
     return f"{stated.symbol:18s} {stated.text:22s} {stated.name}" + f" ({stated.reason})" * bool(
         stated.reason
     )

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Union, get_args, get_origin
 
 import typer
 
+import neusee.recipes
+from neusee.workflows.cli import lazy_imports as lazy
 from neusee.workflows.cli.command_frame import failing, refusing, say
 from neusee.workflows.cli.command_options import Debug
 from neusee.workflows.graph.diagnostics import nearest
@@ -96,19 +98,16 @@ def schema(
     """Print the JSON schema of recipes for editors."""
     import json
 
-    from neusee.workflows.handbook import json_schema
-
-    say([json.dumps(json_schema.schema(_own(recipe)), indent=1)])
+    say([json.dumps(lazy.json_schema.schema(_own(recipe)), indent=1)])
 
 
 def _own(recipe: str | None) -> Own:
     """Return the modules of the families of nodes that a recipe names, by family."""
     if recipe is None:
         return {}
-    from neusee.workflows.recipe.loading import families_of
 
     with refusing():
-        return families_of(recipe)
+        return lazy.loading.families_of(recipe)
 
 
 # --- what the commands print ----------------------------------------------------------------------
@@ -116,11 +115,9 @@ def _own(recipe: str | None) -> Own:
 
 def recipe_lines() -> list[str]:
     """Return a line for each recipe with its title, then a line for each group with its options."""
-    from neusee.workflows.recipe import loading
-
-    titles = columns([[recipe.name, recipe.title] for recipe in loading.recipes()])
+    titles = columns([[recipe.name, recipe.title] for recipe in lazy.loading.recipes()])
     groups: list[str] = []
-    for name, options in loading.groups().items():
+    for name, options in lazy.loading.groups().items():
         names = ", ".join(option.name for option in options)
         groups.append(f"  {name}: {names}")
     return [*titles, "", "groups, as in `neusee run laser=six`", *groups]
@@ -128,28 +125,24 @@ def recipe_lines() -> list[str]:
 
 def nodes_lines(own: Own = MappingProxyType({})) -> list[str]:
     """Return a line for each node, sorted by family, with the first sentence of its docstring."""
-    from neusee.workflows.recipe.node_families import all_nodes, broken_families, family_title
-
-    nodes = dict(all_nodes(own))
+    nodes = dict(lazy.node_families.all_nodes(own))
     width = max(map(len, nodes), default=0)
     lines: list[str] = []
     for family, paths in groupby(nodes, lambda path: path.partition(".")[0]):
-        lines += ["", first_sentence(family_title(family, own))]
+        lines += ["", first_sentence(lazy.node_families.family_title(family, own))]
         lines += [f"{path:<{width}}  {first_sentence(nodes[path].__doc__)}" for path in paths]
     lines += _networks(own)
-    broken = broken_families().values()
+    broken = lazy.node_families.broken_families().values()
     return [*lines[1:], *([""] if broken else []), *broken]
 
 
 def _networks(own: Own) -> list[str]:
     """Return a line for each network class of the user's families."""
-    from neusee.nodes.own_modules import network_classes
-
     lines = ["", "Network classes, for restore.network"]
     for family, module in own.items():
         lines += [
             f"{family}.{name}  {first_sentence(vars(x).get('__doc__'))}"
-            for name, x in network_classes(module).items()
+            for name, x in lazy.own_modules.network_classes(module).items()
         ]
     return lines if len(lines) > 2 else []
 
@@ -158,13 +151,11 @@ def node_lines(name: str, own: Own = MappingProxyType({})) -> list[str]:
     """Return the help on one node; for `reading` the interpretations of the paper, for
     `glossary` the field's terms.
     """
-    from neusee.workflows.recipe.node_families import all_nodes
-
     if name == "glossary":
         return glossary_lines()
     if name == "reading":
         return _reading_lines()
-    nodes = dict(all_nodes(own))
+    nodes = dict(lazy.node_families.all_nodes(own))
     if name not in nodes:
         raise LookupError(f"there is no node {name}: {nearest(name, nodes)}")
     uses = list(_uses(name))
@@ -204,8 +195,6 @@ def glossary_lines() -> list[str]:
 
 
 def _recipes() -> Path:
-    import neusee.recipes
-
     return Path(neusee.recipes.__file__).parent
 
 
@@ -223,13 +212,11 @@ def _kind(hint: Any) -> str:
     """Describe a parameter's type in words: its unit, its allowed texts, or the range of its
     numbers.
     """
-    from neusee.nodes import units
-
     for name, words in _TYPES_IN_WORDS.items():
-        if hint == getattr(units, name):
+        if hint == getattr(lazy.units, name):
             return words
     metadata, arguments = getattr(hint, "__metadata__", ()), get_args(hint)
-    if any(isinstance(extra, units.IsFile) for extra in metadata):
+    if any(isinstance(extra, lazy.units.IsFile) for extra in metadata):
         return _TYPES_IN_WORDS["DataFile"]
     if metadata and (words := _quantity(hint)):
         return words
@@ -253,10 +240,7 @@ def _quantity(hint: Any) -> str:
     """Describe a quantity by its name, its range and an example, or return "" for a number
     without a unit.
     """
-    from neusee.nodes import units
-    from neusee.nodes.units import in_words, number_ranges
-
-    number_range = next(number_ranges(hint), None)
+    number_range = next(lazy.units.number_ranges(hint), None)
     if (
         number_range is None
         or not number_range.si
@@ -266,8 +250,9 @@ def _quantity(hint: Any) -> str:
         return ""
     name, usual = _QUANTITIES[number_range.si]
     example = next(
-        (text for kind, text in _EXAMPLES.items() if hint == getattr(units, kind)), usual
+        (text for kind, text in _EXAMPLES.items() if hint == getattr(lazy.units, kind)), usual
     )
+    in_words = lazy.units.in_words
     greatest = in_words(number_range.greatest, number_range.si)
     if number_range.least == 0:
         return (

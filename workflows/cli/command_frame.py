@@ -15,10 +15,13 @@ from typing import TYPE_CHECKING, Any, NoReturn, TextIO, cast
 
 import typer
 
+from neusee.workflows.cli import lazy_imports as lazy
 from neusee.workflows.cli.commands_and_exit_codes import BAD, FAILED, INTERRUPTED, TYPED
 from neusee.workflows.cli.interrupt_signal import say_stopped
+from neusee.workflows.graph.diagnostics import RecipeError, visible
 from neusee.workflows.keys.sealed_files import text_of
 from neusee.workflows.report.terminal_text import json_line
+from neusee.workflows.store.remote_store import open_store
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
@@ -104,10 +107,9 @@ def load(
     runs this recipe.
     """
     name, changes, first = split(words, before)
-    from neusee.workflows.recipe.loading import load as read
 
     with refusing():
-        recipe = read(name, changes, first=first)
+        recipe = lazy.loading.load(name, changes, first=first)
     search_for_garbage()
     again = ["neusee", *command, name, *changes]
     return (replace(recipe, exact=True), [*again, "--exact"]) if exact else (recipe, again)
@@ -118,8 +120,6 @@ def refusing() -> Iterator[None]:
     """Print every mistake of a recipe and end the command if the ``with`` block raises
     `RecipeError`.
     """
-    from neusee.workflows.graph.diagnostics import RecipeError
-
     try:
         yield
     except RecipeError as error:
@@ -178,8 +178,6 @@ def say_line(line: str) -> None:
 
 def fail(message: str, code: int = BAD) -> NoReturn:
     """Print a message to stderr and end the command."""
-    from neusee.workflows.graph.diagnostics import visible
-
     print(visible(message), file=sys.stderr)
     raise typer.Exit(code)
 
@@ -188,8 +186,6 @@ def the_store() -> Store:
     """Open the result store that the environment variable ``NEUSEE_CACHE`` names, or the default
     store.
     """
-    from neusee.workflows.store.remote_store import open_store
-
     with failing(ValueError, ModuleNotFoundError, before="NEUSEE_CACHE: "):
         return open_store()
 
@@ -236,15 +232,13 @@ def kept_training(out: Path, recipe: str) -> str:
     """Return a clause that says up to which iteration the newest checkpoint keeps a training of
     ``recipe``.
     """
-    from neusee.workflows.training.loop.resumable_loop import StateFile
-
     states = [*out.glob(f"{recipe}_*/state.pt"), *out.glob(f"{recipe}_*/mask.state")]
     if not states:
         return "no checkpoint is written yet, so nothing is kept"
     newest = max(states, key=lambda path: path.stat().st_mtime)
     state: dict[str, Any] = {}
     with suppress(ValueError):
-        state = StateFile(newest).read(strict=False)
+        state = lazy.resumable_loop.StateFile(newest).read(strict=False)
     stage = f" of stage {state['stage']}" if state.get("stage") else ""
     upto = f" up to iteration {state['iteration']}{stage}" if "iteration" in state else ""
     return f"the training{upto} is kept in {newest.parent}"
@@ -275,8 +269,5 @@ def print_warning(message: Warning | str, *where: object, **details: object) -> 
     """Print a warning as one line on stderr, in place of Python's form, which shows a line of
     source code.
     """
-    from neusee.workflows.cli.repetition import doubt_answer
-    from neusee.workflows.graph.diagnostics import visible
-
-    doubt_answer()
+    lazy.repetition.doubt_answer()
     print(f"warning: {visible(str(message))}", file=sys.stderr, flush=True)

@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from neusee.workflows.cli import lazy_imports as lazy
 from neusee.workflows.cli.command_frame import fail, failing, keep_for_result, print_warning
+from neusee.workflows.report.run_folder import writable_folder
 from neusee.workflows.report.terminal_text import lasts
 from neusee.workflows.store.cache_settings import parse_size
 
@@ -61,8 +63,6 @@ Memory = Annotated[str, typer.Option("--memory", help=_MEMORY)]
 
 def _writable(out: Path) -> Path:
     """End the command before any work if the results could not be written to the folder ``out``."""
-    from neusee.workflows.report.run_folder import writable_folder
-
     with failing(ValueError, before="--out: "):
         return writable_folder(out)
 
@@ -163,10 +163,8 @@ def option_words(options: Mapping[str, Any]) -> list[str]:
 
 def check_device(device: str) -> None:
     """End the command if this machine does not have ``device``, which may be a list with commas."""
-    from neusee.workflows.engine.local_executor import check_devices
-
     with failing(ValueError, before="--device "):
-        check_devices(device)
+        lazy.local_executor.check_devices(device)
 
 
 def memory_limit(text: str) -> int | None:
@@ -186,9 +184,8 @@ def within_memory(text: str) -> Iterator[int | None]:
     if limit is None:
         yield None
         return
-    from neusee.workflows.engine.memory_limits import limited
 
-    with limited(limit):
+    with lazy.memory_limits.limited(limit):
         yield limit
 
 
@@ -210,7 +207,7 @@ def executor_of(
     try:
         import distributed  # noqa: F401
 
-        from neusee.workflows.engine.dask_cluster import cluster
+        cluster = lazy.dask_cluster.cluster
     except ModuleNotFoundError as error:
         fail(
             f'--executor {place}: {error.name} is not installed: pip install "neusee[distributed]"'
@@ -233,11 +230,10 @@ def check_executor(place: str, job: Sequence[str]) -> None:
         return
     if find_spec("dask_jobqueue") is None:
         fail(f'--executor {place}: dask_jobqueue is not installed: pip install "neusee[slurm]"')
-    from neusee.workflows.engine.dask_cluster import SlurmOptions, missing_command
 
     with failing(ValueError, before="--job "):
-        SlurmOptions.read(job)
-    if name := missing_command():
+        lazy.dask_cluster.SlurmOptions.read(job)
+    if name := lazy.dask_cluster.missing_command():
         fail(
             f"--executor {place}: this machine has no command {name}: run it where jobs of SLURM"
             " are submitted"

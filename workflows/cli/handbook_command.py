@@ -10,9 +10,12 @@ from typing import Annotated
 
 import typer
 
+from neusee.workflows.cli import lazy_imports as lazy
 from neusee.workflows.cli.command_frame import failing, say
 from neusee.workflows.cli.command_options import Debug, Quiet, progress_lines
 from neusee.workflows.cli.commands_and_exit_codes import FAILED
+from neusee.workflows.handbook import guide_pages, site_build
+from neusee.workflows.handbook.guide_pages import NoPicture
 
 
 def handbook(
@@ -37,18 +40,14 @@ def handbook(
     The first build takes minutes, because it runs the commands of the pages; a later one takes
     their results from the cache. Needs `pip install "neusee[docs]"`.
     """
-    from neusee.workflows.handbook import guide_pages, site_build
-
     with failing(site_build.HandbookError, before="neusee handbook: "):
         site_build.check_modules()
         site_build.check_folder(out)
-    from neusee.workflows.cli.handbook_reference import reference_pages
-    from neusee.workflows.handbook.guide_pages import NoPicture
 
     with failing(
         site_build.HandbookError, NoPicture, OSError, code=FAILED, before="neusee handbook: "
     ):
-        reference = reference_pages(guide_pages.GUIDE.parent)
+        reference = lazy.handbook_reference.reference_pages(guide_pages.GUIDE.parent)
         page = site_build.build_handbook(out, reference, pictures, progress_lines(quiet))
     say([str(page)])
     if opens and not (_has_display() and webbrowser.open(page.absolute().as_uri())) and not quiet:

@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
+from neusee.workflows.cli import lazy_imports as lazy
 from neusee.workflows.cli.command_frame import fail, failing, say
 from neusee.workflows.cli.command_options import AsJson, Debug
 from neusee.workflows.cli.commands_and_exit_codes import DONE, MISSED
+from neusee.workflows.contract.surroundings import elsewhere
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -225,13 +227,10 @@ def check(
     a process with other surroundings. A network class of yours is called on small pictures. The
     exit code is 3 if a rule fails. Runs the code.
     """
-    from neusee.workflows.contract.surroundings import elsewhere
-
     with failing(LookupError), elsewhere(early=not _is_of_neusee(place)) as process:
         nodes, networks = _found(place)
-        from neusee.workflows.contract.node_contract import check_all
 
-        by_name = check_all(nodes, networks, process)
+        by_name = lazy.node_contract.check_all(nodes, networks, process)
     failed = sum(f.ok is False for f in chain.from_iterable(by_name.values()))
     if as_json:
         document = {name: list(map(asdict, findings)) for name, findings in by_name.items()}
@@ -263,10 +262,8 @@ def _is_of_neusee(place: str) -> bool:
 
 def _installed(family: str) -> ModuleType | None:
     """Return the module of a family of an installed package; None for a family of neusee."""
-    from neusee.workflows.recipe.node_families import module_of
-
     try:
-        return module_of(family)
+        return lazy.node_families.module_of(family)
     except LookupError:
         return None
 
@@ -293,27 +290,19 @@ def _found(place: str) -> tuple[dict[str, Node], dict[str, type[nn.Module]]]:
     """Return the nodes and the network classes at a place by name; raise `LookupError` if there
     are none.
     """
-    from neusee.workflows.contract.node_contract import whole_networks
-    from neusee.workflows.recipe.node_families import (
-        find_node,
-        import_own,
-        installed_as,
-        is_known,
-        nodes_of,
-        own_nodes,
-    )
-
     family = place.partition(".")[0]
-    if not place.endswith(".py") and "/" not in place and is_known(family):
+    if not place.endswith(".py") and "/" not in place and lazy.node_families.is_known(family):
         if place == family:
             module = _installed(family)
-            networks = whole_networks(module) if module else {}
-            return _within(family, nodes_of(family)), _within(family, networks)
+            networks = lazy.node_contract.whole_networks(module) if module else {}
+            return _within(family, lazy.node_families.nodes_of(family)), _within(family, networks)
         if not _is_module(place):
-            return {place: find_node(place)}, {}
-    module = import_own(place, Path.cwd())
-    name = installed_as(module.__name__) or module.__name__.rpartition(".")[2]
-    return _within(name, own_nodes(name, module)), _within(name, whole_networks(module))
+            return {place: lazy.node_families.find_node(place)}, {}
+    module = lazy.node_families.import_own(place, Path.cwd())
+    name = lazy.node_families.installed_as(module.__name__) or module.__name__.rpartition(".")[2]
+    return _within(name, lazy.node_families.own_nodes(name, module)), _within(
+        name, lazy.node_contract.whole_networks(module)
+    )
 
 
 def _within(family: str, members: Mapping[str, T]) -> dict[str, T]:

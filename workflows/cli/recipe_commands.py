@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from neusee.workflows.cli import lazy_imports as lazy
 from neusee.workflows.cli.command_frame import (
     fail,
     failing,
@@ -43,6 +44,8 @@ from neusee.workflows.cli.command_options import (
 )
 from neusee.workflows.cli.commands_and_exit_codes import FAILED, MISSED, TYPED
 from neusee.workflows.cli.repetition import keep_answer, keep_run, say_and_keep
+from neusee.workflows.graph.diagnostics import RecipeError
+from neusee.workflows.report.run_folder import find_run, rebuild
 from neusee.workflows.report.terminal_text import commands_to_try, json_line
 
 if TYPE_CHECKING:
@@ -107,18 +110,16 @@ def run(
     with within_memory(memory) as limit:
         recipe, command = load(words, "run", exact=exact)
     _check_rerun(recipe, again)
-    from neusee.workflows.engine.wanted_steps import steps_of, wanted
-    from neusee.workflows.report import console
-    from neusee.workflows.simulation.simulate_recipe import simulate
-    from neusee.workflows.tolerance.cheaper_steps import with_substitutions
 
     check_device(device)
     silent = as_json or quiet
     before = _opening(recipe, command, silent)
     store = the_store()
     predicted = _predicted(recipe, store, device, limit, executor == "local", silent)
-    cheaper = with_substitutions(recipe, wanted(recipe))
-    table = console.RunTable(cheaper, steps_of(cheaper), console.mode_for(silent), predicted)
+    cheaper = lazy.cheaper_steps.with_substitutions(recipe, lazy.wanted_steps.wanted(recipe))
+    table = lazy.console.RunTable(
+        cheaper, lazy.wanted_steps.steps_of(cheaper), lazy.console.mode_for(silent), predicted
+    )
     with (
         resumable(
             lambda: kept_in(
@@ -128,14 +129,16 @@ def run(
         executor_of(executor, store, jobs, _speaker(silent)) as cluster,
         table,
     ):
-        done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit, again)
+        done = lazy.simulate_recipe.simulate(
+            cheaper, store, out, command, device, table.watch, cluster, limit, again
+        )
     if silent:
         hints = []
         _say_briefly(done, as_json)
     else:
         recipe_words = command[2:-1] if exact else command[2:]
         hints = commands_to_try(recipe, recipe_words, _loads)
-        say(console.closing(done.document, str(done.page), hints))
+        say(lazy.console.closing(done.document, str(done.page), hints))
     if done.document["missed"]:
         raise typer.Exit(MISSED)
     if executor == "local" and not again:
@@ -154,21 +157,17 @@ def _speaker(silent: bool) -> Callable[[str], None]:
 
 def _opening(recipe: Recipe, command: Sequence[str], silent: bool) -> list[str]:
     """Say what is run, unless silent, and return what was said."""
-    from neusee.workflows.report import console
-
     if silent:
         return []
-    lines = console.opening(recipe, shlex.join(command[1:]))
+    lines = lazy.console.opening(recipe, shlex.join(command[1:]))
     say(lines)
     return lines
 
 
 def _check_rerun(recipe: Recipe, names: Sequence[str]) -> None:
     """End the command for a name in ``--rerun`` that is of no step."""
-    from neusee.workflows.graph.recipe_graph import copies_of
-
     try:
-        copies_of(recipe, names)
+        lazy.recipe_graph.copies_of(recipe, names)
     except ValueError as error:
         fail(f"--rerun: {error}")
 
@@ -180,11 +179,14 @@ def _text(
 
     Without ``hints`` that is the path of the page alone.
     """
-    from neusee.workflows.report.console import closing
 
     def text(folder: str, took: str) -> str:
         page = f"{folder}/report.html"
-        return "\n".join([*before, *closing(done.document, page, hints, took)]) if hints else page
+        return (
+            "\n".join([*before, *lazy.console.closing(done.document, page, hints, took)])
+            if hints
+            else page
+        )
 
     return text
 
@@ -210,11 +212,11 @@ def _predicted(
     A run on this machine ends before any step if the limit of memory, or the memory that is free,
     is too small.
     """
-    from neusee.workflows.explain.run_forecast import lanes_for, planned
-
     if silent and not local:
         return {}
-    plan = planned(recipe, store, lanes_for(recipe, device, memory))
+    plan = lazy.run_forecast.planned(
+        recipe, store, lazy.run_forecast.lanes_for(recipe, device, memory)
+    )
     if local:
         _refuse_beyond_memory(plan, memory)
     line = _forecast_of(plan)
@@ -232,20 +234,15 @@ def _refuse_beyond_memory(plan: Plan, memory: int | None) -> None:
 
 def _forecast_of(plan: Plan) -> str:
     """Return the line that says how long a run will take, or an empty text."""
-    from neusee.workflows.report.console import forecast_line
-
     unknown = sum(not estimate.known for estimate in plan.expected.values())
     seconds = plan.schedule.makespan if plan.schedule else 0.0
-    return forecast_line(seconds, len(plan.expected), unknown)
+    return lazy.console.forecast_line(seconds, len(plan.expected), unknown)
 
 
 def _loads(words: Sequence[str]) -> bool:
     """Return True if a recipe with its changes has no mistake."""
-    from neusee.workflows.graph.diagnostics import RecipeError
-    from neusee.workflows.recipe.loading import load as read
-
     try:
-        read(words[0], list(words[1:]))
+        lazy.loading.load(words[0], list(words[1:]))
     except RecipeError:
         return False
     return True
@@ -257,12 +254,13 @@ def validate(words: Words = None, as_json: AsJson = False, debug: Debug = False)
     All mistakes are listed at once, each with its file, line and column and the nearest known name.
     """
     recipe, command = load(words, "run")
-    from neusee.workflows.report.console import contents_of, opening
 
     if as_json:
-        text = json_line({"valid": True, "command": shlex.join(command), **contents_of(recipe)})
+        text = json_line(
+            {"valid": True, "command": shlex.join(command), **lazy.console.contents_of(recipe)}
+        )
     else:
-        text = "\n".join(opening(recipe, shlex.join(command[1:])))
+        text = "\n".join(lazy.console.opening(recipe, shlex.join(command[1:])))
     say_and_keep(text, recipe)
 
 
@@ -289,17 +287,16 @@ def plan(
     """
     with within_memory(memory) as limit:
         recipe, command = load(words, "plan", exact=exact)
-    from neusee.workflows.explain import run_forecast
 
     check_device(device)
     store = the_store()
     if devices:
         with refusing():
-            forecast = run_forecast.Forecast(
-                run_forecast.simulated_lines(recipe, store, devices), [], {}, False
+            forecast = lazy.run_forecast.Forecast(
+                lazy.run_forecast.simulated_lines(recipe, store, devices), [], {}, False
             )
     else:
-        forecast = run_forecast.forecast(recipe, store, device, limit)
+        forecast = lazy.run_forecast.forecast(recipe, store, device, limit)
     text = (
         json_line({"command": shlex.join(command), **asdict(forecast)})
         if as_json
@@ -325,11 +322,10 @@ def why(
     `sensor.read_noise 10.5 -> 20 e- (argument 2)`, or the code that changed.
     """
     recipe, _ = load(words, before=1)
-    from neusee.workflows.explain.why_rerun import why_lines
 
     store = the_store()
     with failing(ValueError):
-        lines = why_lines(recipe, store, step, device)
+        lines = lazy.why_rerun.why_lines(recipe, store, step, device)
     say_and_keep("\n".join(lines), recipe, store)
 
 
@@ -339,9 +335,8 @@ def config(words: Words = None, debug: Debug = False) -> None:
     The output is YAML: a recipe that can be run.
     """
     recipe, _ = load(words)
-    from neusee.workflows.simulation.simulate_recipe import recipe_text
 
-    say_and_keep("\n".join(recipe_text(recipe).splitlines()), recipe)
+    say_and_keep("\n".join(lazy.simulate_recipe.recipe_text(recipe).splitlines()), recipe)
 
 
 def report(
@@ -354,8 +349,6 @@ def report(
     debug: Debug = False,
 ) -> None:
     """Write the page of a run again from stored results."""
-    from neusee.workflows.report.run_folder import find_run, rebuild
-
     with failing(FileNotFoundError):
         say([str(rebuild(find_run(folder, out)))])
 
@@ -382,17 +375,18 @@ def safety(
     """
     recipe, command = load(words, "safety")
     store = the_store()
-    from neusee.workflows.graph.run_error import RunError
-    from neusee.workflows.safety.run_safety import assess
-    from neusee.workflows.safety.safety_text import lines
 
-    with refusing(), failing(RunError, code=FAILED):
-        folder, assessment = assess(recipe, store, out, command)
+    with refusing(), failing(lazy.run_error.RunError, code=FAILED):
+        folder, assessment = lazy.run_safety.assess(recipe, store, out, command)
 
     def text(page: str) -> str:
         if as_json:
             return json_line({"report": page, **assessment.document})
-        return page if quiet else "\n".join([*lines(assessment.paragraphs), "", f"page   {page}"])
+        return (
+            page
+            if quiet
+            else "\n".join([*lazy.safety_text.lines(assessment.paragraphs), "", f"page   {page}"])
+        )
 
     say([text(str(folder / "report.html"))])
     keep_answer(text, as_json, out, folder, assessment.report, recipe)
@@ -440,12 +434,11 @@ def sweep(
         fail(f"--on-error {on_error}: write stop or continue")
     check_device(device)
     store = the_store()
-    from neusee.workflows.cli.sweep_screen import run_sweep
 
     policy: OnError = "continue" if on_error == "continue" else "stop"
     with refusing(), resumable(lambda: kept_in(store, "the points that are finished are")):
         search_for_garbage()
-        code = run_sweep(
+        code = lazy.sweep_screen.run_sweep(
             name,
             words,
             first=first,
@@ -508,16 +501,17 @@ def restore(
     frames, changes, first = split_frames(words)
     check_device(device)
     folder = Path.cwd()
-    from neusee.workflows.restoration.frame_recipes import named_frames, recipes_of
 
     with within_memory(memory) as limit, refusing():
-        files = named_frames(frames, folder)
-        recipes = recipes_of(files, camera, mask, changes, folder, first, psf)
+        files = lazy.frame_recipes.named_frames(frames, folder)
+        recipes = lazy.frame_recipes.recipes_of(files, camera, mask, changes, folder, first, psf)
     store, silent = the_store(), quiet or as_json
     options = option_words({"camera": camera, "mask": mask, "psf": psf})
-    from neusee.workflows.graph.run_error import RunError
 
-    with resumable(lambda: kept_in(store, "finished steps are")), failing(RunError, code=FAILED):
+    with (
+        resumable(lambda: kept_in(store, "finished steps are")),
+        failing(lazy.run_error.RunError, code=FAILED),
+    ):
         for file, recipe in zip(files, recipes, strict=True):
             command = ["neusee", "restore", str(file), *changes, *options]
             done = _restored(recipe, store, out, command, (device, limit), silent)
@@ -533,19 +527,22 @@ def _restored(
     silent: bool,
 ) -> Simulation:
     """Run the recipe of a frame, with the lines of its steps unless the command is silent."""
-    from neusee.workflows.engine.wanted_steps import steps_of, wanted
-    from neusee.workflows.explain.run_forecast import lanes_for, planned
-    from neusee.workflows.report import console
-    from neusee.workflows.simulation.simulate_recipe import simulate
-    from neusee.workflows.tolerance.cheaper_steps import with_substitutions
-
     device, limit = place
-    _refuse_beyond_memory(planned(recipe, store, lanes_for(recipe, device, limit)), limit)
+    _refuse_beyond_memory(
+        lazy.run_forecast.planned(
+            recipe, store, lazy.run_forecast.lanes_for(recipe, device, limit)
+        ),
+        limit,
+    )
     if not silent:
-        say(console.opening(recipe, shlex.join(command[1:])))
-    cheaper = with_substitutions(recipe, wanted(recipe))
-    with console.RunTable(cheaper, steps_of(cheaper), console.mode_for(silent), {}) as table:
-        return simulate(cheaper, store, out, command, device, table.watch, None, limit)
+        say(lazy.console.opening(recipe, shlex.join(command[1:])))
+    cheaper = lazy.cheaper_steps.with_substitutions(recipe, lazy.wanted_steps.wanted(recipe))
+    with lazy.console.RunTable(
+        cheaper, lazy.wanted_steps.steps_of(cheaper), lazy.console.mode_for(silent), {}
+    ) as table:
+        return lazy.simulate_recipe.simulate(
+            cheaper, store, out, command, device, table.watch, None, limit
+        )
 
 
 def _say(done: Simulation, as_json: bool, quiet: bool) -> None:
@@ -554,11 +551,9 @@ def _say(done: Simulation, as_json: bool, quiet: bool) -> None:
     elif quiet:
         say([str(done.page)])
     else:
-        from neusee.workflows.report.console import story_lines
-
         say(
             [
-                *story_lines(done.document),
+                *lazy.console.story_lines(done.document),
                 "",
                 f"restored {done.folder / 'data' / 'restored.png'}",
                 f"report   {done.page}",
@@ -599,20 +594,18 @@ def compare(
     --fail-above says what may differ at most; a number that only one run has differs by more than
     any limit.
     """
-    from neusee.workflows.comparison.run_record import NotComparable, read_record
-
-    with failing(NotComparable):
-        records = [read_record(where, out) for where in (left, right)]
-        from neusee.workflows.comparison import comparison_report
-
-        comparison = comparison_report.compare(*records)
-    page = comparison_report.write_comparison(comparison, out, ["neusee", *TYPED]) / "report.html"
+    with failing(lazy.run_record.NotComparable):
+        records = [lazy.run_record.read_record(where, out) for where in (left, right)]
+        comparison = lazy.comparison_report.compare(*records)
+    page = (
+        lazy.comparison_report.write_comparison(comparison, out, ["neusee", *TYPED]) / "report.html"
+    )
     if as_json:
-        say_json({"report": str(page), **comparison_report.document(comparison)})
+        say_json({"report": str(page), **lazy.comparison_report.document(comparison)})
     elif quiet:
         say([str(page)])
     else:
-        say([*comparison_report.lines(comparison), "", f"page   {page}"])
+        say([*lazy.comparison_report.lines(comparison), "", f"page   {page}"])
     if comparison.largest > fail_above:
         worst = max(comparison.numbers, key=lambda number: number.relative)
         fail(

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 from neusee.workflows.answers import repeated_command
 from neusee.workflows.answers.repeated_command import Said
+from neusee.workflows.answers.results_folder import FOLDER, PAGE, TOOK, RunResults
+from neusee.workflows.cli import lazy_imports as lazy
 
 if TYPE_CHECKING:
     from neusee.workflows.graph.recipe_graph import Recipe
@@ -46,10 +48,7 @@ def say_and_keep(
     ``store``: the store on which the answer rests. ``memory``: bytes that must be free, without
     which it would differ.
     """
-    # imports typer, which a stored answer does not need
-    from neusee.workflows.cli.command_frame import say_line
-
-    say_line(text)
+    lazy.command_frame.say_line(text)
     for command in repeated_command.running:
         results = Said(store, memory) if store else None
         command.keep(text, False, recipe, results)
@@ -67,8 +66,6 @@ def keep_answer(
 
     ``text`` returns the text of the command for the path of its page.
     """
-    from neusee.workflows.answers.results_folder import PAGE
-
     for command in repeated_command.running:
         command.keep(text(PAGE), as_json, recipe, repeated_command.Results(folder, out, report))
 
@@ -86,8 +83,6 @@ def keep_run(
     ``text`` returns the text of the command for the path of the folder of the run and the seconds
     that it took.
     """
-    from neusee.workflows.answers.results_folder import FOLDER, TOOK, RunResults
-
     for command in repeated_command.running:
         results = RunResults(done.folder, out, done.document, done.taken, store)
         command.keep(text(FOLDER, TOOK), as_json, recipe, results)

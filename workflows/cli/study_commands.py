@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from neusee.workflows.cli import lazy_imports as lazy
 from neusee.workflows.cli.command_frame import (
     fail,
     failing,
@@ -299,24 +300,21 @@ def _run(
     recipe, command = load(words, "study", kind)
     refuse(recipe, options)
     store = the_store()
-    from neusee.workflows.api import verbs
-    from neusee.workflows.graph.run_error import RunError
-    from neusee.workflows.studies.run_study import count_failures
 
     command += option_words(options)
     progress = progress_lines(quiet or as_json)
     stopping = resumable(lambda: kept_in(store, "the parts that are finished are"))
     with (
         stopping,
-        failing(RunError, ImportError, code=FAILED),
+        failing(lazy.run_error.RunError, ImportError, code=FAILED),
         failing(ValueError, code=BAD),
         refusing(),
     ):
-        folder = verbs.study(
+        folder = lazy.verbs.study(
             recipe, kind=kind, store=store, out=out, command=command, progress=progress, **options
         )
     say_folder(folder, as_json)
-    if count := count_failures(folder):
+    if count := lazy.run_study.count_failures(folder):
         fail(f"{count} do not hold: see {folder / 'report.html'}", FAILED)
 
 
@@ -415,13 +413,15 @@ def evaluate(
 
 def _evaluate(name: str, **options: Any) -> Path:
     store = the_store()
-    from neusee.workflows.api import verbs
-    from neusee.workflows.evaluation.pipelines import EvaluationRefused
-    from neusee.workflows.graph.run_error import RunError
 
     stopping = resumable(lambda: kept_in(store, "the points that are finished are"))
-    with stopping, failing(EvaluationRefused), failing(RunError, code=FAILED), refusing():
-        return verbs.evaluate(name, store=store, **options)
+    with (
+        stopping,
+        failing(lazy.pipelines.EvaluationRefused),
+        failing(lazy.run_error.RunError, code=FAILED),
+        refusing(),
+    ):
+        return lazy.verbs.evaluate(name, store=store, **options)
 
 
 def _numbers(text: str) -> list[float]:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from neusee.workflows.cli import lazy_imports as lazy
 from neusee.workflows.cli.command_frame import (
     fail,
     failing,
@@ -83,11 +84,8 @@ def train(
         _refuse_stage_and_mesh(recipe, stage, mesh)
         check_device(device)
         return _lift(recipe, command, out, device, quiet, as_json)
-    from neusee.workflows.api import verbs
-    from neusee.workflows.graph.run_error import RunError
-    from neusee.workflows.training.process_mesh import MeshError, device_here, joined, processes
 
-    device, (rank, world) = device_here(device), processes()
+    device, (rank, world) = lazy.process_mesh.device_here(device), lazy.process_mesh.processes()
     check_device(device)
     silent = quiet or as_json or rank > 0
     who = f"process {rank}: " if world > 1 else ""
@@ -99,13 +97,13 @@ def train(
     lengths = _lengths(recipe, stages)
     with (
         resumable(lambda: kept_training(out, recipe.name)),
-        failing(RunError, ValueError, ArithmeticError, code=FAILED, before=who),
-        failing(MeshError, before=who),
+        failing(lazy.run_error.RunError, ValueError, ArithmeticError, code=FAILED, before=who),
+        failing(lazy.process_mesh.MeshError, before=who),
         refusing(),
-        joined(mesh, device) as processes_here,
+        lazy.process_mesh.joined(mesh, device) as processes_here,
         _loss_bar(silent, lengths) as watch,
     ):
-        folder = verbs.train(
+        folder = lazy.verbs.train(
             recipe,
             store=the_store(),
             device=device,
@@ -150,18 +148,15 @@ def _lift(
     recipe: Recipe, command: list[str], out: Path, device: str, quiet: bool, as_json: bool
 ) -> None:
     """Train the network of a recipe that reconstructs spectra from RGB."""
-    from neusee.workflows.api import verbs
-    from neusee.workflows.graph.run_error import RunError
-
     assert recipe.lifting is not None
     lengths, silent = {0: recipe.lifting.iterations}, quiet or as_json
     with (
         resumable(lambda: kept_training(out, recipe.name)),
-        failing(RunError, ValueError, ArithmeticError, code=FAILED),
+        failing(lazy.run_error.RunError, ValueError, ArithmeticError, code=FAILED),
         refusing(),
         _loss_bar(silent, lengths) as watch,
     ):
-        folder = verbs.train(
+        folder = lazy.verbs.train(
             recipe,
             store=the_store(),
             device=device,
