@@ -7,7 +7,7 @@ import functools
 import math
 import re
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -81,20 +81,26 @@ def _beside(name: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
     if not labels:
         return []
     if name == _SETTINGS:
-        return [
-            f"{label} {old.get(label, USUAL.get(label))} -> {new.get(label, USUAL.get(label))},"
-            " a setting of this process"
-            for label in labels
-        ]
+        return [_other_setting(label, old, new) for label in labels]
+    return [_other_cause(name, old, new)]
+
+
+def _other_setting(label: str, old: dict[str, str], new: dict[str, str]) -> str:
+    before, after = old.get(label, USUAL.get(label)), new.get(label, USUAL.get(label))
+    return f"{label} {before} -> {after}, a setting of this process"
+
+
+def _other_cause(name: str, old: dict[str, str], new: dict[str, str]) -> str:
+    """Return the text clause for a version or a dependency that differs."""
     if name == "Python" or name.startswith("package "):
-        return [_other_version(name, old.get("version"), new.get("version"))]
+        return _other_version(name, old.get("version"), new.get("version"))
     if name == "closure":
-        return ["a value that the function of the node holds from the function around it changed"]
+        return "a value that the function of the node holds from the function around it changed"
     if name == _PROGRAM:
-        return ["the program itself changed, which the node imports (neusee/workflows)"]
+        return "the program itself changed, which the node imports (neusee/workflows)"
     if not old or not new:
-        return [f"{name} is declared {'now' if new else 'no more'}"]
-    return [f"declared {name} changed" if name.startswith("file ") else f"{name} changed"]
+        return f"{name} is declared {'now' if new else 'no more'}"
+    return f"declared {name} changed" if name.startswith("file ") else f"{name} changed"
 
 
 def _other_version(name: str, before: str | None, after: str | None) -> str:
@@ -111,15 +117,15 @@ def _inside(module: str, old: dict[str, str], new: dict[str, str]) -> list[str]:
     file = _file(module)
     differ = [label for label in new if label in old and old[label] != new[label]]
     lines = _lines(module) if differ else {}
-    places = {label: f" (line {lines[label]})" if label in lines else "" for label in differ}
-    changed = [
-        f"{'code of ' + label if label.endswith('()') else _named(label)} in {file}"
-        f" changed{places[label]}"
-        for label in differ
-    ]
+    changed = [_changed_definition(label, file, lines.get(label)) for label in differ]
     added = [f"{_named(label)} was added to {file}" for label in new if label not in old]
     removed = [f"{_named(label)} was removed from {file}" for label in old if label not in new]
     return changed + added + removed
+
+
+def _changed_definition(label: str, file: str, line: int | None) -> str:
+    definition = f"code of {label}" if label.endswith("()") else _named(label)
+    return f"{definition} in {file} changed{f' (line {line})' if line is not None else ''}"
 
 
 def _lines(module: str) -> dict[str, int]:
@@ -204,11 +210,7 @@ class Wording:
         if isinstance(new, Mapping) and "file" in new:
             inside = f" ({path}{f', {source}' if source else ''})" if setting else where
             return f"file {_file_wording(step, name)}: {_other_file(old, new)}{inside}"
-        written = (
-            setting.value
-            if setting and not (isinstance(setting.value, str) and "${" in setting.value)
-            else None
-        )
+        written = _written_value(setting)
         if old is _ABSENT:
             return f"{path} is new: {_as_written(written, new)}{where}"
         before, after = _both(written, old, new)
@@ -223,12 +225,7 @@ class Wording:
         if name not in step.param_marks:
             return None, f"default of {step.node.path}"
         mark = str(step.param_marks[name])
-        marked = self._marked.get(mark, [])
-        here = ("steps", step.name.partition("[")[0], "with", name)
-        named = [s for s in marked if s.path == here] or [
-            s for s in marked if s.path[-1:] == (name,)
-        ]
-        setting = (named or marked)[0] if named or len(marked) == 1 else None
+        setting = _setting_of(self._marked.get(mark, []), step, name)
         return setting, setting.source if setting else mark
 
     @cached_property
@@ -239,6 +236,21 @@ class Wording:
             if not setting.default:
                 settings[setting.source.partition(", ")[0]].append(setting)
         return settings
+
+
+def _setting_of(marked: list[Setting], step: Step, name: str) -> Setting | None:
+    """Return which of the settings at one location gives the parameter ``name`` its value."""
+    here = ("steps", step.name.partition("[")[0], "with", name)
+    of_step = [setting for setting in marked if setting.path == here]
+    named = of_step or [setting for setting in marked if setting.path[-1:] == (name,)]
+    return (named or marked)[0] if named or len(marked) == 1 else None
+
+
+def _written_value(setting: Setting | None) -> Any:
+    """Return the value that the user wrote, or None for a reference to another value."""
+    if setting is None or (isinstance(setting.value, str) and "${" in setting.value):
+        return None
+    return setting.value
 
 
 def _file_wording(step: Step | None, name: str) -> str:
@@ -260,10 +272,7 @@ def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
     """
     after = _as_written(written, new)
     if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
-        parts = (
-            written if isinstance(written, list) and len(written) == len(old) else [None] * len(old)
-        )
-        return f"[{', '.join(map(_in_unit_of, parts, new, old))}]", after
+        return _parts_in_units_of(written, new, old), after
     if isinstance(old, Mapping) and isinstance(new, Mapping):
         return _items(old, new)
     unit = _unit(written, new)
@@ -272,6 +281,12 @@ def _both(written: Any, old: Any, new: Any) -> tuple[str, str]:
     if before in (spoken(new), after.partition(" ")[0]):
         return repr(old), repr(new)
     return before, after
+
+
+def _parts_in_units_of(written: Any, new: list[Any], old: list[Any]) -> str:
+    is_alike = isinstance(written, list) and len(written) == len(old)
+    parts = written if is_alike else [None] * len(old)
+    return f"[{', '.join(map(_in_unit_of, parts, new, old))}]"
 
 
 def _in_unit_of(written: Any, new: Any, old: Any) -> str:
@@ -380,6 +395,20 @@ class Roots:
             way.append(pair.label)
             pair = self.above[pair]
         return way[::-1]
+
+
+def _only_in(names: Iterable[str], others: Container[str]) -> list[str]:
+    return [name for name in names if name not in others]
+
+
+def _changed_pairs(now: Mapping[str, Key], then: Mapping[str, Key]) -> list[Pair]:
+    """Return the names that both have, with different keys."""
+    return [Pair(name, key, then[name]) for name, key in now.items() if then.get(name, key) != key]
+
+
+def _each_once(texts: Iterable[str], instead: str) -> list[str]:
+    """Return each text once, with ``instead`` in place of an empty text."""
+    return list(dict.fromkeys(text or instead for text in texts))
 
 
 class Comparison:
@@ -499,14 +528,11 @@ class Comparison:
             return self._source(path, labels[0], new[0], old[0])
         then = dict(zip([self.step(key) or key for key in old], old, strict=True))
         now = dict(zip(labels, new, strict=True))
-        if len(old) == len(new) and (len(then) < len(old) or not then.keys() & now.keys()):
+        has_names = len(then) == len(old) and not then.keys().isdisjoint(now)
+        if len(old) == len(new) and not has_names:
             return self._one_by_one(path, labels, new, old)
-        texts = self._joined(
-            path, [n for n in now if n not in then], [n for n in then if n not in now]
-        )
-        pairs = [
-            Pair(name, key, then[name]) for name, key in now.items() if then.get(name, key) != key
-        ]
+        texts = self._joined(path, _only_in(now, then), _only_in(then, now))
+        pairs = _changed_pairs(now, then)
         return texts or ([] if pairs else ["the order of its sources changed"]), pairs
 
     def _one_by_one(
@@ -532,12 +558,12 @@ class Comparison:
         exchanged = f"reads {label}, not {was}{self._wired(path)}"
         between, key = self._between(new, (was,))
         if key is not None:
-            texts = [self._came(name) or exchanged for name in between]
-            return list(dict.fromkeys(texts)), [Pair(str(was), key, old)] if key != old else []
+            texts = _each_once(map(self._came, between), exchanged)
+            return texts, [Pair(str(was), key, old)] if key != old else []
         between, key = self._between(old, (label, self.step(new)))
         if key is not None:
-            texts = [self._went(name) or exchanged for name in between]
-            return list(dict.fromkeys(texts)), [Pair(label, new, key)] if key != new else []
+            texts = _each_once(map(self._went, between), exchanged)
+            return texts, [Pair(label, new, key)] if key != new else []
         before, after = self.origin(old), self.origin(new)
         if before and after and before["node"] == after["node"]:
             return [], [Pair(label, new, old)]

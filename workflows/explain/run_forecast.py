@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from neusee.workflows.engine.cost_model import Costs, Estimate, Range, sizes_of
 from neusee.workflows.engine.local_executor import lanes_of, memory_limit, program_memory
@@ -17,21 +17,19 @@ from neusee.workflows.engine.placement_inputs import past_costs, prepare, runnin
 from neusee.workflows.engine.resolve_keys import resolve
 from neusee.workflows.engine.step_job import Lane, StepJob
 from neusee.workflows.engine.wanted_steps import steps_of, wanted
+from neusee.workflows.explain.cluster_forecast import cluster_lines
 from neusee.workflows.graph.recipe_graph import Recipe, needed, nodes_of
 from neusee.workflows.keys.cache_key import Key, device_kind
 from neusee.workflows.keys.code_digest import Code
 from neusee.workflows.placement.heft_schedule import Schedule, TooLarge
+from neusee.workflows.placement.machine_file import read_machines
 from neusee.workflows.report.contents import FIGURES, files_of
 from neusee.workflows.report.files_beside import LARGE, ROOM
 from neusee.workflows.report.terminal_text import columns
 from neusee.workflows.store.cache_settings import UNITS, format_size
+from neusee.workflows.store.metadata import Metadata
 from neusee.workflows.store.result_store import Store
 from neusee.workflows.tolerance.cheaper_steps import with_substitutions
-
-if TYPE_CHECKING:
-    from neusee.workflows.engine.cost_model import Estimate
-    from neusee.workflows.store.result_store import Store
-
 
 # --- forecast table -------------------------------------------------------------------------------
 
@@ -290,18 +288,15 @@ def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane], beside: flo
     """
     recipe = with_substitutions(recipe, wanted(recipe))
     order = steps_of(recipe)
-    devices = [lane.device for lane in lanes.values()]
+    devices = _devices_of(lanes)
     code = Code(store.code_memo)
     resolved = resolve(recipe, order, store, ",".join(devices), code)
     keys, left_out = resolved.keys, {name: resolved.left_out(name) for name in order}
     awake, loaded = _awake(recipe, keys, store, wanted(recipe))
-    makers: dict[Key, str] = {}
-    for name in order:
-        if name in awake and not left_out[name]:
-            makers.setdefault(keys[name], name)
-    works = [_work(recipe, name, keys, devices) for name in makers.values()]
+    makers = _first_of_each_key(_running(order, awake, left_out), keys)
+    works = [_work(recipe, name, keys, devices) for name in makers]
     costs = past_costs(store, sizes_of(recipe, order)) if works else Costs([])
-    abouts = {work.key: about for work in works if (about := store.about(work.key))}
+    abouts = _metadata_of(works, store)
     kinds = sorted({lane.kind for lane in lanes.values()} | {"cpu"})
     expected = costs.in_turn(((w.step.name, w.step, abouts.get(w.key)) for w in works), kinds)
     empty = Plan(recipe, order, keys, left_out, awake, loaded, expected, {}, None)
@@ -310,11 +305,41 @@ def planned(recipe: Recipe, store: Store, lanes: Mapping[str, Lane], beside: flo
     except TooLarge as error:
         return replace(empty, refused=str(error))
     where = {w.step.name: w.lane for w in prepared.works}
-    running = running_peak(prepared.schedule, lanes) + (
-        held_beside(recipe, costs, beside) if works else 0.0
-    )
+    running = running_peak(prepared.schedule, lanes)
+    if works:
+        running += held_beside(recipe, costs, beside)
     plan = replace(empty, lanes=where, schedule=prepared.schedule, running=running)
     return _with_report(plan, store, costs, lanes, code)
+
+
+def _devices_of(lanes: Mapping[str, Lane]) -> list[str]:
+    return [lane.device for lane in lanes.values()]
+
+
+def _running(
+    order: Iterable[str], awake: Container[str], left_out: Mapping[str, bool | None]
+) -> list[str]:
+    """Return the steps that will run, as far as it is known."""
+    return [name for name in order if name in awake and not left_out[name]]
+
+
+def _memory_of(lanes: Collection[Lane]) -> float:
+    """Return the bytes that the process may use on ``lanes``, with what it holds itself."""
+    return sum(lane.memory for lane in lanes) + max((lane.held for lane in lanes), default=0.0)
+
+
+def _first_of_each_key(names: Iterable[str], keys: Mapping[str, Key]) -> list[str]:
+    """Return the steps ``names`` without those that have the key of an earlier one."""
+    makers: dict[Key, str] = {}
+    for name in names:
+        makers.setdefault(keys[name], name)
+    return list(makers.values())
+
+
+def _metadata_of(works: Iterable[StepJob], store: Store) -> dict[Key, Metadata]:
+    """Return the metadata of the results that the store knows, by key."""
+    abouts = ((work.key, store.about(work.key)) for work in works)
+    return {key: about for key, about in abouts if about}
 
 
 def _with_report(
@@ -324,19 +349,13 @@ def _with_report(
     small for the report.
     """
     cpu = [lane for lane in lanes.values() if lane.kind == "cpu"]
-    shown = shown_steps(plan.recipe)
+    shown, devices = shown_steps(plan.recipe), _devices_of(lanes)
     order = needed(plan.recipe, shown)
-    keys = resolve(
-        plan.recipe, order, store, ",".join(lane.device for lane in lanes.values()), code
-    ).keys
+    keys = resolve(plan.recipe, order, store, ",".join(devices), code).keys
     of_run = {plan.keys[name] for name in plan.order}
-    makers: dict[Key, str] = {}
-    for name in _awake(plan.recipe, keys, store, shown, of_run)[0]:
-        makers.setdefault(keys[name], name)
-    devices = [lane.device for lane in lanes.values()]
-    works = [
-        _work(plan.recipe, name, keys, devices) for name in order if name in set(makers.values())
-    ]
+    awake = _awake(plan.recipe, keys, store, shown, of_run)[0]
+    makers = set(_first_of_each_key(awake, keys))
+    works = [_work(plan.recipe, name, keys, devices) for name in order if name in makers]
     costs = costs.with_sizes(sizes_of(plan.recipe, order))
     try:
         peak = report_peak(
@@ -344,7 +363,7 @@ def _with_report(
         )
     except TooLarge as error:
         return replace(plan, refused=f"for the report, {error}")
-    limit = sum(lane.memory for lane in cpu) + max((lane.held for lane in cpu), default=0.0)
+    limit = _memory_of(cpu)
     plan = replace(plan, reporting=peak)
     if not cpu or peak <= limit:
         return plan
@@ -388,13 +407,7 @@ def _totals(plan: Plan) -> dict[str, Any]:
     range, bytes and memory.
     """
     took = plan.schedule.makespan if plan.schedule else None
-    sums = [(cost.seconds["cpu"], cost.spread[1]) for cost in plan.expected.values()]
-    alone = sum(seconds for seconds, _ in sums)
-    ends = {
-        "least": sum(seconds * around.least for seconds, around in sums),
-        "most": sum(seconds * around.most for seconds, around in sums),
-    }
-    ranged = {end: took * total / alone for end, total in ends.items()} if took and alone else {}
+    ranged = _range_of(took, plan.expected.values()) if took else {}
     return {
         "steps": len(plan.expected),
         "guesses": sum(not cost.known for cost in plan.expected.values()),
@@ -405,13 +418,23 @@ def _totals(plan: Plan) -> dict[str, Any]:
     }
 
 
+def _range_of(took: float, costs: Collection[Estimate]) -> dict[str, float]:
+    """Return the least and the most seconds of a run that is expected to take ``took``; none if
+    all its steps take no time.
+    """
+    times = [(cost.seconds["cpu"], cost.spread[1]) for cost in costs]
+    alone = sum(seconds for seconds, _ in times)
+    if not alone:
+        return {}
+    least = sum(seconds * around.least for seconds, around in times)
+    most = sum(seconds * around.most for seconds, around in times)
+    return {"least": took * least / alone, "most": took * most / alone}
+
+
 def simulated_lines(recipe: Recipe, store: Store, machines: str) -> list[str]:
     """Return the forecast of a run with an empty store on the machines of a YAML file, as lines
     of text.
     """
-    from neusee.workflows.explain.cluster_forecast import cluster_lines
-    from neusee.workflows.placement.machine_file import read_machines
-
     cluster, recipe = read_machines(machines), with_substitutions(recipe, wanted(recipe))
     costs, kinds = (
         past_costs(store, sizes_of(recipe, steps_of(recipe))),
@@ -432,14 +455,7 @@ def _sums(plan: Plan, lanes: Mapping[str, Lane], totals: Mapping[str, Any]) -> l
         lines += _wrapped(
             f"left out or not, depending on the values of the inputs: {', '.join(unsure)}"
         )
-    seconds = totals["seconds"]
-    took = (
-        f"about {seconds_text(seconds)} s"
-        if seconds
-        else "no schedule"
-        if seconds is None
-        else "no time"
-    )
+    took = _took_text(totals["seconds"])
     guessed = f", {totals['guesses']} of them guessed at the upper end, because never measured"
     read, new = format_size(sum(plan.loaded.values())), format_size(int(totals["bytes"]))
     would = (
@@ -447,18 +463,32 @@ def _sums(plan: Plan, lanes: Mapping[str, Lane], totals: Mapping[str, Any]) -> l
         f" run{guessed if totals['guesses'] else ''}"
     )
     lines += _wrapped(f"{would}: {took}, {new} new, {read} to load")
-    if plan.schedule and plan.expected:
+    if plan.expected:
+        lines += _memory_lines(plan, lanes)
+    return [*lines, *(_wrapped(f"refused: {plan.refused}") if plan.refused else [])]
+
+
+def _took_text(seconds: Mapping[str, float] | float | None) -> str:
+    if seconds is None:
+        return "no schedule"
+    return f"about {seconds_text(seconds)} s" if isinstance(seconds, Mapping) else "no time"
+
+
+def _memory_lines(plan: Plan, lanes: Mapping[str, Lane]) -> list[str]:
+    """Return lines with the peak memory of each device and of the process."""
+    lines = []
+    if plan.schedule:
         for name, lane in lanes.items():
             peak = format_size(plan.schedule.peak.get(name, 0.0))
             lines.append(f"memory  {name}: {peak} at most, of {format_size(max(lane.memory, 0.0))}")
-    if plan.running and plan.expected:
+    if plan.running:
         held = format_size(max(lane.held for lane in lanes.values()))
         lines += _wrapped(
             f"memory  process: {format_size(plan.running)} while the steps run, of which the"
             f" program itself holds {held}; {format_size(plan.reporting)} while the report is"
             " written"
         )
-    return [*lines, *(_wrapped(f"refused: {plan.refused}") if plan.refused else [])]
+    return lines
 
 
 def _wrapped(text: str) -> list[str]:

@@ -65,21 +65,20 @@ def changes(base: Config, other: Config, apart: str) -> list[str]:
     """Return the overrides that turn the values of one recipe into those of another, but for the
     block ``apart``.
     """
-    own, was = (
-        {
-            path: s.value
-            for path, s in config.settings.items()
-            if not s.default and s.path[0] != apart
-        }
-        for config in (other, base)
-    )
-    removed = [f"~{path}" for path in was if path not in own]
-    put = [f"{path}={flow(x)}" if path in was else f"+{path}={flow(x)}" for path, x in own.items()]
-    return removed + [
-        text
-        for text, (path, x) in zip(put, own.items(), strict=True)
-        if path not in was or was[path] != x
-    ]
+    own, was = _given_values(other, apart), _given_values(base, apart)
+    overrides = [f"~{path}" for path in was if path not in own]
+    for path, value in own.items():
+        if path not in was:
+            overrides.append(f"+{path}={flow(value)}")
+        elif was[path] != value:
+            overrides.append(f"{path}={flow(value)}")
+    return overrides
+
+
+def _given_values(config: Config, apart: str) -> dict[str, Any]:
+    """Return the values of a recipe that are no defaults, but for those of the block ``apart``."""
+    given = {path: s for path, s in config.settings.items() if not s.default}
+    return {path: setting.value for path, setting in given.items() if setting.path[0] != apart}
 
 
 def _lines(tree: Mapping[str | int, Any], depth: int) -> Iterator[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Literal
 
 from neusee.nodes import Check, Node, TensorStats
@@ -86,6 +87,11 @@ __all__ = [
 Wire = str | tuple[str, ...] | None
 
 
+def names_in(wire: Wire) -> tuple[str, ...]:
+    """Return the names of the steps that a wire reads."""
+    return (wire,) if isinstance(wire, str) else wire or ()
+
+
 @dataclass(frozen=True, slots=True)
 class Step:
     """One step of a recipe: a node (a function), its validated parameters and the steps that
@@ -105,8 +111,8 @@ class Step:
     sources: tuple[str, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        wires = ((wire,) if isinstance(wire, str) else wire for wire in self.wires.values())
-        object.__setattr__(self, "sources", tuple(name for names in wires for name in names or ()))
+        names = chain.from_iterable(map(names_in, self.wires.values()))
+        object.__setattr__(self, "sources", tuple(names))
 
 
 @dataclass(frozen=True, slots=True)
@@ -319,8 +325,12 @@ def knowers(recipe: Recipe, steps: Iterable[str]) -> list[str]:
 
 def known(recipe: Recipe, readers: Iterable[str]) -> list[str]:
     """Return the steps whose results tell the steps ``readers`` what optics and lasers are."""
-    wires = (recipe.steps[name].wires.get(key) for name in readers for key in KNOWLEDGE)
-    return [name for wire in wires for name in ((wire,) if isinstance(wire, str) else wire or ())]
+    names: list[str] = []
+    for reader in readers:
+        wires = recipe.steps[reader].wires
+        for key in KNOWLEDGE:
+            names += names_in(wires.get(key))
+    return names
 
 
 def with_copies(

@@ -118,11 +118,9 @@ def tensors_of(form: Form) -> list[Tensor]:
 
     if isinstance(form, Tensor):
         return [form]
-    return (
-        [tensor for item in form for tensor in tensors_of(item)]
-        if isinstance(form, tuple | list)
-        else []
-    )
+    if isinstance(form, tuple | list):
+        return list(chain.from_iterable(map(tensors_of, form)))
+    return []
 
 
 def alike(form: Form, other: Form) -> bool:
@@ -134,10 +132,10 @@ def alike(form: Form, other: Form) -> bool:
     if type(form) is not type(other):
         return False
     if isinstance(form, Tensor):
-        same = (
-            form.shape == other.shape and form.dtype == other.dtype and form.device == other.device
-        )
-        return same and (form.device.type == "meta" or equal(form, other))
+        looks = (form.shape, form.dtype, form.device)
+        if looks != (other.shape, other.dtype, other.device):
+            return False
+        return form.device.type == "meta" or equal(form, other)
     if isinstance(form, list | tuple):
         return len(form) == len(other) and all(map(alike, form, other))
     return form is None or (isinstance(form, str | int | float) and form == other)

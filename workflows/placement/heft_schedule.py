@@ -8,7 +8,7 @@ from bisect import bisect_left, bisect_right
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 
@@ -149,6 +149,14 @@ Copy = tuple[float, float, float]  #: departure from the source, arrival, last u
 Of = tuple[int, float, int]  #: task of the result, bytes of the result, device
 
 
+def _most_memory(graph: Graph) -> float:
+    """Return an upper bound of the bytes that a schedule holds on a device at any time."""
+    numbers = range(len(graph.tasks))
+    most = sum(graph.own) + max((graph.work(i, 1) for i in numbers), default=0.0)
+    parts_sent = (graph.sizes[i] for i in numbers if graph.tasks[i].takes)
+    return most + sum(max(0.0, math.ceil(size)) for size in chain.from_iterable(parts_sent))
+
+
 class PartialSchedule:
     """Unfinished schedule: a task is added after the tasks that compute its inputs, and keeps
     its device and times.
@@ -162,17 +170,8 @@ class PartialSchedule:
         self.free_at: list[float] = [0.0] * count
         self.left = [len(readers) for readers in graph.readers]
         self.gaps: list[tuple[list[float], list[float]]] = [([0.0], [math.inf]) for _ in devices]
-        upper_bound = sum(graph.own) + max((graph.work(i, 1) for i in range(count)), default=0.0)
-        sent = sum(
-            max(0.0, math.ceil(s))
-            for t, sizes in enumerate(graph.sizes)
-            for s in sizes
-            if graph.tasks[t].takes
-        )
-        self.rooms = [
-            MemoryProfile(d.memory) if bounded and d.memory < upper_bound + sent else None
-            for d in devices
-        ]
+        enough = _most_memory(graph) if bounded else -math.inf
+        self.rooms = [MemoryProfile(d.memory) if d.memory < enough else None for d in devices]
         # no delay to itself
         self.links = [[graph.cluster.link(a.name, b.name) for b in devices] for a in devices]
         self.least = [own + graph.work(i, graph.tasks[i].parts) for i, own in enumerate(graph.own)]
@@ -507,8 +506,15 @@ def _best(graph: Graph, orders: Sequence[Sequence[int]]) -> Schedule:
     schedule = _placed(PartialSchedule(graph, bounded=False), orders[0]).schedule()
     if all(peak <= memory[name] for name, peak in schedule.peak.items()):
         return schedule
+    return _shortest(graph, (*orders[1:], orders[0]))
+
+
+def _shortest(graph: Graph, orders: Sequence[Sequence[int]]) -> Schedule:
+    """Return the shortest schedule within the memory, or raise the least error of the task
+    orders.
+    """
     best, refused = None, list[TooLarge]()
-    for order in (*orders[1:], orders[0]):
+    for order in orders:
         board = _placed(PartialSchedule(graph), order, best.makespan if best else math.inf)
         if board.refused:
             refused.append(board.too_large())
@@ -528,31 +534,55 @@ def _placed(
     A task that does not fit into memory waits until later tasks free memory. The placement stops
     early if it cannot end before ``below``.
     """
-    graph = board.graph
-    missing, turn = [len(sources) for sources in graph.sources], {i: n for n, i in enumerate(order)}
-    ready = [n for n, i in enumerate(order) if not missing[i]]
-    waiting: list[int] = []
-    while ready or waiting:
-        forced = not ready
-        if forced:
-            ready, waiting = [min(waiting)], sorted(waiting)[1:]
-        n = heapq.heappop(ready)
+    turns = _Turns(board.graph, order)
+    while turns.ready or turns.waiting:
+        n, forced = turns.take()
         i = order[n]
         if forced:
             board.force(i)
-        elif not board.place(i, graph.able[i]):
-            waiting.append(n)
+        elif not board.place(i, board.graph.able[i]):
+            turns.waiting.append(n)
             continue
         if below < math.inf and (forced or board.end[i] >= below):
             return board
-        for reader in graph.readers[i]:
-            missing[reader] -= 1
-            if not missing[reader]:
-                heapq.heappush(ready, turn[reader])
-        if waiting and board.gave_back(i):
-            ready, waiting = [*ready, *waiting], []
-            heapq.heapify(ready)
+        turns.release(i)
+        if turns.waiting and board.gave_back(i):
+            turns.try_again()
     return board
+
+
+class _Turns:
+    """Places in an order of tasks: of those that may be placed now, the first one first, and of
+    those that wait until memory is free.
+    """
+
+    def __init__(self, graph: Graph, order: Sequence[int]) -> None:
+        self._readers = graph.readers
+        self._missing = [len(sources) for sources in graph.sources]
+        self._turn = {i: n for n, i in enumerate(order)}
+        self.ready = [n for n, i in enumerate(order) if not self._missing[i]]
+        self.waiting: list[int] = []
+
+    def take(self) -> tuple[int, bool]:
+        """Return the next place, and whether it was only waiting: a task that does not fit must
+        then be placed all the same.
+        """
+        if self.ready:
+            return heapq.heappop(self.ready), False
+        first, *self.waiting = sorted(self.waiting)
+        return first, True
+
+    def release(self, i: int) -> None:
+        """Let those tasks be placed that waited only for the result of task ``i``."""
+        for reader in self._readers[i]:
+            self._missing[reader] -= 1
+            if not self._missing[reader]:
+                heapq.heappush(self.ready, self._turn[reader])
+
+    def try_again(self) -> None:
+        """Let all waiting tasks be placed."""
+        self.ready, self.waiting = [*self.ready, *self.waiting], []
+        heapq.heapify(self.ready)
 
 
 # --- one device -----------------------------------------------------------------------------------

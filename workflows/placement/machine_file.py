@@ -109,12 +109,10 @@ def _devices(groups: list[dict[str, Any]]) -> dict[Device, dict[str, Any]]:
 
     A device has a name such as ``cpu``, or ``a/cuda:0`` for GPU 0 of the machine ``a``.
     """
-    rows = [
-        (machine, group)
-        for group in groups
-        for machine in group["node"]
-        for _ in range(group["count"])
-    ]
+    rows = list[tuple[str, dict[str, Any]]]()
+    for group in groups:
+        for machine in group["node"]:
+            rows += [(machine, group)] * group["count"]
     total, numbers = (
         Counter((machine, group["kind"]) for machine, group in rows),
         Counter[tuple[str, str]](),
@@ -290,12 +288,13 @@ def _absent(links: Value | None, kinds: set[str]) -> list[Diagnostic]:
     """Return a diagnostic for each kind of device, such as ``cuda``, that has a link but is not
     in the cluster.
     """
-    return [
-        _problem(link, f"there is no device of kind {name}; {nearest(name, kinds)}", link.key)
-        for pair, link in (links.items.items() if links else ())
-        for name in dict.fromkeys(pair.split("-"))
-        if name not in kinds
-    ]
+    diagnostics = []
+    for pair, link in links.items.items() if links else ():
+        for name in dict.fromkeys(pair.split("-")):
+            if name not in kinds:
+                message = f"there is no device of kind {name}; {nearest(name, kinds)}"
+                diagnostics.append(_problem(link, message, link.key))
+    return diagnostics
 
 
 def _problem(value: Value, message: str, mark: Location | None = None) -> Diagnostic:

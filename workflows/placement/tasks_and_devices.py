@@ -7,6 +7,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain, permutations
 from typing import Any
 
 from neusee.workflows.graph.diagnostics import nearest
@@ -220,33 +221,21 @@ class Graph:
 
     def __init__(self, tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) -> None:
         self.tasks, self.cluster = tuple(tasks), cluster
-        index = {task.name: i for i, task in enumerate(self.tasks)}
-        if len(index) < len(self.tasks):
-            twice = next(t.name for i, t in enumerate(self.tasks) if index[t.name] != i)
-            raise ValueError(f"two tasks have the name {twice}")
-        for name in (*(s for task in self.tasks for s in task.sources), *keep):
-            if name not in index:
-                raise ValueError(f"there is no task {name}; {nearest(name, index)}")
-        self.sources = [[index[s] for s in dict.fromkeys(task.sources)] for task in self.tasks]
-        self.readers: list[list[int]] = [[] for _ in self.tasks]
-        for i, sources in enumerate(self.sources):
-            for j in sources:
-                self.readers[j].append(i)
-        self.kept = {index[name] for name in keep}
-        self.sizes = [
-            [task.takes.get(self.tasks[j].name, self.tasks[j].bytes) for j in sources]
-            for task, sources in zip(self.tasks, self.sources, strict=True)
-        ]
+        index = _numbers_of_names(self.tasks, keep)
+        self.sources = [_sources_of(task, index) for task in self.tasks]
+        self.readers = _readers_of(self.sources)
+        self.kept = set(map(index.__getitem__, keep))
+        self.sizes = list(map(self._sent, self.tasks, self.sources))
         # whole bytes add up without round-off
         self.own = [float(math.ceil(task.bytes)) for task in self.tasks]
-        self.able = [
-            [d for d, device in enumerate(cluster.devices) if device.name in t.seconds]
-            for t in self.tasks
-        ]
-        self.seconds = [
-            [t.seconds.get(device.name, math.inf) for device in cluster.devices] for t in self.tasks
-        ]
+        self.able = [_able_devices(task, cluster) for task in self.tasks]
+        self.seconds = [_seconds_by_device(task, cluster) for task in self.tasks]
         self._check()
+
+    def _sent(self, task: Task, sources: list[int]) -> list[float]:
+        """Return the bytes that a task takes of the result of each of its sources."""
+        results = [self.tasks[j] for j in sources]
+        return [task.takes.get(result.name, result.bytes) for result in results]
 
     def held(self, i: int) -> bool:
         """Return True if a later task reads the result of task ``i``, or if the run keeps the
@@ -289,6 +278,42 @@ class Graph:
                 )
         if len(self.by(range(len(self.tasks)))) < len(self.tasks):
             raise ValueError("the tasks depend on each other in a cycle")
+
+
+def _numbers_of_names(tasks: Sequence[Task], keep: Collection[str]) -> dict[str, int]:
+    """Return the number of each task by its name; raise ValueError for a name that two tasks have,
+    and for one that a task reads, or the run keeps, and that none has.
+    """
+    index = {task.name: i for i, task in enumerate(tasks)}
+    if len(index) < len(tasks):
+        twice = next(task.name for i, task in enumerate(tasks) if index[task.name] != i)
+        raise ValueError(f"two tasks have the name {twice}")
+    read = chain.from_iterable(task.sources for task in tasks)
+    for name in (*read, *keep):
+        if name not in index:
+            raise ValueError(f"there is no task {name}; {nearest(name, index)}")
+    return index
+
+
+def _sources_of(task: Task, index: Mapping[str, int]) -> list[int]:
+    return [index[name] for name in dict.fromkeys(task.sources)]
+
+
+def _readers_of(sources: Sequence[Sequence[int]]) -> list[list[int]]:
+    """Return the tasks that read the result of each task."""
+    readers: list[list[int]] = [[] for _ in sources]
+    for i, read in enumerate(sources):
+        for j in read:
+            readers[j].append(i)
+    return readers
+
+
+def _able_devices(task: Task, cluster: Cluster) -> list[int]:
+    return [d for d, device in enumerate(cluster.devices) if device.name in task.seconds]
+
+
+def _seconds_by_device(task: Task, cluster: Cluster) -> list[float]:
+    return [task.seconds.get(device.name, math.inf) for device in cluster.devices]
 
 
 def ranked(graph: Graph, ranks: Sequence[float]) -> list[int]:
@@ -363,7 +388,7 @@ def _mean_transfer(graph: Graph) -> tuple[float, float]:
     devices.
     """
     names = [device.name for device in graph.cluster.devices]
-    links = [graph.cluster.link(a, b) for a in names for b in names if a != b]
+    links = [graph.cluster.link(a, b) for a, b in permutations(names, 2)]
     count = max(len(links), 1)
     return (
         sum(link.latency for link in links) / count,

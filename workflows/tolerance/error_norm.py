@@ -39,16 +39,24 @@ def _errors(value: Any, reference: Any) -> tuple[float, float]:
     pairs, mean, largest = [(value, reference)], 0.0, 0.0
     while pairs:
         a, b = pairs.pop()
-        if isinstance(b, dict) and isinstance(a, dict) and a.keys() == b.keys():
-            pairs += [(a[name], b[name]) for name in b]
-        elif isinstance(b, tuple | list) and isinstance(a, tuple | list) and len(a) == len(b):
-            pairs += list(zip(a, b, strict=True))
+        inner = _inner_pairs(a, b)
+        if inner is not None:
+            pairs += inner
         elif isinstance(b, Tensor | int | float) and isinstance(a, Tensor | int | float):
             errors = _tensor_errors(torch.as_tensor(a), torch.as_tensor(b))
             mean, largest = max(mean, errors[0]), max(largest, errors[1])
         elif a is not b:
             raise ValueError(f"cannot compare {_kind(a)} with {_kind(b)}")
     return mean, largest
+
+
+def _inner_pairs(a: Any, b: Any) -> list[tuple[Any, Any]] | None:
+    """Return the pairs of values in two dictionaries or sequences of one form, or None."""
+    if isinstance(b, dict) and isinstance(a, dict) and a.keys() == b.keys():
+        return [(a[name], b[name]) for name in b]
+    if isinstance(b, tuple | list) and isinstance(a, tuple | list) and len(a) == len(b):
+        return list(zip(a, b, strict=True))
+    return None
 
 
 def _tensor_errors(a: Tensor, b: Tensor) -> tuple[float, float]:

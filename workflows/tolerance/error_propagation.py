@@ -198,11 +198,19 @@ def _bound(
         return None
     inputs = [_gathered(step.wires.get(i), bounds) for i in step.node.inputs]
     facts = facts_of(step.name)
-    hook = step.node.hooks.propagate_error if _propagates(step, recipe) else None
-    if one_draw and hook is not None:
-        hook = step.node.hooks.propagate_draw or hook
+    hook = _propagation(step, one_draw) if _propagates(step, recipe) else None
     carried = _carried(step, inputs, facts, hook)
     return _together(carried, own, facts)
+
+
+def _propagation(step: Step, one_draw: bool) -> Callable[..., float | ErrorBound] | None:
+    """Return the hook of a node that bounds how errors pass, with ``one_draw`` that for a single
+    draw of the noise if there is one.
+    """
+    hooks = step.node.hooks
+    if one_draw and hooks.propagate_error is not None:
+        return hooks.propagate_draw or hooks.propagate_error
+    return hooks.propagate_error
 
 
 def _together(carried: ErrorBound, own: ErrorBound | None, facts: TensorStats | None) -> ErrorBound:
@@ -268,18 +276,31 @@ def _own(
     share = done.bound if omitted else done.error and done.error[0]
     if not share or (facts := facts_of(done.step)) is None:
         return None
-    largest = max(abs(facts.min), abs(facts.max))
-    if omitted and hooks.skip_scale is not None:
-        largest = hooks.skip_scale(facts, **step.params)
-    # a share of the full result, of which this result has at least the share 1 - `share`
-    rms = share * largest / (1.0 - share) if share < 1.0 and largest > 0 else math.inf
-    if omitted and one_draw and hooks.skip_draw is not None:
-        rms *= hooks.skip_draw(facts, **step.params)
     if omitted:
-        return ErrorBound(
-            rms, estimated=hooks.skip_estimated, scattered=rms if step.node.random else 0.0
-        )
+        return _of_omission(step, share, facts, one_draw)
+    rms = _of_full_result(share, max(abs(facts.min), abs(facts.max)))
     return ErrorBound(rms, peak=done.error[1] if done.error else None, estimated=hooks.estimated)
+
+
+def _of_omission(step: Step, share: float, facts: TensorStats, one_draw: bool) -> ErrorBound:
+    """Return the error of leaving out a step, which is at most ``share`` of its full result."""
+    hooks = step.node.hooks
+    largest = max(abs(facts.min), abs(facts.max))
+    if hooks.skip_scale is not None:
+        largest = hooks.skip_scale(facts, **step.params)
+    rms = _of_full_result(share, largest)
+    if one_draw and hooks.skip_draw is not None:
+        rms *= hooks.skip_draw(facts, **step.params)
+    return ErrorBound(
+        rms, estimated=hooks.skip_estimated, scattered=rms if step.node.random else 0.0
+    )
+
+
+def _of_full_result(share: float, largest: float) -> float:
+    """Return a ``share`` of the full result as an error, where the largest element of the result
+    that there is has at least the share 1 - ``share`` of it.
+    """
+    return share * largest / (1.0 - share) if share < 1.0 and largest > 0 else math.inf
 
 
 def _carried(
@@ -294,12 +315,26 @@ def _carried(
     The approximation of a step may count cheaper forms of its inputs, but never what was left out
     of the inputs: the step cannot know of it.
     """
-    hooks, errors = step.node.hooks, list(_flat(inputs))
-    if not any(error.rms for error in errors):
+    errors = [error for error in _flat(inputs) if error.rms]
+    if not errors:
         return _EXACT
-    estimated = hooks.estimated or any(error.estimated for error in errors if error.rms)
+    estimated = step.node.hooks.estimated or any(error.estimated for error in errors)
     if hook is None or result is None or any(math.isinf(error.rms) for error in errors):
         return ErrorBound(math.inf, estimated=estimated)
+    return _passed_apart(step, inputs, result, hook, estimated)
+
+
+def _passed_apart(
+    step: Step,
+    inputs: list[_Input],
+    result: TensorStats,
+    hook: Callable[..., float | ErrorBound],
+    estimated: bool,
+) -> ErrorBound:
+    """Return the error that a step makes of the errors of its inputs: of those like noise apart
+    from all others.
+    """
+    hooks = step.node.hooks
     alike = _passed(step, hook, _parts(inputs, scattered=False), result)
     noise = _passed(step, hooks.propagate_scattered or hook, _parts(inputs, scattered=True), result)
     return ErrorBound(
