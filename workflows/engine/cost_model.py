@@ -6,7 +6,7 @@ import itertools
 import json
 import math
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
@@ -213,10 +213,8 @@ def _sizes(recipe: Recipe, order: Sequence[str], smallest: float) -> dict[str, S
     sizes: dict[str, Size] = {}
     for name in order:
         step = recipe.steps[name]
-        inputs, below = (
-            inputs_of(step, forms),
-            [sizes[source] for source in dict.fromkeys(step.sources)],
-        )
+        inputs = inputs_of(step, forms)
+        below = [sizes[source] for source in dict.fromkeys(step.sources)]
         remembered = _sized.get(name)
         if remembered is not None and remembered.holds(step, inputs, below, smallest):
             forms[name], sizes[name] = remembered.form, remembered.size
@@ -227,9 +225,8 @@ def _sizes(recipe: Recipe, order: Sequence[str], smallest: float) -> dict[str, S
             sizes[name] = Size(0.0, math.inf, math.inf, math.inf)
             continue
         sizes[name] = _size(step, inputs, forms[name], below, smallest)
-        # a guess, so that the sizes of later steps can be computed
         if forms[name] is None and not sizes[name].known:
-            forms[name] = next((x for x in inputs if x is not None), None)
+            forms[name] = _guessed_form(inputs)
         if remembered is not None and alike(forms[name], remembered.form):
             # the same object, so that later steps have the size that they had
             forms[name] = remembered.form
@@ -237,6 +234,13 @@ def _sizes(recipe: Recipe, order: Sequence[str], smallest: float) -> dict[str, S
             Sized(step, inputs, below, smallest, forms[name], sizes[name], has_path(step.params))
         )
     return sizes
+
+
+def _guessed_form(inputs: Sequence[Form]) -> Form:
+    """Return the form of the first known input, so that the sizes of later steps can be
+    computed.
+    """
+    return next((form for form in inputs if form is not None), None)
 
 
 def _size(
@@ -320,6 +324,22 @@ class Estimate:
     def peak(self) -> float:
         """Return the memory of the step beside its inputs, in bytes."""
         return self.bytes + self.work + self.libraries
+
+
+def _of_size(rows: Iterable[Row], size: Size) -> Iterator[Row]:
+    """Yield the runs of a step of about this size."""
+    for row in rows:
+        measured = _size_of_work(row)
+        if measured and _alike(measured, size):
+            yield row
+
+
+def _largest_extent(rows: Iterable[Row]) -> float:
+    return max((_extent(_size_of_work(row)) for row in rows), default=0.0)
+
+
+def _measured_peaks(rows: Iterable[Row]) -> list[float]:
+    return [float(row["peak"]) for row in rows if row.get("peak") is not None]
 
 
 class Costs:
@@ -414,15 +434,11 @@ class Costs:
         on this machine.
         """
         law, past = shipped().get(path), self._nodes.get(path, [])
-        newest = (
-            row for row in reversed(past) if (other := _size_of_work(row)) and _alike(other, size)
-        )
-        if same := list(itertools.islice(newest, _NEWEST)):
+        same = list(itertools.islice(_of_size(reversed(past), size), _NEWEST))
+        if same:
             return self._repeated(same[::-1], kinds, size, law)
         rows = [row for row in past if _size_of_work(row)]
-        if law is None and _FARTHEST * max(
-            (_extent(_size_of_work(row)) for row in rows), default=0.0
-        ) < _extent(size):
+        if law is None and _FARTHEST * _largest_extent(rows) < _extent(size):
             return self._guess(path, kinds, size, rows[-_NEWEST:])
         base = law or guess()
         factors = _scales(base, rows[-_NEWEST:], self._faster)
@@ -436,7 +452,7 @@ class Costs:
     ) -> Estimate:
         """Predict a step by the median of earlier runs of the same size."""
         result = size.result if size else float(median(row["bytes"] for row in rows))
-        peaks = [float(row["peak"]) for row in rows if row.get("peak") is not None]
+        peaks = _measured_peaks(rows)
         lower_bound = law.peak(size) * law.spread[0].least if law and size else 0.0
         peak = max(median(peaks) if peaks else 0.0, result, lower_bound)
         seconds = {kind: self._seconds(rows, kind) for kind in kinds}

@@ -77,10 +77,7 @@ def as_function(
     order = in_order(sources, names)
     if idle := sorted((replaced | tuned.keys()) - set(order)):
         raise ValueError(f"no output depends on {', '.join(idle)}")
-    live, roots = dict[str, None](), {*replaced, *tuned, *redraw}
-    for name in order:
-        if name in roots or not live.keys().isdisjoint(sources[name]):
-            live[name] = None
+    live = _from_roots(order, sources, {*replaced, *tuned, *redraw})
     border = set(names).union(*(sources[step] for step in live))
     fixed = run(recipe, store, sorted(border - live.keys()), device=device)
     left_out = {
@@ -89,6 +86,17 @@ def as_function(
     return _Function(
         recipe, free, names, replaced, tuned, list(live), fixed.values, left_out, device, caller
     )
+
+
+def _from_roots(
+    order: Iterable[str], sources: Mapping[str, Iterable[str]], roots: Collection[str]
+) -> dict[str, None]:
+    """Return the steps ``roots`` and those that depend on them, in running order."""
+    live = dict[str, None]()
+    for name in order:
+        if name in roots or not live.keys().isdisjoint(sources[name]):
+            live[name] = None
+    return live
 
 
 def _read(recipe: Recipe, free: tuple[str, ...]) -> tuple[set[str], dict[str, dict[str, str]]]:
@@ -149,16 +157,19 @@ class _Function:
             )
         values, ledger = dict(self.fixed), self._spent.copy()
         for name in self.live:
-            step, is_given = self.recipe.steps[name], name in self.given
-            values[name] = (
-                settle(theta[name])
-                if is_given
-                else self._evaluate(step, values, theta, ledger, seed)
-            )
-            for source in () if is_given else set(step.sources):
-                if self._last[source] == name and source not in self.wanted:
-                    del values[source]
+            if name in self.given:
+                values[name] = settle(theta[name])
+            else:
+                step = self.recipe.steps[name]
+                values[name] = self._evaluate(step, values, theta, ledger, seed)
+                self._free(name, values)
         return {name: values[name] for name in self.wanted}
+
+    def _free(self, name: str, values: dict[str, Any]) -> None:
+        """Delete the values that no later step reads than the step ``name``."""
+        for source in set(self.recipe.steps[name].sources):
+            if self._last[source] == name and source not in self.wanted:
+                del values[source]
 
     def _evaluate(
         self, step: Step, values: dict[str, Any], theta: Theta, ledger: ErrorBudget, seed: int

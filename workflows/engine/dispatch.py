@@ -4,9 +4,10 @@ collected.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 from neusee.workflows.engine.step_job import Executor, Outcome, StepJob
@@ -96,7 +97,7 @@ class Loop:
 
         A chain of another lane may move to ``lane`` if the other lane is busy or lost.
         """
-        running = [work for chain in self.busy.values() for work in chain]
+        running = list(itertools.chain.from_iterable(self.busy.values()))
         lanes = self.executor.lanes
         for place in range(len(self._ready) - 1, -1, -1):
             chain = self._chains[self._ready[place]]
@@ -130,20 +131,24 @@ class Loop:
         """Mark the device of a finished job as idle, and the chains that waited only for its
         result as ready.
         """
-        i = self._chain_of[outcome.work.key]
-        last = outcome.work.key == self._chains[i][-1].key
-        if outcome.held:
-            self._hold(i, outcome.work.key)
-        elif last:
-            self._open -= 1
-            self._held.pop(i, None)
+        key = outcome.work.key
+        i = self._chain_of[key]
+        last = key == self._chains[i][-1].key
         if outcome.held or last or outcome.error or outcome.lost:
             self.busy.pop(outcome.work.lane, None)
         if outcome.held:
+            self._hold(i, key)
             return
-        waiting = self._after.pop(outcome.work.key, ())
+        if last:
+            self._open -= 1
+            self._held.pop(i, None)
+        self._free_waiting(key)
+
+    def _free_waiting(self, key: Key) -> None:
+        """Mark the chains that waited only for a result as ready."""
+        waiting = self._after.pop(key, ())
         for i in waiting:
-            self._missing[i].discard(outcome.work.key)
+            self._missing[i].discard(key)
         freed = [i for i in waiting if not self._missing[i]]
         self._ready += freed
         if len(self.executor.lanes) > 1 or freed:
@@ -165,21 +170,31 @@ def chains_of(works: Sequence[StepJob], fused: bool) -> list[Chain]:
     """
     if not fused:
         return [(work,) for work in works]
-    readers = Counter[Key]()
-    for work in works:
-        readers.update(set(work.sources))
+    readers = Counter(itertools.chain.from_iterable(set(work.sources) for work in works))
     planned = {work.key for work in works}
     chains: dict[Key, list[StepJob]] = {}  # by the key of the last job
     for work in works:
-        above = [key for key in dict.fromkeys(work.sources) if key in planned]
-        chain = chains.get(above[0]) if len(above) == 1 and readers[above[0]] == 1 else None
-        if chain and not chain[-1].wanted and chain[-1].lane == work.lane:
+        above = list(planned.intersection(work.sources))
+        is_alone = len(above) == 1 and readers[above[0]] == 1
+        chain = chains.get(above[0]) if is_alone else None
+        if chain and _continues(chain, work):
             del chains[above[0]]
             chains[work.key] = [*chain, work]
         else:
             chains[work.key] = [work]
-    order = {work.key: i for i, work in enumerate(works)}
-    return [tuple(chain) for chain in sorted(chains.values(), key=lambda c: order[c[0].key])]
+    return _in_order_of_first_jobs(chains.values(), works)
+
+
+def _in_order_of_first_jobs(
+    chains: Iterable[list[StepJob]], works: Sequence[StepJob]
+) -> list[Chain]:
+    place = {work.key: i for i, work in enumerate(works)}
+    return sorted(map(tuple, chains), key=lambda chain: place[chain[0].key])
+
+
+def _continues(chain: Sequence[StepJob], work: StepJob) -> bool:
+    """Return True if a job on the device of a chain reads a result that nobody else asked for."""
+    return not chain[-1].wanted and chain[-1].lane == work.lane
 
 
 def _moved(work: StepJob, lane: str, device: str) -> StepJob:

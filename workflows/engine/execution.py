@@ -15,6 +15,7 @@ from neusee.workflows.engine.local_executor import Local
 from neusee.workflows.engine.missing_values import Upstream, uses_of
 from neusee.workflows.engine.node_call import places
 from neusee.workflows.engine.placement_inputs import (
+    Prepared,
     joined,
     past_costs,
     prepare,
@@ -410,21 +411,7 @@ class Execution:
         """Compute the values with the keys ``plan`` and yield each outcome; after an error no
         further step begins.
         """
-        self.costs = self.costs or past_costs(
-            self.store, sizes_of(self.recipe, needed(self.recipe, self.wanted))
-        )
-        # a small one stays in memory until it is read
-        threshold = 0.0 if asked else small_result(executor)
-        large_targets = {
-            key for key in targets if self.costs.size_of(self.makers[key].name) >= threshold
-        }
-        works = [self._work(key, key in large_targets, executor) for key in plan]
-        try:
-            prepared = prepare(
-                works, self.costs, self.receipts, executor.lanes, targets, self.values
-            )
-        except TooLarge as error:
-            raise RunError(self.recipe.steps[error.task], [], error) from error
+        prepared = self._prepared(plan, targets, asked, executor)
         self.schedule = joined(self.schedule, prepared.schedule)
         chains = chains_of(prepared.works, fused=not executor.shares)
         if not executor.shares:  # values for other chains must be in the store
@@ -438,6 +425,26 @@ class Execution:
         except BaseException:
             executor.cancel()
             raise
+
+    def _prepared(
+        self, plan: list[Key], targets: Collection[Key], asked: bool, executor: Executor
+    ) -> Prepared:
+        """Return the jobs that compute the values with the keys ``plan``, on their devices; raise
+        `RunError` if the memory is too small.
+        """
+        self.costs = self.costs or past_costs(
+            self.store, sizes_of(self.recipe, needed(self.recipe, self.wanted))
+        )
+        # a small one stays in memory until it is read
+        threshold = 0.0 if asked else small_result(executor)
+        large_targets = {
+            key for key in targets if self.costs.size_of(self.makers[key].name) >= threshold
+        }
+        works = [self._work(key, key in large_targets, executor) for key in plan]
+        try:
+            return prepare(works, self.costs, self.receipts, executor.lanes, targets, self.values)
+        except TooLarge as error:
+            raise RunError(self.recipe.steps[error.task], [], error) from error
 
     def _work(self, key: Key, target: bool, executor: Executor) -> StepJob:
         step = self.makers[key]

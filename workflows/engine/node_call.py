@@ -178,7 +178,9 @@ def band_count(step: Step, inputs: Sequence[Any]) -> int:
     ]
     if any(not isinstance(value, Tensor) and type(value) not in BAND_FIELDS for _, value in banded):
         return 0  # a low-rank cube has no slice of one band
-    counts = {x.shape[axis] for axis, value in banded for x in band_tensors(value) if _has(x, axis)}
+    counts = set[int]()
+    for axis, value in banded:
+        counts.update(x.shape[axis] for x in band_tensors(value) if _has(x, axis))
     return counts.pop() if len(counts) == 1 else 0
 
 

@@ -89,9 +89,19 @@ def _scheduled(
     if len(lanes) == 1:
         plain = _one_after_another(works, expected, only, keep, read)
         if plain.peak[only] <= lane.memory:
-            return Prepared(
-                [w if w.lane else replace(w, lane=only) for w in works], expected, plain
-            )
+            jobs = [work if work.lane else replace(work, lane=only) for work in works]
+            return Prepared(jobs, expected, plain)
+    return _shared_out(works, expected, lanes, keep, read)
+
+
+def _shared_out(
+    works: Sequence[StepJob],
+    expected: Mapping[Key, Estimate],
+    lanes: Mapping[str, Lane],
+    keep: Collection[Key],
+    read: Mapping[Key, float],
+) -> Prepared:
+    """Return the jobs on the devices where they end soonest within the memory."""
     planned = {w.step.name: w for w in works}
     names = {w.key: w.step.name for w in works}
     tasks = [_task(w, expected[w.key], lanes, names, read) for w in works]
@@ -177,18 +187,24 @@ def _task(
     names: Mapping[Key, str],
     read: Mapping[Key, float],
 ) -> Task:
-    if _cpu_only(work):
-        on_cpu = [name for name, lane in lanes.items() if lane.kind == "cpu"]
-        seconds = {name: estimate.seconds["cpu"] for name in on_cpu or lanes}
-    else:
-        allowed = places(work.step, [lane.device for lane in lanes.values()])
-        here = {name: lane for name, lane in lanes.items() if lane.device in allowed}
-        seconds = {name: estimate.seconds[lane.kind] for name, lane in here.items()}
+    seconds = _seconds_by_lane(work, estimate, lanes)
     sources = tuple(dict.fromkeys(names[key] for key in work.sources if key in names))
     beside = estimate.work + sum(read[key] for key in set(work.sources) if key in read)
     return Task(
         work.step.name, sources, seconds, estimate.bytes, beside, parts_of(work.step, estimate)
     )
+
+
+def _seconds_by_lane(
+    work: StepJob, estimate: Estimate, lanes: Mapping[str, Lane]
+) -> dict[str, float]:
+    """Return the predicted time (s) of a job on each device that may compute it."""
+    if _cpu_only(work):
+        on_cpu = [name for name, lane in lanes.items() if lane.kind == "cpu"]
+        return dict.fromkeys(on_cpu or lanes, estimate.seconds["cpu"])
+    allowed = places(work.step, [lane.device for lane in lanes.values()])
+    here = {name: lane for name, lane in lanes.items() if lane.device in allowed}
+    return {name: estimate.seconds[lane.kind] for name, lane in here.items()}
 
 
 def parts_of(step: Step, estimate: Estimate) -> int:

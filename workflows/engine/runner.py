@@ -177,10 +177,7 @@ def run(
     """
     began = time.perf_counter()
     check_devices(device)
-    names = recipe.outputs if outputs is None else tuple(outputs)
-    for name in names:
-        if name not in recipe.steps:
-            raise ValueError(unknown_step(name, recipe.steps))
+    names = _outputs_of(recipe, outputs)
     again = copies_of(recipe, anew)
     recipe = with_substitutions(recipe, names)
     store = store or open_store()
@@ -213,6 +210,15 @@ def run(
         finally:
             work.close()
             give_back()
+
+
+def _outputs_of(recipe: Recipe, outputs: Iterable[str] | None) -> tuple[str, ...]:
+    """Return the steps that a run is asked for, or raise ValueError for a name of no step."""
+    names = recipe.outputs if outputs is None else tuple(outputs)
+    for name in names:
+        if name not in recipe.steps:
+            raise ValueError(unknown_step(name, recipe.steps))
+    return names
 
 
 def _stricter(recipe: Recipe, scale: float, work: Execution, outputs: tuple[str, ...]) -> Recipe:
@@ -255,28 +261,55 @@ def _attempt(work: Execution, outputs: tuple[str, ...], began: float, shows: boo
     """Run the recipe; raise `ToleranceNotProven` if its errors cannot be proved to be within the
     tolerance.
     """
-    recipe, store = work.recipe, work.store
+    recipe = work.recipe
     order = needed(recipe, outputs)
     with torch.no_grad():
         work.resolve(order)
         first = tolerance_frontier(recipe, order, outputs)
         missing = work.missing(outputs) if first else set()
-        targets = [work.keys[name] for name in outputs]
-        if early := [name for name in first if work.keys[name] in missing]:
-            # a sweep shows nothing
-            early = _targets_first(work, order, early, outputs, missing) if shows else early
-            work.make([work.keys[name] for name in early], keep=False, later=targets)
+        _make_early(work, order, first, outputs, missing, shows)
         lead = order if first and not missing else needed(recipe, first)
         proved = proof(recipe, lead, outputs, partial(_record_so_far, work), work.known_facts)
         over = proved.over(recipe)
         if over > 1.0 and not recipe.exact:
             raise ToleranceNotProven(over)
-        work.make(targets, keep=False)
+        work.make([work.keys[name] for name in outputs], keep=False)
+    return _result_of(work, outputs, began, None if missing else proved)
+
+
+def _make_early(
+    work: Execution,
+    order: list[str],
+    first: Iterable[str],
+    outputs: tuple[str, ...],
+    missing: set[Key],
+    shows: bool,
+) -> None:
+    """Compute the missing results of the steps ``first``, by which the errors of a run are
+    judged.
+
+    With ``shows``, outputs that need only shorter steps are computed as well; a sweep shows
+    nothing.
+    """
+    early = [name for name in first if work.keys[name] in missing]
+    if early and shows:
+        early = _targets_first(work, order, early, outputs, missing)
+    if early:
+        later = [work.keys[name] for name in outputs]
+        work.make([work.keys[name] for name in early], keep=False, later=later)
+
+
+def _result_of(
+    work: Execution, outputs: tuple[str, ...], began: float, proved: ErrorBounds | None
+) -> Result:
+    """Return the result of a run that is over; without ``proved``, its errors are bounded here."""
+    recipe, store = work.recipe, work.store
     values = {name: to_device(work.values[work.keys[name]], work.devices[0]) for name in outputs}
+    order = needed(recipe, outputs)
     done = work.account(order)
     peak = process_peak()
     seconds = time.perf_counter() - began
-    if missing:  # otherwise all results were known before
+    if proved is None:
         proved = proof(recipe, order, outputs, done.__getitem__, work.known_facts)
     return Result(
         values=values,

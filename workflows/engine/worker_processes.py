@@ -136,14 +136,19 @@ class _Team(Generic[T]):
                 yield self._lost.popleft(), None
             for pipe in wait(list(self._now)) if self._now else ():
                 assert isinstance(pipe, Connection)
-                index, number = self._now.pop(pipe)
-                answer = self._answer(pipe)
-                if answer is not None:
-                    self._hand(index, pipe)
-                yield number, answer[0] if answer else None
+                yield self._result(pipe)
             if not self._now:  # no worker is left
                 self._lost += chain.from_iterable(self._left)
                 self._left = []
+
+    def _result(self, pipe: Connection) -> tuple[int, tuple[T] | None]:
+        """Return the piece of work that a worker had and its result, and hand it the next one."""
+        index, number = self._now.pop(pipe)
+        answer = self._answer(pipe)
+        if answer is None:
+            return number, None
+        self._hand(index, pipe)
+        return number, answer[0]
 
     def close(self) -> None:
         """End all workers, at once where they still work."""
