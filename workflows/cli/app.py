@@ -24,7 +24,6 @@ from neusee.workflows.cli.commands_and_exit_codes import (
 )
 from neusee.workflows.cli.interrupt_signal import Interrupts, said, say_stopped
 from neusee.workflows.engine.machine_resources import free_processors
-from neusee.workflows.graph.diagnostics import visible
 from neusee.workflows.recipe.text.hydra_habits import ADVICE_ON_MULTIRUN
 
 if TYPE_CHECKING:
@@ -162,5 +161,5 @@ def _explained(error: Exception) -> int:
 
     cause = type(error).__name__
     text = str(error) if cause in ("RunError", "UnfollowedCode") else f"{cause}: {error}"
-    print(visible(f"{text}   (--debug shows where)"), file=sys.stderr)
+    print(lazy.diagnostics.visible(f"{text}   (--debug shows where)"), file=sys.stderr)
     return BAD if cause == "UnfollowedCode" else FAILED

@@ -2,7 +2,7 @@
 
 To import one takes from 0.04 s (typer, pydantic) to more than a second (torch), and many commands
 need few of them: ``neusee --help`` none, ``neusee recipes`` no torch. Whatever is quicker is
-imported at the top of the file that uses it.
+imported at the top of the file that uses it, but for what ``neusee --help`` would import.
 
     from neusee.workflows.cli import lazy_imports as lazy
     lazy.simulate_recipe.simulate(recipe, store, ...)
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from neusee.workflows.explain import why_rerun as why_rerun
     from neusee.workflows.frames import folder_recipe as folder_recipe
     from neusee.workflows.frames import sensor_group as sensor_group
+    from neusee.workflows.graph import diagnostics as diagnostics
     from neusee.workflows.graph import recipe_graph as recipe_graph
     from neusee.workflows.graph import run_error as run_error
     from neusee.workflows.handbook import json_schema as json_schema
@@ -84,6 +85,7 @@ _MODULES = (
     "workflows.explain.why_rerun",
     "workflows.frames.folder_recipe",
     "workflows.frames.sensor_group",
+    "workflows.graph.diagnostics",
     "workflows.graph.recipe_graph",
     "workflows.graph.run_error",
     "workflows.handbook.json_schema",
