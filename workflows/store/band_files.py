@@ -181,11 +181,7 @@ class Blobs:
         size = expected[0].nbytes if expected else 0
         if not size:
             return torch.empty(*shape, dtype=dtype)
-        if (first := self.about(names[0]))[:2] != expected[0][:2]:  # before memory is reserved
-            error = ValueError(
-                f"it holds {first.dtype} {first.shape}, not {dtype} {expected[0].shape}"
-            )
-            raise self._damaged(names[0], error)
+        self._need_kind(names[0], expected[0])  # before memory is reserved
         if _LIBC is not None and size % mmap.PAGESIZE == 0:
             with suppress(OSError):  # a file system or a limit that allows no maps
                 space = _reserve(len(names) * size)
@@ -196,6 +192,13 @@ class Blobs:
         x = torch.empty(*shape, dtype=dtype)
         self._fill(names, expected, bytes_of(x), None, verify)
         return x
+
+    def _need_kind(self, name: str, expected: Blob) -> None:
+        """Raise `Damaged` if a stored band has another type or shape than the ``expected`` one."""
+        stored = self.about(name)
+        if stored[:2] != expected[:2]:
+            text = f"it holds {stored.dtype} {stored.shape}, not {expected.dtype} {expected.shape}"
+            raise self._damaged(name, ValueError(text))
 
     def _fill(
         self,
@@ -294,14 +297,8 @@ def _trailer(file: int, name: str) -> tuple[Blob, bytes]:
     body = tail[-36 - length : -4]
     if len(body) != length + 32:
         raise ValueError("the trailer of the band file is missing or cut short")
-    said = json.loads(body[:length])
-    if not isinstance(said, list) or len(said) < 2:
-        raise ValueError("the trailer of the band file is not what was written")
-    if said[2:3] != [FORMAT] or len(said) != 5:
-        raise OtherFormat(
-            f"its format is version {said[2] if len(said) > 2 else 1!r}, not version {FORMAT}"
-        )
-    (dtype, shape, _, own, sign), xxh3 = said, body[length:].decode(errors="replace")
+    dtype, shape, own, sign = _fields_of_trailer(body[:length])
+    xxh3 = body[length:].decode(errors="replace")
     if own != name or not isinstance(sign, str) or not is_shape(shape) or not is_checksum(xxh3):
         raise ValueError(
             f"the band file belongs to the band {own!r}, or its trailer is not what was written"
@@ -314,6 +311,19 @@ def _trailer(file: int, name: str) -> tuple[Blob, bytes]:
     return blob, body[:length]
 
 
+def _fields_of_trailer(text: bytes) -> tuple[Any, Any, Any, Any]:
+    """Return type, shape, name and signature that the trailer of a band file states."""
+    said = json.loads(text)
+    if not isinstance(said, list) or len(said) < 2:
+        raise ValueError("the trailer of the band file is not what was written")
+    if said[2:3] != [FORMAT] or len(said) != 5:
+        raise OtherFormat(
+            f"its format is version {said[2] if len(said) > 2 else 1!r}, not version {FORMAT}"
+        )
+    dtype, shape, _, own, sign = said
+    return dtype, shape, own, sign
+
+
 def _load(
     file: BufferedReader, expected: Blob, into: memoryview, address: int | None, verify: bool
 ) -> None:
@@ -324,14 +334,7 @@ def _load(
     check.
     """
     blob, kind = _trailer(file.fileno(), expected.name)
-    if blob[:2] != expected[:2]:
-        raise ValueError(
-            f"the band file holds {blob.dtype} {blob.shape}, not {expected.dtype} {expected.shape}"
-        )
-    if expected.xxh3 and blob.xxh3 != expected.xxh3:
-        raise ValueError(
-            "the band file holds a different band than the band that was written with this result"
-        )
+    _refuse_other_band(blob, expected)
     copied = address is None or may_change(file.fileno())
     # a map is looked into once the file was read: where a device fails, a read raises an error and
     # ends no process
@@ -340,11 +343,32 @@ def _load(
         _map(None if copied else file.fileno(), address, blob.nbytes)
     if copied and file.readinto(into) != len(into):
         raise ValueError("the band file was truncated while it was read")
-    if verify and (checksum or _checksum(into, kind)) != blob.xxh3:
+    if verify:
+        _refuse_changed_bytes(blob, checksum or _checksum(into, kind))
+    _check_signed(blob, into)
+
+
+def _refuse_other_band(blob: Blob, expected: Blob) -> None:
+    if blob[:2] != expected[:2]:
+        raise ValueError(
+            f"the band file holds {blob.dtype} {blob.shape}, not {expected.dtype} {expected.shape}"
+        )
+    if expected.xxh3 and blob.xxh3 != expected.xxh3:
+        raise ValueError(
+            "the band file holds a different band than the band that was written with this result"
+        )
+
+
+def _refuse_changed_bytes(blob: Blob, checksum: str) -> None:
+    if checksum != blob.xxh3:
         raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
+
+
+def _check_signed(blob: Blob, data: memoryview) -> None:
+    """Check the signature of a band, where this store has a secret to sign with."""
     if secrets():
         plain = _kind(blob.dtype, blob.shape, blob.name)
-        check_signature(blob.sign, "band", blob.name, _sha256(into, plain))
+        check_signature(blob.sign, "band", blob.name, _sha256(data, plain))
 
 
 def _reserve(size: int) -> Any:

@@ -390,6 +390,12 @@ class Checked:
     problem: str  #: empty if the result is undamaged
 
 
+def _outside_budget(sizes: Mapping[str, int], folder: str) -> int:
+    """Return the bytes of those files that do not count towards the budget of the store."""
+    uncounted = (f"{folder}/tmp/", f"{folder}/bad/")
+    return sum(size for path, size in sizes.items() if path.startswith(uncounted))
+
+
 class Maintained(Protocol):
     """Base class of `Store` with the methods for maintenance, such as eviction and a check for
     damage.
@@ -416,9 +422,7 @@ class Maintained(Protocol):
         budget = self.budget if budget is None else budget
         before = total(self.disk)
         orphans = dict(sweep(self.disk, dry))
-        # files outside the budget
-        uncounted = (f"{self.disk.folder}/tmp/", f"{self.disk.folder}/bad/")
-        outside = sum(size for path, size in orphans.items() if path.startswith(uncounted))
+        outside = _outside_budget(orphans, self.disk.folder)
         left = before - (sum(orphans.values()) - outside)
         deleted, refused = self.make_room(left - budget, dry) if budget is not None else ([], [])
         after = left - sum(c.size for c in deleted) if dry or not deleted else total(self.disk)

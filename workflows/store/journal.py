@@ -199,12 +199,14 @@ class Journal:
             return self._rebuild()
         self._head, self._offset = head, start + len(raw)
         self._rows += _parsed(raw)
-        if (
-            self._whole
-            and len(self._rows) > _SPARE
-            and len(self._rows) > 2 * len({row["key"] for row in self._rows})
-        ):
-            self._replace(list({row["key"]: row for row in self._rows}.values()))
+        if self._whole and len(self._rows) > _SPARE:
+            self._drop_old_rows()
+
+    def _drop_old_rows(self) -> None:
+        """Write the journal anew with the newest row of each key, if most rows are older ones."""
+        newest = {row["key"]: row for row in self._rows}
+        if len(self._rows) > 2 * len(newest):
+            self._replace(list(newest.values()))
 
     def _first_byte(self, file: BinaryIO, head: int, all_lines: bool) -> int:
         """Return where the first read begins: after the first line, or at the start of a line

@@ -260,6 +260,14 @@ class SmallResults:
         if append(self._path, b"\n" + raw, flags) != len(raw) + 1:
             raise OSError(f"{self._path}: the disk has no space left to record a result")
 
+    def _add(self, line: bytes) -> None:
+        """Keep a line of the file, as the newest of its key, unless it is no line of a result."""
+        if line.startswith(_HEAD):
+            key = line[_KEY].decode(errors="replace")
+            if key.isalnum():  # it may be a part of a path
+                self._lines.pop(key, None)
+                self._lines[key] = line
+
     def _read_new_lines(self) -> None:
         """Read the lines added to the file of small results since the last call, or all lines of
         a replaced file.
@@ -279,11 +287,7 @@ class SmallResults:
             raw = file.read()
             end = raw.rfind(b"\n") if not raw.endswith(b"}") else len(raw)
             for line in raw[:end].split(b"\n"):
-                if line.startswith(_HEAD):
-                    key = line[_KEY].decode(errors="replace")
-                    if key.isalnum():  # it may be a part of a path
-                        self._lines.pop(key, None)  # keep the newest line last
-                        self._lines[key] = line
+                self._add(line)
             self._file, self._offset = os.fstat(file.fileno()).st_ino, self._offset + max(0, end)
         if self._offset > MOST:
             self.compact()

@@ -11,7 +11,8 @@ import mmap
 import os
 import types
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import IO, Any, TypeGuard, get_args, get_origin, get_type_hints
 
 import torch
@@ -87,6 +88,9 @@ def made(kind: NamedTupleType, items: list[Any]) -> Any:
     return tuple.__new__(kind, items)
 
 
+_PLAIN = (Tensor, bool, str, bytes, list, dict)  #: types of stored values without a rule of theirs
+
+
 def fits(value: Any, kind: Any) -> bool:
     """Return True if a value has the annotated type ``kind``; a type that no stored value has
     allows every value.
@@ -98,18 +102,22 @@ def fits(value: Any, kind: Any) -> bool:
         return any(fits(value, alternative) for alternative in inner)
     if origin in (list, dict) or (origin is tuple and not hasattr(value, "_fields")):
         return isinstance(value, origin) and _items_fit(value, origin, inner)
+    return origin is not None or _fits_plain(value, kind)
+
+
+def _fits_plain(value: Any, kind: Any) -> bool:
+    """Return True if a value has a type without parameters, or if no stored value has that
+    type.
+    """
     if kind is None or kind is types.NoneType:
         return value is None
     if kind is float:
         return isinstance(value, int | float) and not isinstance(value, bool)
     if kind is int:
         return isinstance(value, int) and not isinstance(value, bool)
-    simple = (
-        isinstance(kind, type)
-        and origin is None
-        and (kind in (Tensor, bool, str, bytes, list, dict) or _is_named_tuple(kind))
-    )
-    return isinstance(value, kind) if simple else True
+    if isinstance(kind, type) and (kind in _PLAIN or _is_named_tuple(kind)):
+        return isinstance(value, kind)
+    return True
 
 
 def _items_fit(value: Any, origin: type, inner: tuple[Any, ...]) -> bool:
@@ -310,28 +318,36 @@ def _layout(item: Any, listed: _Listed, blobs: Blobs | None) -> dict[str, Any]:
     if isinstance(item, Tensor):
         return {"tensor": listed.add(item)}
     if isinstance(item, bytes):
-        return {
-            "bytes": listed.add(
-                torch.frombuffer(bytearray(item), dtype=torch.uint8) if item else torch.empty(0)
-            )
-        }
-    if isinstance(item, tuple):
-        items = [_layout(i, listed, blobs) for i in item]
-        return (
-            {"tuple": items}
-            if type(item) is tuple
-            else {"class": _class_name(item), "items": items}
-        )
-    if isinstance(item, list):
-        return {"list": [_layout(i, listed, blobs) for i in item]}
-    if isinstance(item, dict) and all(isinstance(k, str) for k in item):
-        return {"dict": {k: _layout(v, listed, blobs) for k, v in item.items()}}
+        return {"bytes": listed.add(_tensor_of_bytes(item))}
+    if isinstance(item, tuple | list | dict):
+        return _collection_layout(item, listed, blobs)
     if item is None or isinstance(item, bool | int | float | str):
         return {"value": item}
-    raise TypeError(
+    raise _cannot_be_stored(item)
+
+
+def _cannot_be_stored(item: Any) -> TypeError:
+    return TypeError(
         "a step must return tensors, numbers, strings, bytes or collections of these, not"
         f" {type(item)}"
     )
+
+
+def _tensor_of_bytes(text: bytes) -> Tensor:
+    return torch.frombuffer(bytearray(text), dtype=torch.uint8) if text else torch.empty(0)
+
+
+def _collection_layout(
+    item: tuple[Any, ...] | list[Any] | dict[Any, Any], listed: _Listed, blobs: Blobs | None
+) -> dict[str, Any]:
+    if isinstance(item, dict):
+        if not all(isinstance(key, str) for key in item):
+            raise _cannot_be_stored(item)
+        return {"dict": {key: _layout(value, listed, blobs) for key, value in item.items()}}
+    items = [_layout(i, listed, blobs) for i in item]
+    if isinstance(item, list):
+        return {"list": items}
+    return {"tuple": items} if type(item) is tuple else {"class": _class_name(item), "items": items}
 
 
 def _stack_layout(item: Stacked, blobs: Blobs) -> dict[str, Any]:
@@ -367,36 +383,33 @@ def unpack(
 def _unpacked(
     layout: dict[str, Any], tensors: list[Tensor], blobs: Blobs | None, verify: bool, typed: bool
 ) -> Any:
-    if "class" in layout or "tuple" in layout:
-        items = [
-            _unpacked(i, tensors, blobs, verify, typed)
-            for i in layout["items" if "class" in layout else "tuple"]
-        ]
-        return (
-            made(stored_type(layout["class"]), items)
-            if typed and "class" in layout
-            else tuple(items)
-        )
+    inner = partial(_unpacked, tensors=tensors, blobs=blobs, verify=verify, typed=typed)
+    if "class" in layout:
+        items = list(map(inner, layout["items"]))
+        return made(stored_type(layout["class"]), items) if typed else tuple(items)
     ((kind, body),) = layout.items()
     if kind in ("tensor", "bytes"):
-        if body >= len(tensors):
-            raise ValueError(f"the value needs tensor {body}, but only {len(tensors)} are stored")
-        return tensors[body] if kind == "tensor" else _bytes(tensors[body])
+        return _stored_tensor(kind, body, tensors)
     if kind == "stacked":
-        if blobs is None:
-            raise ValueError(
-                "the value has band files: give the folder of the band files as ``blobs``"
-            )
-        return blobs.read(
-            body["names"], body["shape"], dtype_of(body["dtype"]), verify, body["xxh3"]
-        )
-    if kind == "list":
-        return [_unpacked(i, tensors, blobs, verify, typed) for i in body]
-    return (
-        {k: _unpacked(v, tensors, blobs, verify, typed) for k, v in body.items()}
-        if kind == "dict"
-        else body
-    )
+        return _stacked_bands(body, blobs, verify)
+    if kind in ("tuple", "list"):
+        items = list(map(inner, body))
+        return tuple(items) if kind == "tuple" else items
+    if kind == "dict":
+        return dict(zip(body, map(inner, body.values()), strict=True))
+    return body
+
+
+def _stored_tensor(kind: str, number: int, tensors: list[Tensor]) -> Tensor | bytes:
+    if number >= len(tensors):
+        raise ValueError(f"the value needs tensor {number}, but only {len(tensors)} are stored")
+    return tensors[number] if kind == "tensor" else _bytes(tensors[number])
+
+
+def _stacked_bands(body: dict[str, Any], blobs: Blobs | None, verify: bool) -> Tensor:
+    if blobs is None:
+        raise ValueError("the value has band files: give the folder of the band files as ``blobs``")
+    return blobs.read(body["names"], body["shape"], dtype_of(body["dtype"]), verify, body["xxh3"])
 
 
 def _bytes(x: Tensor) -> bytes:
@@ -488,23 +501,36 @@ def read(path: str, expected: str | None, sha256: str | None = None) -> list[Ten
     Compare the file with the checksum ``expected`` and the digest ``sha256`` if given. Raises
     `ValueError` for a file that differs, or that `write` did not write.
     """
-    checks: list[tuple[Any, str | None]] = [(xxhash.xxh3_128, expected), (hashlib.sha256, sha256)]
-    digests = [function() for function, text in checks if text is not None]
+    checksum = xxhash.xxh3_128() if expected is not None else None
+    signed = hashlib.sha256() if sha256 is not None else None
     with open(path, "rb", buffering=0, opener=open_now) as file:
-        if may_change(file.fileno()):
-            data = _copied(file)
-            for digest in digests:
-                digest.update(data)
-        else:
-            # read and not mapped: where a device fails, a read raises an error, and a look into a
-            # map ends the process
-            digests_of(file, *digests)
-            data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
-    hexdigests = [digest.hexdigest() for digest in digests]
-    if expected is not None and hexdigests[0] != expected:
+        data = _mapped(file, [digest for digest in (checksum, signed) if digest is not None])
+    if checksum is not None and checksum.hexdigest() != expected:
         raise ValueError("checksum mismatch: the stored bytes have changed since they were written")
-    if sha256 is not None and hexdigests[-1:] != [sha256]:
+    if signed is not None and signed.hexdigest() != sha256:
         raise ValueError("the stored bytes are not those that were signed")
+    return _tensors_in(data)
+
+
+def _mapped(file: IO[bytes], digests: Sequence[Any]) -> mmap.mmap:
+    """Map a file into memory, or copy it if another user could change it; the ``digests`` are
+    updated with its bytes.
+    """
+    if may_change(file.fileno()):
+        data = _copied(file)
+        for digest in digests:
+            digest.update(data)
+        return data
+    # read and not mapped: where a device fails, a read raises an error, and a look into a map ends
+    # the process
+    digests_of(file, *digests)
+    return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+
+
+def _tensors_in(data: mmap.mmap) -> list[Tensor]:
+    """Return the tensors of a safetensors file; raise ValueError for a file that `write` did not
+    write.
+    """
     start = 8 + int.from_bytes(data[:8], "little")
     header = json.loads(data[8:start]) if start <= len(data) else None
     if not isinstance(header, dict) or not isinstance(kinds := header.get("__metadata__"), dict):
@@ -560,15 +586,24 @@ def tensor_kind(x: Tensor) -> str:
     return name
 
 
+def _type_and_count(kind: Any, shape: Any) -> tuple[torch.dtype, int]:
+    """Return the type and the number of elements of a stored tensor; raise `ValueError` if they
+    cannot be right.
+    """
+    dtype = _NAMES.get(kind) if isinstance(kind, str) else None
+    count = math.prod(shape) if is_shape(shape) else None
+    if dtype is None or count is None or not is_count(count):
+        raise ValueError(
+            f"a stored tensor has the type {str(kind)[:20]} and the shape {str(shape)[:60]}"
+        )
+    return dtype, count
+
+
 def _tensor(data: Any, offset: int, kind: Any, shape: Any, is_complex: bool) -> Tensor:
     """Return the tensor at an offset of ``data``; raise `ValueError` if type, shape or size
     cannot be right.
     """
-    dtype = _NAMES.get(kind) if isinstance(kind, str) else None
-    if dtype is None or not is_shape(shape) or not is_count(count := math.prod(shape)):
-        raise ValueError(
-            f"a stored tensor has the type {str(kind)[:20]} and the shape {str(shape)[:60]}"
-        )
+    dtype, count = _type_and_count(kind, shape)
     if is_complex and (shape[-1:] != [2] or not dtype.is_floating_point or dtype.itemsize < 2):
         raise ValueError(f"a complex tensor is stored as {kind} of the shape {shape}")
     if offset + count * dtype.itemsize > len(data):
