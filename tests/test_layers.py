@@ -79,7 +79,10 @@ DYNAMIC = {
     "report/run_pictures.py": "report.contents names the function that draws each picture",
     "studies/run_study.py": "a kind of study names its room",
     "recipe/node_families.py": "a recipe names the family of a node",
-    "cli/lazy_imports.py": "a module that takes long to import is imported when it is first used",
+    **{
+        f"{room}/lazy_imports.py": "a module that takes long is imported when it is first used"
+        for room in ("api", "cli", "recipe", "store")
+    },
     "cli/program_options.py": "a command line names the command, whose module alone is imported",
     "training/run_training.py": "TensorBoard is optional, and has no types",
 }

@@ -12,7 +12,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from neusee.workflows.answers.results_folder import kept_files, printed, write_again
+from neusee.workflows.answers.results_folder import (
+    kept_files,
+    printed,
+    said_again,
+    write_again,
+    write_run_again,
+)
 from neusee.workflows.answers.stored_answer import (
     RUN,
     Answer,
@@ -33,6 +39,7 @@ from neusee.workflows.answers.witnesses import (
     taken_from,
     witnesses_of,
 )
+from neusee.workflows.engine.machine_resources import free_memory
 from neusee.workflows.keys.cache_key import digest
 from neusee.workflows.report.run_folder import writable_folder
 from neusee.workflows.store.cache_settings import budget_bytes, default_root
@@ -325,8 +332,6 @@ class Command:
             return printed(
                 answer, write_again(answer, time.perf_counter() - self._began) / "report.html"
             )
-        from neusee.workflows.answers.results_folder import said_again, write_run_again
-
         folder, document = write_run_again(answer, self._disk, time.perf_counter() - self._began)
         note_use(self._disk, answer.stored)
         return said_again(answer, folder, document)
@@ -468,8 +473,6 @@ def _are_free(memory: int) -> bool:
     """Return True if a run may use so many bytes of memory now."""
     if not memory:
         return True
-    from neusee.workflows.engine.machine_resources import free_memory
-
     return _SHARE * free_memory() >= memory
 
 

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from neusee.workflows.api import lazy_imports as lazy
 from neusee.workflows.engine.runner import Result
 from neusee.workflows.engine.runner import run as run_recipe
 from neusee.workflows.graph.recipe_graph import Recipe
@@ -23,13 +24,15 @@ from neusee.workflows.recipe.text.overrides import Override, overrides_of
 from neusee.workflows.report.run_folder import writable_folder
 from neusee.workflows.report.study_folder import Progress, silent
 from neusee.workflows.store.remote_store import open_store
+from neusee.workflows.studies import run_study
+from neusee.workflows.sweeps.sweep_run import Sweep
+from neusee.workflows.sweeps.sweep_run import sweep as run_sweep
 
 if TYPE_CHECKING:
     from neusee.workflows.engine.step_job import Executor
     from neusee.workflows.evaluation.pipelines import Pipeline
     from neusee.workflows.graph.recipe_graph import Event
     from neusee.workflows.store.result_store import Store
-    from neusee.workflows.sweeps.sweep_run import Sweep
     from neusee.workflows.training.process_mesh import Mesh
 
 Named = str | os.PathLike[str]  #: the name of a packaged recipe, or the path of a file
@@ -86,8 +89,6 @@ def sweep(
     Raises: `RecipeError` with all mistakes of all points before anything runs, or the error of the
             first failed point.
     """
-    from neusee.workflows.sweeps.sweep_run import sweep as run_sweep
-
     return run_sweep(
         _name(recipe, "sweep"), axes, _arguments(changes), zip, store, on_error, device
     )
@@ -119,15 +120,18 @@ def train(
     """
     recipe, folder, store = _read(recipe, changes), writable_folder(out), store or open_store()
     if recipe.lifting is not None:
-        from neusee.workflows.training.lift.lift_run import train_lift
-
-        return train_lift(recipe, store, folder, command, progress, device, watch)
-    from neusee.workflows.training.process_mesh import ALONE
-    from neusee.workflows.training.run_training import train as run_training
-
+        return lazy.lift_run.train_lift(recipe, store, folder, command, progress, device, watch)
     numbers = stages if stages is not None else recipe.training.learnt if recipe.training else ()
-    return run_training(
-        recipe, store, folder, command, progress, tuple(numbers), device, watch, mesh or ALONE
+    return lazy.run_training.train(
+        recipe,
+        store,
+        folder,
+        command,
+        progress,
+        tuple(numbers),
+        device,
+        watch,
+        mesh or lazy.process_mesh.ALONE,
     )
 
 
@@ -164,8 +168,7 @@ def evaluate(
     to which filters and stops bring every pipeline; by: ``best``, ``filter`` or ``stop``.
     Raises: `EvaluationRefused` with every mistake before anything runs, `RunError` if a step fails.
     """
-    from neusee.workflows.evaluation import run_evaluation
-
+    run_evaluation = lazy.run_evaluation
     here, name, words = Path.cwd(), _name(recipe, "evaluate"), _arguments(changes)
     own = run_evaluation.read_settings(name, words, here)
     return run_evaluation.evaluate(
@@ -206,11 +209,9 @@ def calibrate(
             recipe without a
     likelihood.
     """
-    from neusee.workflows.calibration import run_calibration
-
     recipe, store = _read(recipe, changes), store or open_store()
     options: dict[str, Any] = {"walkers": walkers, "move": move, "draws": draws}
-    return run_calibration.calibrate(
+    return lazy.run_calibration.calibrate(
         recipe, store, writable_folder(out), command, progress, **options
     )
 
@@ -234,8 +235,6 @@ def study(
     ``"protection"``. options: the options of this kind, as ``neusee study KIND --help`` lists them.
     Raises: ValueError for an unknown kind or an unsuitable recipe, `RunError` if a step fails.
     """
-    from neusee.workflows.studies import run_study
-
     if kind not in run_study.KINDS:
         raise ValueError(f"there is no study {kind!r}: write one of {', '.join(run_study.KINDS)}")
     return run_study.study_recipe(

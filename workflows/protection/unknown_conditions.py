@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
+from neusee.nodes.flare import surface_of
 from neusee.workflows.recipe.distributions.law_text import read_law
 from neusee.workflows.recipe.distributions.shapes import draw_laws
 
@@ -49,8 +50,6 @@ class Condition:
         """Return the parameter ``surfaces`` of `flare.stray_light` for a lens that scatters this
         share of the light.
         """
-        from neusee.nodes.flare import surface_of
-
         return {"lens": surface_of(self.scatter)}
 
     @property

@@ -15,6 +15,9 @@ from neusee.workflows.graph.diagnostics import Diagnostic, Location, RecipeError
 from neusee.workflows.graph.final_values import Config, Setting, changes
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
 from neusee.workflows.keys.sealed_files import head_of
+from neusee.workflows.recipe import lazy_imports as lazy
+from neusee.workflows.recipe.blocks.evaluate_block import read_evaluate
+from neusee.workflows.recipe.blocks.settings_block import read_block
 from neusee.workflows.recipe.distributions.law_text import read_mismatch
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
 from neusee.workflows.recipe.global_settings import (
@@ -278,19 +281,13 @@ def _settings_blocks(
     """
     if not blocks:
         return composed, None, None, None, None
-    from neusee.workflows.recipe.blocks.evaluate_block import read_evaluate
-    from neusee.workflows.recipe.blocks.train_block import read_lift_training, read_training
-
-    composed, training = read_training(composed, class_context(modules))
-    composed, lifting = read_lift_training(composed)
+    composed, training = lazy.train_block.read_training(composed, class_context(modules))
+    composed, lifting = lazy.train_block.read_lift_training(composed)
     composed, evaluation = read_evaluate(composed)
     if TRACED not in composed.root.items:
         return composed, training, lifting, evaluation, None
-    from neusee.nodes.calibrate import Traceability
-    from neusee.workflows.recipe.blocks.settings_block import read_block
-
     composed, traceability = read_block(
-        composed, TRACED, Traceability, composed.root.items[TRACED].plain
+        composed, TRACED, lazy.calibrate.Traceability, composed.root.items[TRACED].plain
     )
     return composed, training, lifting, evaluation, traceability
 
@@ -424,9 +421,7 @@ def _safety(
     """
     if SAFETY not in root.items:
         return None
-    from neusee.workflows.recipe.blocks.safety_block import read_safety
-
-    return read_safety(root, references, diagnostics, files)
+    return lazy.safety_block.read_safety(root, references, diagnostics, files)
 
 
 def _causes(problems: list[Diagnostic], own: OwnFamilies) -> list[Diagnostic]:

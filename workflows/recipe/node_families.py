@@ -22,6 +22,7 @@ import neusee.nodes
 from neusee.nodes import Node
 from neusee.nodes.own_modules import FAMILY, import_file, network_classes, note_module
 from neusee.workflows.graph.diagnostics import Diagnostic, nearest
+from neusee.workflows.recipe import lazy_imports as lazy
 from neusee.workflows.recipe.text.recipe_files import NO_CODE_VARIABLE, is_strange
 from neusee.workflows.recipe.text.renamed_keys import instead
 from neusee.workflows.recipe.text.yaml_values import Value, kind
@@ -197,15 +198,13 @@ def import_own(where: str, folder: Path) -> ModuleType:
 
     Raises `LookupError` with place and cause.
     """
-    from neusee.workflows.observation.observed_call import import_observed  # imports torch
-
     is_path = _names_path(where)
     path = Path(folder, where).expanduser()
     try:
         if is_path:
             full_path = path.resolve() if where in _FOLDERS else path.absolute()
-            return import_file(full_path, import_observed)
-        module = import_observed(where)
+            return import_file(full_path, lazy.observed_call.import_observed)
+        module = lazy.observed_call.import_observed(where)
         note_module(where)
         return module
     except ModuleNotFoundError as error:

@@ -36,6 +36,7 @@ from neusee.workflows.graph.step_shapes import (
     tensors_of,
 )
 from neusee.workflows.keys.cache_key import files_in, is_own
+from neusee.workflows.recipe import lazy_imports as lazy
 from neusee.workflows.recipe.node_families import Own, class_context, nodes_of
 from neusee.workflows.recipe.steps import Declared
 from neusee.workflows.recipe.text.field_errors import message_of
@@ -182,9 +183,7 @@ def _checked(bound: Step, hook: Callable[[], Sequence[str]]) -> Sequence[str]:
     """
     if not is_own(bound.node.fn.__module__):
         return hook()
-    from neusee.workflows.observation.observed_call import call_hook  # imports torch
-
-    return call_hook(bound.node, hook, bound.params)
+    return lazy.observed_call.call_hook(bound.node, hook, bound.params)
 
 
 def _problems(

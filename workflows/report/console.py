@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from neusee.workflows.graph.recipe_graph import Event, StepRecord, by_family
+from neusee.workflows.report.live_table import LiveTable
 from neusee.workflows.report.paper_readings import consequences
 from neusee.workflows.report.run_page import shape_of, unchecked_lines, unit_of
 from neusee.workflows.report.run_summary import SENTENCES
@@ -118,8 +119,6 @@ class ProgressTable(ABC):
 
     def __enter__(self) -> Self:
         if self.mode == "live":
-            from neusee.workflows.report.live_table import LiveTable
-
             self._live = LiveTable(self)
             self._live.start()
         self.show_row(self.header)

@@ -13,8 +13,9 @@ from stat import S_ISREG
 from typing import IO, TYPE_CHECKING, Any
 
 from neusee.workflows.keys.sealed_files import seal_record, secrets
+from neusee.workflows.store import lazy_imports as lazy
 from neusee.workflows.store import metadata
-from neusee.workflows.store.metadata import INLINE, UNREADABLE, Metadata, is_kept
+from neusee.workflows.store.metadata import INLINE, UNREADABLE, Metadata, checked_layout, is_kept
 from neusee.workflows.store.shared_folder import Disk, append, open_now
 
 if TYPE_CHECKING:
@@ -42,27 +43,22 @@ def described(
 
     Small tensors are part of the metadata.
     """
-    from neusee.workflows.store import serialization
-
-    layout, tensors = serialization.pack(value, blobs)
+    layout, tensors = lazy.serialization.pack(value, blobs)
     size = inline = sum(t.nbytes for t in tensors)
-    bands = serialization.blobs_in(layout)
+    bands = checked_layout(layout)
     if bands:
         size = max(inline, about.get("bytes") or 0)
     entry = {"key": key, **about, "layout": layout, "bytes": size, "payload": None, "kept": True}
     if inline <= INLINE:
-        entry["tensors"], tensors = [serialization.to_text(t) for t in tensors], []
+        entry["tensors"], tensors = [lazy.serialization.to_text(t) for t in tensors], []
     return entry, tensors, bands
 
 
 def written(file: IO[bytes], tensors: list[Tensor]) -> Metadata:
     """Write tensors to a new file and to the disk; return the size and the digests of the file."""
-    from neusee.workflows.store import serialization
-
     sha256 = hashlib.sha256() if secrets() else None
-    xxh3 = (
-        serialization.write(file, tensors, sha256) if sha256 else serialization.write(file, tensors)
-    )
+    write = lazy.serialization.write
+    xxh3 = write(file, tensors, sha256) if sha256 else write(file, tensors)
     file.flush()
     os.fsync(file.fileno())
     return {"size": file.tell(), "xxh3": xxh3} | ({"sha256": sha256.hexdigest()} if sha256 else {})
@@ -78,16 +74,14 @@ def load(
 
     Raises one of the errors in `UNREADABLE` if the value is missing or damaged.
     """
-    from neusee.workflows.store import serialization
-
     bands = about.get("bands")
     check = verify == "always" or (verify == "sampled" and _draw.random() < _SAMPLED)
-    tensors, compared = [serialization.from_text(*t) for t in about.get("tensors") or ()], 0
+    tensors, compared = [lazy.serialization.from_text(*t) for t in about.get("tensors") or ()], 0
     if about["payload"]:
         tensors, compared = _tensors_of_file(disk, about, verify, check)
     if bands and verify == "sampled" and not check:
         check = newest(blobs, bands["names"]) > bands["newest"]
-    return serialization.unpack(about["layout"], tensors, blobs, check, typed), compared
+    return lazy.serialization.unpack(about["layout"], tensors, blobs, check, typed), compared
 
 
 def _tensors_of_file(
@@ -96,8 +90,6 @@ def _tensors_of_file(
     """Return the tensors in the file of a value, and the number of bytes compared with the
     checksum: all if ``check``, or if the file is not the one that was written.
     """
-    from neusee.workflows.store import serialization
-
     payload, path = about["payload"], disk.path(about["key"], "safetensors")
     stamp = stamp_of(path)
     if stamp[1] != payload["size"]:
@@ -107,15 +99,13 @@ def _tensors_of_file(
     due = check or (verify == "sampled" and stamp != payload.get("stamp"))
     # whatever ``verify`` says: the checksum has no key
     sha256 = payload.get("sha256", "") if secrets() else None
-    tensors = serialization.read(path, payload["xxh3"] if due else None, sha256)
+    tensors = lazy.serialization.read(path, payload["xxh3"] if due else None, sha256)
     return tensors, payload["size"] if due else 0
 
 
 def check_kind(value: Any, kind: Any) -> None:
     """Raise `ValueError` for a value that does not have the annotated type ``kind``."""
-    from neusee.workflows.store.serialization import fits
-
-    if not fits(value, kind):
+    if not lazy.serialization.fits(value, kind):
         raise ValueError(f"the value is {type(value).__name__}, which the step does not return")
 
 

@@ -34,7 +34,15 @@ from neusee.workflows.keys.sealed_files import (
     secrets,
 )
 from neusee.workflows.store.cache_settings import Verify
-from neusee.workflows.store.metadata import UNREADABLE, Metadata, is_kept, read, receipt, unseal_of
+from neusee.workflows.store.metadata import (
+    UNREADABLE,
+    Metadata,
+    checked_layout,
+    is_kept,
+    read,
+    receipt,
+    unseal_of,
+)
 from neusee.workflows.store.payload import newest, stamp_of
 from neusee.workflows.store.result_store import Store
 
@@ -569,9 +577,7 @@ class RemoteStore(Store):
         """Copy a value from the URL into the local folder after a check of every byte; return
         False if a copy fails.
         """
-        from neusee.workflows.store.serialization import blobs_in
-
-        payload, bands = about["payload"], blobs_in(about["layout"])
+        payload, bands = about["payload"], checked_layout(about["layout"])
         missing = {name: xxh3 for name, xxh3 in bands.items() if not self.blobs.has(name)}
         with ExitStack() as files:
             payload_file, *parts = (self._part(files, name) for name in (key, *missing))
@@ -669,12 +675,10 @@ class RemoteStore(Store):
         """Return the local paths of the payload and band files of a value, by the name of each
         file at the URL.
         """
-        from neusee.workflows.store.serialization import blobs_in
-
         paths = {}
         if payload := about["payload"]:
             paths[_payload_name(key, payload["xxh3"])] = self.disk.path(key, "safetensors")
-        for name, xxh3 in blobs_in(about["layout"]).items():
+        for name, xxh3 in checked_layout(about["layout"]).items():
             paths[_band_name(name, xxh3)] = self.blobs.path(name)
         return paths
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
 from neusee.workflows.keys.sealed_files import NotRead, Unsigned, seal_record, unseal_record
+from neusee.workflows.store import lazy_imports as lazy
 from neusee.workflows.store import metadata, payload
 from neusee.workflows.store.cache_settings import Verify, budget_bytes, default_root, verify_mode
 from neusee.workflows.store.eviction import LOW, CacheBudget, Maintained
@@ -205,9 +206,7 @@ class Store(Warned, Maintained):
     @cached_property
     def blobs(self) -> Blobs:
         """Return the folder of the band files of the store, which hold one spectral band each."""
-        from neusee.workflows.store.band_files import Blobs
-
-        return Blobs(self.root / "bands")
+        return lazy.band_files.Blobs(self.root / "bands")
 
     def has(self, key: str) -> bool:
         """Return True if the value of ``key`` is stored, without reading the value."""

@@ -418,13 +418,6 @@ def _bytes(x: Tensor) -> bytes:
     return x.numpy().tobytes()
 
 
-def blobs_in(layout: Any) -> dict[str, str]:
-    """Return the checksum (xxh3) of every band file that the layout of a value names, by the
-    name of the band.
-    """
-    return checked_layout(layout)
-
-
 def _class_name(item: tuple[Any, ...]) -> str:
     """Return the name of the class of a named tuple in the registry; raise `TypeError` for any
     other class.

@@ -14,6 +14,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+from neusee.nodes import optics, spectra
 from neusee.workflows.graph.recipe_graph import (
     METRIC_TOLERANCE,
     Recipe,
@@ -246,8 +247,6 @@ class _Draft:
         """Add steps that compute the PSF of an image for few bands, if nothing else reads it;
         return the wires.
         """
-        from neusee.nodes import optics
-
         name = image.wires.get("psf")
         step = self.recipe.steps[name] if isinstance(name, str) else None
         if step is None or step.node is not optics.psf or not self._only(step.name, image.name):
@@ -288,8 +287,6 @@ class _Draft:
         """Add a step that computes the weight of each wavelength band in each channel sum;
         return the step's name.
         """
-        from neusee.nodes import spectra
-
         well = _well(readers)
         name, wires = (
             f"{responses}.{'wells' if well else 'rows'}",
@@ -303,8 +300,6 @@ class _Draft:
 
         The conversion to low rank comes as early as the nodes allow.
         """
-        from neusee.nodes import spectra
-
         step, new = self.recipe.steps[name], f"{name}.mixture"
         through = next(
             (i for i in step.node.accepts_low_rank if isinstance(step.wires.get(i), str)), None

@@ -14,6 +14,7 @@ import torch
 from neusee.nodes.values import Psf
 from neusee.workflows.store import band_files, serialization
 from neusee.workflows.store.band_files import Blobs, Damaged, Stacked, bytes_of
+from neusee.workflows.store.metadata import checked_layout
 
 PAGES = (4, 32, 64)  #: float32 slices of two pages
 DTYPES = [*serialization._DTYPES, torch.complex64, torch.complex128]
@@ -249,7 +250,7 @@ def test_a_layout_names_its_blobs_and_gives_the_stack_back(blobs):
     # of an unknown cut-off, and of the list
     assert [t.tolist() for t in tensors] == [[], [], [1.0, 1.0, 1.0]]
     layout = json.loads(json.dumps(layout))
-    assert set(serialization.blobs_in(layout)) == {*names, *psf.clear_peak.names}
+    assert set(checked_layout(layout)) == {*names, *psf.clear_peak.names}
     found = serialization.unpack(layout, tensors, Blobs(blobs.root))
     assert type(found["psf"]) is Psf
     assert torch.equal(found["psf"].intensity, x)
@@ -261,7 +262,7 @@ def test_a_layout_names_its_blobs_and_gives_the_stack_back(blobs):
 def test_without_blobs_a_stack_is_a_tensor_like_any_other():
     x = stack(*PAGES)
     layout, tensors = serialization.pack([Stacked(x, ("aa.0",) * 4), 3])
-    assert serialization.blobs_in(layout) == {}
+    assert checked_layout(layout) == {}
     assert torch.equal(serialization.unpack(layout, tensors)[0], x)
 
 

@@ -22,6 +22,7 @@ from neusee.nodes.losses import (
     SceneLight,
 )
 from neusee.nodes.own_modules import NetworkClass
+from neusee.nodes.restore import own_network, try_network
 from neusee.nodes.units import (
     Angle,
     Count,
@@ -562,8 +563,6 @@ def _wrong_network(block: Value, training: Training) -> Iterator[Diagnostic]:
     """Yield a diagnostic for each setting of the packaged networks, and for a class that fails
     on a small picture.
     """
-    from neusee.nodes.restore import own_network, try_network
-
     network = training.network
     if network.architecture is None:
         yield from _without_class(block)

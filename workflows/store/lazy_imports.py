@@ -1,0 +1,29 @@
+"""Modules of the store that reach torch, imported when a value is first read or written: metadata,
+leases and the list of a cache need none of them, and torch takes a second.
+
+    from neusee.workflows.store import lazy_imports as lazy
+    lazy.serialization.pack(value)
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from neusee.workflows.store import band_files as band_files
+    from neusee.workflows.store import serialization as serialization
+
+#: modules below neusee
+_MODULES = (
+    "workflows.store.band_files",
+    "workflows.store.serialization",
+)
+_BY_NAME = {module.rpartition(".")[2]: module for module in _MODULES}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a module when it is first used."""
+    if name not in _BY_NAME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return importlib.import_module(f"neusee.{_BY_NAME[name]}")
