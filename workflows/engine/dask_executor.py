@@ -22,7 +22,14 @@ import torch
 
 from neusee.nodes.own_modules import own_modules
 from neusee.workflows.engine.machine_resources import FRESH, there_is
-from neusee.workflows.engine.step_job import InputMissing, Lane, Outcome, StepJob, carry_out
+from neusee.workflows.engine.step_job import (
+    InputMissing,
+    Lane,
+    Outcome,
+    StepJob,
+    carry_out,
+    keys_in,
+)
 from neusee.workflows.graph.run_error import RunError
 from neusee.workflows.keys.cache_key import Key, code_of, is_private
 from neusee.workflows.keys.code_digest import Code
@@ -345,7 +352,7 @@ def kinds_of(work: StepJob) -> dict[Key, Any]:
             kind = get_args(lists[0])[0] if lists else Any
         if kind is Any:
             list(all_nodes())
-        kinds |= dict.fromkeys(read if isinstance(read, tuple) else [read] if read else [], kind)
+        kinds |= dict.fromkeys(keys_in(read), kind)
     return kinds
 
 

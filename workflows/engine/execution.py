@@ -87,7 +87,8 @@ class RunSeries:
         The next run computes private results again, which may differ then.
         """
         public = [key for key in keys if not is_private(key)]
-        self.facts = {key: stats for key in public if (stats := facts.get(key)) is not None}
+        known = ((key, facts.get(key)) for key in public)
+        self.facts = {key: stats for key, stats in known if stats is not None}
 
 
 # --- values in memory -----------------------------------------------------------------------------
@@ -486,15 +487,16 @@ class Execution:
             self.again[key] if key in self.again else self._reading(key)
             for key in set(work.sources)
         )
-        path, expected = work.step.node.path, self.expected[work.key]
-        seconds = (
-            self.took[path]
-            if path in self.took
-            else expected.seconds["cpu"]
-            if expected.known
-            else _QUICK
+        return replace(
+            work, refetch_seconds=refetch, unlocked=self._probable_seconds(work) < _QUICK
         )
-        return replace(work, refetch_seconds=refetch, unlocked=seconds < _QUICK)
+
+    def _probable_seconds(self, work: StepJob) -> float:
+        """Return the time of a job as this run measured its node, or as it is predicted."""
+        path, expected = work.step.node.path, self.expected[work.key]
+        if path in self.took:
+            return self.took[path]
+        return expected.seconds["cpu"] if expected.known else _QUICK
 
     def _note(self, outcome: Outcome) -> None:
         """Record the outcome of a step, or raise the error in this outcome."""

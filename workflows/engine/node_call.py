@@ -168,15 +168,18 @@ def plain_of(value: Any) -> Any:
     return value._make(map(plain_of, value)) if type(value) in BAND_FIELDS else value
 
 
+def _is_cut_by_band(value: Any) -> bool:
+    return isinstance(value, Tensor) or type(value) in BAND_FIELDS
+
+
 def band_count(step: Step, inputs: Sequence[Any]) -> int:
     """Return the number of bands that a step computes independently of each other; 0 if the step
     has no such bands.
     """
     named = zip(step.node.inputs, inputs, strict=False)
-    banded = [
-        (axis, value) for name, value in named if (axis := _axis(step, name, value)) is not None
-    ]
-    if any(not isinstance(value, Tensor) and type(value) not in BAND_FIELDS for _, value in banded):
+    axes = [(_axis(step, name, value), value) for name, value in named]
+    banded = [(axis, value) for axis, value in axes if axis is not None]
+    if not all(_is_cut_by_band(value) for _, value in banded):
         return 0  # a low-rank cube has no slice of one band
     counts = set[int]()
     for axis, value in banded:
@@ -190,7 +193,7 @@ def bands_in(node: Node, inputs: Sequence[Any]) -> int:
     """
     for name, value in zip(node.inputs, inputs, strict=False):
         axis = node.bands.get(name) if node.bands else None
-        if axis is not None and (isinstance(value, Tensor) or type(value) in BAND_FIELDS):
+        if axis is not None and _is_cut_by_band(value):
             return max((x.shape[axis] for x in band_tensors(value) if _has(x, axis)), default=1)
     return 1
 

@@ -130,6 +130,11 @@ class InputMissing(Exception):
     """
 
 
+def keys_in(read: Read) -> tuple[Key, ...]:
+    """Return the cache keys of the values of one input."""
+    return (read,) if isinstance(read, str) else read or ()
+
+
 @dataclass(frozen=True, slots=True)
 class StepJob:
     """A step to compute, with the cache keys of its inputs."""
@@ -156,7 +161,7 @@ class StepJob:
         """Return the cache keys of all values that the job reads."""
         keys: list[Key] = []
         for read in self.reads:
-            keys += [read] if isinstance(read, str) else read or ()
+            keys += keys_in(read)
         return tuple(keys)
 
 

@@ -638,4 +638,6 @@ def _few(names: list[str]) -> str:
 
 
 def _listed(value: Any) -> list[Any]:
-    return [] if value is None else [value] if isinstance(value, str) else list(value)
+    if value is None:
+        return []
+    return [value] if isinstance(value, str) else list(value)

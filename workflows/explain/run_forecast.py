@@ -69,9 +69,9 @@ def _row(name: str, plan: Plan, store: Store) -> Row:
     if name in plan.expected:
         where = plan.lanes.get(name, "?")
         return row | {"state": "run", "where": where, **_costs(plan.expected[name], where)}
-    state = (
-        "stored" if store.has(plan.keys[name]) else "run" if name in plan.awake else "not needed"
-    )
+    state = "run" if name in plan.awake else "not needed"
+    if store.has(plan.keys[name]):
+        state = "stored"
     measured = (
         {"seconds": _ranged(about["seconds"], Range()), "bytes": about["bytes"]} if about else {}
     )
@@ -148,7 +148,9 @@ def _figures(value: float) -> str:
     """Return a number as text without an exponent: two decimals below 1, one below 10, and none
     above.
     """
-    return f"{value:.{2 if value < 0.995 else 1 if value < 9.95 else 0}f}"
+    if value < 0.995:
+        return f"{value:.2f}"
+    return f"{value:.1f}" if value < 9.95 else f"{value:.0f}"
 
 
 # --- report memory --------------------------------------------------------------------------------

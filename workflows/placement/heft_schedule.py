@@ -487,11 +487,8 @@ def heft(tasks: Sequence[Task], cluster: Cluster, keep: Collection[str] = ()) ->
     except TooLarge as error:
         # reports the memory for one device, if this is less
         return _alone(graph, _able(graph), error)
-    sooner = {
-        d: took
-        for d in _able(graph)
-        if (took := sum(row[d] for row in graph.seconds)) < schedule.makespan
-    }
+    seconds = {d: sum(row[d] for row in graph.seconds) for d in _able(graph)}
+    sooner = {d: took for d, took in seconds.items() if took < schedule.makespan}
     try:
         return _alone(graph, sorted(sooner, key=sooner.__getitem__)) if sooner else schedule
     except TooLarge:

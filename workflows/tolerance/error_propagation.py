@@ -219,9 +219,9 @@ def _together(carried: ErrorBound, own: ErrorBound | None, facts: TensorStats | 
     """
     if own is None:
         return replace(carried, stats=facts)
-    peak = (
-        None if own.peak is None else own.peak + carried.peak if carried.peak is not None else None
-    )
+    peak = None
+    if own.peak is not None and carried.peak is not None:
+        peak = own.peak + carried.peak
     return ErrorBound(
         carried.rms + own.rms,
         stats=facts,
@@ -385,7 +385,10 @@ def _gathered(wire: Wire, bounds: Mapping[str, ErrorBound]) -> _Input:
 
 def _flat(inputs: Iterable[_Input]) -> Iterator[ErrorBound]:
     for error in inputs:
-        yield from error if isinstance(error, list) else [error] if error else []
+        if isinstance(error, list):
+            yield from error
+        elif error:
+            yield error
 
 
 # --- expected errors ------------------------------------------------------------------------------

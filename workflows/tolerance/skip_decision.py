@@ -266,7 +266,7 @@ class ErrorBudget:
         """Return the error bound of each omitted step on which ``step`` depends, by the name of
         the omitted step.
         """
-        parts = [spent for name in dict.fromkeys(step.sources) if (spent := self._spent.get(name))]
+        parts = list(filter(None, map(self._spent.get, dict.fromkeys(step.sources))))
         if not parts:
             return {}
         first, *others = parts
