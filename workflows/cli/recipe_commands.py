@@ -120,6 +120,7 @@ def run(
     table = lazy.console.RunTable(
         cheaper, lazy.wanted_steps.steps_of(cheaper), lazy.console.mode_for(silent), predicted
     )
+    simulate = lazy.simulate_recipe.simulate
     with (
         resumable(
             lambda: kept_in(
@@ -129,9 +130,7 @@ def run(
         executor_of(executor, store, jobs, _speaker(silent)) as cluster,
         table,
     ):
-        done = lazy.simulate_recipe.simulate(
-            cheaper, store, out, command, device, table.watch, cluster, limit, again
-        )
+        done = simulate(cheaper, store, out, command, device, table.watch, cluster, limit, again)
     if silent:
         hints = []
         _say_briefly(done, as_json)
