@@ -1,5 +1,5 @@
-"""Modules that reach torch, imported for the few recipes that need them: torch takes a second, and
-most recipes are loaded without it.
+"""Modules that are imported for the few recipes that need them: the blocks of settings, and what
+reaches torch, which takes a second.
 
     from neusee.workflows.recipe import lazy_imports as lazy
     lazy.train_block.read_training(composed, context)
@@ -13,14 +13,18 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from neusee.nodes import calibrate as calibrate
     from neusee.workflows.observation import observed_call as observed_call
+    from neusee.workflows.recipe.blocks import evaluate_block as evaluate_block
     from neusee.workflows.recipe.blocks import safety_block as safety_block
+    from neusee.workflows.recipe.blocks import settings_block as settings_block
     from neusee.workflows.recipe.blocks import train_block as train_block
 
 #: modules below neusee
 _MODULES = (
     "nodes.calibrate",
     "workflows.observation.observed_call",
+    "workflows.recipe.blocks.evaluate_block",
     "workflows.recipe.blocks.safety_block",
+    "workflows.recipe.blocks.settings_block",
     "workflows.recipe.blocks.train_block",
 )
 _BY_NAME = {module.rpartition(".")[2]: module for module in _MODULES}

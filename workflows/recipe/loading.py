@@ -16,8 +16,6 @@ from neusee.workflows.graph.final_values import Config, Setting, changes
 from neusee.workflows.graph.recipe_graph import Recipe, Step, Wire
 from neusee.workflows.keys.sealed_files import head_of
 from neusee.workflows.recipe import lazy_imports as lazy
-from neusee.workflows.recipe.blocks.evaluate_block import read_evaluate
-from neusee.workflows.recipe.blocks.settings_block import read_block
 from neusee.workflows.recipe.distributions.law_text import read_mismatch
 from neusee.workflows.recipe.distributions.nominal_values import Uncertain, settle
 from neusee.workflows.recipe.global_settings import (
@@ -283,10 +281,10 @@ def _settings_blocks(
         return composed, None, None, None, None
     composed, training = lazy.train_block.read_training(composed, class_context(modules))
     composed, lifting = lazy.train_block.read_lift_training(composed)
-    composed, evaluation = read_evaluate(composed)
+    composed, evaluation = lazy.evaluate_block.read_evaluate(composed)
     if TRACED not in composed.root.items:
         return composed, training, lifting, evaluation, None
-    composed, traceability = read_block(
+    composed, traceability = lazy.settings_block.read_block(
         composed, TRACED, lazy.calibrate.Traceability, composed.root.items[TRACED].plain
     )
     return composed, training, lifting, evaluation, traceability
