@@ -18,13 +18,17 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from stored_results import store, stored
+
 from neusee.workflows.graph.diagnostics import Location, RecipeError
 from neusee.workflows.recipe.text.yaml_values import parse, read
 
+DOCUMENT = "yaml_suite"  #: in `results/`
 ALIKE = "read like the reference"
 REFUSED = "refused with a place"
 INVALID_REFUSED = "refused with a place, and no YAML"
@@ -143,26 +147,25 @@ def _mappings_alike(ours: dict[Any, Any], reference: dict[str, Any]) -> bool:
     return all(alike(value, reference[key]) for key, value in values.items())
 
 
-def report(outcomes: list[Outcome]) -> Iterator[str]:
-    """Yield the lines of the tables in `RESULTS.md`."""
-    yield f"{len(outcomes)} cases; ruamel.yaml {version('ruamel.yaml')}.\n"
-    yield from _table(outcomes)
+def listed(outcomes: list[Outcome]) -> Iterator[str]:
+    """Yield a line for each case that is neither read like its reference nor refused in its place."""
     for state in LISTED:
-        listed = [result for result in outcomes if result.state == state]
-        if listed:
+        of_state = [result for result in outcomes if result.state == state]
+        if of_state:
             yield f"\n{state}:\n"
-        yield from map(_row, listed)
+        yield from map(_row, of_state)
 
 
-def _table(outcomes: list[Outcome]) -> Iterator[str]:
+def table(outcomes: list[Outcome]) -> dict[str, list[Any]]:
+    """Return the columns and the rows of the table of outcomes by kind of reference."""
     counts = Counter((result.case.kind, result.state) for result in outcomes)
     occurring = {result.state for result in outcomes}
     states = [state for state in (ALIKE, REFUSED, INVALID_REFUSED, *LISTED) if state in occurring]
-    yield f"| the reference is | cases | {' | '.join(states)} |"
-    yield "|---" * (len(states) + 2) + "|"
+    rows = []
     for kind in KINDS:
         numbers = [counts[kind, state] for state in states]
-        yield f"| {kind} | {sum(numbers)} | {' | '.join(map(str, numbers))} |"
+        rows.append([kind, *map(str, (sum(numbers), *numbers))])
+    return {"columns": ["the reference is", "cases", *states], "rows": rows}
 
 
 def _row(result: Outcome) -> str:
@@ -181,7 +184,16 @@ def main() -> None:
         outcomes = [outcome(case, Path(folder)) for case in cases(options.folder)]
     if not outcomes:
         raise SystemExit(f"{options.folder} has no cases: give a checkout of the branch data")
-    print("\n".join(report(outcomes)))
+    document = stored(DOCUMENT)
+    [old] = document["tables"]
+    conditions = (
+        f"{len(outcomes)} cases of the branch `data`, each read as a recipe file, or as the value of"
+        f" an argument if it is no mapping; ruamel.yaml {version('ruamel.yaml')}."
+    )
+    today = date.today().isoformat()
+    document["tables"] = [old | table(outcomes) | {"conditions": conditions, "date": today}]
+    store(DOCUMENT, document)
+    print("\n".join(listed(outcomes)))
     if options.refused:
         for result in outcomes:
             if result.state == REFUSED and result.case.kind == "a mapping":

@@ -99,7 +99,7 @@ def work(job: dict[str, Any], rank: int, world: int, port: int) -> None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            with joined("", "cpu") as mesh:
+            with joined("cpu") as mesh:
                 DO[job["do"]](job, mesh)
         code = 0
     except BaseException:

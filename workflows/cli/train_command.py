@@ -62,7 +62,6 @@ def train(
     words: Words = None,
     stage: Annotated[Stages, typer.Option("--stage", help=_STAGES)] = Stages.BOTH,
     device: Annotated[str, typer.Option("--device", help="Where to train: cpu or cuda.")] = "cpu",
-    mesh: Annotated[str, typer.Option("--mesh", hidden=True)] = "",
     as_json: AsJson = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -81,7 +80,7 @@ def train(
     """
     recipe, command = load(words or ["train_small"], "train")
     if recipe.lifting is not None:
-        _refuse_stage_and_mesh(recipe, stage, mesh)
+        _refuse_stage(recipe, stage)
         check_device(device)
         return _lift(recipe, command, out, device, quiet, as_json)
 
@@ -92,15 +91,13 @@ def train(
     learnt = recipe.training.learnt if recipe.training else ()
     stages = _NUMBERS.get(stage, learnt)
     command += ["--stage", stage.value]
-    if mesh:
-        command += ["--mesh", mesh]
     lengths = _lengths(recipe, stages)
     with (
         resumable(lambda: kept_training(out, recipe.name)),
         failing(lazy.run_error.RunError, ValueError, ArithmeticError, code=FAILED, before=who),
         failing(lazy.process_mesh.MeshError, before=who),
         refusing(),
-        lazy.process_mesh.joined(mesh, device) as processes_here,
+        lazy.process_mesh.joined(device) as processes_here,
         _loss_bar(silent, lengths) as watch,
     ):
         folder = lazy.verbs.train(
@@ -119,13 +116,10 @@ def train(
         _say_results(folder, as_json, lines)
 
 
-def _refuse_stage_and_mesh(recipe: Recipe, stage: Stages, mesh: str) -> None:
-    """End the command for options that the training of a lift does not have."""
-    if stage is not Stages.BOTH or mesh:
-        fail(
-            f"{recipe.name} learns a lift, which has neither stages nor a mesh: leave --stage"
-            " and --mesh out"
-        )
+def _refuse_stage(recipe: Recipe, stage: Stages) -> None:
+    """End the command for an option that the training of a lift does not have."""
+    if stage is not Stages.BOTH:
+        fail(f"{recipe.name} learns a lift, which has no stages: leave --stage out")
 
 
 def _lengths(recipe: Recipe, stages: Iterable[int]) -> dict[int, int]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from torch import nn
 
 
 class MeshError(ValueError):
-    """Error for several processes that contradict the recipe or an argument, such as ``--mesh``."""
+    """Error for several processes that contradict the recipe or each other."""
 
 
 @dataclass(frozen=True)
@@ -114,29 +113,6 @@ def processes() -> tuple[int, int]:
     return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
 
 
-def require_mesh(text: str, world: int) -> None:
-    """Raise MeshError unless ``text`` is empty or, such as ``4x1``, the number ``world`` of
-    processes.
-    """
-    if not text:
-        return
-    if not re.fullmatch(r"[1-9]\d*x[1-9]\d*", text):
-        raise MeshError(f"--mesh {text}: write PROCESSESx1, such as 4x1, or leave --mesh out")
-    count, shares = map(int, text.split("x"))
-    if shares > 1:
-        raise MeshError(
-            f"--mesh {text}: processes do not share the bands of a picture, each has pictures of"
-            f" its own: write --mesh {count * shares}x1, or leave --mesh out"
-        )
-    if count != world:
-        start = f"torchrun --nproc-per-node {count} --no-python neusee train ..."
-        processes = "there is 1" if world == 1 else f"there are {world}"
-        raise MeshError(
-            f"--mesh {text} is for {count} processes and {processes}: start {start}, or write"
-            f" {world}x1"
-        )
-
-
 def device_here(device: str) -> str:
     """Return the name of this process's device, such as ``cuda:1`` for the second process on a
     machine.
@@ -146,13 +122,9 @@ def device_here(device: str) -> str:
 
 
 @contextmanager
-def joined(text: str, device: str) -> Iterator[Mesh]:
-    """Return a context in which this process belongs to the processes of `torchrun`.
-
-    Raises MeshError if ``text``, the argument of ``--mesh``, contradicts their number.
-    """
+def joined(device: str) -> Iterator[Mesh]:
+    """Return a context in which this process belongs to the processes of `torchrun`."""
     rank, world = processes()
-    require_mesh(text, world)
     if world == 1:
         yield ALONE
         return

@@ -254,7 +254,7 @@ def test_the_command_learns_a_lift_and_knows_no_stages(tmp_path, capsys, monkeyp
     with pytest.raises(SystemExit) as error:
         main(["train", "train_lift", *TINY, "--stage", "1"])
     assert error.value.code == 2
-    assert "neither stages nor a mesh" in capsys.readouterr().err
+    assert "learns a lift, which has no stages" in capsys.readouterr().err
     with pytest.raises(SystemExit) as done:
         main(
             [

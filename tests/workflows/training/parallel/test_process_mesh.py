@@ -4,7 +4,6 @@ fails.
 
 import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +13,7 @@ import torch
 from safetensors.torch import load_file
 
 from neusee.workflows import Store, load
-from neusee.workflows.training.process_mesh import Mesh, MeshError, require_mesh
+from neusee.workflows.training.process_mesh import Mesh, MeshError
 from neusee.workflows.training.run_training import train
 from tests.workflows.training.noise_photographs import noise_photograph
 
@@ -225,11 +224,6 @@ def test_torchrun_starts_it_and_stops_all_where_one_fails(tmp_path):
     (folder,) = (tmp_path / "runs").iterdir()
     assert once.stdout.splitlines().count(str(folder)) == 1
     assert json.loads((folder / "training.json").read_text())["mesh"] == "2x1"
-    wrong = subprocess.run(
-        [*start, "--mesh", "1x2"], env=environment, capture_output=True, text=True, check=False
-    )
-    assert wrong.returncode != 0
-    assert "--mesh 1x2: processes do not share the bands of a picture" in wrong.stderr
 
 
 LEAVES = """
@@ -242,7 +236,7 @@ from neusee.workflows.training.process_mesh import joined
 def threads():
     return [path.read_text().strip() for path in Path("/proc/self/task").glob("*/comm")]
 
-with joined("2x1", "cpu") as mesh:
+with joined("cpu") as mesh:
     dist.all_reduce(torch.ones(3))
     assert "pt_gloo_runloop" in threads()
 Path(sys.argv[1], str(mesh.rank)).write_text(" ".join(threads()))  # the mesh is held
@@ -266,26 +260,6 @@ def test_no_thread_of_a_mesh_runs_on_after_it(tmp_path):
     assert done.returncode == 0, done.stderr
     for rank in "01":
         assert "gloo" not in (tmp_path / rank).read_text()
-
-
-@pytest.mark.parametrize(("text", "world"), [("", 1), ("", 4), ("4x1", 4)])
-def test_a_mesh_that_fits_is_accepted(text, world):
-    require_mesh(text, world)
-
-
-@pytest.mark.parametrize(
-    ("text", "world", "said"),
-    [
-        ("4x1", 1, "there is 1: start torchrun --nproc-per-node 4"),
-        ("3", 3, "write PROCESSESx1"),
-        ("0x2", 2, "write PROCESSES"),
-        ("4x2", 8, "--mesh 4x2: processes do not share the bands of a picture, each has pictures of"
-         " its own: write --mesh 8x1, or leave --mesh out"),
-    ],
-)  # fmt: skip
-def test_a_mesh_that_does_not_fit_is_refused(text, world, said):
-    with pytest.raises(MeshError, match=re.escape(said)):
-        require_mesh(text, world)
 
 
 def test_a_batch_that_cannot_be_shared_is_refused_where_it_stands(tmp_path):
